@@ -1,0 +1,53 @@
+"""jimpact: differentiable laws for impacts with several contacts, in JAX.
+
+The mental model: a `Scene` (mass matrix, contact normals) turns velocities into contact space,
+`W = N^T M^-1 N` and gap velocities `gamma = N^T v` (negative on approach); a *law* maps
+`(W, gamma-)` and its own parameters to impulses `p >= 0`; `impact` gives
+`v+ = v- + M^-1 N p`, the energy change (<= 0 dissipates) and a status code.
+Laws and scenes are pytrees: `jax.jit`, `jax.vmap` and `jax.grad` work over all of them.
+
+>>> import jimpact as ji
+>>> out = ji.impact(ji.LZB(1.0), ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+>>> [round(float(v), 3) for v in out.velocity]
+[-0.071, 0.076, 0.995]
+"""
+
+from importlib import import_module
+from typing import Any
+
+__version__ = "0.1.0"
+
+# module -> public names, imported on first use so that `jimpact --help` stays fast. No module is
+# named like a public name: importing it would put the module in the function's place.
+_WHERE = {
+    "scene": (
+        "Scene delassus_matrix gap_velocity kinetic_angles kinetic_energy momentum "
+        "normalized_delassus normalized_gap_velocity velocity_change"
+    ),
+    "scenes": "chain column scene_from_gaps",
+    "laws": "REGISTRY",
+    "laws.base": "Law",
+    "laws.newton": "Newton",
+    "laws.lzb": "LZB distributing_rule",
+    "impacts": "Impact impact raise_on_failure",
+    "status": "STATUS",
+    "consistency": "Audit audit summary",
+    "histories": "History history",
+    "experiments": "Experiments read_experiments",
+    "fitting": "Fit fit",
+}
+_MODULE = {name: module for module, names in _WHERE.items() for name in names.split()}
+
+__all__ = sorted([*_MODULE, "__version__"])
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE:
+        raise AttributeError(f"module 'jimpact' has no attribute {name!r}")
+    value = getattr(import_module(f"jimpact.{_MODULE[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

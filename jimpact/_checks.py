@@ -1,0 +1,77 @@
+"""Host-side argument checks with one error template; tracers pass unchecked."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+def is_traced(value: Any) -> bool:
+    """Whether `value` is (or holds) an abstract value inside a JAX transformation."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
+
+
+def as_float_array(name: str, value: Any) -> jax.Array:
+    """`value` as a floating JAX array; text, objects and complex numbers are refused."""
+    if isinstance(value, jax.Array):
+        array = value
+    else:
+        host = np.asarray(value)
+        if host.dtype.kind not in "fiub":
+            raise TypeError(f"Argument `{name}` must be numeric, but has value {value!r}.")
+        array = jnp.asarray(value)
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise TypeError(f"Argument `{name}` must be real, but has dtype {array.dtype}.")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(float)
+    return array
+
+
+def check_values(
+    name: str,
+    value: Any,
+    *,
+    low: float = -np.inf,
+    high: float = np.inf,
+    open_low: bool = False,
+    nan_allowed: bool = False,
+) -> None:
+    """Raise a ValueError unless all entries are numbers between `low` and `high`."""
+    if value is None or is_traced(value):
+        return
+    entries = np.asarray(value, dtype=float)
+    finite = np.isfinite(entries) | (np.isnan(entries) & nan_allowed)
+    inside = (entries > low if open_low else entries >= low) & (entries <= high)
+    bad = ~(finite & (inside | np.isnan(entries)))
+    if not bad.any():
+        return
+    index = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])
+    where = f" at index {index[0] if len(index) == 1 else index}" if entries.ndim else ""
+    bracket = "(" if open_low else "["
+    allowed = (
+        f"lie in {bracket}{low:g}, {high:g}{']' if np.isfinite(high) else ')'}"
+        if np.isfinite(low) or np.isfinite(high)
+        else "be finite"
+    )
+    raise ValueError(
+        f"Argument `{name}` must {allowed}, but has value {np.atleast_1d(entries)[index]:g}{where}."
+    )
+
+
+def check_shape(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> None:
+    """Raise a ValueError unless `value` has exactly this shape."""
+    if jnp.shape(value) != shape:
+        raise ValueError(
+            f"Argument `{name}` must have shape {shape} ({meaning}), "
+            f"but has shape {tuple(jnp.shape(value))}."
+        )
+
+
+def check_per_contact(name: str, value: Any, contacts: int) -> None:
+    """Raise a ValueError unless `value` is a scalar or has one entry per contact."""
+    if jnp.shape(value) not in ((), (contacts,)):
+        raise ValueError(
+            f"Argument `{name}` must be a scalar or have shape ({contacts},), one value per "
+            f"contact, but has shape {tuple(jnp.shape(value))}."
+        )

@@ -1,0 +1,153 @@
+"""`impact`: the one place that turns a law's impulses into velocities, energy and status."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.laws.base import Law
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
+from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
+from jimpact.status import CODE, STATUS
+
+# A sign is violated only beyond these multiples of the impact's own scale: rounding and the
+# solver's tolerance stay below (float64: 1e-7; float32: about 2e-3).
+SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
+
+
+class Impact(eqx.Module):
+    """Outcome of an impact: v+ [m/s], p [N s], T+ - T- [J], initially stored energy [J], status."""
+
+    velocity: jax.Array
+    impulse: jax.Array
+    tangential_impulse: jax.Array
+    energy_change: jax.Array
+    initial_energy: jax.Array
+    status: jax.Array
+
+
+def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
+    """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
+
+    Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
+
+    Args:
+        law: its parameters are scalars or have one entry per contact.
+        scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
+        velocity: v- (n,) [m/s].
+
+    Returns:
+        `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
+        `initial_energy` (), `status` () int32, 0 = ok (`raise_on_failure`, `jimpact.STATUS`).
+
+    Raises:
+        ValueError: shapes or ranges, on the host; inside jit only the status speaks. NaN in a
+            velocity raises when concrete, and is `not_finite` when traced.
+
+    >>> import jimpact as ji
+    >>> out = ji.impact(ji.LZB(0.9, stiffness=1.0, exponent=1.5), ji.chain([1, 1, 1]), [1, 0, 0])
+    >>> [round(float(v), 4) for v in out.velocity]
+    [-0.0086, 0.1041, 0.9045]
+    """
+    v = as_float_array("velocity", velocity)
+    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    check_values("velocity", v)
+    law, scene, v = in_common_dtype(law, scene, v)
+    for name, value in vars(law).items():
+        if isinstance(value, jax.Array) and value.ndim and value.shape[0] != scene.contacts:
+            check_shape(name, value, (scene.contacts,), "one entry per contact, or a scalar")
+    law.check_options(v.dtype)
+    return _impact(law, scene, v)
+
+
+def in_common_dtype(law: Law, scene: Scene, velocity: jax.Array) -> tuple[Law, Scene, jax.Array]:
+    """All three in the widest floating type among them (Python numbers follow the arrays)."""
+    leaves = [x for x in jax.tree.leaves((law, scene, velocity)) if eqx.is_inexact_array(x)]
+    dtype = jnp.result_type(*leaves)
+    return jax.tree.map(
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (law, scene, velocity)
+    )
+
+
+def without_open_contacts(
+    scene: Scene, delassus: Symmetric, gamma: jax.Array
+) -> tuple[Symmetric, jax.Array]:
+    """W with the rows of open contacts decoupled, and gamma with zeros there (so p_j = 0)."""
+    if scene.gaps is None:
+        return delassus, gamma
+    closed = scene.closed
+    gamma = jnp.where(closed, gamma, 0.0)
+    if isinstance(delassus, Tridiagonal):
+        both = closed[:-1] & closed[1:]
+        off = jnp.where(both, delassus.off_diagonal, 0.0)
+        return Tridiagonal(delassus.diagonal, off), gamma
+    keep = (closed[:, None] & closed[None, :]) | jnp.eye(closed.shape[0], dtype=bool)
+    return jnp.where(keep, delassus, 0.0), gamma
+
+
+@eqx.filter_jit
+def _impact(law: Law, scene: Scene, v: jax.Array) -> Impact:
+    w_all = delassus_matrix(scene)
+    gamma_all = gap_velocity(scene, v)
+    w, gamma = (
+        (w_all, gamma_all) if law.uses_gaps else without_open_contacts(scene, w_all, gamma_all)
+    )
+    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts), 0.0)
+    happens = jnp.any(gamma < 0) | jnp.any(stored > 0) | ~jnp.all(jnp.isfinite(gamma))
+    # where nothing happens the law sees a harmless approach, so that its gradients stay finite
+    p, code = law.impulse(w, jnp.where(happens, gamma, -jnp.ones_like(gamma)))
+    p = jnp.where(happens, p, 0.0)
+    v_plus = v + velocity_change(scene, p)
+    gamma_plus = gamma_all + w_all @ p
+    change = 0.5 * jnp.sum((gamma_all + gamma_plus) * p)
+    code = jnp.where(happens, code, CODE["ok"])
+    code = jnp.maximum(
+        code, _signs(diagonal(w), gamma, gamma_plus, p, change, stored, scene.closed)
+    )
+    finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
+    code = jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32)
+    tangential = jnp.zeros(0 if scene.tangents is None else scene.tangents.shape[1], v.dtype)
+    return Impact(v_plus, p, tangential, change, jnp.sum(stored), code)
+
+
+def _signs(
+    w_diagonal: jax.Array,
+    gamma: jax.Array,
+    gamma_plus: jax.Array,
+    p: jax.Array,
+    change: jax.Array,
+    stored: jax.Array,
+    closed: jax.Array,
+) -> jax.Array:
+    """The gravest of negative_impulse, inadmissible_velocity, energy_gain; 0 if none."""
+    tolerance = SIGN_TOLERANCE.get(str(p.dtype), 2e-3)
+    root = jnp.sqrt(w_diagonal)
+    # size of the impact in sqrt(energy): what approaches and what is stored
+    size = jnp.sqrt(jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2) + 2 * jnp.sum(stored))
+    pull = jnp.any(p * root < -tolerance * size)
+    approach = jnp.any(closed & (gamma_plus / root < -tolerance * size))
+    gain = change > jnp.sum(stored) + tolerance * size**2
+    code = jnp.where(gain, CODE["energy_gain"], CODE["ok"])
+    code = jnp.where(approach, CODE["inadmissible_velocity"], code)
+    return jnp.where(pull, CODE["negative_impulse"], code)
+
+
+def raise_on_failure(out: Impact) -> Impact:
+    """Raise a RuntimeError naming every failed impact of `out` (batched or not); else return it.
+
+    Codes that only inform (`plastic_limit`, `impulse_not_unique`, `order_dependent`) pass.
+    """
+    codes = np.atleast_1d(np.asarray(out.status))
+    lines = []
+    for code in np.unique(codes):
+        if STATUS[code].failure:
+            at = np.argwhere(codes == code)
+            first = ", ".join(str(tuple(map(int, i)) if len(i) > 1 else int(i[0])) for i in at[:5])
+            where = f" at {first}{', ...' if len(at) > 5 else ''}" if codes.size > 1 else ""
+            lines.append(f"{STATUS[code].name}: {STATUS[code].message} ({len(at)}{where})")
+    if lines:
+        raise RuntimeError(f"Failed impacts among {codes.size}:\n  " + "\n  ".join(lines))
+    return out

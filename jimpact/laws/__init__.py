@@ -1,0 +1,43 @@
+"""The registry of laws: one row a law. The CLI, the contract tests and the charts read it."""
+
+from typing import Any, NamedTuple
+
+from jimpact.laws.base import Law
+from jimpact.laws.newton import Newton
+
+
+class Row(NamedTuple):
+    """A law, what it promises on every scene, and where it comes from.
+
+    `promises` names the properties the contract suite holds it to; where the law breaks another
+    one of them, its status must say so.
+    """
+
+    law: type[Law]
+    parameters: tuple[str, ...]
+    summary: str
+    right_when: str
+    fails_when: str
+    promises: frozenset[str]
+    source: str
+    bibtex: str
+    fixed: dict[str, Any] = {}
+
+
+BROGLIATO = """@book{brogliato2016,
+  author = {Brogliato, Bernard}, title = {Nonsmooth Mechanics: Models, Dynamics and Control},
+  edition = {3}, publisher = {Springer}, year = {2016}, doi = {10.1007/978-3-319-28664-8}}"""
+
+
+REGISTRY: dict[str, Row] = {
+    "newton": Row(
+        law=Newton,
+        parameters=("restitution",),
+        summary="gamma+ = -e gamma- at every contact",
+        right_when="one contact, or contacts with kinetic angle pi/2",
+        fails_when="contacts at rest (no dispersion), kinetic angles above pi/2 (p < 0)",
+        promises=frozenset({"velocity_scaling", "mass_scaling"}),
+        source="Brogliato, Nonsmooth Mechanics (2016), (6.41) with diagonal E",
+        bibtex=BROGLIATO,
+    ),
+}

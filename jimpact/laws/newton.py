@@ -1,0 +1,57 @@
+"""Newton's law: the diagonal kinematic law `gamma+ = -e gamma-`, contact by contact."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import as_float_array, check_values
+from jimpact.laws.base import Law
+from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal
+from jimpact.status import CODE
+
+# W counts as singular when G (unit diagonal) has an eigenvalue below this multiple of eps * m.
+_SINGULAR = 100.0
+
+
+class Newton(Law):
+    """Newton's restitution at every contact, without complementarity.
+
+    Equation: `gamma+ = -e gamma-`, hence `p = -W^-1 (I + diag(e)) gamma-`.
+
+    Args:
+        restitution: kinematic coefficient e in [0, 1], scalar or one per contact (m,).
+
+    Status: `negative_impulse` or `inadmissible_velocity` where the kinematic law contradicts
+    unilateral contact (kinetic angles above pi/2, separating contacts, unequal e);
+    `impulse_not_unique` for redundant contacts, `infeasible` where they contradict each other.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.41) with a diagonal E.
+
+    >>> import jimpact as ji
+    >>> ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0]), [1.0, 0.0]).velocity.tolist()
+    [0.25, 0.75]
+    """
+
+    restitution: jax.Array
+
+    def __init__(self, restitution: Any):
+        self.restitution = as_float_array("restitution", restitution)
+        check_values("restitution", self.restitution, low=0.0, high=1.0)
+
+    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`p = -W^-1 (1 + e) gamma-`."""
+        required = -(1 + self.restitution) * gap_velocity
+        norm = jnp.sqrt(diagonal(delassus))
+        g = as_matrix(delassus) / (norm[:, None] * norm[None, :])
+        eps = jnp.finfo(g.dtype).eps
+        eigenvalues, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(g))
+        # redundant contacts: G + N N^T, N its null space, is regular and gives the least-norm p
+        null_space = vectors * (eigenvalues < _SINGULAR * eps * g.shape[0])
+        pbar = jnp.linalg.solve(g + null_space @ null_space.T, required / norm)
+        missed = jnp.abs(g @ pbar - required / norm).max() > jnp.sqrt(eps) * (
+            jnp.abs(required / norm).max()
+        )
+        singular = jnp.any(null_space != 0)
+        code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
+        return pbar / norm, jnp.where(singular & missed, CODE["infeasible"], code)

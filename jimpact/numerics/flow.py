@@ -1,0 +1,147 @@
+"""The LZB impact dynamics as a regular, dimensionless flow, and one Runge-Kutta step of it.
+
+With sqrt-energy units (Q for normalized velocities, T for time; see `laws/lzb.py`) the law reads
+
+    x_j' = -omega_j c_j gamma_j,    p_j' = (eta_j + 1)/2 omega_j x_j^eta_j,    gamma = gamma- + G p
+
+with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2.
+In expansion g_j = gamma_j / e_j takes the place of gamma_j, and time runs in units of the smallest
+e at work: nothing is then divided by e, so that e = 0 is an ordinary, differentiable case (the
+whole expansion takes no time; derivatives in e there are one-sided).
+
+A step may advance in time or in another variable xi that grows or falls monotonically:
+
+    TIME     xi = t
+    START    xi = sqrt(t): an impact begins like x ~ t, and forces t^eta are smooth in xi
+    ZERO_G   xi = g_j, ending on g_j = 0: lands on the event exactly (Henon's trick)
+    ROOT_X   xi = sqrt(x_j), ending on x_j = 0: the same for an opening, x_j^eta being smooth in xi
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.tableaux import DOP853
+from jimpact.numerics.tridiagonal import Symmetric
+
+TIME, START, ZERO_G, ROOT_X = 0, 1, 2, 3  # variable of a step
+OPEN, COMPRESSION, EXPANSION = 0, 1, 2  # phase of a contact
+
+Exponent = float | tuple[float, ...] | jax.Array
+
+
+class Flow(NamedTuple):
+    """Parameters of the dimensionless law, all (m,) but the unit-diagonal matrix `coupling` G."""
+
+    coupling: Symmetric
+    omega: jax.Array
+    restitution: jax.Array
+    exponent: Exponent
+
+
+class State(NamedTuple):
+    """Indentation x, scaled gap velocity g, impulse p (all (m,)) and impact time t ()."""
+
+    x: jax.Array
+    g: jax.Array
+    p: jax.Array
+    t: jax.Array
+
+
+def power(x: jax.Array, exponent: Exponent) -> jax.Array:
+    """`max(x, 0)^exponent` with finite derivatives at 0; fast for the static exponents 1, 1.5, 2."""
+    if isinstance(exponent, tuple) and len(set(exponent)) == 1:
+        exponent = exponent[0]
+    positive = x > 0
+    x = jnp.where(positive, x, 0.0)
+    if isinstance(exponent, float):
+        if exponent == 1.0:
+            return x
+        if exponent == 2.0:
+            return x * x
+        if exponent == 1.5:
+            return x * jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    eta = jnp.asarray(exponent, x.dtype)
+    return jnp.where(positive, jnp.exp(eta * jnp.log(jnp.where(positive, x, 1.0))), 0.0)
+
+
+def plus_one(exponent: Exponent) -> Exponent:
+    """`exponent + 1`, static where `exponent` is."""
+    return tuple(e + 1 for e in exponent) if isinstance(exponent, tuple) else exponent + 1
+
+
+def factor(exponent: Exponent, dtype: jnp.dtype) -> jax.Array:
+    """`(eta + 1) / 2`."""
+    return (jnp.asarray(exponent, dtype) + 1) / 2
+
+
+def scales(flow: Flow, phase: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`s_j` with `gamma_j = s_j g_j`, the time unit `s*`, and `s* / s_j` (0/0 = 1)."""
+    s = jnp.where(phase == EXPANSION, flow.restitution, 1.0)
+    unit = s[jnp.argmin(s)]  # not min(): its derivative is shared among ties
+    ratio = jnp.where(s > 0, unit / jnp.where(s > 0, s, 1.0), 1.0)
+    return s, unit, ratio
+
+
+def field(flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array) -> tuple[jax.Array, ...]:
+    """`(x', g', p', t')` with respect to time in units of `s*`, phases frozen."""
+    _, unit, ratio = scales(flow, phase)
+    force = factor(flow.exponent, x.dtype) * flow.omega * power(x, flow.exponent)
+    closing = jnp.where(phase == OPEN, 0.0, -ratio * flow.omega)
+    return closing * g, ratio * (flow.coupling @ force), unit * force, unit
+
+
+def step(
+    flow: Flow,
+    phase: jax.Array,
+    state: State,
+    kind: jax.Array,
+    target: jax.Array,
+    start: jax.Array,
+    length: jax.Array,
+) -> tuple[State, State, State]:
+    """One DOP853 step of `length` in the variable `kind`, which begins at `start`.
+
+    `target` (m,) is one-hot: the contact whose event ends a ZERO_G or ROOT_X step. Returns the
+    end state and the two error estimates.
+    """
+    stages: list[tuple[jax.Array, ...]] = []
+    x, g = state.x, state.g
+    for i, node in enumerate(DOP853.c):
+        if i:
+            x = state.x + length * _combine(DOP853.a[i], stages, 0)
+            g = state.g + length * _combine(DOP853.a[i], stages, 1)
+        xi = start + node * length
+        # the variable of the step is known exactly at every stage
+        x = jnp.where(target & (kind == ROOT_X), xi * xi, x)
+        g = jnp.where(target & (kind == ZERO_G), xi, g)
+        rates = field(flow, phase, x, g)
+        stretch = _stretch(kind, target, xi, rates)
+        stages.append(tuple(rate * stretch for rate in rates))
+    end, high, low = (
+        [length * _combine(weights, stages, row) for row in range(4)]
+        for weights in (DOP853.b, DOP853.error_high, DOP853.error_low)
+    )
+    landed = State(*(y + dy for y, dy in zip(state, end)))
+    landed = landed._replace(
+        x=jnp.where(target & (kind == ROOT_X), 0.0, landed.x),
+        g=jnp.where(target & (kind == ZERO_G), 0.0, landed.g),
+    )
+    return landed, State(*high), State(*low)
+
+
+def _combine(weights: tuple[float, ...], stages: list[tuple[jax.Array, ...]], row: int) -> jax.Array:
+    terms = [w * stage[row] for w, stage in zip(weights, stages) if w]
+    return sum(terms[1:], terms[0])
+
+
+def _stretch(
+    kind: jax.Array, target: jax.Array, xi: jax.Array, rates: tuple[jax.Array, ...]
+) -> jax.Array:
+    """`dt / dxi`."""
+    dx, dg = (jnp.sum(jnp.where(target, rate, 0.0)) for rate in rates[:2])
+    rate = jnp.where(kind == ZERO_G, dg, jnp.where(kind == ROOT_X, dx, 1.0))
+    numerator = jnp.where((kind == START) | (kind == ROOT_X), 2 * xi, 1.0)
+    safe = jnp.where(rate == 0, 1.0, rate)
+    return jnp.where(rate == 0, jnp.nan, 1.0) * numerator / safe

@@ -1,0 +1,109 @@
+"""Builders of scenes: chains, columns, and any system given by its gap function."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.scene import Scene, chain_scene
+
+_WALLS = {
+    False: (False, False),
+    True: (False, True),
+    "right": (False, True),
+    "left": (True, False),
+    "both": (True, True),
+}
+
+CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0
+
+
+def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
+    """A row of bodies along +x; contact j joins bodies j and j+1.
+
+    Equation: `gamma_j = v_{j+1} - v_j`; at a wall on the right `gamma_m = -v_n`, on the left
+    `gamma_1 = v_1`. The Delassus matrix is tridiagonal and never formed densely.
+
+    Args:
+        masses: (n,) > 0 [kg].
+        wall: False; True or 'right': last contact; 'left': first contact; 'both'.
+        gaps: (m,) >= 0 [m], None: all closed.
+
+    Raises:
+        ValueError: masses or gaps out of range or of wrong shape, unknown wall, no contact.
+
+    >>> import jimpact as ji
+    >>> ji.chain([1.0, 1.0, 1.0], wall=True).contacts
+    3
+    """
+    if wall not in _WALLS:
+        raise ValueError(
+            f"Argument `wall` must be one of False, True, 'left', 'right', 'both', "
+            f"but has value {wall!r}."
+        )
+    mass = as_float_array("masses", masses)
+    if mass.ndim != 1:
+        raise ValueError(f"Argument `masses` must have shape (n,), but has shape {mass.shape}.")
+    check_values("masses", mass, low=0.0, open_low=True)
+    left, right = _WALLS[wall]
+    contacts = mass.shape[0] - 1 + left + right
+    if contacts < 1:
+        raise ValueError(
+            f"Argument `masses` must give at least one contact, "
+            f"but {mass.shape[0]} body and wall={wall!r} give none."
+        )
+    if gaps is not None:
+        gaps = as_float_array("gaps", gaps)
+        check_shape("gaps", gaps, (contacts,), "one gap per contact")
+        check_values("gaps", gaps, low=0.0)
+    return chain_scene(mass, (left, right), gaps)
+
+
+def column(masses: Any, gaps: Any = None) -> Scene:
+    """A column of bodies above a floor: `chain(masses, wall='right')`, +x down, body 1 on top.
+
+    >>> import jimpact as ji
+    >>> ji.column([1.0, 1.0]).contacts
+    2
+    """
+    return chain(masses, wall="right", gaps=gaps)
+
+
+def scene_from_gaps(
+    gap_function: Callable[[jax.Array], jax.Array],
+    mass: Any,
+    q: Any,
+    closed_below: float = CLOSED_BELOW,
+) -> Scene:
+    """Scene of a system at configuration `q`; the normals are the gradients of its gaps.
+
+    Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
+
+    Args:
+        gap_function: q (n,) -> gaps f(q) (m,) [m], written with jax.numpy.
+        mass: M (n,) or (n, n), or a function q -> M(q).
+        q: (n,) configuration.
+        closed_below: gaps with |f| up to this count as closed [m].
+
+    Raises:
+        ValueError: penetration (f < -closed_below), or what `Scene` refuses.
+
+    >>> import jax.numpy as jnp, jimpact as ji
+    >>> bouncing = ji.scene_from_gaps(lambda q: q[1:] - 0.5, [1.0, 1.0], [0.0, 0.5])
+    >>> bouncing.normals.tolist()
+    [[0.0], [1.0]]
+    """
+    q = as_float_array("q", q)
+    check_values("q", q)
+    f = jnp.atleast_1d(gap_function(q))
+    if not is_traced(f) and bool(jnp.any(f < -closed_below)):
+        worst = int(jnp.argmin(f))
+        raise ValueError(
+            f"Argument `q` must have no penetration (f >= -{closed_below:g} m), "
+            f"but gap {worst} has value {float(f[worst]):g} m."
+        )
+    normals = jax.jacobian(lambda x: jnp.atleast_1d(gap_function(x)))(q).T
+    gaps = jnp.where(f > closed_below, f, 0.0)
+    return Scene(mass(q) if callable(mass) else mass, normals, gaps=gaps)

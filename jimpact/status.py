@@ -1,0 +1,28 @@
+"""Status codes of an impact: set on the device, worded and raised on the host."""
+
+from typing import NamedTuple
+
+
+class Status(NamedTuple):
+    """One row of the table; `failure` marks results that must not be used as they are."""
+
+    name: str
+    message: str
+    failure: bool
+
+
+# The code is the row number; where several apply the highest wins, so rows go from mild to grave.
+STATUS = (
+    Status("ok", "the impact is resolved within tolerance", False),
+    Status("impulse_not_unique", "v+ is determined, the impulses are one of many", False),
+    Status("order_dependent", "the outcome depends on the order of adjacent collisions", False),
+    Status("plastic_limit", "contacts re-close without end; finished in the plastic limit", False),
+    Status("energy_gain", "the outcome holds more energy than was there before", True),
+    Status("inadmissible_velocity", "a contact still approaches after the impact", True),
+    Status("negative_impulse", "a contact would have to pull (p < 0)", True),
+    Status("infeasible", "the law has no solution for this scene", True),
+    Status("max_steps", "the step limit ended the impact before it was over", True),
+    Status("not_finite", "the result or its input is NaN or infinite", True),
+)
+
+CODE = {row.name: code for code, row in enumerate(STATUS)}
