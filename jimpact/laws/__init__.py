@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from jimpact.laws.base import Law
+from jimpact.laws.lzb import LZB
 from jimpact.laws.newton import Newton
 
 
@@ -29,7 +30,27 @@ BROGLIATO = """@book{brogliato2016,
   edition = {3}, publisher = {Springer}, year = {2016}, doi = {10.1007/978-3-319-28664-8}}"""
 
 
+LIU = """@article{liu2008,
+  author = {Liu, Caishan and Zhao, Zhen and Brogliato, Bernard},
+  title = {Frictionless multiple impacts in multibody systems. I. Theoretical framework},
+  journal = {Proceedings of the Royal Society A}, volume = {464}, pages = {3193--3211},
+  year = {2008}, doi = {10.1098/rspa.2008.0078}}"""
+
+EVERY_PROPERTY = frozenset(
+    {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
+)
+
 REGISTRY: dict[str, Row] = {
+    "lzb": Row(
+        law=LZB,
+        parameters=("restitution", "stiffness", "exponent", "initial_energy"),
+        summary="energetic restitution, distributed by the stiffness ratios",
+        right_when="local, rate-independent contacts with known stiffness ratios (touching beads)",
+        fails_when="bulk waves (rods), viscous contacts, gaps that must re-close, adhesion",
+        promises=EVERY_PROPERTY,
+        source="Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.67)-(6.73)",
+        bibtex=LIU,
+    ),
     "newton": Row(
         law=Newton,
         parameters=("restitution",),

@@ -6,6 +6,7 @@ it, or its error is too large and it is shortened. As soon as the contacts at wo
 from each other and press no other contact, the rest follows from the energy in closed form.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -54,11 +55,27 @@ class Carry(NamedTuple):
     done: jax.Array
 
 
+def explicit_step(
+    flow: Flow,
+    phase: jax.Array,
+    state: State,
+    kind: jax.Array,
+    target: jax.Array,
+    start: jax.Array,
+    length: jax.Array,
+    due: jax.Array,
+    tolerance: jax.Array,
+) -> tuple[State, State, State]:
+    """`flow.step`, which needs neither the expected time of the event nor the tolerance."""
+    return step(flow, phase, state, kind, target, start, length)
+
+
 class Control(NamedTuple):
-    """Local tolerance (m,) of each contact, pass limit, and whether to finish in closed form."""
+    """Local tolerance (m,) of each contact, pass limit, and how to step and to finish."""
 
     tolerance: jax.Array
     max_steps: int
+    step: Callable[..., tuple[State, State, State]] = explicit_step
     closed_form: bool = True
 
 
@@ -81,7 +98,7 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
         retargeted=jnp.zeros((), bool),
         passes=count,
         accepted=count,
-        closures=count,
+        closures=jnp.zeros(m, jnp.int32),
         done=jnp.zeros((), bool),
     )
     return _finish(flow, control, carry)
@@ -89,14 +106,17 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
 
 def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     """One pass of the loop."""
-    # where events lie and how long steps are is decided, not differentiated
-    carry = carry._replace(
-        **{name: jax.lax.stop_gradient(getattr(carry, name)) for name in ("h", "due", "begun")}
-    )
-    state, phase, kind, target = carry.state, carry.phase, carry.kind, carry.target
+    phase, kind, target = carry.phase, carry.kind, carry.target
+    h, due, begun = jax.lax.stop_gradient((carry.h, carry.due, carry.begun))
+    carry = carry._replace(h=h, due=due, begun=begun)
     start, length = _interval(carry)
-    new, high, low = step(flow, phase, state, kind, target, start, length)
-    error = _error(control, *jax.lax.stop_gradient((high, low)))
+    reached, high, low = control.step(
+        flow, phase, carry.state, kind, target, start, length, due, control.tolerance
+    )
+    # what follows decides where events lie and how long steps are: it is not differentiated
+    exact_flow, exact_state = flow, carry.state
+    flow, state, new, high, low = jax.lax.stop_gradient((flow, carry.state, reached, high, low))
+    error = _error(control, high, low)
     exact = jnp.isfinite(error) & (error <= 1)
 
     before = _margins(control, phase, state)
@@ -119,8 +139,8 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
 
     # accepted: move, and change the phase of the contact landed on
     arrived = jnp.where(flips, at_once, accept & landing & target)
-    moved = State(*(jnp.where(accept, b, a) for a, b in zip(state, new)))
-    moved, new_phase, closed = _change_phase(flow, phase, moved, arrived)
+    moved = State(*(jnp.where(accept, b, a) for a, b in zip(exact_state, reached)))
+    moved, new_phase, closed = _change_phase(exact_flow, phase, moved, arrived)
 
     fraction_g = jnp.where(crossed_g, _crossing(before.g, after.g, slope.g * span), jnp.inf)
     fraction_x = jnp.where(crossed_x, _crossing(before.x, after.x, slope.x * span), jnp.inf)
@@ -181,7 +201,7 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
         done=carry.done,
     )
     out = _aim_at_opening(flow, out, accept)
-    return _finish(flow, control, out)
+    return _finish(exact_flow, control, out)
 
 
 def _interval(carry: Carry) -> tuple[jax.Array, jax.Array]:
@@ -284,15 +304,16 @@ def _change_phase(
     rests = arrived & ~expanded & (phase != OPEN)
     g = jnp.where(rests, 0.0, g)
     x = jnp.where(new_phase == OPEN, 0.0, state.x)
-    closed = jnp.sum(arrived & (phase == OPEN), dtype=jnp.int32)
+    closed = (arrived & (phase == OPEN)).astype(jnp.int32)
     return state._replace(x=x, g=g), new_phase, closed
 
 
 def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
     """Turn the next step into a landing on the opening that is about to come."""
-    dx, _, _, _ = field(flow, carry.phase, carry.state.x, carry.state.g)
+    x, g = jax.lax.stop_gradient((carry.state.x, carry.state.g))
+    dx, _, _, _ = field(flow, carry.phase, x, g)
     expanding = (carry.phase == EXPANSION) & (dx < 0)
-    due = jnp.where(expanding, carry.state.x / jnp.where(expanding, -dx, 1.0), jnp.inf)
+    due = jnp.where(expanding, x / jnp.where(expanding, -dx, 1.0), jnp.inf)
     soonest = jnp.min(due)
     aim = accepted & (carry.kind == TIME) & (soonest < NEAR_OPENING * carry.h)
     target = jnp.arange(due.shape[0]) == jnp.argmin(due)

@@ -1,0 +1,135 @@
+"""The LZB impact in units of its own: results do not depend on the user's unit system.
+
+With Q the largest normalized approach velocity (or stored energy) of the impact, contact j has
+
+    x_ref,j = ((eta_j + 1) Q^2 / (2 k_j))^(1 / (eta_j + 1)),   t_ref,j = x_ref,j / (Q sqrt(W_jj))
+
+and omega_j = T / t_ref,j with T the smallest t_ref: the flow of `numerics/flow.py`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics import impulse_form, stepper
+from jimpact.numerics.flow import Exponent, Flow
+from jimpact.numerics.propagator import propagate
+from jimpact.numerics.sensitivity import both_modes
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.status import CODE
+
+METHODS = ("time", "propagator", "impulse")
+# Derivatives are one or two digits worse than values at the same tolerance.
+GRADIENT_TIGHTENING = 0.1
+ROUNDING_FLOOR = 16  # the local tolerance is at least so many eps
+ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
+
+
+class Inputs(NamedTuple):
+    """What the dimensionless outcome depends on; `coupling` holds the entries beside 1 of G."""
+
+    coupling: jax.Array
+    omega: jax.Array
+    restitution: jax.Array
+    exponent: jax.Array | None
+    gamma: jax.Array
+    x: jax.Array
+    tolerance: jax.Array
+
+
+class Units(NamedTuple):
+    """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m]."""
+
+    velocity: jax.Array
+    time: jax.Array
+    root: jax.Array
+    indentation: jax.Array
+
+
+def to_dimensionless(
+    delassus: Symmetric,
+    gamma: jax.Array,
+    restitution: jax.Array,
+    stiffness: jax.Array,
+    exponent: Exponent,
+    stored: jax.Array,
+    rtol: float,
+) -> tuple[Inputs, Units]:
+    """Inputs of the dimensionless problem and the units to return from it."""
+    m, dtype = gamma.shape[0], gamma.dtype
+    eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
+    root = jnp.sqrt(diagonal(delassus))
+    qn = gamma / root
+    approach = jnp.where(gamma < 0, qn, 0.0)
+    q = jax.lax.stop_gradient(jnp.sqrt(jnp.max(approach**2 + 2 * stored)))
+    x_ref = ((eta + 1) * q**2 / (2 * stiffness)) ** (1 / (eta + 1))
+    t_ref = x_ref / (q * root)
+    time = jax.lax.stop_gradient(jnp.min(t_ref))
+    # tolerance is asked of velocities: where W_jj is large, impulses must be finer
+    fastest = jnp.max(jnp.maximum(-gamma, jnp.sqrt(2 * stored) * root))
+    weight = jax.lax.stop_gradient(jnp.maximum(1.0, q * root / fastest))
+    loaded = stored > 0
+    x = jnp.where(loaded, (2 * jnp.where(loaded, stored, 1.0) / q**2) ** (1 / (eta + 1)), 0.0)
+    g = scaled(delassus, 1 / root)
+    beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
+    inputs = Inputs(
+        coupling=beside,
+        omega=time / t_ref,
+        restitution=jnp.broadcast_to(restitution, (m,)),
+        exponent=exponent if isinstance(exponent, jax.Array) else None,
+        gamma=qn / q,
+        x=x,
+        tolerance=rtol / weight,
+    )
+    return inputs, Units(q, time, root, x_ref)
+
+
+def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
+    """The flow of these inputs; `exponent` is the static one where `inputs` hold none."""
+    m = inputs.gamma.shape[0]
+    if chain:
+        coupling: Symmetric = Tridiagonal(jnp.ones_like(inputs.gamma), inputs.coupling)
+    else:
+        i, j = jnp.triu_indices(m, 1)
+        upper = jnp.zeros((m, m), inputs.gamma.dtype).at[i, j].set(inputs.coupling)
+        coupling = jnp.eye(m, dtype=inputs.gamma.dtype) + upper + upper.T
+    eta = exponent if inputs.exponent is None else inputs.exponent
+    return Flow(coupling, inputs.omega, inputs.restitution, eta)
+
+
+def control_of(inputs: Inputs, tighten: float, max_steps: int, method: str) -> stepper.Control:
+    """Local tolerances, not below rounding."""
+    floor = ROUNDING_FLOOR * float(jnp.finfo(inputs.gamma.dtype).eps)
+    tolerance = jnp.maximum(tighten * inputs.tolerance, floor)
+    return stepper.Control(
+        tolerance, max_steps, step=propagate if method == "propagator" else stepper.explicit_step
+    )
+
+
+def solve(
+    inputs: Inputs, exponent: Exponent, chain: bool, max_steps: int, method: str
+) -> tuple[jax.Array, jax.Array]:
+    """Dimensionless impulses and status, differentiable in both modes."""
+    static = None if isinstance(exponent, jax.Array) else exponent
+
+    def run(given: Inputs, differentiated: bool) -> tuple[jax.Array, jax.Array]:
+        flow = flow_of(given, static, chain)  # type: ignore[arg-type]
+        if method == "impulse":
+            return _walk(flow, given, max_steps)
+        tighten = GRADIENT_TIGHTENING if differentiated else 1.0
+        control = control_of(given, tighten, max_steps, method)
+        end = stepper.solve(flow, control, given.gamma, given.x)
+        at_rest = (end.closures >= ENDLESS) & (jnp.abs(end.state.g) <= given.tolerance)
+        code = jnp.where(jnp.any(at_rest), CODE["plastic_limit"], CODE["ok"])
+        return end.state.p, jnp.where(end.done, code, CODE["max_steps"])
+
+    return both_modes(run)(inputs)
+
+
+def _walk(flow: Flow, given: Inputs, max_steps: int) -> tuple[jax.Array, jax.Array]:
+    eta = jnp.asarray(flow.exponent, given.x.dtype)
+    energy = 0.5 * jnp.where(given.x > 0, jnp.where(given.x > 0, given.x, 1.0) ** (eta + 1), 0.0)
+    dp = jax.lax.stop_gradient(jnp.min(given.tolerance))
+    end = impulse_form.solve(flow, dp, max_steps, given.gamma, energy)
+    return end.p, jnp.where(impulse_form.at_work(end), CODE["max_steps"], CODE["ok"])

@@ -1,0 +1,90 @@
+"""Exact steps of the linear flow (eta = 1): the exponential of its matrix, applied as a series.
+
+With phases frozen `x' = -r omega g`, `g' = r G omega x` is linear, so a step is a Taylor
+polynomial in its length, summed to rounding. Unlike an eigenvector form it can be differentiated
+where frequencies coincide. Events are roots of that polynomial.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.flow import ROOT_X, START, TIME, Flow, State, field
+from jimpact.numerics.tridiagonal import as_matrix
+
+TERMS = 26  # 2^26 / 26! < 2e-19: beyond rounding for steps up to REACH
+REACH = 2.0  # step length times the largest frequency
+NEWTON_STEPS = 8  # from the parabola's root, quadratic convergence leaves rounding only
+LANDED = 1e-12  # |event variable| that counts as on the event
+
+
+def propagate(
+    flow: Flow,
+    phase: jax.Array,
+    state: State,
+    kind: jax.Array,
+    target: jax.Array,
+    start: jax.Array,
+    length: jax.Array,
+    due: jax.Array,
+    tolerance: jax.Array,
+) -> tuple[State, State, State]:
+    """As `flow.step`, for exponent 1; the "error" only keeps the step within REACH."""
+    coefficients = _series(flow, phase, state)
+    landing = (kind != TIME) & (kind != START)
+    row = jnp.where(kind == ROOT_X, coefficients.x, coefficients.g)
+    event = jnp.sum(jnp.where(target, row, 0.0), axis=1)
+    h = jnp.where(kind == START, (start + length) ** 2 - start**2, length)
+    h = jnp.where(landing, _root(event, due), h)
+    end = State(*(_evaluate(series, h) for series in coefficients))
+    end = end._replace(
+        x=jnp.where(target & (kind == ROOT_X), 0.0, end.x),
+        g=jnp.where(target & landing & (kind != ROOT_X), 0.0, end.g),
+    )
+    strength = jnp.max(jnp.sum(jnp.abs(as_matrix(flow.coupling)) * flow.omega[None, :], axis=1))
+    frequency = jnp.sqrt(strength * jnp.max(flow.omega))
+    missed = landing & ~((h > 0) & (jnp.abs(_evaluate(event, h)) < LANDED))
+    size = jnp.where(missed, jnp.nan, (h * frequency / REACH) ** 8)
+    error = State(jnp.zeros_like(end.x), jnp.zeros_like(end.g), size * tolerance, size * 0)
+    return end, error, error._replace(p=jnp.zeros_like(end.p))
+
+
+def _series(flow: Flow, phase: jax.Array, state: State) -> State:
+    """Taylor coefficients (TERMS, m) of x, g, p and (TERMS,) of t in the length of the step."""
+    still = field(flow, phase, 0 * state.x, 0 * state.g)[3]
+
+    def following(carry: State, order: jax.Array) -> tuple[State, State]:
+        dx, dg, dp, _ = field_linear(flow, phase, carry.x, carry.g)
+        dt = jnp.where(order == 1, still, 0.0)
+        after = State(dx / order, dg / order, dp / order, dt)
+        return after, after
+
+    first = state
+    _, rest = jax.lax.scan(following, first, jnp.arange(1, TERMS, dtype=state.x.dtype))
+    return State(*(jnp.concatenate([a[None], b]) for a, b in zip(first, rest)))
+
+
+def field_linear(
+    flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array
+) -> tuple[jax.Array, ...]:
+    """`flow.field` continued to x < 0, as a coefficient of a series may be."""
+    up = field(flow, phase, x, g)
+    down = field(flow, phase, -x, -g)
+    return up[0], up[1] - down[1], up[2] - down[2], up[3]
+
+
+def _evaluate(series: jax.Array, h: jax.Array) -> jax.Array:
+    value = series[-1]
+    for row in series[-2::-1]:
+        value = value * h + row
+    return value
+
+
+def _root(event: jax.Array, guess: jax.Array) -> jax.Array:
+    """Root of the event polynomial near `guess`, differentiable by one more Newton step."""
+    fixed = jax.lax.stop_gradient(event)
+    slopes = fixed[1:] * jnp.arange(1, TERMS, dtype=fixed.dtype)
+    h = guess
+    for _ in range(NEWTON_STEPS):
+        h = h - _evaluate(fixed, h) / _evaluate(slopes, h)
+    h = jax.lax.stop_gradient(h)
+    return h - _evaluate(event, h) / _evaluate(slopes, h)
