@@ -12,9 +12,11 @@ whole expansion takes no time; derivatives in e there are one-sided).
 A step may advance in time or in another variable xi that grows or falls monotonically:
 
     TIME     xi = t
-    START    xi = sqrt(t): an impact begins like x ~ t, and forces t^eta are smooth in xi
+    START    xi = t^(1/r): an impact begins like x ~ t, and forces t^eta are smooth in xi
     ZERO_G   xi = g_j, ending on g_j = 0: lands on the event exactly (Henon's trick)
-    ROOT_X   xi = sqrt(x_j), ending on x_j = 0: the same for an opening, x_j^eta being smooth in xi
+    ROOT_X   xi = x_j^(1/r), ending on x_j = 0: the same for an opening, x_j^eta smooth in xi
+
+with r = 2 where 2 eta is known to be whole, else 4.
 """
 
 from typing import NamedTuple
@@ -74,6 +76,13 @@ def plus_one(exponent: Exponent) -> Exponent:
     return tuple(e + 1 for e in exponent) if isinstance(exponent, tuple) else exponent + 1
 
 
+def root_order(exponent: Exponent) -> int:
+    """`r` of the START and ROOT_X variables: powers `xi^(r eta)` are then smooth enough."""
+    known = isinstance(exponent, (float, tuple))
+    etas = np.atleast_1d(np.asarray(exponent)) if known else np.array([0.1])
+    return 2 if np.all(2 * etas == np.round(2 * etas)) else 4
+
+
 def factor(exponent: Exponent, dtype: jnp.dtype) -> jax.Array:
     """`(eta + 1) / 2`."""
     return (jnp.asarray(exponent, dtype) + 1) / 2
@@ -110,7 +119,7 @@ def step(
     end state and the two error estimates. The stages are a loop of matrix products: unrolled,
     the derivative takes seven times as long to compile.
     """
-    m, dtype = state.x.shape[0], state.x.dtype
+    m, dtype, r = state.x.shape[0], state.x.dtype, root_order(flow.exponent)
     a, c = jnp.asarray(_DENSE_A, dtype), jnp.asarray(DOP853.c, dtype)
     known_x, known_g = target & (kind == ROOT_X), target & (kind == ZERO_G)
     y = jnp.concatenate([state.x, state.g])
@@ -119,11 +128,11 @@ def step(
         at = y + length * (a[i] @ slopes[:, : 2 * m])
         xi = start + c[i] * length
         # the variable of the step is known exactly at every stage
-        x = jnp.where(known_x, xi * xi, at[:m])
+        x = jnp.where(known_x, xi**r, at[:m])
         g = jnp.where(known_g, xi, at[m:])
         rates = field(flow, phase, x, g)
         row = jnp.concatenate([*rates[:3], rates[3][None]])
-        return slopes.at[i].set(row * _stretch(kind, target, xi, rates))
+        return slopes.at[i].set(row * _stretch(kind, target, xi, rates, r))
 
     slopes = jax.lax.fori_loop(0, len(c), stage, jnp.zeros((len(c), 3 * m + 1), dtype))
     weights = jnp.asarray([DOP853.b, DOP853.error_high, DOP853.error_low], dtype)
@@ -137,11 +146,11 @@ def step(
 
 
 def _stretch(
-    kind: jax.Array, target: jax.Array, xi: jax.Array, rates: tuple[jax.Array, ...]
+    kind: jax.Array, target: jax.Array, xi: jax.Array, rates: tuple[jax.Array, ...], r: int
 ) -> jax.Array:
     """`dt / dxi`."""
     dx, dg = (jnp.sum(jnp.where(target, rate, 0.0)) for rate in rates[:2])
     rate = jnp.where(kind == ZERO_G, dg, jnp.where(kind == ROOT_X, dx, 1.0))
-    numerator = jnp.where((kind == START) | (kind == ROOT_X), 2 * xi, 1.0)
+    numerator = jnp.where((kind == START) | (kind == ROOT_X), r * xi ** (r - 1), 1.0)
     safe = jnp.where(rate == 0, 1.0, rate)
     return jnp.where(rate == 0, jnp.nan, 1.0) * numerator / safe

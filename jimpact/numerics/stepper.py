@@ -25,12 +25,13 @@ from jimpact.numerics.flow import (
     field,
     plus_one,
     power,
+    root_order,
     scales,
     step,
 )
 from jimpact.numerics.tridiagonal import Tridiagonal
 
-FIRST_STEP = 0.05  # of the fastest contact's time scale: no contact can turn around so soon
+FIRST_STEP = 0.2  # in xi: no contact can turn around within xi^r of the fastest time scale
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.9  # of the step-size control
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
 NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact
@@ -45,9 +46,9 @@ class Carry(NamedTuple):
     phase: jax.Array  # (m,)
     kind: jax.Array  # variable of the next step
     target: jax.Array  # (m,) one-hot: event it lands on
-    h: jax.Array  # time step to try
+    h: jax.Array  # time step to try; in START a step of xi
     due: jax.Array  # estimated time to the event of a landing step
-    begun: jax.Array  # time spent in START steps
+    begun: jax.Array  # xi reached by START steps
     retargeted: jax.Array
     passes: jax.Array
     accepted: jax.Array
@@ -109,7 +110,7 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     phase, kind, target = carry.phase, carry.kind, carry.target
     h, due, begun = jax.lax.stop_gradient((carry.h, carry.due, carry.begun))
     carry = carry._replace(h=h, due=due, begun=begun)
-    start, length = _interval(carry)
+    start, length = _interval(flow, carry)
     reached, high, low = control.step(
         flow, phase, carry.state, kind, target, start, length, due, control.tolerance
     )
@@ -128,10 +129,14 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     others = ~(target & landing)
     crossed_g = others & (after.g < -snap)
     crossed_x = others & (after.x < -snap)
-    span = jnp.where(landing, carry.due, carry.h)
+    # time the step takes, or is expected to take
+    r = root_order(flow.exponent)
+    in_start = (begun + h) ** r - begun**r
+    span = jnp.select([landing, kind == START], [due, in_start], h)
     dipped = ~landing & others & _dips(before.g, after.g, slope.g * span, slope_end.g * span, snap)
+    idle = ~_matters(flow, control, state) & ~_matters(flow, control, new)
     at_once = (crossed_g & (before.g <= snap) & (slope.g <= 0)) | (
-        (crossed_g | crossed_x) & (span < SHORTEST)
+        (crossed_g | crossed_x) & ((span < SHORTEST) | idle)
     )
     flips = exact & jnp.any(at_once)
     event = exact & ~flips & jnp.any(crossed_g | crossed_x | dipped)
@@ -151,7 +156,6 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     factor = jnp.where(
         jnp.isfinite(error), jnp.clip(SAFETY * (error + 1e-10) ** (-1 / 8), SHRINK, GROWTH), SHRINK
     )
-    h_stretched = _stretched(carry, length, factor, accept)
     # an event inside the step: land on it where its variable runs monotonically towards it
     opens = first_x <= first_g
     next_target = jnp.arange(phase.shape[0]) == jnp.where(
@@ -165,35 +169,31 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     can_land = (
         heads_there
         & jnp.isfinite(jnp.minimum(first_g, first_x))
-        & ~((kind == START) & (carry.begun == 0))
+        & ~((kind == START) & (begun == 0))
         & ~carry.retargeted
         & (first == jnp.minimum(first_g, first_x))
     )
     land = event & can_land
     short = jnp.where(landing, 0.5 * first, 0.7 * first) * span
-    h = jnp.where(
-        accept,
-        jnp.where(landing, carry.h, h_stretched),
-        jnp.where(
-            flips,
-            carry.h,
-            jnp.where(
-                event, jnp.where(land, carry.h, short), jnp.where(landing, 0.5 * span, h_stretched)
-            ),
-        ),
+    # START ends with the first event; until then h is a step of xi
+    leaves = (kind == START) & event & (begun > 0)
+    keeps = flips | (accept & landing)
+    next_h = jnp.select(
+        [keeps, accept, land, event & (kind == START) & ~leaves, event, landing],
+        [h, factor * h, jnp.where(leaves, span, h), 0.7 * first * h, short, 0.5 * span],
+        factor * h,
     )
-    stays_start = (kind == START) & ~(event & (carry.begun > 0))
     next_kind = jnp.where(
-        land, jnp.where(opens, ROOT_X, ZERO_G), jnp.where(stays_start, START, TIME)
+        land, jnp.where(opens, ROOT_X, ZERO_G), jnp.where((kind == START) & ~leaves, START, TIME)
     )
     out = Carry(
         state=moved,
         phase=new_phase,
         kind=next_kind.astype(jnp.int32),
         target=next_target & land,
-        h=h,
+        h=next_h,
         due=jnp.where(land, first * span, 0.0),
-        begun=carry.begun + jnp.where(accept & (kind == START), carry.h, 0.0),
+        begun=begun + jnp.where(accept & (kind == START), h, 0.0),
         retargeted=land & landing,
         passes=carry.passes + 1,
         accepted=carry.accepted + accept,
@@ -204,25 +204,17 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     return _finish(exact_flow, control, out)
 
 
-def _interval(carry: Carry) -> tuple[jax.Array, jax.Array]:
+def _interval(flow: Flow, carry: Carry) -> tuple[jax.Array, jax.Array]:
     """Start and length of the next step in its own variable."""
+    r = root_order(flow.exponent)
     x = jnp.sum(jnp.where(carry.target, carry.state.x, 0.0))
     g = jnp.sum(jnp.where(carry.target, carry.state.g, 0.0))
-    root = jnp.sqrt(jnp.where(x > 0, x, 1.0))
-    xi = jnp.sqrt(carry.begun)
+    x = jnp.where(x > 0, x, 1.0)
+    root = jnp.sqrt(x) if r == 2 else jnp.sqrt(jnp.sqrt(x))
     kinds = [carry.kind == START, carry.kind == ZERO_G, carry.kind == ROOT_X]
-    start = jnp.select(kinds, [xi, g, root], 0.0)
-    length = jnp.select(kinds, [jnp.sqrt(carry.begun + carry.h) - xi, -g, -root], carry.h)
+    start = jnp.select(kinds, [carry.begun, g, root], 0.0)
+    length = jnp.select(kinds, [carry.h, -g, -root], carry.h)
     return start, length
-
-
-def _stretched(
-    carry: Carry, length: jax.Array, factor: jax.Array, accept: jax.Array
-) -> jax.Array:
-    """Next time step when the step's own variable is to advance by `factor * length`."""
-    at = jnp.sqrt(carry.begun) + jnp.where(accept, length, 0.0)
-    in_root = (at + factor * length) ** 2 - at**2
-    return jnp.where(carry.kind == START, in_root, factor * carry.h)
 
 
 def _error(control: Control, high: State, low: State) -> jax.Array:
@@ -235,6 +227,12 @@ def _error(control: Control, high: State, low: State) -> jax.Array:
     fifth, third = size(high), size(low)
     scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
     return jnp.where(scale > 0, fifth**2 / jnp.where(scale > 0, scale, 1.0), fifth)
+
+
+def _matters(flow: Flow, control: Control, state: State) -> jax.Array:
+    """Whether load and velocity of a contact are more than what is neglected."""
+    total = power(state.x, plus_one(flow.exponent)) + state.g**2
+    return jax.lax.stop_gradient(total > ((NEGLIGIBLE + 2 * SNAP) * control.tolerance) ** 2)
 
 
 class Margin(NamedTuple):
@@ -330,7 +328,7 @@ def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
     s, _, _ = scales(flow, phase)
     gamma = s * state.g
     slack = NEGLIGIBLE * control.tolerance
-    at_work = (state.x > 0) | (gamma < -slack)
+    at_work = ((state.x > 0) | (gamma < 0)) & _matters(flow, control, state)
     # of each decoupled contact gamma+ = e sqrt(x^(eta+1) + g^2), since x^(eta+1) + g^2 is kept
     total = power(state.x, plus_one(flow.exponent)) + state.g**2
     rebound = flow.restitution * jnp.sqrt(jnp.where(at_work, total, 1.0))

@@ -1,0 +1,241 @@
+"""Measured impacts: velocities before and after, their errors, and what is wrong with them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_values
+from jimpact.csv_shots import read_table
+from jimpact.scene import Scene
+
+
+class Experiments(eqx.Module):
+    """Shots: velocities measured before and after impacts of the same bodies.
+
+    Args:
+        pre: v- (K, n), or (n,) for one shot [m/s].
+        post: v+ of the same shape [m/s]; NaN marks a value that was not measured.
+        sigma: standard error of each `post` value, (K, n) or a scalar, > 0 [m/s]; None: unknown,
+            then `fit` estimates one common noise from the residual.
+        scenes: one `Scene` a shot, all of the same kind and sizes; None: `fit` gets the scene.
+        shots: K labels for tables and pictures; None: 1, 2, ...
+
+    Raises:
+        ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, nothing
+            measured, scenes that do not belong to these velocities.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.26, 0.73], sigma=0.01)
+    >>> data.pre.shape
+    (1, 2)
+    """
+
+    pre: jax.Array
+    post: jax.Array
+    sigma: jax.Array | None
+    scenes: tuple[Scene, ...] | None
+    shots: tuple[str, ...] = eqx.field(static=True)
+    lost_freedom: int = eqx.field(static=True)  # independent values that a correction removed
+
+    def __init__(
+        self,
+        pre: Any,
+        post: Any,
+        sigma: Any = None,
+        scenes: Sequence[Scene] | None = None,
+        shots: Sequence[str] | None = None,
+        lost_freedom: int = 0,
+    ):
+        self.pre = _as_rows("pre", pre)
+        self.post = _as_rows("post", post)
+        if self.pre.shape != self.post.shape:
+            raise ValueError(
+                "Arguments `pre` and `post` must have the same shape, "
+                f"but have shapes {self.pre.shape} and {self.post.shape}."
+            )
+        check_values("pre", self.pre)
+        check_values("post", self.post, nan_allowed=True)
+        measured = ~np.isnan(np.asarray(self.post))
+        if not measured.any():
+            raise ValueError("Argument `post` must hold a measured value, but all are missing.")
+        self.sigma = None if sigma is None else _as_sigma(sigma, measured)
+        self.scenes = None if scenes is None else _as_scenes(scenes, self.pre.shape)
+        labels = shots if shots is not None else range(1, len(measured) + 1)
+        self.shots = tuple(str(label) for label in labels)
+        if len(self.shots) != len(measured):
+            raise ValueError(
+                f"Argument `shots` must have {len(measured)} labels, one per shot, "
+                f"but has {len(self.shots)}."
+            )
+        self.lost_freedom = lost_freedom
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Boolean (K, n): which `post` values were measured."""
+        return ~np.isnan(np.asarray(self.post))
+
+    def scene_of(self, scene: Scene | None, shot: int) -> Scene:
+        """The scene of one shot (counted from 0): its own, or else the given common one."""
+        own = scene if self.scenes is None else self.scenes[shot]
+        if own is None:
+            raise ValueError(
+                "Argument `scene` must be a Scene where the experiments carry none, but is None."
+            )
+        if own.size != self.pre.shape[1]:
+            raise ValueError(
+                "Argument `experiments` must have one velocity per body of the scene: it has "
+                f"{self.pre.shape[1]} a shot, but the scene has {own.size}."
+            )
+        return own
+
+    def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
+        """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
+
+        Equation: `C^T M (v+ - v-)`, columns of C spanning the complement of range(N), each
+        scaled to a largest entry of 1. A chain without walls has c = 1, C = (1, ..., 1): its
+        total momentum. NaN for shots with missing values.
+
+        >>> import jimpact as ji
+        >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
+        >>> data.momentum_excess(ji.chain([1.0, 1.0])).round(12).tolist()
+        [[0.1]]
+        """
+        rows = [m @ (post - pre) for m, pre, post in self.balances(scene)]
+        return np.array(rows).reshape(len(self.shots), -1)
+
+    def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
+        """Conserved momentum after over before, (K, c); inf or NaN where there was none before."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            rows = [(m @ post) / (m @ pre) for m, pre, post in self.balances(scene)]
+        return np.array(rows).reshape(len(self.shots), -1)
+
+    def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
+        """`T+ / T-` of every shot (K,); NaN for shots with missing values."""
+        ratios = []
+        for k, (pre, post) in enumerate(zip(np.asarray(self.pre), np.asarray(self.post))):
+            mass = dense_mass(self.scene_of(scene, k))
+            before = pre @ mass @ pre
+            ratios.append(post @ mass @ post / before if before > 0 else np.nan)
+        return np.array(ratios)
+
+    def momentum_corrected(self, scene: Scene | None = None) -> "Experiments":
+        """The same shots, moved as little as possible so that they conserve momentum.
+
+        Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
+        (sigma = 1 where unknown). For equal masses in a chain: the mean excess is taken from each
+        component. Shots with missing values stay as they are.
+
+        >>> import jimpact as ji
+        >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
+        >>> data.momentum_corrected(ji.chain([1.0, 1.0])).post.round(12).tolist()
+        [[0.15, 0.85]]
+        """
+        post = np.array(self.post, dtype=float)
+        variance = np.ones_like(post) if self.sigma is None else np.asarray(self.sigma, float) ** 2
+        lost = self.lost_freedom
+        for k, (m, pre, row) in enumerate(self.balances(scene)):
+            if len(m) == 0 or np.isnan(row).any():
+                continue
+            weighted = variance[k][:, None] * m.T
+            post[k] -= weighted @ np.linalg.solve(m @ weighted, m @ (row - pre))
+            lost += len(m)
+        return Experiments(self.pre, post, self.sigma, self.scenes, self.shots, lost)
+
+    def balances(
+        self, scene: Scene | None
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Of every shot: C^T M (c, n), v-, v+."""
+        pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
+        scenes = [self.scene_of(scene, k) for k in range(len(pre))]
+        return [(conserved_momenta(s), a, b) for s, a, b in zip(scenes, pre, post)]
+
+
+def dense_mass(scene: Scene) -> np.ndarray:
+    """M (n, n)."""
+    mass = np.asarray(scene.mass, float)
+    return np.diag(mass) if mass.ndim == 1 else mass
+
+
+def conserved_momenta(scene: Scene) -> np.ndarray:
+    """`C^T M` (c, n): C spans the complement of range(N) and of the bilateral constraints."""
+    forces = np.asarray(scene.normals, float)
+    if scene.constraints is not None:
+        forces = np.hstack([forces, np.asarray(scene.constraints, float)])
+    u, singular, _ = np.linalg.svd(forces)
+    rank = int((singular > singular[0] * max(forces.shape) * np.finfo(float).eps).sum())
+    complement = u[:, rank:]
+    largest = np.argmax(np.abs(complement).round(12), axis=0)
+    return (complement / complement[largest, np.arange(complement.shape[1])]).T @ dense_mass(scene)
+
+
+def _as_rows(name: str, value: Any) -> jax.Array:
+    array = as_float_array(name, value)
+    array = array[None, :] if array.ndim == 1 else array
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(
+            f"Argument `{name}` must have shape (K, n), K >= 1 shots of n velocities, "
+            f"but has shape {tuple(array.shape)}."
+        )
+    return array
+
+
+def _as_sigma(value: Any, measured: np.ndarray) -> jax.Array:
+    sigma = as_float_array("sigma", value)
+    if sigma.shape == measured.shape[1:] and len(measured) == 1:
+        sigma = sigma[None, :]
+    if sigma.shape not in ((), measured.shape):
+        raise ValueError(
+            f"Argument `sigma` must be a scalar or have shape {measured.shape} like `post`, "
+            f"but has shape {tuple(sigma.shape)}."
+        )
+    sigma = jnp.broadcast_to(sigma, measured.shape)
+    # the error of a value that was not measured does not matter
+    check_values("sigma", np.where(measured, np.asarray(sigma), 1.0), low=0.0, open_low=True)
+    return jnp.where(measured, sigma, jnp.nan)
+
+
+def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, ...]:
+    scenes = tuple(scenes)
+    if len(scenes) != shape[0]:
+        raise ValueError(
+            f"Argument `scenes` must have one scene per shot, {shape[0]}, but has {len(scenes)}."
+        )
+    layout = [(jax.tree.structure(s), [x.shape for x in jax.tree.leaves(s)]) for s in scenes]
+    for k, scene in enumerate(scenes):
+        if scene.size != shape[1]:
+            raise ValueError(
+                f"Argument `scenes` must have {shape[1]} bodies as the velocities have, "
+                f"but the scene of shot {k + 1} has {scene.size}."
+            )
+        if layout[k] != layout[0]:
+            raise ValueError(
+                "Argument `scenes` must hold scenes of one kind (same bodies, contacts, walls; "
+                f"gaps in all or in none), but that of shot {k + 1} differs from the first."
+            )
+    return scenes
+
+
+def read_experiments(path: str | Path) -> Experiments:
+    """Read shots from a CSV file whose headers state the units.
+
+    Columns: `pre_1[m/s]`, `post_1[m/s]` and so on for every body, optional `sigma_1[m/s]`, ...
+    (standard errors of `post`) and `shot` (a label). Units: m/s, cm/s, mm/s, km/h, in/s, ft/s,
+    converted to m/s. An empty `post` cell is a value that was not measured.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: unknown or missing unit, missing, unknown or repeated column, text in a
+            number, a line of the wrong length, no shots, sigma <= 0; with file, line and column.
+
+    >>> import jimpact as ji
+    >>> from importlib.resources import files
+    >>> ji.read_experiments(files("jimpact") / "data" / "three_balls.csv").post.round(4).tolist()
+    [[-0.0605, 0.1049, 0.9978]]
+    """
+    table = read_table(path)
+    return Experiments(table.pre, table.post, table.sigma, shots=table.shots)
