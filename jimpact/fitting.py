@@ -4,30 +4,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from jimpact.defects import data_defects
 from jimpact.experiments import Experiments
-from jimpact.fit_problem import Evaluation, Problem, build_problem
+from jimpact.fit_problem import Problem, build_problem
 from jimpact.fit_report import report, to_json
+from jimpact.fit_warnings import fit_warnings, is_converged
 from jimpact.laws.base import Law
 from jimpact.multistart import Search, search
 from jimpact.numerics.least_squares import Method, check_method, default_steps
 from jimpact.parameters import DEFAULT_FREE, bounds_of, free_parameters
 from jimpact.scene import Scene
-from jimpact.status import STATUS
-from jimpact.uncertainty import Uncertainty, uncertainty
-
-# A fit counts as converged when a full Gauss-Newton step would lower the sum of squares by less
-# than this share: a thousandth of a standard error, times what one degree of freedom is worth.
-CONVERGED = 1e-6
-
-# Residuals below this share of the measured velocities are rounding and solver tolerance.
-EXACT = 1e-7
-EXACT_FLOAT32 = 1e-4
+from jimpact.uncertainty import RANK_TOLERANCE, uncertainty
 
 
 class Start(NamedTuple):
@@ -45,8 +35,8 @@ class Fit:
     P free parameters `names`, contacts numbered from 1; K shots of n velocities.
     `standard_error` is inf where the data cannot see a parameter, NaN where no degree of freedom
     is left to estimate the noise from. `rank` < P: see `identifiability`. `starts`: the distinct
-    minima, best first. `noise`: estimated standard error of one velocity [m/s], 1 where `sigma`
-    was given (then it is a multiple of sigma).
+    minima, best first. `noise`: estimated standard error of one velocity [m/s], NaN where no
+    degree of freedom is left, 1 where `sigma` was given.
     """
 
     law: Law
@@ -61,10 +51,8 @@ class Fit:
     predicted: np.ndarray
     residual: np.ndarray
     rms: float
-    sum_of_squares: float
     noise: float
     degrees_of_freedom: int
-    noise_is_known: bool
     rank: int
     singular_values: np.ndarray
     identifiability: tuple[str, ...]
@@ -72,6 +60,7 @@ class Fit:
     status: np.ndarray
     converged: bool
     steps: int
+    unfinished: int
     warnings: tuple[str, ...]
     experiments: Experiments
 
@@ -84,7 +73,7 @@ class Fit:
         if not 0 < level < 1:
             raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
         tail = 0.5 + 0.5 * level
-        known = self.noise_is_known or self.degrees_of_freedom < 1
+        known = self.experiments.sigma is not None or self.degrees_of_freedom < 1
         quantile = ndtri(tail) if known else stdtrit(self.degrees_of_freedom, tail)
         half = quantile * self.standard_error
         return np.clip(
@@ -150,7 +139,7 @@ def fit(
     limits = bounds_of(parameters, law, bounds)
     problem = build_problem(law, scene, experiments, parameters, limits)
     steps = max_steps or default_steps(method)
-    found = search(problem, limits, method, starts, seed, steps, progress)
+    found = search(problem, method, starts, seed, steps, progress)
     return _as_fit(problem, experiments, scene, found, limits, method, notes)
 
 
@@ -163,48 +152,44 @@ def _as_fit(
     method: Method,
     notes: list[str],
 ) -> Fit:
-    best: Evaluation = found.best
-    measured = experiments.measured
-    sigma_known = experiments.sigma is not None
-    total = int(measured.sum()) - experiments.lost_freedom
+    measured, sigma_known = experiments.measured, experiments.sigma is not None
+    size = float(problem.size)
+    log = np.asarray(problem.scaling.log)
     spread = uncertainty(
-        problem.parameters.names,
-        best.jacobian,
-        problem.scale,
-        np.asarray(problem.interval.log),
-        best.sum_of_squares,
-        total,
-        sigma_known,
-    )
-    residual = np.where(measured, np.asarray(experiments.post) - best.velocity, np.nan)
-    converged = _is_converged(best, problem, found.at_bound)
-    law = problem.parameters.put(problem.law, jnp.asarray(best.value))
-    fitted = Fit(
-        law=law,
-        method=method if isinstance(method, str) else "optax transformation",
         names=problem.parameters.names,
-        value=best.value,
+        jacobian=size * found.jacobian,
+        scale=np.where(log, found.value, np.asarray(problem.scaling.scale)),
+        log=log,
+        sum_of_squares=size**2 * found.minima[0][0],
+        values=int(measured.sum()) - experiments.lost_freedom,
+        noise_is_known=sigma_known,
+        rank_tolerance=RANK_TOLERANCE[str(problem.pre.dtype)],
+    )
+    residual = np.where(measured, np.asarray(experiments.post, float) - found.velocity, np.nan)
+    converged = is_converged(problem, found)
+    return Fit(
+        law=problem.parameters.put(problem.law, jnp.asarray(found.value, problem.pre.dtype)),
+        method=method if isinstance(method, str) else "optax",
+        names=problem.parameters.names,
+        value=found.value,
         standard_error=spread.standard_error,
         covariance=spread.covariance,
         correlation=spread.correlation,
         bounds=limits,
         at_bound=found.at_bound,
-        predicted=best.velocity,
+        predicted=found.velocity,
         residual=residual,
         rms=float(np.sqrt(np.nanmean(residual**2))),
-        sum_of_squares=best.sum_of_squares,
-        noise=spread.noise if sigma_known else spread.noise * problem.unit,
+        noise=spread.noise,
         degrees_of_freedom=spread.degrees_of_freedom,
-        noise_is_known=sigma_known,
         rank=spread.rank,
         singular_values=spread.singular_values,
-        identifiability=spread.unseen,
-        starts=tuple(Start(*row) for row in found.minima),
-        status=best.status,
+        identifiability=(*notes, *spread.unseen),
+        starts=tuple(Start(size**2 * cost, value, count) for cost, value, count in found.minima),
+        status=found.status,
         converged=converged,
         steps=found.steps,
-        warnings=(),
+        unfinished=found.unfinished,
+        warnings=tuple(fit_warnings(problem, experiments, scene, found, spread, converged)),
         experiments=experiments,
     )
-    warnings = _warnings(fitted, spread, scene, problem, found, notes)
-    return eqx.tree_at(lambda f: f.warnings, fitted, warnings) if False else _with(fitted, warnings)

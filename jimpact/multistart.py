@@ -1,179 +1,150 @@
-"""Many starts, the distinct minima they end in, and minima that lie on a bound."""
+"""Many starts at once, and the distinct minima they end in."""
 
 import contextlib
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from jimpact.fit_problem import Evaluation, Problem, evaluate, solve
-from jimpact.numerics.least_squares import Method
-from jimpact.parameters import LOGARITHMIC, START_FACTOR, START_SCALES
+from jimpact.fit_problem import Problem, advance_all, begin_all
+from jimpact.numerics.least_squares import Method, State
+from jimpact.parameters import LOGARITHMIC
 
-LANES = 4  # starts that run together: compiled once, and a long fit reports between batches
+PASSES = 10  # between two looks at the progress
 
-START_MARGIN = 0.01  # share of an interval by which a start is kept off its bounds
-RESTART_MARGIN = 1e-6  # the same when a found minimum is refined
-NEAR_BOUND = 1e-2  # share of the natural scale within which the bound itself is tried
-SAME_COST = 1e-6  # relative sums of squares closer than this are one: the solver stops there
-SAME_VALUE = 1e-3  # values closer than this, in natural scales, are one minimum
+# Random starts: a stiffness within this factor of the user's, a parameter without two bounds
+# within this many natural scales of the user's.
+START_FACTOR = 20.0
+START_SCALES = 2.0
+
+# Relative sums of squares, and values in natural scales, closer than this are one minimum: a
+# hundred times what solvers leave, and far below what a measurement resolves.
+SAME_COST = 1e-6
+SAME_VALUE = 1e-3
+# Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
+# tolerance of the impact.
+EXACT = {"float64": 1e-14, "float32": 1e-8}
+
 BAR_AFTER = 2.0  # seconds after which a fit counts as long
 
 
 class Search(NamedTuple):
-    """Best evaluation, which parameters lie on a bound, steps taken, distinct minima."""
+    """The best end point (weighted as in `Problem`), and all distinct minima, best first."""
 
-    best: Evaluation
+    value: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray  # of the scaled parameters
+    velocity: np.ndarray
+    status: np.ndarray
+    gain: float  # relative decrease of the sum of squares that a further step promises
     at_bound: np.ndarray
     steps: int
-    minima: list[tuple[float, np.ndarray, int]]  # sum of squares, values, starts
+    minima: list[tuple[float, np.ndarray, int]]  # |r|^2, values, how many starts
+    unfinished: int  # starts that ran out of steps
 
 
 def search(
     problem: Problem,
-    limits: tuple[np.ndarray, np.ndarray],
     method: Method,
     starts: int,
     seed: int,
     max_steps: int,
     progress: bool | None,
 ) -> Search:
-    """Run all starts, keep the best, then try the bounds it comes near to."""
-    points = _start_points(problem, limits, starts, seed)
-    free = np.zeros(points.shape[1], bool)
-    ends: list[Evaluation] = []
-    longest = 0
-    with _bar(starts, progress) as advance:
-        for first in range(0, starts, LANES):
-            batch = points[first : first + LANES]
-            found, steps = _run(problem, batch, START_MARGIN, [free] * len(batch), method, max_steps)
-            ends += found
-            longest = max(longest, steps)
-            advance(len(batch))
-    best = min(ends, key=lambda end: end.sum_of_squares)
-    minima = _distinct(problem, ends)
-    best, at_bound = _try_bounds(problem, limits, best, method, max_steps)
-    minima[0] = (best.sum_of_squares, best.value, minima[0][2])
-    return Search(best, at_bound, longest, minima)
+    """Run all starts to their ends and keep the best."""
+    points = jnp.asarray(_start_points(problem, starts, seed), problem.pre.dtype)
+    states = begin_all(problem, points, method, max_steps)
+    with _bar(starts, max_steps, progress) as show:
+        while True:
+            states = advance_all(problem, states, method, max_steps, PASSES)
+            done, steps = np.asarray(states.done), np.asarray(states.steps)
+            show(int(done.sum()), int(steps.max()))
+            if (done | (steps >= max_steps)).all():
+                return _found(problem, states)
 
 
-def _start_points(
-    problem: Problem, limits: tuple[np.ndarray, np.ndarray], starts: int, seed: int
-) -> np.ndarray:
-    """Starts (S, P): the law's own values, then random ones inside the bounds."""
-    rng = np.random.default_rng(seed)
-    own = problem.parameters.of(problem.law)
-    share = rng.random((starts, len(own)))
-    low, high = (np.array(end) for end in limits)
-    points = np.empty_like(share)
+def _found(problem: Problem, states: State) -> Search:
+    y, low, high = (np.asarray(x) for x in (states.y, problem.low, problem.high))
+    squares = 2 * np.asarray(states.cost, float)
+    values = np.array([problem.scaling.to_value(row) for row in states.y], float)
+    groups = _groups(squares, y, EXACT[str(y.dtype)])
+    best = groups[0][0]
+    velocity, status = states.kept
+    # starts that ran out of steps have no minimum to tell, unless they are the best there is
+    ends = [[i for i in g if bool(states.done[i]) or i == best] for g in groups]
+    return Search(
+        value=values[best],
+        residual=np.asarray(states.residual[best], float),
+        jacobian=np.asarray(states.jacobian[best], float),
+        velocity=np.asarray(velocity[best], float),
+        status=np.asarray(status[best]),
+        gain=2 * float(states.gain[best]) / squares[best] if squares[best] > 0 else 0.0,
+        at_bound=(y[best] <= low) | (y[best] >= high),
+        steps=int(np.max(states.steps)),
+        minima=[(float(squares[g[0]]), values[g[0]], len(g)) for g in ends if g],
+        unfinished=len(y) - sum(len(g) for g in ends),
+    )
+
+
+def _groups(squares: np.ndarray, y: np.ndarray, exact: float) -> list[list[int]]:
+    """Starts that ended in the same minimum, best minimum first.
+
+    Among equally good ones the earliest start comes first: it began at the user's own values.
+    """
+    groups: list[list[int]] = []
+    least = np.nanmin(squares)
+    equal = squares <= least + SAME_COST * least + exact
+    for i in np.lexsort((np.arange(len(y)), np.where(equal, least, squares))):
+        for group in groups:
+            first = group[0]
+            close = abs(squares[i] - squares[first]) <= SAME_COST * squares[first] + exact
+            if close and np.abs(y[i] - y[first]).max() < SAME_VALUE:
+                group.append(int(i))
+                break
+        else:
+            groups.append([int(i)])
+    return groups
+
+
+def _start_points(problem: Problem, starts: int, seed: int) -> np.ndarray:
+    """Starts y (S, P): the law's own values, then random ones inside the bounds."""
+    own = problem.scaling.from_value(problem.parameters.of(problem.law))
+    low, high = np.asarray(problem.low, float), np.asarray(problem.high, float)
+    first, last = low.copy(), high.copy()
     for i, field, _ in problem.parameters.each():
-        if field in LOGARITHMIC:
-            near = max(low[i], own[i] / START_FACTOR), min(high[i], own[i] * START_FACTOR)
-            points[:, i] = near[0] * (near[1] / near[0]) ** share[:, i]
-            continue
-        around = own[i] + START_SCALES * problem.scale[i] * np.array([-1.0, 1.0])
-        ends = [b if np.isfinite(b) else a for a, b in zip(around, (low[i], high[i]))]
-        points[:, i] = ends[0] + (ends[1] - ends[0]) * share[:, i]
+        reach = np.log(START_FACTOR) if field in LOGARITHMIC else START_SCALES
+        if field in LOGARITHMIC or not np.isfinite(low[i]):
+            first[i] = max(low[i], own[i] - reach)
+        if field in LOGARITHMIC or not np.isfinite(high[i]):
+            last[i] = min(high[i], own[i] + reach)
+    points = first + (last - first) * np.random.default_rng(seed).random((starts, len(own)))
     points[0] = own
     return points
 
 
-def _run(
-    problem: Problem,
-    points: np.ndarray,
-    margin: float,
-    held: list[np.ndarray],
-    method: Method,
-    max_steps: int,
-) -> tuple[list[Evaluation], int]:
-    """Solve from up to LANES points (fewer are padded) and evaluate where they end."""
-    rows = [min(i, len(points) - 1) for i in range(LANES)]
-    x = jnp.asarray(points[rows], problem.pre.dtype)
-    mask = jnp.asarray(np.array(held)[rows])
-    z = problem.interval.from_bounded(x, margin)
-    x, steps = solve(problem, z, mask, x, method, max_steps)
-    results = [np.asarray(a, float) for a in (x, *evaluate(problem, x))]
-    ends = [
-        Evaluation(value, r, jac, v, status.astype(int))
-        for value, r, jac, v, status in zip(*results)
-    ]
-    return ends[: len(points)], int(np.max(steps))
-
-
-def _distinct(problem: Problem, ends: list[Evaluation]) -> list[tuple[float, np.ndarray, int]]:
-    """Minima with the number of starts that ended in each, best first."""
-    minima: list[tuple[float, np.ndarray, int]] = []
-    size = float(np.sum((np.asarray(problem.weight) * problem.unit) ** 2))
-    for end in sorted(ends, key=lambda end: end.sum_of_squares):
-        for i, (cost, value, count) in enumerate(minima):
-            same_cost = end.sum_of_squares - cost <= SAME_COST * (cost + SAME_COST * size)
-            if same_cost and _apart(problem, end.value, value) < SAME_VALUE:
-                minima[i] = (cost, value, count + 1)
-                break
-        else:
-            minima.append((end.sum_of_squares, end.value, 1))
-    return minima
-
-
-def _apart(problem: Problem, a: np.ndarray, b: np.ndarray) -> float:
-    """Largest difference in natural scales (of the logarithm where that is fitted)."""
-    log = np.asarray(problem.interval.log)
-    ratio = np.log(np.where(log, a, 1.0) / np.where(log, b, 1.0))
-    return float(np.abs(np.where(log, ratio, (a - b) / problem.scale)).max())
-
-
-def _try_bounds(
-    problem: Problem,
-    limits: tuple[np.ndarray, np.ndarray],
-    best: Evaluation,
-    method: Method,
-    max_steps: int,
-) -> tuple[Evaluation, np.ndarray]:
-    """Put parameters near a bound on it, all or one at a time, where that fits as well."""
-    low, high = limits
-    nearest = np.where(best.value - low < high - best.value, low, high)
-    gap = np.array([_gap(problem, i, best.value, nearest) for i in range(len(nearest))])
-    near = np.flatnonzero(gap < NEAR_BOUND)
-    if len(near) == 0:
-        return best, np.zeros(len(nearest), bool)
-    choices = [near, *([i] for i in near if len(near) > 1)][:LANES]
-    held = [np.isin(np.arange(len(nearest)), choice) for choice in choices]
-    points = np.array([np.where(mask, nearest, best.value) for mask in held])
-    ends, _ = _run(problem, points, RESTART_MARGIN, held, method, max_steps)
-    order = np.argsort([end.sum_of_squares for end in ends], kind="stable")
-    winner = int(order[0])
-    if ends[winner].sum_of_squares > (1 + SAME_COST) * best.sum_of_squares:
-        return best, np.zeros(len(nearest), bool)
-    return ends[winner], held[winner]
-
-
-def _gap(problem: Problem, i: int, value: np.ndarray, bound: np.ndarray) -> float:
-    if not np.isfinite(bound[i]):
-        return np.inf
-    if bool(problem.interval.log[i]):
-        return float(abs(np.log(value[i] / bound[i])))
-    return float(abs(value[i] - bound[i]) / problem.scale[i])
-
-
 @contextlib.contextmanager
-def _bar(starts: int, progress: bool | None) -> Iterator:
-    """Yield `advance(count)`; the bar appears on a terminal once the fit turns out long."""
-    show = sys.stderr.isatty() if progress is None else progress
-    if not show:
-        yield lambda count: None
+def _bar(
+    starts: int, max_steps: int, progress: bool | None
+) -> Iterator[Callable[[int, int], None]]:
+    """Yield `show(starts done, steps)`; the bar appears once the fit turns out to be long."""
+    if not (sys.stderr.isatty() if progress is None else progress):
+        yield lambda done, steps: None
         return
-    columns = (TextColumn("fit: {task.completed}/{task.total} starts"), BarColumn())
-    bar = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True)
-    task = bar.add_task("fit", total=starts)
+    text = TextColumn("fit: {task.fields[ready]} of {task.fields[starts]} starts done, step")
+    count = TextColumn("{task.completed} of at most {task.total}")
+    bar = Progress(
+        text, count, BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
+    )
+    task = bar.add_task("fit", total=max_steps, ready=0, starts=starts)
     timer = threading.Timer(0.0 if progress else BAR_AFTER, bar.start)
     timer.start()
     try:
-        yield lambda count: bar.advance(task, count)
+        yield lambda done, steps: bar.update(task, completed=steps, ready=done)
     finally:
         timer.cancel()
         bar.stop()

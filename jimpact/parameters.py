@@ -28,11 +28,6 @@ LOGARITHMIC = ("stiffness",)  # fitted in their logarithm: only ratios of them h
 # no further influence that a measurement could see.
 STIFFNESS_RANGE = 1e4
 
-# Random starts: stiffness within this factor of the user's start, other fields without two
-# bounds within this many scales of theirs.
-START_FACTOR = 20.0
-START_SCALES = 2.0
-
 
 class Parameters(eqx.Module):
     """The P free entries of a law, in the order of `names`; indices count flattened entries."""

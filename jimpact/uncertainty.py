@@ -41,20 +41,20 @@ def uncertainty(
     """Linearized errors at a minimum.
 
     Equation: `C = s^2 (J^T J)^-1` on the seen subspace, `s^2 = |r|^2 / (values - rank)`, or 1
-    where the weights are known errors. J is scaled by the natural size of each parameter, and
-    its rank is the number of singular values above `rank_tolerance` times the largest.
+    where the weights are known errors; rank = number of singular values of J, its columns scaled
+    by the natural size of each parameter, above `rank_tolerance` times the largest.
 
     Args:
         names: of the parameters (P,).
-        jacobian: (R, P) of the weighted residuals.
-        scale: natural size (P,) of each parameter.
+        jacobian: (R, P) of the weighted residuals, columns already scaled.
+        scale: the natural size (P,) of each parameter.
         log: (P,) whether changes are told in percent.
         sum_of_squares: |r|^2.
         values: independent measured values.
         noise_is_known: whether the weights are 1 / sigma.
         rank_tolerance: see `RANK_TOLERANCE`.
     """
-    _, singular, directions = np.linalg.svd(jacobian * scale, full_matrices=True)
+    _, singular, directions = np.linalg.svd(jacobian, full_matrices=True)
     singular = np.pad(singular, (0, len(names) - len(singular)))
     rank = int(np.sum(singular > rank_tolerance * singular[0]))
     freedom = values - rank
@@ -98,10 +98,11 @@ def _in_words(
     for i in np.argsort(-np.abs(step), kind="stable"):
         if abs(step[i]) > TAKES_PART * SMALL_CHANGE:
             change = f"{100 * abs(step[i]):.2g} %" if log[i] else f"{abs(step[i] * scale[i]):.2g}"
-            parts.append(f"{names[i]} {'up' if step[i] > 0 else 'down'} by {change}")
+            parts.append(f"{names[i]} goes {'up' if step[i] > 0 else 'down'} by {change}")
     if len(parts) == 1:
-        return f"The data cannot see {parts[0].split(' ')[0]}: it changes no measured velocity."
+        name = parts[0].split(" ")[0]
+        return f"The data cannot see {name}: no measured velocity depends on it."
     return (
-        f"The data cannot see {parts[0]} with {', '.join(parts[1:])}: "
-        "no measured velocity changes."
+        f"The data cannot see a combination: no measured velocity changes when {parts[0]}, "
+        f"together with {' and '.join(parts[1:])}."
     )

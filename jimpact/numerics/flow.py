@@ -13,7 +13,7 @@ A step may advance in time or in another variable xi that grows or falls monoton
 
     TIME     xi = t
     START    xi = t^(1/r): an impact begins like x ~ t, and forces t^eta are smooth in xi
-    ZERO_G   xi = g_j, ending on g_j = 0: lands on the event exactly (Henon's trick)
+    ZERO_G   xi = g_j, ending on g_j = 0 (or a given value): lands on the event exactly (Henon's trick)
     ROOT_X   xi = x_j^(1/r), ending on x_j = 0: the same for an opening, x_j^eta smooth in xi
 
 with r = 2 where 2 eta is known to be whole, else 4.
@@ -141,7 +141,7 @@ def step(
         for row in length * (weights @ slopes)
     )
     end = State(*(before + by for before, by in zip(state, change)))
-    end = end._replace(x=jnp.where(known_x, 0.0, end.x), g=jnp.where(known_g, 0.0, end.g))
+    end = end._replace(x=jnp.where(known_x, 0.0, end.x), g=jnp.where(known_g, start + length, end.g))
     return end, high, low
 
 

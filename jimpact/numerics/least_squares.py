@@ -1,28 +1,52 @@
-"""Nonlinear least squares from several starts at once: Levenberg-Marquardt or gradient descent.
+"""Nonlinear least squares in a box: Levenberg-Marquardt, or gradient descent with optax.
 
-The caller evaluates residual and Jacobian together, forward mode. Solvers see a function whose
-derivative rule is that Jacobian: an impact is traced and compiled once, whatever the solver asks.
+Minimize `|r(y)|^2 / 2` subject to `low <= y <= high`. Steps are cut at the box, and a variable
+on a bound whose gradient points outward is left out of the step, so minima on a bound are found
+exactly. (Smooth maps of the box onto the real line put them at infinity: Levenberg-Marquardt then
+still crawled after 100 steps, every start ending elsewhere.) One pass evaluates residual and
+Jacobian together once, so that the impact is compiled once; a solve can be continued.
 """
 
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-import optimistix as optx
 
-Evaluate = Callable[[jax.Array, Any], tuple[jax.Array, jax.Array]]
+# y (P,) -> residual (R,), Jacobian (R, P), anything else to keep of the best point
+Evaluate = Callable[[jax.Array], tuple[jax.Array, jax.Array, Any]]
 Method = str | optax.GradientTransformation
 
-DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 600, "sgd": 2000}
+DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1000}
 
-# Relative change of parameters and residual at which a solver stops: a hundredth of what the
-# derivatives of an impact are worth, so that stopping adds no error of its own.
-STOP = {"float64": 1e-9, "float32": 1e-4}
+# Done when an undamped Gauss-Newton step promises less than this share of the sum of squares:
+# the distance to the minimum is then its root, a hundred-thousandth of the standard error.
+STOP_GAIN = {"float64": 1e-10, "float32": 1e-6}
+# ... or less than this: residuals are of order 1, and impacts are good to 1e-8 (1e-5).
+STOP_EXACT = {"float64": 1e-18, "float32": 1e-11}
 
-_ADAM_RATE = 0.1  # in z, where an interval is a few units long
-_SGD_RATE = 0.3
+_DAMPING = 1e-2  # first Levenberg-Marquardt damping, relative to the curvatures
+_LESS, _MORE = 0.2, 4.0  # factors of the damping after a good and a bad step
+_LEAST, _STUCK = 1e-10, 1e10  # range of the damping; above, no downhill step exists
+_FLAT = 1e-10  # curvatures below this share of the largest are damped as if they had it
+_ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are of order 1
+
+
+class State(eqx.Module):
+    """The best point so far, what the next pass tries, and the method's memory."""
+
+    y: jax.Array
+    residual: jax.Array
+    jacobian: jax.Array
+    kept: Any
+    cost: jax.Array
+    gain: jax.Array  # what a Gauss-Newton step from the best point still promises
+    trial: jax.Array
+    memory: Any
+    steps: jax.Array
+    done: jax.Array
 
 
 def check_method(method: Any) -> None:
@@ -39,43 +63,109 @@ def default_steps(method: Method) -> int:
     return DEFAULT_STEPS[method if isinstance(method, str) else "adam"]
 
 
-def minimize(
-    evaluate: Evaluate, z: jax.Array, args: Any, method: Method, max_steps: int
+def begin(y: jax.Array, first: tuple[Any, Any, Any], method: Method, max_steps: int) -> State:
+    """State before the first pass from y (P,); `first` is shaped like what `evaluate` returns."""
+    infinite = jnp.asarray(jnp.inf, y.dtype)
+    if method == "levenberg-marquardt":
+        memory: Any = jnp.asarray(_DAMPING, y.dtype)
+    else:
+        memory = _transformation(method, max_steps).init(y)
+    steps, done = jnp.asarray(0), jnp.asarray(False)
+    return State(y, *first, infinite, infinite, y, memory, steps, done)
+
+
+def advance(
+    evaluate: Evaluate,
+    low: jax.Array,
+    high: jax.Array,
+    method: Method,
+    max_steps: int,
+    state: State,
+    passes: int,
+) -> State:
+    """Up to `passes` passes more, fewer if done or at the step limit."""
+    last = jnp.minimum(state.steps + passes, max_steps)
+
+    def one(state: State) -> State:
+        residual, jacobian, kept = evaluate(state.trial)
+        cost = 0.5 * jnp.sum(residual**2)
+        better = cost < state.cost
+        here = (state.trial, residual, jacobian, kept, cost)
+        best = (state.y, state.residual, state.jacobian, state.kept, state.cost)
+        best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
+        y, r, jac, kept, least = best
+        gain = _step(y, r, jac, low, high, jnp.asarray(_LEAST, y.dtype))[1]
+        if method == "levenberg-marquardt":
+            memory = jnp.maximum(state.memory * jnp.where(better, _LESS, _MORE), _LEAST)
+            move = _step(y, r, jac, low, high, memory)[0]
+            trial = jnp.clip(y + move, low, high)
+            stuck = memory > _STUCK
+        else:
+            gradient = _free(state.trial, jacobian.T @ residual, low, high)
+            move, memory = _transformation(method, max_steps).update(
+                gradient,
+                state.memory,
+                state.trial,
+                value=cost,
+                grad=gradient,
+                value_fn=lambda y: _cost(evaluate, jnp.clip(y, low, high)),
+            )
+            trial = jnp.clip(state.trial + move, low, high)
+            stuck = jnp.asarray(False)
+        dtype = str(y.dtype)
+        done = stuck | (gain <= STOP_GAIN[dtype] * least + STOP_EXACT[dtype])
+        return State(y, r, jac, kept, least, gain, trial, memory, state.steps + 1, done)
+
+    return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
+
+
+def _free(y: jax.Array, gradient: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """The gradient without variables that sit on a bound and are pushed against it."""
+    pushed = ((y <= low) & (gradient > 0)) | ((y >= high) & (gradient < 0))
+    return jnp.where(pushed, 0.0, gradient)
+
+
+def _step(
+    y: jax.Array,
+    residual: jax.Array,
+    jacobian: jax.Array,
+    low: jax.Array,
+    high: jax.Array,
+    damping: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Minimize `|r(z, args)|^2` from one start z (P,); returns the best z and the steps taken."""
+    """Damped Gauss-Newton step of the free variables, and the decrease it promises."""
+    gradient = jacobian.T @ residual
+    pushed = (_free(y, gradient, low, high) == 0) & (gradient != 0)
+    jacobian = jnp.where(pushed[None, :], 0.0, jacobian)
+    gradient = jnp.where(pushed, 0.0, gradient)
+    hessian = jacobian.T @ jacobian
+    curvature = jnp.diagonal(hessian)
+    largest = jnp.max(curvature)
+    curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
+    move = -jnp.linalg.solve(hessian + jnp.diag(damping * curvature), gradient)
+    return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
+
+
+def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
+    """`|r|^2 / 2`, its derivative taken from the Jacobian that `evaluate` gives (line searches)."""
 
     @jax.custom_jvp
-    def residual(z: jax.Array, args: Any) -> jax.Array:
-        return evaluate(z, args)[0]
+    def cost(y: jax.Array) -> jax.Array:
+        return 0.5 * jnp.sum(evaluate(y)[0] ** 2)
 
-    @residual.defjvp
+    @cost.defjvp
     def _rule(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-        value, jacobian = evaluate(*primals)
-        return value, jacobian @ tangents[0]
+        residual, jacobian, _ = evaluate(primals[0])
+        return 0.5 * jnp.sum(residual**2), (jacobian.T @ residual) @ tangents[0]
 
-    stop = STOP[str(z.dtype)]
-    if method == "levenberg-marquardt":
-        solver = optx.LevenbergMarquardt(rtol=stop, atol=stop)
-        found = optx.least_squares(residual, solver, z, args, max_steps=max_steps, throw=False)
-    else:
-        descent = _transformation(method, max_steps)
-        solver = optx.BestSoFarMinimiser(optx.OptaxMinimiser(descent, rtol=stop, atol=stop))
-        found = optx.minimise(
-            lambda z, args: 0.5 * jnp.sum(residual(z, args) ** 2),
-            solver,
-            z,
-            args,
-            max_steps=max_steps,
-            throw=False,
-        )
-    return found.value, found.stats["num_steps"]
+    return cost(y)
 
 
-def _transformation(method: Method, max_steps: int) -> optax.GradientTransformation:
+def _transformation(method: Method, max_steps: int) -> optax.GradientTransformationExtraArgs:
     if method == "adam":
-        return optax.adam(optax.cosine_decay_schedule(_ADAM_RATE, max_steps))
-    if method == "sgd":
-        return optax.sgd(_SGD_RATE, momentum=0.9)
-    if method == "lbfgs":
-        return optax.lbfgs()
-    return method
+        method = optax.adam(optax.cosine_decay_schedule(_ADAM_RATE, max_steps))
+    elif method == "sgd":
+        method = optax.sgd(_SGD_RATE, momentum=_SGD_MOMENTUM)
+    elif method == "lbfgs":
+        method = optax.lbfgs()
+    return optax.with_extra_args_support(method)

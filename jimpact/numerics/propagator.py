@@ -33,12 +33,13 @@ def propagate(
     landing = (kind != TIME) & (kind != START)
     row = jnp.where(kind == ROOT_X, coefficients.x, coefficients.g)
     event = jnp.sum(jnp.where(target, row, 0.0), axis=1)
+    event = event.at[0].add(jnp.where(kind == ROOT_X, 0.0, -(start + length)))
     h = jnp.where(kind == START, (start + length) ** 2 - start**2, length)
     h = jnp.where(landing, _root(event, due), h)
     end = State(*(_evaluate(series, h) for series in coefficients))
     end = end._replace(
         x=jnp.where(target & (kind == ROOT_X), 0.0, end.x),
-        g=jnp.where(target & landing & (kind != ROOT_X), 0.0, end.g),
+        g=jnp.where(target & landing & (kind != ROOT_X), start + length, end.g),
     )
     strength = jnp.max(jnp.sum(jnp.abs(as_matrix(flow.coupling)) * flow.omega[None, :], axis=1))
     frequency = jnp.sqrt(strength * jnp.max(flow.omega))

@@ -35,6 +35,7 @@ FIRST_STEP = 0.2  # in xi: no contact can turn around within xi^r of the fastest
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.9  # of the step-size control
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
 NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact
+RESIDUAL = 1.0  # loads and velocities below this part of the tolerance end the impact
 NEAR_OPENING = 1.5  # an expansion expected to end within so many steps is landed on
 SHORTEST = 1e-13  # a step this small cannot be resolved: the pending event is taken at once
 
@@ -110,7 +111,7 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     phase, kind, target = carry.phase, carry.kind, carry.target
     h, due, begun = jax.lax.stop_gradient((carry.h, carry.due, carry.begun))
     carry = carry._replace(h=h, due=due, begun=begun)
-    start, length = _interval(flow, carry)
+    start, length = _interval(flow, control, carry)
     reached, high, low = control.step(
         flow, phase, carry.state, kind, target, start, length, due, control.tolerance
     )
@@ -126,14 +127,13 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     slope_end = _margin_slopes(flow, phase, new)
     landing = (kind == ZERO_G) | (kind == ROOT_X)
     snap = SNAP * control.tolerance
-    others = ~(target & landing)
-    crossed_g = others & (after.g < -snap)
-    crossed_x = others & (after.x < -snap)
+    crossed_g = ~(target & (kind == ZERO_G)) & (after.g < -snap)
+    crossed_x = ~(target & (kind == ROOT_X)) & (after.x < -snap)
     # time the step takes, or is expected to take
     r = root_order(flow.exponent)
     in_start = (begun + h) ** r - begun**r
     span = jnp.select([landing, kind == START], [due, in_start], h)
-    dipped = ~landing & others & _dips(before.g, after.g, slope.g * span, slope_end.g * span, snap)
+    dipped = ~landing & _dips(before.g, after.g, slope.g * span, slope_end.g * span, snap)
     idle = ~_matters(flow, control, state) & ~_matters(flow, control, new)
     at_once = (crossed_g & (before.g <= snap) & (slope.g <= 0)) | (
         (crossed_g | crossed_x) & ((span < SHORTEST) | idle)
@@ -145,7 +145,8 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     # accepted: move, and change the phase of the contact landed on
     arrived = jnp.where(flips, at_once, accept & landing & target)
     moved = State(*(jnp.where(accept, b, a) for a, b in zip(exact_state, reached)))
-    moved, new_phase, closed = _change_phase(exact_flow, phase, moved, arrived)
+    opened = arrived & (phase == EXPANSION) & jnp.where(flips, crossed_x, kind == ROOT_X)
+    moved, new_phase, closed = _change_phase(exact_flow, phase, moved, arrived, opened)
 
     fraction_g = jnp.where(crossed_g, _crossing(before.g, after.g, slope.g * span), jnp.inf)
     fraction_x = jnp.where(crossed_x, _crossing(before.x, after.x, slope.x * span), jnp.inf)
@@ -204,16 +205,18 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     return _finish(exact_flow, control, out)
 
 
-def _interval(flow: Flow, carry: Carry) -> tuple[jax.Array, jax.Array]:
+def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, jax.Array]:
     """Start and length of the next step in its own variable."""
     r = root_order(flow.exponent)
     x = jnp.sum(jnp.where(carry.target, carry.state.x, 0.0))
     g = jnp.sum(jnp.where(carry.target, carry.state.g, 0.0))
+    closing = carry.target & (carry.phase == OPEN)  # closes once its approach matters
+    g_end = -NEGLIGIBLE * jnp.sum(jnp.where(closing, control.tolerance, 0.0))
     x = jnp.where(x > 0, x, 1.0)
     root = jnp.sqrt(x) if r == 2 else jnp.sqrt(jnp.sqrt(x))
     kinds = [carry.kind == START, carry.kind == ZERO_G, carry.kind == ROOT_X]
     start = jnp.select(kinds, [carry.begun, g, root], 0.0)
-    length = jnp.select(kinds, [carry.h, -g, -root], carry.h)
+    length = jnp.select(kinds, [carry.h, g_end - g, -root], carry.h)
     return start, length
 
 
@@ -229,10 +232,12 @@ def _error(control: Control, high: State, low: State) -> jax.Array:
     return jnp.where(scale > 0, fifth**2 / jnp.where(scale > 0, scale, 1.0), fifth)
 
 
-def _matters(flow: Flow, control: Control, state: State) -> jax.Array:
-    """Whether load and velocity of a contact are more than what is neglected."""
+def _matters(
+    flow: Flow, control: Control, state: State, part: float = NEGLIGIBLE + 2 * SNAP
+) -> jax.Array:
+    """Whether load and velocity of a contact are more than `part` of the tolerance."""
     total = power(state.x, plus_one(flow.exponent)) + state.g**2
-    return jax.lax.stop_gradient(total > ((NEGLIGIBLE + 2 * SNAP) * control.tolerance) ** 2)
+    return jax.lax.stop_gradient(total > (part * control.tolerance) ** 2)
 
 
 class Margin(NamedTuple):
@@ -290,16 +295,15 @@ def _dip_at(f0: jax.Array, f1: jax.Array, d0: jax.Array) -> jax.Array:
 
 
 def _change_phase(
-    flow: Flow, phase: jax.Array, state: State, arrived: jax.Array
+    flow: Flow, phase: jax.Array, state: State, arrived: jax.Array, opened: jax.Array
 ) -> tuple[State, jax.Array, jax.Array]:
-    """The next phase of the contacts that `arrived` at an event; g stays continuous in gamma."""
-    expanded = arrived & (phase == EXPANSION) & (state.x <= 0)
+    """The next phase of the contacts that `arrived` at an event; gamma stays continuous."""
     turned = jnp.where(state.x > 0, EXPANSION, OPEN)
     following = jnp.where(phase == COMPRESSION, turned, COMPRESSION)
-    following = jnp.where(expanded, OPEN, following)
+    following = jnp.where(opened, OPEN, following)
     new_phase = jnp.where(arrived, following, phase).astype(jnp.int32)
-    g = jnp.where(expanded, flow.restitution * state.g, state.g)
-    rests = arrived & ~expanded & (phase != OPEN)
+    g = jnp.where(opened, flow.restitution * state.g, state.g)
+    rests = arrived & ~opened & (phase != OPEN)
     g = jnp.where(rests, 0.0, g)
     x = jnp.where(new_phase == OPEN, 0.0, state.x)
     closed = (arrived & (phase == OPEN)).astype(jnp.int32)
@@ -327,8 +331,7 @@ def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
     state, phase = carry.state, carry.phase
     s, _, _ = scales(flow, phase)
     gamma = s * state.g
-    slack = NEGLIGIBLE * control.tolerance
-    at_work = ((state.x > 0) | (gamma < 0)) & _matters(flow, control, state)
+    at_work = ((state.x > 0) | (gamma < 0)) & _matters(flow, control, state, RESIDUAL)
     # of each decoupled contact gamma+ = e sqrt(x^(eta+1) + g^2), since x^(eta+1) + g^2 is kept
     total = power(state.x, plus_one(flow.exponent)) + state.g**2
     rebound = flow.restitution * jnp.sqrt(jnp.where(at_work, total, 1.0))
@@ -342,7 +345,7 @@ def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
         off = coupling * (1 - jnp.eye(coupling.shape[0], dtype=coupling.dtype))
         strength, pulled = jnp.abs(off), jnp.minimum(off, 0.0) @ dp
     coupled = at_work & (strength @ at_work.astype(gamma.dtype) > 0)
-    pressed = ~at_work & (gamma + pulled < -slack)
+    pressed = ~at_work & (gamma + pulled < -RESIDUAL * control.tolerance)
     alone = ~jnp.any(coupled | pressed)
     if not control.closed_form:
         alone = ~jnp.any(at_work)

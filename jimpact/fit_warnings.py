@@ -1,0 +1,92 @@
+"""What a user must know before trusting a fit, in words."""
+
+import numpy as np
+
+from jimpact.defects import data_defects
+from jimpact.experiments import Experiments
+from jimpact.fit_problem import Problem
+from jimpact.multistart import EXACT, Search
+from jimpact.scene import Scene
+from jimpact.status import STATUS
+from jimpact.uncertainty import Uncertainty
+
+# Converged: a full Gauss-Newton step would lower the sum of squares by less than this share, a
+# thousandth of a standard error away from the minimum.
+CONVERGED = 1e-6
+
+# Minima whose sums of squares differ by less than this many noise variances fit equally well:
+# the difference is what moving by one standard error costs.
+EQUALLY_GOOD = 1.0
+
+# Scatter beyond the stated sigma is worth a word above this ratio (chi^2 per degree of freedom 4).
+TOO_MUCH_SCATTER = 2.0
+
+
+def is_converged(problem: Problem, found: Search) -> bool:
+    """Whether no Gauss-Newton step could still lower the sum of squares, or the fit is perfect."""
+    return found.gain <= CONVERGED or found.minima[0][0] <= EXACT[str(problem.pre.dtype)]
+
+
+def fit_warnings(
+    problem: Problem,
+    experiments: Experiments,
+    scene: Scene | None,
+    found: Search,
+    spread: Uncertainty,
+    converged: bool,
+) -> list[str]:
+    """All warnings, those about the data first."""
+    stored = float(np.sum(problem.law.stored_energy(experiments.scene_of(scene, 0).contacts)))
+    lines = data_defects(experiments, scene, stored)
+    if not converged:
+        lines.append("The fit has not converged: allow more `max_steps` or `starts`.")
+    lines += _statuses(found.status, experiments.shots)
+    names = problem.parameters.names
+    for i in np.flatnonzero(found.at_bound):
+        lines.append(
+            f"{names[i]} ends at its bound {found.value[i]:g}: its error holds for one side."
+        )
+    if spread.rank < len(names):
+        lines.append(
+            f"The data determine {spread.rank} of {len(names)} parameters (rank "
+            f"{spread.rank} of {len(names)}); the values given are one choice of many."
+        )
+    elif (several := _equally_good(problem, found, spread)) > 1:
+        lines.append(f"{several} different minima fit equally well: see the starts.")
+    if spread.degrees_of_freedom < 1 and experiments.sigma is None:
+        lines.append(
+            "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
+        )
+    if experiments.sigma is not None and spread.degrees_of_freedom > 0:
+        chi_squared = float(problem.size) ** 2 * found.minima[0][0]
+        scatter = np.sqrt(chi_squared / spread.degrees_of_freedom)
+        if scatter > TOO_MUCH_SCATTER:
+            lines.append(
+                f"The residuals are {scatter:.1f} times what sigma allows: the law or the stated "
+                "errors are wrong, and the standard errors too small."
+            )
+    if problem.pre.dtype == np.float32:
+        lines.append(
+            "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
+            'jax.config.update("jax_enable_x64", True) gives float64.'
+        )
+    return lines
+
+
+def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
+    lines = []
+    for code in np.unique(status):
+        if STATUS[code].failure:
+            at = ", ".join(shots[k] for k in np.flatnonzero(status == code)[:6])
+            count = int(np.sum(status == code))
+            lines.append(
+                f"The fitted law fails in {count} of {len(shots)} shots ({at}): "
+                f"{STATUS[code].name}, {STATUS[code].message}."
+            )
+    return lines
+
+
+def _equally_good(problem: Problem, found: Search, spread: Uncertainty) -> int:
+    noise = spread.noise / float(problem.size) if np.isfinite(spread.noise) else 0.0
+    more = max(EQUALLY_GOOD * noise**2, EXACT[str(problem.pre.dtype)])
+    return sum(cost <= found.minima[0][0] + more for cost, _, _ in found.minima)
