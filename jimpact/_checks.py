@@ -61,17 +61,17 @@ def check_values(
 
 def check_shape(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> None:
     """Raise a ValueError unless `value` has exactly this shape."""
-    if jnp.shape(value) != shape:
+    if np.shape(value) != shape:
         raise ValueError(
             f"Argument `{name}` must have shape {shape} ({meaning}), "
-            f"but has shape {tuple(jnp.shape(value))}."
+            f"but has shape {tuple(np.shape(value))}."
         )
 
 
 def check_per_contact(name: str, value: Any, contacts: int) -> None:
     """Raise a ValueError unless `value` is a scalar or has one entry per contact."""
-    if jnp.shape(value) not in ((), (contacts,)):
+    if np.shape(value) not in ((), (contacts,)):
         raise ValueError(
             f"Argument `{name}` must be a scalar or have shape ({contacts},), one value per "
-            f"contact, but has shape {tuple(jnp.shape(value))}."
+            f"contact, but has shape {tuple(np.shape(value))}."
         )

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.experiments import Experiments
+from jimpact.experiments import Experiments, dense_mass
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.numerics.least_squares import Method, State, advance, begin
-from jimpact.parameters import LOGARITHMIC, Parameters
-from jimpact.scene import Scene, kinetic_energy
+from jimpact.parameters import LOGARITHMIC, Parameters, entries, with_entries
+from jimpact.scene import Scene
 from jimpact.status import CODE
 
 # Outcomes whose velocities mean nothing. A trial that meets one gets a residual far above any
@@ -21,29 +21,19 @@ UNUSABLE = ("infeasible", "max_steps", "not_finite")
 PENALTY = 1e3  # times the largest velocity
 
 
-class Scaling(eqx.Module):
-    """Scaled parameters `y = x / scale`, or `y = log x` where `log` is set: of order 1."""
-
-    scale: jax.Array
-    log: jax.Array
-
-    def to_value(self, y: jax.Array) -> jax.Array:
-        """x (P,) of y (P,)."""
-        return jnp.where(self.log, jnp.exp(jnp.where(self.log, y, 0.0)), y * self.scale)
-
-    def from_value(self, x: np.ndarray) -> np.ndarray:
-        """y of x, (..., P), on the host."""
-        log = np.asarray(self.log)
-        with np.errstate(divide="ignore"):
-            return np.where(log, np.log(np.where(log, x, 1.0)), x / np.asarray(self.scale, float))
-
-
 class Problem(eqx.Module):
-    """Law, shots and box of one fit: a pytree that compiled functions take as argument."""
+    """Law, shots and box of one fit: a pytree that compiled functions take as argument.
+
+    Solvers work on y (Q,), of which the first P count, the rest is 0. The entries of the law's
+    fields in scaled form are `offset + mix y`; an entry is `scale` times that, or its exponential
+    where `log` is set.
+    """
 
     law: Law
-    parameters: Parameters
-    scaling: Scaling
+    mix: jax.Array
+    offset: jax.Array
+    scale: jax.Array
+    log: jax.Array
     low: jax.Array  # bounds of y
     high: jax.Array
     scenes: Scene  # one, or stacked one a shot
@@ -52,6 +42,7 @@ class Problem(eqx.Module):
     weight: jax.Array  # 0 where not measured; makes |r|^2 a mean square relative to `unit`
     size: jax.Array  # () size r is (v+ - measured) / sigma, with sigma = 1 m/s where unknown
     unit: jax.Array  # () the largest velocity [m/s]
+    fields: tuple[str, ...] = eqx.field(static=True)
     scene_per_shot: bool = eqx.field(static=True)
 
 
@@ -71,41 +62,57 @@ def build_problem(
     sigma = np.ones_like(post) if experiments.sigma is None else np.asarray(experiments.sigma)
     weight = np.where(experiments.measured, 1 / sigma, 0.0)
     size = unit * np.linalg.norm(weight)
-    energy = max(float(kinetic_energy(s, v)) for s, v in zip(own, experiments.pre)) or 1.0
-    scaling = _scaling(parameters, law, energy, dtype)
-    low, high = (jnp.asarray(scaling.from_value(end), dtype) for end in limits)
+    energy = max(0.5 * v @ dense_mass(s) @ v for s, v in zip(own, pre)) or 1.0
+    values = entries(law, parameters.fields)
+    scale, log = _scales(parameters, values, energy)
+    offset, mix = to_scaled(values, scale, log), np.zeros((len(values), len(values)))
+    for i, group in enumerate(parameters.groups):
+        mix[list(group), i], offset[list(group)] = 1.0, 0.0
+    bounds = np.zeros((2, len(values)))
+    first, count = parameters.first, len(parameters.names)
+    bounds[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
+    arrays = {"mix": mix, "offset": offset, "scale": scale, "low": bounds[0], "high": bounds[1]}
+    arrays |= {"post": post, "weight": weight / size, "size": size, "unit": unit}
     return Problem(
         law=law,
-        parameters=parameters,
-        scaling=scaling,
-        low=low,
-        high=high,
+        log=jnp.asarray(log),
         scenes=jax.tree.map(lambda *x: jnp.stack(x), *own) if per_shot else own[0],
         pre=experiments.pre,
-        post=jnp.asarray(post),
-        weight=jnp.asarray(weight / size, dtype),
-        size=jnp.asarray(size, dtype),
-        unit=jnp.asarray(unit, dtype),
+        fields=parameters.fields,
         scene_per_shot=per_shot,
+        **{name: jnp.asarray(array, dtype) for name, array in arrays.items()},
     )
 
 
-def _scaling(parameters: Parameters, law: Law, energy: float, dtype: Any) -> Scaling:
-    """What counts as a change of order 1: an energy, or else 1 or |value|; stiffness in its log."""
-    scale = np.maximum(np.abs(parameters.of(law)), 1.0)
-    log = np.zeros(len(scale), bool)
-    for i, field, _ in parameters.each():
-        log[i] = field in LOGARITHMIC
-        if field == "initial_energy":
-            scale[i] = energy
-    return Scaling(jnp.asarray(scale, dtype), jnp.asarray(log))
+def _scales(
+    parameters: Parameters, values: np.ndarray, energy: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each entry: the size of a change of order 1 (or 1, where fitted in its logarithm), log."""
+    log = np.array([field in LOGARITHMIC for field in parameters.entry_fields])
+    of_energy = np.array([field == "initial_energy" for field in parameters.entry_fields])
+    scale = np.where(of_energy, energy, np.maximum(np.abs(values), 1.0))
+    return np.where(log, 1.0, scale), log
+
+
+def to_scaled(values: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.ndarray:
+    """Scaled form of entries, on the host."""
+    with np.errstate(divide="ignore"):
+        return np.where(log, np.log(np.where(log, values, 1.0)), values / scale)
+
+
+def from_scaled(scaled: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.ndarray:
+    """Entries of their scaled form, on the host."""
+    return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled * scale)
 
 
 def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
-    """Weighted residual (K n,), its Jacobian (K n, P), and v+ (K, n), status (K,)."""
+    """Weighted residual (K n,), its Jacobian (K n, Q), and v+ (K, n), status (K,)."""
 
     def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
-        law = problem.parameters.put(problem.law, problem.scaling.to_value(y))
+        scaled = problem.offset + problem.mix @ y
+        exponential = jnp.exp(jnp.where(problem.log, scaled, 0.0))
+        values = jnp.where(problem.log, exponential, scaled * problem.scale)
+        law = with_entries(problem.law, problem.fields, values)
         axes = (None, 0 if problem.scene_per_shot else None, 0)
         out = jax.vmap(impact, in_axes=axes)(law, problem.scenes, problem.pre)
         codes = jnp.asarray([CODE[name] for name in UNUSABLE])
@@ -120,7 +127,7 @@ def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any
 
 @eqx.filter_jit
 def begin_all(problem: Problem, starts: jax.Array, method: Method, max_steps: int) -> State:
-    """States of a batch of starts y (S, P)."""
+    """States of a batch of starts y (S, Q)."""
     shots, bodies = problem.pre.shape
 
     def one(y: jax.Array) -> State:

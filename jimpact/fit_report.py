@@ -71,10 +71,10 @@ def _told(title: str, lines: tuple[str, ...]) -> list[str]:
 
 
 def _minima(fit: "Fit") -> list[str]:
-    total = sum(start.count for start in fit.starts) + fit.unfinished
-    late = f"{fit.unfinished} of {total} starts ran out of steps." if fit.unfinished else ""
+    total = sum(start.count for start in fit.starts) + fit.lost_starts
+    late = f"{fit.lost_starts} of {total} starts did not converge." if fit.lost_starts else ""
     if len(fit.starts) == 1:
-        one = f"{total - fit.unfinished} of {total} starts ended in this minimum. {late}"
+        one = f"{total - fit.lost_starts} of {total} starts ended in this minimum. {late}"
         return [one.rstrip()] if total > 1 else []
     lines = [f"{len(fit.starts)} minima of {total} starts:  sum of squares, starts, values"]
     for start in fit.starts[:_MINIMA_SHOWN]:

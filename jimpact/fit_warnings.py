@@ -6,13 +6,10 @@ from jimpact.defects import data_defects
 from jimpact.experiments import Experiments
 from jimpact.fit_problem import Problem
 from jimpact.multistart import EXACT, Search
+from jimpact.parameters import Parameters
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 from jimpact.uncertainty import Uncertainty
-
-# Converged: a full Gauss-Newton step would lower the sum of squares by less than this share, a
-# thousandth of a standard error away from the minimum.
-CONVERGED = 1e-6
 
 # Minima whose sums of squares differ by less than this many noise variances fit equally well:
 # the difference is what moving by one standard error costs.
@@ -22,26 +19,21 @@ EQUALLY_GOOD = 1.0
 TOO_MUCH_SCATTER = 2.0
 
 
-def is_converged(problem: Problem, found: Search) -> bool:
-    """Whether no Gauss-Newton step could still lower the sum of squares, or the fit is perfect."""
-    return found.gain <= CONVERGED or found.minima[0][0] <= EXACT[str(problem.pre.dtype)]
-
-
 def fit_warnings(
     problem: Problem,
+    parameters: Parameters,
     experiments: Experiments,
     scene: Scene | None,
     found: Search,
     spread: Uncertainty,
-    converged: bool,
 ) -> list[str]:
     """All warnings, those about the data first."""
     stored = float(np.sum(problem.law.stored_energy(experiments.scene_of(scene, 0).contacts)))
     lines = data_defects(experiments, scene, stored)
-    if not converged:
+    if not found.converged:
         lines.append("The fit has not converged: allow more `max_steps` or `starts`.")
     lines += _statuses(found.status, experiments.shots)
-    names = problem.parameters.names
+    names = parameters.names
     for i in np.flatnonzero(found.at_bound):
         lines.append(
             f"{names[i]} ends at its bound {found.value[i]:g}: its error holds for one side."

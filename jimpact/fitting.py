@@ -11,11 +11,17 @@ from scipy.special import ndtri, stdtrit
 from jimpact.experiments import Experiments
 from jimpact.fit_problem import Problem, build_problem
 from jimpact.fit_report import report, to_json
-from jimpact.fit_warnings import fit_warnings, is_converged
+from jimpact.fit_warnings import fit_warnings
 from jimpact.laws.base import Law
 from jimpact.multistart import Search, search
 from jimpact.numerics.least_squares import Method, check_method, default_steps
-from jimpact.parameters import DEFAULT_FREE, bounds_of, free_parameters
+from jimpact.parameters import (
+    DEFAULT_FREE,
+    Parameters,
+    bounds_of,
+    free_parameters,
+    with_entries,
+)
 from jimpact.scene import Scene
 from jimpact.uncertainty import RANK_TOLERANCE, uncertainty
 
@@ -60,7 +66,7 @@ class Fit:
     status: np.ndarray
     converged: bool
     steps: int
-    unfinished: int
+    lost_starts: int
     warnings: tuple[str, ...]
     experiments: Experiments
 
@@ -113,7 +119,8 @@ def fit(
             ratios matter, so contact 1 is held, and a scalar stiffness cannot be fitted.
         scene: the scene of all shots; None where the experiments carry one a shot.
         experiments: measured shots.
-        free: names of fields, or {field: True or a boolean mask over contacts}.
+        free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of
+            groups}: contacts with equal numbers are tied, 0 is held.
         bounds: {field: (low, high)}; default [0, 1] for restitution, > 0 for stiffness, ...
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
@@ -139,12 +146,13 @@ def fit(
     limits = bounds_of(parameters, law, bounds)
     problem = build_problem(law, scene, experiments, parameters, limits)
     steps = max_steps or default_steps(method)
-    found = search(problem, method, starts, seed, steps, progress)
-    return _as_fit(problem, experiments, scene, found, limits, method, notes)
+    found = search(problem, parameters, method, starts, seed, steps, progress)
+    return _as_fit(problem, parameters, experiments, scene, found, limits, method, notes)
 
 
 def _as_fit(
     problem: Problem,
+    parameters: Parameters,
     experiments: Experiments,
     scene: Scene | None,
     found: Search,
@@ -154,23 +162,21 @@ def _as_fit(
 ) -> Fit:
     measured, sigma_known = experiments.measured, experiments.sigma is not None
     size = float(problem.size)
-    log = np.asarray(problem.scaling.log)
     spread = uncertainty(
-        names=problem.parameters.names,
+        names=parameters.names,
         jacobian=size * found.jacobian,
-        scale=np.where(log, found.value, np.asarray(problem.scaling.scale)),
-        log=log,
+        scale=found.scale,
+        log=found.log,
         sum_of_squares=size**2 * found.minima[0][0],
         values=int(measured.sum()) - experiments.lost_freedom,
         noise_is_known=sigma_known,
         rank_tolerance=RANK_TOLERANCE[str(problem.pre.dtype)],
     )
     residual = np.where(measured, np.asarray(experiments.post, float) - found.velocity, np.nan)
-    converged = is_converged(problem, found)
     return Fit(
-        law=problem.parameters.put(problem.law, jnp.asarray(found.value, problem.pre.dtype)),
+        law=with_entries(problem.law, problem.fields, jnp.asarray(found.entries)),
         method=method if isinstance(method, str) else "optax",
-        names=problem.parameters.names,
+        names=parameters.names,
         value=found.value,
         standard_error=spread.standard_error,
         covariance=spread.covariance,
@@ -187,9 +193,9 @@ def _as_fit(
         identifiability=(*notes, *spread.unseen),
         starts=tuple(Start(size**2 * cost, value, count) for cost, value, count in found.minima),
         status=found.status,
-        converged=converged,
+        converged=found.converged,
         steps=found.steps,
-        unfinished=found.unfinished,
-        warnings=tuple(fit_warnings(problem, experiments, scene, found, spread, converged)),
+        lost_starts=found.lost,
+        warnings=tuple(fit_warnings(problem, parameters, experiments, scene, found, spread)),
         experiments=experiments,
     )

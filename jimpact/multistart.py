@@ -6,14 +6,15 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from jimpact.fit_problem import Problem, advance_all, begin_all
+from jimpact.fit_problem import Problem, advance_all, begin_all, from_scaled, to_scaled
 from jimpact.numerics.least_squares import Method, State
-from jimpact.parameters import LOGARITHMIC
+from jimpact.parameters import Parameters, entries
 
 PASSES = 10  # between two looks at the progress
 
@@ -29,6 +30,9 @@ SAME_VALUE = 1e-3
 # Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
 # tolerance of the impact.
 EXACT = {"float64": 1e-14, "float32": 1e-8}
+# A start has converged when a full Gauss-Newton step would lower the sum of squares by less than
+# this share: it is then a thousandth of a standard error away from the minimum.
+CONVERGED = 1e-6
 
 BAR_AFTER = 2.0  # seconds after which a fit counts as long
 
@@ -36,20 +40,23 @@ BAR_AFTER = 2.0  # seconds after which a fit counts as long
 class Search(NamedTuple):
     """The best end point (weighted as in `Problem`), and all distinct minima, best first."""
 
-    value: np.ndarray
-    residual: np.ndarray
-    jacobian: np.ndarray  # of the scaled parameters
+    value: np.ndarray  # of the parameters (P,)
+    entries: np.ndarray  # of all entries (Q,) of the named fields
+    scale: np.ndarray  # natural size of a change of each parameter, at the value found
+    log: np.ndarray  # whether it is fitted in its logarithm
+    jacobian: np.ndarray  # (K n, P), of the scaled parameters
     velocity: np.ndarray
     status: np.ndarray
-    gain: float  # relative decrease of the sum of squares that a further step promises
+    converged: bool
     at_bound: np.ndarray
     steps: int
     minima: list[tuple[float, np.ndarray, int]]  # |r|^2, values, how many starts
-    unfinished: int  # starts that ran out of steps
+    lost: int  # starts that did not converge
 
 
 def search(
     problem: Problem,
+    parameters: Parameters,
     method: Method,
     starts: int,
     seed: int,
@@ -57,7 +64,7 @@ def search(
     progress: bool | None,
 ) -> Search:
     """Run all starts to their ends and keep the best."""
-    points = jnp.asarray(_start_points(problem, starts, seed), problem.pre.dtype)
+    points = jnp.asarray(_start_points(problem, parameters, starts, seed), problem.pre.dtype)
     states = begin_all(problem, points, method, max_steps)
     with _bar(starts, max_steps, progress) as show:
         while True:
@@ -65,30 +72,42 @@ def search(
             done, steps = np.asarray(states.done), np.asarray(states.steps)
             show(int(done.sum()), int(steps.max()))
             if (done | (steps >= max_steps)).all():
-                return _found(problem, states)
+                return _found(problem, parameters, jax.device_get(states))
 
 
-def _found(problem: Problem, states: State) -> Search:
-    y, low, high = (np.asarray(x) for x in (states.y, problem.low, problem.high))
+def _found(problem: Problem, parameters: Parameters, states: State) -> Search:
+    """Pick the best end (the states are on the host)."""
+    count, first = len(parameters.names), parameters.first
+    scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
+    y = states.y[:, :count]
     squares = 2 * np.asarray(states.cost, float)
-    values = np.array([problem.scaling.to_value(row) for row in states.y], float)
-    groups = _groups(squares, y, EXACT[str(y.dtype)])
+    values = from_scaled(np.asarray(y, float), scale, log)
+    exact = EXACT[str(y.dtype)]
+    converged = (states.gain * 2 <= CONVERGED * squares) | (squares <= exact)
+    groups = _groups(squares, y, exact)
     best = groups[0][0]
-    velocity, status = states.kept
-    # starts that ran out of steps have no minimum to tell, unless they are the best there is
-    ends = [[i for i in g if bool(states.done[i]) or i == best] for g in groups]
+    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
+    # starts that did not converge have no minimum to tell, unless they are the best there is
+    ends = [[i for i in g if converged[i] or i == best] for g in groups]
     return Search(
         value=values[best],
-        residual=np.asarray(states.residual[best], float),
-        jacobian=np.asarray(states.jacobian[best], float),
-        velocity=np.asarray(velocity[best], float),
-        status=np.asarray(status[best]),
-        gain=2 * float(states.gain[best]) / squares[best] if squares[best] > 0 else 0.0,
+        entries=_all_entries(problem, states.y[best]),
+        scale=np.where(log, values[best], scale),
+        log=log,
+        jacobian=np.asarray(states.jacobian[best][:, :count], float),
+        velocity=np.asarray(states.kept[0][best], float),
+        status=states.kept[1][best],
+        converged=bool(converged[best]),
         at_bound=(y[best] <= low) | (y[best] >= high),
         steps=int(np.max(states.steps)),
         minima=[(float(squares[g[0]]), values[g[0]], len(g)) for g in ends if g],
-        unfinished=len(y) - sum(len(g) for g in ends),
+        lost=len(y) - sum(len(g) for g in ends),
     )
+
+
+def _all_entries(problem: Problem, y: np.ndarray) -> np.ndarray:
+    scaled = np.asarray(problem.offset, float) + np.asarray(problem.mix, float) @ y
+    return from_scaled(scaled, np.asarray(problem.scale, float), np.asarray(problem.log))
 
 
 def _groups(squares: np.ndarray, y: np.ndarray, exact: float) -> list[list[int]]:
@@ -111,19 +130,22 @@ def _groups(squares: np.ndarray, y: np.ndarray, exact: float) -> list[list[int]]
     return groups
 
 
-def _start_points(problem: Problem, starts: int, seed: int) -> np.ndarray:
-    """Starts y (S, P): the law's own values, then random ones inside the bounds."""
-    own = problem.scaling.from_value(problem.parameters.of(problem.law))
-    low, high = np.asarray(problem.low, float), np.asarray(problem.high, float)
-    first, last = low.copy(), high.copy()
-    for i, field, _ in problem.parameters.each():
-        reach = np.log(START_FACTOR) if field in LOGARITHMIC else START_SCALES
-        if field in LOGARITHMIC or not np.isfinite(low[i]):
-            first[i] = max(low[i], own[i] - reach)
-        if field in LOGARITHMIC or not np.isfinite(high[i]):
-            last[i] = min(high[i], own[i] + reach)
-    points = first + (last - first) * np.random.default_rng(seed).random((starts, len(own)))
-    points[0] = own
+def _start_points(
+    problem: Problem, parameters: Parameters, starts: int, seed: int
+) -> np.ndarray:
+    """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
+    first = parameters.first
+    values = entries(problem.law, parameters.fields)[first]
+    scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
+    own = to_scaled(values, scale, log)
+    low, high = (np.array(end, float)[: len(own)] for end in (problem.low, problem.high))
+    reach = np.where(log, np.log(START_FACTOR), START_SCALES)
+    low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
+    points = np.zeros((starts, len(problem.low)))
+    share = np.random.default_rng(seed).random((starts, len(own)))
+    points[:, : len(own)] = low + (high - low) * share
+    points[0, : len(own)] = own
     return points
 
 

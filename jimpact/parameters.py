@@ -1,12 +1,11 @@
 """Which entries of a law are free, their names, bounds and natural scales."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jimpact.laws.base import Law
@@ -29,67 +28,84 @@ LOGARITHMIC = ("stiffness",)  # fitted in their logarithm: only ratios of them h
 STIFFNESS_RANGE = 1e4
 
 
-class Parameters(eqx.Module):
-    """The P free entries of a law, in the order of `names`; indices count flattened entries."""
+@dataclasses.dataclass(frozen=True)
+class Parameters:
+    """P free parameters. Each moves one or several (tied) of the Q entries of the named fields.
 
-    fields: tuple[str, ...] = eqx.field(static=True)
-    indices: tuple[tuple[int, ...], ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
+    Entries are numbered through the flattened fields, in the order of `fields`; entries in no
+    group are held. (All entries are kept so that a compiled fit does not depend on the groups.)
+    """
 
-    def of(self, law: Law) -> np.ndarray:
-        """Values (P,) in a law."""
-        return np.concatenate(
-            [np.ravel(getattr(law, f))[list(i)] for f, i in zip(self.fields, self.indices)]
-        ).astype(float)
+    fields: tuple[str, ...]
+    names: tuple[str, ...]
+    groups: tuple[tuple[int, ...], ...]
+    entry_fields: tuple[str, ...]  # of each entry
 
-    def put(self, law: Law, values: jax.Array) -> Law:
-        """The law with these values (P,)."""
-        start = 0
-        for field, index in zip(self.fields, self.indices):
-            old = getattr(law, field)
-            new = values[start : start + len(index)].astype(old.dtype)
-            new = old.reshape(-1).at[jnp.asarray(index)].set(new).reshape(old.shape)
-            law = eqx.tree_at(lambda tree, f=field: getattr(tree, f), law, new)
-            start += len(index)
-        return law
+    @property
+    def first(self) -> list[int]:
+        """The first entry of every group: it stands for the parameter."""
+        return [group[0] for group in self.groups]
 
-    def each(self) -> Iterator[tuple[int, str, int]]:
-        """(position, field, index in the field) of every parameter."""
-        pairs = [(f, i) for f, index in zip(self.fields, self.indices) for i in index]
-        for position, (field, i) in enumerate(pairs):
-            yield position, field, i
+    def field_of(self, parameter: int) -> str:
+        """The field that a parameter belongs to."""
+        return self.entry_fields[self.groups[parameter][0]]
+
+
+def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
+    """All entries (Q,) of these fields of a law."""
+    return np.concatenate([np.ravel(np.asarray(getattr(law, f), float)) for f in fields])
+
+
+def with_entries(law: Law, fields: tuple[str, ...], values: jax.Array) -> Law:
+    """The law with these entries (Q,)."""
+    start = 0
+    for field in fields:
+        old = getattr(law, field)
+        new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
+        law = eqx.tree_at(lambda tree, f=field: getattr(tree, f), law, new)
+        start += old.size
+    return law
 
 
 def free_parameters(law: Law, contacts: int, free: Any) -> tuple[Parameters, list[str]]:
     """The parameters that `free` names, and notes on what was held instead."""
     known = _array_fields(law)
-    masks, notes = {}, []
+    labels, notes = {}, []
     for field, choice in _as_mapping(free, known).items():
         if field not in known:
             raise ValueError(_unknown_field(law, field, known))
-        mask = _as_mask(field, choice, np.shape(getattr(law, field)))
-        if mask.any():
-            masks[field] = mask
-    if "stiffness" in masks and masks["stiffness"].all() and _only_ratios(law, masks):
-        if masks["stiffness"].size == 1:
+        labels[field] = _as_labels(field, choice, np.shape(getattr(law, field)))
+    if "stiffness" in labels and labels["stiffness"].all() and _only_ratios(law, labels):
+        held = labels["stiffness"] == labels["stiffness"].flat[0]
+        if held.all():
             raise ValueError(
-                "Argument `free` must not hold a scalar `stiffness`: with equal exponents a common "
-                "factor of all stiffnesses changes nothing, so the data cannot determine it. Give "
-                "the law one stiffness per contact to fit their ratios, or free only `restitution`."
+                "Argument `free` must not hold a scalar `stiffness` (or one for all contacts): "
+                "with equal exponents a common factor of all stiffnesses changes nothing, so the "
+                "data cannot determine it. Give the law one stiffness per contact to fit their "
+                "ratios, or free only `restitution`."
             )
-        masks["stiffness"][0] = False
+        labels["stiffness"][held] = 0
         notes.append(
             "stiffness[1] is held at its start: with equal exponents only stiffness ratios matter."
         )
-    if not masks:
+    names, groups, start = [], [], 0
+    for field, label in labels.items():
+        for value in dict.fromkeys(label[label > 0].tolist()):
+            members = np.argwhere(label == value)
+            names.append(_name(field, members, label.size))
+            groups.append(tuple((start + np.flatnonzero(label == value)).tolist()))
+        start += label.size
+    if not names:
         raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
-    names = [
-        field + (f"[{','.join(str(i + 1) for i in index)}]" if index else "")
-        for field, mask in masks.items()
-        for index in np.argwhere(mask).tolist()
-    ]
-    indices = tuple(tuple(np.flatnonzero(mask).tolist()) for mask in masks.values())
-    return Parameters(tuple(masks), indices, tuple(names)), notes
+    owners = tuple(field for field, label in labels.items() for _ in range(label.size))
+    return Parameters(tuple(labels), tuple(names), tuple(groups), owners), notes
+
+
+def _name(field: str, members: np.ndarray, size: int) -> str:
+    """restitution (all tied), restitution[2] (contact 2), restitution[1=3] (tied), matrix[1,2]."""
+    if len(members) == size and (size > 1 or members.shape[1] == 0):
+        return field
+    return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
 
 
 def _array_fields(law: Law) -> list[str]:
@@ -120,12 +136,13 @@ def _unknown_field(law: Law, field: str, known: list[str]) -> str:
     )
 
 
-def _as_mask(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
+def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Integers shaped like the field: 0 is held, entries with equal numbers are tied."""
     mask = np.asarray(choice)
-    if mask.dtype != bool:
+    if mask.dtype.kind not in "biu" or (mask < 0).any():
         raise ValueError(
-            f"Argument `free` must map `{field}` to True, False or a boolean mask, "
-            f"but has value {choice!r}."
+            f"Argument `free` must map `{field}` to True, False, a boolean mask or numbers of "
+            f"groups (0 is held), but has value {choice!r}."
         )
     if mask.shape not in ((), shape):
         tied = "one value for all contacts (tied)" if shape == () else f"of shape {shape}"
@@ -133,42 +150,50 @@ def _as_mask(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
             f"Argument `free` must have a mask of shape {shape} for `{field}`, which is {tied} "
             f"in this law, but has a mask of shape {mask.shape}."
         )
-    return np.broadcast_to(mask, shape).copy()
+    if mask.dtype == bool:  # each free entry is a group of its own
+        count = np.arange(1, np.prod(shape, dtype=int) + 1).reshape(shape)
+        return np.where(mask, count, 0)
+    return np.array(np.broadcast_to(mask, shape), dtype=int)
 
 
-def _only_ratios(law: Law, masks: Mapping[str, np.ndarray]) -> bool:
+def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
     """Whether a common factor of all stiffnesses is invisible: LZB with equal exponents."""
     if not isinstance(law, LZB):
         return False
     exponents = np.unique(np.asarray(law.exponent, dtype=float))
-    tied = np.ndim(law.exponent) == 0 or "exponent" not in masks
-    return len(exponents) == 1 and tied
+    stay_equal = "exponent" not in labels or len(set(labels["exponent"].flat)) == 1
+    return len(exponents) == 1 and stay_equal
 
 
 def bounds_of(
     parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds (P,): the user's, or else the field's domain."""
-    start, known = parameters.of(law), set(parameters.fields)
-    low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
     given = dict(bounds or {})
+    known = {parameters.field_of(i) for i in range(len(parameters.names))}
     for field in given:
         if field not in known:
             raise ValueError(
                 f"Argument `bounds` must name free parameters, {', '.join(sorted(known))}, "
                 f"but has {field!r}."
             )
-    pairs = {field: _bound_pair(field, given[field], law) for field in given}
-    for i, field, index in parameters.each():
-        low[i], high[i] = DOMAIN.get(field, (-np.inf, np.inf))
-        if field in pairs:
-            low[i], high[i] = (side[index] for side in pairs[field])
+    values = entries(law, parameters.fields)
+    ends = np.empty((2, len(values)))
+    for field in parameters.fields:
+        inside = np.array([owner == field for owner in parameters.entry_fields])
+        if field in given:
+            ends[:, inside] = _bound_pair(field, given[field], law)
         elif field in LOGARITHMIC:
-            low[i], high[i] = start[i] / STIFFNESS_RANGE, start[i] * STIFFNESS_RANGE
-        if not low[i] <= start[i] <= high[i]:
+            ends[:, inside] = values[inside] / STIFFNESS_RANGE, values[inside] * STIFFNESS_RANGE
+        else:
+            ends[:, inside] = np.array(DOMAIN.get(field, (-np.inf, np.inf)))[:, None]
+    low = np.array([ends[0, list(group)].max() for group in parameters.groups])
+    high = np.array([ends[1, list(group)].min() for group in parameters.groups])
+    for name, start, a, b in zip(parameters.names, values[parameters.first], low, high):
+        if not a <= start <= b:
             raise ValueError(
-                f"Argument `bounds` must include the start of `{parameters.names[i]}`, "
-                f"{start[i]:g}, but is [{low[i]:g}, {high[i]:g}]."
+                f"Argument `bounds` must include the start of `{name}`, {start:g}, "
+                f"but is [{a:g}, {b:g}]."
             )
     return low, high
 

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_values, is_traced
+from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.laws.base import Law
 from jimpact.numerics.flow import Exponent
 from jimpact.numerics.dimensionless import METHODS, solve, to_dimensionless
@@ -15,6 +15,11 @@ from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself
 FINEST_RTOL_IN_EPS = 16  # below this many roundings the error estimate is noise
+
+
+def default_rtol(method: str, dtype: jnp.dtype) -> float:
+    """Tolerance used where the law names none."""
+    return DEFAULT_RTOL_IMPULSE if method == "impulse" else DEFAULT_RTOL.get(str(dtype), 1e-5)
 
 
 def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
@@ -126,6 +131,8 @@ class LZB(Law):
             raise ValueError(
                 f"Argument `method` must be one of {METHODS}, but has value {method!r}."
             )
+        if isinstance(self.exponent_static, tuple) and self.restitution.ndim:
+            check_shape("exponent", self.exponent_static, self.restitution.shape, "per contact")
         if method == "propagator" and self.exponent_static != 1.0:
             raise ValueError(
                 "Argument `exponent` must be the float 1.0 for method='propagator', "
@@ -155,8 +162,7 @@ class LZB(Law):
         self, delassus: Symmetric, gap_velocity: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Impulses at the end of the impact dynamics."""
-        m, dtype = gap_velocity.shape[0], gap_velocity.dtype
-        default = DEFAULT_RTOL_IMPULSE if self.method == "impulse" else DEFAULT_RTOL[str(dtype)]
+        m = gap_velocity.shape[0]
         inputs, units = to_dimensionless(
             delassus,
             gap_velocity,
@@ -164,7 +170,7 @@ class LZB(Law):
             self.stiffness,
             self.exponent,
             self.stored_energy(m),
-            self.rtol or default,
+            self.rtol or default_rtol(self.method, gap_velocity.dtype),
         )
         chain = isinstance(delassus, Tridiagonal)
         p, code = solve(inputs, self.exponent, chain, self.max_steps, self.method)

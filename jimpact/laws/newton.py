@@ -47,7 +47,7 @@ class Newton(Law):
         eps = jnp.finfo(g.dtype).eps
         eigenvalues, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(g))
         # redundant contacts: G + N N^T, N its null space, is regular and gives the least-norm p
-        null_space = vectors * (eigenvalues < _SINGULAR * eps * g.shape[0])
+        null_space = jnp.where((eigenvalues < _SINGULAR * eps * g.shape[0])[None, :], vectors, 0.0)
         pbar = jnp.linalg.solve(g + null_space @ null_space.T, required / norm)
         missed = jnp.abs(g @ pbar - required / norm).max() > jnp.sqrt(eps) * (
             jnp.abs(required / norm).max()

@@ -16,7 +16,7 @@ A step may advance in time or in another variable xi that grows or falls monoton
     ZERO_G   xi = g_j, ending on g_j = 0 (or a given value): lands on the event exactly (Henon's trick)
     ROOT_X   xi = x_j^(1/r), ending on x_j = 0: the same for an opening, x_j^eta smooth in xi
 
-with r = 2 where 2 eta is known to be whole, else 4.
+with r = 2 where 2 eta is known to be whole, else 8.
 """
 
 from typing import NamedTuple
@@ -43,6 +43,14 @@ class Flow(NamedTuple):
     omega: jax.Array
     restitution: jax.Array
     exponent: Exponent
+
+
+def frozen(flow: Flow) -> Flow:
+    """The same flow, not differentiated (a static exponent stays static)."""
+    exponent = flow.exponent
+    if isinstance(exponent, jax.Array):
+        exponent = jax.lax.stop_gradient(exponent)
+    return Flow(*jax.lax.stop_gradient(flow[:3]), exponent)
 
 
 class State(NamedTuple):
@@ -80,7 +88,7 @@ def root_order(exponent: Exponent) -> int:
     """`r` of the START and ROOT_X variables: powers `xi^(r eta)` are then smooth enough."""
     known = isinstance(exponent, (float, tuple))
     etas = np.atleast_1d(np.asarray(exponent)) if known else np.array([0.1])
-    return 2 if np.all(2 * etas == np.round(2 * etas)) else 4
+    return 2 if np.all(2 * etas == np.round(2 * etas)) else 8
 
 
 def factor(exponent: Exponent, dtype: jnp.dtype) -> jax.Array:

@@ -15,6 +15,9 @@ import jax.numpy as jnp
 from jimpact.numerics.flow import Flow, power
 
 
+EMPTY = 1e-14  # energy below this part of the largest is rounding: the contact is unloaded
+
+
 class Walk(NamedTuple):
     """Gap velocity, potential energy and impulse (m,), and the steps taken."""
 
@@ -45,16 +48,41 @@ def advance(flow: Flow, dp: jax.Array, walk: Walk) -> Walk:
     # implicit first step: dp_j = scale F_j(u_j dp_j)
     first = (scale * force(flow, approach)) * jnp.where(approach > 0, 1.0, 0.0)
     increment = jnp.where(energy > 0, scale * f, power(first, eta + 1))
-    increment = jnp.where(jnp.arange(dp.size + f.size - 1) == primary, dp, increment)
+    is_primary = jnp.arange(gamma.shape[0]) == primary
+    increment = jnp.where(is_primary, dp, increment)
+    increment = increment * _emptying(flow, walk, is_primary, increment)
     after = gamma + flow.coupling @ increment
+    # exact work of the step; its error is the first-order one of the distributing rule alone
     middle = 0.5 * (gamma + after)
     rate = jnp.where(middle > 0, 1 / flow.restitution**2, 1.0)
+    left = jnp.maximum(energy - rate * middle * increment, 0.0)
     return Walk(
         after,
-        jnp.maximum(energy - rate * middle * increment, 0.0),
+        jnp.where(left > EMPTY * jnp.max(energy + approach**2), left, 0.0),
         walk.p + increment,
         walk.steps + 1,
     )
+
+
+def _emptying(
+    flow: Flow, walk: Walk, is_primary: jax.Array, increment: jax.Array
+) -> jax.Array:
+    """Fraction of the step at which the primary contact is unloaded; 1 if it is not.
+
+    Ending there, not on a fixed step, is what the derivative of the outcome depends on.
+    """
+
+    def of_primary(values: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(is_primary, values, 0.0))
+
+    gamma, energy, dp = of_primary(walk.gamma), of_primary(walk.energy), of_primary(increment)
+    bend = of_primary(flow.coupling @ increment)
+    budget = energy * of_primary(flow.restitution) ** 2 / dp
+    expands = (gamma + 0.5 * bend > 0) & (energy > 0)
+    root = jnp.sqrt(jnp.maximum(jnp.where(expands, gamma**2 + 2 * bend * budget, 1.0), 0.0))
+    denominator = jnp.where(expands, gamma + root, 1.0)
+    fraction = 2 * budget / jnp.where(denominator > 0, denominator, 1.0)
+    return jnp.where(expands & (denominator > 0) & (fraction < 1), fraction, 1.0)
 
 
 def at_work(walk: Walk) -> jax.Array:

@@ -29,7 +29,8 @@ STOP_EXACT = {"float64": 1e-18, "float32": 1e-11}
 
 _DAMPING = 1e-2  # first Levenberg-Marquardt damping, relative to the curvatures
 _LESS, _MORE = 0.2, 4.0  # factors of the damping after a good and a bad step
-_LEAST, _STUCK = 1e-10, 1e10  # range of the damping; above, no downhill step exists
+_LEAST = {"float64": 1e-10, "float32": 1e-5}  # smallest damping: keeps the matrix positive
+_STUCK = 1e6  # above this damping a kink of the law lets nothing pass
 _FLAT = 1e-10  # curvatures below this share of the largest are damped as if they had it
 _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are of order 1
 
@@ -94,9 +95,10 @@ def advance(
         best = (state.y, state.residual, state.jacobian, state.kept, state.cost)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
         y, r, jac, kept, least = best
-        gain = _step(y, r, jac, low, high, jnp.asarray(_LEAST, y.dtype))[1]
+        floor = jnp.asarray(_LEAST[str(y.dtype)], y.dtype)
+        gain = _step(y, r, jac, low, high, floor)[1]
         if method == "levenberg-marquardt":
-            memory = jnp.maximum(state.memory * jnp.where(better, _LESS, _MORE), _LEAST)
+            memory = jnp.maximum(state.memory * jnp.where(better, _LESS, _MORE), floor)
             move = _step(y, r, jac, low, high, memory)[0]
             trial = jnp.clip(y + move, low, high)
             stuck = memory > _STUCK
@@ -142,7 +144,8 @@ def _step(
     curvature = jnp.diagonal(hessian)
     largest = jnp.max(curvature)
     curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
-    move = -jnp.linalg.solve(hessian + jnp.diag(damping * curvature), gradient)
+    factor = jax.scipy.linalg.cho_factor(hessian + jnp.diag(damping * curvature))
+    move = -jax.scipy.linalg.cho_solve(factor, gradient)
     return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
 
 

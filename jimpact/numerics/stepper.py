@@ -23,6 +23,7 @@ from jimpact.numerics.flow import (
     Flow,
     State,
     field,
+    frozen,
     plus_one,
     power,
     root_order,
@@ -31,7 +32,8 @@ from jimpact.numerics.flow import (
 )
 from jimpact.numerics.tridiagonal import Tridiagonal
 
-FIRST_STEP = 0.2  # in xi: no contact can turn around within xi^r of the fastest time scale
+FIRST_TIME = 0.05  # of the fastest contact's time scale: no contact can turn around so soon
+RESTART = 0.1  # first START step after a closing, as a part of the step before it
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.9  # of the step-size control
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
 NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact
@@ -94,7 +96,7 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
         phase=phase,
         kind=jnp.asarray(START, jnp.int32),
         target=jnp.zeros(m, bool),
-        h=jnp.asarray(FIRST_STEP, dtype),
+        h=jnp.asarray(FIRST_TIME ** (1 / root_order(flow.exponent)), dtype),
         due=zero,
         begun=zero,
         retargeted=jnp.zeros((), bool),
@@ -117,7 +119,8 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     )
     # what follows decides where events lie and how long steps are: it is not differentiated
     exact_flow, exact_state = flow, carry.state
-    flow, state, new, high, low = jax.lax.stop_gradient((flow, carry.state, reached, high, low))
+    flow = frozen(flow)
+    state, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
     error = _error(control, high, low)
     exact = jnp.isfinite(error) & (error <= 1)
 
@@ -187,6 +190,12 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     next_kind = jnp.where(
         land, jnp.where(opens, ROOT_X, ZERO_G), jnp.where((kind == START) & ~leaves, START, TIME)
     )
+    begun = begun + jnp.where(accept & (kind == START), h, 0.0)
+    if r > 2:  # x ~ t^2 after a closing, so t^(2 eta) is smooth enough only where 2 eta is whole
+        begins = jnp.any(closed > 0)
+        next_kind = jnp.where(begins, START, next_kind)
+        next_h = jnp.where(begins, (RESTART * span) ** (1 / r), next_h)
+        begun = jnp.where(begins, 0.0, begun)
     out = Carry(
         state=moved,
         phase=new_phase,
@@ -194,10 +203,10 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
         target=next_target & land,
         h=next_h,
         due=jnp.where(land, first * span, 0.0),
-        begun=begun + jnp.where(accept & (kind == START), h, 0.0),
+        begun=begun,
         retargeted=land & landing,
         passes=carry.passes + 1,
-        accepted=carry.accepted + accept,
+        accepted=carry.accepted + accept.astype(jnp.int32),
         closures=carry.closures + closed,
         done=carry.done,
     )
@@ -213,7 +222,7 @@ def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, ja
     closing = carry.target & (carry.phase == OPEN)  # closes once its approach matters
     g_end = -NEGLIGIBLE * jnp.sum(jnp.where(closing, control.tolerance, 0.0))
     x = jnp.where(x > 0, x, 1.0)
-    root = jnp.sqrt(x) if r == 2 else jnp.sqrt(jnp.sqrt(x))
+    root = jnp.sqrt(x) if r == 2 else jnp.sqrt(jnp.sqrt(jnp.sqrt(x)))
     kinds = [carry.kind == START, carry.kind == ZERO_G, carry.kind == ROOT_X]
     start = jnp.select(kinds, [carry.begun, g, root], 0.0)
     length = jnp.select(kinds, [carry.h, g_end - g, -root], carry.h)
@@ -363,10 +372,10 @@ def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
     )
 
 
-def solve(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry:
-    """Run an impact from gap velocities `gamma` and indentations `x` to its end."""
+def run(flow: Flow, control: Control, carry: Carry) -> Carry:
+    """Run an impact from `begin` to its end, or to the pass limit."""
     return jax.lax.while_loop(
         lambda c: ~c.done & (c.passes < control.max_steps),
         lambda c: advance(flow, control, c),
-        begin(flow, control, gamma, x),
+        carry,
     )

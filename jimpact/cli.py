@@ -1,0 +1,101 @@
+"""The command line: `jimpact fit`, `jimpact laws`. Heavy imports wait until a command runs."""
+
+import dataclasses
+import json as json_module
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from jimpact import __version__
+
+Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
+
+
+@dataclasses.dataclass(frozen=True)
+class FitCommand:
+    """Fit a law to measured velocities; without a file: the bundled three balls."""
+
+    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
+        "three_balls.toml"
+    )
+    """Study file, or the name of a bundled one (three_balls.toml, air_track.toml)."""
+    law: str | None = None
+    """Law in the place of the study's (see `jimpact laws`)."""
+    method: Method | None = None
+    """Solver; default: the study's, or levenberg-marquardt."""
+    starts: int | None = None
+    """Number of starts; default: the study's, or 8."""
+    seed: int | None = None
+    """Seed of the random starts."""
+    out: Path = Path("jimpact-fit.png")
+    """Picture (.png, .pdf, .svg), or a directory for it."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def run(self) -> int:
+        """Fit, print, draw."""
+        from jimpact.fit_command import run
+
+        return run(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class LawsCommand:
+    """List the laws: what they say, when they are right and when they fail."""
+
+    bibtex: bool = False
+    """Print the references as BibTeX."""
+    json: bool = False
+    """Print JSON instead of a table."""
+
+    def run(self) -> int:
+        """Print the registry."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from jimpact.laws import REGISTRY
+
+        if self.bibtex:
+            print("\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values())))
+        elif self.json:
+            told = ("parameters", "summary", "right_when", "fails_when", "source")
+            rows = {name: {k: getattr(row, k) for k in told} for name, row in REGISTRY.items()}
+            print(json_module.dumps(rows, indent=2))
+        else:
+            table = Table()
+            for title in ("law", "parameters", "says", "right when", "fails when"):
+                table.add_column(title, overflow="fold")
+            for name, row in REGISTRY.items():
+                parameters = ", ".join(row.parameters)
+                table.add_row(name, parameters, row.summary, row.right_when, row.fails_when)
+            Console().print(table)
+        return 0
+
+
+Command = (
+    Annotated[FitCommand, tyro.conf.subcommand("fit")]
+    | Annotated[LawsCommand, tyro.conf.subcommand("laws")]
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point; exit code 2 for bad input."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments == ["--version"]:
+        print(f"jimpact {__version__}")
+        return 0
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="jimpact",
+        config=(tyro.conf.FlagCreatePairsOff,),
+        description="Differentiable impact laws for several simultaneous contacts. "
+        "--version prints the version.",
+        args=arguments,
+    )
+    return command.run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+"""`jimpact fit`: the study's fit, its yardsticks, a report, a picture."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from jimpact.fitting import Fit
+from jimpact.laws import Newton
+from jimpact.laws.lzb import LZB
+from jimpact.study import Study, read_study
+
+if TYPE_CHECKING:
+    from jimpact.cli import FitCommand
+
+PICTURE = "jimpact-fit.png"
+RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
+
+
+def run(command: "FitCommand") -> int:
+    """Run the command; 2 for bad input, told in one line on stderr."""
+    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
+    try:
+        path = _picture_path(command.out)
+        study = read_study(command.study, command.law)
+        options = {"method": command.method, "starts": command.starts, "seed": command.seed}
+        fits = _all_fits(study, options)
+    except (ValueError, TypeError, OSError) as error:
+        print(f"jimpact fit: {error}", file=sys.stderr)
+        return 2
+    from jimpact.plots import plot_fit
+
+    others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
+    plot_fit(fits[RAW], others, study.title).savefig(path, dpi=150)
+    if command.json:
+        told = {name: fit.to_dict() for name, fit in fits.items()}
+        print(json.dumps({"title": study.title, "fits": told, "picture": str(path)}, indent=2))
+    else:
+        _print_report(study, fits, path)
+    return 0
+
+
+def _picture_path(out: Path) -> Path:
+    path = out if out.suffix else out / PICTURE
+    if path.suffix not in (".png", ".pdf", ".svg"):
+        raise ValueError(f"--out must end in .png, .pdf or .svg or be a directory, but is '{out}'.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:
+    """The study's fit and its yardsticks; as `fits` of one law share their compiled program."""
+    own, everything = _per_contact(study)
+    fits = {RAW: own.run(**options)}
+    if any("break momentum" in line for line in fits[RAW].warnings):
+        data = study.experiments.momentum_corrected(study.scene)
+        fits[CORRECTED] = replace(own, experiments=data).run(**options)
+    if not isinstance(study.law, Newton):
+        newton = replace(study, law=Newton(0.5), free={"restitution": True}, bounds={})
+        fits[YARDSTICK] = newton.run(**options)
+    if everything is not None:
+        fits[ALL_FREE] = everything.run(**options)
+    return fits
+
+
+def _per_contact(study: Study) -> tuple[Study, Study | None]:
+    """The study of an LZB law with one value per contact, tied where it had one for all.
+
+    And the study with every e and stiffness ratio free, None where that is no LZB or no more.
+    """
+    law, contacts = study.law, study.scene.contacts
+    fields = ("restitution", "stiffness")
+    if not isinstance(law, LZB) or contacts < 2 or not set(study.free) <= set(fields):
+        return study, None
+    tied = {}
+    for name in fields:
+        choice = np.asarray(study.free.get(name, False))
+        one_each = np.arange(1, contacts + 1) if np.ndim(getattr(law, name)) else 1
+        labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
+        tied[name] = np.broadcast_to(labels, (contacts,))
+    values = [np.broadcast_to(getattr(law, name), (contacts,)) for name in fields]
+    law = LZB(*values, law.exponent, law.initial_energy)
+    own = replace(study, law=law, free=tied)
+    if len(np.unique(tied["restitution"])) == contacts and tied["stiffness"].all():
+        return own, None
+    return own, replace(own, free=dict.fromkeys(fields, True))
+
+
+def _print_report(study: Study, fits: dict[str, Fit], path: Path) -> None:
+    console = Console(highlight=False)
+    console.print(f"[bold]{escape(study.title)}[/bold]")
+    console.print(_table(fits))
+    everything = fits.get(ALL_FREE)
+    if everything is not None:
+        names, count = ", ".join(everything.names), len(everything.names)
+        console.print(f"With {escape(names)} free the rank is {everything.rank} of {count}.")
+        for line in everything.identifiability:
+            console.print(escape(line))
+    console.print()
+    console.print(escape(str(fits[RAW])))
+    console.print(f"\nPicture: {escape(str(path))}")
+
+
+def _table(fits: dict[str, Fit]) -> Table:
+    table = Table("law", "data", "parameters", title="Fits", title_justify="left")
+    table.add_column("rms [m/s]", justify="right")
+    table.add_column("rank", justify="right")
+    for name, fit in fits.items():
+        data = name if name in (RAW, CORRECTED) else RAW
+        parameters = "\n".join(map(_value, range(len(fit.names)), [fit] * len(fit.names)))
+        rank = f"{fit.rank} of {len(fit.names)}"
+        table.add_row(type(fit.law).__name__, data, escape(parameters), f"{fit.rms:.4f}", rank)
+    return table
+
+
+def _value(i: int, fit: Fit) -> str:
+    error = fit.standard_error[i]
+    spread = "unseen" if np.isinf(error) else "± unknown" if np.isnan(error) else f"± {error:.2g}"
+    at_bound = ", at its bound" if fit.at_bound[i] else ""
+    return f"{fit.names[i]} = {fit.value[i]:.6g} {spread}{at_bound}"

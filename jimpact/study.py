@@ -1,0 +1,158 @@
+"""A study: one TOML file with scene, law, what is free, and the data file."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jimpact.experiments import Experiments, read_experiments
+from jimpact.fitting import Fit, fit
+from jimpact.laws import REGISTRY, Row
+from jimpact.laws.base import Law
+from jimpact.scene import Scene
+from jimpact.scenes import chain
+
+BUNDLED = "three_balls.toml"
+
+_TABLES = ("title", "scene", "law", "fit", "data")
+_SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
+_FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
+_DATA_KEYS = ("file", "momentum_corrected")
+
+
+@dataclass(frozen=True)
+class Study:
+    """What `read_study` found; `run` fits it."""
+
+    title: str
+    scene: Scene
+    law: Law
+    free: dict[str, Any]
+    bounds: dict[str, Any]
+    experiments: Experiments
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def run(self, **options: Any) -> Fit:
+        """`fit` with the study's options; keyword arguments that are not None go first."""
+        given = {key: value for key, value in options.items() if value is not None}
+        return fit(
+            self.law,
+            self.scene,
+            self.experiments,
+            self.free,
+            bounds=self.bounds,
+            **(self.options | given),
+        )
+
+
+def read_study(path: str | Path, law: str | None = None) -> Study:
+    """Read a study file; `law` puts another law in the place of the study's.
+
+    Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`); `[law]` name and start
+    values, a number for all contacts or a list with one each, and `[law.bounds]`; `[fit]` free (a
+    list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
+    to the study), momentum_corrected. A name of a bundled study is found where no such file is.
+
+    Raises:
+        FileNotFoundError: no such study or data file.
+        ValueError: no TOML, unknown or missing keys, and whatever scene, law or data refuse.
+
+    >>> from jimpact.study import read_study
+    >>> read_study("three_balls.toml").title
+    'Three equal hard balls, one shot'
+    """
+    path = _locate(Path(path))
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: the study must be a TOML file, but {error}.") from None
+    try:
+        return _study(tables, path, law)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _locate(path: Path) -> Path:
+    if path.is_file():
+        return path
+    bundled = Path(str(files("jimpact") / "data" / path.name))
+    if path.parent == Path() and bundled.is_file():
+        return bundled
+    names = ", ".join(sorted(p.name for p in bundled.parent.glob("*.toml")))
+    raise FileNotFoundError(f"Study '{path}' does not exist; bundled studies are {names}.")
+
+
+def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Study:
+    _check_keys("the study", tables, _TABLES, required=("scene", "law", "data"))
+    for name in ("scene", "law", "fit", "data"):
+        if not isinstance(tables.get(name, {}), dict):
+            raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
+    scene = _scene(tables["scene"])
+    options = dict(tables.get("fit", {}))
+    _check_keys("[fit]", options, _FIT_KEYS)
+    row, values, bounds = _law_table(tables["law"], other_law)
+    free = options.pop("free", ["restitution"])
+    free = free if isinstance(free, dict) else dict.fromkeys(_as_names(free), True)
+    if other_law is not None:
+        free = {name: mask for name, mask in free.items() if name in row.parameters}
+    if "exponent" in values:  # fixed exponents are fast as numbers, free ones must be arrays
+        given = values["exponent"]
+        fixed = tuple(given) if isinstance(given, list) else given
+        values["exponent"] = np.asarray(given, float) if "exponent" in free else fixed
+    law = row.law(**values, **row.fixed)
+    data = tables["data"]
+    _check_keys("[data]", data, _DATA_KEYS, required=("file",))
+    experiments = read_experiments(path.parent / data["file"])
+    experiments.scene_of(scene, 0)
+    if data.get("momentum_corrected", False):
+        experiments = experiments.momentum_corrected(scene)
+    title = str(tables.get("title", path.stem))
+    return Study(title, scene, law, free, bounds, experiments, options)
+
+
+def _scene(table: Mapping[str, Any]) -> Scene:
+    _check_keys("[scene]", table, _SCENE_KEYS, required=("masses_kg",))
+    wall = table.get("wall", False)
+    if not isinstance(wall, bool | str):
+        raise ValueError(f"`wall` must be true, false or a side, but is {wall!r}.")
+    return chain(table["masses_kg"], wall, table.get("gaps_m"))
+
+
+def _law_table(
+    table: Mapping[str, Any], other: str | None
+) -> tuple[Row, dict[str, Any], dict[str, Any]]:
+    """Registry row, start values and bounds; of another law only what both have is kept."""
+    table = dict(table)
+    _check_keys("[law]", table, tuple(table), required=("name",))
+    own = str(table.pop("name")).lower()
+    name = (other or own).lower()
+    for key in (own, name):
+        if key not in REGISTRY:
+            raise ValueError(f"the law must be one of {', '.join(REGISTRY)}, but is {key!r}.")
+    row = REGISTRY[name]
+    bounds = table.pop("bounds", {})
+    _check_keys("[law]", table, (*REGISTRY[own].parameters, "name", "bounds"))
+    _check_keys("[law.bounds]", bounds, REGISTRY[own].parameters)
+    kept = {k: v for k, v in table.items() if k in row.parameters}
+    return row, kept, {k: v for k, v in bounds.items() if k in row.parameters}
+
+
+def _as_names(free: Any) -> list[str]:
+    if isinstance(free, list) and all(isinstance(name, str) for name in free):
+        return free
+    raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
+
+
+def _check_keys(
+    where: str, table: Mapping[str, Any], allowed: tuple[str, ...], required: tuple[str, ...] = ()
+) -> None:
+    for key in required:
+        if key not in table:
+            raise ValueError(f"{where} must have the key `{key}`, but has {', '.join(table)}.")
+    for key in table:
+        if key not in allowed:
+            raise ValueError(f"{where} may have the keys {', '.join(allowed)}, but has `{key}`.")
