@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"jimpact {__version__}")
         return 0
     command = tyro.cli(
-        Command,  # type: ignore[arg-type]
+        Command,
         prog="jimpact",
         config=(tyro.conf.FlagCreatePairsOff,),
         description="Differentiable impact laws for several simultaneous contacts. "

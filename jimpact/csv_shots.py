@@ -48,7 +48,8 @@ def read_table(path: str | Path) -> Table:
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: the file must be UTF-8 text, but is not ({error}).") from None
     reader = csv.reader(text.splitlines())
-    rows = [(reader.line_num, [c.strip() for c in row]) for row in reader if any(map(str.strip, row))]
+    lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    rows = [(number, row) for number, row in lines if any(row)]
     if not rows:
         raise ValueError(f"{path}: the file is empty; its first line must name the columns.")
     header_line, headers = rows[0]
@@ -83,8 +84,7 @@ def _column(where: str, index: int, header: str) -> Column:
     if match is None:
         hint = " (columns are separated by commas)" if ";" in header or "\t" in header else ""
         raise ValueError(
-            f"{where}: column {index + 1} must be one of {_ALLOWED}, "
-            f"but has name {header!r}{hint}."
+            f"{where}: column {index + 1} must be one of {_ALLOWED}, but has name {header!r}{hint}."
         )
     kind, body, unit = match.groups()
     if not unit:

@@ -146,9 +146,7 @@ class Experiments(eqx.Module):
             lost += len(m)
         return Experiments(self.pre, post, self.sigma, self.scenes, self.shots, lost)
 
-    def balances(
-        self, scene: Scene | None
-    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    def balances(self, scene: Scene | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Of every shot: C^T M (c, n), v-, v+."""
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
         scenes = [self.scene_of(scene, k) for k in range(len(pre))]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from jimpact.cli import FitCommand
 
 PICTURE = "jimpact-fit.png"
-RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
+RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "corrected", "Newton", "all free"
 
 
 def run(command: "FitCommand") -> int:
@@ -85,8 +86,8 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
         one_each = np.arange(1, contacts + 1) if np.ndim(getattr(law, name)) else 1
         labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
         tied[name] = np.broadcast_to(labels, (contacts,))
-    values = [np.broadcast_to(getattr(law, name), (contacts,)) for name in fields]
-    law = LZB(*values, law.exponent, law.initial_energy)
+    e, k = (np.broadcast_to(getattr(law, name), (contacts,)) for name in fields)
+    law = LZB(e, k, exponent=law.exponent, initial_energy=law.initial_energy)
     own = replace(study, law=law, free=tied)
     if len(np.unique(tied["restitution"])) == contacts and tied["stiffness"].all():
         return own, None
@@ -100,28 +101,32 @@ def _print_report(study: Study, fits: dict[str, Fit], path: Path) -> None:
     everything = fits.get(ALL_FREE)
     if everything is not None:
         names, count = ", ".join(everything.names), len(everything.names)
-        console.print(f"With {escape(names)} free the rank is {everything.rank} of {count}.")
+        console.print(
+            f"With {escape(names)} free the rank is {everything.rank} of {count}.", soft_wrap=True
+        )
         for line in everything.identifiability:
-            console.print(escape(line))
+            console.print(escape(line), soft_wrap=True)
     console.print()
-    console.print(escape(str(fits[RAW])))
-    console.print(f"\nPicture: {escape(str(path))}")
+    console.print(escape(str(fits[RAW])), soft_wrap=True)
+    console.print(f"\nPicture: {escape(str(path))}", soft_wrap=True)
 
 
 def _table(fits: dict[str, Fit]) -> Table:
-    table = Table("law", "data", "parameters", title="Fits", title_justify="left")
+    table = Table("law", "data", "parameter", "value", box=box.SIMPLE_HEAD, pad_edge=False)
     table.add_column("rms [m/s]", justify="right")
     table.add_column("rank", justify="right")
     for name, fit in fits.items():
         data = name if name in (RAW, CORRECTED) else RAW
-        parameters = "\n".join(map(_value, range(len(fit.names)), [fit] * len(fit.names)))
+        values = "\n".join(_value(fit, i) for i in range(len(fit.names)))
         rank = f"{fit.rank} of {len(fit.names)}"
-        table.add_row(type(fit.law).__name__, data, escape(parameters), f"{fit.rms:.4f}", rank)
+        names = escape("\n".join(fit.names))
+        table.add_row(type(fit.law).__name__, data, names, values, f"{fit.rms:.4f}", rank)
     return table
 
 
-def _value(i: int, fit: Fit) -> str:
+def _value(fit: Fit, i: int) -> str:
     error = fit.standard_error[i]
+    if fit.at_bound[i]:
+        return f"{fit.value[i]:.5g} (bound)"
     spread = "unseen" if np.isinf(error) else "± unknown" if np.isnan(error) else f"± {error:.2g}"
-    at_bound = ", at its bound" if fit.at_bound[i] else ""
-    return f"{fit.names[i]} = {fit.value[i]:.6g} {spread}{at_bound}"
+    return f"{fit.value[i]:.5g} {spread}"

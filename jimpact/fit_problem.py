@@ -115,7 +115,7 @@ def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any
         law = with_entries(problem.law, problem.fields, values)
         axes = (None, 0 if problem.scene_per_shot else None, 0)
         out = jax.vmap(impact, in_axes=axes)(law, problem.scenes, problem.pre)
-        codes = jnp.asarray([CODE[name] for name in UNUSABLE])
+        codes = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
         bad = jnp.any(out.status[:, None] == codes[None, :], axis=1)
         error = jnp.where(bad[:, None], PENALTY * problem.unit, out.velocity - problem.post)
         residual = (error * problem.weight).reshape(-1)

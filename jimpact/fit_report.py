@@ -52,10 +52,8 @@ def _parameters(fit: "Fit") -> list[str]:
 def _quality(fit: "Fit") -> list[str]:
     lines = [f"rms residual   {fit.rms:.4g} m/s"]
     if fit.experiments.sigma is not None:
-        lines.append(
-            f"chi^2          {fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom} degrees of "
-            "freedom (sigma given)"
-        )
+        squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
+        lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
     elif np.isfinite(fit.noise):
         lines.append(
             f"noise          {fit.noise:.4g} m/s a velocity, estimated with "

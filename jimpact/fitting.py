@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import ndtri, stdtrit
+from scipy.special import ndtri, stdtrit  # type: ignore[import-untyped]
 
 from jimpact.experiments import Experiments
 from jimpact.fit_problem import Problem, build_problem
@@ -26,7 +26,8 @@ from jimpact.scene import Scene
 from jimpact.uncertainty import RANK_TOLERANCE, uncertainty
 
 
-class Start(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Start:
     """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many."""
 
     sum_of_squares: float

@@ -4,6 +4,7 @@ import contextlib
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -16,7 +17,11 @@ from jimpact.fit_problem import Problem, advance_all, begin_all, from_scaled, to
 from jimpact.numerics.least_squares import Method, State
 from jimpact.parameters import Parameters, entries
 
+LANES = 4  # starts that run together; those that are done make room
 PASSES = 10  # between two looks at the progress
+# A Levenberg-Marquardt start that gains less than this share in so many passes sits on a kink of
+# the law (a change in the sequence of contacts), where steps zigzag: it is given up.
+SLOW = 1e-3
 
 # Random starts: a stiffness within this factor of the user's, a parameter without two bounds
 # within this many natural scales of the user's.
@@ -65,21 +70,35 @@ def search(
 ) -> Search:
     """Run all starts to their ends and keep the best."""
     points = jnp.asarray(_start_points(problem, parameters, starts, seed), problem.pre.dtype)
-    states = begin_all(problem, points, method, max_steps)
+    states = jax.device_get(begin_all(problem, points, method, max_steps))
+    active, lanes = list(range(starts)), min(starts, LANES)
     with _bar(starts, max_steps, progress) as show:
-        while True:
-            states = advance_all(problem, states, method, max_steps, PASSES)
-            done, steps = np.asarray(states.done), np.asarray(states.steps)
-            show(int(done.sum()), int(steps.max()))
-            if (done | (steps >= max_steps)).all():
-                return _found(problem, parameters, jax.device_get(states))
+        while active:
+            before = states.cost.copy()
+            for batch in (active[i : i + lanes] for i in range(0, len(active), lanes)):
+                rows = [batch[min(i, len(batch) - 1)] for i in range(lanes)]
+                some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], states)
+                some = jax.device_get(advance_all(problem, some, method, max_steps, PASSES))
+                states = jax.tree.map(partial(_with_rows, rows), states, some)
+                show(starts - len(active), int(states.steps.max()))
+            ended = states.done | (states.steps >= max_steps)
+            if method == "levenberg-marquardt":
+                ended |= (before - states.cost <= SLOW * before) & np.isfinite(before)
+            active = [i for i in active if not ended[i]]
+    return _found(problem, parameters, states)
+
+
+def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray:
+    leaf = np.array(leaf)
+    leaf[rows] = new
+    return leaf
 
 
 def _found(problem: Problem, parameters: Parameters, states: State) -> Search:
     """Pick the best end (the states are on the host)."""
     count, first = len(parameters.names), parameters.first
     scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
-    y = states.y[:, :count]
+    y = np.asarray(states.y)[:, :count]
     squares = 2 * np.asarray(states.cost, float)
     values = from_scaled(np.asarray(y, float), scale, log)
     exact = EXACT[str(y.dtype)]
@@ -91,7 +110,7 @@ def _found(problem: Problem, parameters: Parameters, states: State) -> Search:
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
     return Search(
         value=values[best],
-        entries=_all_entries(problem, states.y[best]),
+        entries=_all_entries(problem, np.asarray(states.y)[best]),
         scale=np.where(log, values[best], scale),
         log=log,
         jacobian=np.asarray(states.jacobian[best][:, :count], float),
@@ -130,9 +149,7 @@ def _groups(squares: np.ndarray, y: np.ndarray, exact: float) -> list[list[int]]
     return groups
 
 
-def _start_points(
-    problem: Problem, parameters: Parameters, starts: int, seed: int
-) -> np.ndarray:
+def _start_points(problem: Problem, parameters: Parameters, starts: int, seed: int) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
     first = parameters.first
     values = entries(problem.law, parameters.fields)[first]

@@ -210,9 +210,7 @@ def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray
         ) from None
     smallest, largest = DOMAIN.get(field, (-np.inf, np.inf))
     if not (low < high).all():
-        raise ValueError(
-            f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}."
-        )
+        raise ValueError(f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}.")
     if (low < smallest).any() or (high > largest).any():
         raise ValueError(
             f"Argument `bounds` must lie in [{smallest:g}, {largest:g}] for `{field}`, "

@@ -15,7 +15,6 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#0
 _GREY = "#777777"
 _SPREAD = 0.6  # width that the bodies of one shot take, of the distance between shots
 _LABELLED = 16  # shots up to which every one gets its label
-_STYLE = {"spines.top": False, "spines.right": False}
 
 
 def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
@@ -53,7 +52,7 @@ def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "")
     bottom.set_ylabel("measured − fitted [m/s]")
     bottom.axhline(0, color=_GREY, lw=0.8)
     _shot_axis(bottom, fit, dodge)
-    _legend(top, fit, others or {}, error is not None)
+    _legend(figure, fit, others or {}, error is not None)
     top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g} m/s", loc="left")
     for axes in (top, bottom):
         axes.spines[["top", "right"]].set_visible(False)
@@ -73,6 +72,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     if len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
         axes.set_xlabel("body")
+        axes.set_xlim(-_SPREAD * 0.7, _SPREAD * 0.7)
         return
     ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
     longest = max(len(labels[k]) for k in ticks)
@@ -81,7 +81,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def _legend(axes: Axes, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
+def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
     bars = "" if not has_bars else ", ± sigma" if fit.experiments.sigma is not None else ", ± noise"
     plain: dict[str, Any] = {"ls": "none", "color": "black"}
     handles = [
@@ -95,4 +95,10 @@ def _legend(axes: Axes, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> 
             handles.append(
                 Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
             )
-    axes.legend(handles=handles, frameon=False, fontsize="small", ncols=min(len(handles), 3))
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        frameon=False,
+        fontsize="small",
+        ncols=min(len(handles), 5),
+    )

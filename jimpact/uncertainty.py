@@ -72,16 +72,14 @@ def uncertainty(
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
     told = tuple(_in_words(names, row, scale, log) for row in _reduced(null))
-    return Uncertainty(
-        rank, singular, freedom, noise, covariance, correlation, error, told
-    )
+    return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, told)
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:
     """The same subspace in reduced row echelon form: each direction with few parameters."""
     rows = null.copy()
     for i in range(len(rows)):
-        row, column = np.unravel_index(np.argmax(np.abs(rows[i:])), rows[i:].shape)
+        row, column = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
         rows[[i, i + row]] = rows[[i + row, i]]
         rows[i] /= rows[i, column]
         others = np.arange(len(rows)) != i
@@ -103,6 +101,6 @@ def _in_words(
         name = parts[0].split(" ")[0]
         return f"The data cannot see {name}: no measured velocity depends on it."
     return (
-        f"The data cannot see a combination: no measured velocity changes when {parts[0]}, "
-        f"together with {' and '.join(parts[1:])}."
+        "The data cannot see a combination: no measured velocity changes when "
+        f"{', '.join(parts[:-1])} and {parts[-1]} together."
     )

@@ -8,7 +8,7 @@ Jacobian together once, so that the impact is compiled once; a solve can be cont
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -17,7 +17,7 @@ import optax
 
 # y (P,) -> residual (R,), Jacobian (R, P), anything else to keep of the best point
 Evaluate = Callable[[jax.Array], tuple[jax.Array, jax.Array, Any]]
-Method = str | optax.GradientTransformation
+Method: TypeAlias = "str | optax.GradientTransformation"
 
 DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1000}
 
@@ -104,14 +104,16 @@ def advance(
             stuck = memory > _STUCK
         else:
             gradient = _free(state.trial, jacobian.T @ residual, low, high)
-            move, memory = _transformation(method, max_steps).update(
-                gradient,
-                state.memory,
-                state.trial,
-                value=cost,
-                grad=gradient,
-                value_fn=lambda y: _cost(evaluate, jnp.clip(y, low, high)),
-            )
+            # optax itself mixes integers and floats: it needs the standard promotion
+            with jax.numpy_dtype_promotion("standard"):
+                move, memory = _transformation(method, max_steps).update(
+                    gradient,
+                    state.memory,
+                    state.trial,
+                    value=cost,
+                    grad=gradient,
+                    value_fn=lambda y: _cost(evaluate, jnp.clip(y, low, high)),
+                )
             trial = jnp.clip(state.trial + move, low, high)
             stuck = jnp.asarray(False)
         dtype = str(y.dtype)

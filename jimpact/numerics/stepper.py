@@ -221,8 +221,9 @@ def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, ja
     g = jnp.sum(jnp.where(carry.target, carry.state.g, 0.0))
     closing = carry.target & (carry.phase == OPEN)  # closes once its approach matters
     g_end = -NEGLIGIBLE * jnp.sum(jnp.where(closing, control.tolerance, 0.0))
-    x = jnp.where(x > 0, x, 1.0)
-    root = jnp.sqrt(x) if r == 2 else jnp.sqrt(jnp.sqrt(jnp.sqrt(x)))
+    safe = jnp.where(x > 0, x, 1.0)
+    root = jnp.sqrt(safe) if r == 2 else jnp.sqrt(jnp.sqrt(jnp.sqrt(safe)))
+    root = jnp.where(x > 0, root, 0.0)
     kinds = [carry.kind == START, carry.kind == ZERO_G, carry.kind == ROOT_X]
     start = jnp.select(kinds, [carry.begun, g, root], 0.0)
     length = jnp.select(kinds, [carry.h, g_end - g, -root], carry.h)
@@ -324,7 +325,7 @@ def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
     x, g = jax.lax.stop_gradient((carry.state.x, carry.state.g))
     dx, _, _, _ = field(flow, carry.phase, x, g)
     expanding = (carry.phase == EXPANSION) & (dx < 0)
-    due = jnp.where(expanding, x / jnp.where(expanding, -dx, 1.0), jnp.inf)
+    due = jnp.where(expanding, jnp.maximum(x, 0.0) / jnp.where(expanding, -dx, 1.0), jnp.inf)
     soonest = jnp.min(due)
     aim = accepted & (carry.kind == TIME) & (soonest < NEAR_OPENING * carry.h)
     target = jnp.arange(due.shape[0]) == jnp.argmin(due)

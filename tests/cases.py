@@ -1,0 +1,27 @@
+"""The test table: one row a law. Each row makes the law from coefficients for m contacts."""
+
+import jax.numpy as jnp
+
+import jimpact as ji
+
+
+def newton(e, k):
+    return ji.Newton(e)
+
+
+def lzb(exponent, method="time"):
+    def make(e, k):
+        return ji.LZB(e, k, exponent, method=method)
+
+    return make
+
+
+# name: (registry name, maker, accuracy of the outcome, accuracy of its derivatives)
+LAWS = {
+    "newton": ("newton", newton, 1e-12, 1e-12),
+    "lzb-linear": ("lzb", lzb(1.0), 1e-7, 1e-6),
+    "lzb-hertz": ("lzb", lzb(1.5), 1e-7, 1e-6),
+    "lzb-array-exponent": ("lzb", lzb(jnp.array(1.4)), 1e-7, 1e-6),
+    "lzb-propagator": ("lzb", lzb(1.0, "propagator"), 1e-12, 1e-11),
+    "lzb-impulse": ("lzb", lzb(1.5, "impulse"), 1e-3, 1e-1),
+}

@@ -1,0 +1,194 @@
+"""Reading shots, what is refused, and what the data break."""
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+import jimpact as ji
+from jimpact.csv_shots import UNITS
+from jimpact.defects import data_defects
+
+DATA = files("jimpact") / "data"
+CHAIN = ji.chain([1.0, 1.0, 1.0])
+
+
+def written(tmp_path, text, encoding="utf-8"):
+    path = tmp_path / "shots.csv"
+    path.write_bytes(text.encode(encoding))
+    return path
+
+
+def test_bundled_data():
+    balls = ji.read_experiments(DATA / "three_balls.csv")
+    np.testing.assert_array_equal(balls.pre, [[1.0, 0.0, 0.0]])
+    np.testing.assert_array_equal(balls.post, [[-0.0605, 0.1049, 0.9978]])
+    carts = ji.read_experiments(DATA / "air_track.csv")
+    assert carts.shots == ("1", "2", "3", "4", "5")
+    np.testing.assert_allclose(carts.pre[0], [0.7102, 0.0], rtol=1e-15)  # was in cm/s
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"),
+    [("m/s", 1), ("cm/s", 0.01), ("mm/s", 0.001), ("km/h", 1 / 3.6), ("in/s", 0.0254), ("ft/s", 0.3048)],
+)
+def test_units(tmp_path, unit, factor):
+    path = written(tmp_path, f"pre_1[m/s],post_1[{unit}],sigma_1[{unit}]\n1,-2,0.5\n")
+    data = ji.read_experiments(path)
+    np.testing.assert_allclose([data.pre[0, 0], data.post[0, 0]], [1, -2 * factor], rtol=1e-15)
+    np.testing.assert_allclose(data.sigma[0, 0], 0.5 * factor, rtol=1e-15)
+    assert unit in UNITS
+
+
+def test_missing_values_labels_and_foreign_line_ends(tmp_path):
+    text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\nNaN,1,,2,0\r\n"
+    data = ji.read_experiments(written(tmp_path, text))
+    np.testing.assert_array_equal(data.pre, [[2, 0], [2, 0]])
+    np.testing.assert_array_equal(data.post, [[1, np.nan], [1, np.nan]])
+    assert data.sigma is None
+    assert data.shots == ("first", "2")
+
+
+def test_sigma_of_an_unmeasured_value_may_be_empty(tmp_path):
+    header = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s],sigma_1[m/s],sigma_2[m/s]\n"
+    data = ji.read_experiments(written(tmp_path, header + "1,0,0.1,,0.01,\n"))
+    np.testing.assert_array_equal(data.sigma, [[0.01, np.nan]])
+
+
+HEAD = "pre_1[m/s],post_1[m/s]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"shots\.csv: the file is empty"),
+        (HEAD, r"shots\.csv: the file has no shots"),
+        ("pre_1[m/s],post_1[mph]\n1,1\n", r"line 1: the unit of column `post_1\[mph\]` must be one of m/s, .*'mph'"),
+        ("pre_1[m/s],post_1\n1,1\n", r"line 1: column `post_1` must state its unit, as in `post_1\[m/s\]`"),
+        ("pre_1[m/s],post_1[]\n1,1\n", r"column `post_1\[\]` must state its unit"),
+        ("pre_1[m/s],pre_2[m/s],post_1[m/s]\n1,1,1\n", r"column `post_2\[unit\]` is missing"),
+        ("pre_1[m/s],post_1[m/s],pre_3[m/s],post_3[m/s]\n1,1,1,1\n", r"column `pre_2\[unit\]` is missing"),
+        ("shot\n1\n", r"column `pre_1\[unit\]` is missing"),
+        ("pre_1[m/s],post_1[m/s],pre_2[m/s],post_2[m/s],sigma_1[m/s]\n1,1,1,1,1\n", r"`sigma_2\[unit\]` is missing"),
+        ("pre_1[m/s],post_1[m/s],mass\n1,1,1\n", r"column 3 must be one of `shot`.*'mass'"),
+        ("pre_0[m/s],post_1[m/s]\n1,1\n", r"column 1 must be one of"),
+        ("pre_1[m/s];post_1[m/s]\n1;1\n", r"columns are separated by commas"),
+        ("pre_1[m/s],pre_1[m/s],post_1[m/s]\n1,1,1\n", r"column `pre_1\[m/s\]` must occur once"),
+        (HEAD + "1,0.5\n2,fast\n", r"line 3, column `post_1\[m/s\]`: the value must be a number, but is 'fast'"),
+        (HEAD + "1,inf\n", r"line 2, column `post_1\[m/s\]`: the value must be finite, but is 'inf'"),
+        (HEAD + ",1\n", r"column `pre_1\[m/s\]`: a velocity before the impact must be given"),
+        (HEAD + "1,1,1\n", r"line 2: a shot must have 2 values, one per column, but has 3"),
+        ("pre_1[m/s],post_1[m/s],sigma_1[cm/s]\n1,1,0\n", r"line 2, column `sigma_1\[cm/s\]`: .* must be > 0, but is 0"),
+        ("pre_1[m/s],post_1[m/s],sigma_1[m/s]\n1,1,-2\n", r"must be > 0, but is -2"),
+        ("pre_1[m/s],post_1[m/s],sigma_1[m/s]\n1,1,\n", r"must be > 0, but is empty"),
+        (HEAD + "1,\n", r"`post` must hold a measured value"),
+    ],
+)  # fmt: skip
+def test_bad_files(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        ji.read_experiments(written(tmp_path, text))
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(FileNotFoundError, match="'nowhere.csv' does not exist"):
+        ji.read_experiments("nowhere.csv")
+    with pytest.raises(ValueError, match="must be UTF-8 text"):
+        ji.read_experiments(written(tmp_path, HEAD, encoding="utf-16"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"pre": [], "post": []}, r"`pre` must have shape \(K, n\)"),
+        ({"pre": [1.0, 0.0], "post": [1.0]}, r"`pre` and `post` must have the same shape"),
+        ({"pre": [np.nan, 0.0], "post": [1.0, 0.0]}, r"`pre` must be finite"),
+        ({"pre": [1.0, 0.0], "post": [np.inf, 0.0]}, r"`post` must be finite"),
+        ({"pre": [1.0, 0.0], "post": [np.nan, np.nan]}, r"must hold a measured value"),
+        ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "sigma": [0.1, 0.0]}, r"`sigma` must lie in \(0, inf\)"),
+        ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "sigma": [0.1] * 3}, r"`sigma` must be a scalar or have shape"),
+        ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "shots": ["a", "b"]}, r"`shots` must have 1 labels"),
+        ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "scenes": []}, r"`scenes` must have one scene per shot"),
+        ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "scenes": [CHAIN]}, r"`scenes` must have 2 bodies"),
+        (
+            {"pre": [[1.0, 0.0]] * 2, "post": [[0.0, 1.0]] * 2,
+             "scenes": [ji.chain([1.0, 1.0]), ji.chain([1.0, 1.0], wall=True)]},
+            r"scenes of one kind .* shot 2 differs",
+        ),
+    ],
+)  # fmt: skip
+def test_bad_experiments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ji.Experiments(**arguments)
+
+
+def test_momentum_of_the_measured_balls():
+    data = ji.read_experiments(DATA / "three_balls.csv")
+    np.testing.assert_allclose(data.momentum_excess(CHAIN), [[0.0422]], atol=1e-15)
+    np.testing.assert_allclose(data.momentum_ratio(CHAIN), [[1.0422]], atol=1e-15)
+    np.testing.assert_allclose(data.energy_ratio(CHAIN), [1.01026910], atol=1e-8)
+    corrected = data.momentum_corrected(CHAIN)
+    np.testing.assert_allclose(corrected.post, data.post - 0.0422 / 3, atol=1e-15)
+    assert corrected.lost_freedom == 1
+    assert data_defects(data, CHAIN) == [
+        "The data break momentum (after / before): shot 1: 1.0422; no law can reproduce that part "
+        "(rms 0.0141 m/s).",
+        "The data gain energy (after / before): shot 1: 1.0103.",
+    ]
+    assert data_defects(corrected, CHAIN) == []
+
+
+def test_correction_is_the_smallest_change_in_units_of_sigma():
+    scene = ji.chain([1.0, 2.0])
+    data = ji.Experiments([3.0, 0.0], [0.0, 1.8], sigma=[0.1, 0.3])
+    # Lagrange: change_i proportional to sigma_i^2 m_i, momentum excess 0.6 removed
+    share = np.array([0.01 * 1.0, 0.09 * 2.0])
+    expected = np.array([0.0, 1.8]) - 0.6 * share / (share @ [1.0, 2.0])
+    np.testing.assert_allclose(data.momentum_corrected(scene).post[0], expected, atol=1e-14)
+
+
+def test_a_wall_takes_all_momentum_and_two_pairs_conserve_two():
+    data = ji.Experiments([1.0, 0.0], [-0.5, 0.2])
+    assert data.momentum_excess(ji.chain([1.0, 1.0], wall=True)).shape == (1, 0)
+    np.testing.assert_array_equal(
+        data.momentum_corrected(ji.chain([1.0, 1.0], wall=True)).post, data.post
+    )
+    pairs = ji.Scene([1.0] * 4, np.array([[-1.0, 1, 0, 0], [0, 0, -1, 1]]).T)
+    four = ji.Experiments([1.0, 0, 2, 0], [0.0, 1.1, 0.5, 1.2])
+    excess = four.momentum_excess(pairs)
+    assert excess.shape == (1, 2)
+    corrected = np.asarray(four.momentum_corrected(pairs).post[0])
+    np.testing.assert_allclose(corrected, [-0.05, 1.05, 0.65, 1.35], atol=1e-14)
+
+
+def test_incomplete_shots_are_neither_judged_nor_corrected():
+    data = ji.Experiments([[1.0, 0.0]] * 2, [[0.0, np.nan], [0.0, 1.1]])
+    scene = ji.chain([1.0, 1.0])
+    assert np.isnan(data.momentum_excess(scene)[0, 0])
+    corrected = data.momentum_corrected(scene)
+    np.testing.assert_allclose(corrected.post, [[0.0, np.nan], [-0.05, 1.05]], atol=1e-15)
+    assert "shot 2: 1.1000" in data_defects(data, scene)[0]
+
+
+def test_defects_are_held_against_sigma():
+    scene = ji.chain([1.0, 1.0])
+    inside = ji.Experiments([1.0, 0.0], [0.1, 0.95], sigma=0.02)  # excess 0.05, error 0.028
+    outside = ji.Experiments([1.0, 0.0], [0.1, 0.95], sigma=0.01)
+    assert data_defects(inside, scene) == []
+    assert len(data_defects(outside, scene)) == 1
+    stored = ji.Experiments([1.0, 0.0], [-0.1, 1.1])  # gains 0.11 J
+    assert "gain energy" in data_defects(stored, scene)[0]
+    assert data_defects(stored, scene, stored_energy=0.2) == []
+
+
+def test_many_defects_are_summed_up():
+    data = ji.Experiments([[1.0, 0.0]] * 9, [[0.0, 1.1]] * 8 + [[0.0, 1.3]])
+    line = data_defects(data, ji.chain([1.0, 1.0]))[0]
+    assert "9 of 9 shots, 1.1000 to 1.3000" in line
+
+
+def test_a_scene_is_needed():
+    data = ji.Experiments([1.0, 0.0], [0.0, 1.0])
+    with pytest.raises(ValueError, match="`scene` must be a Scene where the experiments carry none"):
+        data.momentum_excess()
+    own = ji.Experiments([1.0, 0.0], [0.0, 1.1], scenes=[ji.chain([1.0, 1.0])])
+    np.testing.assert_allclose(own.momentum_excess(), [[0.1]], atol=1e-15)
