@@ -117,8 +117,9 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
     lines += [f"{i + 1:10d} {a:14.8g} {b:14.8g}" for i, (a, b) in enumerate(pairs)]
     lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
-    g0, g1 = np.asarray(gap_velocity(scene, velocity)), np.asarray(
-        gap_velocity(scene, out.velocity)
+    g0, g1 = (
+        np.asarray(gap_velocity(scene, velocity)),
+        np.asarray(gap_velocity(scene, out.velocity)),
     )
     for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
         note = "" if closed else "   open: takes no part"

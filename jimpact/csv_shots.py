@@ -16,7 +16,7 @@ UNITS = {  # in m/s
     "ft/s": 0.3048,
 }
 _KINDS = ("pre", "post", "sigma")
-_HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[(.*)\])?")
+_HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[([^]]*)\])?")
 _ALLOWED = "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ..."
 
 

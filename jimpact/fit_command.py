@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jimpact.cli import FitCommand
 
 PICTURE = "jimpact-fit.png"
-RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "corrected", "Newton", "all free"
+RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
 def run(command: "FitCommand") -> int:
@@ -98,6 +98,8 @@ def _print_report(study: Study, fits: dict[str, Fit], path: Path) -> None:
     console = Console(highlight=False)
     console.print(f"[bold]{escape(study.title)}[/bold]")
     console.print(_table(fits))
+    if CORRECTED in fits:
+        console.print("corrected: changed as little as possible so that momentum is conserved")
     everything = fits.get(ALL_FREE)
     if everything is not None:
         names, count = ", ".join(everything.names), len(everything.names)
@@ -116,7 +118,7 @@ def _table(fits: dict[str, Fit]) -> Table:
     table.add_column("rms [m/s]", justify="right")
     table.add_column("rank", justify="right")
     for name, fit in fits.items():
-        data = name if name in (RAW, CORRECTED) else RAW
+        data = "corrected" if name == CORRECTED else RAW
         values = "\n".join(_value(fit, i) for i in range(len(fit.names)))
         rank = f"{fit.rank} of {len(fit.names)}"
         names = escape("\n".join(fit.names))

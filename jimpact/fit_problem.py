@@ -56,7 +56,11 @@ def build_problem(
     """Arrays, weights and natural scales of a fit."""
     own = [experiments.scene_of(scene, k) for k in range(len(experiments.shots))]
     per_shot = experiments.scenes is not None
-    dtype = experiments.pre.dtype
+    leaves = jax.tree.leaves((law, own, experiments.pre))
+    dtype = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
+    law, *own = jax.tree.map(
+        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (law, *own)
+    )
     pre, post = np.asarray(experiments.pre), np.nan_to_num(np.asarray(experiments.post))
     unit = max(np.abs(pre).max(), np.abs(post).max()) or 1.0
     sigma = np.ones_like(post) if experiments.sigma is None else np.asarray(experiments.sigma)
@@ -72,12 +76,11 @@ def build_problem(
     first, count = parameters.first, len(parameters.names)
     bounds[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
     arrays = {"mix": mix, "offset": offset, "scale": scale, "low": bounds[0], "high": bounds[1]}
-    arrays |= {"post": post, "weight": weight / size, "size": size, "unit": unit}
+    arrays |= {"pre": pre, "post": post, "weight": weight / size, "size": size, "unit": unit}
     return Problem(
         law=law,
         log=jnp.asarray(log),
         scenes=jax.tree.map(lambda *x: jnp.stack(x), *own) if per_shot else own[0],
-        pre=experiments.pre,
         fields=parameters.fields,
         scene_per_shot=per_shot,
         **{name: jnp.asarray(array, dtype) for name, array in arrays.items()},

@@ -140,13 +140,14 @@ def fit(
     0.4
     """
     check_method(method)
-    if not isinstance(starts, int) or starts < 1:
-        raise ValueError(f"Argument `starts` must be an integer >= 1, but has value {starts!r}.")
+    steps = default_steps(method) if max_steps is None else max_steps
+    for name, count in (("starts", starts), ("max_steps", steps)):
+        if not isinstance(count, int) or count < 1:
+            raise ValueError(f"Argument `{name}` must be an integer >= 1, but has value {count!r}.")
     contacts = experiments.scene_of(scene, 0).contacts
     parameters, notes = free_parameters(law, contacts, free)
     limits = bounds_of(parameters, law, bounds)
     problem = build_problem(law, scene, experiments, parameters, limits)
-    steps = max_steps or default_steps(method)
     found = search(problem, parameters, method, starts, seed, steps, progress)
     return _as_fit(problem, parameters, experiments, scene, found, limits, method, notes)
 

@@ -59,7 +59,7 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     for name, value in vars(law).items():
         if isinstance(value, jax.Array) and value.ndim and value.shape[0] != scene.contacts:
             check_shape(name, value, (scene.contacts,), "one entry per contact, or a scalar")
-    law.check_options(v.dtype)
+    law.check_options(v.dtype, scene.contacts)
     return _impact(law, scene, v)
 
 
@@ -95,7 +95,7 @@ def _impact(law: Law, scene: Scene, v: jax.Array) -> Impact:
     w, gamma = (
         (w_all, gamma_all) if law.uses_gaps else without_open_contacts(scene, w_all, gamma_all)
     )
-    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts), 0.0)
+    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
     happens = jnp.any(gamma < 0) | jnp.any(stored > 0) | ~jnp.all(jnp.isfinite(gamma))
     # where nothing happens the law sees a harmless approach, so that its gradients stay finite
     p, code = law.impulse(w, jnp.where(happens, gamma, -jnp.ones_like(gamma)))

@@ -176,12 +176,11 @@ def _bar(
         return
     text = TextColumn("fit: {task.fields[ready]} of {task.fields[starts]} starts done, step")
     count = TextColumn("{task.completed} of at most {task.total}")
-    bar = Progress(
-        text, count, BarColumn(), TimeElapsedColumn(), console=Console(stderr=True), transient=True
-    )
+    console = Console(stderr=True, force_terminal=True if progress else None)
+    bar = Progress(text, count, BarColumn(), TimeElapsedColumn(), console=console, transient=True)
     task = bar.add_task("fit", total=max_steps, ready=0, starts=starts)
-    timer = threading.Timer(0.0 if progress else BAR_AFTER, bar.start)
-    timer.start()
+    timer = threading.Timer(BAR_AFTER, bar.start)
+    (bar if progress else timer).start()
     try:
         yield lambda done, steps: bar.update(task, completed=steps, ready=done)
     finally:

@@ -50,6 +50,7 @@ def lzb_oracle(mass, normals, velocity, k, e, eta, u0=0.0, tol=1e-12, slack=1e-1
 
         events = []
         for j in range(m):
+
             def g(_, y, j=j):
                 return (gamma0 + w @ y[m:])[j]
 
@@ -73,8 +74,13 @@ def lzb_oracle(mass, normals, velocity, k, e, eta, u0=0.0, tol=1e-12, slack=1e-1
         working = force(x)[force(x) > 0] if np.any(x > 0) else None
         horizon = 1e6 if working is None else 1e8
         step = solve_ivp(
-            rhs, (0, horizon), np.concatenate([x, p]), method="DOP853",
-            events=[fun for _, fun in events], rtol=tol, atol=tol * 1e-4,
+            rhs,
+            (0, horizon),
+            np.concatenate([x, p]),
+            method="DOP853",
+            events=[fun for _, fun in events],
+            rtol=tol,
+            atol=tol * 1e-4,
         )
         x, p, t = step.y[:m, -1], step.y[m:, -1], t + step.t[-1]
         peak = np.maximum(peak, force(x))

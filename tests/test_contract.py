@@ -184,8 +184,10 @@ HARD = st.floats(-6, 6)
 
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(
-    e=st.tuples(PAIRS, PAIRS), logk=st.tuples(HARD, HARD),
-    logm=st.tuples(HARD, HARD, HARD), v=st.tuples(SPEEDS, SPEEDS, SPEEDS),
+    e=st.tuples(PAIRS, PAIRS),
+    logk=st.tuples(HARD, HARD),
+    logm=st.tuples(HARD, HARD, HARD),
+    v=st.tuples(SPEEDS, SPEEDS, SPEEDS),
 )
 @pytest.mark.parametrize("name", ["newton", "lzb-hertz", "lzb-linear"])
 def test_extreme_input_is_right_or_flagged(name, e, logk, logm, v):

@@ -30,7 +30,14 @@ def test_bundled_data():
 
 @pytest.mark.parametrize(
     ("unit", "factor"),
-    [("m/s", 1), ("cm/s", 0.01), ("mm/s", 0.001), ("km/h", 1 / 3.6), ("in/s", 0.0254), ("ft/s", 0.3048)],
+    [
+        ("m/s", 1),
+        ("cm/s", 0.01),
+        ("mm/s", 0.001),
+        ("km/h", 1 / 3.6),
+        ("in/s", 0.0254),
+        ("ft/s", 0.3048),
+    ],
 )
 def test_units(tmp_path, unit, factor):
     path = written(tmp_path, f"pre_1[m/s],post_1[{unit}],sigma_1[{unit}]\n1,-2,0.5\n")
@@ -90,7 +97,7 @@ def test_bad_files(tmp_path, text, message):
 
 
 def test_files_that_cannot_be_read(tmp_path):
-    with pytest.raises(FileNotFoundError, match="'nowhere.csv' does not exist"):
+    with pytest.raises(FileNotFoundError, match=r"'nowhere\.csv' does not exist"):
         ji.read_experiments("nowhere.csv")
     with pytest.raises(ValueError, match="must be UTF-8 text"):
         ji.read_experiments(written(tmp_path, HEAD, encoding="utf-16"))
@@ -188,7 +195,9 @@ def test_many_defects_are_summed_up():
 
 def test_a_scene_is_needed():
     data = ji.Experiments([1.0, 0.0], [0.0, 1.0])
-    with pytest.raises(ValueError, match="`scene` must be a Scene where the experiments carry none"):
+    with pytest.raises(
+        ValueError, match="`scene` must be a Scene where the experiments carry none"
+    ):
         data.momentum_excess()
     own = ji.Experiments([1.0, 0.0], [0.0, 1.1], scenes=[ji.chain([1.0, 1.0])])
     np.testing.assert_allclose(own.momentum_excess(), [[0.1]], atol=1e-15)

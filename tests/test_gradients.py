@@ -64,7 +64,9 @@ def everything(law, masses, v):
 
 def test_forward_equals_reverse_in_every_parameter():
     law = ji.LZB(
-        jnp.array([0.8, 0.6, 0.9]), jnp.array([1.0, 0.5, 2.0]), jnp.array([1.5, 1.3, 1.0]),
+        jnp.array([0.8, 0.6, 0.9]),
+        jnp.array([1.0, 0.5, 2.0]),
+        jnp.array([1.5, 1.3, 1.0]),
         jnp.array([0.01, 0.02, 0.03]),
     )
     args = (law, jnp.array([1.0, 2.0, 1.5]), jnp.array([1.0, 0.1, -0.2]))
@@ -132,7 +134,9 @@ def test_derivative_at_zero_restitution_is_the_one_sided_limit():
 
 
 @pytest.mark.parametrize("e", [0.0, 0.05, 1.0])
-@pytest.mark.parametrize("v", [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.5, -1.0], [1.0, 0.0, -1.0]])
+@pytest.mark.parametrize(
+    "v", [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.5, -1.0], [1.0, 0.0, -1.0]]
+)
 def test_no_nan_at_the_edges(e, v):
     grads = jax.jit(jax.grad(everything, argnums=(0, 1, 2)))(
         ji.LZB(jnp.full(3, e), jnp.ones(3)), jnp.ones(3), jnp.array(v)

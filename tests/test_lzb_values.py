@@ -105,7 +105,9 @@ def test_zero_restitution_is_the_limit():
     np.testing.assert_allclose(out.velocity, [-0.234948, 0.901615, 0.901615], atol=1e-6)
     # the oracle cannot take e = 0: it must approach it linearly in e
     mass, normals = reference.chain_matrices([3.0, 1.0, 2.0])
-    near = [reference.lzb_oracle(mass, normals, v, [1.0, 3.0], [0.95, e], 1.5)[0] for e in (1e-3, 2e-3)]
+    near = [
+        reference.lzb_oracle(mass, normals, v, [1.0, 3.0], [0.95, e], 1.5)[0] for e in (1e-3, 2e-3)
+    ]
     np.testing.assert_allclose(out.velocity, 2 * near[0] - near[1], atol=5e-6)
 
 
@@ -140,7 +142,9 @@ def test_inputs_on_which_siconos_fails():
     assert int(out.status) == 0
     assert -0.5 < float(out.energy_change) < 0
     tiny = ji.impact(ji.LZB(1.0, 7e9), ji.chain(np.full(3, 1e-8)), [3e-5, 0.0, 0.0])  # 5e-18 J
-    np.testing.assert_allclose(tiny.velocity / 3e-5, [-0.0709523537, 0.0764030391, 0.9945493146], atol=1e-7)
+    np.testing.assert_allclose(
+        tiny.velocity / 3e-5, [-0.0709523537, 0.0764030391, 0.9945493146], atol=1e-7
+    )
     light = ji.impact(ji.LZB(1.0), ji.chain([1.0, 1e-3, 1.0]), [1.0, 0.0, 0.0])
     mass, normals = reference.chain_matrices([1.0, 1e-3, 1.0])
     expected, *_ = reference.lzb_oracle(mass, normals, [1.0, 0, 0], 1.0, 1.0, 1.5, max_phases=4000)
@@ -215,7 +219,9 @@ def _random_scenes(bodies, wall, count, seed):
 def test_honest_tolerance_over_random_scenes(rtol):
     """99 % within 10 rtol; the worst within 100 rtol or flagged."""
     errors = []
-    for seed, (bodies, wall) in enumerate([(2, True), (3, False), (4, True), (5, False), (6, True)]):
+    for seed, (bodies, wall) in enumerate(
+        [(2, True), (3, False), (4, True), (5, False), (6, True)]
+    ):
         for exponent in (1.0, 1.3, 1.5, 2.0):
             args = _random_scenes(bodies, wall, 26, seed)
 

@@ -28,5 +28,5 @@ class Law(eqx.Module):
         """Energy (m,) [J] stored in the contacts before the impact."""
         return jnp.zeros(contacts)
 
-    def check_options(self, dtype: jnp.dtype) -> None:
-        """Raise where an option cannot be met in this floating-point precision."""
+    def check_options(self, dtype: jnp.dtype, contacts: int) -> None:
+        """Raise where an option does not fit the floating-point precision or the contacts."""

@@ -149,7 +149,9 @@ def step(
         for row in length * (weights @ slopes)
     )
     end = State(*(before + by for before, by in zip(state, change)))
-    end = end._replace(x=jnp.where(known_x, 0.0, end.x), g=jnp.where(known_g, start + length, end.g))
+    end = end._replace(
+        x=jnp.where(known_x, 0.0, end.x), g=jnp.where(known_g, start + length, end.g)
+    )
     return end, high, low
 
 

@@ -64,9 +64,7 @@ def advance(flow: Flow, dp: jax.Array, walk: Walk) -> Walk:
     )
 
 
-def _emptying(
-    flow: Flow, walk: Walk, is_primary: jax.Array, increment: jax.Array
-) -> jax.Array:
+def _emptying(flow: Flow, walk: Walk, is_primary: jax.Array, increment: jax.Array) -> jax.Array:
     """Fraction of the step at which the primary contact is unloaded; 1 if it is not.
 
     Ending there, not on a fixed step, is what the derivative of the outcome depends on.
@@ -90,9 +88,7 @@ def at_work(walk: Walk) -> jax.Array:
     return jnp.any((walk.energy > 0) | (walk.gamma < 0))
 
 
-def solve(
-    flow: Flow, dp: jax.Array, max_steps: int, gamma: jax.Array, energy: jax.Array
-) -> Walk:
+def solve(flow: Flow, dp: jax.Array, max_steps: int, gamma: jax.Array, energy: jax.Array) -> Walk:
     """Walk to the end of the impact, or for `max_steps` steps."""
     zero = jnp.zeros((), jnp.int32)
     return jax.lax.while_loop(

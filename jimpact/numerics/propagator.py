@@ -64,9 +64,7 @@ def _series(flow: Flow, phase: jax.Array, state: State) -> State:
     return State(*(jnp.concatenate([a[None], b]) for a, b in zip(first, rest)))
 
 
-def field_linear(
-    flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array
-) -> tuple[jax.Array, ...]:
+def field_linear(flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array) -> tuple[jax.Array, ...]:
     """`flow.field` continued to x < 0, as a coefficient of a series may be."""
     up = field(flow, phase, x, g)
     down = field(flow, phase, -x, -g)
@@ -74,18 +72,21 @@ def field_linear(
 
 
 def _evaluate(series: jax.Array, h: jax.Array) -> jax.Array:
-    value = series[-1]
-    for row in series[-2::-1]:
-        value = value * h + row
-    return value
+    """Horner's rule, as a loop: unrolled it would take seconds to compile."""
+
+    def following(value: jax.Array, row: jax.Array) -> tuple[jax.Array, None]:
+        return value * h + row, None
+
+    return jax.lax.scan(following, jnp.zeros_like(series[0]), series, reverse=True)[0]
 
 
 def _root(event: jax.Array, guess: jax.Array) -> jax.Array:
     """Root of the event polynomial near `guess`, differentiable by one more Newton step."""
     fixed = jax.lax.stop_gradient(event)
     slopes = fixed[1:] * jnp.arange(1, TERMS, dtype=fixed.dtype)
-    h = guess
-    for _ in range(NEWTON_STEPS):
-        h = h - _evaluate(fixed, h) / _evaluate(slopes, h)
-    h = jax.lax.stop_gradient(h)
+
+    def newton(_: int, h: jax.Array) -> jax.Array:
+        return h - _evaluate(fixed, h) / _evaluate(slopes, h)
+
+    h = jax.lax.stop_gradient(jax.lax.fori_loop(0, NEWTON_STEPS, newton, guess))
     return h - _evaluate(event, h) / _evaluate(slopes, h)

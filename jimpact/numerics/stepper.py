@@ -283,9 +283,7 @@ def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
     return jnp.clip(jnp.where(slope <= 0, stable, other), 0.0, 1.0)
 
 
-def _dips(
-    f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.Array
-) -> jax.Array:
+def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.Array) -> jax.Array:
     """Whether the cubic through both ends falls below zero between them and returns."""
     candidates = (d0 < 0) & (d1 > 0) & (f0 > snap) & (f1 >= -snap)
     u = _dip_at(f0, f1, d0)

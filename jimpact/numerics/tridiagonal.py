@@ -24,9 +24,7 @@ class Tridiagonal(eqx.Module):
 
     def scaled(self, scale: jax.Array) -> "Tridiagonal":
         """`diag(scale) A diag(scale)`."""
-        return Tridiagonal(
-            self.diagonal * scale**2, self.off_diagonal * scale[:-1] * scale[1:]
-        )
+        return Tridiagonal(self.diagonal * scale**2, self.off_diagonal * scale[:-1] * scale[1:])
 
 
 Symmetric = jax.Array | Tridiagonal

@@ -1,0 +1,185 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3 (ipykernel)
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Fit a law to a measured Newton's cradle
+#
+# Three equal hard balls, two of them touching at rest, the first strikes them. The velocities
+# after the impact were measured once and are quoted by Brogliato, *Nonsmooth Mechanics* (2016),
+# section 6.1.2. We look at the data, fit two laws, ask what one shot can and cannot tell, and
+# check the stated errors on simulated shots.
+
+# %%
+# %matplotlib inline
+import time
+from importlib.resources import files
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np
+from matplotlib.figure import Figure
+
+import jimpact as ji
+from jimpact.plots import plot_fit
+
+began = time.perf_counter()
+balls = ji.chain([1.0, 1.0, 1.0])
+measured = ji.read_experiments(files("jimpact") / "data" / "three_balls.csv")
+print("before", measured.pre[0], "\nafter ", measured.post[0], "m/s")
+
+# %% [markdown]
+# ## What is wrong with the data
+#
+# No force but those between the balls acts in the instant of the impact: the total momentum must
+# stay, and the energy must not grow. Both are violated, so each velocity carries an error of at
+# least about 0.014. Every law conserves momentum; none can reproduce that part.
+
+# %%
+print("momentum after / before", measured.momentum_ratio(balls)[0])
+print("energy   after / before", measured.energy_ratio(balls)[0])
+
+# %% [markdown]
+# ## One coefficient of restitution: LZB and Newton
+#
+# The LZB law distributes the impulse over the contacts by their stiffness ratio (here 1, Hertz
+# contacts) and takes the energetic coefficient of restitution $e$ of a contact. A scalar field of
+# a law is one value for all contacts.
+
+# %%
+lzb = ji.fit(ji.LZB(0.95), balls, measured, free="restitution")
+print(lzb)
+
+# %% [markdown]
+# The residual is mostly the momentum defect. With a third of the excess taken from each velocity
+# (the smallest change that restores momentum) the same $e$ leaves half the residual:
+
+# %%
+corrected = measured.momentum_corrected(balls)
+lzb_corrected = ji.fit(ji.LZB(0.95), balls, corrected, free="restitution")
+newton = ji.fit(ji.Newton(0.5), balls, measured)
+for name, fit in (("LZB", lzb), ("LZB, corrected", lzb_corrected), ("Newton", newton)):
+    print(f"{name:16s} e = {fit.value[0]:.4f} ± {fit.standard_error[0]:.4f}   rms {fit.rms:.4f} m/s")
+
+# %% [markdown]
+# Newton's law lets the two resting balls leave together, whatever $e$: it cannot disperse the
+# energy. (Grey crosses.)
+
+# %%
+plot_fit(lzb, {"Newton fitted": newton}, title="Three balls, one shot")
+
+# %% [markdown]
+# ## What one shot cannot tell
+#
+# Give each contact its own $e$ and free the stiffness ratio $k_2/k_1$. Three velocities are
+# measured, but momentum ties them together: two numbers, three parameters.
+
+# %%
+both_e = ji.LZB([0.95, 0.95], [1.0, 1.0])
+three = ji.fit(both_e, balls, corrected)
+print(f"rank {three.rank} of {len(three.names)}, rms {three.rms:.1e} m/s")
+print("standard errors", three.standard_error)
+print("\n".join(three.identifiability))
+
+# %% [markdown]
+# A profile shows the valley: hold the ratio, fit both $e$. Over a whole range of ratios the shot is
+# reproduced exactly; only where an $e$ would have to exceed 1 does the fit get worse. The values
+# that a solver returns for such a fit are one point of this valley, which is why their standard
+# errors are infinite.
+
+# %%
+ratios = np.geomspace(0.3, 3.0, 41)
+profile = [
+    ji.fit(
+        ji.LZB([0.95, 0.95], [1.0, ratio]),
+        balls,
+        corrected,
+        free={"restitution": True, "stiffness": False},
+        starts=2,
+    )
+    for ratio in ratios
+]
+figure = Figure(figsize=(7, 5), layout="constrained")
+top, bottom = figure.subplots(2, 1, sharex=True)
+top.plot(ratios, [fit.rms for fit in profile], color="#0072B2")
+top.set_ylabel("rms residual [m/s]")
+for contact, colour in ((0, "#D55E00"), (1, "#009E73")):
+    values = [fit.value[contact] for fit in profile]
+    bottom.plot(ratios, values, color=colour, label=f"restitution[{contact + 1}]")
+bottom.set(xscale="log", xlabel="stiffness ratio k2 / k1", ylabel="fitted e")
+bottom.legend(frameon=False)
+exact = [ratio for ratio, fit in zip(ratios, profile) if fit.rms < 1e-6]
+print(f"reproduced exactly for every ratio from {min(exact):.2f} to {max(exact):.2f}")
+figure
+
+# %% [markdown]
+# ## Known parameters from simulated shots
+#
+# From here on all data are **simulated**. Four kinds of shots, in which the balls come from both
+# sides, determine all three parameters; more shots of the first kind alone would not.
+
+# %%
+truth = ji.LZB([0.9, 0.8], [1.0, 1.5])
+kinds = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.5, 0.0]])
+pre = np.tile(kinds, (2, 1))
+noise = 0.01  # m/s
+exact_post = np.array([ji.impact(truth, balls, v).velocity for v in pre])
+start = ji.LZB([0.95, 0.95], [1.0, 1.0])
+
+
+def simulated_fit(seed, starts):
+    error = noise * np.random.default_rng(seed).normal(size=pre.shape)
+    return ji.fit(start, balls, ji.Experiments(pre, exact_post + error), starts=starts)
+
+
+print(simulated_fit(0, starts=8))
+
+# %%
+same = ji.Experiments(np.tile(kinds[:1], (8, 1)), np.tile(exact_post[:1], (8, 1)))
+print("eight shots of the first kind: rank", ji.fit(start, balls, same).rank, "of 3")
+
+# %% [markdown]
+# ## Are the stated errors true?
+#
+# Repeat the simulated experiment many times and count how often the 95 % confidence interval holds
+# the true value. With N repetitions the count itself scatters: 95 % ± 1.3 % for N = 300.
+
+# %%
+true_value = np.array([0.9, 0.8, 1.5])
+repeats = 300
+fits = [simulated_fit(seed, starts=1) for seed in range(1, repeats + 1)]
+intervals = np.array([fit.confidence_interval(0.95) for fit in fits])
+inside = (intervals[:, :, 0] <= true_value) & (true_value <= intervals[:, :, 1])
+values = np.array([fit.value for fit in fits])
+stated = np.array([fit.standard_error for fit in fits])
+print(f"{repeats} simulated experiments, all converged: {all(fit.converged for fit in fits)}")
+print("parameter        true    mean   scatter  stated error  coverage of the 95 % interval")
+for i, name in enumerate(fits[0].names):
+    print(
+        f"{name:15s} {true_value[i]:5.2f} {values[:, i].mean():7.4f} {values[:, i].std(ddof=1):8.4f}"
+        f" {np.median(stated[:, i]):12.4f} {100 * inside[:, i].mean():10.1f} %"
+    )
+assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.04)  # three standard deviations of a count
+
+# %%
+figure = Figure(figsize=(8, 2.8), layout="constrained")
+for i, axes in enumerate(figure.subplots(1, 3)):
+    axes.hist(values[:, i], bins=30, color="#56B4E9")
+    axes.axvline(true_value[i], color="black", lw=1)
+    axes.set_xlabel(fits[0].names[i])
+    axes.spines[["top", "right"]].set_visible(False)
+figure
+
+# %%
+print(f"run time {time.perf_counter() - began:.0f} s")

@@ -1,0 +1,411 @@
+"""Fits with a closed form, recovery of known parameters, honesty about what cannot be known."""
+
+import json
+from importlib.resources import files
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from scipy import stats
+
+import jimpact as ji
+from jimpact.laws.base import Law
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.status import CODE
+
+DATA = files("jimpact") / "data"
+PAIR = ji.chain([1.0, 2.0])
+BALLS = ji.chain([1.0, 1.0, 1.0])
+SHOTS = np.array([[1.0, 0.0], [2.0, 0.3], [1.5, -1.0], [0.8, 0.1]])
+
+
+def simulated(law, scene, pre, noise=0.0, seed=0):
+    exact = np.array([ji.impact(law, scene, v).velocity for v in pre])
+    return exact + noise * np.random.default_rng(seed).normal(size=exact.shape)
+
+
+def newton_in_closed_form(post, weight, pre=SHOTS, scene=PAIR):
+    """v+ is linear in e: e and its error by linear regression."""
+    at_0 = simulated(ji.Newton(0.0), scene, pre)
+    slope = simulated(ji.Newton(1.0), scene, pre) - at_0
+    known = ~np.isnan(post)
+    w, x, y = weight[known], slope[known], (post - at_0)[known]
+    e = (w**2 * x) @ y / ((w * x) @ (w * x))
+    rest = float(np.sum((w * (y - e * x)) ** 2))
+    return e, 1 / np.sqrt(float((w * x) @ (w * x))), rest
+
+
+# --------------------------------------------------------------------- closed forms
+
+
+def test_single_contact_newton_is_the_velocity_ratio():
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments([1.0, 0.0], [-0.1, 0.55]), starts=1)
+    np.testing.assert_allclose(found.law.restitution, 0.65, rtol=1e-8)  # -gamma+ / gamma-
+    assert found.law.restitution.shape == ()
+    assert found.converged
+
+
+def test_errors_from_the_residual_are_those_of_linear_regression():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    e, error, rest = newton_in_closed_form(post, np.ones_like(post))
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    noise = np.sqrt(rest / 7)
+    np.testing.assert_allclose(found.value, [e], rtol=1e-10)
+    np.testing.assert_allclose(found.noise, noise, rtol=1e-10)
+    np.testing.assert_allclose(found.standard_error, [noise * error], rtol=1e-10)
+    np.testing.assert_allclose(found.rms, np.sqrt(rest / 8), rtol=1e-10)
+    half = stats.t.ppf(0.95, 7) * noise * error
+    np.testing.assert_allclose(found.confidence_interval(0.9), [[e - half, e + half]], rtol=1e-9)
+    np.testing.assert_allclose(found.residual, post - found.predicted, atol=1e-15)
+
+
+def test_given_errors_weigh_and_are_not_rescaled():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    sigma = np.random.default_rng(1).uniform(0.01, 0.1, post.shape)
+    e, error, _ = newton_in_closed_form(post, 1 / sigma)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma))
+    np.testing.assert_allclose(found.value, [e], rtol=1e-10)
+    np.testing.assert_allclose(found.standard_error, [error], rtol=1e-10)
+    half = stats.norm.ppf(0.975) * error
+    np.testing.assert_allclose(found.confidence_interval(), [[e - half, e + half]], rtol=1e-9)
+
+
+def test_missing_values_do_not_count():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    post[0, 1] = post[2, 0] = np.nan
+    e, error, rest = newton_in_closed_form(post, np.ones_like(post))
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    np.testing.assert_allclose(found.value, [e], rtol=1e-10)
+    np.testing.assert_allclose(found.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-10)
+    assert found.degrees_of_freedom == 5
+    assert np.isnan(found.residual[0, 1])
+
+
+def test_corrected_momentum_costs_degrees_of_freedom():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    data = ji.Experiments(SHOTS, post).momentum_corrected(PAIR)
+    assert ji.fit(ji.Newton(0.9), PAIR, data).degrees_of_freedom == 8 - 4 - 1
+
+
+def test_stated_errors_that_are_too_small_are_noticed():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.1)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.01))
+    assert any("times what sigma allows" in line for line in found.warnings)
+
+
+# --------------------------------------------------------------------- methods, bounds
+
+
+@pytest.mark.parametrize("method", ["adam", "sgd", "lbfgs", optax.rmsprop(0.01)])
+def test_gradient_descent_agrees_with_levenberg_marquardt(method):
+    post = simulated(ji.Newton([0.6, 0.3]), BALLS, PRE_3, noise=0.01)
+    data = ji.Experiments(PRE_3, post)
+    law = ji.Newton([0.9, 0.9])
+    best = ji.fit(law, BALLS, data)
+    found = ji.fit(law, BALLS, data, method=method, starts=2)
+    assert found.converged or method not in ("adam", "sgd", "lbfgs")
+    tolerance = 1e-3 if found.converged else 0.2
+    assert np.all(np.abs(found.value - best.value) < tolerance * best.standard_error)
+    assert found.method == (method if isinstance(method, str) else "optax")
+
+
+PRE_3 = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, -2.0], [1.0, 0.5, 0.0]])
+
+
+def test_too_few_steps_are_told():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
+    found = ji.fit(ji.Newton(0.9), PAIR, data, method="adam", starts=1, max_steps=3)
+    assert not found.converged
+    assert "not converged" in " ".join(found.warnings)
+    assert "NOT converged" in str(found)
+
+
+def test_carts_that_stick_end_at_the_bound():
+    data = ji.read_experiments(DATA / "air_track.csv")
+    for law in (ji.Newton(0.3), ji.Newton(0.0)):
+        found = ji.fit(law, ji.chain([0.34175, 0.15449]), data)
+        assert float(found.law.restitution) == 0.0
+        assert found.at_bound[0]
+        assert "restitution ends at its bound 0" in " ".join(found.warnings)
+        assert "The data break momentum" in found.warnings[0]
+        assert found.confidence_interval()[0, 0] == 0.0
+
+
+def test_user_bounds_hold():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS))
+    found = ji.fit(ji.Newton(0.9), PAIR, data, bounds={"restitution": (0.8, 0.95)})
+    np.testing.assert_allclose(found.value, [0.8])
+    assert found.at_bound.all()
+
+
+def test_starts_are_reproducible():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05))
+    first, again = (ji.fit(ji.Newton(0.9), PAIR, data, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first.value, again.value)
+
+
+# --------------------------------------------------------------------- LZB
+
+
+def test_three_measured_balls_with_one_e():
+    data = ji.read_experiments(DATA / "three_balls.csv")
+    found = ji.fit(ji.LZB(0.95), BALLS, data, free="restitution")
+    np.testing.assert_allclose(found.value, [0.9911], atol=1e-4)
+    np.testing.assert_allclose(found.rms, 0.0166, atol=5e-5)
+    assert found.law.restitution.shape == ()
+    corrected = ji.fit(ji.LZB(0.95), BALLS, data.momentum_corrected(BALLS), free="restitution")
+    np.testing.assert_allclose(corrected.value, [0.9911], atol=1e-4)
+    np.testing.assert_allclose(corrected.rms, 0.0089, atol=5e-5)
+    assert corrected.warnings == ()
+    assert "1.0422" in found.warnings[0]
+    assert "1.0103" in found.warnings[1]
+
+
+@pytest.fixture(scope="module")
+def rank_2_of_3():
+    data = ji.read_experiments(DATA / "three_balls.csv")
+    return ji.fit(ji.LZB([0.95, 0.95], [1.0, 1.0]), BALLS, data)
+
+
+def test_one_shot_of_three_balls_determines_two_of_three(rank_2_of_3):
+    found = rank_2_of_3
+    assert found.names == ("restitution[1]", "restitution[2]", "stiffness[2]")
+    assert found.rank == 2
+    assert np.isinf(found.standard_error).all()
+    assert found.law.stiffness[0] == 1.0
+    held, unseen = found.identifiability
+    assert "stiffness[1] is held" in held
+    assert all(name in unseen for name in found.names)
+    assert "The data determine 2 of 3 parameters" in " ".join(found.warnings)
+    np.testing.assert_allclose(found.rms, 0.0422 / 3, rtol=1e-6)  # the momentum defect alone
+
+
+def test_the_unseen_combination_is_really_unseen(rank_2_of_3):
+    law, words = rank_2_of_3.law, rank_2_of_3.identifiability[1]
+    step = {}
+    for name in rank_2_of_3.names:
+        way, _, size, *rest = words.split(f"{name} goes ")[1].split(" ")[:4]
+        relative = 0.01 if rest and rest[0].startswith("%") else 1.0
+        step[name] = float(size.rstrip(".,")) * relative * (1 if way == "up" else -1)
+    moved = ji.LZB(
+        [float(law.restitution[i]) + step[f"restitution[{i + 1}]"] for i in (0, 1)],
+        [1.0, float(law.stiffness[1]) * (1 + step["stiffness[2]"])],
+    )
+    change = ji.impact(moved, BALLS, [1.0, 0, 0]).velocity - rank_2_of_3.predicted[0]
+    alone = ji.LZB(law.restitution, moved.stiffness)
+    seen = ji.impact(alone, BALLS, [1.0, 0, 0]).velocity - rank_2_of_3.predicted[0]
+    # two digits of the steps are told, second order remains
+    assert np.abs(change).max() < 0.05 * np.abs(seen).max()
+
+
+def test_known_parameters_are_recovered_from_varied_shots():
+    truth = ji.LZB([0.9, 0.7], [1.0, 2.0])
+    data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
+    found = ji.fit(ji.LZB([0.8, 0.8], [1.0, 1.0]), BALLS, data)
+    assert found.rank == 3
+    np.testing.assert_allclose(found.value, [0.9, 0.7, 2.0], rtol=1e-6)
+    assert type(found.law) is ji.LZB
+    assert found.identifiability == (
+        "stiffness[1] is held at its start: with equal exponents only stiffness ratios matter.",
+    )
+
+
+def test_masks_groups_and_held_contacts():
+    truth = ji.LZB([0.9, 0.9], [3.0, 6.0])
+    data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
+    start = ji.LZB([0.8, 0.9], [3.0, 5.0])
+    tied = ji.fit(start, BALLS, data, {"restitution": [1, 1], "stiffness": True})
+    assert tied.names == ("restitution", "stiffness[2]")
+    np.testing.assert_allclose(tied.law.restitution, [0.9, 0.9], rtol=1e-6)
+    np.testing.assert_allclose(tied.law.stiffness, [3.0, 6.0], rtol=1e-6)
+    masked = ji.fit(start, BALLS, data, {"restitution": [True, False], "stiffness": [False, True]})
+    assert masked.names == ("restitution[1]", "stiffness[2]")
+    np.testing.assert_allclose(masked.value, [0.9, 6.0], rtol=1e-6)
+    assert masked.law.restitution[1] == 0.9
+
+
+def test_a_free_exponent():
+    truth = ji.LZB(0.9, exponent=1.3)
+    data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
+    start = ji.LZB(0.8, exponent=jnp.asarray(1.5))
+    found = ji.fit(start, BALLS, data, ("restitution", "exponent"), starts=2)
+    np.testing.assert_allclose(found.value, [0.9, 1.3], rtol=1e-5)
+
+
+def test_a_contact_that_is_never_loaded_is_named():
+    pre = [[1.0, 0.0, 5.0], [2.0, 0.0, 5.0], [1.0, -1.0, 5.0], [3.0, 0.0, 9.0]]  # 3 runs away
+    data = ji.Experiments(pre, simulated(ji.LZB([0.9, 0.5], [1.0, 1.0]), BALLS, pre))
+    found = ji.fit(ji.LZB([0.8, 0.8], [1.0, 1.0]), BALLS, data)
+    assert found.rank == 1
+    told = " ".join(found.identifiability)
+    assert "cannot see restitution[2]: no measured velocity depends on it" in told
+    assert "cannot see stiffness[2]: no measured velocity depends on it" in told
+    np.testing.assert_allclose(found.value[0], 0.9, rtol=1e-6)
+    assert np.isfinite(found.standard_error[0])
+    np.testing.assert_array_equal(found.standard_error[1:], np.inf)
+
+
+# --------------------------------------------------------------------- any law
+
+
+class Coupled(Law):
+    """A law made for the tests: gamma+ = -matrix gamma-, with a switch to misbehave."""
+
+    matrix: jax.Array
+    broken_below: float = -np.inf
+
+    def impulse(self, delassus, gap_velocity):
+        w = as_matrix(delassus)
+        change = -(self.matrix + jnp.eye(len(w))) @ gap_velocity
+        bad = self.matrix[0, 0] < self.broken_below
+        p = jnp.where(bad, jnp.nan, jnp.linalg.solve(w, change))
+        return p, jnp.where(bad, CODE["max_steps"], CODE["ok"])
+
+
+class Even(Law):
+    """v+ depends on root^2 only: two minima."""
+
+    root: jax.Array
+
+    def impulse(self, delassus, gap_velocity):
+        change = -(1 + self.root**2) * gap_velocity
+        return jnp.linalg.solve(as_matrix(delassus), change), jnp.asarray(CODE["ok"])
+
+
+def test_a_law_with_a_matrix_field():
+    truth = Coupled(jnp.array([[0.6, 0.1], [0.05, 0.4]]))
+    data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
+    found = ji.fit(Coupled(jnp.eye(2)), BALLS, data, free="matrix", starts=2)
+    assert found.names == ("matrix[1,1]", "matrix[1,2]", "matrix[2,1]", "matrix[2,2]")
+    np.testing.assert_allclose(found.law.matrix, truth.matrix, atol=1e-9)
+    mask = [[True, False], [False, True]]
+    diagonal = ji.fit(Coupled(truth.matrix), BALLS, data, free={"matrix": mask}, starts=2)
+    assert diagonal.names == ("matrix[1,1]", "matrix[2,2]")
+
+
+def test_trials_that_fail_do_not_poison_the_fit():
+    truth = Coupled(jnp.array([[0.6, 0.1], [0.05, 0.4]]), broken_below=0.3)
+    data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
+    bounds = {"matrix": (-1.0, 1.0)}  # a third of the random starts fail at once
+    found = ji.fit(Coupled(jnp.eye(2), 0.3), BALLS, data, "matrix", bounds=bounds)
+    np.testing.assert_allclose(found.law.matrix, truth.matrix, atol=1e-9)
+    assert np.isfinite([start.sum_of_squares for start in found.starts]).all()
+
+
+def test_a_fitted_law_that_fails_is_told():
+    pre = [[1.0, 0.0, -1.0]]
+    truth = Coupled(jnp.array([[1.2, 0.0], [0.0, 1.2]]))  # gains energy
+    data = ji.Experiments(pre, simulated(truth, BALLS, pre))
+    found = ji.fit(truth, BALLS, data, {"matrix": [[1, 0], [0, 1]]}, starts=2)
+    assert "fails in 1 of 1 shots (1): energy_gain" in " ".join(found.warnings)
+
+
+def test_minima_that_fit_equally_well_are_told():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.49), PAIR, SHOTS, noise=0.001))
+    found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root")
+    np.testing.assert_allclose(sorted(s.value[0] for s in found.starts), [-0.7, 0.7], atol=2e-3)
+    assert sum(s.count for s in found.starts) + found.lost_starts == 8
+    assert found.value[0] > 0  # the first start leads there
+    assert "2 different minima fit equally well" in " ".join(found.warnings)
+
+
+def test_one_scene_a_shot():
+    scenes = [ji.chain([1.0, 2.0]), ji.chain([3.0, 1.0]), ji.chain([1.0, 1.0])]
+    pre = SHOTS[:3]
+    post = [ji.impact(ji.Newton(0.6), s, v).velocity for s, v in zip(scenes, pre)]
+    data = ji.Experiments(pre, np.array(post), scenes=scenes)
+    found = ji.fit(ji.Newton(0.9), None, data)
+    np.testing.assert_allclose(found.value, [0.6], rtol=1e-9)
+    assert found.warnings == ()
+
+
+def test_the_widest_precision_counts():
+    narrow = jnp.asarray(simulated(ji.Newton(0.6), PAIR, SHOTS), jnp.float32)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, narrow), starts=1)
+    assert found.law.restitution.dtype == jnp.float64
+    mixed = ji.Experiments(jnp.asarray(SHOTS, jnp.float32), narrow, sigma=0.1)
+    assert ji.fit(ji.Newton(0.9), PAIR, mixed, starts=1).law.restitution.dtype == jnp.float64
+
+
+def test_float32_works_and_says_so():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS)
+    with jax.enable_x64(False):
+        found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 2.0]), ji.Experiments(SHOTS, post))
+    np.testing.assert_allclose(found.value, [0.6], rtol=1e-4)
+    assert "float32" in " ".join(found.warnings)
+
+
+# --------------------------------------------------------------------- what is refused
+
+TWO = ji.Experiments(SHOTS, SHOTS)
+THREE = ji.Experiments(PRE_3, PRE_3)
+PER_CONTACT = ji.LZB([0.9, 0.9], [1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("law", "scene", "data", "options", "message"),
+    [
+        (ji.Newton(0.9), PAIR, TWO, {"free": "elasticity"}, r"parameters of Newton, one of restitution, but has 'elasticity'"),
+        (ji.Newton(0.9), PAIR, TWO, {"free": ()}, r"leaves none free"),
+        (ji.Newton(0.9), PAIR, TWO, {"free": {"restitution": False}}, r"leaves none free"),
+        (PER_CONTACT, BALLS, THREE, {"free": {"restitution": [True]}}, r"mask of shape \(2,\) for `restitution`"),
+        (ji.LZB(0.9), BALLS, THREE, {"free": {"restitution": [True, True]}}, r"one value for all contacts \(tied\)"),
+        (ji.Newton(0.9), PAIR, TWO, {"free": {"restitution": 0.5}}, r"True, False, a boolean mask or numbers of groups"),
+        (ji.LZB(0.9), BALLS, THREE, {}, r"must not hold a scalar `stiffness`.*a common factor"),
+        (PER_CONTACT, BALLS, THREE, {"free": {"stiffness": [1, 1]}}, r"must not hold a scalar `stiffness`"),
+        (ji.LZB(0.9), BALLS, THREE, {"free": "exponent"}, r"`exponent`: it is a fixed number.*exponent=jnp.asarray"),
+        (ji.Newton(0.9), PAIR, TWO, {"bounds": {"restitution": (0.0, 0.5)}}, r"include the start of `restitution`, 0.9, but is \[0, 0.5\]"),
+        (ji.Newton(0.9), PAIR, TWO, {"bounds": {"restitution": (0.95, 0.5)}}, r"low < high for `restitution`"),
+        (ji.Newton(0.9), PAIR, TWO, {"bounds": {"restitution": (0.0, 2.0)}}, r"lie in \[0, 1\] for `restitution`"),
+        (ji.Newton(0.9), PAIR, TWO, {"bounds": {"restitution": 0.5}}, r"map `restitution` to \(low, high\)"),
+        (ji.Newton(0.9), PAIR, TWO, {"bounds": {"stiffness": (1.0, 2.0)}}, r"name free parameters, restitution, but has 'stiffness'"),
+        (PER_CONTACT, BALLS, THREE, {"bounds": {"stiffness": (0.0, 2.0)}}, r"must be > 0 for `stiffness`"),
+        (ji.Newton(0.9), BALLS, TWO, {}, r"one velocity per body of the scene: it has 2 a shot, but the scene has 3"),
+        (ji.Newton(0.9), None, TWO, {}, r"`scene` must be a Scene"),
+        (ji.Newton([0.9, 0.9]), PAIR, TWO, {}, r"`restitution` must have shape \(1,\)"),
+        (ji.Newton(0.9), PAIR, TWO, {"method": "newton"}, r"`method` must be one of 'levenberg-marquardt', .*'newton'"),
+        (ji.Newton(0.9), PAIR, TWO, {"starts": 0}, r"`starts` must be an integer >= 1"),
+        (ji.Newton(0.9), PAIR, TWO, {"max_steps": 0}, r"`max_steps` must be an integer >= 1"),
+    ],
+)  # fmt: skip
+def test_bad_arguments(law, scene, data, options, message):
+    with pytest.raises(ValueError, match=message):
+        ji.fit(law, scene, data, **options)
+
+
+def test_bad_level():
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1)
+    with pytest.raises(ValueError, match=r"`level` must lie in \(0, 1\)"):
+        found.confidence_interval(95)
+
+
+# --------------------------------------------------------------------- report
+
+
+def test_report_and_json(rank_2_of_3):
+    text = str(rank_2_of_3)
+    assert "rank           2 of 3 parameters" in text
+    assert "unseen" in text
+    told = json.loads(json.dumps(rank_2_of_3.to_dict(), allow_nan=False))
+    assert [p["seen"] for p in told["parameters"]] == [False] * 3
+    assert told["parameters"][0]["standard_error"] is None
+    assert told["rank"] == 2
+    assert told["shots"] == ["1"]
+
+
+def test_no_degree_of_freedom_leaves_errors_unknown():
+    data = ji.Experiments([1.0, 0.0], [np.nan, 0.6])
+    found = ji.fit(ji.Newton(0.9), PAIR, data, starts=1)
+    assert np.isnan(found.standard_error[0])
+    assert "unknown" in str(found)
+    assert "No degree of freedom" in " ".join(found.warnings)
+
+
+def test_a_progress_bar_can_be_asked_for(capsys):
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
+    ji.fit(ji.Newton(0.9), PAIR, data, progress=True)
+    assert "starts done" in capsys.readouterr().err
+    ji.fit(ji.Newton(0.9), PAIR, data)  # no terminal: no bar
+    assert capsys.readouterr().err == ""
