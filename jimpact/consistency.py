@@ -9,6 +9,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape
 from jimpact.impacts import SIGN_TOLERANCE, Impact
+from jimpact.numerics.tridiagonal import diagonal
 from jimpact.scene import (
     Scene,
     delassus_matrix,
@@ -16,7 +17,6 @@ from jimpact.scene import (
     kinetic_energy,
     momentum,
 )
-from jimpact.numerics.tridiagonal import diagonal
 from jimpact.status import STATUS
 
 

@@ -70,7 +70,9 @@ corrected = measured.momentum_corrected(balls)
 lzb_corrected = ji.fit(ji.LZB(0.95), balls, corrected, free="restitution")
 newton = ji.fit(ji.Newton(0.5), balls, measured)
 for name, fit in (("LZB", lzb), ("LZB, corrected", lzb_corrected), ("Newton", newton)):
-    print(f"{name:16s} e = {fit.value[0]:.4f} ± {fit.standard_error[0]:.4f}   rms {fit.rms:.4f} m/s")
+    print(
+        f"{name:16s} e = {fit.value[0]:.4f} ± {fit.standard_error[0]:.4f}   rms {fit.rms:.4f} m/s"
+    )
 
 # %% [markdown]
 # Newton's law lets the two resting balls leave together, whatever $e$: it cannot disperse the

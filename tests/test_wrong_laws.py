@@ -9,7 +9,7 @@ from test_contract import SCENES, check_promises
 from test_lzb_values import case
 
 import jimpact as ji
-from jimpact.numerics import flow, stepper
+from jimpact.numerics import events, flow, stepper
 
 
 class WrongSign(ji.Newton):
@@ -73,7 +73,7 @@ def check_values_hold():
     ("module", "name", "wrong"),
     [
         (flow, "scales", missing_square),
-        (stepper, "_change_phase", no_recompression),
+        (events, "change_phase", no_recompression),
     ],
 )
 def test_check_values_catch(monkeypatch, module, name, wrong):

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.laws.base import Law
-from jimpact.numerics.flow import Exponent
 from jimpact.numerics.dimensionless import METHODS, solve, to_dimensionless
+from jimpact.numerics.flow import Exponent
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}

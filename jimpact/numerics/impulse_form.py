@@ -14,7 +14,6 @@ import jax.numpy as jnp
 
 from jimpact.numerics.flow import Flow, power
 
-
 EMPTY = 1e-14  # energy below this part of the largest is rounding: the contact is unloaded
 
 

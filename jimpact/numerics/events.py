@@ -1,0 +1,172 @@
+"""Changes of phase of the contacts: where a trial step meets one, and what it does to the state.
+
+A margin is the distance to a change of phase, >= 0 while the phase lasts: minus the gap velocity
+in compression, gap velocity and indentation in expansion, gap velocity of an open contact.
+Nothing here is differentiated but `change_phase`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.flow import (
+    COMPRESSION,
+    EXPANSION,
+    OPEN,
+    ROOT_X,
+    ZERO_G,
+    Flow,
+    State,
+    field,
+    plus_one,
+    power,
+)
+
+SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
+NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact
+SHORTEST = 1e-13  # a step this small cannot be resolved: the pending event is taken at once
+
+
+class Margin(NamedTuple):
+    """Distances (m,) to a change of phase by indentation and by gap velocity."""
+
+    x: jax.Array
+    g: jax.Array
+
+
+class Events(NamedTuple):
+    """What a trial step of length `span` in time has met."""
+
+    inside: jax.Array  # an event lies inside the step
+    at_once: jax.Array  # (m,) these contacts change phase where the step begins
+    opens: jax.Array  # (m,) of those and of the landing target: changes by opening
+    first: jax.Array  # fraction of the step up to the earliest event
+    by_opening: jax.Array  # the earliest event is an opening
+    target: jax.Array  # (m,) one-hot, its contact
+    monotone: jax.Array  # its variable runs towards it from the beginning of the step
+
+
+def matters(
+    flow: Flow, tolerance: jax.Array, state: State, part: float = NEGLIGIBLE + 2 * SNAP
+) -> jax.Array:
+    """Whether load and velocity of each contact are more than `part` of the tolerance."""
+    total = power(state.x, plus_one(flow.exponent)) + state.g**2
+    return jax.lax.stop_gradient(total > (part * tolerance) ** 2)
+
+
+def find(
+    flow: Flow,
+    tolerance: jax.Array,
+    phase: jax.Array,
+    kind: jax.Array,
+    target: jax.Array,
+    span: jax.Array,
+    state: State,
+    new: State,
+) -> Events:
+    """Events between `state` and `new`; the one a landing step ends on is not among them."""
+    snap = SNAP * tolerance
+    before, after = _margins(tolerance, phase, state), _margins(tolerance, phase, new)
+    slope, slope_end = _slopes(flow, phase, state), _slopes(flow, phase, new)
+    landing = (kind == ZERO_G) | (kind == ROOT_X)
+    crossed_g = ~(target & (kind == ZERO_G)) & (after.g < -snap)
+    crossed_x = ~(target & (kind == ROOT_X)) & (after.x < -snap)
+    dipped = ~landing & _dips(before.g, after.g, slope.g * span, slope_end.g * span, snap)
+    idle = ~matters(flow, tolerance, state) & ~matters(flow, tolerance, new)
+    at_once = (crossed_g & (before.g <= snap) & (slope.g <= 0)) | (
+        (crossed_g | crossed_x) & ((span < SHORTEST) | idle)
+    )
+    at_g = jnp.where(crossed_g, _crossing(before.g, after.g, slope.g * span), jnp.inf)
+    at_x = jnp.where(crossed_x, _crossing(before.x, after.x, slope.x * span), jnp.inf)
+    at_dip = jnp.where(dipped, _dip_at(before.g, after.g, slope.g * span), jnp.inf)
+    by_opening = jnp.min(at_x) <= jnp.min(at_g)
+    crossing = jnp.minimum(jnp.min(at_x), jnp.min(at_g))
+    soonest = jnp.where(by_opening, jnp.argmin(at_x), jnp.argmin(at_g))
+    next_target = jnp.arange(phase.shape[0]) == soonest
+    heads_x = next_target & (slope.x < 0)
+    heads_g = next_target & (slope.g < 0) & (before.g > snap)
+    return Events(
+        inside=jnp.any(crossed_g | crossed_x | dipped),
+        at_once=at_once,
+        opens=(phase == EXPANSION) & jnp.where(at_once, crossed_x, target & (kind == ROOT_X)),
+        first=jnp.minimum(crossing, jnp.min(at_dip)),
+        by_opening=by_opening,
+        target=next_target,
+        monotone=jnp.any(jnp.where(by_opening, heads_x, heads_g))
+        & jnp.isfinite(crossing)
+        & (crossing <= jnp.min(at_dip)),
+    )
+
+
+def change_phase(
+    flow: Flow, phase: jax.Array, state: State, arrived: jax.Array, opened: jax.Array
+) -> tuple[State, jax.Array, jax.Array]:
+    """State and phases once the contacts `arrived` have changed theirs, and which closed.
+
+    `gamma` stays continuous: an opening contact returns from `g = gamma / e` to `gamma`.
+    """
+    opened = arrived & opened
+    turned = jnp.where(state.x > 0, EXPANSION, OPEN)
+    following = jnp.where(phase == COMPRESSION, turned, COMPRESSION)
+    following = jnp.where(opened, OPEN, following)
+    new_phase = jnp.where(arrived, following, phase).astype(jnp.int32)
+    g = jnp.where(opened, flow.restitution * state.g, state.g)
+    at_rest = arrived & ~opened & (phase != OPEN)
+    g = jnp.where(at_rest, 0.0, g)
+    x = jnp.where(new_phase == OPEN, 0.0, state.x)
+    return state._replace(x=x, g=g), new_phase, arrived & (phase == OPEN)
+
+
+def next_opening(flow: Flow, phase: jax.Array, state: State) -> tuple[jax.Array, jax.Array]:
+    """Expected time to the next opening, and its contact (m,) one-hot."""
+    dx, _, _, _ = field(flow, phase, state.x, state.g)
+    expanding = (phase == EXPANSION) & (dx < 0)
+    x = jnp.maximum(state.x, 0.0)
+    due = jnp.where(expanding, x / jnp.where(expanding, -dx, 1.0), jnp.inf)
+    return jnp.min(due), jnp.arange(due.shape[0]) == jnp.argmin(due)
+
+
+def _signs(phase: jax.Array) -> jax.Array:
+    return jnp.where(phase == COMPRESSION, -1.0, 1.0)
+
+
+def _margins(tolerance: jax.Array, phase: jax.Array, state: State) -> Margin:
+    slack = jnp.where(phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
+    g = _signs(phase) * state.g + slack
+    return Margin(jnp.where(phase == EXPANSION, state.x, 1.0), g)
+
+
+def _slopes(flow: Flow, phase: jax.Array, state: State) -> Margin:
+    dx, dg, _, _ = field(flow, phase, state.x, state.g)
+    return Margin(jnp.where(phase == EXPANSION, dx, 0.0), _signs(phase) * dg)
+
+
+def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
+    """First root in (0, 1] of the parabola through f0 >= 0, its slope there, and f1 < 0."""
+    f0 = jnp.maximum(f0, 0.0)
+    a = f1 - f0 - slope
+    root = jnp.sqrt(jnp.maximum(slope**2 - 4 * a * f0, 0.0))
+    denominator = root - slope
+    falling = 2 * f0 / jnp.where(denominator == 0, 1.0, denominator)
+    rising = (slope + root) / jnp.where(a == 0, 1.0, -2 * a)
+    return jnp.clip(jnp.where(slope <= 0, falling, rising), 0.0, 1.0)
+
+
+def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.Array) -> jax.Array:
+    """Whether the cubic through both ends falls below zero between them and returns."""
+    candidates = (d0 < 0) & (d1 > 0) & (f0 > snap) & (f1 >= -snap)
+    u = _dip_at(f0, f1, d0)
+    value = (
+        f0 * (1 + 2 * u) * (1 - u) ** 2
+        + d0 * u * (1 - u) ** 2
+        + f1 * u**2 * (3 - 2 * u)
+        + d1 * u**2 * (u - 1)
+    )
+    return candidates & (value < -snap)
+
+
+def _dip_at(f0: jax.Array, f1: jax.Array, d0: jax.Array) -> jax.Array:
+    """Minimum of the parabola through f0, its slope d0 < 0, and f1."""
+    a = f1 - f0 - d0
+    return jnp.clip(-d0 / jnp.where(a == 0, 1.0, 2 * a), 0.0, 1.0)

@@ -1,0 +1,46 @@
+"""The end of an impact: nothing at work, or only contacts that do not feel each other.
+
+A contact j that works alone keeps `x_j^(eta_j+1) + g_j^2`, so its rebound is
+`gamma_j+ = e_j sqrt(x_j^(eta_j+1) + g_j^2)`, whatever part of its stroke lies behind it.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.events import matters
+from jimpact.numerics.flow import Flow, State, plus_one, power, scales
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
+
+RESIDUAL = 1.0  # loads and velocities below this part of the tolerance end the impact
+
+
+def finish(
+    flow: Flow, tolerance: jax.Array, phase: jax.Array, state: State, closed_form: bool
+) -> tuple[jax.Array, State]:
+    """Whether the rest follows in closed form (False: only where nothing is left), and the end."""
+    s, _, _ = scales(flow, phase)
+    gamma = s * state.g
+    at_work = ((state.x > 0) | (gamma < 0)) & matters(flow, tolerance, state, RESIDUAL)
+    total = power(state.x, plus_one(flow.exponent)) + state.g**2
+    rebound = flow.restitution * jnp.sqrt(jnp.where(at_work, total, 1.0))
+    dp = jnp.where(at_work, rebound - gamma, 0.0)
+    strength, pull = _beside(flow.coupling)
+    coupled = at_work & (strength @ at_work.astype(gamma.dtype) > 0)
+    pressed = ~at_work & (gamma + pull @ dp < -RESIDUAL * tolerance)
+    alone = ~jnp.any(coupled | pressed) if closed_form else ~jnp.any(at_work)
+    end = State(
+        x=jnp.zeros_like(state.x),
+        g=jnp.where(at_work, rebound, gamma),
+        p=state.p + dp,
+        t=state.t,
+    )
+    return alone, end
+
+
+def _beside(coupling: Symmetric) -> tuple[Symmetric, Symmetric]:
+    """`|G|` and `min(G, 0)` without the diagonal."""
+    if isinstance(coupling, Tridiagonal):
+        none, off = jnp.zeros_like(coupling.diagonal), coupling.off_diagonal
+        return Tridiagonal(none, jnp.abs(off)), Tridiagonal(none, jnp.minimum(off, 0.0))
+    off = coupling * (1 - jnp.eye(coupling.shape[0], dtype=coupling.dtype))
+    return jnp.abs(off), jnp.minimum(off, 0.0)
