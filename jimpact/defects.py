@@ -17,6 +17,8 @@ def data_defects(
 ) -> list[str]:
     """What the data break beyond their error: at most one line each for momentum and energy.
 
+    Momentum is told as `1 + excess / sum |m v-|`: after over before where all bodies move one way.
+
     Args:
         experiments: the shots; those with missing values are not judged.
         scene: the common scene, None where the shots carry their own.
@@ -25,7 +27,7 @@ def data_defects(
     >>> import jimpact as ji
     >>> from jimpact.defects import data_defects
     >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
-    'The data gain energy (after / before): shot 1: 1.4400.'
+    'The data gain energy (1 = conserved): shot 1: 1.4400.'
     """
     momentum, energy = {}, {}
     energy_ratios = experiments.energy_ratio(scene)
@@ -34,10 +36,10 @@ def data_defects(
             continue
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma[k], float)
         for row in rows:
-            excess, before = row @ (post - pre), row @ pre
+            excess, scale = row @ (post - pre), np.abs(row) @ np.abs(pre)
             error = None if sigma is None else float(np.linalg.norm(row * sigma))
-            if _is_defect(excess, np.abs(row) @ np.abs(pre), error):
-                momentum[k] = (before + excess) / before if before else np.inf
+            if _is_defect(excess, scale, error):
+                momentum[k] = 1 + excess / scale if scale else np.inf
         mass = dense_mass(experiments.scene_of(scene, k))
         t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
         error = None if sigma is None else float(np.linalg.norm((mass @ post) * sigma))
@@ -47,11 +49,11 @@ def data_defects(
     lines = []
     if momentum:
         lines.append(
-            f"The data break momentum (after / before): {_listed(experiments, momentum)}; "
+            f"The data break momentum (1 = conserved): {_listed(experiments, momentum)}; "
             f"no law can reproduce that part{_floor(experiments, scene)}."
         )
     if energy:
-        lines.append(f"The data gain energy (after / before): {_listed(experiments, energy)}.")
+        lines.append(f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.")
     return lines
 
 

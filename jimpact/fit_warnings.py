@@ -5,6 +5,7 @@ import numpy as np
 from jimpact.defects import data_defects
 from jimpact.experiments import Experiments
 from jimpact.fit_problem import Problem
+from jimpact.laws.base import Law
 from jimpact.multistart import EXACT, Search
 from jimpact.parameters import Parameters
 from jimpact.scene import Scene
@@ -20,6 +21,7 @@ TOO_MUCH_SCATTER = 2.0
 
 
 def fit_warnings(
+    law: Law,
     problem: Problem,
     parameters: Parameters,
     experiments: Experiments,
@@ -28,10 +30,13 @@ def fit_warnings(
     spread: Uncertainty,
 ) -> list[str]:
     """All warnings, those about the data first."""
-    stored = float(np.sum(problem.law.stored_energy(experiments.scene_of(scene, 0).contacts)))
+    stored = float(np.sum(law.stored_energy(experiments.scene_of(scene, 0).contacts)))
     lines = data_defects(experiments, scene, stored)
     if not found.converged:
-        lines.append("The fit has not converged: allow more `max_steps` or `starts`.")
+        lines.append(
+            "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
+            "a kink of the law, where the sequence of contacts changes)."
+        )
     lines += _statuses(found.status, experiments.shots)
     names = parameters.names
     for i in np.flatnonzero(found.at_bound):

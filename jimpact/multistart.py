@@ -27,6 +27,9 @@ SLOW = 1e-3
 # within this many natural scales of the user's.
 START_FACTOR = 20.0
 START_SCALES = 2.0
+# Random coefficients of restitution start above this: below, contacts of a chain re-close many
+# times, which takes ten times as long and hardly occurs in hard bodies. (Fits do go there.)
+START_RESTITUTION = 0.3
 
 # Relative sums of squares, and values in natural scales, closer than this are one minimum: a
 # hundred times what solvers leave, and far below what a measurement resolves.
@@ -102,8 +105,8 @@ def _found(problem: Problem, parameters: Parameters, states: State) -> Search:
     squares = 2 * np.asarray(states.cost, float)
     values = from_scaled(np.asarray(y, float), scale, log)
     exact = EXACT[str(y.dtype)]
-    converged = (states.gain * 2 <= CONVERGED * squares) | (squares <= exact)
-    groups = _groups(squares, y, exact)
+    converged = (2 * np.asarray(states.gain) <= CONVERGED * squares) | (squares <= exact)
+    groups = _groups(squares, y, converged, exact)
     best = groups[0][0]
     low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
     # starts that did not converge have no minimum to tell, unless they are the best there is
@@ -129,15 +132,18 @@ def _all_entries(problem: Problem, y: np.ndarray) -> np.ndarray:
     return from_scaled(scaled, np.asarray(problem.scale, float), np.asarray(problem.log))
 
 
-def _groups(squares: np.ndarray, y: np.ndarray, exact: float) -> list[list[int]]:
+def _groups(
+    squares: np.ndarray, y: np.ndarray, converged: np.ndarray, exact: float
+) -> list[list[int]]:
     """Starts that ended in the same minimum, best minimum first.
 
-    Among equally good ones the earliest start comes first: it began at the user's own values.
+    Of equally good ends a converged one comes first, then the earliest start: the first start is
+    the user's own.
     """
     groups: list[list[int]] = []
     least = np.nanmin(squares)
     equal = squares <= least + SAME_COST * least + exact
-    for i in np.lexsort((np.arange(len(y)), np.where(equal, least, squares))):
+    for i in np.lexsort((np.arange(len(y)), ~converged, np.where(equal, least, squares))):
         for group in groups:
             first = group[0]
             close = abs(squares[i] - squares[first]) <= SAME_COST * squares[first] + exact
@@ -159,6 +165,8 @@ def _start_points(problem: Problem, parameters: Parameters, starts: int, seed: i
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
     low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
     high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
+    elastic = [parameters.entry_fields[i] == "restitution" for i in first]
+    low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
     points = np.zeros((starts, len(problem.low)))
     share = np.random.default_rng(seed).random((starts, len(own)))
     points[:, : len(own)] = low + (high - low) * share

@@ -72,7 +72,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     if len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
         axes.set_xlabel("body")
-        axes.set_xlim(-_SPREAD * 0.7, _SPREAD * 0.7)
+        axes.set_xlim(-_SPREAD * 0.5, _SPREAD * 0.5)
         return
     ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
     longest = max(len(labels[k]) for k in ticks)

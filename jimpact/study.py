@@ -103,7 +103,7 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
         given = values["exponent"]
         fixed = tuple(given) if isinstance(given, list) else given
         values["exponent"] = np.asarray(given, float) if "exponent" in free else fixed
-    law = row.law(**values, **row.fixed)
+    law = row.law(**values)
     data = tables["data"]
     _check_keys("[data]", data, _DATA_KEYS, required=("file",))
     experiments = read_experiments(path.parent / data["file"])

@@ -99,8 +99,8 @@ def _in_words(
             parts.append(f"{names[i]} goes {'up' if step[i] > 0 else 'down'} by {change}")
     if len(parts) == 1:
         name = parts[0].split(" ")[0]
-        return f"The data cannot see {name}: no measured velocity depends on it."
+        return f"The data cannot see {name}: no measured velocity depends on it (to first order)."
     return (
-        "The data cannot see a combination: no measured velocity changes when "
+        "The data cannot see a combination: no measured velocity changes (to first order) when "
         f"{', '.join(parts[:-1])} and {parts[-1]} together."
     )

@@ -96,19 +96,19 @@ print("\n".join(three.identifiability))
 
 # %% [markdown]
 # A profile shows the valley: hold the ratio, fit both $e$. Over a whole range of ratios the shot is
-# reproduced exactly; only where an $e$ would have to exceed 1 does the fit get worse. The values
-# that a solver returns for such a fit are one point of this valley, which is why their standard
-# errors are infinite.
+# reproduced exactly; it ends only where an $e$ would have to exceed 1. The values that a solver
+# returns for such a fit are one point of this valley, which is why their standard errors are
+# infinite.
 
 # %%
-ratios = np.geomspace(0.3, 3.0, 41)
+ratios = np.linspace(0.9, 1.4, 51)
 profile = [
     ji.fit(
         ji.LZB([0.95, 0.95], [1.0, ratio]),
         balls,
         corrected,
         free={"restitution": True, "stiffness": False},
-        starts=2,
+        starts=4,
     )
     for ratio in ratios
 ]
@@ -119,7 +119,7 @@ top.set_ylabel("rms residual [m/s]")
 for contact, colour in ((0, "#D55E00"), (1, "#009E73")):
     values = [fit.value[contact] for fit in profile]
     bottom.plot(ratios, values, color=colour, label=f"restitution[{contact + 1}]")
-bottom.set(xscale="log", xlabel="stiffness ratio k2 / k1", ylabel="fitted e")
+bottom.set(xlabel="stiffness ratio k2 / k1", ylabel="fitted e")
 bottom.legend(frameon=False)
 exact = [ratio for ratio, fit in zip(ratios, profile) if fit.rms < 1e-6]
 print(f"reproduced exactly for every ratio from {min(exact):.2f} to {max(exact):.2f}")
@@ -129,10 +129,12 @@ figure
 # ## Known parameters from simulated shots
 #
 # From here on all data are **simulated**. Four kinds of shots, in which the balls come from both
-# sides, determine all three parameters; more shots of the first kind alone would not.
+# sides, determine all three parameters; more shots of the first kind alone would not. The sum of
+# squares has other minima, in which the contacts open and close in another order: the fit starts
+# from several points and lists where they end.
 
 # %%
-truth = ji.LZB([0.9, 0.8], [1.0, 1.5])
+truth = ji.LZB([0.9, 0.95], [1.0, 1.5])
 kinds = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, -1.0], [1.0, 0.5, 0.0]])
 pre = np.tile(kinds, (2, 1))
 noise = 0.01  # m/s
@@ -140,12 +142,13 @@ exact_post = np.array([ji.impact(truth, balls, v).velocity for v in pre])
 start = ji.LZB([0.95, 0.95], [1.0, 1.0])
 
 
-def simulated_fit(seed, starts):
+def simulated_shots(seed):
     error = noise * np.random.default_rng(seed).normal(size=pre.shape)
-    return ji.fit(start, balls, ji.Experiments(pre, exact_post + error), starts=starts)
+    return ji.Experiments(pre, exact_post + error)
 
 
-print(simulated_fit(0, starts=8))
+first = ji.fit(start, balls, simulated_shots(0), starts=8)
+print(first)
 
 # %%
 same = ji.Experiments(np.tile(kinds[:1], (8, 1)), np.tile(exact_post[:1], (8, 1)))
@@ -154,13 +157,16 @@ print("eight shots of the first kind: rank", ji.fit(start, balls, same).rank, "o
 # %% [markdown]
 # ## Are the stated errors true?
 #
-# Repeat the simulated experiment many times and count how often the 95 % confidence interval holds
-# the true value. With N repetitions the count itself scatters: 95 % ± 1.3 % for N = 300.
+# Repeat the simulated experiment and count how often the 95 % confidence interval holds the true
+# value. With 400 repetitions the count itself scatters: 95 % ± 1.1 %. Each fit starts once, from
+# the law just found (one start from further off may end in another minimum).
 
 # %%
-true_value = np.array([0.9, 0.8, 1.5])
-repeats = 300
-fits = [simulated_fit(seed, starts=1) for seed in range(1, repeats + 1)]
+true_value = np.array([0.9, 0.95, 1.5])
+repeats = 400
+fits = [
+    ji.fit(first.law, balls, simulated_shots(seed), starts=1) for seed in range(1, repeats + 1)
+]
 intervals = np.array([fit.confidence_interval(0.95) for fit in fits])
 inside = (intervals[:, :, 0] <= true_value) & (true_value <= intervals[:, :, 1])
 values = np.array([fit.value for fit in fits])
@@ -172,7 +178,7 @@ for i, name in enumerate(fits[0].names):
         f"{name:15s} {true_value[i]:5.2f} {values[:, i].mean():7.4f} {values[:, i].std(ddof=1):8.4f}"
         f" {np.median(stated[:, i]):12.4f} {100 * inside[:, i].mean():10.1f} %"
     )
-assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.04)  # three standard deviations of a count
+assert np.all(np.abs(inside.mean(axis=0) - 0.95) < 0.035)  # three standard deviations of a count
 
 # %%
 figure = Figure(figsize=(8, 2.8), layout="constrained")

@@ -137,9 +137,9 @@ def test_momentum_of_the_measured_balls():
     np.testing.assert_allclose(corrected.post, data.post - 0.0422 / 3, atol=1e-15)
     assert corrected.lost_freedom == 1
     assert data_defects(data, CHAIN) == [
-        "The data break momentum (after / before): shot 1: 1.0422; no law can reproduce that part "
+        "The data break momentum (1 = conserved): shot 1: 1.0422; no law can reproduce that part "
         "(rms 0.0141 m/s).",
-        "The data gain energy (after / before): shot 1: 1.0103.",
+        "The data gain energy (1 = conserved): shot 1: 1.0103.",
     ]
     assert data_defects(corrected, CHAIN) == []
 
@@ -185,6 +185,12 @@ def test_defects_are_held_against_sigma():
     stored = ji.Experiments([1.0, 0.0], [-0.1, 1.1])  # gains 0.11 J
     assert "gain energy" in data_defects(stored, scene)[0]
     assert data_defects(stored, scene, stored_energy=0.2) == []
+
+
+def test_no_momentum_before_leaves_no_ratio():
+    data = ji.Experiments([0.1, -0.3 + 0.2], [0.2, 0.1])
+    assert data.momentum_ratio(ji.chain([1.0, 1.0]))[0, 0] == np.inf
+    assert "shot 1: 2.5000" in data_defects(data, ji.chain([1.0, 1.0]))[0]
 
 
 def test_many_defects_are_summed_up():

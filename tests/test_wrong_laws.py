@@ -9,7 +9,7 @@ from test_contract import SCENES, check_promises
 from test_lzb_values import case
 
 import jimpact as ji
-from jimpact.numerics import events, flow, stepper
+from jimpact.numerics import events, flow, isolated
 
 
 class WrongSign(ji.Newton):
@@ -81,7 +81,7 @@ def test_check_values_catch(monkeypatch, module, name, wrong):
     broken = wrong(getattr(module, name))
     monkeypatch.setattr(module, name, broken)
     if name == "scales":
-        monkeypatch.setattr(stepper, name, broken)
+        monkeypatch.setattr(isolated, name, broken)
     jax.clear_caches()
     try:
         with pytest.raises(AssertionError):

@@ -1,6 +1,6 @@
 """The registry of laws: one row a law. The CLI, the contract tests and the charts read it."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
@@ -22,7 +22,6 @@ class Row(NamedTuple):
     promises: frozenset[str]
     source: str
     bibtex: str
-    fixed: dict[str, Any] = {}
 
 
 BROGLIATO = """@book{brogliato2016,

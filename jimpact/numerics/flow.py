@@ -13,7 +13,7 @@ A step may advance in time or in another variable xi that grows or falls monoton
 
     TIME     xi = t
     START    xi = t^(1/r): an impact begins like x ~ t, and forces t^eta are smooth in xi
-    ZERO_G   xi = g_j, ending on g_j = 0 (or a given value): lands on the event exactly (Henon's trick)
+    ZERO_G   xi = g_j, ending on g_j = 0 (or a given value): lands on the event (Henon's trick)
     ROOT_X   xi = x_j^(1/r), ending on x_j = 0: the same for an opening, x_j^eta smooth in xi
 
 with r = 2 where 2 eta is known to be whole, else 8.
@@ -63,7 +63,7 @@ class State(NamedTuple):
 
 
 def power(x: jax.Array, exponent: Exponent) -> jax.Array:
-    """`max(x, 0)^exponent` with finite derivatives at 0; fast for the static exponents 1, 1.5, 2."""
+    """`max(x, 0)^exponent` with finite derivatives at 0; fast for static 1, 1.5 and 2."""
     if isinstance(exponent, tuple) and len(set(exponent)) == 1:
         exponent = exponent[0]
     positive = x > 0
