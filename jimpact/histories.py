@@ -11,11 +11,17 @@ from jimpact.impacts import in_common_dtype, without_open_contacts
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.numerics import stepper
-from jimpact.numerics.dimensionless import Units, control_of, flow_of, to_dimensionless
+from jimpact.numerics.dimensionless import (
+    Units,
+    control_of,
+    flow_of,
+    reclosing,
+    status_of,
+    to_dimensionless,
+)
 from jimpact.numerics.flow import START, TIME, State, factor, plus_one, power, root_order, scales
 from jimpact.numerics.tridiagonal import Tridiagonal
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
-from jimpact.status import CODE
 
 TRACED_RECORDS = 512  # passes kept when the number needed cannot be looked up (inside jit, grad)
 
@@ -145,7 +151,6 @@ def _history(law: LZB, scene: Scene, v: jax.Array, samples: int, records: int) -
         return 0.5 * units.velocity**2 * power(x, plus_one(law.exponent))
 
     impulse = states.p * (units.velocity / units.root)[None, :]
-    done = end.done | jnp.any(kept.done)
     return History(
         time=times * units.time,
         force=jax.vmap(force)(states.x),
@@ -156,7 +161,7 @@ def _history(law: LZB, scene: Scene, v: jax.Array, samples: int, records: int) -
         velocity=jax.vmap(lambda p: v + velocity_change(scene, p))(impulse),
         duration=end.state.t * units.time,
         maximum_force=jnp.max(jax.vmap(force)(kept.state.x), axis=0),
-        status=jnp.where(done, CODE["ok"], CODE["max_steps"]).astype(jnp.int32),
+        status=status_of(end, reclosing(end, control.tolerance)).astype(jnp.int32),
     )
 
 

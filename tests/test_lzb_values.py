@@ -240,3 +240,37 @@ def test_honest_tolerance_over_random_scenes(rtol):
     print(f"error/rtol over {len(errors)} scenes at {rtol:g}: 50/90/99/100 % {quantiles}")
     assert quantiles[2] < 10
     assert quantiles[3] < 100
+
+
+def test_loaded_separating_contact_without_restitution_opens_at_once():
+    args = ([1.0, 1.0], 1.5, [0.0, 1.0])
+    scene, v = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 2.0]
+    at_zero, near = (ji.impact(ji.LZB([1.0, e], *args), scene, v) for e in (0.0, 1e-9))
+    np.testing.assert_allclose(at_zero.velocity, [0.0, 1.0, 2.0], atol=1e-8)
+    np.testing.assert_allclose(near.velocity, at_zero.velocity, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("masses", "k", "exponent", "u0"),
+    [
+        ([1.0, 1.0, 1.0], [6.454323290983815e-05, 367.0], (5.0, 1.3), 0.0),
+        ([0.4649, 0.7916, 0.8412], [6.6944, 0.0506], (1.3, 2.0), [1.38e-6, 0.0]),
+    ],
+)
+def test_slow_plastic_limits(masses, k, exponent, u0):
+    """Mixed exponents let the last approach fade slowly: still the common velocity, flagged."""
+    out = ji.impact(ji.LZB(0.0, k, exponent, u0), ji.chain(masses), [1.0, 0.0, 0.0])
+    assert ji.STATUS[int(out.status)].name == "plastic_limit"
+    np.testing.assert_allclose(out.velocity, masses[0] / sum(masses), atol=2e-7)
+
+
+def test_trapped_chain_comes_to_rest():
+    e, exponent = [0.5905, 0.163, 0.137, 0.2167, 0.3254], (1.3, 5.0, 1.01, 1.01, 1.5)
+    out = ji.impact(
+        ji.LZB(e, exponent=exponent), ji.chain(np.ones(4), wall="both"), [0.62, 0.34, -0.11, 1.49]
+    )
+    assert ji.STATUS[int(out.status)].name == "plastic_limit"
+    np.testing.assert_allclose(out.velocity, 0.0, atol=1e-7)
+    assert ji.STATUS[
+        int(ji.history(ji.LZB(0.0), ji.chain(np.ones(3)), [1.0, 0, 0]).status)
+    ].name == ("plastic_limit")

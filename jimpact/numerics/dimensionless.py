@@ -16,7 +16,7 @@ from jimpact.numerics import impulse_form, stepper
 from jimpact.numerics.flow import Exponent, Flow
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
 from jimpact.status import CODE
 
 METHODS = ("time", "propagator", "impulse")
@@ -24,6 +24,7 @@ METHODS = ("time", "propagator", "impulse")
 # more cost a third more steps.
 GRADIENT_TIGHTENING = 0.01
 ROUNDING_FLOOR = 16  # the local tolerance is at least so many eps
+RIDGE = 64  # eps on the diagonal of G: redundant contacts are singular, the remainder is tiny
 ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
 
 
@@ -121,11 +122,34 @@ def solve(
         tighten = GRADIENT_TIGHTENING if differentiated else 1.0
         control = control_of(given, tighten, max_steps, method)
         end = stepper.run(flow, control, stepper.begin(flow, control, given.gamma, given.x))
-        at_rest = (end.closures >= ENDLESS) & (jnp.abs(end.state.g) <= given.tolerance)
-        code = jnp.where(jnp.any(at_rest), CODE["plastic_limit"], CODE["ok"])
-        return end.state.p, jnp.where(end.done, code, CODE["max_steps"])
+        at_rest = reclosing(end, given.tolerance)
+        p = end.state.p + plastic_remainder(flow, given.gamma, end.state.p, at_rest)
+        return p, status_of(end, at_rest)
 
     return both_modes(run)(inputs)
+
+
+def reclosing(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
+    """Contacts (m,) as good as at rest where some re-closed again and again."""
+    quiet = jnp.abs(end.state.g) <= 2 * stepper.WIDENED * tolerance
+    endless = quiet & (end.closures >= ENDLESS)
+    return end.done & (endless | (jnp.any(endless) & quiet & (end.state.g < 0)))
+
+
+def status_of(end: stepper.Carry, at_rest: jax.Array) -> jax.Array:
+    """Status code of a finished or interrupted run."""
+    code = jnp.where(jnp.any(at_rest), CODE["plastic_limit"], CODE["ok"])
+    return jnp.where(end.done, code, CODE["max_steps"])
+
+
+def plastic_remainder(flow: Flow, gamma: jax.Array, p: jax.Array, at_rest: jax.Array) -> jax.Array:
+    """Impulses that bring the contacts `at_rest` to exactly gamma+ = 0: the limit they approach."""
+    g = as_matrix(flow.coupling)
+    both = at_rest[:, None] & at_rest[None, :]
+    unit = jnp.eye(g.shape[0], dtype=g.dtype)
+    ridge = RIDGE * float(jnp.finfo(g.dtype).eps)
+    missing = jnp.where(at_rest, -(gamma + flow.coupling @ p), 0.0)
+    return jnp.linalg.solve(jnp.where(both, g, unit) + ridge * unit, missing)
 
 
 def _walk(flow: Flow, given: Inputs, max_steps: int) -> tuple[jax.Array, jax.Array]:

@@ -32,6 +32,8 @@ RESTART = 0.1  # first START step after a closing, as a part of the step before 
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 LEAST_ERROR = 1e-10  # in tolerances; keeps the growth factor finite
 NEAR_OPENING = 1.0  # an expansion expected to end within so many steps is landed on
+PATIENCE = 2000  # passes per contact after which an impact is let end at WIDENED tolerances
+WIDENED = 100.0
 CUT_SHORT = 0.7  # part of the way to an event that a step stops at where it cannot land
 
 
@@ -80,8 +82,11 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
     m, dtype = gamma.shape[0], gamma.dtype
     phase = jnp.where((gamma <= 0) | (x > 0), COMPRESSION, OPEN).astype(jnp.int32)
     phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
+    # loaded, separating and e = 0: it opens at once and returns nothing
+    spent = (phase == EXPANSION) & (flow.restitution == 0)
+    phase, x = jnp.where(spent, OPEN, phase), jnp.where(spent, 0.0, x)
     s = jnp.where(phase == EXPANSION, flow.restitution, 1.0)
-    g = jnp.where(s > 0, gamma / jnp.where(s > 0, s, 1.0), 0.0)
+    g = gamma / s
     zero, no = jnp.zeros((), dtype), jnp.zeros((), bool)
     first = jnp.asarray(FIRST_TIME ** (1 / root_order(flow.exponent)), dtype)
     carry = Carry(
@@ -242,10 +247,16 @@ def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
     )
 
 
+def _patience(carry: Carry) -> jax.Array:
+    """Widens what counts as nothing left once an impact drags on."""
+    drags = carry.passes > PATIENCE * carry.phase.shape[0]
+    return jnp.where(drags, WIDENED, 1.0).astype(carry.h.dtype)
+
+
 def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
     """End the impact if nothing is left to integrate."""
     alone, end = isolated.finish(
-        flow, control.tolerance, carry.phase, carry.state, control.closed_form
+        flow, control.tolerance * _patience(carry), carry.phase, carry.state, control.closed_form
     )
     over = ~carry.done & alone
     return carry._replace(
