@@ -33,13 +33,10 @@ def run(command: "FitCommand") -> int:
         study = read_study(command.study, command.law)
         options = {"method": command.method, "starts": command.starts, "seed": command.seed}
         fits = _all_fits(study, options)
+        _draw(study, fits, path)
     except (ValueError, TypeError, OSError) as error:
         print(f"jimpact fit: {error}", file=sys.stderr)
         return 2
-    from jimpact.plots import plot_fit
-
-    others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
-    plot_fit(fits[RAW], others, study.title).savefig(path, dpi=150)
     if command.json:
         told = {name: fit.to_dict() for name, fit in fits.items()}
         print(json.dumps({"title": study.title, "fits": told, "picture": str(path)}, indent=2))
@@ -52,12 +49,19 @@ def _picture_path(out: Path) -> Path:
     path = out if out.suffix else out / PICTURE
     if path.suffix not in (".png", ".pdf", ".svg"):
         raise ValueError(f"--out must end in .png, .pdf or .svg or be a directory, but is '{out}'.")
-    path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
 
+def _draw(study: Study, fits: dict[str, Fit], path: Path) -> None:
+    from jimpact.plots import plot_fit  # matplotlib, late: bad input is told sooner
+
+    others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_fit(fits[RAW], others, study.title).savefig(path, dpi=150)
+
+
 def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:
-    """The study's fit and its yardsticks; as `fits` of one law share their compiled program."""
+    """The study's fit and its yardsticks; fits of one law share one compiled program."""
     own, everything = _per_contact(study)
     fits = {RAW: own.run(**options)}
     if any("break momentum" in line for line in fits[RAW].warnings):

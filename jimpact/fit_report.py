@@ -9,8 +9,7 @@ from jimpact.status import STATUS
 if TYPE_CHECKING:
     from jimpact.fitting import Fit
 
-_WIDTH = 96
-_SHOTS_SHOWN = 12
+_VELOCITIES_SHOWN = 24
 _MINIMA_SHOWN = 5
 
 
@@ -74,9 +73,10 @@ def _minima(fit: "Fit") -> list[str]:
     if len(fit.starts) == 1:
         one = f"{total - fit.lost_starts} of {total} starts ended in this minimum. {late}"
         return [one.rstrip()] if total > 1 else []
-    lines = [f"{len(fit.starts)} minima of {total} starts:  sum of squares, starts, values"]
+    what = "minima" if fit.rank == len(fit.names) else "end points in a valley"
+    lines = [f"{len(fit.starts)} {what} of {total} starts:  sum of squares, starts, values"]
     for start in fit.starts[:_MINIMA_SHOWN]:
-        values = ", ".join(f"{name} {v:.5g}" for name, v in zip(fit.names, start.value))
+        values = ", ".join(f"{name} {v:.4g}" for name, v in zip(fit.names, start.value))
         lines.append(f"  {start.sum_of_squares:12.5g} {start.count:4d}   {values}")
     if len(fit.starts) > _MINIMA_SHOWN:
         lines.append(f"  ... and {len(fit.starts) - _MINIMA_SHOWN} more")
@@ -87,7 +87,8 @@ def _shots(fit: "Fit") -> list[str]:
     data = fit.experiments
     pre, post = np.asarray(data.pre, float), np.asarray(data.post, float)
     lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s} [m/s]"]
-    for k in range(min(len(pre), _SHOTS_SHOWN)):
+    shown = max(1, _VELOCITIES_SHOWN // pre.shape[1])
+    for k in range(min(len(pre), shown)):
         code = int(fit.status[k])
         note = "" if code == 0 else f"   {STATUS[code].name}"
         for i in range(pre.shape[1]):
@@ -95,8 +96,8 @@ def _shots(fit: "Fit") -> list[str]:
             seen = "-" if np.isnan(post[k, i]) else f"{post[k, i]:.6g}"
             values = f"{pre[k, i]:12.6g} {seen:>12s} {fit.predicted[k, i]:12.6g}"
             lines.append(f"{label:>8s} {i + 1:5d} {values}{note if i == 0 else ''}")
-    if len(pre) > _SHOTS_SHOWN:
-        lines.append(f"     ... and {len(pre) - _SHOTS_SHOWN} more shots")
+    if len(pre) > shown:
+        lines.append(f"     ... and {len(pre) - shown} more shots")
     return lines
 
 

@@ -118,14 +118,15 @@ def fit(
         law: start values. A scalar field is one value for all contacts (tied), an (m,) field is
             free contact by contact. The stiffnesses of `LZB` with equal exponents: only their
             ratios matter, so contact 1 is held, and a scalar stiffness cannot be fitted.
-        scene: the scene of all shots; None where the experiments carry one a shot.
+        scene: the scene of all shots; not used where the experiments carry one a shot.
         experiments: measured shots.
         free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of
             groups}: contacts with equal numbers are tied, 0 is held.
         bounds: {field: (low, high)}; default [0, 1] for restitution, > 0 for stiffness, ...
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
-        starts: number of starts, the first from the law's values, the others random (`seed`).
+        starts: number of starts, the first from the law's values, the others random (`seed`); if
+            more than one, further ones around the best follow as long as they improve it.
         max_steps: iterations per start.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 

@@ -1,27 +1,25 @@
 """Many starts at once, and the distinct minima they end in."""
 
-import contextlib
-import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from jimpact.fit_problem import Problem, advance_all, begin_all, from_scaled, to_scaled
 from jimpact.numerics.least_squares import Method, State
 from jimpact.parameters import Parameters, entries
+from jimpact.progress import progress_bar
 
 LANES = 4  # starts that run together; those that are done make room
 PASSES = 10  # between two looks at the progress
 # A Levenberg-Marquardt start that gains less than this share in so many passes sits on a kink of
 # the law (a change in the sequence of contacts), where steps zigzag: it is given up.
 SLOW = 1e-3
+# One whose sum of squares is this far above the best must gain this share to go on.
+BEHIND, SLOW_BEHIND = 10.0, 0.1
 
 # Random starts: a stiffness within this factor of the user's, a parameter without two bounds
 # within this many natural scales of the user's.
@@ -30,6 +28,12 @@ START_SCALES = 2.0
 # Random coefficients of restitution start above this: below, contacts of a chain re-close many
 # times, which takes ten times as long and hardly occurs in hard bodies. (Fits do go there.)
 START_RESTITUTION = 0.3
+
+# The law is only piecewise smooth, so that the sum of squares has side minima close to a minimum.
+# Starts around the best find lower ones; they repeat while they gain.
+ROUNDS = 5
+NEAR_SPREAD = 2.0  # standard errors
+NEAR_RCOND = 1e-10  # directions the data cannot see are not searched
 
 # Relative sums of squares, and values in natural scales, closer than this are one minimum: a
 # hundred times what solvers leave, and far below what a measurement resolves.
@@ -41,8 +45,6 @@ EXACT = {"float64": 1e-14, "float32": 1e-8}
 # A start has converged when a full Gauss-Newton step would lower the sum of squares by less than
 # this share: it is then a thousandth of a standard error away from the minimum.
 CONVERGED = 1e-6
-
-BAR_AFTER = 2.0  # seconds after which a fit counts as long
 
 
 class Search(NamedTuple):
@@ -71,24 +73,49 @@ def search(
     max_steps: int,
     progress: bool | None,
 ) -> Search:
-    """Run all starts to their ends and keep the best."""
-    points = jnp.asarray(_start_points(problem, parameters, starts, seed), problem.pre.dtype)
-    states = jax.device_get(begin_all(problem, points, method, max_steps))
-    active, lanes = list(range(starts)), min(starts, LANES)
-    with _bar(starts, max_steps, progress) as show:
-        while active:
-            before = states.cost.copy()
-            for batch in (active[i : i + lanes] for i in range(0, len(active), lanes)):
-                rows = [batch[min(i, len(batch) - 1)] for i in range(lanes)]
-                some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], states)
-                some = jax.device_get(advance_all(problem, some, method, max_steps, PASSES))
-                states = jax.tree.map(partial(_with_rows, rows), states, some)
-                show(starts - len(active), int(states.steps.max()))
-            ended = states.done | (states.steps >= max_steps)
-            if method == "levenberg-marquardt":
-                ended |= (before - states.cost <= SLOW * before) & np.isfinite(before)
-            active = [i for i in active if not ended[i]]
+    """Run all starts to their ends, then a few near the best as long as they improve it."""
+    rng = np.random.default_rng(seed)
+    points = _start_points(problem, parameters, starts, rng)
+    with progress_bar(starts, max_steps, progress) as show:
+        states = _run(problem, points, method, max_steps, show)
+        for _ in range(ROUNDS if starts > 1 else 0):
+            best = int(np.nanargmin(states.cost))
+            least = float(states.cost[best])
+            if 2 * least <= EXACT[str(states.y.dtype)]:
+                break
+            points = _near(problem, states, best, min(starts, LANES), rng)
+            more = _run(problem, points, method, max_steps, show)
+            states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
+            if np.nanmin(more.cost) > (1 - SLOW) * least:
+                break
     return _found(problem, parameters, states)
+
+
+def _run(
+    problem: Problem,
+    points: np.ndarray,
+    method: Method,
+    max_steps: int,
+    show: Callable[[int, int], None],
+) -> State:
+    """Solve from points (S, Q), a few at a time; the states come back to the host."""
+    starts = jnp.asarray(points, problem.pre.dtype)
+    states = jax.device_get(begin_all(problem, starts, method, max_steps))
+    active, lanes = list(range(len(points))), min(len(points), LANES)
+    while active:
+        before = states.cost.copy()
+        for batch in (active[i : i + lanes] for i in range(0, len(active), lanes)):
+            rows = [batch[min(i, len(batch) - 1)] for i in range(lanes)]
+            some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], states)
+            some = jax.device_get(advance_all(problem, some, method, max_steps, PASSES))
+            states = jax.tree.map(partial(_with_rows, rows), states, some)
+            show(len(points) - len(active), int(states.steps.max()))
+        ended = states.done | (states.steps >= max_steps)
+        if method == "levenberg-marquardt":
+            share = np.where(states.cost > BEHIND * np.nanmin(states.cost), SLOW_BEHIND, SLOW)
+            ended |= (before - states.cost <= share * before) & np.isfinite(before)
+        active = [i for i in active if not ended[i]]
+    return states
 
 
 def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -155,7 +182,22 @@ def _groups(
     return groups
 
 
-def _start_points(problem: Problem, parameters: Parameters, starts: int, seed: int) -> np.ndarray:
+def _near(
+    problem: Problem, states: State, best: int, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
+    jacobian = np.asarray(states.jacobian[best], float)
+    measured = int(np.sum(np.asarray(problem.weight) > 0))
+    variance = 2 * float(states.cost[best]) / measured
+    spread = np.sqrt(variance * np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=NEAR_RCOND)))
+    y = np.asarray(states.y[best], float)
+    points = y + NEAR_SPREAD * spread * rng.normal(size=(count, len(y)))
+    return np.clip(points, np.asarray(problem.low), np.asarray(problem.high))
+
+
+def _start_points(
+    problem: Problem, parameters: Parameters, starts: int, rng: np.random.Generator
+) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
     first = parameters.first
     values = entries(problem.law, parameters.fields)[first]
@@ -168,29 +210,7 @@ def _start_points(problem: Problem, parameters: Parameters, starts: int, seed: i
     elastic = [parameters.entry_fields[i] == "restitution" for i in first]
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
     points = np.zeros((starts, len(problem.low)))
-    share = np.random.default_rng(seed).random((starts, len(own)))
+    share = rng.random((starts, len(own)))
     points[:, : len(own)] = low + (high - low) * share
     points[0, : len(own)] = own
     return points
-
-
-@contextlib.contextmanager
-def _bar(
-    starts: int, max_steps: int, progress: bool | None
-) -> Iterator[Callable[[int, int], None]]:
-    """Yield `show(starts done, steps)`; the bar appears once the fit turns out to be long."""
-    if not (sys.stderr.isatty() if progress is None else progress):
-        yield lambda done, steps: None
-        return
-    text = TextColumn("fit: {task.fields[ready]} of {task.fields[starts]} starts done, step")
-    count = TextColumn("{task.completed} of at most {task.total}")
-    console = Console(stderr=True, force_terminal=True if progress else None)
-    bar = Progress(text, count, BarColumn(), TimeElapsedColumn(), console=console, transient=True)
-    task = bar.add_task("fit", total=max_steps, ready=0, starts=starts)
-    timer = threading.Timer(BAR_AFTER, bar.start)
-    (bar if progress else timer).start()
-    try:
-        yield lambda done, steps: bar.update(task, completed=steps, ready=done)
-    finally:
-        timer.cancel()
-        bar.stop()

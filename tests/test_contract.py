@@ -111,9 +111,9 @@ def test_chain_equals_dense_scene(row):
     np.testing.assert_allclose(a.velocity, b.velocity, atol=2 * accuracy)
 
 
-def test_jit_equals_eager_and_vmap_equals_loop(row, scene):
+def test_jit_equals_eager_and_vmap_equals_loop(row):
     _, make, accuracy, _ = row
-    chain, v = scene
+    chain, v = SCENES["chain"]()
     law = make(E, K)
     one = ji.impact(law, chain, v)
     jitted = jax.jit(ji.impact)(law, chain, v)
@@ -126,8 +126,9 @@ def test_jit_equals_eager_and_vmap_equals_loop(row, scene):
         assert int(many.status[i]) == int(single.status)
 
 
-def test_dtype_is_kept(row, scene):
+def test_dtype_is_kept(row):
     _, make, _, _ = row
+    scene = SCENES["chain"]()
     single = jax.tree.map(lambda x: x.astype(jnp.float32), (make(E, K), *scene))
     out = ji.impact(*single)
     assert {x.dtype for x in jax.tree.leaves(out)} == {jnp.dtype("float32"), jnp.dtype("int32")}

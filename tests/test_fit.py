@@ -247,6 +247,19 @@ def test_a_contact_that_is_never_loaded_is_named():
     np.testing.assert_array_equal(found.standard_error[1:], np.inf)
 
 
+@pytest.mark.slow
+def test_nine_parameters_of_a_chain_before_a_wall():
+    scene = ji.chain([1.0, 2.0, 1.5, 3.0, 1.0], wall=True)
+    truth = ji.LZB(np.linspace(0.95, 0.8, 5), np.linspace(1.0, 3.0, 5))
+    pre = np.random.default_rng(0).normal(size=(12, 5))
+    data = ji.Experiments(pre, simulated(truth, scene, pre, noise=0.001, seed=1))
+    found = ji.fit(ji.LZB(np.full(5, 0.9), np.ones(5)), scene, data)
+    expected = np.concatenate([truth.restitution, truth.stiffness[1:]])
+    assert found.rank == 9
+    assert np.all(np.abs(found.value - expected) < 4 * found.standard_error)
+    assert 0.0007 < found.noise < 0.0013
+
+
 # --------------------------------------------------------------------- any law
 
 
@@ -306,7 +319,7 @@ def test_minima_that_fit_equally_well_are_told():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.49), PAIR, SHOTS, noise=0.001))
     found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root")
     np.testing.assert_allclose(sorted(s.value[0] for s in found.starts), [-0.7, 0.7], atol=2e-3)
-    assert sum(s.count for s in found.starts) + found.lost_starts == 8
+    assert sum(s.count for s in found.starts) + found.lost_starts >= 8
     assert found.value[0] > 0  # the first start leads there
     assert "2 different minima fit equally well" in " ".join(found.warnings)
 
