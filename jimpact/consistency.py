@@ -115,7 +115,7 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
         "coordinate          v-             v+   [m/s]",
     ]
     pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
-    lines += [f"{i + 1:10d} {a:14.8g} {b:14.8g}" for i, (a, b) in enumerate(pairs)]
+    lines += [f"{i + 1:10d} {a:14.6g} {b:14.6g}" for i, (a, b) in enumerate(pairs)]
     lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
     g0, g1 = (
         np.asarray(gap_velocity(scene, velocity)),
@@ -123,5 +123,5 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     )
     for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
         note = "" if closed else "   open: takes no part"
-        lines.append(f"{j + 1:7d} {a:15.8g} {b:14.8g} {p:21.8g}{note}")
+        lines.append(f"{j + 1:7d} {a:15.6g} {b:14.6g} {p:21.6g}{note}")
     return "\n".join(lines)

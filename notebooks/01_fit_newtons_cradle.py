@@ -164,9 +164,7 @@ print("eight shots of the first kind: rank", ji.fit(start, balls, same).rank, "o
 # %%
 true_value = np.array([0.9, 0.95, 1.5])
 repeats = 400
-fits = [
-    ji.fit(first.law, balls, simulated_shots(seed), starts=1) for seed in range(1, repeats + 1)
-]
+fits = [ji.fit(first.law, balls, simulated_shots(seed), starts=1) for seed in range(1, repeats + 1)]
 intervals = np.array([fit.confidence_interval(0.95) for fit in fits])
 inside = (intervals[:, :, 0] <= true_value) & (true_value <= intervals[:, :, 1])
 values = np.array([fit.value for fit in fits])
