@@ -66,6 +66,8 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     size = jnp.where(size > 0, size, 1.0)
     change = kinetic_energy(scene, out.velocity) - kinetic_energy(scene, v)
     residual = momentum(scene, out.velocity - v) - scene.normals @ out.impulse
+    if scene.tangents is not None:
+        residual = residual - scene.tangents @ out.tangential_impulse
     if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
         basis = jnp.linalg.qr(scene.constraints)[0]
         residual = residual - basis @ (basis.T @ residual)

@@ -83,7 +83,7 @@ def history(
     check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
     check_values("velocity", v)
     law, scene, v = in_common_dtype(law, scene, v)
-    law.check_options(v.dtype, scene.contacts)
+    law.check_options(v.dtype, scene)
     if records is None and is_traced((law, scene, v)):
         records = TRACED_RECORDS
     elif records is None:

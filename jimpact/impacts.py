@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.laws.base import Law
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
@@ -55,12 +55,28 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     v = as_float_array("velocity", velocity)
     check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
     check_values("velocity", v)
+    _check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     for name, value in vars(law).items():
-        if isinstance(value, jax.Array) and value.ndim and value.shape[0] != scene.contacts:
+        if isinstance(value, jax.Array) and value.ndim == 1 and len(value) != scene.contacts:
             check_shape(name, value, (scene.contacts,), "one entry per contact, or a scalar")
-    law.check_options(v.dtype, scene.contacts)
+    law.check_options(v.dtype, scene)
     return _impact(law, scene, v)
+
+
+def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
+    """A velocity that breaks a bilateral constraint is an error."""
+    if scene.constraints is None or is_traced((scene.constraints, velocity)):
+        return
+    h, v = np.asarray(scene.constraints), np.asarray(velocity)
+    rate, size = np.abs(h.T @ v), np.abs(h).T @ np.abs(v)
+    bad = rate > SIGN_TOLERANCE.get(str(v.dtype), 2e-3) * size
+    if bad.any():
+        j = int(np.argmax(bad))
+        raise ValueError(
+            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but "
+            f"constraint {j + 1} has the rate {(h.T @ v)[j]:g}."
+        )
 
 
 def in_common_dtype(law: Law, scene: Scene, velocity: jax.Array) -> tuple[Law, Scene, jax.Array]:
@@ -95,21 +111,23 @@ def _impact(law: Law, scene: Scene, v: jax.Array) -> Impact:
     w, gamma = (
         (w_all, gamma_all) if law.uses_gaps else without_open_contacts(scene, w_all, gamma_all)
     )
-    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
+    taking_part = jnp.ones_like(scene.closed) if law.uses_gaps else scene.closed
+    stored = jnp.where(taking_part, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
     happens = jnp.any(gamma < 0) | jnp.any(stored > 0) | ~jnp.all(jnp.isfinite(gamma))
     # where nothing happens the law sees a harmless approach, so that its gradients stay finite
-    p, code = law.impulse(w, jnp.where(happens, gamma, -jnp.ones_like(gamma)))
-    p = jnp.where(happens, p, 0.0)
-    v_plus = v + velocity_change(scene, p)
-    gamma_plus = gamma_all + w_all @ p
+    approach = jnp.where(happens, gamma, -jnp.ones_like(gamma))
+    p, tangential, code = law.all_impulses(scene, w, approach, v)
+    p, tangential = jnp.where(happens, p, 0.0), jnp.where(happens, tangential, 0.0)
+    jump = velocity_change(scene, p, tangential)
+    v_plus = v + jump
+    gamma_plus = gamma_all + (w_all @ p if tangential.size == 0 else gap_velocity(scene, jump))
     change = 0.5 * jnp.sum((gamma_all + gamma_plus) * p)
+    if scene.tangents is not None:
+        change = change + 0.5 * jnp.sum((scene.tangents.T @ (v + v_plus)) * tangential)
     code = jnp.where(happens, code, CODE["ok"])
-    code = jnp.maximum(
-        code, _signs(diagonal(w), gamma, gamma_plus, p, change, stored, scene.closed)
-    )
+    code = jnp.maximum(code, _signs(diagonal(w), gamma, gamma_plus, p, change, stored, taking_part))
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     code = jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32)
-    tangential = jnp.zeros(0 if scene.tangents is None else scene.tangents.shape[1], v.dtype)
     return Impact(v_plus, p, tangential, change, jnp.sum(stored), code)
 
 

@@ -11,6 +11,7 @@
 #   T = v^T M v / 2  kinetic energy                              [J]
 """
 
+import operator
 from typing import Any
 
 import equinox as eqx
@@ -19,8 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
 
+_CONSTRAINTS = operator.attrgetter("constraints")
 _SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of M that rounding may cause in float32
 
 
@@ -155,6 +157,18 @@ def _check_scene(scene: Scene) -> None:
                 f"but has shape {scene.constraints.shape}."
             )
         check_values("constraints", scene.constraints)
+        _check_independent(scene.constraints)
+
+
+def _check_independent(constraints: jax.Array) -> None:
+    if is_traced(constraints):
+        return
+    rank, b = np.linalg.matrix_rank(np.asarray(constraints)), constraints.shape[1]
+    if rank < b:
+        raise ValueError(
+            f"Argument `constraints` must have independent columns, but {b} columns have "
+            f"rank {rank}."
+        )
 
 
 def _check_mass(mass: jax.Array) -> None:
@@ -205,16 +219,20 @@ def _solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
         free = jax.scipy.linalg.solve(scene.mass, right, assume_a="pos")
     if scene.constraints is None:
         return free
-    unconstrained = eqx.tree_at(lambda s: s.constraints, scene, None)
     h = scene.constraints
-    m_inv_h = _solve_mass(unconstrained, h)
+    m_inv_h = _solve_mass(without_constraints(scene), h)
     return free - m_inv_h @ jnp.linalg.solve(h.T @ m_inv_h, h.T @ free)
 
 
-def velocity_change(scene: Scene, impulse: jax.Array) -> jax.Array:
-    """`v+ - v- = M^-1 N p` (n,) [m/s] of contact impulses `p` (m,) [N s]."""
+def velocity_change(
+    scene: Scene, impulse: jax.Array, tangential: jax.Array | None = None
+) -> jax.Array:
+    """`v+ - v- = M^-1 (N p + H p_t)` (n,) [m/s] of contact impulses [N s]; p_t None: 0."""
     if scene.walls is None:
-        return _solve_mass(scene, scene.normals @ impulse)
+        push = scene.normals @ impulse
+        if scene.tangents is not None and tangential is not None:
+            push = push + scene.tangents @ tangential
+        return _solve_mass(scene, push)
     left, right = scene.walls
     padded = jnp.pad(impulse, (int(not left), int(not right)))
     return -jnp.diff(padded) / scene.mass
@@ -238,15 +256,27 @@ def delassus_matrix(scene: Scene) -> Symmetric:
     return Tridiagonal(padded[:-1] + padded[1:], -shared)
 
 
+def without_constraints(scene: Scene) -> Scene:
+    """The scene as if it had no bilateral constraints."""
+    return scene if scene.constraints is None else eqx.tree_at(_CONSTRAINTS, scene, None)
+
+
+def kinetic_norm(scene: Scene) -> jax.Array:
+    """`|grad f_j|` in the metric of M^-1 (m,), the square roots of the free W_jj."""
+    return jnp.sqrt(diagonal(delassus_matrix(without_constraints(scene))))
+
+
 def normalized_delassus(scene: Scene) -> Symmetric:
-    """`G = diag(W)^-1/2 W diag(W)^-1/2`: unit diagonal, `G_ij = -cos(theta_ij)`."""
-    w = delassus_matrix(scene)
-    return scaled(w, 1 / jnp.sqrt(diagonal(w)))
+    """`G = W` between unit normals: unit diagonal, `G_ij = -cos(theta_ij)`.
+
+    Bilateral constraints distort it, its diagonal included: Brogliato (2016), (6.35).
+    """
+    return scaled(delassus_matrix(scene), 1 / kinetic_norm(scene))
 
 
 def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
-    """`gamma_j / sqrt(W_jj)` (m,), the normal quasi-velocities of Brogliato (2016), (6.24)."""
-    return gap_velocity(scene, velocity) / jnp.sqrt(diagonal(delassus_matrix(scene)))
+    """`gamma_j / |grad f_j|` (m,), the normal quasi-velocities of Brogliato (2016), (6.24)."""
+    return gap_velocity(scene, velocity) / kinetic_norm(scene)
 
 
 def kinetic_angles(scene: Scene) -> jax.Array:
@@ -259,6 +289,6 @@ def kinetic_angles(scene: Scene) -> jax.Array:
     >>> float(ji.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))
     1.1071
     """
-    from jimpact.numerics.tridiagonal import as_matrix
-
-    return jnp.pi - jnp.arccos(jnp.clip(as_matrix(normalized_delassus(scene)), -1.0, 1.0))
+    w = delassus_matrix(scene)
+    cosine = as_matrix(scaled(w, 1 / jnp.sqrt(diagonal(w))))
+    return jnp.pi - jnp.arccos(jnp.clip(cosine, -1.0, 1.0))

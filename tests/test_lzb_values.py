@@ -79,8 +79,10 @@ def test_against_the_oracle(row):
     for scene in (ji.chain(masses, wall=wall), ji.Scene(mass, normals)):
         out = ji.impact(law, scene, v)
         np.testing.assert_allclose(out.velocity, expected, rtol=0, atol=2e-9)
-        np.testing.assert_allclose(out.impulse, p, rtol=0, atol=2e-8)
         assert int(out.status) in (0, 3)
+        if int(out.status) == 0 or np.linalg.matrix_rank(normals) == len(p):
+            # (a jammed chain keeps an internal squeeze that depends on the cut-off, W dp = 0)
+            np.testing.assert_allclose(out.impulse, p, rtol=0, atol=2e-8)
     if int(out.status) == 0:  # else the duration of endless re-closing depends on the cut-off
         h = ji.history(law, scene, v)
         np.testing.assert_allclose(h.duration, duration, rtol=1e-6)

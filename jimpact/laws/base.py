@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.numerics.tridiagonal import Symmetric
+from jimpact.scene import Scene
 
 
 class Law(eqx.Module):
@@ -24,9 +25,20 @@ class Law(eqx.Module):
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Contact impulses p (m,) [N s] and the law's own status code ()."""
 
+    def all_impulses(
+        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Normal p (m,) and tangential p_t impulses, and status; what `impact()` calls.
+
+        For laws that need more of the scene than W and gamma-: its gaps, its tangents.
+        """
+        p, code = self.impulse(delassus, gap_velocity)
+        count = 0 if scene.tangents is None else scene.tangents.shape[1]
+        return p, jnp.zeros(count, p.dtype), code
+
     def stored_energy(self, contacts: int) -> jax.Array:
         """Energy (m,) [J] stored in the contacts before the impact."""
         return jnp.zeros(contacts)
 
-    def check_options(self, dtype: jnp.dtype, contacts: int) -> None:
-        """Raise where an option does not fit the floating-point precision or the contacts."""
+    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
+        """Raise where an option does not fit the floating-point precision or the scene."""

@@ -11,6 +11,7 @@ from jimpact.laws.base import Law
 from jimpact.numerics.dimensionless import METHODS, solve, to_dimensionless
 from jimpact.numerics.flow import Exponent
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
+from jimpact.scene import Scene
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself
@@ -147,10 +148,10 @@ class LZB(Law):
         """`U_0` (m,) [J]."""
         return jnp.broadcast_to(self.initial_energy, (contacts,))
 
-    def check_options(self, dtype: jnp.dtype, contacts: int) -> None:
+    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
         """A tolerance finer than the precision can hold is an error."""
         if isinstance(self.exponent_static, tuple):
-            check_shape("exponent", self.exponent_static, (contacts,), "one per contact")
+            check_shape("exponent", self.exponent_static, (scene.contacts,), "one per contact")
         finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
         if self.rtol is not None and self.rtol < finest:
             raise ValueError(
