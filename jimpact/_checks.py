@@ -68,6 +68,13 @@ def check_shape(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> 
         )
 
 
+def check_square(name: str, value: Any) -> None:
+    """Raise a ValueError unless `value` is a square matrix."""
+    shape = np.shape(value)
+    if len(shape) != 2 or shape[0] != shape[1]:
+        raise ValueError(f"Argument `{name}` must be a square matrix, but has shape {shape}.")
+
+
 def check_per_contact(name: str, value: Any, contacts: int) -> None:
     """Raise a ValueError unless `value` is a scalar or has one entry per contact."""
     if np.shape(value) not in ((), (contacts,)):

@@ -99,7 +99,7 @@ def without_open_contacts(
     if isinstance(delassus, Tridiagonal):
         both = closed[:-1] & closed[1:]
         off = jnp.where(both, delassus.off_diagonal, 0.0)
-        return Tridiagonal(delassus.diagonal, off), gamma
+        return Tridiagonal(delassus.diagonal, off, delassus.regular), gamma
     keep = (closed[:, None] & closed[None, :]) | jnp.eye(closed.shape[0], dtype=bool)
     return jnp.where(keep, delassus, 0.0), gamma
 

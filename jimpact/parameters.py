@@ -186,7 +186,7 @@ def bounds_of(
         elif field in LOGARITHMIC:
             ends[:, inside] = values[inside] / STIFFNESS_RANGE, values[inside] * STIFFNESS_RANGE
         else:
-            ends[:, inside] = np.array(DOMAIN.get(field, (-np.inf, np.inf)))[:, None]
+            ends[:, inside] = np.array(_domain(field, law))[:, None]
     low = np.array([ends[0, list(group)].max() for group in parameters.groups])
     high = np.array([ends[1, list(group)].min() for group in parameters.groups])
     for name, start, a, b in zip(parameters.names, values[parameters.first], low, high):
@@ -196,6 +196,10 @@ def bounds_of(
                 f"but is [{a:g}, {b:g}]."
             )
     return low, high
+
+
+def _domain(field: str, law: Law) -> tuple[float, float]:
+    return law.domain().get(field, DOMAIN.get(field, (-np.inf, np.inf)))
 
 
 def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray]:
@@ -208,7 +212,7 @@ def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray
             f"Argument `bounds` must map `{field}` to (low, high), each a number or of shape "
             f"{shape}, but has {pair!r}."
         ) from None
-    smallest, largest = DOMAIN.get(field, (-np.inf, np.inf))
+    smallest, largest = _domain(field, law)
     if not (low < high).all():
         raise ValueError(f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}.")
     if (low < smallest).any() or (high > largest).any():

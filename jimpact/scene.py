@@ -253,7 +253,7 @@ def delassus_matrix(scene: Scene) -> Symmetric:
     inverse = 1 / scene.mass
     padded = jnp.pad(inverse, (int(left), int(right)))
     shared = inverse[int(not left) : scene.size - int(not right)]
-    return Tridiagonal(padded[:-1] + padded[1:], -shared)
+    return Tridiagonal(padded[:-1] + padded[1:], -shared, scene.contacts <= scene.size)
 
 
 def without_constraints(scene: Scene) -> Scene:

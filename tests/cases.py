@@ -9,6 +9,14 @@ def newton(e, k):
     return ji.Newton(e)
 
 
+def moreau(e, k):
+    return ji.Moreau(e)
+
+
+def poisson(e, k):
+    return ji.Poisson(e)
+
+
 def lzb(exponent, method="time"):
     def make(e, k):
         return ji.LZB(e, k, exponent, method=method)
@@ -19,6 +27,8 @@ def lzb(exponent, method="time"):
 # name: (registry name, maker, accuracy of the outcome, accuracy of its derivatives)
 LAWS = {
     "newton": ("newton", newton, 1e-12, 1e-12),
+    "moreau": ("moreau", moreau, 1e-12, 1e-12),
+    "poisson": ("poisson", poisson, 1e-12, 1e-12),
     "lzb-linear": ("lzb", lzb(1.0), 1e-7, 1e-6),
     "lzb-hertz": ("lzb", lzb(1.5), 1e-7, 1e-6),
     "lzb-array-exponent": ("lzb", lzb(jnp.array(1.4)), 1e-7, 1e-6),

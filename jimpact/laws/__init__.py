@@ -4,7 +4,9 @@ from typing import NamedTuple
 
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
+from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
+from jimpact.laws.poisson import Poisson
 
 
 class Row(NamedTuple):
@@ -35,6 +37,15 @@ LIU = """@article{liu2008,
   journal = {Proceedings of the Royal Society A}, volume = {464}, pages = {3193--3211},
   year = {2008}, doi = {10.1098/rspa.2008.0078}}"""
 
+MOREAU = """@incollection{moreau1988,
+  author = {Moreau, Jean Jacques}, title = {Unilateral contact and dry friction in finite freedom
+  dynamics}, booktitle = {Nonsmooth Mechanics and Applications}, publisher = {Springer},
+  pages = {1--82}, year = {1988}, doi = {10.1007/978-3-7091-2624-0_1}}"""
+
+PFEIFFER = """@book{pfeiffer1996,
+  author = {Pfeiffer, Friedrich and Glocker, Christoph},
+  title = {Multibody Dynamics with Unilateral Contacts}, publisher = {Wiley}, year = {1996}}"""
+
 EVERY_PROPERTY = frozenset(
     {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
 )
@@ -59,5 +70,25 @@ REGISTRY: dict[str, Row] = {
         promises=frozenset({"velocity_scaling", "mass_scaling"}),
         source="Brogliato, Nonsmooth Mechanics (2016), (6.41) with diagonal E",
         bibtex=BROGLIATO,
+    ),
+    "moreau": Row(
+        law=Moreau,
+        parameters=("restitution",),
+        summary="0 <= gamma+ + e gamma- and p >= 0, one of them zero",
+        right_when="stiffness rising along the chain (k2/k1 >> 1), plastic or decoupled contacts",
+        fails_when="chains at rest (no dispersion), contacts that separate before the impact",
+        promises=frozenset({"impulse_sign", "velocity_scaling", "mass_scaling"}),
+        source="Moreau (1988); Brogliato (2016), (6.51)",
+        bibtex=MOREAU,
+    ),
+    "poisson": Row(
+        law=Poisson,
+        parameters=("restitution",),
+        summary="every contact returns e times the impulse of its compression",
+        right_when="contacts that reach their largest compression together",
+        fails_when="dispersion in chains (would need e > 1), unequal e (may gain energy)",
+        promises=EVERY_PROPERTY - {"energy"},
+        source="Pfeiffer and Glocker (1996); Brogliato (2016), (6.76)-(6.79)",
+        bibtex=PFEIFFER,
     ),
 }

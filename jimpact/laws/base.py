@@ -42,3 +42,7 @@ class Law(eqx.Module):
 
     def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
         """Raise where an option does not fit the floating-point precision or the scene."""
+
+    def domain(self) -> dict[str, tuple[float, float]]:
+        """Where a fit may look for a field's values, if not in the domain its name implies."""
+        return {}

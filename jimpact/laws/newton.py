@@ -7,11 +7,9 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.laws.base import Law
-from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal
+from jimpact.numerics.linear import solve_symmetric
+from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 from jimpact.status import CODE
-
-# W counts as singular when G (unit diagonal) has an eigenvalue below this multiple of eps * m.
-_SINGULAR = 100.0
 
 
 class Newton(Law):
@@ -41,17 +39,9 @@ class Newton(Law):
 
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """`p = -W^-1 (1 + e) gamma-`."""
-        required = -(1 + self.restitution) * gap_velocity
         norm = jnp.sqrt(diagonal(delassus))
         g = as_matrix(delassus) / (norm[:, None] * norm[None, :])
-        eps = jnp.finfo(g.dtype).eps
-        eigenvalues, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(g))
-        # redundant contacts: G + N N^T, N its null space, is regular and gives the least-norm p
-        null_space = jnp.where((eigenvalues < _SINGULAR * eps * g.shape[0])[None, :], vectors, 0.0)
-        pbar = jnp.linalg.solve(g + null_space @ null_space.T, required / norm)
-        missed = jnp.abs(g @ pbar - required / norm).max() > jnp.sqrt(eps) * (
-            jnp.abs(required / norm).max()
-        )
-        singular = jnp.any(null_space != 0)
+        required = -(1 + self.restitution) * gap_velocity / norm
+        pbar, singular, missed = solve_symmetric(g, required, regular=is_regular(delassus))
         code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
-        return pbar / norm, jnp.where(singular & missed, CODE["infeasible"], code)
+        return pbar / norm, jnp.where(missed, CODE["infeasible"], code)

@@ -6,10 +6,14 @@ import jax.numpy as jnp
 
 
 class Tridiagonal(eqx.Module):
-    """Symmetric tridiagonal matrix: `diagonal` (m,), `off_diagonal` (m - 1,)."""
+    """Symmetric tridiagonal matrix: `diagonal` (m,), `off_diagonal` (m - 1,).
+
+    `regular`: known to be regular whatever its values (a chain with no more contacts than bodies).
+    """
 
     diagonal: jax.Array
     off_diagonal: jax.Array
+    regular: bool = eqx.field(static=True, default=False)
 
     def __matmul__(self, vector: jax.Array) -> jax.Array:
         """Matrix-vector product in O(m)."""
@@ -24,7 +28,8 @@ class Tridiagonal(eqx.Module):
 
     def scaled(self, scale: jax.Array) -> "Tridiagonal":
         """`diag(scale) A diag(scale)`."""
-        return Tridiagonal(self.diagonal * scale**2, self.off_diagonal * scale[:-1] * scale[1:])
+        off = self.off_diagonal * scale[:-1] * scale[1:]
+        return Tridiagonal(self.diagonal * scale**2, off, self.regular)
 
 
 Symmetric = jax.Array | Tridiagonal
@@ -38,6 +43,11 @@ def as_matrix(matrix: Symmetric) -> jax.Array:
 def diagonal(matrix: Symmetric) -> jax.Array:
     """Diagonal of a `Tridiagonal` or an array."""
     return matrix.diagonal if isinstance(matrix, Tridiagonal) else jnp.diagonal(matrix)
+
+
+def is_regular(matrix: Symmetric) -> bool:
+    """Whether the matrix is known to be regular without looking at its values."""
+    return isinstance(matrix, Tridiagonal) and matrix.regular
 
 
 def scaled(matrix: Symmetric, scale: jax.Array) -> Symmetric:

@@ -1,0 +1,75 @@
+"""Moreau's law: Newton's restitution in complementarity form."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import as_float_array, check_shape, check_square, check_values
+from jimpact.laws.base import Law
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
+from jimpact.scene import Scene
+
+
+class Moreau(Law):
+    """Moreau's impact law: a contact either reverses its gap velocity or takes no impulse.
+
+    Equation: `0 <= G pbar + (I + E) qn-  _|_  pbar >= 0`, in normalized gap velocities
+    `qn = gamma / |grad f|` and impulses `pbar = |grad f| p`; with a scalar or diagonal E
+    `0 <= gamma+ + e gamma-  _|_  p >= 0`.
+
+    Args:
+        restitution: e in [0, 1], scalar or one per contact (m,), or a matrix E (m, m).
+
+    Status: `inadmissible_velocity` where a contact that separated before the impact is driven
+    together (the law then asks for gamma+ >= -e gamma- < 0 only); `energy_gain`, with unequal e;
+    `infeasible` (a body squeezed between walls with unequal e); `impulse_not_unique` for redundant
+    contacts (of all p that of least |pbar| is given).
+
+    Derivatives are one-sided where a contact is about to take part (p_j = 0 = gamma+ + e gamma-).
+
+    Source: Moreau (1988); Brogliato, Nonsmooth Mechanics (2016), (6.51).
+
+    >>> import jimpact as ji
+    >>> out = ji.impact(ji.Moreau(0.5), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0])
+    >>> out.velocity.round(6).tolist()
+    [-0.25, 0.25, 0.25]
+    """
+
+    restitution: jax.Array
+
+    def __init__(self, restitution: Any):
+        self.restitution = as_float_array("restitution", restitution)
+        if self.restitution.ndim < 2:
+            check_values("restitution", self.restitution, low=0.0, high=1.0)
+        else:
+            check_square("restitution", self.restitution)
+            check_values("restitution", self.restitution)
+
+    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
+        """A matrix must have one row and one column per contact."""
+        if self.restitution.ndim == 2:
+            shape = (scene.contacts, scene.contacts)
+            check_shape("restitution", self.restitution, shape, "one row per contact")
+
+    def all_impulses(
+        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Entries of a matrix E that couple to an open contact do not count."""
+        if self.restitution.ndim < 2:
+            return super().all_impulses(scene, delassus, gap_velocity, velocity)
+        both = scene.closed[:, None] & scene.closed[None, :]
+        among_closed = eqx.tree_at(
+            lambda law: law.restitution, self, jnp.where(both, self.restitution, 0.0)
+        )
+        return Law.all_impulses(among_closed, scene, delassus, gap_velocity, velocity)
+
+    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The solution of one linear complementarity problem."""
+        norm = jnp.sqrt(diagonal(delassus))
+        qn, e = gap_velocity / norm, self.restitution
+        required = qn + (e @ qn if e.ndim == 2 else e * qn)
+        found = solve_lcp(as_matrix(delassus), required * norm, regular=is_regular(delassus))
+        return found.z, found.code

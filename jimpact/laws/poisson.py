@@ -1,0 +1,60 @@
+"""Poisson's law in the two-stage form of Pfeiffer and Glocker."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_values
+from jimpact.laws.base import Law
+from jimpact.numerics.lcp import solve_lcp
+from jimpact.numerics.tridiagonal import Symmetric, as_matrix, is_regular
+
+
+class Poisson(Law):
+    """Poisson's restitution of impulses: compression to rest, then expansion.
+
+    Equation: compression `0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0`; expansion
+    `p_e = e p_c + s`, `0 <= gamma+ = gamma_c + W p_e  _|_  s >= 0`; `p = p_c + p_e`.
+
+    Args:
+        restitution: kinetic coefficient e in [0, 1], scalar or one per contact (m,).
+        allow_above_one: let e exceed 1, which dispersion in a chain would need.
+
+    Status: `impulse_not_unique` for redundant contacts (v+ then rests on the p_c of least norm
+    where their e differ), `energy_gain` where unequal or large e create energy.
+
+    Derivatives are one-sided where a contact is about to take part in either stage.
+
+    Source: Pfeiffer and Glocker (1996); Brogliato, Nonsmooth Mechanics (2016), (6.76)-(6.79) with
+    the errata of `docs/equations.md`.
+
+    >>> import jimpact as ji
+    >>> law = ji.Poisson([0.4, 1.0])
+    >>> ji.impact(law, ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]).velocity.round(4).tolist()
+    [0.0667, 0.2667, 0.6667]
+    """
+
+    restitution: jax.Array
+    allow_above_one: bool = eqx.field(static=True)
+
+    def __init__(self, restitution: Any, *, allow_above_one: bool = False):
+        self.restitution = as_float_array("restitution", restitution)
+        self.allow_above_one = allow_above_one
+        high = np.inf if allow_above_one else 1.0
+        check_values("restitution", self.restitution, low=0.0, high=high)
+
+    def domain(self) -> dict[str, tuple[float, float]]:
+        """Values a fit may give the coefficients."""
+        return {"restitution": (0.0, np.inf)} if self.allow_above_one else {}
+
+    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Two linear complementarity problems."""
+        w, regular = as_matrix(delassus), is_regular(delassus)
+        compression = solve_lcp(w, gap_velocity, regular=regular)
+        returned = self.restitution * compression.z
+        supplement = solve_lcp(w, compression.w + w @ returned, regular=regular)
+        code = jnp.maximum(compression.code, supplement.code)
+        return compression.z + returned + supplement.z, code
