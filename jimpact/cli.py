@@ -1,4 +1,4 @@
-"""The command line: `jimpact fit`, `jimpact laws`. Heavy imports wait until a command runs."""
+"""The command line: `jimpact fit`, `compare`, `laws`. Heavy imports wait until a command runs."""
 
 import dataclasses
 import json as json_module
@@ -42,6 +42,32 @@ class FitCommand:
 
 
 @dataclasses.dataclass(frozen=True)
+class CompareCommand:
+    """Every law on one scene, side by side: velocities, energy, dispersion, audit, time."""
+
+    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
+        "three_balls.toml"
+    )
+    """Study file, or the name of a bundled one; its [data] may be missing."""
+    velocity: tuple[float, ...] | None = None
+    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
+    shot: int = 1
+    """Which measured shot, counted from 1."""
+    fit: bool = False
+    """Fit every law to the data too, with one coefficient and with one per contact."""
+    out: Path = Path("jimpact-compare.png")
+    """Picture (.png, .pdf, .svg), or a directory for it."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def run(self) -> int:
+        """Compare, print, draw."""
+        from jimpact.compare_command import run
+
+        return run(self)
+
+
+@dataclasses.dataclass(frozen=True)
 class LawsCommand:
     """List the laws: what they say, when they are right and when they fail."""
 
@@ -76,6 +102,7 @@ class LawsCommand:
 
 Command = (
     Annotated[FitCommand, tyro.conf.subcommand("fit")]
+    | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
     | Annotated[LawsCommand, tyro.conf.subcommand("laws")]
 )
 

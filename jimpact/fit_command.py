@@ -65,6 +65,7 @@ def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:
     own, everything = _per_contact(study)
     fits = {RAW: own.run(**options)}
     if any("break momentum" in line for line in fits[RAW].warnings):
+        assert study.experiments is not None  # it was fitted
         data = study.experiments.momentum_corrected(study.scene)
         fits[CORRECTED] = replace(own, experiments=data).run(**options)
     if not isinstance(study.law, Newton):

@@ -26,18 +26,24 @@ _DATA_KEYS = ("file", "momentum_corrected")
 
 @dataclass(frozen=True)
 class Study:
-    """What `read_study` found; `run` fits it."""
+    """What `read_study` found; `run` fits it.
+
+    `parameters` are the law's values as the file gives them; `experiments` is None without data.
+    """
 
     title: str
     scene: Scene
     law: Law
     free: dict[str, Any]
     bounds: dict[str, Any]
-    experiments: Experiments
+    experiments: Experiments | None
+    parameters: dict[str, Any]
     options: dict[str, Any] = field(default_factory=dict)
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options; keyword arguments that are not None go first."""
+        if self.experiments is None:
+            raise ValueError("a study must have a [data] table to be fitted, but has none.")
         given = {key: value for key, value in options.items() if value is not None}
         return fit(
             self.law,
@@ -55,7 +61,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`); `[law]` name and start
     values, a number for all contacts or a list with one each, and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
-    to the study), momentum_corrected. A name of a bundled study is found where no such file is.
+    to the study), momentum_corrected; without data a study can be compared, not fitted. A name of a bundled study is found where no such file is.
 
     Raises:
         FileNotFoundError: no such study or data file.
@@ -87,7 +93,7 @@ def _locate(path: Path) -> Path:
 
 
 def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Study:
-    _check_keys("the study", tables, _TABLES, required=("scene", "law", "data"))
+    _check_keys("the study", tables, _TABLES, required=("scene", "law"))
     for name in ("scene", "law", "fit", "data"):
         if not isinstance(tables.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
@@ -104,14 +110,17 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
         fixed = tuple(given) if isinstance(given, list) else given
         values["exponent"] = np.asarray(given, float) if "exponent" in free else fixed
     law = row.law(**values)
-    data = tables["data"]
-    _check_keys("[data]", data, _DATA_KEYS, required=("file",))
-    experiments = read_experiments(path.parent / data["file"])
-    experiments.scene_of(scene, 0)
-    if data.get("momentum_corrected", False):
-        experiments = experiments.momentum_corrected(scene)
+    experiments = _experiments(tables["data"], path, scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
-    return Study(title, scene, law, free, bounds, experiments, options)
+    return Study(title, scene, law, free, bounds, experiments, values, options)
+
+
+def _experiments(table: Mapping[str, Any], path: Path, scene: Scene) -> Experiments:
+    _check_keys("[data]", table, _DATA_KEYS, required=("file",))
+    experiments = read_experiments(path.parent / table["file"])
+    experiments.scene_of(scene, 0)
+    corrected = table.get("momentum_corrected", False)
+    return experiments.momentum_corrected(scene) if corrected else experiments
 
 
 def _scene(table: Mapping[str, Any]) -> Scene:

@@ -89,6 +89,16 @@ def test_against_the_oracle(row):
         np.testing.assert_allclose(h.maximum_force, peak, rtol=1e-7)
 
 
+def test_what_many_closings_leave_over_is_no_approach():
+    """200 closings of contact 1 while contact 2 presses: both end at rest, to rounding."""
+    g = 0.9908170287626599
+    scene = ji.Scene(np.linalg.inv([[1.0, -g], [-g, 1.0]]), np.eye(2))
+    law = ji.LZB([0.18740681, 0.2059518], [1.24614193, 0.4188893])
+    out = ji.impact(law, scene, [0.91974436, -0.95153349])
+    assert ji.STATUS[int(out.status)].name == "plastic_limit"
+    np.testing.assert_allclose(out.velocity, 0.0, atol=1e-13)
+
+
 def test_precompression_against_the_oracle():
     mass, normals = reference.chain_matrices([1.0, 2.0, 1.0])
     u0, v = [0.3, 0.05], [1.0, 0.0, 0.2]
