@@ -64,8 +64,9 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     approach = jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2)
     size = jnp.sqrt(approach + 2 * out.initial_energy)
     size = jnp.where(size > 0, size, 1.0)
-    change = kinetic_energy(scene, out.velocity) - kinetic_energy(scene, v)
-    residual = momentum(scene, out.velocity - v) - scene.normals @ out.impulse
+    jump = momentum(scene, out.velocity - v)
+    change = 0.5 * jump @ (out.velocity + v)  # T+ - T- without their cancellation
+    residual = jump - scene.normals @ out.impulse
     if scene.tangents is not None:
         residual = residual - scene.tangents @ out.tangential_impulse
     if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
@@ -124,6 +125,6 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
         np.asarray(gap_velocity(scene, out.velocity)),
     )
     for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
-        note = "" if closed else "   open: takes no part"
+        note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
         lines.append(f"{j + 1:7d} {a:15.6g} {b:14.6g} {p:21.6g}{note}")
     return "\n".join(lines)

@@ -10,7 +10,8 @@ import numpy as np
 from jimpact.experiments import Experiments, dense_mass
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
-from jimpact.numerics.least_squares import Method, State, advance, begin
+from jimpact.matrix_fit import matrix_region
+from jimpact.numerics.least_squares import Box, Method, Region, State, advance, begin
 from jimpact.parameters import LOGARITHMIC, Parameters, entries, with_entries
 from jimpact.scene import Scene
 from jimpact.status import CODE
@@ -36,6 +37,7 @@ class Problem(eqx.Module):
     log: jax.Array
     low: jax.Array  # bounds of y
     high: jax.Array
+    region: Region  # where y may lie: the box, or a part of it
     scenes: Scene  # one, or stacked one a shot
     pre: jax.Array
     post: jax.Array  # 0 where not measured
@@ -77,8 +79,11 @@ def build_problem(
     bounds[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
     arrays = {"mix": mix, "offset": offset, "scale": scale, "low": bounds[0], "high": bounds[1]}
     arrays |= {"pre": pre, "post": post, "weight": weight / size, "size": size, "unit": unit}
+    shown = own if per_shot else own[:1]
+    region = matrix_region(law, shown, scale * offset, scale[:, None] * mix, bounds)
     return Problem(
         law=law,
+        region=region or Box(*(jnp.asarray(end, dtype) for end in bounds)),
         log=jnp.asarray(log),
         scenes=jax.tree.map(lambda *x: jnp.stack(x), *own) if per_shot else own[0],
         fields=parameters.fields,
@@ -134,6 +139,7 @@ def begin_all(problem: Problem, starts: jax.Array, method: Method, max_steps: in
     shots, bodies = problem.pre.shape
 
     def one(y: jax.Array) -> State:
+        y = problem.region.retract(y)
         velocity, status = jnp.zeros_like(problem.pre), jnp.zeros(shots, jnp.int32)
         residual = jnp.zeros(shots * bodies, y.dtype)
         jacobian = jnp.zeros((shots * bodies, y.shape[0]), y.dtype)
@@ -151,8 +157,7 @@ def advance_all(
     def one(state: State) -> State:
         return advance(
             lambda y: _evaluate(problem, y),
-            problem.low,
-            problem.high,
+            problem.region,
             method,
             max_steps,
             state,

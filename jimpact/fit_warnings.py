@@ -6,6 +6,8 @@ from jimpact.defects import data_defects
 from jimpact.experiments import Experiments
 from jimpact.fit_problem import Problem
 from jimpact.laws.base import Law
+from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.matrix_fit import boundary, encloses
 from jimpact.multistart import EXACT, Search
 from jimpact.parameters import Parameters
 from jimpact.scene import Scene
@@ -43,6 +45,7 @@ def fit_warnings(
         lines.append(
             f"{names[i]} ends at its bound {found.value[i]:g}: its error holds for one side."
         )
+    lines += _matrix(law, problem, experiments.scene_of(scene, 0), found)
     if spread.rank < len(names):
         lines.append(
             f"The data determine {spread.rank} of {len(names)} parameters (rank "
@@ -81,6 +84,22 @@ def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
                 f"{STATUS[code].name}, {STATUS[code].message}."
             )
     return lines
+
+
+def _matrix(law: Law, problem: Problem, scene: Scene, found: Search) -> list[str]:
+    """Where the conditions on a restitution matrix hold it back, or are not asked for."""
+    edges = boundary(problem.region, found.entries)
+    if edges:
+        return [
+            f"The matrix ends at the edge of the admissible ones ({'; '.join(edges)}): the errors "
+            "hold for the side inside."
+        ]
+    if isinstance(law, RestitutionMatrix) and not encloses(law, scene):
+        return [
+            "Nothing keeps this matrix consistent for other approach velocities than the measured: "
+            "the conditions are for (m, m) matrices with admissible=True."
+        ]
+    return []
 
 
 def _equally_good(problem: Problem, found: Search, spread: Uncertainty) -> int:

@@ -118,6 +118,8 @@ def fit(
         law: start values. A scalar field is one value for all contacts (tied), an (m,) field is
             free contact by contact. The stiffnesses of `LZB` with equal exponents: only their
             ratios matter, so contact 1 is held, and a scalar stiffness cannot be fitted.
+            The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
+            approach velocity, at every evaluation and with every method; the start must be so.
         scene: the scene of all shots; not used where the experiments carry one a shot.
         experiments: measured shots.
         free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of

@@ -61,7 +61,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`); `[law]` name and start
     values, a number for all contacts or a list with one each, and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
-    to the study), momentum_corrected; without data a study can be compared, not fitted. A name of a bundled study is found where no such file is.
+    to the study), momentum_corrected; without data a study can be compared, not fitted. A name of
+    a bundled study is found where no such file is.
 
     Raises:
         FileNotFoundError: no such study or data file.

@@ -17,6 +17,14 @@ def poisson(e, k):
     return ji.Poisson(e)
 
 
+def binary(order):
+    def make(e, k):
+        m = max(jnp.size(e), jnp.size(k))
+        return ji.Binary(e, tuple(reversed(range(m))) if order == "tuple" else order)
+
+    return make
+
+
 def lzb(exponent, method="time"):
     def make(e, k):
         return ji.LZB(e, k, exponent, method=method)
@@ -29,6 +37,10 @@ LAWS = {
     "newton": ("newton", newton, 1e-12, 1e-12),
     "moreau": ("moreau", moreau, 1e-12, 1e-12),
     "poisson": ("poisson", poisson, 1e-12, 1e-12),
+    "binary-fastest": ("binary", binary("fastest"), 1e-12, 1e-12),
+    "binary-earliest": ("binary", binary("earliest"), 1e-12, 1e-12),
+    "binary-left-to-right": ("binary", binary("left_to_right"), 1e-12, 1e-12),
+    "binary-tuple": ("binary", binary("tuple"), 1e-12, 1e-12),
     "lzb-linear": ("lzb", lzb(1.0), 1e-7, 1e-6),
     "lzb-hertz": ("lzb", lzb(1.5), 1e-7, 1e-6),
     "lzb-array-exponent": ("lzb", lzb(jnp.array(1.4)), 1e-7, 1e-6),

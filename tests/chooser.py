@@ -5,6 +5,8 @@ balls (masses and stiffnesses over two decades, one e per contact) and 200 gener
 contacts in three coordinates, all with random velocities in which something approaches.
 """
 
+import operator
+
 import jax
 
 if __name__ == "__main__":
@@ -70,7 +72,7 @@ def broken(make):
             outcome(*(np.concatenate(x) for x in zip(plain, scaled, backwards)))
         )
         after, faster, turned = np.split(out.velocity, 3)
-        found, status = jax.tree.map(lambda x: x[: len(v)], (found, out.status))
+        found, status = jax.tree.map(operator.itemgetter(slice(len(v))), (found, out.status))
         same = _SAME * np.abs(v).max(axis=1)
         bad = [
             ~found.momentum,

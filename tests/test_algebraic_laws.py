@@ -188,7 +188,9 @@ def test_inclusion():
 
 
 def test_coupling_is_block_triangular():
-    block = ji.Scene([2.0, 2.0, 0.3], [[0, 0], [1.0, 1.0], [-0.5, 0.5]], [[1.0, 1.0], [0, 0], [0.7, 0.7]])
+    block = ji.Scene(
+        [2.0, 2.0, 0.3], [[0, 0], [1.0, 1.0], [-0.5, 0.5]], [[1.0, 1.0], [0, 0], [0.7, 0.7]]
+    )
     gbar = np.asarray(ji.contact_coupling(block))
     np.testing.assert_allclose(gbar[:2, :2], ji.normalized_delassus(block), atol=1e-14)
     np.testing.assert_allclose(gbar[2, :2], 0, atol=1e-14)
@@ -244,7 +246,10 @@ BAD = [
     (lambda: ji.Moreau(-0.1), r"`restitution` must lie in \[0, 1\], but has value -0\.1"),
     (lambda: ji.Moreau([[0.5, 0.1]]), r"`restitution` must be a square matrix.*\(1, 2\)"),
     (lambda: ji.Moreau([[0.5, np.nan], [0, 0.5]]), r"`restitution`.*nan at index \(0, 1\)"),
-    (lambda: ji.impact(ji.Moreau(np.eye(3)), EQUAL, ONE), r"`restitution` must have shape \(2, 2\)"),
+    (
+        lambda: ji.impact(ji.Moreau(np.eye(3)), EQUAL, ONE),
+        r"`restitution` must have shape \(2, 2\)",
+    ),
     (lambda: ji.Poisson([0.5, 1.2]), r"`restitution`.*1\.2 at index 1"),
     (lambda: ji.Poisson(-1.0, allow_above_one=True), r"`restitution` must lie in \[0, inf\)"),
     (lambda: ji.impact(ji.Poisson([0.5] * 3), EQUAL, ONE), r"`restitution` must have shape \(2,\)"),

@@ -83,7 +83,9 @@ def test_nothing_happens(row):
 
 
 def test_open_contacts_take_no_part(row):
-    _, make, accuracy, _ = row
+    entry, make, accuracy, _ = row
+    if entry.law.uses_gaps:
+        pytest.skip("its open contacts may close: tested with the law")
     v = jnp.array([1.0, 0.0, -0.5])
     gapped = ji.impact(make(E, K), ji.chain(jnp.ones(3), gaps=jnp.array([0.0, 1e-3])), v)
     alone = ji.impact(make(E[0], K[0]), ji.chain(jnp.ones(2)), v[:2])
@@ -95,6 +97,8 @@ def test_open_contacts_take_no_part(row):
 
 def test_permutation(row):
     _, make, accuracy, _ = row
+    if getattr(make(E, K), "order", "fastest") not in ("fastest", "earliest"):
+        pytest.skip("its order is by number of the contact")
     scene, v = SCENES["plane"]()
     swapped = ji.Scene(scene.mass, scene.normals[:, ::-1])
     a = ji.impact(make(E, K), scene, v)
@@ -190,7 +194,9 @@ HARD = st.floats(-6, 6)
     logm=st.tuples(HARD, HARD, HARD),
     v=st.tuples(SPEEDS, SPEEDS, SPEEDS),
 )
-@pytest.mark.parametrize("name", ["newton", "lzb-hertz", "lzb-linear"])
+@pytest.mark.parametrize(
+    "name", ["newton", "moreau", "poisson", "binary-fastest", "lzb-hertz", "lzb-linear"]
+)
 def test_extreme_input_is_right_or_flagged(name, e, logk, logm, v):
     make = LAWS[name][1]
     law = make(jnp.array(e), 10.0 ** jnp.array(logk))

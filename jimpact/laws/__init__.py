@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 from jimpact.laws.base import Law
+from jimpact.laws.binary import Binary
 from jimpact.laws.lzb import LZB
 from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
@@ -46,6 +47,11 @@ PFEIFFER = """@book{pfeiffer1996,
   author = {Pfeiffer, Friedrich and Glocker, Christoph},
   title = {Multibody Dynamics with Unilateral Contacts}, publisher = {Wiley}, year = {1996}}"""
 
+TOWNE = """@article{towne1977,
+  author = {Towne, Dudley H. and Hadlock, Charles R.},
+  title = {One-dimensional collisions and {C}hebyshev polynomials},
+  journal = {American Journal of Physics}, volume = {45}, pages = {255--259}, year = {1977}}"""
+
 EVERY_PROPERTY = frozenset(
     {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
 )
@@ -75,7 +81,7 @@ REGISTRY: dict[str, Row] = {
         law=Moreau,
         parameters=("restitution",),
         summary="0 <= gamma+ + e gamma- and p >= 0, one of them zero",
-        right_when="stiffness rising along the chain (k2/k1 >> 1), plastic or decoupled contacts",
+        right_when="stiffness rising along the chain, plastic or decoupled contacts",
         fails_when="chains at rest (no dispersion), contacts that separate before the impact",
         promises=frozenset({"impulse_sign", "velocity_scaling", "mass_scaling"}),
         source="Moreau (1988); Brogliato (2016), (6.51)",
@@ -90,5 +96,15 @@ REGISTRY: dict[str, Row] = {
         promises=EVERY_PROPERTY - {"energy"},
         source="Pfeiffer and Glocker (1996); Brogliato (2016), (6.76)-(6.79)",
         bibtex=PFEIFFER,
+    ),
+    "binary": Row(
+        law=Binary,
+        parameters=("restitution",),
+        summary="pair collisions one after another, in a given order",
+        right_when="gaps well above the indentation, stiffness falling along the chain",
+        fails_when="touching equal balls (the striker never reverses), ties: order dependent",
+        promises=EVERY_PROPERTY,
+        source="Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)",
+        bibtex=TOWNE,
     ),
 }

@@ -13,12 +13,14 @@ import jax.numpy as jnp
 from jimpact.numerics.flow import (
     COMPRESSION,
     EXPANSION,
+    FROM_GAP,
     OPEN,
     ROOT_X,
     ZERO_G,
     Flow,
     State,
     field,
+    lands,
     plus_one,
     power,
 )
@@ -67,16 +69,18 @@ def find(
 ) -> Events:
     """Events between `state` and `new`; the one a landing step ends on is not among them."""
     snap = SNAP * tolerance
-    before, after = _margins(tolerance, phase, state), _margins(tolerance, phase, new)
+    before, after = _margins(flow, tolerance, phase, state), _margins(flow, tolerance, phase, new)
     slope, slope_end = _slopes(flow, phase, state), _slopes(flow, phase, new)
-    landing = (kind == ZERO_G) | (kind == ROOT_X)
+    landing = lands(kind)
     crossed_g = ~(target & (kind == ZERO_G)) & (after.g < -snap)
-    crossed_x = ~(target & (kind == ROOT_X)) & (after.x < -snap)
+    crossed_x = ~(target & ((kind == ROOT_X) | (kind == FROM_GAP))) & (after.x < -snap)
     dipped = ~landing & _dips(before.g, after.g, slope.g * span, slope_end.g * span, snap)
     idle = ~matters(flow, tolerance, state) & ~matters(flow, tolerance, new)
     at_once = (crossed_g & (before.g <= snap) & (slope.g <= 0)) | (
         (crossed_g | crossed_x) & ((span < SHORTEST) | idle)
     )
+    if flow.gapped:  # gaps that close together
+        at_once |= crossed_x & (phase == OPEN) & (before.x <= snap) & (slope.x <= 0)
     at_g = jnp.where(crossed_g, _crossing(before.g, after.g, slope.g * span), jnp.inf)
     at_x = jnp.where(crossed_x, _crossing(before.x, after.x, slope.x * span), jnp.inf)
     at_dip = jnp.where(dipped, _dip_at(before.g, after.g, slope.g * span), jnp.inf)
@@ -114,7 +118,8 @@ def change_phase(
     g = jnp.where(opened, flow.restitution * state.g, state.g)
     at_rest = arrived & ~opened & (phase != OPEN)
     g = jnp.where(at_rest, 0.0, g)
-    x = jnp.where(new_phase == OPEN, 0.0, state.x)
+    reset = arrived & (opened | (phase == OPEN)) if flow.gapped else new_phase == OPEN
+    x = jnp.where(reset, 0.0, state.x)
     return state._replace(x=x, g=g), new_phase, arrived & (phase == OPEN)
 
 
@@ -131,7 +136,11 @@ def _signs(phase: jax.Array) -> jax.Array:
     return jnp.where(phase == COMPRESSION, -1.0, 1.0)
 
 
-def _margins(tolerance: jax.Array, phase: jax.Array, state: State) -> Margin:
+def _margins(flow: Flow, tolerance: jax.Array, phase: jax.Array, state: State) -> Margin:
+    if flow.gapped:
+        g = jnp.where(phase == OPEN, 1.0, _signs(phase) * state.g)
+        x = jnp.where(phase == OPEN, -state.x, state.x)
+        return Margin(jnp.where(phase == COMPRESSION, 1.0, x), g)
     slack = jnp.where(phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
     g = _signs(phase) * state.g + slack
     return Margin(jnp.where(phase == EXPANSION, state.x, 1.0), g)
@@ -139,6 +148,10 @@ def _margins(tolerance: jax.Array, phase: jax.Array, state: State) -> Margin:
 
 def _slopes(flow: Flow, phase: jax.Array, state: State) -> Margin:
     dx, dg, _, _ = field(flow, phase, state.x, state.g)
+    if flow.gapped:
+        rate = jnp.where(phase == OPEN, -dx, dx)
+        rate = jnp.where(phase == COMPRESSION, 0.0, rate)
+        return Margin(rate, jnp.where(phase == OPEN, 0.0, _signs(phase) * dg))
     return Margin(jnp.where(phase == EXPANSION, dx, 0.0), _signs(phase) * dg)
 
 

@@ -15,6 +15,10 @@ A step may advance in time or in another variable xi that grows or falls monoton
     START    xi = t^(1/r): an impact begins like x ~ t, and forces t^eta are smooth in xi
     ZERO_G   xi = g_j, ending on g_j = 0 (or a given value): lands on the event (Henon's trick)
     ROOT_X   xi = x_j^(1/r), ending on x_j = 0: the same for an opening, x_j^eta smooth in xi
+    FROM_GAP xi = x_j from below to x_j = 0: a gap closes
+
+Contacts with gaps (`gapped`, the compliant law): an open contact keeps track of x_j = -gap_j and
+closes when that returns to 0; without, geometry is frozen and it closes when gamma_j < 0.
 
 with r = 2 where 2 eta is known to be whole, else 8.
 """
@@ -28,7 +32,7 @@ import numpy as np
 from jimpact.numerics.tableaux import DOP853
 from jimpact.numerics.tridiagonal import Symmetric
 
-TIME, START, ZERO_G, ROOT_X = 0, 1, 2, 3  # variable of a step
+TIME, START, ZERO_G, ROOT_X, FROM_GAP = 0, 1, 2, 3, 4  # variable of a step
 OPEN, COMPRESSION, EXPANSION = 0, 1, 2  # phase of a contact
 
 _DENSE_A = np.array([[*row, *[0.0] * (len(DOP853.c) - len(row))] for row in DOP853.a])
@@ -43,6 +47,7 @@ class Flow(NamedTuple):
     omega: jax.Array
     restitution: jax.Array
     exponent: Exponent
+    gapped: bool = False
 
 
 def frozen(flow: Flow) -> Flow:
@@ -50,7 +55,7 @@ def frozen(flow: Flow) -> Flow:
     exponent = flow.exponent
     if isinstance(exponent, jax.Array):
         exponent = jax.lax.stop_gradient(exponent)
-    return Flow(*jax.lax.stop_gradient(flow[:3]), exponent)
+    return Flow(*jax.lax.stop_gradient(flow[:3]), exponent, flow.gapped)
 
 
 class State(NamedTuple):
@@ -60,6 +65,11 @@ class State(NamedTuple):
     g: jax.Array
     p: jax.Array
     t: jax.Array
+
+
+def lands(kind: jax.Array) -> jax.Array:
+    """Whether a step of this kind ends on an event."""
+    return (kind == ZERO_G) | (kind == ROOT_X) | (kind == FROM_GAP)
 
 
 def power(x: jax.Array, exponent: Exponent) -> jax.Array:
@@ -108,7 +118,9 @@ def field(flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array) -> tuple[jax
     """`(x', g', p', t')` with respect to time in units of `s*`, phases frozen."""
     _, unit, ratio = scales(flow, phase)
     force = factor(flow.exponent, x.dtype) * flow.omega * power(x, flow.exponent)
-    closing = jnp.where(phase == OPEN, 0.0, -ratio * flow.omega)
+    closing = -ratio * flow.omega
+    if not flow.gapped:
+        closing = jnp.where(phase == OPEN, 0.0, closing)
     return closing * g, ratio * (flow.coupling @ force), unit * force, unit
 
 
@@ -129,14 +141,15 @@ def step(
     """
     m, dtype, r = state.x.shape[0], state.x.dtype, root_order(flow.exponent)
     a, c = jnp.asarray(_DENSE_A, dtype), jnp.asarray(DOP853.c, dtype)
-    known_x, known_g = target & (kind == ROOT_X), target & (kind == ZERO_G)
+    known_x = target & ((kind == ROOT_X) | (kind == FROM_GAP))
+    known_g = target & (kind == ZERO_G)
     y = jnp.concatenate([state.x, state.g])
 
     def stage(i: jax.Array, slopes: jax.Array) -> jax.Array:
         at = y + length * (a[i] @ slopes[:, : 2 * m])
         xi = start + c[i] * length
         # the variable of the step is known exactly at every stage
-        x = jnp.where(known_x, xi**r, at[:m])
+        x = jnp.where(known_x, jnp.where(kind == FROM_GAP, xi, xi**r), at[:m])
         g = jnp.where(known_g, xi, at[m:])
         rates = field(flow, phase, x, g)
         row = jnp.concatenate([*rates[:3], rates[3][None]])
@@ -160,7 +173,7 @@ def _stretch(
 ) -> jax.Array:
     """`dt / dxi`."""
     dx, dg = (jnp.sum(jnp.where(target, rate, 0.0)) for rate in rates[:2])
-    rate = jnp.where(kind == ZERO_G, dg, jnp.where(kind == ROOT_X, dx, 1.0))
+    rate = jnp.where(kind == ZERO_G, dg, jnp.where(lands(kind), dx, 1.0))
     numerator = jnp.where((kind == START) | (kind == ROOT_X), r * xi ** (r - 1), 1.0)
     safe = jnp.where(rate == 0, 1.0, rate)
     return jnp.where(rate == 0, jnp.nan, 1.0) * numerator / safe

@@ -1,14 +1,16 @@
-"""Nonlinear least squares in a box: Levenberg-Marquardt, or gradient descent with optax.
+"""Nonlinear least squares in a region: Levenberg-Marquardt, or gradient descent with optax.
 
-Minimize `|r(y)|^2 / 2` subject to `low <= y <= high`. Steps are cut at the box, and a variable
-on a bound whose gradient points outward is left out of the step, so minima on a bound are found
-exactly. (Smooth maps of the box onto the real line put them at infinity: Levenberg-Marquardt then
-still crawled after 100 steps, every start ending elsewhere.) One pass evaluates residual and
-Jacobian together once, so that the impact is compiled once; a solve can be continued.
+Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `Box` `low <= y <= high`. Steps are cut at
+the box, and a variable on a bound whose gradient points outward is left out of the step, so minima
+on a bound are found exactly. (Smooth maps of the box onto the real line put them at infinity:
+Levenberg-Marquardt then still crawled after 100 steps, every start ending elsewhere.) One pass
+evaluates residual and Jacobian together once, so that the impact is compiled once; a solve can be
+continued.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
+from functools import partial
+from typing import Any, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
@@ -33,6 +35,53 @@ _LEAST = {"float64": 1e-10, "float32": 1e-5}  # smallest damping: keeps the matr
 _STUCK = 1e6  # above this damping a kink of the law lets nothing pass
 _FLAT = 1e-10  # curvatures below this share of the largest are damped as if they had it
 _ADAM_RATE, _SGD_RATE, _SGD_MOMENTUM = 0.1, 0.3, 0.9  # in y, where ranges are of order 1
+
+
+class Region(Protocol):
+    """A convex set of y, as far as the methods need it."""
+
+    def retract(self, y: jax.Array) -> jax.Array:
+        """y itself, or a point of the region near it."""
+
+    def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
+        """The gradient without what would push y out of the region."""
+
+    def step(
+        self, y: jax.Array, residual: jax.Array, jacobian: jax.Array, damping: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Damped Gauss-Newton step inside the region, and the decrease it promises."""
+
+
+class Box(eqx.Module):
+    """The region `low <= y <= high`."""
+
+    low: jax.Array
+    high: jax.Array
+
+    def retract(self, y: jax.Array) -> jax.Array:
+        """The nearest point of the box."""
+        return jnp.clip(y, self.low, self.high)
+
+    def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
+        """The gradient without variables that sit on a bound and are pushed against it."""
+        pushed = ((y <= self.low) & (gradient > 0)) | ((y >= self.high) & (gradient < 0))
+        return jnp.where(pushed, 0.0, gradient)
+
+    def step(
+        self, y: jax.Array, residual: jax.Array, jacobian: jax.Array, damping: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Damped Gauss-Newton step of the free variables, and the decrease it promises."""
+        gradient = jacobian.T @ residual
+        pushed = (self.free_gradient(y, gradient) == 0) & (gradient != 0)
+        jacobian = jnp.where(pushed[None, :], 0.0, jacobian)
+        gradient = jnp.where(pushed, 0.0, gradient)
+        hessian = jacobian.T @ jacobian
+        curvature = jnp.diagonal(hessian)
+        largest = jnp.max(curvature)
+        curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
+        factor = jax.scipy.linalg.cho_factor(hessian + jnp.diag(damping * curvature))
+        move = -jax.scipy.linalg.cho_solve(factor, gradient)
+        return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
 
 
 class State(eqx.Module):
@@ -77,8 +126,7 @@ def begin(y: jax.Array, first: tuple[Any, Any, Any], method: Method, max_steps: 
 
 def advance(
     evaluate: Evaluate,
-    low: jax.Array,
-    high: jax.Array,
+    region: Region,
     method: Method,
     max_steps: int,
     state: State,
@@ -96,14 +144,15 @@ def advance(
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
         y, r, jac, kept, least = best
         floor = jnp.asarray(_LEAST[str(y.dtype)], y.dtype)
-        gain = _step(y, r, jac, low, high, floor)[1]
         if method == "levenberg-marquardt":
             memory = jnp.maximum(state.memory * jnp.where(better, _LESS, _MORE), floor)
-            move = _step(y, r, jac, low, high, memory)[0]
-            trial = jnp.clip(y + move, low, high)
+            step = partial(region.step, y, r, jac)
+            moves, gains = jax.vmap(step)(jnp.stack([floor, memory]))  # compiled once
+            gain, trial = gains[0], y + moves[1]
             stuck = memory > _STUCK
         else:
-            gradient = _free(state.trial, jacobian.T @ residual, low, high)
+            gain = region.step(y, r, jac, floor)[1]
+            gradient = region.free_gradient(state.trial, jacobian.T @ residual)
             # optax itself mixes integers and floats: it needs the standard promotion
             with jax.numpy_dtype_promotion("standard"):
                 move, memory = _transformation(method, max_steps).update(
@@ -112,43 +161,16 @@ def advance(
                     state.trial,
                     value=cost,
                     grad=gradient,
-                    value_fn=lambda y: _cost(evaluate, jnp.clip(y, low, high)),
+                    value_fn=lambda y: _cost(evaluate, region.retract(y)),
                 )
-            trial = jnp.clip(state.trial + move, low, high)
+            trial = state.trial + move
             stuck = jnp.asarray(False)
+        trial = region.retract(trial)
         dtype = str(y.dtype)
         done = stuck | (gain <= STOP_GAIN[dtype] * least + STOP_EXACT[dtype])
         return State(y, r, jac, kept, least, gain, trial, memory, state.steps + 1, done)
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
-
-
-def _free(y: jax.Array, gradient: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """The gradient without variables that sit on a bound and are pushed against it."""
-    pushed = ((y <= low) & (gradient > 0)) | ((y >= high) & (gradient < 0))
-    return jnp.where(pushed, 0.0, gradient)
-
-
-def _step(
-    y: jax.Array,
-    residual: jax.Array,
-    jacobian: jax.Array,
-    low: jax.Array,
-    high: jax.Array,
-    damping: jax.Array,
-) -> tuple[jax.Array, jax.Array]:
-    """Damped Gauss-Newton step of the free variables, and the decrease it promises."""
-    gradient = jacobian.T @ residual
-    pushed = (_free(y, gradient, low, high) == 0) & (gradient != 0)
-    jacobian = jnp.where(pushed[None, :], 0.0, jacobian)
-    gradient = jnp.where(pushed, 0.0, gradient)
-    hessian = jacobian.T @ jacobian
-    curvature = jnp.diagonal(hessian)
-    largest = jnp.max(curvature)
-    curvature = jnp.maximum(curvature, jnp.where(largest > 0, _FLAT * largest, 1.0))
-    factor = jax.scipy.linalg.cho_factor(hessian + jnp.diag(damping * curvature))
-    move = -jax.scipy.linalg.cho_solve(factor, gradient)
-    return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
 
 
 def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:

@@ -17,6 +17,7 @@ from jimpact.numerics import flow as flows
 from jimpact.numerics.flow import (
     COMPRESSION,
     EXPANSION,
+    FROM_GAP,
     OPEN,
     ROOT_X,
     START,
@@ -24,6 +25,8 @@ from jimpact.numerics.flow import (
     ZERO_G,
     Flow,
     State,
+    field,
+    lands,
     root_order,
 )
 
@@ -81,6 +84,7 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
     """State before the impact; a touching contact at rest starts in compression."""
     m, dtype = gamma.shape[0], gamma.dtype
     phase = jnp.where((gamma <= 0) | (x > 0), COMPRESSION, OPEN).astype(jnp.int32)
+    phase = jnp.where(x < 0, OPEN, phase)
     phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
     # loaded, separating and e = 0: it opens at once and returns nothing
     spent = (phase == EXPANSION) & (flow.restitution == 0)
@@ -102,7 +106,7 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
         closures=jnp.zeros(m, jnp.int32),
         done=no,
     )
-    return _finish(flow, control, carry)
+    return _finish(flow, control, _fly(flow, carry) if flow.gapped else carry)
 
 
 def run(flow: Flow, control: Control, carry: Carry) -> Carry:
@@ -135,7 +139,7 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     inside = exact & ~flips & found.inside
     accept = exact & ~flips & ~found.inside
 
-    landing = (kind == ZERO_G) | (kind == ROOT_X)
+    landing = lands(kind)
     arrived = jnp.where(flips, found.at_once, accept & landing & target)
     moved = State(*(jnp.where(accept, b, a) for a, b in zip(carry.state, reached)))
     moved, new_phase, closed = events.change_phase(flow, phase, moved, arrived, found.opens)
@@ -146,7 +150,8 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
         passes=carry.passes + 1,
         closures=carry.closures + closed.astype(jnp.int32),
     )
-    return _finish(flow, control, _aim_at_opening(flow, out, accept))
+    out = _aim_at_opening(flow, out, accept)
+    return _finish(flow, control, _fly(flow, out) if flow.gapped else out)
 
 
 def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, jax.Array]:
@@ -158,9 +163,9 @@ def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, ja
     safe = jnp.where(x > 0, x, 1.0)
     root = jnp.sqrt(safe) if root_order(flow.exponent) == 2 else jnp.sqrt(jnp.sqrt(jnp.sqrt(safe)))
     root = jnp.where(x > 0, root, 0.0)
-    kinds = [carry.kind == START, carry.kind == ZERO_G, carry.kind == ROOT_X]
-    start = jnp.select(kinds, [carry.begun, g, root], 0.0)
-    length = jnp.select(kinds, [carry.h, g_end - g, -root], carry.h)
+    kinds = [carry.kind == kind for kind in (START, ZERO_G, ROOT_X, FROM_GAP)]
+    start = jnp.select(kinds, [carry.begun, g, root, x], 0.0)
+    length = jnp.select(kinds, [carry.h, g_end - g, -root, -x], carry.h)
     return start, length
 
 
@@ -168,7 +173,7 @@ def _span(flow: Flow, carry: Carry) -> jax.Array:
     """Time the step takes, or is expected to take."""
     r = root_order(flow.exponent)
     in_start = (carry.begun + carry.h) ** r - carry.begun**r
-    landing = (carry.kind == ZERO_G) | (carry.kind == ROOT_X)
+    landing = lands(carry.kind)
     return jnp.select([landing, carry.kind == START], [carry.due, in_start], carry.h)
 
 
@@ -197,7 +202,7 @@ def _next_step(
 ) -> Carry:
     """Variable, target and length of the next step."""
     h, kind, begun, r = carry.h, carry.kind, carry.begun, root_order(flow.exponent)
-    landing = (kind == ZERO_G) | (kind == ROOT_X)
+    landing = lands(kind)
     starting = kind == START
     factor = jnp.clip(SAFETY * (error + LEAST_ERROR) ** (-1 / 8), SHRINK, GROWTH)
     factor = jnp.where(jnp.isfinite(error), factor, SHRINK)
@@ -205,6 +210,7 @@ def _next_step(
     land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
     leaves = starting & inside & (begun > 0)
     short = CUT_SHORT * found.first
+    gap_closes = jnp.any(found.target & (carry.phase == OPEN))
     cases = [
         (flips | (accept & landing), h),
         (accept, factor * h),
@@ -216,14 +222,17 @@ def _next_step(
     next_h = jnp.select([case for case, _ in cases], [value for _, value in cases], factor * h)
     next_kind = jnp.where(
         land,
-        jnp.where(found.by_opening, ROOT_X, ZERO_G),
+        jnp.where(found.by_opening, jnp.where(gap_closes, FROM_GAP, ROOT_X), ZERO_G),
         jnp.where(starting & ~leaves, START, TIME),
     )
     begun = begun + jnp.where(accept & starting, h, 0.0)
-    if r > 2:  # x ~ t^2 after a closing, so t^(2 eta) is smooth enough only where 2 eta is whole
+    # x ~ t^2 after a closing, so t^(2 eta) is smooth enough where 2 eta is whole; but a gap closes
+    # with x ~ t
+    if r > 2 or flow.gapped:
         begins = jnp.any(closed)
         next_kind = jnp.where(begins, START, next_kind)
-        next_h = jnp.where(begins, (RESTART * span) ** (1 / r), next_h)
+        fresh = jnp.minimum(RESTART * span, FIRST_TIME)
+        next_h = jnp.where(begins, fresh ** (1 / r), next_h)
         begun = jnp.where(begins, 0.0, begun)
     return carry._replace(
         kind=next_kind.astype(jnp.int32),
@@ -244,6 +253,21 @@ def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
         kind=jnp.where(aim, ROOT_X, carry.kind).astype(jnp.int32),
         target=jnp.where(aim, target, carry.target),
         due=jnp.where(aim, due, carry.due),
+    )
+
+
+def _fly(flow: Flow, carry: Carry) -> Carry:
+    """While all contacts are open, go to the next closing in one step, however far it is."""
+    state = jax.lax.stop_gradient(carry.state)
+    dx, _, _, _ = field(flows.frozen(flow), carry.phase, state.x, state.g)
+    closing = (carry.phase == OPEN) & (state.x < 0) & (dx > 0)
+    due = jnp.where(closing, -state.x / jnp.where(closing, dx, 1.0), jnp.inf)
+    flies = jnp.all(carry.phase == OPEN) & jnp.any(closing)
+    return carry._replace(
+        kind=jnp.where(flies, FROM_GAP, carry.kind).astype(jnp.int32),
+        target=jnp.where(flies, jnp.arange(due.shape[0]) == jnp.argmin(due), carry.target),
+        due=jnp.where(flies, jnp.min(due), carry.due),
+        retargeted=carry.retargeted & ~flies,
     )
 
 

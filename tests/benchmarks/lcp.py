@@ -72,7 +72,9 @@ def main():
         "enumeration": enumeration,
         "qpax": qpax_solver(),
     }
-    print(f"{'m':>2} {'solver':24} {'us':>8} {'ratio':>7} {'compile s':>9} {'max |w-|, |z-|':>15} jvp us")
+    print(
+        f"{'m':>2} {'solver':24} {'us':>8} {'ratio':>7} {'compile s':>9} {'max |w-|, |z-|':>15} jvp us"
+    )
     for m in (2, 3, 5, 8):
         w, q = problems(m)
         ours = None
@@ -84,10 +86,14 @@ def main():
             worst = -float(jnp.minimum(z.min(), (jnp.einsum("kij,kj->ki", w, z) + q).min()))
             slope = np.nan
             if name != "qpax":  # it has no forward mode
-                jvp = jax.jit(jax.vmap(lambda w, q, f=solver: jax.jvp(lambda b: f(w, b), (q,), (q,))[1]))
+                jvp = jax.jit(
+                    jax.vmap(lambda w, q, f=solver: jax.jvp(lambda b: f(w, b), (q,), (q,))[1])
+                )
                 slope, _ = timed(jvp, w, q)
             ours = ours or cost
-            print(f"{m:2d} {name:24} {cost:8.2f} {cost / ours:7.2f} {first:9.2f} {worst:15.1e} {slope:6.2f}")
+            print(
+                f"{m:2d} {name:24} {cost:8.2f} {cost / ours:7.2f} {first:9.2f} {worst:15.1e} {slope:6.2f}"
+            )
 
 
 if __name__ == "__main__":

@@ -1,0 +1,223 @@
+"""Binary collisions: the contacts collide one after another, in a given order."""
+
+import operator
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
+from jimpact.laws.base import Law
+from jimpact.numerics import collisions
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
+from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
+
+ORDERS = ("fastest", "earliest", "left_to_right")
+
+
+class Binary(Law):
+    """Sequential pair collisions until no contact approaches.
+
+    Equation, at one contact after another: `p_j = -(1 + e_j) gamma_j / W_jj`,
+    `gamma += W[:, j] p_j`, hence `gamma_j+ = -e_j gamma_j` there.
+
+    Args:
+        restitution: kinematic coefficient e in [0, 1], scalar or one per contact (m,).
+        order: 'fastest': the contact with the largest approach speed [m/s];
+            'earliest': the one that closes first (gap / approach speed), gaps change in free
+            flight between collisions (None: all closed), ties are decided by 'fastest';
+            'left_to_right': contacts 0 .. m-1 in turn, again and again;
+            a tuple of all contact indices (0-based, repeats allowed): in turn, likewise. Contacts
+            that do not approach are skipped.
+        max_collisions: the law gives up after so many.
+
+    In every order but 'earliest' gap sizes do not matter: open contacts that approach collide too.
+
+    Status: `order_dependent` where two coupled contacts were equally fast (early) within rounding
+    (the lower index went first); `plastic_limit` where collisions go on forever: for two contacts
+    exactly iff z >= 1 and the state is in the invariant cone, gamma+ = 0 then; for more where
+    approach speeds decay below rounding without ending; `max_steps` at `max_collisions`.
+
+    Derivatives, forward and reverse, in restitution, W and gamma-, at the order found. v+ is
+    continuous where the number of collisions changes, with one-sided derivatives; it jumps where
+    the order of coupled contacts changes. Derivatives in gaps are zero.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.3), (6.4), (6.13) corrected, (6.17)-(6.21);
+    Towne and Hadlock, Am. J. Phys. 45 (1977) 255 (number of collisions).
+
+    >>> import jimpact as ji
+    >>> from jimpact.laws.binary import Binary
+    >>> out = ji.impact(Binary([0.9, 0.8]), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0])
+    >>> [round(float(v), 6) for v in out.velocity]
+    [-0.266667, -0.050667, 0.456]
+    """
+
+    uses_gaps: ClassVar[bool] = True
+
+    restitution: jax.Array
+    order: str | tuple[int, ...] = eqx.field(static=True)
+    max_collisions: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        restitution: Any,
+        order: str | Sequence[int] = "fastest",
+        *,
+        max_collisions: int = 10_000,
+    ):
+        self.restitution = as_float_array("restitution", restitution)
+        check_values("restitution", self.restitution, low=0.0, high=1.0)
+        self.order = _checked_order(order)
+        self.max_collisions = _positive_int("max_collisions", max_collisions)
+
+    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
+        """An order that names no such contact, or leaves one out, is an error."""
+        check_per_contact("restitution", self.restitution, scene.contacts)
+        if isinstance(self.order, str):
+            return
+        m = scene.contacts
+        if max(self.order) >= m:
+            raise ValueError(
+                f"Argument `order` must hold contact indices 0 to {m - 1}, "
+                f"but has value {self.order!r}."
+            )
+        missing = sorted(set(range(m)) - set(self.order))
+        if missing:
+            raise ValueError(
+                f"Argument `order` must name every contact, but contact {missing[0]} is missing "
+                f"in {self.order!r} and could approach forever."
+            )
+        if m > 1 and any(a == b for a, b in zip(self.order, self.order[1:] + self.order[:1])):
+            raise ValueError(
+                "Argument `order` must not name a contact twice in a row (the last and the first "
+                f"follow each other), but has value {self.order!r}: it separates at once."
+            )
+
+    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Sum of the impulses of all collisions; contacts without gaps."""
+        p, end = self._solve(delassus, gap_velocity, None)
+        return p, end.code
+
+    def all_impulses(
+        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Impulses of all collisions; the gaps of the scene matter in the order 'earliest'."""
+        p, end = self._solve(delassus, gap_velocity, scene.gaps)
+        count = 0 if scene.tangents is None else scene.tangents.shape[1]
+        return p, jnp.zeros(count, p.dtype), end.code
+
+    def _cycle(self, m: int) -> tuple[int, ...] | None:
+        if isinstance(self.order, tuple):
+            return self.order
+        return tuple(range(m)) if self.order == "left_to_right" else None
+
+    def _gaps(self, gaps: jax.Array | None, gamma: jax.Array) -> jax.Array | None:
+        if self.order != "earliest":
+            return None
+        return jnp.zeros_like(gamma) if gaps is None else gaps
+
+    def _solve(
+        self, delassus: Symmetric, gamma: jax.Array, gaps: jax.Array | None
+    ) -> tuple[jax.Array, collisions.End]:
+        return collisions.solve(
+            delassus,
+            gamma,
+            self.restitution,
+            self._gaps(gaps, gamma),
+            self._cycle(gamma.shape[0]),
+            self.max_collisions,
+        )
+
+    def collisions(self, scene: Scene, velocity: Any) -> jax.Array:
+        """Number of collisions () int32 until the end; -1: without end; jit, vmap.
+
+        `max_collisions` where the law gave up. Approaches slower than rounding do not count.
+
+        Source: Brogliato (2016), (6.19), (6.20) with ceil for floor: three balls, v- = (v, 0, 0),
+        have `N = ceil(pi / arccos z) - 1`.
+
+        >>> import jimpact as ji
+        >>> from jimpact.laws.binary import Binary
+        >>> int(Binary(0.5).collisions(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]))
+        3
+        """
+        law, scene, v = self._prepared(scene, velocity)
+        return _count(law, scene, v)
+
+    def sequence(
+        self, scene: Scene, velocity: Any, limit: int = 100
+    ) -> list[tuple[int, float | None, np.ndarray]]:
+        """The first `limit` collisions: contact, time [s] ('earliest', else None), velocities.
+
+        A host function, for looking at; it does not stop at a plastic limit.
+
+        >>> import jimpact as ji
+        >>> from jimpact.laws.binary import Binary
+        >>> balls = ji.chain([1.0, 1.0, 1.0])
+        >>> for contact, _, v in Binary(0.5).sequence(balls, [1.0, 0.0, 0.0]):
+        ...     print(contact, v.round(6))
+        0 [0.25 0.75 0.  ]
+        1 [0.25   0.1875 0.5625]
+        0 [0.203125 0.234375 0.5625  ]
+        """
+        law, scene, v = self._prepared(scene, velocity)
+        w, gamma = delassus_matrix(scene), gap_velocity(scene, v)
+        inputs = collisions.to_inputs(w, gamma, law.restitution, law._gaps(scene.gaps, gamma))
+        cycle = law._cycle(scene.contacts)
+        options = collisions.Options(cycle, self.max_collisions, isinstance(w, Tridiagonal))
+        g, at = collisions.coupling_matrix(inputs, options), collisions.begin(inputs)
+        steps: list[tuple[int, float | None, np.ndarray]] = []
+        while len(steps) < min(limit, self.max_collisions) and collisions.approaches(inputs, at):
+            before, at = at, _collide(inputs, options, g, at)
+            contact = int(jnp.argmax(at.p - before.p))
+            time = float(at.time) if law.order == "earliest" else None
+            steps.append(
+                (contact, time, np.asarray(v + velocity_change(scene, at.p / inputs.root)))
+            )
+        return steps
+
+    def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
+        from jimpact.impacts import in_common_dtype  # which itself imports this package
+
+        v = as_float_array("velocity", velocity)
+        check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+        check_values("velocity", v)
+        law, scene, v = in_common_dtype(self, scene, v)
+        law.check_options(v.dtype, scene)
+        assert isinstance(law, Binary)
+        return law, scene, v
+
+
+@eqx.filter_jit
+def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
+    gamma = gap_velocity(scene, velocity)
+    return law._solve(delassus_matrix(scene), gamma, scene.gaps)[1].number
+
+
+_collide = eqx.filter_jit(collisions.collide)
+
+
+def _positive_int(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not hasattr(value, "__index__") or operator.index(value) < 1:
+        raise ValueError(f"Argument `{name}` must be an int >= 1, but has value {value!r}.")
+    return operator.index(value)
+
+
+def _checked_order(order: Any) -> str | tuple[int, ...]:
+    """`order` as a name or a tuple of ints; what needs no scene to be wrong is refused here."""
+    if isinstance(order, str) and order in ORDERS:
+        return order
+    if not isinstance(order, (tuple, list)) or not order:
+        raise ValueError(
+            f"Argument `order` must be one of {ORDERS} or a tuple of contact indices, "
+            f"but has value {order!r}."
+        )
+    bad = [j for j in order if isinstance(j, bool) or not hasattr(j, "__index__") or j < 0]
+    if bad:
+        raise ValueError(
+            f"Argument `order` must hold contact indices >= 0, but has value {order!r}."
+        )
+    return tuple(operator.index(j) for j in order)

@@ -1,0 +1,243 @@
+"""The convex set `{w: A w >= b, |w| <= r}` on the host: extremes, samples, plane boundary."""
+
+from itertools import combinations
+from math import comb
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq, linprog  # type: ignore[import-untyped]
+
+# All computations are scaled to r = 1; LP solvers are right to 1e-7.
+_FLAT = 1e-6  # a row whose slack stays below this everywhere is an equality
+_ROUNDING = 1e-10  # feasibility of points that are computed in closed form
+_INDEPENDENT = 1e-8  # relative singular value that counts as nonzero
+_MOST_FACETS = 20_000  # candidate facets of a cone, all of which are tried
+_FARTHEST = 1e8  # distance after which the search for a minimum gives up and takes what it has
+_GRADIENT = 1e-12  # of least squares: a gradient below this is zero
+_ROUNDS = 10  # of least squares: rounds per column; two are usual
+_MIXING = 30  # hit-and-run steps per dimension; every sample has its own walk
+
+
+class CappedPolyhedron(NamedTuple):
+    """`{w: rows w >= offset, |w| <= radius}`, rows (k, d) of unit length."""
+
+    rows: np.ndarray
+    offset: np.ndarray
+    radius: float
+
+    def excess(self, w: np.ndarray) -> np.ndarray:
+        """How far the points w (..., d) are outside, 0 or less inside."""
+        beyond = np.linalg.norm(w, axis=-1) - self.radius
+        lacking = (self.offset - w @ self.rows.T).max(axis=-1, initial=-np.inf)
+        return np.maximum(beyond, lacking)
+
+    def project(self, point: np.ndarray) -> np.ndarray:
+        """Nearest point of the polyhedron alone (least distance programming)."""
+        need = self.offset - self.rows @ point
+        if not (need > 0).any():
+            return point
+        target = np.zeros(self.rows.shape[1] + 1)
+        target[-1] = 1.0
+        active = least_squares(np.vstack([self.rows.T, need / need.max()]), target) > 0
+        return point + np.linalg.lstsq(self.rows[active], need[active], rcond=None)[0]
+
+    def lowest(self, direction: np.ndarray) -> np.ndarray:
+        """A point where `direction . w` is least."""
+        length = np.linalg.norm(direction)
+        if length == 0 or self.radius == 0:
+            return self.project(np.zeros_like(direction))
+        c = direction / length
+
+        # minimizes c.w + |w|^2 / (2 s); |w| grows with s until the ball or a least c.w ends it
+        def beyond(s: float) -> float:
+            return float(np.linalg.norm(self.project(-s * c)) - self.radius)
+
+        far = self.radius
+        while beyond(far) < 0:
+            w = self.project(-far * c)
+            touching = self.rows[self.rows @ w - self.offset <= _ROUNDING * self.radius]
+            pushed = touching.T @ least_squares(touching.T, c)
+            if np.linalg.norm(pushed - c) <= _ROUNDING or far > _FARTHEST * self.radius:
+                return w
+            far *= 4
+        if beyond(0.0) >= 0:
+            return self.project(np.zeros_like(c))
+        s = brentq(beyond, 0.0, far, xtol=1e-300, rtol=4 * np.finfo(float).eps)
+        return self.project(-s * c)
+
+    def interior(self) -> np.ndarray:
+        """A point well inside."""
+        dimension = self.rows.shape[1]
+        box = [(-self.radius, self.radius)] * dimension + [(0.0, self.radius)]
+        slack = np.hstack([-self.rows, np.ones((len(self.rows), 1))])
+        cost = np.append(np.zeros(dimension), -1.0)
+        deep = linprog(cost, slack, -self.offset, bounds=box).x[:-1]
+        least = self.project(np.zeros(dimension))
+        step = deep - least
+        if not step.any():
+            return least
+        return least + 0.5 * min(1.0, _chord(least[None], step[None], self.radius)[1][0]) * step
+
+    def sample(self, generator: np.random.Generator, count: int) -> np.ndarray:
+        """`count` points (count, d), uniform: each the end of its own hit-and-run walk."""
+        dimension = self.rows.shape[1]
+        points = np.repeat(self.interior()[None], count, axis=0)
+        for _ in range(_MIXING * dimension):
+            step = generator.normal(size=points.shape)
+            step /= np.linalg.norm(step, axis=1, keepdims=True)
+            slack = np.maximum(points @ self.rows.T - self.offset, 0.0)
+            rate = step @ self.rows.T
+            with np.errstate(divide="ignore", invalid="ignore"):
+                reach = -slack / rate
+            low, high = _chord(points, step, self.radius)
+            high = np.minimum(high, np.where(rate < 0, reach, np.inf).min(1, initial=np.inf))
+            low = np.maximum(low, np.where(rate > 0, reach, -np.inf).max(1, initial=-np.inf))
+            along = low + (high - low) * generator.random(count)
+            points = points + along[:, None] * step
+        return points
+
+    def arc(self) -> tuple[float, float] | None:
+        """First and last angle of the part of the circle |w| = r inside; d = 2 only.
+
+        The set is expected to have one such part; of several, the longest is given.
+        """
+        angle = np.arctan2(self.rows[:, 1], self.rows[:, 0])
+        cut = np.abs(self.offset) <= self.radius
+        half = np.arccos(self.offset[cut] / self.radius)
+        ends = np.sort(np.concatenate([angle[cut] - half, angle[cut] + half]) % (2 * np.pi))
+        if len(ends) == 0:
+            inside = self.excess(self._on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
+            return (0.0, 2 * np.pi) if inside else None
+        width = np.diff(np.append(ends, ends[0] + 2 * np.pi))
+        kept = self.excess(self._on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
+        if kept.all():
+            return 0.0, 2 * np.pi
+        pieces = []
+        for first in np.flatnonzero(kept & ~np.roll(kept, 1)):
+            run = np.roll(kept, -first)
+            length = np.roll(width, -first)[: np.argmin(run)].sum()
+            pieces.append((float(ends[first]), float(ends[first] + length)))
+        return max(pieces, key=lambda piece: piece[1] - piece[0], default=None)
+
+    def boundary(self, arc_points: int) -> np.ndarray:
+        """The boundary, counter-clockwise, with its corners; d = 2 only."""
+        corners = [np.zeros((0, 2))]
+        for i, j in combinations(range(len(self.rows)), 2):
+            pair = self.rows[[i, j]]
+            if abs(np.linalg.det(pair)) > _INDEPENDENT:
+                corners.append(np.linalg.solve(pair, self.offset[[i, j]])[None])
+        arc = self.arc()
+        if arc is not None:
+            corners.append(self._on_circle(np.linspace(*arc, arc_points)))
+        points = np.concatenate(corners)
+        points = points[self.excess(points) <= _ROUNDING * self.radius]
+        relative = points - self.interior()
+        return points[np.argsort(np.arctan2(relative[:, 1], relative[:, 0]))]
+
+    def _on_circle(self, angle: np.ndarray) -> np.ndarray:
+        return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def capped_polyhedron(
+    rows: np.ndarray, offset: np.ndarray, radius: float, may_be_flat: bool
+) -> tuple[CappedPolyhedron, np.ndarray, np.ndarray]:
+    """The set in coordinates u of its own dimension: `w = center + axes u`, axes orthonormal.
+
+    Rows that can only be equalities become part of the affine hull; `|w|^2 = |center|^2 + |u|^2`.
+    """
+    length = np.linalg.norm(rows, axis=1)
+    rows, offset = rows[length > 0] / length[length > 0, None], offset[length > 0]
+    offset = offset / length[length > 0]
+    box = [(-radius, radius)] * rows.shape[1]
+    flat = np.zeros(len(rows), bool)
+    for i, (row, low) in enumerate(zip(rows, offset)):
+        if may_be_flat:
+            highest = -linprog(-row, -rows, -offset, bounds=box).fun
+            flat[i] = highest - low <= _FLAT * radius
+    center = np.zeros(rows.shape[1])
+    axes = np.eye(rows.shape[1])
+    if flat.any():
+        _, singular, basis = np.linalg.svd(rows[flat])
+        rank = int((singular > _INDEPENDENT).sum())
+        center = np.linalg.lstsq(rows[flat], offset[flat], rcond=_INDEPENDENT)[0]
+        axes = basis[rank:].T
+        rows, offset = rows[~flat], offset[~flat] - rows[~flat] @ center
+    within = rows @ axes
+    length = np.linalg.norm(within, axis=1)
+    kept = length > _INDEPENDENT
+    inner = float(np.sqrt(max(radius**2 - float(center @ center), 0.0)))
+    within, offset = within[kept] / length[kept, None], offset[kept] / length[kept]
+    return CappedPolyhedron(within, offset, inner), center, axes
+
+
+def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """`x >= 0` of least `|matrix x - target|` (Lawson and Hanson 1974, ch. 23).
+
+    scipy.optimize.nnls (1.17) misses the minimum of some degenerate problems met here.
+    """
+    count = matrix.shape[1]
+    x, passive, barred = np.zeros(count), np.zeros(count, bool), np.zeros(count, bool)
+    for _ in range(_ROUNDS * count):
+        gradient = matrix.T @ (target - matrix @ x)
+        gradient[passive | barred] = 0.0
+        new = int(np.argmax(gradient))
+        if gradient[new] <= _GRADIENT:
+            break
+        passive[new] = True
+        trial = _on_support(matrix, target, passive)
+        if trial[new] <= 0:  # rounding: this column would not grow
+            passive[new], barred[new] = False, True
+            continue
+        while (trial[passive] <= 0).any():
+            low = np.flatnonzero(passive & (trial <= 0))
+            steps = x[low] / (x[low] - trial[low])
+            x = x + steps.min() * (trial - x)
+            passive[low[steps == steps.min()]] = False
+            trial = _on_support(matrix, target, passive)
+        x, barred[:] = trial, False
+    return x
+
+
+def _on_support(matrix: np.ndarray, target: np.ndarray, support: np.ndarray) -> np.ndarray:
+    x = np.zeros(matrix.shape[1])
+    x[support] = np.linalg.lstsq(matrix[:, support], target, rcond=None)[0]
+    return x
+
+
+def cone_facets(generators: np.ndarray) -> np.ndarray:
+    """Rows F of unit length with `{F w >= 0}` = the cone of the columns (r, m), of rank r.
+
+    A facet holds r - 1 independent generators, so all such subsets are tried.
+
+    Raises:
+        ValueError: m > r and too many subsets.
+    """
+    rank, m = generators.shape
+    if m == rank:
+        inverse = np.linalg.inv(generators)
+        return inverse / np.linalg.norm(inverse, axis=1, keepdims=True)
+    if comb(m, rank - 1) > _MOST_FACETS:
+        raise ValueError(
+            f"Argument `scene` must have fewer redundant contacts: {m} contacts of rank {rank} "
+            f"have more than {_MOST_FACETS} candidate facets."
+        )
+    unit = generators / np.linalg.norm(generators, axis=0)
+    facets: list[np.ndarray] = []
+    for subset in combinations(range(m), rank - 1):
+        basis, singular, _ = np.linalg.svd(unit[:, subset])
+        if rank > 1 and singular[-1] <= _INDEPENDENT:
+            continue
+        normal = basis[:, -1]
+        for side in (normal, -normal):
+            if (side @ unit >= -_INDEPENDENT).all() and not any(
+                np.linalg.norm(side - known) <= _INDEPENDENT for known in facets
+            ):
+                facets.append(side)
+    return np.array(facets).reshape(-1, rank)
+
+
+def _chord(points: np.ndarray, steps: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where the lines `points + t steps` enter and leave the ball."""
+    a, b = (steps**2).sum(1), (points * steps).sum(1)
+    root = np.sqrt(np.maximum(b**2 + a * (radius**2 - (points**2).sum(1)), 0.0))
+    return (-b - root) / a, (-b + root) / a

@@ -1,0 +1,298 @@
+"""Fits of a restitution matrix that stay admissible: all data simulated from known matrices."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import jimpact as ji
+from jimpact.fitting import fit
+from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.matrix_fit import matrix_region
+from jimpact.numerics.copositive import margin
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.scene import normalized_delassus
+
+CHAIN = ji.chain([1.0, 2.0, 3.0])
+E_TRUE = np.array([[0.3, 0.1], [0.5, 0.4]])
+START = 0.3 * np.eye(2)
+# four shots; the compiled fit is shared by all tests that use four of three bodies
+PRE = np.array([[1.0, 0.0, -0.2], [1.0, 0.3, 0.0], [0.5, 0.2, -0.4], [0.9, 0.9, -0.3]])
+least_margin = jax.jit(margin)
+after = jax.jit(
+    jax.vmap(lambda e, v: ji.impact(RestitutionMatrix(e), CHAIN, v).velocity, (None, 0))
+)
+
+
+conditions_of = eqx.filter_jit(lambda region, y: region.conditions(y))
+retract_of = eqx.filter_jit(lambda region, y: jax.vmap(region.retract)(y))
+curvature_of = eqx.filter_jit(lambda region, y, weight: region.curvature(y, weight))
+
+
+def inverse(scene):
+    return np.linalg.inv(np.asarray(as_matrix(normalized_delassus(scene))))
+
+
+def slacks(e, g_inverse):
+    """Of the three conditions, computed from their definitions."""
+    energy = float(least_margin(jnp.asarray(g_inverse - e.T @ g_inverse @ e))[0])
+    return e.min(), (g_inverse @ (np.eye(len(e)) + e)).min(), energy
+
+
+def shots(matrix, noise=0.0, seed=0, pre=PRE):
+    post = np.asarray(after(jnp.asarray(matrix), jnp.asarray(pre)))
+    return ji.Experiments(pre, post + noise * np.random.default_rng(seed).normal(size=post.shape))
+
+
+def fitted(data, start=START, **options):
+    free = options.pop("free", True)
+    return fit(RestitutionMatrix(start), CHAIN, data, {"matrix": free}, starts=2, **options)
+
+
+# -------------------------------------------------------------------------------- the set
+
+
+@pytest.fixture(scope="module")
+def region():
+    """Three contacts, a bound on one entry, another one held."""
+    scene = ji.chain([1.0, 0.7, 2.0, 1.5])
+    bounds = np.tile([[-np.inf], [np.inf]], (1, 9))
+    bounds[1, 3] = 0.25
+    mix = np.diag((np.arange(9) != 5).astype(float))
+    law = RestitutionMatrix(0.2 * np.eye(3))
+    return matrix_region(law, [scene], np.zeros(9), mix, bounds), inverse(scene)
+
+
+def test_points_outside_are_drawn_back_to_the_boundary(region):
+    region, g_inverse = region
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(300, 9)) * rng.uniform(0.1, 3, size=(300, 1))
+    points[100:] = np.abs(points[100:])
+    back = np.asarray(retract_of(region, jnp.asarray(points)))
+    edges = set()
+    for wild, y in zip(points, back):
+        e = y.reshape(3, 3) * (np.arange(9) != 5).reshape(3, 3)
+        free = np.delete(y, 5).min()
+        values = (free, *slacks(e, g_inverse)[1:], 0.25 - y[3])
+        assert min(values) > -1e-13
+        if not np.array_equal(wild, y):
+            edges.add(int(np.argmin(values)))
+            assert min(values) < 1e-11  # on the boundary
+    assert edges == {0, 2, 3}  # E >= 0, energy, the bound (of a chain G^-1 >= 0: no pull)
+    center = np.asarray(region.center)
+    np.testing.assert_array_equal(np.asarray(region.retract(region.center)), center)
+
+
+def test_conditions_are_the_definitions(region):
+    region, g_inverse = region
+    e = np.abs(np.random.default_rng(2).normal(size=(3, 3)))
+    e[1, 2] = 0.0
+    slack, rows = conditions_of(region, jnp.asarray(e.ravel()))
+    free = np.arange(9) != 5
+    np.testing.assert_allclose(slack[:9][free], e.ravel()[free], atol=1e-15)
+    np.testing.assert_allclose(slack[9:18], (g_inverse @ (np.eye(3) + e)).ravel(), atol=1e-13)
+    np.testing.assert_allclose(np.min(slack[-7:]), slacks(e, g_inverse)[2], atol=1e-12)
+    step = 1e-6 * np.random.default_rng(3).normal(size=9) * free
+    moved = conditions_of(region, jnp.asarray(e.ravel() + step))[0]
+    np.testing.assert_allclose(moved - slack, rows @ step, atol=1e-10)
+
+
+def test_curvature_is_the_second_derivative_of_the_least_energy(region):
+    region, g_inverse = region
+    e = np.array([[0.6, 0.3, 0.2], [0.2, 0.5, 0.0], [0.1, 0.3, 0.6]])  # minimizer inside a face
+    q = jnp.asarray(g_inverse - e.T @ g_inverse @ e)
+    x = np.asarray(least_margin(q)[1])
+    face = sum(int(x[i] > 1e-9) << (2 - i) for i in range(3)) - 1
+    pressure = jnp.zeros(7).at[face].set(1.0)
+    found = curvature_of(region, jnp.asarray(e.ravel()), pressure)
+    rng, step = np.random.default_rng(4), 1e-4
+    for _ in range(3):
+        way = rng.normal(size=9) * (np.arange(9) != 5)
+
+        def energy(t, way=way):
+            return slacks(e + t * way.reshape(3, 3), g_inverse)[2]
+
+        second = (energy(step) - 2 * energy(0) + energy(-step)) / step**2
+        np.testing.assert_allclose(-(way @ found @ way), second, rtol=2e-5)
+
+
+def test_every_scene_counts_and_open_contacts_do_not():
+    """A flat pair (impulses would pull: off-diagonal entries needed) beside a gapped chain."""
+    pair = ji.Scene([1.0, 1.0, 1.0], [[1.0, 0.5], [0.0, 1.0], [0.0, 0.0]])
+    gapped = ji.chain([1.0, 2.0, 1.0], gaps=[0.0, 1e-3])
+    g = np.asarray(normalized_delassus(pair))
+    start = 1.2 * g - np.eye(2)  # G^-1 (I + E) has zeros: a start on the boundary
+    bounds = np.tile([[-np.inf], [np.inf]], (1, 4))
+    law = RestitutionMatrix(start)
+    region = matrix_region(law, [pair, gapped, pair], np.zeros(4), np.eye(4), bounds)
+    assert region.inverse.shape[0] == 2
+    rng = np.random.default_rng(7)
+    back = np.asarray(retract_of(region, jnp.asarray(rng.uniform(-0.2, 2.0, size=(200, 4)))))
+    edges = set()
+    for y in back:
+        e = y.reshape(2, 2)
+        values = (*slacks(e, inverse(pair)), *slacks(e[:1, :1], np.eye(1))[1:])
+        assert min(values) > -1e-13
+        edges.add(int(np.argmin(values)))
+    assert edges >= {1, 2}
+    # a restitution of contact 2 above 1 is no gain for the chain, where contact 2 is open
+    tall = np.array([[0.5, 0.1], [0.1, 1.5]])
+    only = matrix_region(RestitutionMatrix(START), [gapped], np.zeros(4), np.eye(4), bounds)
+    np.testing.assert_array_equal(only.retract(jnp.asarray(tall.ravel())), tall.ravel())
+    over = np.asarray(only.retract(jnp.asarray([1.5, 0.1, 0.1, 0.5])))
+    np.testing.assert_allclose(over[0], 1.0, rtol=1e-12)
+
+
+# ---------------------------------------------------------------------------------- fits
+
+
+def test_one_shot_is_always_reproduced():
+    """Prop. 6.1; and one shot leaves one number a row of E unseen."""
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        v = np.array([1.0, 0.2, -0.3])
+        post = np.linalg.solve(  # any gap velocities after, with the momentum before
+            np.vstack([np.diff(np.eye(3), axis=0), [1.0, 2.0, 3.0]]),
+            np.append(rng.normal(size=2), v @ [1.0, 2.0, 3.0]),
+        )
+        data = ji.Experiments(np.tile(v, (4, 1)), np.tile(post, (4, 1)))
+        law = RestitutionMatrix(START, admissible=False)
+        found = fit(law, CHAIN, data, {"matrix": True}, starts=1)
+        np.testing.assert_allclose(found.residual, 0, atol=1e-8)
+        assert found.rank == 2
+        assert any("Nothing keeps this matrix consistent" in line for line in found.warnings)
+
+
+def test_too_few_shots_say_which_entries_are_undetermined():
+    """Only contact 1 approaches: the second column of E has no effect."""
+    data = shots(E_TRUE, pre=np.tile([1.0, 0.0, 0.0], (4, 1)))
+    found = fitted(data)
+    np.testing.assert_allclose(found.residual, 0, atol=1e-8)
+    assert found.rank == 2
+    for name in ("matrix[1,2]", "matrix[2,2]"):
+        assert any(f"cannot see {name}:" in line for line in found.identifiability)
+    np.testing.assert_allclose(np.asarray(found.law.matrix)[:, 0], E_TRUE[:, 0], atol=1e-8)
+    assert np.isinf(found.standard_error[[1, 3]]).all()
+    assert np.isfinite(found.standard_error[[0, 2]]).all()
+
+
+def test_several_simulated_shots_recover_the_matrix():
+    found = fitted(shots(E_TRUE))
+    np.testing.assert_allclose(found.law.matrix, E_TRUE, atol=1e-9)
+    assert found.rank == 4
+    assert found.converged
+    assert not any("edge" in line for line in found.warnings)
+    assert found.names == ("matrix[1,1]", "matrix[1,2]", "matrix[2,1]", "matrix[2,2]")
+
+
+def test_a_sparsity_pattern_is_kept():
+    sparse = np.array([[0.3, 0.0], [0.5, 0.4]])
+    found = fitted(shots(sparse), free=np.array([[True, False], [True, True]]))
+    assert float(found.law.matrix[0, 1]) == 0.0
+    np.testing.assert_allclose(found.law.matrix, sparse, atol=1e-9)
+    assert not any("edge" in line for line in found.warnings)  # held zeros are no edge
+
+
+def test_the_admissible_least_squares_solution_is_found():
+    """Noisy data that gain energy: the constrained minimum, against scipy."""
+    data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)
+    found = fitted(data)
+    g_inverse = inverse(CHAIN)
+    assert min(slacks(np.asarray(found.law.matrix), g_inverse)) > -1e-13
+    assert any("copositive (energy)" in line for line in found.warnings)
+    assert found.converged
+    assert found.rank == 4
+    pre, post = jnp.asarray(data.pre), data.post
+
+    def residual(e):
+        return (after(jnp.asarray(e).reshape(2, 2), pre) - post).reshape(-1)
+
+    offset = np.asarray(residual(np.zeros(4)))
+    slope = np.stack([np.asarray(residual(unit)) - offset for unit in np.eye(4)], axis=1)
+
+    def conditions(e):  # copositive 2 x 2: closed form
+        q = g_inverse - e.reshape(2, 2).T @ g_inverse @ e.reshape(2, 2)
+        root = np.sqrt(max(q[0, 0], 0) * max(q[1, 1], 0))
+        impulses = (g_inverse @ (np.eye(2) + e.reshape(2, 2))).ravel()
+        return np.array([*e, *impulses, q[0, 0], q[1, 1], q[0, 1] + root])
+
+    oracle = minimize(
+        lambda e: np.sum((slope @ e + offset) ** 2),
+        E_TRUE.ravel(),
+        constraints={"type": "ineq", "fun": conditions},
+        method="SLSQP",
+        options={"ftol": 1e-15, "maxiter": 500},
+    )
+    free = np.linalg.lstsq(slope, -offset, rcond=None)[0]
+    assert min(conditions(free)) < -0.01  # the conditions matter
+    np.testing.assert_allclose(found.law.matrix.ravel(), oracle.x, atol=3e-6)
+    np.testing.assert_allclose(np.sum(np.asarray(found.residual) ** 2), oracle.fun, rtol=1e-8)
+
+
+RECORD = []
+
+
+class Watched(RestitutionMatrix):
+    """Tells every matrix it is evaluated with."""
+
+    def all_impulses(self, scene, delassus, gap_velocity, velocity):
+        jax.debug.callback(lambda e: RECORD.append(np.array(e)), self.matrix)
+        return super().all_impulses(scene, delassus, gap_velocity, velocity)
+
+
+@pytest.mark.parametrize("method", ["levenberg-marquardt", "adam"])
+def test_every_iterate_is_admissible(method):
+    """... and gradient descent ends where Levenberg-Marquardt does."""
+    data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)
+    RECORD.clear()
+    found = fit(Watched(START), CHAIN, data, {"matrix": True}, starts=3, method=method)
+    jax.effects_barrier()
+    tried = np.unique(np.concatenate([e.reshape(-1, 2, 2) for e in RECORD]), axis=0)
+    assert len(tried) > 5
+    g_inverse = inverse(CHAIN)
+    worst = min(min(slacks(e, g_inverse)) for e in tried)
+    assert worst > -1e-13
+    assert worst < 1e-9  # some were drawn back to the boundary
+    np.testing.assert_allclose(found.law.matrix, fitted(data).law.matrix, atol=1e-5)
+
+
+# ----------------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ([[0.3, -0.1], [0.0, 0.3]], "E >= 0 fails by 0.1"),
+        ([[0.3, 0.0], [1.3, 0.3]], r"copositive \(energy\) fails"),
+    ],
+)
+def test_a_start_that_is_not_admissible(start, message):
+    with pytest.raises(ValueError, match=message):
+        fitted(shots(E_TRUE), start=np.array(start))
+
+
+def test_a_start_whose_impulses_would_pull():
+    """e I on two contacts with a kinetic angle above pi/2."""
+    scene = ji.Scene([1.0, 1.0], [[1.0, 0.5], [0.0, 1.0]])
+    data = ji.Experiments([[-1.0, -1.0]], [[0.5, 0.5]])
+    with pytest.raises(ValueError, match=r"G\^-1 \(I \+ E\) >= 0 fails"):
+        fit(RestitutionMatrix(START), scene, data, {"matrix": True})
+
+
+def test_scenes_without_an_admissible_set():
+    redundant = ji.Scene([1.0, 1.0], [[1.0, 1.0], [0.0, 0.0]])
+    data = ji.Experiments([[-1.0, 0.0]], [[0.5, 0.0]])
+    with pytest.raises(ValueError, match="no redundant contacts"):
+        fit(RestitutionMatrix(START), redundant, data, {"matrix": True})
+    eight = ji.Experiments([[1.0, 0, 0, 0, 0, 0, 0, 0]], [[0.0, 0, 0, 0, 0, 0, 0, 1.0]])
+    with pytest.raises(ValueError, match="at most 6 contacts"):
+        fit(RestitutionMatrix(0.1 * np.eye(7)), ji.chain(jnp.ones(8)), eight, {"matrix": True})
+
+
+def test_held_entries_that_leave_no_room():
+    """Elastic first column: any entry more in the second would gain energy somewhere."""
+    elastic = np.eye(2)
+    with pytest.raises(ValueError, match="must leave room"):
+        fitted(shots(E_TRUE), start=elastic, free=np.array([[False, True], [False, False]]))
