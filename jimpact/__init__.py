@@ -38,6 +38,16 @@ _WHERE = {
     "consistency": "Audit audit summary",
     "histories": "History history",
     "comparison": "Comparison compare dispersion_index energy_ratio",
+    "restitution_audit": "MatrixAudit audit_matrix carnot_energy_loss dissipation_matrix",
+    "friction_consistency": (
+        "FrictionBounds friction_bounds friction_energy_change friction_impulses"
+    ),
+    "admissible": "AdmissibleSet admissible_set",
+    "plot_admissible": "plot_admissible_set",
+    "numerics.copositive": "Copositivity copositivity",
+    "quasi": (
+        "contact_power from_quasi_velocities kinetic_energy_split quasi_basis to_quasi_velocities"
+    ),
     "inclusion": "InclusionOutcome contact_coupling restitution_inclusion",
     "experiments": "Experiments read_experiments",
     "fitting": "Fit fit",

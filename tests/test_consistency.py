@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.friction_bounds import (
+from jimpact.friction_consistency import (
     friction_bounds,
     friction_energy_change,
     friction_impulses,
@@ -233,6 +233,10 @@ def test_audit_agrees_with_sampled_velocities():
         p = -np.linalg.solve(g, (np.eye(m) + e) @ qn.T)
         assert found.kinematic.holds == bool((-e @ qn.T >= -1e-12).all())
         assert found.kinetic.holds == bool((p >= -1e-12).all())
+        # least entries, from the approaches of single contacts
+        close(found.kinetic.worst, p[:, -m:].min(), 1e-10)
+        close(p[found.kinetic.where[0], found.kinetic.where[1] - m], p[:, -m:].min(), 1e-10)
+        close(found.kinematic.worst, (-e @ qn[-m:].T).min())
         gain = 0.5 * np.sum((qn - qn @ e.T) * p.T, axis=1) / np.sum(qn**2, axis=1)
         assert -0.5 * found.energetic.margin >= gain.max() - 1e-12
         # the witness, in velocities of the scene

@@ -5,7 +5,7 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq, linprog  # type: ignore[import-untyped]
+from scipy.optimize import brentq, linprog
 
 # All computations are scaled to r = 1; LP solvers are right to 1e-7.
 _FLAT = 1e-6  # a row whose slack stays below this everywhere is an equality

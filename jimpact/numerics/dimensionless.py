@@ -57,6 +57,7 @@ def to_dimensionless(
     exponent: Exponent,
     stored: jax.Array,
     rtol: float,
+    gaps: jax.Array | None = None,
 ) -> tuple[Inputs, Units]:
     """Inputs of the dimensionless problem and the units to return from it."""
     m, dtype = gamma.shape[0], gamma.dtype
@@ -73,6 +74,8 @@ def to_dimensionless(
     weight = jax.lax.stop_gradient(jnp.maximum(1.0, q * root / fastest))
     loaded = stored > 0
     x = jnp.where(loaded, (2 * jnp.where(loaded, stored, 1.0) / q**2) ** (1 / (eta + 1)), 0.0)
+    if gaps is not None:
+        x = jnp.where(gaps > 0, -gaps / x_ref, x)
     g = scaled(delassus, 1 / root)
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     inputs = Inputs(
@@ -87,7 +90,7 @@ def to_dimensionless(
     return inputs, Units(q, time, root, x_ref)
 
 
-def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
+def flow_of(inputs: Inputs, exponent: Exponent, chain: bool, gapped: bool = False) -> Flow:
     """The flow of these inputs; `exponent` is the static one where `inputs` hold none."""
     m = inputs.gamma.shape[0]
     if chain:
@@ -97,7 +100,7 @@ def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
         upper = jnp.zeros((m, m), inputs.gamma.dtype).at[i, j].set(inputs.coupling)
         coupling = jnp.eye(m, dtype=inputs.gamma.dtype) + upper + upper.T
     eta = exponent if inputs.exponent is None else inputs.exponent
-    return Flow(coupling, inputs.omega, inputs.restitution, eta)
+    return Flow(coupling, inputs.omega, inputs.restitution, eta, gapped)
 
 
 def control_of(inputs: Inputs, tighten: float, max_steps: int, method: str) -> stepper.Control:
@@ -110,13 +113,18 @@ def control_of(inputs: Inputs, tighten: float, max_steps: int, method: str) -> s
 
 
 def solve(
-    inputs: Inputs, exponent: Exponent, chain: bool, max_steps: int, method: str
+    inputs: Inputs,
+    exponent: Exponent,
+    chain: bool,
+    max_steps: int,
+    method: str = "time",
+    gapped: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
     """Dimensionless impulses and status, differentiable in both modes."""
     static = None if isinstance(exponent, jax.Array) else exponent
 
     def run(given: Inputs, differentiated: bool) -> tuple[jax.Array, jax.Array]:
-        flow = flow_of(given, static, chain)  # type: ignore[arg-type]
+        flow = flow_of(given, static, chain, gapped)  # type: ignore[arg-type]
         if method == "impulse":
             return _walk(flow, given, max_steps)
         tighten = GRADIENT_TIGHTENING if differentiated else 1.0

@@ -71,7 +71,7 @@ class AdmissibleMatrices(eqx.Module):
         after = jnp.einsum("sij,sfj->sfi", e, x)
         return _square(inverse, x) - _square(inverse, after)
 
-    def worst(self, y: jax.Array) -> "Approaches":
+    def worst(self, y: jax.Array) -> Approaches:
         """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
 
         The minimizer with a given support is an eigenvector of the smallest eigenvalue there
@@ -128,8 +128,10 @@ class AdmissibleMatrices(eqx.Module):
         rate = jnp.einsum("sij,sfj->sfi", self.matrices(y), x) - start
         a, b = _square(self.inverse, rate), jnp.einsum("sfi,sij,sfj->sf", start, self.inverse, rate)
         c = _square(self.inverse, x) - _square(self.inverse, start)  # > 0
-        divisor = b + jnp.sqrt(jnp.maximum(b**2 + a * c, 0.0))
-        return jnp.where(divisor > 0, c / jnp.where(divisor > 0, divisor, 1.0), jnp.inf)
+        root = jnp.sqrt(jnp.maximum(b**2 + a * c, 0.0))
+        # of a s^2 + 2 b s = c, in the form that does not cancel
+        above, below = jnp.where(b > 0, c, root - b), jnp.where(b > 0, root + b, a)
+        return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.inf)
 
     def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Slacks (C,), >= 0 but for rounding, of all conditions, and their derivatives (C, Q)."""
