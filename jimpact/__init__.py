@@ -31,6 +31,11 @@ _WHERE = {
     "laws.moreau": "Moreau",
     "laws.poisson": "Poisson",
     "laws.binary": "Binary",
+    "laws.compliant": "Compliant",
+    "rheology": (
+        "Bistiffness Force Hertz HuntCrossley KelvinVoigt KuwabaraKono LinearSpring PowerLaw "
+        "UserForce"
+    ),
     "han_gilmore_tree": "HanGilmoreOutcome han_gilmore",
     "laws.lzb": "LZB distributing_rule",
     "impacts": "Impact impact raise_on_failure",

@@ -4,7 +4,7 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -45,7 +45,7 @@ def run(command: "CompareCommand") -> int:
         print(f"jimpact compare: {error}", file=sys.stderr)
         return 2
     if command.json:
-        told = {"title": study.title, "velocity": list(map(float, velocity))}
+        told: dict[str, Any] = {"title": study.title, "velocity": velocity.tolist()}
         told |= {"laws": found.to_dict(), "fits": {n: f.to_dict() for n, f in fits.items()}}
         print(json.dumps(told | {"picture": str(path)}, indent=2))
     else:

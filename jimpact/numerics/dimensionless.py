@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import impulse_form, stepper
-from jimpact.numerics.flow import Exponent, Flow
+from jimpact.numerics.flow import Exponent, Flow, Viscous
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
@@ -119,16 +119,21 @@ def solve(
     max_steps: int,
     method: str = "time",
     gapped: bool = False,
+    viscous: Viscous | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Dimensionless impulses and status, differentiable in both modes."""
     static = None if isinstance(exponent, jax.Array) else exponent
 
-    def run(given: Inputs, differentiated: bool) -> tuple[jax.Array, jax.Array]:
-        flow = flow_of(given, static, chain, gapped)  # type: ignore[arg-type]
+    def run(
+        both: tuple[Inputs, Viscous | None], differentiated: bool
+    ) -> tuple[jax.Array, jax.Array]:
+        given, force = both
+        flow = flow_of(given, static, chain, gapped)._replace(viscous=force)  # type: ignore[arg-type]
         if method == "impulse":
             return _walk(flow, given, max_steps)
         tighten = GRADIENT_TIGHTENING if differentiated else 1.0
         control = control_of(given, tighten, max_steps, method)
+        control = control._replace(closed_form=force is None)
         end = stepper.run(flow, control, stepper.begin(flow, control, given.gamma, given.x))
         at_rest = reclosing(end, given.tolerance)
         p = end.state.p + plastic_remainder(flow, given.gamma, end.state.p, at_rest)
@@ -139,7 +144,7 @@ def solve(
         p = p + plastic_remainder(flow, given.gamma, p, at_rest | beside)
         return p, status_of(end, at_rest)
 
-    return both_modes(run)(inputs)
+    return both_modes(run)((inputs, viscous))
 
 
 def reclosing(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:

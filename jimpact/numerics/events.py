@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jimpact.numerics.flow import (
     COMPRESSION,
     EXPANSION,
-    FROM_GAP,
+    ONSET,
     OPEN,
     ROOT_X,
     ZERO_G,
@@ -73,7 +73,7 @@ def find(
     slope, slope_end = _slopes(flow, phase, state), _slopes(flow, phase, new)
     landing = lands(kind)
     crossed_g = ~(target & (kind == ZERO_G)) & (after.g < -snap)
-    crossed_x = ~(target & ((kind == ROOT_X) | (kind == FROM_GAP))) & (after.x < -snap)
+    crossed_x = ~(target & landing & (kind != ZERO_G)) & (after.x < -snap)
     dipped = ~landing & _dips(before.g, after.g, slope.g * span, slope_end.g * span, snap)
     idle = ~matters(flow, tolerance, state) & ~matters(flow, tolerance, new)
     at_once = (crossed_g & (before.g <= snap) & (slope.g <= 0)) | (
@@ -93,7 +93,8 @@ def find(
     return Events(
         inside=jnp.any(crossed_g | crossed_x | dipped),
         at_once=at_once,
-        opens=(phase == EXPANSION) & jnp.where(at_once, crossed_x, target & (kind == ROOT_X)),
+        opens=(phase == EXPANSION)
+        & jnp.where(at_once, crossed_x, target & ((kind == ROOT_X) | (kind == ONSET))),
         first=jnp.minimum(crossing, jnp.min(at_dip)),
         by_opening=by_opening,
         target=next_target,
@@ -118,8 +119,11 @@ def change_phase(
     g = jnp.where(opened, flow.restitution * state.g, state.g)
     at_rest = arrived & ~opened & (phase != OPEN)
     g = jnp.where(at_rest, 0.0, g)
-    reset = arrived & (opened | (phase == OPEN)) if flow.gapped else new_phase == OPEN
-    x = jnp.where(reset, 0.0, state.x)
+    if flow.slackens:
+        x = jnp.where(arrived & (phase == OPEN), jnp.maximum(state.x, 0.0), state.x)
+    else:
+        reset = arrived & (opened | (phase == OPEN)) if flow.gapped else new_phase == OPEN
+        x = jnp.where(reset, 0.0, state.x)
     return state._replace(x=x, g=g), new_phase, arrived & (phase == OPEN)
 
 
@@ -140,6 +144,9 @@ def _margins(flow: Flow, tolerance: jax.Array, phase: jax.Array, state: State) -
     if flow.gapped:
         g = jnp.where(phase == OPEN, 1.0, _signs(phase) * state.g)
         x = jnp.where(phase == OPEN, -state.x, state.x)
+        if flow.slackens:
+            onset = flow.viscous.onset(state.x, state.g)  # type: ignore[union-attr]
+            x = jnp.where(phase == EXPANSION, onset, jnp.where(state.x > 0, -onset, x))
         return Margin(jnp.where(phase == COMPRESSION, 1.0, x), g)
     slack = jnp.where(phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
     g = _signs(phase) * state.g + slack
@@ -150,6 +157,11 @@ def _slopes(flow: Flow, phase: jax.Array, state: State) -> Margin:
     dx, dg, _, _ = field(flow, phase, state.x, state.g)
     if flow.gapped:
         rate = jnp.where(phase == OPEN, -dx, dx)
+        if flow.slackens:
+            onset = flow.viscous.onset  # type: ignore[union-attr]
+            turning = jax.jvp(onset, (state.x, state.g), (dx, dg))[1]
+            slack = (phase == OPEN) & (state.x > 0)
+            rate = jnp.where(phase == EXPANSION, turning, jnp.where(slack, -turning, rate))
         rate = jnp.where(phase == COMPRESSION, 0.0, rate)
         return Margin(rate, jnp.where(phase == OPEN, 0.0, _signs(phase) * dg))
     return Margin(jnp.where(phase == EXPANSION, dx, 0.0), _signs(phase) * dg)

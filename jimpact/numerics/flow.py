@@ -16,14 +16,17 @@ A step may advance in time or in another variable xi that grows or falls monoton
     ZERO_G   xi = g_j, ending on g_j = 0 (or a given value): lands on the event (Henon's trick)
     ROOT_X   xi = x_j^(1/r), ending on x_j = 0: the same for an opening, x_j^eta smooth in xi
     FROM_GAP xi = x_j from below to x_j = 0: a gap closes
+    ONSET    xi = a function of x_j and x_j' to 0: a viscous contact gets slack, or loaded again
 
 Contacts with gaps (`gapped`, the compliant law): an open contact keeps track of x_j = -gap_j and
 closes when that returns to 0; without, geometry is frozen and it closes when gamma_j < 0.
+A `viscous` force replaces the power law; it is never tensile, so that a contact may be open (slack)
+with x_j > 0.
 
 with r = 2 where 2 eta is known to be whole, else 8.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,12 +35,30 @@ import numpy as np
 from jimpact.numerics.tableaux import DOP853
 from jimpact.numerics.tridiagonal import Symmetric
 
-TIME, START, ZERO_G, ROOT_X, FROM_GAP = 0, 1, 2, 3, 4  # variable of a step
+TIME, START, ZERO_G, ROOT_X, FROM_GAP, ONSET = 0, 1, 2, 3, 4, 5  # variable of a step
 OPEN, COMPRESSION, EXPANSION = 0, 1, 2  # phase of a contact
 
 _DENSE_A = np.array([[*row, *[0.0] * (len(DOP853.c) - len(row))] for row in DOP853.a])
 
 Exponent = float | tuple[float, ...] | jax.Array
+
+
+class Viscous(NamedTuple):
+    """A force `model` (see `rheology.py`) and the units (m,) that make it dimensionless."""
+
+    model: Any
+    indentation: jax.Array  # [m]
+    speed: jax.Array  # [m/s]
+    force: jax.Array  # [N]
+
+    def push(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
+        """Dimensionless force, not tensile."""
+        x = jnp.maximum(x, 0.0) * self.indentation
+        return jnp.maximum(self.model.force(x, -gamma * self.speed), 0.0) / self.force
+
+    def onset(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
+        """Smooth function with the sign of the force, of order 1."""
+        return self.model.onset(x * self.indentation, -gamma * self.speed) / self.force
 
 
 class Flow(NamedTuple):
@@ -48,6 +69,12 @@ class Flow(NamedTuple):
     restitution: jax.Array
     exponent: Exponent
     gapped: bool = False
+    viscous: Viscous | None = None
+
+    @property
+    def slackens(self) -> bool:
+        """Whether a contact may lose its force before its indentation."""
+        return self.viscous is not None and self.viscous.model.slackens
 
 
 def frozen(flow: Flow) -> Flow:
@@ -55,7 +82,8 @@ def frozen(flow: Flow) -> Flow:
     exponent = flow.exponent
     if isinstance(exponent, jax.Array):
         exponent = jax.lax.stop_gradient(exponent)
-    return Flow(*jax.lax.stop_gradient(flow[:3]), exponent, flow.gapped)
+    viscous = jax.tree.map(jax.lax.stop_gradient, flow.viscous)
+    return Flow(*jax.lax.stop_gradient(flow[:3]), exponent, flow.gapped, viscous)
 
 
 class State(NamedTuple):
@@ -69,7 +97,7 @@ class State(NamedTuple):
 
 def lands(kind: jax.Array) -> jax.Array:
     """Whether a step of this kind ends on an event."""
-    return (kind == ZERO_G) | (kind == ROOT_X) | (kind == FROM_GAP)
+    return (kind != TIME) & (kind != START)
 
 
 def power(x: jax.Array, exponent: Exponent) -> jax.Array:
@@ -117,7 +145,10 @@ def scales(flow: Flow, phase: jax.Array) -> tuple[jax.Array, jax.Array, jax.Arra
 def field(flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array) -> tuple[jax.Array, ...]:
     """`(x', g', p', t')` with respect to time in units of `s*`, phases frozen."""
     _, unit, ratio = scales(flow, phase)
-    force = factor(flow.exponent, x.dtype) * flow.omega * power(x, flow.exponent)
+    if flow.viscous is None:
+        force = factor(flow.exponent, x.dtype) * flow.omega * power(x, flow.exponent)
+    else:
+        force = jnp.where(phase == OPEN, 0.0, flow.viscous.push(x, g))
     closing = -ratio * flow.omega
     if not flow.gapped:
         closing = jnp.where(phase == OPEN, 0.0, closing)
@@ -153,7 +184,11 @@ def step(
         g = jnp.where(known_g, xi, at[m:])
         rates = field(flow, phase, x, g)
         row = jnp.concatenate([*rates[:3], rates[3][None]])
-        return slopes.at[i].set(row * _stretch(kind, target, xi, rates, r))
+        dx, dg = rates[:2]
+        if flow.slackens:
+            turning = jax.jvp(flow.viscous.onset, (x, g), (dx, dg))[1]  # type: ignore[union-attr]
+            dx = jnp.where(kind == ONSET, turning, dx)
+        return slopes.at[i].set(row * _stretch(kind, target, xi, (dx, dg), r))
 
     slopes = jax.lax.fori_loop(0, len(c), stage, jnp.zeros((len(c), 3 * m + 1), dtype))
     weights = jnp.asarray([DOP853.b, DOP853.error_high, DOP853.error_low], dtype)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.numerics.events import matters
-from jimpact.numerics.flow import Flow, State, plus_one, power, scales
+from jimpact.numerics.flow import OPEN, Flow, State, plus_one, power, scales
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 
 RESIDUAL = 1.0  # loads and velocities below this part of the tolerance end the impact
@@ -20,7 +20,8 @@ def finish(
     """Whether the rest follows in closed form (False: only where nothing is left), and the end."""
     s, _, _ = scales(flow, phase)
     gamma = s * state.g
-    at_work = ((state.x > 0) | (gamma < 0)) & matters(flow, tolerance, state, RESIDUAL)
+    loaded = (state.x > 0) & (phase != OPEN)  # a slack contact is not
+    at_work = (loaded | (gamma < 0)) & matters(flow, tolerance, state, RESIDUAL)
     total = power(state.x, plus_one(flow.exponent)) + state.g**2
     rebound = flow.restitution * jnp.sqrt(jnp.where(at_work, total, 1.0))
     dp = jnp.where(at_work, rebound - gamma, 0.0)

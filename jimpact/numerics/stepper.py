@@ -18,6 +18,7 @@ from jimpact.numerics.flow import (
     COMPRESSION,
     EXPANSION,
     FROM_GAP,
+    ONSET,
     OPEN,
     ROOT_X,
     START,
@@ -163,9 +164,13 @@ def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, ja
     safe = jnp.where(x > 0, x, 1.0)
     root = jnp.sqrt(safe) if root_order(flow.exponent) == 2 else jnp.sqrt(jnp.sqrt(jnp.sqrt(safe)))
     root = jnp.where(x > 0, root, 0.0)
-    kinds = [carry.kind == kind for kind in (START, ZERO_G, ROOT_X, FROM_GAP)]
-    start = jnp.select(kinds, [carry.begun, g, root, x], 0.0)
-    length = jnp.select(kinds, [carry.h, g_end - g, -root, -x], carry.h)
+    onset = jnp.zeros_like(x)
+    if flow.slackens:
+        values = flow.viscous.onset(carry.state.x, carry.state.g)  # type: ignore[union-attr]
+        onset = jnp.sum(jnp.where(carry.target, values, 0.0))
+    kinds = [carry.kind == kind for kind in (START, ZERO_G, ROOT_X, FROM_GAP, ONSET)]
+    start = jnp.select(kinds, [carry.begun, g, root, x, onset], 0.0)
+    length = jnp.select(kinds, [carry.h, g_end - g, -root, -x, -onset], carry.h)
     return start, length
 
 
@@ -210,7 +215,8 @@ def _next_step(
     land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
     leaves = starting & inside & (begun > 0)
     short = CUT_SHORT * found.first
-    gap_closes = jnp.any(found.target & (carry.phase == OPEN))
+    gap_closes = jnp.any(found.target & (carry.phase == OPEN) & (carry.state.x <= 0))
+    in_x = jnp.where(gap_closes, FROM_GAP, ONSET if flow.slackens else ROOT_X)
     cases = [
         (flips | (accept & landing), h),
         (accept, factor * h),
@@ -222,7 +228,7 @@ def _next_step(
     next_h = jnp.select([case for case, _ in cases], [value for _, value in cases], factor * h)
     next_kind = jnp.where(
         land,
-        jnp.where(found.by_opening, jnp.where(gap_closes, FROM_GAP, ROOT_X), ZERO_G),
+        jnp.where(found.by_opening, in_x, ZERO_G),
         jnp.where(starting & ~leaves, START, TIME),
     )
     begun = begun + jnp.where(accept & starting, h, 0.0)
@@ -246,6 +252,8 @@ def _next_step(
 
 def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
     """Turn the next step into a landing on the opening that is about to come."""
+    if flow.slackens:
+        return carry
     state = jax.lax.stop_gradient(carry.state)
     due, target = events.next_opening(flows.frozen(flow), carry.phase, state)
     aim = accepted & (carry.kind == TIME) & (due < NEAR_OPENING * carry.h)

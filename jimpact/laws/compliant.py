@@ -1,0 +1,108 @@
+"""Compliant penalization: contacts with real gaps and a force-indentation law."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import check_per_contact, check_values
+from jimpact.laws.base import Law
+from jimpact.laws.lzb import FINEST_RTOL_IN_EPS, default_rtol
+from jimpact.numerics.dimensionless import solve, to_dimensionless
+from jimpact.numerics.flow import Viscous
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
+from jimpact.rheology import Bistiffness, Force
+from jimpact.scene import Scene
+
+
+class Compliant(Law):
+    """Unilateral compliant contacts, each with its own gap: opens, waits, closes again.
+
+    Equation: `M v' = N F`, `x_j' = -gamma_j`, `F_j = max(f(x_j, x_j'), 0)` while `x_j > 0`, from
+    `x_j = -gap_j` until nothing approaches any more. Free flight between contacts is exact, so
+    that gaps of any size cost nothing. Geometry (M and N) is frozen.
+
+    Args:
+        force: of `rheology.py`: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
+            `Bistiffness(k, eta, e)`, `KelvinVoigt(k, c)`, `HuntCrossley(k, d, eta)`,
+            `KuwabaraKono(k, A)`, `UserForce(function, parameters)`.
+        rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
+        max_steps: passes of the integrator before it gives up.
+
+    Status: `max_steps`; `plastic_limit` where contacts re-close without end.
+
+    Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-; one-sided
+    where a gap is 0 and at grazing events. Where two orders of collision meet the outcome changes
+    within gaps of about `gap_scale`, and the derivative there is as large as that says.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.14)-(6.16).
+
+    >>> import jimpact as ji
+    >>> law = ji.Compliant(ji.Hertz(1.0))
+    >>> out = ji.impact(law, ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1]), [1.0, 0.0, 0.0])
+    >>> [round(float(v), 5) for v in out.velocity]
+    [-0.04821, 0.05089, 0.99732]
+    """
+
+    uses_gaps: ClassVar[bool] = True
+
+    force: Force
+    rtol: float | None = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+
+    def __init__(self, force: Force, *, rtol: float | None = None, max_steps: int = 100_000):
+        if not isinstance(force, Force):
+            raise TypeError(
+                f"Argument `force` must be a contact force such as Hertz(k), but has value {force!r}."
+            )
+        if rtol is not None:
+            check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
+        self.force, self.rtol, self.max_steps = force, rtol, max_steps
+
+    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
+        """Parameters per contact, and a tolerance that the precision can hold."""
+        for name, value in vars(self.force).items():
+            if isinstance(value, (jax.Array, tuple)) and name != "parameters":  # the user's own
+                check_per_contact(name, value, scene.contacts)
+        finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
+        if self.rtol is not None and self.rtol < finest:
+            raise ValueError(
+                f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
+                f"but has value {self.rtol:g}: enable jax_enable_x64 for finer tolerances."
+            )
+
+    def all_impulses(
+        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Impulses over the whole encounter, gaps included."""
+        gaps = jnp.zeros_like(gap_velocity) if scene.gaps is None else scene.gaps
+        p, code = self._solve(delassus, gap_velocity, gaps)
+        count = 0 if scene.tangents is None else scene.tangents.shape[1]
+        return p, jnp.zeros(count, p.dtype), code
+
+    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Impulses of contacts that touch."""
+        return self._solve(delassus, gap_velocity, jnp.zeros_like(gap_velocity))
+
+    def _solve(
+        self, delassus: Symmetric, gamma: jax.Array, gaps: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        m, force = gamma.shape[0], self.force
+        ones, none = jnp.ones_like(gamma), jnp.zeros_like(gamma)
+        rtol = self.rtol or default_rtol("time", gamma.dtype)
+        chain, viscous = isinstance(delassus, Tridiagonal), None
+        if isinstance(force, Bistiffness):
+            k, e = (jnp.broadcast_to(z, (m,)) for z in (force.stiffness, force.restitution))
+            exponent = force.exponent
+        else:  # in units of a spring that stores the impact's energy at the force's indentation
+            q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(delassus)))
+            k = (q / force.indentation_scale(0.5 * q**2 * ones)) ** 2
+            k, e, exponent = jax.lax.stop_gradient(k), ones, 1.0
+        inputs, units = to_dimensionless(delassus, gamma, e, k, exponent, none, rtol, gaps)
+        momentum = units.velocity / units.root
+        if not isinstance(force, Bistiffness):
+            speed = units.velocity * units.root
+            viscous = Viscous(force, units.indentation, speed, momentum / units.time)
+        p, code = solve(inputs, exponent, chain, self.max_steps, gapped=True, viscous=viscous)
+        return p * momentum, code

@@ -1,0 +1,1 @@
+"""The parts of `monte_carlo`: distributions, chunks of samples, their statistics, their files."""

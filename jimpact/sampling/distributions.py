@@ -1,0 +1,218 @@
+"""What a sample is drawn from: uniform, normal, rows of an array, the user's own function."""
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.laws.base import Law
+from jimpact.parameters import DOMAIN
+
+OVERLAP = (
+    "a negative gap is an overlap, that is a precompressed contact: give LZB the energy stored in "
+    "it (`initial_energy`) and leave the gap at 0."
+)
+
+
+class Distribution(eqx.Module):
+    """Independent entries, each with its own parameters, or the same for all."""
+
+    @abc.abstractmethod
+    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+        """One draw (size,); with `non_negative` truncated at 0."""
+
+    @abc.abstractmethod
+    def check(self, name: str, size: int, non_negative: bool) -> None:
+        """Raise where the parameters do not fit."""
+
+
+class Uniform(Distribution):
+    """Independent and uniform between `low` and `high`, scalars or one per entry (m,).
+
+    >>> import jimpact as ji
+    >>> from jimpact.sampling.distributions import Uniform
+    >>> Uniform(0.0, [1e-6, 2e-6])
+    Uniform(low=0, high=[1e-06, 2e-06])
+    """
+
+    low: jax.Array
+    high: jax.Array
+
+    def __init__(self, low: Any, high: Any):
+        self.low, self.high = as_float_array("low", low), as_float_array("high", high)
+        check_values("low", self.low)
+        check_values("high", self.high)
+        if np.any(np.asarray(self.low) > np.asarray(self.high)):
+            raise ValueError(f"Argument `high` must be at least `low`, but has {self!r}.")
+
+    def __repr__(self) -> str:
+        return f"Uniform(low={_told(self.low)}, high={_told(self.high)})"
+
+    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+        """One draw (size,)."""
+        low, high = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.low, self.high))
+        return jnp.minimum(low + (high - low) * jax.random.uniform(key, (size,), dtype), high)
+
+    def check(self, name: str, size: int, non_negative: bool) -> None:
+        """Raise where `low` is negative and must not be, or the shapes do not fit."""
+        _check_sizes(self, name, size, ("low", "high"))
+        if non_negative and np.any(np.asarray(self.low) < 0):
+            raise ValueError(
+                f"Argument `{name}` must not yield negative values, but {self!r} does; {OVERLAP}"
+            )
+
+
+class Normal(Distribution):
+    """Independent and normal, `mean` and `std` > 0 scalars or one per entry (m,).
+
+    As a distribution of gaps it is truncated at 0 (drawn again, not clipped), so the gaps have a
+    larger mean and a smaller spread than `mean` and `std` say where these are comparable.
+
+    >>> import jimpact as ji
+    >>> from jimpact.sampling.distributions import Normal
+    >>> Normal(1e-5, 1e-6)
+    Normal(mean=1e-05, std=1e-06)
+    """
+
+    mean: jax.Array
+    std: jax.Array
+
+    def __init__(self, mean: Any, std: Any):
+        self.mean, self.std = as_float_array("mean", mean), as_float_array("std", std)
+        check_values("mean", self.mean)
+        check_values("std", self.std, low=0.0, open_low=True)
+
+    def __repr__(self) -> str:
+        return f"Normal(mean={_told(self.mean)}, std={_told(self.std)})"
+
+    def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
+        """One draw (size,)."""
+        mean, std = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.mean, self.std))
+        if not non_negative:
+            return mean + std * jax.random.normal(key, (size,), dtype)
+        unit = jax.random.truncated_normal(key, -mean / std, jnp.inf, (size,), dtype)
+        return jnp.maximum(mean + std * unit, 0)  # rounding only
+
+    def check(self, name: str, size: int, non_negative: bool) -> None:
+        """Raise where a truncated distribution has a negative mean, or the shapes do not fit."""
+        _check_sizes(self, name, size, ("mean", "std"))
+        if non_negative and np.any(np.asarray(self.mean) < 0):
+            raise ValueError(
+                f"Argument `{name}` is truncated at 0 and must have a mean of at least 0, but is "
+                f"{self!r}; {OVERLAP}"
+            )
+
+
+class Rows(eqx.Module):
+    """Given samples (S, size): sample i is row i."""
+
+    values: Any
+
+    def __repr__(self) -> str:
+        return f"{len(self.values)} given rows"
+
+
+class RandomLaw(eqx.Module):
+    """A law some of whose parameters are drawn anew for every sample: `key -> Law`.
+
+    Args:
+        law: everything that is not drawn.
+        parameters: by field, `restitution=Uniform(0.8, 0.9)`; entries are independent (give the
+            law a scalar to have one value for all contacts).
+
+    Raises:
+        ValueError: no such field, or a distribution that leaves its domain (as a Normal does
+            where the domain is bounded; a function `key -> Law` may do anything).
+
+    >>> import jax, jimpact as ji
+    >>> from jimpact.sampling.distributions import RandomLaw, Uniform
+    >>> drawn = RandomLaw(ji.Newton(0.5), restitution=Uniform(0.8, 0.9))(jax.random.key(0))
+    >>> 0.8 <= float(drawn.restitution) <= 0.9
+    True
+    """
+
+    law: Law
+    parameters: dict[str, Distribution]
+
+    def __init__(self, law: Law, **parameters: Distribution):
+        fields = {k: v for k, v in vars(law).items() if eqx.is_inexact_array(v)}
+        for name, distribution in parameters.items():
+            if name not in fields:
+                raise ValueError(
+                    f"{type(law).__name__} has the parameters {', '.join(fields)}, but not "
+                    f"`{name}`; none of them can be drawn as `{name}`."
+                )
+            if not isinstance(distribution, Distribution):
+                raise TypeError(
+                    f"Argument `{name}` must be Uniform or Normal, but is {distribution!r}."
+                )
+            distribution.check(name, fields[name].size, non_negative=False)
+            _check_domain(name, distribution)
+        self.law, self.parameters = law, parameters
+
+    def __call__(self, key: jax.Array) -> Law:
+        """The law of this key."""
+        law = self.law
+        for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
+            old = getattr(law, name)
+            new = distribution.sample(jax.random.fold_in(key, i), old.size, old.dtype, False)
+            law = eqx.tree_at(lambda tree, f=name: getattr(tree, f), law, new.reshape(old.shape))
+        return law
+
+
+Source = Distribution | Rows | Callable[[jax.Array], Any] | jax.Array | None
+
+
+def as_source(name: str, value: Any, size: int, non_negative: bool) -> Source:
+    """A distribution, a function of a key, rows, or a constant (size,); checked on the host."""
+    if isinstance(value, Distribution):
+        value.check(name, size, non_negative)
+        return value
+    if callable(value):
+        drawn = value(jax.random.key(0, impl="threefry2x32"))
+        check_shape(f"{name}(key)", drawn, (size,), "one draw")
+        return value
+    array = as_float_array(name, value)
+    if array.ndim == 2:
+        check_shape(name, array, (len(array), size), "one sample a row")
+    else:
+        check_shape(name, array, (size,), "or one sample a row")
+    check_values(name, array)
+    if non_negative and np.any(np.asarray(array) < 0):
+        where = np.argwhere(np.asarray(array) < 0)[0].tolist()
+        raise ValueError(
+            f"Argument `{name}` must not be negative, but has value "
+            f"{float(array[tuple(where)]):g} at index {where}; {OVERLAP}"
+        )
+    return Rows(np.asarray(array)) if array.ndim == 2 else array
+
+
+def _check_sizes(value: Any, name: str, size: int, fields: tuple[str, ...]) -> None:
+    for field in fields:
+        if np.shape(getattr(value, field)) not in ((), (size,)):
+            raise ValueError(
+                f"Argument `{name}` must have scalars or {size} values in `{field}`, but is "
+                f"{value!r}."
+            )
+
+
+def _check_domain(name: str, distribution: Distribution) -> None:
+    low, high = DOMAIN.get(name, (-np.inf, np.inf))
+    if isinstance(distribution, Uniform):
+        least, most = np.min(np.asarray(distribution.low)), np.max(np.asarray(distribution.high))
+    else:
+        least, most = -np.inf, np.inf
+    if least < low or most > high:
+        raise ValueError(
+            f"Argument `{name}` must lie in [{low:g}, {high:g}], but {distribution!r} can leave it."
+        )
+
+
+def _told(value: jax.Array) -> str:
+    entries = [f"{x:g}" for x in np.ravel(np.asarray(value))]
+    return entries[0] if np.ndim(value) == 0 else f"[{', '.join(entries)}]"
