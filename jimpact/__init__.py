@@ -51,8 +51,11 @@ _WHERE = {
     "plot_admissible": "plot_admissible_set",
     "numerics.copositive": "Copositivity copositivity",
     "quasi": (
-        "contact_power from_quasi_velocities kinetic_energy_split quasi_basis to_quasi_velocities"
+        "ContactPower contact_power from_quasi_velocities kinetic_energy_split quasi_basis "
+        "to_quasi_velocities"
     ),
+    "laws.restitution_matrix": "RestitutionMatrix",
+    "rocking": "RockingRatio housner_restitution rocking_matrix rocking_ratios",
     "inclusion": "InclusionOutcome contact_coupling restitution_inclusion",
     "experiments": "Experiments read_experiments",
     "fitting": "Fit fit",

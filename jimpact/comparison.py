@@ -137,7 +137,7 @@ def compare(
 
     >>> import jimpact as ji
     >>> table = ji.compare(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0], restitution=1.0)
-    >>> table.entries["moreau"].outcome.velocity.round(4).tolist()
+    >>> [round(float(v), 4) for v in table.entries["moreau"].outcome.velocity]
     [-0.3333, 0.6667, 0.6667]
     """
     v = as_float_array("velocity", velocity)

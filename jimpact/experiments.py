@@ -164,10 +164,9 @@ def dense_mass(scene: Scene) -> np.ndarray:
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:
-    """`C^T M` (c, n): C spans the complement of range(N) and of the bilateral constraints."""
-    forces = np.asarray(scene.normals, float)
-    if scene.constraints is not None:
-        forces = np.hstack([forces, np.asarray(scene.constraints, float)])
+    """`C^T M` (c, n): C spans the complement of all contact and constraint directions."""
+    others = [x for x in (scene.tangents, scene.constraints) if x is not None]
+    forces = np.hstack([np.asarray(x, float) for x in (scene.normals, *others)])
     u, singular, _ = np.linalg.svd(forces)
     rank = int((singular > singular[0] * max(forces.shape) * np.finfo(float).eps).sum())
     complement = u[:, rank:]

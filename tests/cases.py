@@ -17,6 +17,10 @@ def poisson(e, k):
     return ji.Poisson(e)
 
 
+def restitution_matrix(e, k):
+    return ji.RestitutionMatrix(jnp.diag(jnp.atleast_1d(e)))
+
+
 def binary(order):
     def make(e, k):
         m = max(jnp.size(e), jnp.size(k))
@@ -37,6 +41,7 @@ LAWS = {
     "newton": ("newton", newton, 1e-12, 1e-12),
     "moreau": ("moreau", moreau, 1e-12, 1e-12),
     "poisson": ("poisson", poisson, 1e-12, 1e-12),
+    "restitution-matrix": ("restitution_matrix", restitution_matrix, 1e-12, 1e-12),
     "binary-fastest": ("binary", binary("fastest"), 1e-12, 1e-12),
     "binary-earliest": ("binary", binary("earliest"), 1e-12, 1e-12),
     "binary-left-to-right": ("binary", binary("left_to_right"), 1e-12, 1e-12),

@@ -12,6 +12,7 @@ import jax
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
 
+import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
@@ -23,6 +24,7 @@ _SAME = 1e-5  # outcomes closer than this, relative to the velocities, are the s
 LAWS = {
     "`LZB`": lambda e, k: ji.LZB(e, k, rtol=1e-7),
     "`Newton`": lambda e, k: ji.Newton(e),
+    "`RestitutionMatrix`": lambda e, k: ji.RestitutionMatrix(jnp.diag(0.8 * e) + 0.2),
     "`Moreau`": lambda e, k: ji.Moreau(e),
     "`Poisson`": lambda e, k: ji.Poisson(e),
     "`Binary`": lambda e, k: ji.Binary(e),

@@ -8,6 +8,7 @@ from jimpact.laws.lzb import LZB
 from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
 from jimpact.laws.poisson import Poisson
+from jimpact.laws.restitution_matrix import RestitutionMatrix
 
 
 class Row(NamedTuple):
@@ -106,5 +107,15 @@ REGISTRY: dict[str, Row] = {
         promises=EVERY_PROPERTY,
         source="Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)",
         bibtex=TOWNE,
+    ),
+    "restitution_matrix": Row(
+        law=RestitutionMatrix,
+        parameters=("matrix",),
+        summary="qn+ = -E qn-: a full matrix of coefficients, tangential blocks included",
+        right_when="E is known or fitted for this very system and kind of approach; rocking",
+        fails_when="other masses or geometry than E was found for; E outside the admissible set",
+        promises=frozenset({"velocity_scaling", "mass_scaling"}),
+        source="Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)",
+        bibtex=BROGLIATO,
     ),
 }

@@ -34,7 +34,7 @@ class Moreau(Law):
 
     >>> import jimpact as ji
     >>> out = ji.impact(ji.Moreau(0.5), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0])
-    >>> out.velocity.round(6).tolist()
+    >>> [round(float(v), 6) for v in out.velocity]
     [-0.25, 0.25, 0.25]
     """
 

@@ -33,7 +33,8 @@ class Poisson(Law):
 
     >>> import jimpact as ji
     >>> law = ji.Poisson([0.4, 1.0])
-    >>> ji.impact(law, ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]).velocity.round(4).tolist()
+    >>> out = ji.impact(law, ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+    >>> [round(float(v), 4) for v in out.velocity]
     [0.0667, 0.2667, 0.6667]
     """
 

@@ -53,7 +53,8 @@ def solve_lcp(
 
     >>> import jax.numpy as jnp
     >>> from jimpact.numerics.lcp import solve_lcp
-    >>> solve_lcp(jnp.array([[2.0, -1.0], [-1.0, 2.0]]), jnp.array([-1.0, 3.0])).z.tolist()
+    >>> found = solve_lcp(jnp.array([[2.0, -1.0], [-1.0, 2.0]]), jnp.array([-1.0, 3.0]))
+    >>> [round(float(z), 6) for z in found.z]
     [0.5, 0.0]
     """
     diagonal = jax.lax.stop_gradient(jnp.diagonal(matrix))
@@ -105,7 +106,7 @@ def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, ja
 def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Lemke's method with lexicographic ratios: which z are basic at the end, status code."""
     m, dtype = b.shape[0], b.dtype
-    tolerance = _ROUNDING * jnp.finfo(dtype).eps * m
+    tolerance = _ROUNDING * float(jnp.finfo(dtype).eps) * m
     ones = jnp.ones((m, 1), dtype)
     rows = jnp.concatenate([jnp.eye(m, dtype=dtype), -a, -ones, b[:, None]], axis=1)
     artificial = 2 * m
@@ -136,7 +137,7 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     return support, code
 
 
-def _leaving(state: _Tableau, artificial: int, tolerance: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _leaving(state: _Tableau, artificial: int, tolerance: float) -> tuple[jax.Array, jax.Array]:
     """Row of the least ratio, ties broken lexicographically; and whether there is none (a ray)."""
     m = state.basis.shape[0]
     column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(state.rows.dtype)

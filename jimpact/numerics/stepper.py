@@ -35,6 +35,7 @@ FIRST_TIME = 0.05  # of the fastest contact's time scale: no contact can turn ar
 RESTART = 0.1  # first START step after a closing, as a part of the step before it
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 LEAST_ERROR = 1e-10  # in tolerances; keeps the growth factor finite
+WIDE_GAP = 64  # eps of a gap: its error estimate is no more than rounding
 NEAR_OPENING = 1.0  # an expansion expected to end within so many steps is landed on
 PATIENCE = 2000  # passes per contact after which an impact is let end at WIDENED tolerances
 WIDENED = 100.0
@@ -130,7 +131,7 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
         flow, phase, carry.state, kind, target, start, length, due, control.tolerance
     )
     state, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
-    error = _error(control, high, low)
+    error = _error(control, jnp.minimum(state.x, new.x), high, low)
     span = _span(flow, carry)
     found = events.find(
         flows.frozen(flow), control.tolerance, phase, kind, target, span, state, new
@@ -145,11 +146,14 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     moved = State(*(jnp.where(accept, b, a) for a, b in zip(carry.state, reached)))
     moved, new_phase, closed = events.change_phase(flow, phase, moved, arrived, found.opens)
     following = _next_step(flow, carry, found, error, span, flips, inside, accept, closed)
+    # however short the step, the force has no value: given up, for the status to say
+    broken = ~jnp.isfinite(error) & ~landing & (span < events.SHORTEST)
     out = following._replace(
-        state=moved,
+        state=moved._replace(p=jnp.where(broken, jnp.nan, moved.p)),
         phase=new_phase,
         passes=carry.passes + 1,
         closures=carry.closures + closed.astype(jnp.int32),
+        done=carry.done | broken,
     )
     out = _aim_at_opening(flow, out, accept)
     return _finish(flow, control, _fly(flow, out) if flow.gapped else out)
@@ -182,12 +186,15 @@ def _span(flow: Flow, carry: Carry) -> jax.Array:
     return jnp.select([landing, carry.kind == START], [carry.due, in_start], carry.h)
 
 
-def _error(control: Control, high: State, low: State) -> jax.Array:
-    """Hairer's combination of the two estimates, in units of the tolerance."""
+def _error(control: Control, least: jax.Array, high: State, low: State) -> jax.Array:
+    """Hairer's combination of the two estimates, in units of the tolerance; `least` x: gaps."""
+    gap = jnp.where(least < 0, -least, 0.0)
+    rounding = WIDE_GAP * float(jnp.finfo(gap.dtype).eps) * gap
 
     def size(estimate: State) -> jax.Array:
-        rows = [jnp.abs(row) for row in (estimate.x, estimate.g, estimate.p)]
-        return jnp.max(jnp.maximum(jnp.maximum(rows[0], rows[1]), rows[2]) / control.tolerance)
+        x = jnp.abs(estimate.x) / (control.tolerance + rounding)
+        rest = jnp.maximum(jnp.abs(estimate.g), jnp.abs(estimate.p)) / control.tolerance
+        return jnp.max(jnp.maximum(x, rest))
 
     fifth, third = size(high), size(low)
     scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
