@@ -117,7 +117,7 @@ def registered_laws(values: Mapping[str, Any]) -> dict[str, Law]:
     def made(row: Row) -> Law | None:
         if row.parameters[0] not in values:
             return None
-        return row.law(**{key: values[key] for key in row.parameters if key in values})
+        return row.build(**{key: values[key] for key in row.parameters if key in values})
 
     laws = {name: made(row) for name, row in REGISTRY.items()}
     return {name: law for name, law in laws.items() if law is not None}

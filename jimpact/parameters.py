@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jimpact.laws.base import Law
+from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB
 
 DEFAULT_FREE = ("restitution", "stiffness")
@@ -51,18 +52,24 @@ class Parameters:
         return self.entry_fields[self.groups[parameter][0]]
 
 
+def value_of(law: Law, field: str) -> Any:
+    """A field of a law, or of the force of a compliant one; None if it has none."""
+    own = getattr(law, field, None)
+    return getattr(law.force, field, None) if own is None and isinstance(law, Compliant) else own
+
+
 def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
     """All entries (Q,) of these fields of a law."""
-    return np.concatenate([np.ravel(np.asarray(getattr(law, f), float)) for f in fields])
+    return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
 
 
 def with_entries(law: Law, fields: tuple[str, ...], values: jax.Array) -> Law:
     """The law with these entries (Q,)."""
     start = 0
     for field in fields:
-        old = getattr(law, field)
+        old = value_of(law, field)
         new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
-        law = eqx.tree_at(lambda tree, f=field: getattr(tree, f), law, new)
+        law = eqx.tree_at(lambda tree, f=field: value_of(tree, f), law, new)
         start += old.size
     return law
 
@@ -74,7 +81,7 @@ def free_parameters(law: Law, contacts: int, free: Any) -> tuple[Parameters, lis
     for field, choice in _as_mapping(free, known).items():
         if field not in known:
             raise ValueError(_unknown_field(law, field, known))
-        labels[field] = _as_labels(field, choice, np.shape(getattr(law, field)))
+        labels[field] = _as_labels(field, choice, np.shape(value_of(law, field)))
     if "stiffness" in labels and labels["stiffness"].all() and _only_ratios(law, labels):
         held = labels["stiffness"] == labels["stiffness"].flat[0]
         if held.all():
@@ -110,7 +117,13 @@ def _name(field: str, members: np.ndarray, size: int) -> str:
 
 def _array_fields(law: Law) -> list[str]:
     """Public names of the law's float arrays (`exponent_array` is reached as `exponent`)."""
-    fields = [f.name for f in dataclasses.fields(law) if eqx.is_inexact_array(getattr(law, f.name))]
+    parts = (law, law.force) if isinstance(law, Compliant) else (law,)
+    fields = [
+        f.name
+        for part in parts
+        for f in dataclasses.fields(part)
+        if eqx.is_inexact_array(getattr(part, f.name))
+    ]
     return [name.removesuffix("_array") for name in fields]
 
 
@@ -125,7 +138,7 @@ def _as_mapping(free: Any, known: list[str]) -> dict[str, Any]:
 
 def _unknown_field(law: Law, field: str, known: list[str]) -> str:
     name = type(law).__name__
-    if isinstance(getattr(law, field, None), (float, tuple)):
+    if isinstance(value_of(law, field), (float, tuple)):
         return (
             f"Argument `free` must not hold `{field}`: it is a fixed number of this {name}; "
             f"give {field}=jnp.asarray(...) to the law to make it a parameter."
@@ -204,7 +217,7 @@ def _domain(field: str, law: Law) -> tuple[float, float]:
 
 def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of a field, flattened; each end is a scalar or shaped like the field."""
-    shape = np.shape(getattr(law, field))
+    shape = np.shape(value_of(law, field))
     try:
         low, high = (np.broadcast_to(np.asarray(end, float), shape).ravel() for end in pair)
     except (TypeError, ValueError):

@@ -52,8 +52,8 @@ class Force(eqx.Module):
 class Bistiffness(Force):
     """Elastic-plastic contact of `LZB`: loading `k x^eta`, unloading steeper, to a residual x.
 
-    Equation: loading `F = k x^eta`; from (x_c, F_c) unloading `F = F_c ((x - x_r) / (x_c - x_r))^eta`
-    with the residual indentation `x_r = (1 - e^2) x_c`; the surface then stays at x_r. The pair's
+    Equation: loading `F = k x^eta`; unloading from (x_c, F_c) along
+    `F = F_c ((x - x_r) / (x_c - x_r))^eta` with the residual indentation `x_r = (1 - e^2) x_c`; the surface then stays at x_r. The pair's
     restitution coefficient is e, whatever the speed; e = 1 is elastic.
 
     Args:
@@ -97,7 +97,7 @@ class Bistiffness(Force):
         return self.stiffness * jnp.where(positive, power, 0.0)
 
 
-def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:  # noqa: N802
+def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:
     """Elastic contact `F = k x^eta`.
 
     >>> from jimpact.rheology import PowerLaw
@@ -108,12 +108,12 @@ def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:  # noqa: N802
     return Bistiffness(stiffness, exponent)
 
 
-def Hertz(stiffness: Any) -> Bistiffness:  # noqa: N802
+def Hertz(stiffness: Any) -> Bistiffness:
     """Hertz contact `F = k x^1.5`, k in [N / m^1.5] (see `hertz_stiffness`)."""
     return Bistiffness(stiffness, 1.5)
 
 
-def LinearSpring(stiffness: Any) -> Bistiffness:  # noqa: N802
+def LinearSpring(stiffness: Any) -> Bistiffness:
     """Linear spring `F = k x`."""
     return Bistiffness(stiffness, 1.0)
 

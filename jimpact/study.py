@@ -110,7 +110,7 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
         given = values["exponent"]
         fixed = tuple(given) if isinstance(given, list) else given
         values["exponent"] = np.asarray(given, float) if "exponent" in free else fixed
-    law = row.law(**values)
+    law = row.build(**values)
     experiments = _experiments(tables["data"], path, scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
     return Study(title, scene, law, free, bounds, experiments, values, options)

@@ -36,6 +36,10 @@ def lzb(exponent, method="time"):
     return make
 
 
+def compliant(e, k):
+    return ji.Compliant(ji.Bistiffness(k, 1.5, e))
+
+
 # name: (registry name, maker, accuracy of the outcome, accuracy of its derivatives)
 LAWS = {
     "newton": ("newton", newton, 1e-12, 1e-12),
@@ -46,6 +50,7 @@ LAWS = {
     "binary-earliest": ("binary", binary("earliest"), 1e-12, 1e-12),
     "binary-left-to-right": ("binary", binary("left_to_right"), 1e-12, 1e-12),
     "binary-tuple": ("binary", binary("tuple"), 1e-12, 1e-12),
+    "compliant": ("compliant", compliant, 1e-7, 1e-6),
     "lzb-linear": ("lzb", lzb(1.0), 1e-7, 1e-6),
     "lzb-hertz": ("lzb", lzb(1.5), 1e-7, 1e-6),
     "lzb-array-exponent": ("lzb", lzb(jnp.array(1.4)), 1e-7, 1e-6),

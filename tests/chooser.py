@@ -27,6 +27,7 @@ LAWS = {
     "`RestitutionMatrix`": lambda e, k: ji.RestitutionMatrix(jnp.diag(0.8 * e) + 0.2),
     "`Moreau`": lambda e, k: ji.Moreau(e),
     "`Poisson`": lambda e, k: ji.Poisson(e),
+    "`Compliant`": lambda e, k: ji.Compliant(ji.Bistiffness(k, 1.5, e), rtol=1e-7),
     "`Binary`": lambda e, k: ji.Binary(e),
     "`Binary`, left to right": lambda e, k: ji.Binary(e, order="left_to_right"),
 }

@@ -22,7 +22,13 @@ def _run(rates, y, events, tol):
         f.terminal, f.direction = True, direction
         functions.append(f)
     done = solve_ivp(
-        lambda _, y: rates(y), (0, HORIZON), y, "DOP853", events=functions, rtol=tol, atol=tol * 1e-3
+        lambda _, y: rates(y),
+        (0, HORIZON),
+        y,
+        "DOP853",
+        events=functions,
+        rtol=tol,
+        atol=tol * 1e-3,
     )
     if done.status != 1:
         raise RuntimeError("no event: the impact does not end")
@@ -119,7 +125,14 @@ def viscous(mass, normals, velocity, force, gaps, tol=1e-12, phases=500, onset=N
         events, what = [], []
         for j in range(m):
             if pushing[j]:
-                events.append((lambda y, j=j: max(sign(y, j), -(1.0 if y[j] > 0 else 0.0)) if y[j] > ROUNDING else 1.0, -1))
+                events.append(
+                    (
+                        lambda y, j=j: (
+                            max(sign(y, j), -(1.0 if y[j] > 0 else 0.0)) if y[j] > ROUNDING else 1.0
+                        ),
+                        -1,
+                    )
+                )
                 events.append((lambda y, j=j: y[j] + ROUNDING, -1))
                 what += [(j, False), (j, False)]
             else:

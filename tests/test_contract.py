@@ -107,6 +107,22 @@ def test_permutation(row):
     np.testing.assert_allclose(a.impulse, b.impulse[::-1], atol=2 * accuracy)
 
 
+def test_bilateral_constraints_reduce_the_scene(row):
+    """Four balls, the middle two welded together: three balls, in every law."""
+    _, make, accuracy, _ = row
+    four = jnp.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]])
+    welded = ji.Scene(
+        jnp.array([1.0, 2.0, 0.5, 0.7]), four, constraints=jnp.array([[0.0], [-1], [1], [0]])
+    )
+    three = ji.Scene(jnp.array([1.0, 2.5, 0.7]), jnp.array([[-1.0, 0], [1, -1], [0, 1]]))
+    out = ji.impact(make(E, K), welded, jnp.array([1.0, 0.1, 0.1, -0.4]))
+    same = ji.impact(make(E, K), three, jnp.array([1.0, 0.1, -0.4]))
+    np.testing.assert_allclose(out.velocity[jnp.array([0, 1, 3])], same.velocity, atol=2 * accuracy)
+    np.testing.assert_allclose(out.velocity[1], out.velocity[2], atol=1e-14)
+    np.testing.assert_allclose(out.impulse, same.impulse, atol=2 * accuracy)
+    np.testing.assert_allclose(out.energy_change, same.energy_change, atol=2 * accuracy)
+
+
 def test_chain_equals_dense_scene(row):
     _, make, accuracy, _ = row
     chain, v = SCENES["wall"]()

@@ -156,3 +156,28 @@ def test_public_names_are_functions_not_modules():
         assert type(getattr(ji, name)).__name__ != "module", name
     with pytest.raises(AttributeError, match="no attribute 'Lzb'"):
         _ = ji.Lzb
+
+
+def test_constraints_distort_the_normalized_delassus_matrix():
+    """(6.35): the Schur complement of G over the constraints, normals and gradients of norm 1."""
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=(5, 5))
+    mass, normals, h = x @ x.T + np.eye(5), rng.normal(size=(5, 2)), rng.normal(size=(5, 2))
+    every = np.hstack([h, normals])
+    free = every.T @ np.linalg.solve(mass, every)
+    free = free / np.sqrt(np.outer(np.diag(free), np.diag(free)))
+    bb, bu, uu = free[:2, :2], free[:2, 2:], free[2:, 2:]
+    scene = ji.Scene(mass, normals, constraints=h)
+    g = ji.normalized_delassus(scene)
+    np.testing.assert_allclose(g, uu - bu.T @ np.linalg.solve(bb, bu), atol=1e-12)
+    assert (np.diag(g) < 1).all()
+
+
+def test_velocities_must_satisfy_the_constraints():
+    welded = ji.Scene([1.0, 1.0, 1.0], [[-1.0], [1.0], [0.0]], constraints=[[0.0], [-1.0], [1.0]])
+    with pytest.raises(
+        ValueError, match=r"`velocity` must satisfy .*constraint 1 has the rate 0.5"
+    ):
+        ji.impact(ji.Newton(0.5), welded, [1.0, 0.0, 0.5])
+    with pytest.raises(ValueError, match=r"`constraints` must have independent columns"):
+        ji.Scene([1.0, 1.0], [[1.0], [0.0]], constraints=[[1.0, 2.0], [0.0, 0.0]])

@@ -1,9 +1,11 @@
 """The registry of laws: one row a law. The CLI, the contract tests and the charts read it."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from jimpact.laws.base import Law
 from jimpact.laws.binary import Binary
+from jimpact.laws.compliant import Compliant, compliant
 from jimpact.laws.lzb import LZB
 from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
@@ -26,6 +28,11 @@ class Row(NamedTuple):
     promises: frozenset[str]
     source: str
     bibtex: str
+    make: Callable[..., Law] | None = None  # from `parameters`, where the class takes others
+
+    def build(self, **parameters: Any) -> Law:
+        """The law with these parameters."""
+        return (self.make or self.law)(**parameters)
 
 
 BROGLIATO = """@book{brogliato2016,
@@ -117,5 +124,16 @@ REGISTRY: dict[str, Row] = {
         promises=frozenset({"velocity_scaling", "mass_scaling"}),
         source="Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)",
         bibtex=BROGLIATO,
+    ),
+    "compliant": Row(
+        law=Compliant,
+        parameters=("stiffness", "exponent", "restitution", "rheology", "damping"),
+        summary="springs and dampers between bodies with real gaps",
+        right_when="gaps near the indentation, viscous contacts, known absolute stiffness",
+        fails_when="stiffness and damping unknown in SI units; geometry that turns during contact",
+        promises=frozenset({"impulse_sign", "gap_velocity_sign", "energy"}),
+        source="Brogliato (2016), (6.14)-(6.16); forces as cited in `rheology.py`",
+        bibtex=BROGLIATO,
+        make=compliant,
     ),
 }

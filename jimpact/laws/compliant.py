@@ -1,5 +1,6 @@
 """Compliant penalization: contacts with real gaps and a force-indentation law."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jimpact.laws.lzb import FINEST_RTOL_IN_EPS, default_rtol
 from jimpact.numerics.dimensionless import solve, to_dimensionless
 from jimpact.numerics.flow import Viscous
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
-from jimpact.rheology import Bistiffness, Force
+from jimpact.rheology import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.scene import Scene
 
 
@@ -54,7 +55,8 @@ class Compliant(Law):
     def __init__(self, force: Force, *, rtol: float | None = None, max_steps: int = 100_000):
         if not isinstance(force, Force):
             raise TypeError(
-                f"Argument `force` must be a contact force such as Hertz(k), but has value {force!r}."
+                "Argument `force` must be a contact force such as Hertz(k), "
+                f"but has value {force!r}."
             )
         if rtol is not None:
             check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
@@ -106,3 +108,33 @@ class Compliant(Law):
             viscous = Viscous(force, units.indentation, speed, momentum / units.time)
         p, code = solve(inputs, exponent, chain, self.max_steps, gapped=True, viscous=viscous)
         return p * momentum, code
+
+
+RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")
+
+
+def compliant(
+    stiffness: Any,
+    exponent: Any = 1.5,
+    restitution: Any = 1.0,
+    rheology: str = "bistiffness",
+    damping: Any = None,
+) -> Compliant:
+    """`Compliant` from plain parameters, as a study file gives them."""
+    viscous = {
+        "kelvin-voigt": KelvinVoigt,
+        "hunt-crossley": partial(HuntCrossley, exponent=exponent),
+        "kuwabara-kono": KuwabaraKono,
+    }
+    if rheology not in RHEOLOGIES:
+        raise ValueError(
+            f"Argument `rheology` must be one of {RHEOLOGIES}, but has value {rheology!r}."
+        )
+    if (rheology == "bistiffness") != (damping is None):
+        raise ValueError(
+            "Argument `damping` must be given for a viscous rheology and only there, but "
+            f"`rheology` is {rheology!r} and `damping` has value {damping!r}."
+        )
+    if rheology == "bistiffness":
+        return Compliant(Bistiffness(stiffness, exponent, restitution))
+    return Compliant(viscous[rheology](stiffness, damping))
