@@ -38,7 +38,7 @@ class FitCommand:
         """Fit, print, draw."""
         from jimpact.fit_command import run
 
-        return run(self)
+        return run(**vars(self))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ class CompareCommand:
         """Compare, print, draw."""
         from jimpact.compare_command import run
 
-        return run(self)
+        return run(**vars(self))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,10 +1,10 @@
 """`jimpact compare`: every law on one scene; a table, a picture."""
 
-import json
 import sys
 from dataclasses import replace
+from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,54 +22,48 @@ from jimpact.comparison import (
     verdict,
 )
 from jimpact.fitting import Fit
+from jimpact.pictures import picture_path
 from jimpact.study import Study, read_study
-
-if TYPE_CHECKING:
-    from jimpact.cli import CompareCommand
 
 PICTURE = "jimpact-compare.png"
 
 
-def run(command: "CompareCommand") -> int:
-    """Run the command; 2 for bad input, told in one line on stderr."""
+def run(
+    study: Path, velocity: tuple[float, ...] | None, shot: int, fit: bool, out: Path, json: bool
+) -> int:
+    """Run the command with the options of `CompareCommand`; 2 for bad input, told on stderr."""
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
     try:
-        path = _picture_path(command.out)
-        study = read_study(command.study)
-        velocity, measured = _shot(study, command)
-        laws = registered_laws(study.parameters)
-        found = compare(study.scene, velocity, laws)
-        fits = _fits(study) if command.fit else {}
-        _draw(found, measured, study.title, path)
+        path = picture_path(out, PICTURE)
+        given = read_study(study)
+        before, measured = _velocities(given, velocity, shot)
+        found = compare(given.scene, before, registered_laws(given.parameters))
+        fits = _fits(given) if fit else {}
+        _draw(found, measured, given.title, path)
     except (ValueError, TypeError, OSError) as error:
         print(f"jimpact compare: {error}", file=sys.stderr)
         return 2
-    if command.json:
-        told: dict[str, Any] = {"title": study.title, "velocity": velocity.tolist()}
+    if json:
+        told: dict[str, Any] = {"title": given.title, "velocity": before.tolist()}
         told |= {"laws": found.to_dict(), "fits": {n: f.to_dict() for n, f in fits.items()}}
-        print(json.dumps(told | {"picture": str(path)}, indent=2))
+        print(dumps(told | {"picture": str(path)}, indent=2))
     else:
-        _print(study, found, measured, fits, path)
+        _print(given, found, measured, fits, path)
     return 0
 
 
-def _picture_path(out: Path) -> Path:
-    path = out if out.suffix else out / PICTURE
-    if path.suffix not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"--out must end in .png, .pdf or .svg or be a directory, but is '{out}'.")
-    return path
-
-
-def _shot(study: Study, command: "CompareCommand") -> tuple[np.ndarray, np.ndarray | None]:
+def _velocities(
+    study: Study, velocity: tuple[float, ...] | None, shot: int
+) -> tuple[np.ndarray, np.ndarray | None]:
     """Velocities before the impact, and after it where they were measured."""
-    if command.velocity is not None:
-        return np.asarray(command.velocity, float), None
+    if velocity is not None:
+        return np.asarray(velocity, float), None
     data = study.experiments
     if data is None:
         raise ValueError("--velocity must be given, because the study has no [data].")
-    if not 1 <= command.shot <= len(data.shots):
-        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {command.shot}.")
-    return np.asarray(data.pre[command.shot - 1]), np.asarray(data.post[command.shot - 1])
+    if not 1 <= shot <= len(data.shots):
+        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {shot}.")
+    return np.asarray(data.pre[shot - 1]), np.asarray(data.post[shot - 1])
 
 
 def _fits(study: Study) -> dict[str, Fit]:

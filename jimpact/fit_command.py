@@ -1,10 +1,10 @@
 """`jimpact fit`: the study's fit, its yardsticks, a report, a picture."""
 
-import json
 import sys
 from dataclasses import replace
+from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import numpy as np
@@ -16,40 +16,38 @@ from rich.table import Table
 from jimpact.fitting import Fit
 from jimpact.laws import Newton
 from jimpact.laws.lzb import LZB
+from jimpact.pictures import picture_path
 from jimpact.study import Study, read_study
-
-if TYPE_CHECKING:
-    from jimpact.cli import FitCommand
 
 PICTURE = "jimpact-fit.png"
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
-def run(command: "FitCommand") -> int:
-    """Run the command; 2 for bad input, told in one line on stderr."""
+def run(
+    study: Path,
+    law: str | None,
+    method: str | None,
+    starts: int | None,
+    seed: int | None,
+    out: Path,
+    json: bool,
+) -> int:
+    """Run the command with the options of `FitCommand`; 2 for bad input, told on stderr."""
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
     try:
-        path = _picture_path(command.out)
-        study = read_study(command.study, command.law)
-        options = {"method": command.method, "starts": command.starts, "seed": command.seed}
-        fits = _all_fits(study, options)
-        _draw(study, fits, path)
+        path = picture_path(out, PICTURE)
+        given = read_study(study, law)
+        fits = _all_fits(given, {"method": method, "starts": starts, "seed": seed})
+        _draw(given, fits, path)
     except (ValueError, TypeError, OSError) as error:
         print(f"jimpact fit: {error}", file=sys.stderr)
         return 2
-    if command.json:
+    if json:
         told = {name: fit.to_dict() for name, fit in fits.items()}
-        print(json.dumps({"title": study.title, "fits": told, "picture": str(path)}, indent=2))
+        print(dumps({"title": given.title, "fits": told, "picture": str(path)}, indent=2))
     else:
-        _print_report(study, fits, path)
+        _print_report(given, fits, path)
     return 0
-
-
-def _picture_path(out: Path) -> Path:
-    path = out if out.suffix else out / PICTURE
-    if path.suffix not in (".png", ".pdf", ".svg"):
-        raise ValueError(f"--out must end in .png, .pdf or .svg or be a directory, but is '{out}'.")
-    return path
 
 
 def _draw(study: Study, fits: dict[str, Fit], path: Path) -> None:

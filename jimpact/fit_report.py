@@ -1,19 +1,16 @@
 """The report of a fit as plain text and as JSON-ready data."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from jimpact.status import STATUS
 
-if TYPE_CHECKING:
-    from jimpact.fitting import Fit
-
 _VELOCITIES_SHOWN = 24
 _MINIMA_SHOWN = 5
 
 
-def report(fit: "Fit") -> str:
+def report(fit: Any) -> str:
     """Parameters with errors, quality, what stays unseen, minima, warnings, shots."""
     blocks = [
         [_headline(fit)],
@@ -27,7 +24,7 @@ def report(fit: "Fit") -> str:
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
-def _headline(fit: "Fit") -> str:
+def _headline(fit: Any) -> str:
     shots, bodies = fit.predicted.shape
     values = int(fit.experiments.measured.sum())
     return (
@@ -36,7 +33,7 @@ def _headline(fit: "Fit") -> str:
     )
 
 
-def _parameters(fit: "Fit") -> list[str]:
+def _parameters(fit: Any) -> list[str]:
     width = max(9, *(len(name) for name in fit.names))
     lines = [f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   95 % interval"]
     for i, (low, high) in enumerate(fit.confidence_interval()):
@@ -48,7 +45,7 @@ def _parameters(fit: "Fit") -> list[str]:
     return lines
 
 
-def _quality(fit: "Fit") -> list[str]:
+def _quality(fit: Any) -> list[str]:
     lines = [f"rms residual   {fit.rms:.4g} m/s"]
     if fit.experiments.sigma is not None:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
@@ -67,7 +64,7 @@ def _told(title: str, lines: tuple[str, ...]) -> list[str]:
     return [title, *(f"  - {line}" for line in lines)] if lines else []
 
 
-def _minima(fit: "Fit") -> list[str]:
+def _minima(fit: Any) -> list[str]:
     total = sum(start.count for start in fit.starts) + fit.lost_starts
     late = f"{fit.lost_starts} of {total} starts did not converge." if fit.lost_starts else ""
     if len(fit.starts) == 1:
@@ -83,7 +80,7 @@ def _minima(fit: "Fit") -> list[str]:
     return [*lines, late] if late else lines
 
 
-def _shots(fit: "Fit") -> list[str]:
+def _shots(fit: Any) -> list[str]:
     data = fit.experiments
     pre, post = np.asarray(data.pre, float), np.asarray(data.post, float)
     lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s} [m/s]"]
@@ -101,7 +98,7 @@ def _shots(fit: "Fit") -> list[str]:
     return lines
 
 
-def to_json(fit: "Fit") -> dict[str, Any]:
+def to_json(fit: Any) -> dict[str, Any]:
     """Plain numbers, strings and lists; not finite numbers become None."""
     interval = fit.confidence_interval()
     parameters = [
