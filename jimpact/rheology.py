@@ -53,8 +53,8 @@ class Bistiffness(Force):
     """Elastic-plastic contact of `LZB`: loading `k x^eta`, unloading steeper, to a residual x.
 
     Equation: loading `F = k x^eta`; unloading from (x_c, F_c) along
-    `F = F_c ((x - x_r) / (x_c - x_r))^eta` with the residual indentation `x_r = (1 - e^2) x_c`; the surface then stays at x_r. The pair's
-    restitution coefficient is e, whatever the speed; e = 1 is elastic.
+    `F = F_c ((x - x_r) / (x_c - x_r))^eta` with the residual indentation `x_r = (1 - e^2) x_c`,
+    where the surface then stays. The pair's restitution coefficient is e, whatever the speed.
 
     Args:
         stiffness: k > 0 [N / m^eta].

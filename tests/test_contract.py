@@ -21,7 +21,15 @@ SCENES = {
 E, K = jnp.array([0.9, 0.6]), jnp.array([1.0, 2.5])
 
 
-@pytest.fixture(params=LAWS, ids=list(LAWS))
+def once_a_law():
+    """Every law once; its further methods and orders, which share its code, are slow tests."""
+    seen = set()
+    for name, (law, *_) in LAWS.items():
+        yield pytest.param(name, id=name, marks=[pytest.mark.slow] if law in seen else [])
+        seen.add(law)
+
+
+@pytest.fixture(params=once_a_law())
 def row(request):
     name, make, accuracy, slope_accuracy = LAWS[request.param]
     return ji.REGISTRY[name], make, accuracy, slope_accuracy

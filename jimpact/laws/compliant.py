@@ -1,5 +1,6 @@
 """Compliant penalization: contacts with real gaps and a force-indentation law."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
@@ -121,7 +122,7 @@ def compliant(
     damping: Any = None,
 ) -> Compliant:
     """`Compliant` from plain parameters, as a study file gives them."""
-    viscous = {
+    viscous: dict[str, Callable[..., Force]] = {
         "kelvin-voigt": KelvinVoigt,
         "hunt-crossley": partial(HuntCrossley, exponent=exponent),
         "kuwabara-kono": KuwabaraKono,
