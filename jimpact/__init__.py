@@ -36,6 +36,10 @@ _WHERE = {
         "Bistiffness Force Hertz HuntCrossley KelvinVoigt KuwabaraKono LinearSpring PowerLaw "
         "UserForce"
     ),
+    "gap_scales": "Crossover GapScale crossover gap_scale",
+    "montecarlo": "monte_carlo",
+    "sampling.results": "MonteCarlo",
+    "sampling.distributions": "Normal RandomLaw Uniform",
     "han_gilmore_tree": "HanGilmoreOutcome han_gilmore",
     "laws.lzb": "LZB distributing_rule",
     "impacts": "Impact impact raise_on_failure",

@@ -1,4 +1,7 @@
-"""The command line: `jimpact fit`, `compare`, `laws`. Heavy imports wait until a command runs."""
+"""The command line: `jimpact fit`, `compare`, `montecarlo`, `laws`.
+
+Heavy imports wait until a command runs.
+"""
 
 import dataclasses
 import json as json_module
@@ -68,6 +71,38 @@ class CompareCommand:
 
 
 @dataclasses.dataclass(frozen=True)
+class MonteCarloCommand:
+    """Velocities after an impact whose gaps are random: statistics, histograms, outcome map."""
+
+    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
+        "three_balls_gaps.toml"
+    )
+    """Study file with a [monte_carlo] table, or the name of a bundled one."""
+    samples: int | None = None
+    """Number of samples; default: the study's, or 100000."""
+    seed: int | None = None
+    """Seed; default: the study's, or 0."""
+    executor: Literal["serial", "devices", "dask"] = "serial"
+    """Where: one chunk after another, all devices of the process, or Dask workers."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler; default: workers on this machine."""
+    folder: Path | None = None
+    """Where finished chunks are kept; the same command again continues there."""
+    keep_samples: bool = False
+    """Keep the raw samples in the folder, too."""
+    out: Path = Path("jimpact-montecarlo.png")
+    """Picture (.png, .pdf, .svg), or a directory for it."""
+    json: bool = False
+    """Print JSON instead of a report."""
+
+    def run(self) -> int:
+        """Sample, print, draw."""
+        from jimpact.montecarlo_command import run
+
+        return run(self)
+
+
+@dataclasses.dataclass(frozen=True)
 class LawsCommand:
     """List the laws: what they say, when they are right and when they fail."""
 
@@ -103,6 +138,7 @@ class LawsCommand:
 Command = (
     Annotated[FitCommand, tyro.conf.subcommand("fit")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
+    | Annotated[MonteCarloCommand, tyro.conf.subcommand("montecarlo")]
     | Annotated[LawsCommand, tyro.conf.subcommand("laws")]
 )
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.impacts import in_common_dtype, without_open_contacts
 from jimpact.laws.base import Law
+from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.numerics import stepper
 from jimpact.numerics.dimensionless import (
@@ -21,6 +22,7 @@ from jimpact.numerics.dimensionless import (
 )
 from jimpact.numerics.flow import START, TIME, State, factor, plus_one, power, root_order, scales
 from jimpact.numerics.tridiagonal import Tridiagonal
+from jimpact.rheology import Bistiffness
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
 
 TRACED_RECORDS = 512  # passes kept when the number needed cannot be looked up (inside jit, grad)
@@ -49,13 +51,15 @@ class History(eqx.Module):
 def history(
     law: Law, scene: Scene, velocity: Any, samples: int = 200, records: int | None = None
 ) -> History:
-    """Sample the impact of an `LZB` law on `scene` at equal intervals of impact time.
+    """Sample the impact of an `LZB` or `Compliant` law at equal intervals of impact time.
 
     Equation: `gamma' = W F`, `p' = F`, `F_j = k_j x_j^eta_j`; between the steps of the
     integrator a sample is one more step of the same method.
 
     Args:
-        law: an `LZB` with method 'time'; stiffness in SI units makes time and force SI.
+        law: an `LZB` with method 'time', or a `Compliant` with a power law or a `Bistiffness`
+            (gaps included: `indentation` is 0 while a contact is open); stiffness in SI units
+            makes time and force SI.
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
         samples: number of rows, first before and last after the impact.
@@ -72,10 +76,12 @@ def history(
     >>> round(float(h.duration), 3), round(float(h.maximum_force[0]), 3)  # pi/sqrt(k), sqrt(k)
     (2.221, 1.414)
     """
-    if not isinstance(law, LZB) or law.method != "time":
+    compliant = isinstance(law, Compliant) and isinstance(law.force, Bistiffness)
+    if not compliant and not (isinstance(law, LZB) and law.method == "time"):
         raise TypeError(
-            "Argument `law` must be an LZB law with method='time' (other laws have no impact "
-            f"dynamics to sample), but is {law!r}."
+            "Argument `law` must be an LZB law with method='time' or a Compliant law with a "
+            "Bistiffness force (others have no impact dynamics that are sampled), "
+            f"but is {law!r}."
         )
     if samples < 2:
         raise ValueError(f"Argument `samples` must be at least 2, but has value {samples}.")
@@ -92,22 +98,36 @@ def history(
     return _history(law, scene, v, samples, records)
 
 
+Sampled = LZB | Compliant
+
+
+def _contact(law: Sampled) -> Bistiffness:
+    """Stiffness, exponent and restitution of the contacts."""
+    if isinstance(law, Compliant):
+        return law.force  # type: ignore[return-value]
+    return Bistiffness(law.stiffness, law.exponent, law.restitution)
+
+
 def _setup(
-    law: LZB, scene: Scene, v: jax.Array
+    law: Sampled, scene: Scene, v: jax.Array
 ) -> tuple[stepper.Flow, stepper.Control, stepper.Carry, Units]:
-    w, gamma = without_open_contacts(scene, delassus_matrix(scene), gap_velocity(scene, v))
-    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts), 0.0)
+    w, gamma = delassus_matrix(scene), gap_velocity(scene, v)
+    gapped, contact = isinstance(law, Compliant), _contact(law)
+    if not gapped:
+        w, gamma = without_open_contacts(scene, w, gamma)
+    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
     happens = jnp.any(gamma < 0) | jnp.any(stored > 0)
     inputs, units = to_dimensionless(
         w,
         jnp.where(happens, gamma, -jnp.ones_like(gamma)),
-        law.restitution,
-        law.stiffness,
-        law.exponent,
+        contact.restitution,
+        contact.stiffness,
+        contact.exponent,
         stored,
-        law.rtol or default_rtol(law.method, v.dtype),
+        law.rtol or default_rtol("time", v.dtype),
+        scene.gaps if gapped else None,
     )
-    flow = flow_of(inputs, law.exponent, isinstance(w, Tridiagonal))
+    flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal), gapped)
     control = control_of(inputs, 1.0, law.max_steps, "time")._replace(closed_form=False)
     start = stepper.begin(flow, control, inputs.gamma, inputs.x)
     # nothing happens: over before it begins
@@ -115,13 +135,13 @@ def _setup(
 
 
 @eqx.filter_jit
-def _passes(law: LZB, scene: Scene, v: jax.Array) -> jax.Array:
+def _passes(law: Sampled, scene: Scene, v: jax.Array) -> jax.Array:
     flow, control, start, _ = _setup(law, scene, v)
     return stepper.run(flow, control, start).passes
 
 
 @eqx.filter_jit
-def _history(law: LZB, scene: Scene, v: jax.Array, samples: int, records: int) -> History:
+def _history(law: Sampled, scene: Scene, v: jax.Array, samples: int, records: int) -> History:
     flow, control, start, units = _setup(law, scene, v)
 
     def keep(carry: stepper.Carry, _: None) -> tuple[stepper.Carry, stepper.Carry]:
@@ -142,13 +162,14 @@ def _history(law: LZB, scene: Scene, v: jax.Array, samples: int, records: int) -
 
     states, gammas = jax.vmap(sample)(at, times)
     omega_force = units.velocity / (units.root * units.time)  # dp/dt: dimensionless -> SI
-    rates = factor(law.exponent, v.dtype) * flow.omega
+    eta = _contact(law).exponent
+    rates = factor(eta, v.dtype) * flow.omega
 
     def force(x: jax.Array) -> jax.Array:
-        return rates * power(x, law.exponent) * omega_force
+        return rates * power(x, eta) * omega_force
 
     def energy(x: jax.Array) -> jax.Array:
-        return 0.5 * units.velocity**2 * power(x, plus_one(law.exponent))
+        return 0.5 * units.velocity**2 * power(x, plus_one(eta))
 
     impulse = states.p * (units.velocity / units.root)[None, :]
     return History(

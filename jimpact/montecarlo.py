@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from importlib import import_module
 from pathlib import Path
@@ -82,9 +82,7 @@ def monte_carlo(
     >>> [round(float(v), 2) for v in found.quantile(0.9)]  # one of two mirror images
     [-0.6, 0.16, 1.24]
     """
-    run = planned_run(
-        Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples
-    )
+    run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
     chosen = as_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
@@ -156,12 +154,12 @@ def _merge_ready(
 
 def _computed(
     run: Run, executor: Executor, missing: list[int], read: Callable[[int], Chunk | None]
-) -> Iterator[Chunk]:
-    """The missing chunks; the first of all comes before the others: it sets the histograms."""
+) -> Generator[Chunk]:
+    """The missing chunks; the first of all sets the histograms, and is computed here."""
     if not missing:
         return
     if missing[0] == 0:
-        (first,) = executor.run(run.plan, iter([run.task(0)]))
+        first = run.plan(run.task(0))
         yield first
         missing = missing[1:]
     else:
@@ -183,7 +181,9 @@ def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
     if is_random(sources.law) or is_random(sources.velocity):
         return None
     try:
-        found = import_module("jimpact.gap_scale_of").gap_scale(scene, sources.law, sources.velocity)
+        found = import_module("jimpact.gap_scale_of").gap_scale(
+            scene, sources.law, sources.velocity
+        )
     except (ModuleNotFoundError, ValueError, TypeError):  # a law without stiffness has none
         return None
     delta = np.broadcast_to(np.asarray(found.delta, float), (scene.contacts,))

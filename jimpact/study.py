@@ -13,20 +13,22 @@ from jimpact.experiments import Experiments, read_experiments
 from jimpact.fitting import Fit, fit
 from jimpact.laws import REGISTRY, Row
 from jimpact.laws.base import Law
+from jimpact.sampling.study_table import arguments
 from jimpact.scene import Scene
 from jimpact.scenes import chain
 
 BUNDLED = "three_balls.toml"
 
-_TABLES = ("title", "scene", "law", "fit", "data")
+_TABLES = ("title", "scene", "law", "fit", "data", "monte_carlo")
 _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 _FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
 _DATA_KEYS = ("file", "momentum_corrected")
+_LAW_OPTIONS = {"binary": ("order",)}  # of a law, beside its parameters
 
 
 @dataclass(frozen=True)
 class Study:
-    """What `read_study` found; `run` fits it.
+    """What `read_study` found; `run` fits it, `monte_carlo(**study.monte_carlo)` samples it.
 
     `parameters` are the law's values as the file gives them; `experiments` is None without data.
     """
@@ -39,6 +41,7 @@ class Study:
     experiments: Experiments | None
     parameters: dict[str, Any]
     options: dict[str, Any] = field(default_factory=dict)
+    monte_carlo: dict[str, Any] = field(default_factory=dict)
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options; keyword arguments that are not None go first."""
@@ -61,8 +64,9 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`); `[law]` name and start
     values, a number for all contacts or a list with one each, and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
-    to the study), momentum_corrected; without data a study can be compared, not fitted. A name of
-    a bundled study is found where no such file is.
+    to the study), momentum_corrected; without data a study can be compared, not fitted;
+    `[monte_carlo]` velocity_m_per_s, gaps_m, law, samples, seed (see `jimpact.sampling`). A name
+    of a bundled study is found where no such file is.
 
     Raises:
         FileNotFoundError: no such study or data file.
@@ -95,7 +99,7 @@ def _locate(path: Path) -> Path:
 
 def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Study:
     _check_keys("the study", tables, _TABLES, required=("scene", "law"))
-    for name in ("scene", "law", "fit", "data"):
+    for name in ("scene", "law", "fit", "data", "monte_carlo"):
         if not isinstance(tables.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
     scene = _scene(tables["scene"])
@@ -113,7 +117,8 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
     law = row.build(**values)
     experiments = _experiments(tables["data"], path, scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
-    return Study(title, scene, law, free, bounds, experiments, values, options)
+    sampled = arguments(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}
+    return Study(title, scene, law, free, bounds, experiments, values, options, sampled)
 
 
 def _experiments(table: Mapping[str, Any], path: Path, scene: Scene) -> Experiments:
@@ -145,9 +150,11 @@ def _law_table(
             raise ValueError(f"the law must be one of {', '.join(REGISTRY)}, but is {key!r}.")
     row = REGISTRY[name]
     bounds = table.pop("bounds", {})
-    _check_keys("[law]", table, (*REGISTRY[own].parameters, "name", "bounds"))
+    options = _LAW_OPTIONS.get(own, ())
+    _check_keys("[law]", table, (*REGISTRY[own].parameters, "name", "bounds", *options))
     _check_keys("[law.bounds]", bounds, REGISTRY[own].parameters)
-    kept = {k: v for k, v in table.items() if k in row.parameters}
+    taken = (*row.parameters, *_LAW_OPTIONS.get(name, ()))
+    kept = {k: v for k, v in table.items() if k in taken}
     return row, kept, {k: v for k, v in bounds.items() if k in row.parameters}
 
 

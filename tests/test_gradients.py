@@ -203,3 +203,29 @@ def _descend(law, state, rule, gradient):
     object.__setattr__(only_e, "restitution", gradient.restitution)
     updates, state = rule.update(only_e, state)
     return optax.apply_updates(law, updates), state
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        ji.LZB(0.8, [1.0, 1.0]),
+        ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8)),
+        ji.Compliant(ji.LinearSpring(1.0)),
+        ji.Compliant(ji.KelvinVoigt(1.0, 0.1)),
+    ],
+    ids=["lzb", "bistiffness", "linear", "kelvin-voigt"],
+)
+def test_events_that_coincide(law):
+    """A symmetric impact, in which every event happens at both contacts at once."""
+    masses, v = jnp.array([0.25, 1.0, 0.25]), jnp.array([1.0, 0.0, -1.0])
+    gapped = isinstance(law, ji.Compliant)
+
+    @jax.jit
+    def outcome(shift):  # of ball 1: earlier, later; of its speed where geometry is frozen
+        if not gapped:
+            return ji.impact(law, ji.chain(masses), v.at[0].add(shift)).velocity
+        return ji.impact(law, ji.chain(masses, gaps=jnp.stack([0.5 + shift, 0.5])), v).velocity
+
+    step = 1e-4
+    expected = (outcome(step) - outcome(-step)) / (2 * step)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(outcome))(0.0), expected, atol=2e-5)

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import jax
+
 from jimpact.sampling.chunks import Chunk, Task
 from jimpact.sampling.plans import Plan
 
@@ -29,28 +31,32 @@ class DaskExecutor:
     def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """Chunks as they are completed."""
         try:
-            import cloudpickle
+            import cloudpickle  # type: ignore[import-untyped]
             from distributed import Client, as_completed
         except ImportError:
             raise ImportError(
-                "The executor 'dask' needs the extra `distributed`: pip install jimpact[distributed]"
+                "The executor 'dask' needs the extra `distributed`: "
+                "pip install 'jimpact[distributed]'"
             ) from None
         own = self.client is None or isinstance(self.client, str)
-        client = Client(self.client) if own else self.client
+        client = self.client
+        if self.client is None:
+            client = Client(threads_per_worker=1, dashboard_address=None)
+        elif own:
+            client = Client(self.client)
         try:
             shipped = cloudpickle.dumps(plan)
             window = AHEAD * max(1, sum(client.nthreads().values()))
             running = as_completed()
             for task in tasks:
-                running.add(client.submit(_compute, shipped, task, pure=False))
+                running.add(client.submit(_compute, shipped, plan.x64, task, pure=False))
                 if running.count() >= window:
                     yield _result(running)
             while running.count():
                 yield _result(running)
         finally:
             if own:
-                client.close()
-                client.cluster.close() if client.cluster is not None else None
+                client.close()  # and with it the cluster that it started
 
 
 def _result(running: Any) -> Chunk:
@@ -60,11 +66,12 @@ def _result(running: Any) -> Chunk:
     return chunk
 
 
-def _compute(shipped: bytes, task: Task) -> Chunk:
-    return _plan(shipped)(task)
+def _compute(shipped: bytes, x64: bool, task: Task) -> Chunk:
+    return _plan(shipped, x64)(task)
 
 
 @functools.lru_cache(maxsize=4)
-def _plan(shipped: bytes) -> Plan:
+def _plan(shipped: bytes, x64: bool) -> Plan:
     """The same object for the same bytes, so that a worker compiles a run only once."""
-    return pickle.loads(shipped)
+    with jax.enable_x64(x64):  # else a worker would read float64 arrays as float32
+        return pickle.loads(shipped)

@@ -1,24 +1,23 @@
 """All devices of this process (GPUs, or CPU devices): each works on chunks of its own."""
 
+import queue
 from collections import deque
 from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import jax
 
 from jimpact.sampling.chunks import Chunk, Task
-from jimpact.sampling.plans import Plan, Started
-
-AHEAD = 2  # chunks enqueued on each device, so that none waits for the host
+from jimpact.sampling.plans import Plan
 
 
 @dataclass(frozen=True)
 class Devices:
-    """Chunks in turn on `devices` (None: `jax.devices()`).
+    """One thread a device, chunk by chunk, on `devices` (None: `jax.devices()`).
 
-    Whole chunks, and not their parts, are shared out: the compiled program is the same for any
-    number of devices, and hence so is the result, bit by bit; samples that take long delay no
-    other device.
+    Whole chunks, not their parts, are shared out: the program of a device is the same for any
+    number of them, and hence so is the result, bit by bit. Each device compiles it once.
     """
 
     devices: Sequence[jax.Device] | None = None
@@ -26,10 +25,26 @@ class Devices:
     def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """Chunks in order."""
         devices = list(self.devices or jax.devices())
-        under_way: deque[Started] = deque()
-        for i, task in enumerate(tasks):
-            if len(under_way) == AHEAD * len(devices):
-                yield plan.finish(under_way.popleft())
-            under_way.append(plan.start(task, devices[i % len(devices)]))
-        while under_way:
-            yield plan.finish(under_way.popleft())
+        free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
+        for device in devices:
+            free.put(device)
+
+        def compute(task: Task) -> Chunk:
+            device = free.get()
+            try:
+                return plan(task, device)
+            finally:
+                free.put(device)
+
+        under_way: deque[Future[Chunk]] = deque()
+        with ThreadPoolExecutor(len(devices)) as pool:
+            try:
+                for task in tasks:
+                    under_way.append(pool.submit(compute, task))
+                    if len(under_way) > len(devices):  # one waits, so that no device does
+                        yield under_way.popleft().result()
+                while under_way:
+                    yield under_way.popleft().result()
+            finally:  # the caller stopped: finish what runs, drop what waits
+                for future in under_way:
+                    future.cancel()

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from jimpact.laws.base import Law
 from jimpact.laws.binary import Binary
-from jimpact.laws.compliant import Compliant, compliant
+from jimpact.laws.compliant import Compliant, make_compliant
 from jimpact.laws.lzb import LZB
 from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
@@ -134,6 +134,6 @@ REGISTRY: dict[str, Row] = {
         promises=frozenset({"impulse_sign", "gap_velocity_sign", "energy"}),
         source="Brogliato (2016), (6.14)-(6.16); forces as cited in `rheology.py`",
         bibtex=BROGLIATO,
-        make=compliant,
+        make=make_compliant,
     ),
 }

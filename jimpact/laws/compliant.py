@@ -114,7 +114,7 @@ class Compliant(Law):
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")
 
 
-def compliant(
+def make_compliant(
     stiffness: Any,
     exponent: Any = 1.5,
     restitution: Any = 1.0,

@@ -75,7 +75,7 @@ def to_dimensionless(
     loaded = stored > 0
     x = jnp.where(loaded, (2 * jnp.where(loaded, stored, 1.0) / q**2) ** (1 / (eta + 1)), 0.0)
     if gaps is not None:
-        x = jnp.where(gaps > 0, -gaps / x_ref, x)
+        x = -gaps / x_ref  # at 0 too: its derivative there is the one-sided one
     g = scaled(delassus, 1 / root)
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     inputs = Inputs(

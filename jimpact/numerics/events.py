@@ -69,8 +69,9 @@ def find(
 ) -> Events:
     """Events between `state` and `new`; the one a landing step ends on is not among them."""
     snap = SNAP * tolerance
-    before, after = _margins(flow, tolerance, phase, state), _margins(flow, tolerance, phase, new)
-    slope, slope_end = _slopes(flow, phase, state), _slopes(flow, phase, new)
+    slack = (phase == OPEN) & (state.x > 0)  # where the step begins: not a gap that closes
+    before, after = (_margins(flow, tolerance, phase, slack, y) for y in (state, new))
+    slope, slope_end = (_slopes(flow, phase, slack, y) for y in (state, new))
     landing = lands(kind)
     crossed_g = ~(target & (kind == ZERO_G)) & (after.g < -snap)
     crossed_x = ~(target & landing & (kind != ZERO_G)) & (after.x < -snap)
@@ -114,17 +115,38 @@ def change_phase(
     opened = arrived & opened
     turned = jnp.where(state.x > 0, EXPANSION, OPEN)
     following = jnp.where(phase == COMPRESSION, turned, COMPRESSION)
+    if flow.slackens:  # a slack contact may be loaded again while it still expands
+        still = (phase == OPEN) & (state.x > 0) & (state.g > 0)
+        following = jnp.where(still, EXPANSION, following)
     following = jnp.where(opened, OPEN, following)
+    closed = arrived & (phase == OPEN)
     new_phase = jnp.where(arrived, following, phase).astype(jnp.int32)
-    g = jnp.where(opened, flow.restitution * state.g, state.g)
+    e = flow.restitution
+    g = jnp.where(opened, e * state.g, state.g)
     at_rest = arrived & ~opened & (phase != OPEN)
-    g = jnp.where(at_rest, 0.0, g)
-    if flow.slackens:
-        x = jnp.where(arrived & (phase == OPEN), jnp.maximum(state.x, 0.0), state.x)
-    else:
-        reset = arrived & (opened | (phase == OPEN)) if flow.gapped else new_phase == OPEN
-        x = jnp.where(reset, 0.0, state.x)
-    return state._replace(x=x, g=g), new_phase, arrived & (phase == OPEN)
+    # of events that coincide one is landed on: the others are 0, too, but not their derivatives
+    along = jnp.where(phase == EXPANSION, e, jnp.where(e > 0, 1 / jnp.where(e > 0, e, 1.0), 0.0))
+    along = jnp.where(new_phase == OPEN, 1.0, along)
+    g = jnp.where(at_rest, along * (state.g - jax.lax.stop_gradient(state.g)), g)
+    if not flow.gapped:
+        return state._replace(x=jnp.where(new_phase == OPEN, 0.0, state.x), g=g), new_phase, closed
+    ahead = state.x - jax.lax.stop_gradient(state.x)
+    if not flow.slackens:
+        reset = arrived & (opened | (phase == OPEN))
+        x = jnp.where(reset, jnp.where(opened, e**2, 1.0) * ahead, state.x)
+        return state._replace(x=x, g=g), new_phase, closed
+    x = jnp.where(closed & (state.x <= 0), ahead, state.x)
+    return jumped(flow, state._replace(x=x, g=g), closed), new_phase, closed
+
+
+def jumped(flow: Flow, state: State, closed: jax.Array) -> State:
+    """Adds what a force that jumps at closing has done while x differs from 0: derivatives only."""
+    moves = closed & (state.g < 0)
+    ahead = state.x - jax.lax.stop_gradient(state.x)
+    rate = jnp.where(moves, -flow.omega * state.g, 1.0)
+    push = flow.viscous.push(state.x, state.g)  # type: ignore[union-attr]
+    dp = jnp.where(moves, push * ahead / rate, 0.0)
+    return state._replace(g=state.g + flow.coupling @ dp, p=state.p + dp)
 
 
 def next_opening(flow: Flow, phase: jax.Array, state: State) -> tuple[jax.Array, jax.Array]:
@@ -140,27 +162,28 @@ def _signs(phase: jax.Array) -> jax.Array:
     return jnp.where(phase == COMPRESSION, -1.0, 1.0)
 
 
-def _margins(flow: Flow, tolerance: jax.Array, phase: jax.Array, state: State) -> Margin:
+def _margins(
+    flow: Flow, tolerance: jax.Array, phase: jax.Array, slack: jax.Array, state: State
+) -> Margin:
     if flow.gapped:
         g = jnp.where(phase == OPEN, 1.0, _signs(phase) * state.g)
         x = jnp.where(phase == OPEN, -state.x, state.x)
         if flow.slackens:
             onset = flow.viscous.onset(state.x, state.g)  # type: ignore[union-attr]
-            x = jnp.where(phase == EXPANSION, onset, jnp.where(state.x > 0, -onset, x))
+            x = jnp.where(phase == EXPANSION, onset, jnp.where(slack, -onset, x))
         return Margin(jnp.where(phase == COMPRESSION, 1.0, x), g)
     slack = jnp.where(phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
     g = _signs(phase) * state.g + slack
     return Margin(jnp.where(phase == EXPANSION, state.x, 1.0), g)
 
 
-def _slopes(flow: Flow, phase: jax.Array, state: State) -> Margin:
+def _slopes(flow: Flow, phase: jax.Array, slack: jax.Array, state: State) -> Margin:
     dx, dg, _, _ = field(flow, phase, state.x, state.g)
     if flow.gapped:
         rate = jnp.where(phase == OPEN, -dx, dx)
         if flow.slackens:
             onset = flow.viscous.onset  # type: ignore[union-attr]
             turning = jax.jvp(onset, (state.x, state.g), (dx, dg))[1]
-            slack = (phase == OPEN) & (state.x > 0)
             rate = jnp.where(phase == EXPANSION, turning, jnp.where(slack, -turning, rate))
         rate = jnp.where(phase == COMPRESSION, 0.0, rate)
         return Margin(rate, jnp.where(phase == OPEN, 0.0, _signs(phase) * dg))

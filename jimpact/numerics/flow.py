@@ -53,7 +53,7 @@ class Viscous(NamedTuple):
 
     def push(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
         """Dimensionless force, not tensile."""
-        x = jnp.maximum(x, 0.0) * self.indentation
+        x = jnp.where(x >= 0, x, 0.0) * self.indentation
         return jnp.maximum(self.model.force(x, -gamma * self.speed), 0.0) / self.force
 
     def onset(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
@@ -104,11 +104,11 @@ def power(x: jax.Array, exponent: Exponent) -> jax.Array:
     """`max(x, 0)^exponent` with finite derivatives at 0; fast for static 1, 1.5 and 2."""
     if isinstance(exponent, tuple) and len(set(exponent)) == 1:
         exponent = exponent[0]
+    if isinstance(exponent, float) and exponent == 1.0:
+        return jnp.where(x >= 0, x, 0.0)  # at 0 the derivative of a contact that closes
     positive = x > 0
     x = jnp.where(positive, x, 0.0)
     if isinstance(exponent, float):
-        if exponent == 1.0:
-            return x
         if exponent == 2.0:
             return x * x
         if exponent == 1.5:
@@ -148,7 +148,9 @@ def field(flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array) -> tuple[jax
     if flow.viscous is None:
         force = factor(flow.exponent, x.dtype) * flow.omega * power(x, flow.exponent)
     else:
-        force = jnp.where(phase == OPEN, 0.0, flow.viscous.push(x, g))
+        force = flow.viscous.push(x, g)
+    if flow.gapped:
+        force = jnp.where(phase == OPEN, 0.0, force)
     closing = -ratio * flow.omega
     if not flow.gapped:
         closing = jnp.where(phase == OPEN, 0.0, closing)

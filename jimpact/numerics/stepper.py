@@ -94,9 +94,12 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
     s = jnp.where(phase == EXPANSION, flow.restitution, 1.0)
     g = gamma / s
     zero, no = jnp.zeros((), dtype), jnp.zeros((), bool)
+    state = State(x, g, jnp.zeros(m, dtype), zero)
+    if flow.slackens:
+        state = events.jumped(flow, state, (x == 0) & (gamma < 0))
     first = jnp.asarray(FIRST_TIME ** (1 / root_order(flow.exponent)), dtype)
     carry = Carry(
-        state=State(x, g, jnp.zeros(m, dtype), zero),
+        state=state,
         phase=phase,
         kind=jnp.asarray(START, jnp.int32),
         target=jnp.zeros(m, bool),

@@ -30,8 +30,8 @@ def sample_bar(samples: int, done: int, progress: bool | None) -> Iterator[Calla
         TimeRemainingColumn(),
     )
     bar = Progress(*columns, console=console, transient=True)
-    told = {"count": f"{done:,} of {samples:,} samples", "rate": ""}
-    task = bar.add_task("samples", total=samples, completed=done, **told)
+    count = f"{done:,} of {samples:,} samples"
+    task = bar.add_task("samples", total=samples, completed=done, count=count, rate="")
     timer = threading.Timer(BAR_AFTER, bar.start)
     (bar if progress else timer).start()
     begin, new = time.perf_counter(), 0

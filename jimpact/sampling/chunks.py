@@ -2,20 +2,21 @@
 
 import dataclasses
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from jimpact.sampling import histograms
 from jimpact.sampling.drawing import BAD_INPUTS
 from jimpact.sampling.moments import Moments, moments
-from jimpact.status import STATUS
+from jimpact.status import STATUS, Status
 
 LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
 SHOWN = 4096  # first samples of a run that are kept in memory for pictures
 
 # name, message and whether it is a failure, of every code
-OUTCOMES = [*map(tuple, STATUS), *((*told, True) for told in BAD_INPUTS.values())]
-_FAILURE = np.array([row[2] for row in OUTCOMES])
+OUTCOMES = [*STATUS, *(Status(*told, True) for told in BAD_INPUTS.values())]
+FAILURE = np.array([row.failure for row in OUTCOMES])
 _SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
 
 
@@ -61,7 +62,7 @@ class Chunk:
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything as named arrays, for a file."""
         plain = {name: np.asarray(getattr(self, name)) for name in _PLAIN}
-        parts = {f"moments.{k}": np.asarray(v) for k, v in self.moments._asdict().items()}
+        parts = {f"moments.{k}": np.asarray(v) for k, v in vars(self.moments).items()}
         bad = {f"bad.{k}": v for k, v in self.bad.items()}
         return plain | parts | bad | {f"samples.{k}": v for k, v in self.samples.items()}
 
@@ -76,18 +77,16 @@ def chunk_from(arrays: dict[str, np.ndarray]) -> Chunk:
         start = f"{prefix}."
         return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
 
-    own = {name: arrays[name] for name in _PLAIN}
+    own: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
     own |= {name: int(own[name]) for name in ("number", "count")}
     m = part("moments")
     whole = Moments(int(m["count"]), m["mean"], m["products"])
     return Chunk(**own, moments=whole, bad=part("bad"), samples=part("samples"))
 
 
-def reduced(
-    task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples: bool
-) -> Chunk:
+def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples: bool) -> Chunk:
     """The statistics of the first `task.count` samples of a chunk."""
-    failed = _FAILURE[samples["status"]]
+    failed = FAILURE[samples["status"]]
     whole = np.concatenate([samples["velocity"].T, samples["gaps"].T]).astype(np.float64)
     n = samples["velocity"].shape[1]
     ends = task.ends
@@ -103,7 +102,7 @@ def reduced(
     return Chunk(
         number=task.number,
         count=count,
-        statuses=np.bincount(samples["status"][:count], minlength=len(_FAILURE)),
+        statuses=np.bincount(samples["status"][:count], minlength=len(FAILURE)),
         moments=moments(used),
         low=velocity.min(axis=1, initial=np.inf),
         high=velocity.max(axis=1, initial=-np.inf),
@@ -126,4 +125,4 @@ def _first_ends(velocity: np.ndarray, status: np.ndarray) -> np.ndarray:
 
 def named(counts: np.ndarray) -> dict[str, int]:
     """Status counts by name, those that occurred."""
-    return {OUTCOMES[code][0]: int(counts[code]) for code in np.flatnonzero(counts)}
+    return {OUTCOMES[code].name: int(counts[code]) for code in np.flatnonzero(counts)}

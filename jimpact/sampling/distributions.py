@@ -1,6 +1,7 @@
 """What a sample is drawn from: uniform, normal, rows of an array, the user's own function."""
 
 import abc
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -108,6 +109,17 @@ class Normal(Distribution):
             )
 
 
+def parameter_paths(module: eqx.Module) -> dict[str, str]:
+    """Where the arrays of a law are, by field, those of its parts (Compliant's force) included."""
+    found: dict[str, str] = {}
+    for name, value in vars(module).items():
+        if isinstance(value, eqx.Module):
+            found |= {own: f"{name}.{path}" for own, path in parameter_paths(value).items()}
+        elif eqx.is_inexact_array(value):
+            found[name] = name
+    return found
+
+
 class Rows(eqx.Module):
     """Given samples (S, size): sample i is row i."""
 
@@ -140,28 +152,33 @@ class RandomLaw(eqx.Module):
     parameters: dict[str, Distribution]
 
     def __init__(self, law: Law, **parameters: Distribution):
-        fields = {k: v for k, v in vars(law).items() if eqx.is_inexact_array(v)}
+        paths = parameter_paths(law)
         for name, distribution in parameters.items():
-            if name not in fields:
+            if name not in paths:
                 raise ValueError(
-                    f"{type(law).__name__} has the parameters {', '.join(fields)}, but not "
-                    f"`{name}`; none of them can be drawn as `{name}`."
+                    f"Parameters of {type(law).__name__} that can be random are "
+                    f"{', '.join(paths)}, but not `{name}`."
                 )
             if not isinstance(distribution, Distribution):
                 raise TypeError(
                     f"Argument `{name}` must be Uniform or Normal, but is {distribution!r}."
                 )
-            distribution.check(name, fields[name].size, non_negative=False)
+            distribution.check(name, operator.attrgetter(paths[name])(law).size, False)
             _check_domain(name, distribution)
         self.law, self.parameters = law, parameters
 
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"{type(self.law).__name__}({told})"
+
     def __call__(self, key: jax.Array) -> Law:
         """The law of this key."""
-        law = self.law
+        law, paths = self.law, parameter_paths(self.law)
         for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
-            old = getattr(law, name)
+            get = operator.attrgetter(paths[name])
+            old = get(law)
             new = distribution.sample(jax.random.fold_in(key, i), old.size, old.dtype, False)
-            law = eqx.tree_at(lambda tree, f=name: getattr(tree, f), law, new.reshape(old.shape))
+            law = eqx.tree_at(get, law, new.reshape(old.shape))
         return law
 
 

@@ -79,7 +79,7 @@ def _function(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
 def _pickled(value: Any) -> bytes:
     try:
         return pickle.dumps(value, protocol=4)
-    except Exception:  # noqa: BLE001  (pickling may raise anything)
+    except Exception:
         return _name(value).encode()
 
 

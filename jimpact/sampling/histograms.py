@@ -10,7 +10,8 @@ def bin_range(values: np.ndarray) -> np.ndarray:
     """Low and high ends (d, 2) for the bins of `values` (d, count), with a margin."""
     low, high = values.min(axis=1).astype(float), values.max(axis=1).astype(float)
     margin = MARGIN * (high - low)
-    flat = FLAT * np.maximum(np.maximum(np.abs(low), np.abs(high)), np.finfo(float).tiny)
+    size = np.maximum(np.abs(low), np.abs(high))
+    flat = FLAT * np.where(size > 0, size, 1.0)
     margin = np.maximum(margin, flat)  # also where the range is rounding
     return np.stack([low - margin, high + margin], axis=1)
 

@@ -1,11 +1,12 @@
 """Mean and covariance of a stream, in float64, merged chunk by chunk."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
 
-class Moments(NamedTuple):
+@dataclass(frozen=True)
+class Moments:
     """Count, mean (d,) and the sum of products of deviations from the mean (d, d)."""
 
     count: int

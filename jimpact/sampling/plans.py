@@ -1,7 +1,8 @@
 """What determines a run, and how one chunk of it is computed.
 
-A chunk is always computed at its full size, on one device, by the same compiled programs; the
-statistics are numpy's, in float64. So they depend neither on the executor nor on the devices.
+A chunk is always computed at its full size, on one device, by the same program; the statistics are
+numpy's, in float64. So they depend neither on the executor nor on the number of devices. (A program
+that `shard_map` spreads over two devices has other last bits than that for one.)
 """
 
 import contextlib
@@ -16,8 +17,7 @@ import numpy as np
 
 from jimpact.laws.base import Law
 from jimpact.sampling.chunks import Chunk, Task, reduced
-from jimpact.sampling.distributions import Rows
-from jimpact.sampling.drawing import Drawn, Sources, draw, impacts, is_random, with_gaps
+from jimpact.sampling.drawing import Drawn, Sources, draw, impacts, with_gaps
 from jimpact.scene import Scene
 
 
@@ -33,7 +33,7 @@ class Started:
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Everything that determines the chunks; `finish(start(task))` computes one."""
+    """Everything that determines the chunks; `plan(task)` computes one."""
 
     sources: Sources
     scene: Scene
@@ -45,28 +45,42 @@ class Plan:
     x64: bool
     threefry_partitionable: bool
 
-    def __call__(self, task: Task) -> Chunk:
-        """Compute one chunk."""
-        return self.finish(self.start(task))
+    def __call__(self, task: Task, device: jax.Device | None = None) -> Chunk:
+        """Compute one chunk on a device (None: the default one)."""
+        return self.finish(self.start(task, device))
 
-    def start(self, task: Task, device: jax.Device | None = None) -> "Started":
-        """Enqueue a chunk on a device; returns at once."""
+    def start(self, task: Task, device: jax.Device | None = None) -> Started:
+        """Enqueue a chunk on a device."""
         with self._flags():
             drawn, lanes, scene = self._drawn(task, device)
             return Started(task, drawn, *impacts(drawn, scene, lanes))
 
+    def finish(self, started: Started) -> Chunk:
+        """Wait for a chunk and reduce it."""
+        drawn, empty = started.drawn, np.zeros((self.size, 0))
+        samples = {
+            "velocity": np.asarray(started.velocity),
+            "status": np.asarray(started.status),
+            "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
+            "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
+        }
+        return reduced(started.task, samples, self.bins, self.keep_samples)
+
     def sample(self, task: Task, lane: int) -> tuple[Law, jax.Array, jax.Array | None]:
         """Law, velocity and gaps of one sample, the same bits as in the run."""
         with self._flags():
-            drawn = self._drawn(task, None)[0]
-        parts = (drawn.law, drawn.velocity, drawn.gaps)
-        own = [
-            jax.tree.map(lambda leaf: leaf[lane] if eqx.is_array(leaf) else leaf, part)
-            if varies
-            else part
-            for varies, part in zip(drawn.varies, parts)
-        ]
-        return own[0], own[1], own[2]
+            drawn, _, _ = self._drawn(task, None)
+
+        def own(part: Any) -> Any:
+            return jax.tree.map(lambda leaf: leaf[lane] if eqx.is_array(leaf) else leaf, part)
+
+        law, velocity, gaps = drawn.law, drawn.velocity, drawn.gaps
+        one, two, three = drawn.varies
+        return (
+            own(law) if one else law,
+            own(velocity) if two else velocity,
+            own(gaps) if three else gaps,
+        )
 
     @contextlib.contextmanager
     def _flags(self) -> Iterator[None]:
@@ -75,32 +89,16 @@ class Plan:
         with jax.enable_x64(self.x64), partitionable:
             yield
 
-    def _drawn(self, task: Task, device: Any) -> tuple[Drawn, jax.Array, Scene]:
-        """The draws of the task; placing one input on the device places the computation."""
-        sources = self.sources
-        for name, rows in task.rows.items():
-            at = {"velocity": lambda s: s.velocity, "gaps": lambda s: s.gaps}[name]
-            sources = eqx.tree_at(at, sources, Rows(rows), is_leaf=lambda x: isinstance(x, Rows))
+    def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Drawn, jax.Array, Scene]:
+        """The draws of the task; where its inputs are, there a program runs."""
         key = jax.random.wrap_key_data(jnp.asarray(self.key), impl=self.key_kind)
         key = jax.random.fold_in(key, np.uint32(task.number))
         lanes = np.arange(self.size, dtype=np.uint32)
-        sources, key, lanes, scene = jax.tree.map(
+        sources, scene, key, lanes, rows = jax.tree.map(
             lambda x: jax.device_put(x, device) if eqx.is_array_like(x) else x,
-            (sources, key, lanes, self.scene),
+            (self.sources, self.scene, key, lanes, task.rows),
         )
-        sizes = (self.scene.size, self.scene.contacts)
-        return draw(sources, sizes, key, lanes), lanes, scene
-
-    def finish(self, started: "Started") -> Chunk:
-        """Wait for a chunk and reduce it."""
-        task, size = started.task, self.size
-        m = self.scene.contacts if is_random(self.sources.gaps) else 0
-        samples = {"velocity": np.asarray(started.velocity), "status": np.asarray(started.status)}
-        drawn = started.drawn
-        samples["gaps"] = np.asarray(drawn.gaps) if m else np.zeros((size, 0))
-        before = np.asarray(drawn.velocity)
-        samples["velocity_before"] = before if drawn.varies[1] else np.zeros((size, 0))
-        return reduced(task, samples, self.bins, self.keep_samples)
+        return draw(sources, (scene.size, scene.contacts), key, lanes, rows), lanes, scene
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ _FAILED = {name for name, _, failure in OUTCOMES if failure}
 _MESSAGE = {name: message for name, message, _ in OUTCOMES}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BadSample:
     """A sample that failed: its number, status, gaps (m,) [m] and velocities before (n,) [m/s].
 
@@ -31,7 +31,7 @@ class BadSample:
     velocity: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class MonteCarlo:
     """Statistics of the velocities after an impact; `print` gives a report.
 
@@ -156,7 +156,9 @@ class MonteCarlo:
             line = f"gap {j + 1}: mean {mean:.4g} m, std {std:.4g} m"
             if self.gap_scale is not None:
                 scale = self.gap_scale[j]
-                line += f"; in gap scales of {scale:.3g} m: {mean / scale:.3g} and {std / scale:.3g}"
+                line += (
+                    f"; in gap scales of {scale:.3g} m: {mean / scale:.3g} and {std / scale:.3g}"
+                )
             lines.append(line)
         return lines
 

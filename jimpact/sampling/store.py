@@ -9,8 +9,10 @@ import hashlib
 import io
 import json
 import os
+import tokenize
 import warnings
 import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,18 @@ from jimpact.sampling.chunks import Chunk, chunk_from
 
 FORMAT = 1
 MANIFEST = "manifest.json"
+# what reading a damaged file raises: zip's and numpy's complaints, numpy's about its text headers
+UNUSABLE = (
+    ValueError,
+    KeyError,
+    OSError,
+    EOFError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+    SyntaxError,
+    tokenize.TokenError,
+)
 
 
 class Store:
@@ -36,16 +50,16 @@ class Store:
         self.run = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
         self.folder.mkdir(parents=True, exist_ok=True)
         manifest = self.folder / MANIFEST
-        if manifest.exists():
+        if not any(self.folder.glob("chunk-*.npz")):  # nothing of any run is lost
+            told = {"format": FORMAT, "run": self.run, "identity": identity}
+            _write(manifest, json.dumps(told, indent=2).encode())
+        elif manifest.exists():
             _check_same(manifest, identity)
-        elif any(self.folder.glob("chunk-*.npz")):
+        else:
             raise ValueError(
                 f"Folder '{self.folder}' has chunks but no {MANIFEST}, so whose they are is not "
                 "known: give another folder, or delete them."
             )
-        else:
-            told = {"format": FORMAT, "run": self.run, "identity": identity}
-            _write(manifest, json.dumps(told, indent=2).encode())
 
     def path(self, number: int) -> Path:
         """The file of a chunk."""
@@ -56,7 +70,8 @@ class Store:
         arrays = chunk.arrays()
         checksum = np.frombuffer(_checksum(arrays, self.run), np.uint8)
         buffer = io.BytesIO()
-        np.savez(buffer, run=np.array(self.run), checksum=checksum, **arrays)
+        own: dict[str, Any] = {"run": np.array(self.run), "checksum": checksum}
+        np.savez(buffer, **own, **arrays)  # type: ignore[arg-type]
         _write(self.path(chunk.number), buffer.getvalue())
 
     def read(self, number: int, count: int, all_samples: bool) -> Chunk | None:
@@ -68,7 +83,7 @@ class Store:
             arrays = _checked(path, self.run)
             if int(arrays["number"]) != number:
                 raise ValueError(f"it is chunk {int(arrays['number'])} of this run")
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+        except UNUSABLE as error:
             told = str(error) or type(error).__name__
             warnings.warn(
                 f"'{path}' is not used, its samples are computed again: {told}.", stacklevel=2
@@ -90,13 +105,24 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
 
     Raises:
         FileNotFoundError: no run there. ValueError: a damaged file, or chunks without samples.
+
+    >>> import tempfile, jimpact as ji
+    >>> from jimpact.montecarlo import monte_carlo
+    >>> from jimpact.sampling.distributions import Uniform
+    >>> from jimpact.sampling.store import read_samples
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     options = {"samples": 30, "chunk": 20, "folder": folder, "keep_samples": True}
+    ...     speeds = Uniform([1.0, 0.0], [2.0, 0.0])
+    ...     _ = monte_carlo(ji.Newton(0.5), ji.chain([1.0, 1.0]), speeds, **options)
+    ...     [part["velocity"].shape for part in read_samples(folder)]
+    [(20, 2), (10, 2)]
     """
     folder = Path(folder)
     run = _manifest(folder / MANIFEST)["run"]
     for path in sorted(folder.glob("chunk-*.npz")):
         try:
             chunk = chunk_from(_checked(path, run))
-        except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+        except UNUSABLE as error:
             raise ValueError(f"'{path}' cannot be used: {error}.") from None
         if len(chunk.samples.get("status", ())) != chunk.count:
             raise ValueError(f"'{path}' has no raw samples: run with keep_samples=True.")
@@ -105,7 +131,7 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
 
 def _checked(path: Path, run: str) -> dict[str, np.ndarray]:
     """The arrays of a chunk file of this run."""
-    with np.load(path, allow_pickle=False) as file:
+    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     owner, checksum = str(arrays.pop("run")), arrays.pop("checksum").tobytes()
     if owner != run:

@@ -42,7 +42,7 @@ class Totals:
             self.bad.append(
                 BadSample(
                     index=chunk.number * self.run.plan.size + int(lane),
-                    status=OUTCOMES[int(chunk.bad["status"][i])][0],
+                    status=OUTCOMES[int(chunk.bad["status"][i])].name,
                     gaps=chunk.bad["gaps"][i],
                     velocity=chunk.bad["velocity_before"][i],
                 )

@@ -1,0 +1,555 @@
+"""Monte Carlo: statistics, distributions, failures, resume, sensitivity."""
+
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+import types
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from jimpact.comparison import registered_laws
+from jimpact.impacts import impact
+from jimpact.laws.binary import Binary
+from jimpact.laws.compliant import Compliant
+from jimpact.laws.newton import Newton
+from jimpact.montecarlo import monte_carlo
+from jimpact.rheology import Hertz
+from jimpact.sampling import histograms, store
+from jimpact.sampling.distributions import Normal, RandomLaw, Uniform
+from jimpact.sampling.fingerprints import fingerprint
+from jimpact.sampling.gap_sensitivities import gap_sensitivity
+from jimpact.sampling.moments import merged, moments
+from jimpact.sampling.store import read_samples
+from jimpact.scenes import chain
+
+BALLS = chain([0.25, 1.0, 0.25])
+LAW = Binary(1.0, order="earliest")
+BEFORE = [1.0, 0.0, -1.0]
+LEFT, RIGHT = np.array([-0.6, -0.16, 1.24]), np.array([-1.24, 0.16, 0.6])  # which contact is first
+GAPS = Uniform(0.0, 1e-5)
+CHUNK = 256  # one compiled program for most of this file
+
+
+def sampled(samples=1000, law=LAW, velocity=BEFORE, gaps=GAPS, **options):
+    return monte_carlo(law, BALLS, velocity, gaps, samples, **({"chunk": CHUNK} | options))
+
+
+def same(a, b):
+    """Bitwise, in everything but the time it took."""
+    names = "samples count mean covariance minimum maximum gap_mean gap_covariance edges counts statuses first"
+    return all(
+        fingerprint(getattr(a, name)) == fingerprint(getattr(b, name)) for name in names.split()
+    ) and (fingerprint(a.bad) == fingerprint(b.bad))
+
+
+# ------------------------------------------------------------------ statistics
+
+
+def test_statistics_are_those_of_the_raw_samples(tmp_path):
+    law = RandomLaw(LAW, restitution=Uniform(0.8, 1.0))
+    found = sampled(law=law, folder=tmp_path, keep_samples=True)
+    parts = list(read_samples(tmp_path))
+    assert [len(part["status"]) for part in parts] == [256, 256, 256, 232]
+    v, gaps = (np.concatenate([part[name] for part in parts]) for name in ("velocity", "gaps"))
+    both = np.concatenate([v, gaps], axis=1)
+    covariance = np.cov(both.T)
+    np.testing.assert_allclose(found.mean, v.mean(axis=0), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(found.covariance, covariance[:3, :3], rtol=1e-12)
+    np.testing.assert_allclose(found.gap_mean, gaps.mean(axis=0), rtol=1e-13)
+    np.testing.assert_allclose(found.gap_covariance, covariance[3:, 3:], rtol=1e-11)
+    np.testing.assert_allclose(found.cross_covariance, covariance[:3, 3:], rtol=1e-10)
+    np.testing.assert_array_equal(found.minimum, v.min(axis=0))
+    np.testing.assert_array_equal(found.maximum, v.max(axis=0))
+    assert found.counts.sum(axis=1).tolist() == [1000] * 3
+    for q in (0.0, 0.05, 0.31, 0.95, 1.0):
+        wanted = np.quantile(v, q, axis=0, method="inverted_cdf")
+        assert np.all(np.abs(found.quantile(q) - wanted) <= found.quantile_resolution)
+    np.testing.assert_allclose(found.standard_error, v.std(axis=0, ddof=1) / np.sqrt(1000))
+    np.testing.assert_array_equal(found.first["velocity"], parts[0]["velocity"])
+
+
+def test_each_sample_is_the_impact_of_its_gaps():
+    found = sampled(samples=300)
+    gaps, v = found.first["gaps"], found.first["velocity"]
+    closes_first = np.where((gaps[:, 0] < gaps[:, 1])[:, None], LEFT, RIGHT)
+    np.testing.assert_allclose(v, closes_first[:256], atol=1e-14)
+    share = np.mean(gaps[:, 0] < gaps[:, 1])
+    assert 0.4 < share < 0.6
+    law, scene, velocity = found.replay(7)
+    assert np.asarray(scene.gaps).tobytes() == gaps[7].tobytes()
+    np.testing.assert_allclose(impact(law, scene, velocity).velocity, v[7], atol=1e-14)
+    last = found.replay(299)[1].gaps
+    assert not np.array_equal(np.asarray(last), gaps[299 - 256])  # another chunk, other draws
+    with pytest.raises(ValueError, match=r"`index` must lie in \[0, 299\], but has value 300"):
+        found.replay(300)
+
+
+def test_random_parameters_velocities_and_their_analytic_moments():
+    balls = chain([1.0, 1.0])
+    found = monte_carlo(
+        RandomLaw(Newton(0.5), restitution=Uniform(0.6, 1.0)),
+        balls,
+        [1.0, 0.0],
+        samples=4000,
+        chunk=1000,
+    )
+    # v2+ = (1 + e) / 2
+    assert abs(found.mean[1] - 0.9) < 4 * found.standard_error[1]
+    np.testing.assert_allclose(found.std[1], 0.2 / np.sqrt(12), rtol=0.03)
+    np.testing.assert_allclose(found.quantile(0.25)[1], 0.85, atol=0.01)
+    assert found.gap_mean.shape == (0,)
+    moving = monte_carlo(Newton(0.5), balls, Normal([2.0, 0.0], 0.1), samples=4000, chunk=1000)
+    a = np.array([[0.25, 0.75], [0.75, 0.25]])  # v+ = A v-, all of them approach
+    np.testing.assert_allclose(moving.mean, a @ [2.0, 0.0], atol=4 * 0.1 / np.sqrt(4000))
+    np.testing.assert_allclose(moving.covariance, 0.01 * a @ a.T, rtol=0.1)
+    own = monte_carlo(
+        lambda key: Newton(jax.random.uniform(key)), balls, [1.0, 0.0], samples=10, chunk=16
+    )
+    e = np.array([float(own.replay(i)[0].restitution) for i in range(10)])
+    np.testing.assert_allclose(own.first["velocity"][:, 1], (1 + e) / 2, atol=1e-15)
+
+
+def test_given_samples_are_used_row_by_row():
+    rng = np.random.default_rng(0)
+    gaps = rng.uniform(0, 1e-5, (300, 2))
+    found = monte_carlo(LAW, BALLS, BEFORE, gaps, chunk=CHUNK)
+    assert found.samples == 300
+    np.testing.assert_array_equal(found.first["gaps"], gaps[:256])
+    wanted = np.where((gaps[:, 0] < gaps[:, 1])[:, None], LEFT, RIGHT)
+    np.testing.assert_allclose(found.mean, wanted.mean(axis=0), atol=1e-14)
+    np.testing.assert_array_equal(np.asarray(found.replay(299)[1].gaps), gaps[299])
+    with pytest.raises(ValueError, match="`samples` must be at most 300, the rows of `gaps`"):
+        monte_carlo(LAW, BALLS, BEFORE, gaps, samples=301)
+
+
+def test_float32_samples_are_summed_in_float64():
+    rng = np.random.default_rng(1)
+    values = (1000 + 0.01 * rng.standard_normal((1, 200_000))).astype(np.float32)
+    exact = values.astype(float)
+    whole = moments(values[:, :1])
+    for part in np.array_split(values[:, 1:], 37, axis=1):
+        whole = merged(whole, moments(part))
+    assert whole.count == 200_000
+    np.testing.assert_allclose(whole.mean, exact.mean(axis=1), rtol=1e-14)
+    np.testing.assert_allclose(whole.covariance[0, 0], exact.var(ddof=1), rtol=1e-10)
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), (Newton(0.5), chain([1.0, 1.0])))
+    ends = Uniform(*(jnp.float32(x) for x in (1.0, 2.0)))
+    found = monte_carlo(
+        single[0],
+        single[1],
+        lambda k: jnp.stack([ends.sample(k, 1, jnp.float32, False)[0], jnp.float32(0)]),
+        samples=50,
+        chunk=64,
+    )
+    assert found.first["velocity"].dtype == np.float32
+    assert found.mean.dtype == np.float64
+
+
+def test_histograms_hold_what_lies_outside_the_first_range():
+    ends = histograms.bin_range(np.array([[0.0, 1.0], [3.0, 3.0]]))
+    np.testing.assert_allclose(ends[0], [-0.1, 1.1])
+    assert ends[1, 0] < 3.0 < ends[1, 1]
+    counts = histograms.bin_counts(
+        np.array([[-5.0, 0.5, 9.0, 7.0], [3.0, 3.0, 3.0, 3.0]]), ends, 10
+    )
+    assert counts[0, 0] == 1
+    assert counts[0, -1] == 2
+    assert counts[1].max() == 4
+    low, high = np.array([-5.0, 3.0]), np.array([9.0, 3.0])
+    assert histograms.quantile(0.0, ends, counts, low, high).tolist() == [-5.0, 3.0]
+    assert histograms.quantile(1.0, ends, counts, low, high).tolist() == [9.0, 3.0]
+    assert -5.0 <= histograms.quantile(0.2, ends, counts, low, high)[0] <= -0.1
+
+
+def test_truncated_normal_gaps():
+    normal = Normal([1.0, 3.0], [2.0, 0.1])
+    draws = jax.vmap(lambda key: normal.sample(key, 2, jnp.float64, True))(
+        jax.random.split(jax.random.key(3), 20_000)
+    )
+    assert float(draws.min()) >= 0
+    wanted = stats.truncnorm(-0.5, np.inf, loc=1.0, scale=2.0)
+    assert stats.kstest(np.asarray(draws[:, 0]), wanted.cdf).pvalue > 1e-3
+    np.testing.assert_allclose(float(draws[:, 1].std()), 0.1, rtol=0.03)
+    far = jax.vmap(lambda key: Normal(0.0, 1e-9).sample(key, 1, jnp.float64, True))(
+        jax.random.split(jax.random.key(0), 100)
+    )
+    assert bool(jnp.all((far >= 0) & (far < 1e-8)))
+
+
+# ------------------------------------------------------------------- bad input
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"samples": 0}, ValueError, "`samples` must be at least 1, but has value 0"),
+        ({"samples": -3}, ValueError, "`samples` must be at least 1"),
+        ({"samples": 1e3}, TypeError, "`samples` must be an integer, but has value 1000.0"),
+        ({"samples": True}, ValueError, "`samples` must be at least 1"),
+        ({"chunk": 0}, ValueError, "`chunk` must be at least 1"),
+        ({"bins": 0}, ValueError, "`bins` must be at least 1"),
+        ({"key": "seed"}, TypeError, "`key` must be a JAX random key or an integer"),
+        ({"key": jax.random.split(jax.random.key(0))}, ValueError, "`key` must be one key"),
+        ({"executor": "cloud"}, ValueError, "`executor` must be one of serial, devices, dask"),
+        ({"keep_samples": True}, ValueError, "`folder` must be given to keep samples"),
+        ({"law": 3.0}, TypeError, "`law` must be a Law or a function key -> Law"),
+        ({"law": lambda key: 3.0}, TypeError, "`law` must give a Law for a key"),
+        ({"velocity": [1.0, 0.0]}, ValueError, r"`velocity` must have shape \(3,\)"),
+        ({"velocity": [1.0, np.nan, 0.0]}, ValueError, "`velocity` must be finite"),
+        ({"gaps": None}, ValueError, "`gaps` must be given where neither"),
+        ({"gaps": [0.0, -1e-6]}, ValueError, "negative gap is an overlap.*`initial_energy`"),
+        (
+            {"gaps": [[0.0, 1e-6], [0.0, -1e-6]]},
+            ValueError,
+            r"-1e-06 at index \[1, 1\].*`initial_energy`",
+        ),
+        (
+            {"gaps": Uniform(-1e-6, 1e-5)},
+            ValueError,
+            r"Uniform\(low=-1e-06, high=1e-05\) does.*`initial_energy`",
+        ),
+        ({"gaps": Normal(-1e-6, 1e-5)}, ValueError, "mean of at least 0.*`initial_energy`"),
+        ({"gaps": Uniform(0.0, [1e-5] * 3)}, ValueError, "scalars or 2 values in `high`"),
+        ({"gaps": lambda key: jnp.zeros(3)}, ValueError, r"`gaps\(key\)` must have shape \(2,\)"),
+    ],
+)
+def test_bad_arguments_are_named(change, error, message):
+    with pytest.raises(error, match=message):
+        sampled(**change)
+
+
+def test_bad_distributions_are_named():
+    with pytest.raises(ValueError, match="`high` must be at least `low`"):
+        Uniform(1.0, 0.0)
+    with pytest.raises(ValueError, match="`std` must lie in"):
+        Normal(0.0, 0.0)
+    with pytest.raises(ValueError, match="that can be random are restitution, but not `friction`"):
+        RandomLaw(LAW, friction=Uniform(0.0, 1.0))
+    with pytest.raises(
+        ValueError, match=r"`restitution` must lie in \[0, 1\], but Uniform.* can leave it"
+    ):
+        RandomLaw(LAW, restitution=Uniform(0.5, 1.5))
+    with pytest.raises(ValueError, match="can leave it"):
+        RandomLaw(LAW, restitution=Normal(0.5, 0.01))
+    assert (
+        RandomLaw(Compliant(Hertz(1.0)), stiffness=Uniform(1.0, 2.0))(
+            jax.random.key(0)
+        ).force.stiffness
+        > 1
+    )
+
+
+# -------------------------------------------------------------- failed samples
+
+
+def sometimes_bad(key):
+    gaps = jax.random.uniform(key, (2,), minval=-1e-7, maxval=1e-5)
+    return jnp.where(gaps > 9.9e-6, jnp.nan, gaps)
+
+
+def test_bad_draws_are_counted_listed_and_kept_apart():
+    with pytest.warns(
+        UserWarning, match=r"of 600 samples failed .* bad_gap\); see `bad` and `replay`"
+    ):
+        found = sampled(samples=600, gaps=sometimes_bad)
+    draws = np.stack([np.asarray(found.replay(i)[1].gaps) for i in (0, 1)])
+    np.testing.assert_array_equal(draws, found.first["gaps"][:2])
+    fine = (found.first["gaps"] >= 0).all(axis=1)
+    assert 0 < (~fine).sum() < 50
+    assert found.statuses["bad_gap"] == found.samples - found.count
+    assert len(found.bad) <= 20
+    assert [bad.index for bad in found.bad[: (~fine).sum()]] == np.flatnonzero(~fine)[:20].tolist()
+    bad = found.bad[0]
+    assert bad.status == "bad_gap"
+    assert np.asarray(found.replay(bad.index)[1].gaps).tobytes() == bad.gaps.tobytes()
+    np.testing.assert_allclose(np.abs(found.mean).max(), 0.92, atol=0.05)  # NaN went nowhere
+    assert np.isfinite(found.gap_mean).all()
+    told = str(found)
+    assert f"bad_gap: {found.statuses['bad_gap']}, left out" in told
+    assert f"replay({bad.index})" in told
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_failed_impacts_are_kept_apart():
+    # one collision is allowed: enough for the first row, not for the second
+    rows = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0]] * 4)
+    law = Binary(1.0, order="earliest", max_collisions=1)
+    with pytest.warns(UserWarning, match="4 of 8 samples failed"):
+        found = monte_carlo(law, BALLS, rows, [0.0, 1e-6], chunk=8)
+    assert found.statuses == {"ok": 4, "max_steps": 4}
+    np.testing.assert_allclose(found.mean, impact(law, BALLS, rows[0]).velocity, atol=1e-15)
+    assert [bad.index for bad in found.bad] == [1, 3, 5, 7]
+    np.testing.assert_array_equal(found.bad[0].velocity, rows[1])
+    with pytest.raises(
+        RuntimeError, match="Not one of the first 8 samples gave a usable outcome: 8 max_steps"
+    ):
+        monte_carlo(law, BALLS, rows[1:2].repeat(8, axis=0), [0.0, 1e-6], chunk=8)
+
+
+def test_parameters_out_of_their_domain_fail():
+    law = lambda key: Newton(2 * jax.random.uniform(key))  # noqa: E731
+    with pytest.warns(UserWarning, match="bad_law"):
+        found = monte_carlo(law, chain([1.0, 1.0]), [1.0, 0.0], samples=100, chunk=128)
+    assert 20 < found.statuses["bad_law"] < 80
+    assert found.maximum[1] <= 1.0
+
+
+# ---------------------------------------------------------------------- resume
+
+
+class Stops:
+    """An executor that ctrl-C, or anything else, ends after some chunks."""
+
+    def __init__(self, after, error=KeyboardInterrupt):
+        self.left, self.error = after, error
+
+    def run(self, plan, tasks):
+        for task in tasks:
+            if self.left == 0:
+                raise self.error
+            self.left -= 1
+            yield plan(task)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return sampled()
+
+
+def test_interrupted_runs_continue_with_the_same_bits(tmp_path, whole):
+    with pytest.raises(
+        KeyboardInterrupt,
+        match=r"stopped after 512 of 1,000 samples; they are in .*continues from there",
+    ):
+        sampled(folder=tmp_path, executor=Stops(1))
+    assert len(list(tmp_path.glob("chunk-*.npz"))) == 2
+    found = sampled(folder=tmp_path)
+    assert found.resumed == 512
+    assert same(found, whole)
+    again = sampled(folder=tmp_path, executor=Stops(0))  # nothing is left to compute
+    assert again.resumed == 1000
+    assert same(again, whole)
+    assert "all read from the folder" in str(again)
+    with pytest.raises(KeyboardInterrupt, match="nothing is kept, because no `folder` was given"):
+        sampled(executor=Stops(1))
+
+
+def test_a_run_may_grow(tmp_path, whole):
+    sampled(samples=300, folder=tmp_path)
+    found = sampled(folder=tmp_path)
+    assert found.resumed == 256  # the partial chunk is computed again
+    assert same(found, whole)
+
+
+def test_damaged_and_foreign_chunks_are_named_and_not_used(tmp_path, whole):
+    sampled(folder=tmp_path / "a")
+    sampled(folder=tmp_path / "b", key=1)
+    chunks = sorted((tmp_path / "a").glob("chunk-*.npz"))
+    content = bytearray(chunks[1].read_bytes())
+    at = content.index(np.int64(256).tobytes(), 2000)
+    content[at] ^= 1
+    for path, damaged in ((chunks[1], bytes(content)), (chunks[2], chunks[2].read_bytes()[:500])):
+        path.write_bytes(damaged)
+    shutil.copy(tmp_path / "b" / chunks[3].name, chunks[3])
+    with pytest.warns(UserWarning, match="is not used") as caught:
+        found = sampled(folder=tmp_path / "a")
+    told = [str(warning.message) for warning in caught]
+    assert len(told) == 3
+    assert all(path.name in message for path, message in zip(chunks[1:], told))
+    assert "computed again" in told[0]
+    assert "belongs to another run" in told[2]
+    assert found.resumed == 256
+    assert same(found, whole)
+    shutil.copy(chunks[1], chunks[2])
+    with pytest.warns(UserWarning, match="it is chunk 1 of this run"):
+        assert same(sampled(folder=tmp_path / "a"), whole)
+    with pytest.raises(ValueError, match="has no raw samples"):
+        list(read_samples(tmp_path / "a"))
+
+
+def test_every_single_flipped_byte_is_seen(tmp_path):
+    run = "0" * 64
+    sampled(samples=10, folder=tmp_path, chunk=CHUNK, bins=3)
+    path = next(tmp_path.glob("chunk-*.npz"))
+    run = json.loads((tmp_path / "manifest.json").read_text())["run"]
+    good = path.read_bytes()
+    reference = store._checked(path, run)
+    for at in np.random.default_rng(0).integers(0, len(good), 150):
+        path.write_bytes(good[:at] + bytes([good[at] ^ 0xFF]) + good[at + 1 :])
+        try:
+            arrays = store._checked(path, run)
+        except store.UNUSABLE:
+            continue
+        assert fingerprint(arrays) == fingerprint(reference)  # a byte that carries nothing
+
+
+def test_a_folder_of_another_run_is_refused(tmp_path):
+    sampled(folder=tmp_path)
+    with pytest.raises(ValueError, match="holds another run, which differs in gaps, key:"):
+        sampled(folder=tmp_path, gaps=Uniform(0.0, 2e-5), key=1)
+    with pytest.raises(ValueError, match="differs in law:"):
+        sampled(folder=tmp_path, law=Binary(0.9, order="earliest"))
+    (tmp_path / "manifest.json").write_text("{")
+    with pytest.raises(ValueError, match=r"manifest.json' is damaged"):
+        sampled(folder=tmp_path)
+    (tmp_path / "manifest.json").unlink()
+    with pytest.raises(ValueError, match=r"has chunks but no manifest\.json"):
+        sampled(folder=tmp_path)
+
+
+def test_a_full_disk_is_told_and_costs_nothing(tmp_path, monkeypatch, whole):
+    calls = []
+
+    def full(descriptor):
+        calls.append(descriptor)
+        if len(calls) > 3:  # manifest, two chunks
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(
+        OSError, match="the disk is full; what was there before is intact"
+    ) as caught:
+        sampled(folder=tmp_path)
+    assert caught.value.errno == errno.ENOSPC
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "chunk-0000000.npz",
+        "chunk-0000001.npz",
+        "manifest.json",
+    ]
+    monkeypatch.undo()
+    found = sampled(folder=tmp_path)
+    assert found.resumed == 512
+    assert same(found, whole)
+
+
+def test_functions_are_known_by_source_and_closure():
+    def scaled(factor):
+        return lambda key: factor * jax.random.uniform(key, (2,))
+
+    assert fingerprint(scaled(1.0)) == fingerprint(scaled(1.0))
+    assert fingerprint(scaled(1.0)) != fingerprint(scaled(2.0))
+    assert fingerprint(scaled(1.0)) != fingerprint(sometimes_bad)
+    assert fingerprint(LAW) != fingerprint(Binary(1.0))  # static fields count
+    assert fingerprint(chain([1.0, 1.0], wall=True)) != fingerprint(chain([1.0, 1.0], wall="left"))
+
+
+@pytest.mark.slow
+def test_a_killed_process_continues_with_the_same_bits(tmp_path, whole):
+    code = f"""
+import jax; jax.config.update("jax_enable_x64", True)
+import time, jimpact as ji
+from jimpact.montecarlo import monte_carlo
+from jimpact.sampling.distributions import Uniform
+class Slow:
+    def run(self, plan, tasks):
+        for task in tasks:
+            yield plan(task)
+            time.sleep(1.0)
+monte_carlo(ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25]), [1.0, 0.0, -1.0],
+            Uniform(0.0, 1e-5), 1000, chunk={CHUNK}, executor=Slow(), folder={str(tmp_path)!r})
+"""
+    process = subprocess.Popen([sys.executable, "-c", code])
+    try:
+        end = time.monotonic() + 60
+        while len(list(tmp_path.glob("chunk-*.npz"))) < 2 and time.monotonic() < end:
+            assert process.poll() is None
+            time.sleep(0.02)
+    finally:
+        process.kill()
+        process.wait()
+    found = sampled(folder=tmp_path)
+    assert 512 <= found.resumed < 1000
+    assert same(found, whole)
+
+
+# ----------------------------------------------------------------- sensitivity
+
+
+def test_the_linearization_beside_monte_carlo():
+    law = Compliant(Hertz(1.0))  # indentations of about 0.5 m: metre-sized gaps
+    sampler = {"law": law, "samples": 256, "bins": 50}
+    narrow = sampled(gaps=Uniform([0.30, 0.32], [0.31, 0.33]), **sampler)
+    close = gap_sensitivity(law, BALLS, BEFORE, narrow.gap_mean, narrow)
+    np.testing.assert_allclose(close.explained, 1.0, atol=0.02)
+    assert "nearly linear" in str(close)
+    wide = sampled(gaps=Uniform([0.0, 0.0], [3.0, 3.0]), **sampler)
+    across = gap_sensitivity(law, BALLS, BEFORE, wide.gap_mean, wide)
+    assert np.all(np.abs(across.explained - 1) > 0.2)
+    assert "fails over this spread" in str(across)
+    h = 1e-5
+    rows = np.array([[0.3 + h, 0.32], [0.3 - h, 0.32]])
+    pair = sampled(gaps=rows, **(sampler | {"samples": 2})).first["velocity"]
+    exact = gap_sensitivity(law, BALLS, BEFORE, [0.3, 0.32])
+    np.testing.assert_allclose(exact.jacobian[:, 0], (pair[0] - pair[1]) / (2 * h), atol=1e-4)
+    # moving everything apart by the same time changes nothing: both contacts approach at speed 1
+    np.testing.assert_allclose(exact.jacobian.sum(axis=1), 0.0, atol=1e-6)
+    np.testing.assert_allclose(exact.covariance(np.eye(2)), exact.jacobian @ exact.jacobian.T)
+
+
+def test_where_the_linearization_has_nothing_to_say(whole):
+    jumps = gap_sensitivity(LAW, BALLS, BEFORE, whole.gap_mean, whole)
+    assert not jumps.jacobian.any()
+    assert "jumps where the order of the collisions changes" in str(jumps)
+    ignores = monte_carlo(Newton(0.5), BALLS, BEFORE, GAPS, samples=50, chunk=64)
+    assert "does not depend on the gaps" in str(
+        gap_sensitivity(Newton(0.5), BALLS, BEFORE, [1e-6, 1e-6], ignores)
+    )
+    with pytest.raises(ValueError, match="`gaps` must lie in"):
+        gap_sensitivity(LAW, BALLS, BEFORE, [0.0, -1.0])
+    with pytest.raises(ValueError, match="`sampled` must be given"):
+        _ = gap_sensitivity(LAW, BALLS, BEFORE, [0.0, 1e-6]).explained
+
+
+LAWS = registered_laws({"restitution": 0.9, "stiffness": 1.0, "matrix": 0.9 * np.eye(2)})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LAWS)
+def test_every_law_can_be_sampled(name):
+    law = LAWS[name]
+    if name != "restitution_matrix" and hasattr(law, "restitution"):
+        law = RandomLaw(law, restitution=Uniform(0.8, 0.9))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # some laws do not promise admissible outcomes
+        found = sampled(law=law, velocity=Normal([1.0, 0.0, -1.0], 0.1), samples=64, chunk=64)
+    assert found.count > 0
+    assert found.std.min() > 1e-3
+    law, scene, velocity = found.replay(3)
+    alone = impact(law, scene, velocity)
+    np.testing.assert_allclose(alone.velocity, found.first["velocity"][3], atol=1e-9)
+
+
+def test_gaps_are_told_in_gap_scales(monkeypatch):
+    module = types.ModuleType("gap_scale_of")
+    module.gap_scale = lambda scene, law, velocity: types.SimpleNamespace(
+        delta=np.array([1e-5, 2e-5])
+    )
+    monkeypatch.setitem(sys.modules, "jimpact.gap_scale_of", module)
+    found = sampled(samples=100)
+    np.testing.assert_array_equal(found.gap_scale, [1e-5, 2e-5])
+    assert f"in gap scales of 1e-05 m: {found.gap_mean[0] / 1e-5:.3g}" in str(found)
+    assert found.to_dict()["gap_scale"] == [1e-5, 2e-5]
+
+    def refuses(scene, law, velocity):
+        raise ValueError("a law without stiffness")
+
+    module.gap_scale = refuses
+    assert sampled(samples=100).gap_scale is None
+
+
+def test_progress_is_told_on_request(capfd):
+    sampled(progress=True)
+    told = capfd.readouterr().err
+    assert "1,000 of 1,000 samples" in told
+    assert "/s" in told
+    sampled()
+    assert capfd.readouterr().err == ""
