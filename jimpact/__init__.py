@@ -39,6 +39,8 @@ _WHERE = {
     "gap_scales": "Crossover GapScale crossover gap_scale",
     "montecarlo": "monte_carlo",
     "sampling.results": "MonteCarlo",
+    "sampling.gap_sensitivities": "GapSensitivity gap_sensitivity",
+    "sampling.store": "read_samples",
     "sampling.distributions": "Normal RandomLaw Uniform",
     "han_gilmore_tree": "HanGilmoreOutcome han_gilmore",
     "laws.lzb": "LZB distributing_rule",

@@ -182,7 +182,7 @@ def _damped_spring(zeta: jax.Array) -> jax.Array:
 
 
 def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> jax.Array:
-    k = force.stiffness  # type: ignore[attr-defined]
+    k = force.stiffness
     if isinstance(force, KelvinVoigt):
         unit = 2 * jnp.sqrt(k * mass)
     elif isinstance(force, HuntCrossley):

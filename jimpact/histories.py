@@ -104,7 +104,7 @@ Sampled = LZB | Compliant
 def _contact(law: Sampled) -> Bistiffness:
     """Stiffness, exponent and restitution of the contacts."""
     if isinstance(law, Compliant):
-        return law.force  # type: ignore[return-value]
+        return law.force
     return Bistiffness(law.stiffness, law.exponent, law.restitution)
 
 

@@ -4,7 +4,6 @@ import time
 import warnings
 from collections.abc import Callable, Generator
 from contextlib import closing
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +11,13 @@ import jax
 import numpy as np
 
 from jimpact.executors import Executor, as_executor
+from jimpact.gap_scales import gap_scale
+from jimpact.impacts import in_common_dtype
 from jimpact.laws.base import Law
+from jimpact.laws.compliant import Compliant
 from jimpact.sampling.bars import sample_bar
 from jimpact.sampling.chunks import Chunk
-from jimpact.sampling.drawing import Sources, is_random
+from jimpact.sampling.drawing import Sources
 from jimpact.sampling.planning import BINS, CHUNK, description, identity, planned_run
 from jimpact.sampling.plans import Run
 from jimpact.sampling.results import MonteCarlo
@@ -177,14 +179,10 @@ def _interrupted(run: Run, store: Store | None, done: int) -> str:
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
-    """delta_c (m,) where law and velocity are constant and the law has such a scale."""
-    if is_random(sources.law) or is_random(sources.velocity):
+    """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
+    law, velocity = sources.law, sources.velocity
+    if not (isinstance(law, Compliant) and isinstance(velocity, jax.Array)):
         return None
-    try:
-        found = import_module("jimpact.gap_scale_of").gap_scale(
-            scene, sources.law, sources.velocity
-        )
-    except (ModuleNotFoundError, ValueError, TypeError):  # a law without stiffness has none
-        return None
-    delta = np.broadcast_to(np.asarray(found.delta, float), (scene.contacts,))
-    return delta if np.isfinite(delta).all() and (delta > 0).all() else None
+    law, scene, velocity = in_common_dtype(law, scene, velocity)
+    delta = np.asarray(gap_scale(scene, law, velocity).delta, float)
+    return delta if (delta > 0).all() else None  # 0: nothing approaches

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
@@ -37,7 +38,7 @@ def plot_rheologies(found: Comparison, title: str = "") -> Figure:
     figure.set_layout_engine("constrained")
     loops, outcome = figure.subplots(1, 2)
     for (name, entry), colour in zip(found.entries.items(), COLOURS):
-        first = jax.tree.map(lambda leaf: leaf.ravel()[0], entry.law.force)  # type: ignore[attr-defined]
+        first = jax.tree.map(lambda leaf: leaf.ravel()[0], entry.law.force)
         x, f = _loop(first, mass, speed)
         loops.plot(x, f, color=colour, label=name, lw=1.4)
     loops.set_xlabel("indentation [m]")
@@ -101,13 +102,13 @@ def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarr
         return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
 
     def push(x: float, rate: float) -> float:
-        return float(force.force(np.asarray(max(x, 0.0)), np.asarray(rate)))
+        return float(force.force(jnp.asarray(max(x, 0.0)), jnp.asarray(rate)))
 
     def slack(_: float, y: np.ndarray) -> float:
         return push(y[0], y[1]) if y[1] < 0 else 1.0
 
     slack.terminal = True  # type: ignore[attr-defined]
-    horizon = 1e3 * float(force.indentation_scale(np.asarray(0.5 * mass * speed**2))) / speed
+    horizon = 1e3 * float(force.indentation_scale(jnp.asarray(0.5 * mass * speed**2))) / speed
     done = solve_ivp(
         lambda _, y: [y[1], -max(push(y[0], y[1]), 0.0) / mass],
         (0, horizon),

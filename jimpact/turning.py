@@ -20,7 +20,7 @@ HORIZON = 200.0  # contact times after which an impact is given up
 
 
 class TurningImpact(eqx.Module):
-    """`velocity` (n,) and `position` (n,) when it is over, `duration` () [s], whether it `ended`."""
+    """`velocity` and `position` (n,) when it is over, `duration` () [s], whether it `ended`."""
 
     velocity: jax.Array
     position: jax.Array
@@ -60,9 +60,8 @@ def turning_impact(
 
     >>> import jimpact as ji
     >>> from jimpact.turning import block_gaps, turning_impact
-    >>> out = turning_impact(
-    ...     block_gaps(1.0, 1.0), [1.0, 1.0, 1 / 6], [0.0, 0.5, 0.0], [0.0, -0.5, -1.0], ji.Hertz(1e8)
-    ... )
+    >>> gaps, mass = block_gaps(1.0, 1.0), [1.0, 1.0, 1 / 6]
+    >>> out = turning_impact(gaps, mass, [0.0, 0.5, 0.0], [0.0, -0.5, -1.0], ji.Hertz(1e8))
     >>> bool(out.ended), [round(float(v), 2) for v in out.velocity[1:]]
     (True, [0.61, 0.49])
     """

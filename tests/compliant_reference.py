@@ -136,7 +136,10 @@ def viscous(mass, normals, velocity, force, gaps, tol=1e-12, phases=500, onset=N
                 events.append((lambda y, j=j: y[j] + ROUNDING, -1))
                 what += [(j, False), (j, False)]
             else:
-                events.append((lambda y, j=j: y[j] - ROUNDING if y[j] < 0 or x[j] < 0 else 1.0, 1))
+                gap = x[j] < 0
+                events.append(
+                    (lambda y, j=j, gap=gap: y[j] - ROUNDING if y[j] < 0 or gap else 1.0, 1)
+                )
                 events.append((lambda y, j=j: sign(y, j) if y[j] > ROUNDING else -1.0, 1))
                 what += [(j, True), (j, True)]
         y, rang = _run(rates, np.concatenate([x, v]), events, tol)

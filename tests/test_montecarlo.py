@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 import time
-import types
 import warnings
 
 import jax
@@ -17,6 +16,7 @@ import pytest
 from scipy import stats
 
 from jimpact.comparison import registered_laws
+from jimpact.gap_scales import gap_scale
 from jimpact.impacts import impact
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
@@ -481,6 +481,11 @@ def test_the_linearization_beside_monte_carlo():
     close = gap_sensitivity(law, BALLS, BEFORE, narrow.gap_mean, narrow)
     np.testing.assert_allclose(close.explained, 1.0, atol=0.02)
     assert "nearly linear" in str(close)
+    scale = gap_scale(BALLS, law, BEFORE).delta  # the report tells gaps in units of it
+    np.testing.assert_array_equal(narrow.gap_scale, scale)
+    in_scales = f"in gap scales of {scale[0]:.3g} m: {narrow.gap_mean[0] / scale[0]:.3g} and "
+    assert in_scales in str(narrow)
+    assert narrow.to_dict()["gap_scale"] == scale.tolist()
     wide = sampled(gaps=Uniform([0.0, 0.0], [3.0, 3.0]), **sampler)
     across = gap_sensitivity(law, BALLS, BEFORE, wide.gap_mean, wide)
     assert np.all(np.abs(across.explained - 1) > 0.2)
@@ -496,6 +501,7 @@ def test_the_linearization_beside_monte_carlo():
 
 
 def test_where_the_linearization_has_nothing_to_say(whole):
+    assert whole.gap_scale is None
     jumps = gap_sensitivity(LAW, BALLS, BEFORE, whole.gap_mean, whole)
     assert not jumps.jacobian.any()
     assert "jumps where the order of the collisions changes" in str(jumps)
@@ -526,24 +532,6 @@ def test_every_law_can_be_sampled(name):
     law, scene, velocity = found.replay(3)
     alone = impact(law, scene, velocity)
     np.testing.assert_allclose(alone.velocity, found.first["velocity"][3], atol=1e-9)
-
-
-def test_gaps_are_told_in_gap_scales(monkeypatch):
-    module = types.ModuleType("gap_scale_of")
-    module.gap_scale = lambda scene, law, velocity: types.SimpleNamespace(
-        delta=np.array([1e-5, 2e-5])
-    )
-    monkeypatch.setitem(sys.modules, "jimpact.gap_scale_of", module)
-    found = sampled(samples=100)
-    np.testing.assert_array_equal(found.gap_scale, [1e-5, 2e-5])
-    assert f"in gap scales of 1e-05 m: {found.gap_mean[0] / 1e-5:.3g}" in str(found)
-    assert found.to_dict()["gap_scale"] == [1e-5, 2e-5]
-
-    def refuses(scene, law, velocity):
-        raise ValueError("a law without stiffness")
-
-    module.gap_scale = refuses
-    assert sampled(samples=100).gap_scale is None
 
 
 def test_progress_is_told_on_request(capfd):

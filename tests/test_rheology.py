@@ -209,7 +209,7 @@ def test_derivatives(name):
     at = (k, c, gaps, v)
     rng = np.random.default_rng(0)
     along = jax.tree.map(lambda z: jnp.asarray(rng.normal(size=z.shape)) * jnp.abs(z), at)
-    value, rate = jax.jit(lambda d: jax.jvp(velocity, (at,), (d,)))(along)
+    _, rate = jax.jit(lambda d: jax.jvp(velocity, (at,), (d,)))(along)
     f = jax.jit(lambda s: velocity(jax.tree.map(lambda z, d: z + s * d, at, along)))
     h = 1e-4
     np.testing.assert_allclose(rate, (f(h) - f(-h)) / (2 * h), atol=1e-5)
