@@ -93,7 +93,8 @@ def _locate(path: Path) -> Path:
     bundled = Path(str(files("jimpact") / "data" / path.name))
     if path.parent == Path() and bundled.is_file():
         return bundled
-    names = ", ".join(sorted(p.name for p in bundled.parent.glob("*.toml")))
+    tables = sorted(bundled.parent.glob("*.toml"))
+    names = ", ".join(p.name for p in tables if "[scene]" in p.read_text(encoding="utf-8"))
     raise FileNotFoundError(f"Study '{path}' does not exist; bundled studies are {names}.")
 
 

@@ -11,7 +11,7 @@ import time
 # one device a core: XLA runs the loops of one device on one core, numba uses them all
 os.environ["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={os.cpu_count()}"
 
-import jax  # noqa: E402
+import jax
 
 jax.config.update("jax_enable_x64", True)
 
@@ -90,9 +90,10 @@ def ours(rtol):
 
         mesh = jax.make_mesh((len(jax.devices()),), ("core",))
         along = jax.sharding.PartitionSpec("core")
-        return jax.jit(
-            jax.shard_map(shard, mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
-        )
+        sharding = jax.sharding.NamedSharding(mesh, along)
+        run = jax.shard_map(shard, mesh=mesh, in_specs=along, out_specs=along, check_vma=False)
+        compiled = jax.jit(run)
+        return lambda g: compiled(jax.device_put(g, sharding))
 
     return spread(velocity), spread(jax.jacfwd(velocity))
 
