@@ -99,7 +99,7 @@ class MonteCarloCommand:
         """Sample, print, draw."""
         from jimpact.montecarlo_command import run
 
-        return run(self)
+        return run(**vars(self))
 
 
 @dataclasses.dataclass(frozen=True)
