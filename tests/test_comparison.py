@@ -117,6 +117,7 @@ def test_laws_fitted_to_the_measured_balls(law, rms, restitution):
     assert found.rms == pytest.approx(rms, abs=6e-4)
 
 
+@pytest.mark.slow
 def test_readme_holds_the_chooser_table():
     import chooser
 

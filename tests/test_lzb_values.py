@@ -24,7 +24,9 @@ def case(name):
     return ji.chain(m, wall=data["wall"]), v, (e, k, exponent), expected, p
 
 
-@pytest.mark.parametrize(("rtol", "allowed"), [(None, 1e-6), (1e-10, 1e-8)])
+@pytest.mark.parametrize(
+    ("rtol", "allowed"), [(None, 1e-6), pytest.param(1e-10, 1e-8, marks=pytest.mark.slow)]
+)
 def test_all_check_values(rtol, allowed):
     errors = {}
     for name in VALUES:

@@ -28,6 +28,7 @@ except ImportError as missing:
 BATCH, REPEATS = 4096, 7
 CHUNK = 64
 WIDEST = 2.0  # gap; delta_c is 1
+SLOW = 1e-9  # approach of Verlet that is left alone: its collision would take thousands of steps
 MOST = 10_000_000  # Verlet steps of one impact
 V = jnp.array([1.0, 0.0, 0.0])
 
@@ -41,8 +42,8 @@ def _verlet(g1, g2, h, out):
     while steps < MOST:
         u1, u2 = v1 - v2, v2 - v3
         if x1 <= 0.0 and x2 <= 0.0:  # flight: to the next closing, exactly
-            t1 = -x1 / u1 if u1 > 0.0 else np.inf
-            t2 = -x2 / u2 if u2 > 0.0 else np.inf
+            t1 = -x1 / u1 if u1 > SLOW else np.inf
+            t2 = -x2 / u2 if u2 > SLOW else np.inf
             t = min(t1, t2)
             if t == np.inf:
                 break
