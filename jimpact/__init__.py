@@ -37,6 +37,11 @@ _WHERE = {
         "UserForce"
     ),
     "gap_scales": "Crossover GapScale crossover gap_scale",
+    "calibration": "calibrate compare_rheologies measured_restitution",
+    "materials": "hertz_stiffness sphere_mass",
+    "linear_chain": "bilateral_motion newby_ratio",
+    "turning": "TurningImpact block_gaps turning_impact",
+    "plot_rheology": "plot_forces plot_rheologies",
     "montecarlo": "monte_carlo",
     "sampling.results": "MonteCarlo",
     "sampling.gap_sensitivities": "GapSensitivity gap_sensitivity",

@@ -62,7 +62,13 @@ def held_out(n, wall, number, seed, e_least=1.0):
     }
 
 
-@pytest.mark.parametrize(("n", "wall", "eta"), [(3, False, 1.5), (4, False, 1.0), (2, True, 1.5)])
+@pytest.mark.parametrize(
+    ("n", "wall", "eta"),
+    [
+        (3, False, 1.5),
+        *(pytest.param(*x, marks=pytest.mark.slow) for x in ((4, False, 1.0), (2, True, 1.5))),
+    ],
+)
 @pytest.mark.parametrize("e_least", [1.0, 0.3])
 def test_held_out_gapped_chains(n, wall, eta, e_least):
     """1e-6 at the default tolerance, 1e-9 at rtol = 1e-10, against scipy; elastic and plastic."""
@@ -292,6 +298,7 @@ def test_unit_systems_do_not_matter():
     assert int(status[0]) == 0
 
 
+@pytest.mark.slow
 def test_a_dense_scene_is_the_chain():
     scene = chain(jnp.array([1.0, 2.0, 0.5]), gaps=jnp.array([0.0, 0.2]))
     dense = Scene(scene.mass, scene.normals, gaps=scene.gaps)

@@ -227,7 +227,7 @@ HARD = st.floats(-6, 6)
         "restitution-matrix",
         "binary-fastest",
         "lzb-hertz",
-        "lzb-linear",
+        pytest.param("lzb-linear", marks=pytest.mark.slow),
     ],
 )
 def test_extreme_input_is_right_or_flagged(name, e, logk, logm, v):

@@ -14,6 +14,7 @@ import jimpact
 
 ROOT = Path(__file__).parent.parent
 MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(jimpact.__path__, "jimpact."))]
+LONG = ("jimpact.calibration", "jimpact.plot_rheology")  # all rheologies are compiled
 OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
@@ -27,7 +28,10 @@ def ordinary_flags():
     jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(m, marks=[pytest.mark.slow] if m in LONG else []) for m in MODULES],
+)
 def test_docstrings_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert doctest.testmod(importlib.import_module(name), optionflags=OPTIONS).failed == 0

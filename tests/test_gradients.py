@@ -182,6 +182,7 @@ def test_history_is_differentiable():
     assert float(jax.grad(duration)(2.0)) == pytest.approx(expected, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_gradient_descent_learns_a_restitution():
     optax = pytest.importorskip("optax")
     measured = ji.impact(ji.LZB(0.83), BALLS, V).velocity

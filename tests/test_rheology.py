@@ -129,6 +129,7 @@ def test_kuwabara_kono_series():
     assert 1 - e == pytest.approx(1.15344 * small - 0.79827 * small**2, rel=3e-5)
 
 
+@pytest.mark.slow
 def test_calibration_gives_what_it_was_asked_for():
     e = jnp.array([1.0, 0.97, 0.6, 0.08])
     for force in (KelvinVoigt(1e6, 0.0), HuntCrossley(1e9, 0.0), KuwabaraKono(1e9, 0.0)):
@@ -143,7 +144,9 @@ def test_calibration_gives_what_it_was_asked_for():
     assert float(measured_restitution(slow, 2e-3, 0.003)) > 0.75
 
 
-@pytest.mark.parametrize("force", [KelvinVoigt(2.0, 0.0), KuwabaraKono(2.0, 0.0)])
+@pytest.mark.parametrize(
+    "force", [KelvinVoigt(2.0, 0.0), pytest.param(KuwabaraKono(2.0, 0.0), marks=pytest.mark.slow)]
+)
 def test_calibration_is_differentiable(force):
     def damping(e, m, v):
         return calibrate(force, e, m, v).damping
@@ -159,6 +162,7 @@ def test_calibration_is_differentiable(force):
         assert float(reverse[i]) == pytest.approx(float(forward[i]), rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_same_pair_restitution_other_chain():
     """e = 0.9 at every pair; the outcomes differ by a tenth of the striker's speed."""
     scene, v = chain(jnp.ones(3)), jnp.array([1.0, 0.0, 0.0])

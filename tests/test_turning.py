@@ -77,6 +77,7 @@ def test_mass_that_depends_on_the_configuration():
     assert float(cartesian.velocity[1]) == pytest.approx(-float((turn @ v)[1]), abs=1e-7)
 
 
+@pytest.mark.slow
 def test_reverse_derivative():
     def spin(v):
         return turning_impact(GAPS, MASS, FLAT, v, Hertz(1e6)).velocity[2]
