@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.impacts import SIGN_TOLERANCE
+from jimpact.impacts import sign_tolerance
 from jimpact.numerics.capped_polyhedron import (
     CappedPolyhedron,
     capped_polyhedron,
     cone_facets,
 )
-from jimpact.scene import Scene, gap_velocity, kinetic_energy
+from jimpact.scene import Scene, dense_mass, gap_velocity, kinetic_energy
 
 # Contacts count as redundant when the matrix of their cosines has an eigenvalue below this
 # multiple of eps * m.
@@ -83,7 +83,7 @@ class AdmissibleSet:
         check_values("tolerance", tolerance, low=0.0)
         allowed = self.tolerance if tolerance is None else tolerance
         offset = v - self.center
-        mass = _dense_mass(self.scene)
+        mass = dense_mass(self.scene)
         u = offset @ mass @ self.axes
         beside = offset - u @ self.axes.T  # against the momentum balance
         off = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", beside, mass, beside), 0.0))
@@ -184,9 +184,9 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     v = as_float_array("velocity", velocity)
     check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
     check_values("velocity", v)
-    tolerance = SIGN_TOLERANCE.get(str(scene.mass.dtype), 2e-3)
+    tolerance = sign_tolerance(scene.mass.dtype)
     start, closed = np.asarray(v, float), np.asarray(scene.closed)
-    root = np.linalg.cholesky(_dense_mass(scene))  # y = root^T v has T = |y|^2 / 2
+    root = np.linalg.cholesky(dense_mass(scene))  # y = root^T v has T = |y|^2 / 2
     y = root.T @ start
     free = _unconstrained(scene, root, y, tolerance)
     unit = np.linalg.solve(root, np.asarray(scene.normals, float)[:, closed])
@@ -227,11 +227,6 @@ def _check_count(name: str, value: Any, least: int) -> None:
         raise ValueError(
             f"Argument `{name}` must be an integer >= {least}, but has value {value!r}."
         )
-
-
-def _dense_mass(scene: Scene) -> np.ndarray:
-    mass = np.asarray(scene.mass, float)
-    return np.diag(mass) if mass.ndim == 1 else mass
 
 
 def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:

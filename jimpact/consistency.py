@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape
-from jimpact.impacts import SIGN_TOLERANCE, Impact
+from jimpact.impacts import Impact, sign_tolerance
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.scene import (
     Scene,
@@ -76,7 +76,7 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     worst_impulse = jnp.min(out.impulse * root) / size
     gain = (change - out.initial_energy) / size**2
     off = jnp.abs(residual).max() / jnp.maximum(jnp.abs(momentum(scene, v)).max(), 1e-300)
-    tolerance = SIGN_TOLERANCE.get(str(out.velocity.dtype), 2e-3)
+    tolerance = sign_tolerance(out.velocity.dtype)
     return Audit(
         kinematic=worst_gap_velocity >= -tolerance,
         kinetic=worst_impulse >= -tolerance,

@@ -11,7 +11,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.csv_shots import read_table
-from jimpact.scene import Scene
+from jimpact.scene import Scene, dense_mass
 
 
 class Experiments(eqx.Module):
@@ -155,12 +155,6 @@ class Experiments(eqx.Module):
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
         scenes = [self.scene_of(scene, k) for k in range(len(pre))]
         return [(conserved_momenta(s), a, b) for s, a, b in zip(scenes, pre, post)]
-
-
-def dense_mass(scene: Scene) -> np.ndarray:
-    """M (n, n)."""
-    mass = np.asarray(scene.mass, float)
-    return np.diag(mass) if mass.ndim == 1 else mass
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:

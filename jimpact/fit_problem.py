@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.experiments import Experiments, dense_mass
+from jimpact.experiments import Experiments
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.matrix_fit import matrix_region
 from jimpact.numerics.least_squares import Box, Method, Region, State, advance, begin
 from jimpact.parameters import LOGARITHMIC, Parameters, entries, with_entries
-from jimpact.scene import Scene
+from jimpact.scene import Scene, dense_mass
 from jimpact.status import CODE
 
 # Outcomes whose velocities mean nothing. A trial that meets one gets a residual far above any

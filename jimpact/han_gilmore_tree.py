@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.scene import Scene
+from jimpact.scene import Scene, dense_mass
 
 # Relative to the largest normalized approach velocity at the start: gap velocities and impulses
 # below are zero, velocities that differ by less are the same.
@@ -122,8 +122,7 @@ def _on_host(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Whether a contact is at rest decides the tree: single precision would not do.
     """
-    mass, normals = np.asarray(scene.mass, float), np.asarray(scene.normals, float)
-    inverse = np.diag(1 / mass) if mass.ndim == 1 else np.linalg.inv(mass)
+    normals, inverse = np.asarray(scene.normals, float), np.linalg.inv(dense_mass(scene))
     if scene.constraints is not None:
         h = np.asarray(scene.constraints, float)
         inverse_h = inverse @ h

@@ -18,6 +18,11 @@ from jimpact.status import CODE, STATUS
 SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
 
 
+def sign_tolerance(dtype: jnp.dtype) -> float:
+    """Beyond which part of the impact's size a sign is violated, in this precision."""
+    return SIGN_TOLERANCE.get(str(dtype), SIGN_TOLERANCE["float32"])
+
+
 class Impact(eqx.Module):
     """Outcome of an impact: v+ [m/s], p [N s], T+ - T- [J], initially stored energy [J], status."""
 
@@ -70,7 +75,7 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
         return
     h, v = np.asarray(scene.constraints), np.asarray(velocity)
     rate, size = np.abs(h.T @ v), np.abs(h).T @ np.abs(v)
-    bad = rate > SIGN_TOLERANCE.get(str(v.dtype), 2e-3) * size
+    bad = rate > sign_tolerance(v.dtype) * size
     if bad.any():
         j = int(np.argmax(bad))
         raise ValueError(
@@ -79,13 +84,11 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
         )
 
 
-def in_common_dtype(law: Law, scene: Scene, velocity: jax.Array) -> tuple[Law, Scene, jax.Array]:
-    """All three in the widest floating type among them (Python numbers follow the arrays)."""
-    leaves = [x for x in jax.tree.leaves((law, scene, velocity)) if eqx.is_inexact_array(x)]
+def in_common_dtype(*trees: Any) -> Any:
+    """All of them in the widest floating type among them (Python numbers follow the arrays)."""
+    leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
     dtype = jnp.result_type(*leaves)
-    return jax.tree.map(
-        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (law, scene, velocity)
-    )
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees)
 
 
 def without_open_contacts(
@@ -141,7 +144,7 @@ def _signs(
     closed: jax.Array,
 ) -> jax.Array:
     """The gravest of negative_impulse, inadmissible_velocity, energy_gain; 0 if none."""
-    tolerance = SIGN_TOLERANCE.get(str(p.dtype), 2e-3)
+    tolerance = sign_tolerance(p.dtype)
     root = jnp.sqrt(w_diagonal)
     # size of the impact in sqrt(energy): what approaches and what is stored
     size = jnp.sqrt(jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2) + 2 * jnp.sum(stored))

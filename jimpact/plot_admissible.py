@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jimpact.admissible import AdmissibleSet
-from jimpact.scene import kinetic_norm
+from jimpact.scene import dense_mass, kinetic_norm
 
 _GREY = "#777777"
 _FILL = "#DCE9F3"
@@ -134,9 +134,8 @@ class _Frame:
     """Kinetic coordinates turned so that the outcomes with gamma+ >= 0 open upwards."""
 
     def __init__(self, found: AdmissibleSet, closed: np.ndarray):
-        mass = np.asarray(found.scene.mass, float)
         self._found = found
-        self._metric = found.axes.T @ (np.diag(mass) if mass.ndim == 1 else mass)
+        self._metric = found.axes.T @ dense_mass(found.scene)
         self.radius = found.coordinates.radius
         normals = np.asarray(found.scene.normals, float)[:, closed].T @ found.axes
         push = normals / np.linalg.norm(normals, axis=1, keepdims=True)

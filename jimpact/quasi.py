@@ -12,6 +12,7 @@ from jimpact._checks import as_float_array, check_shape, is_traced
 from jimpact.numerics.tridiagonal import as_matrix
 from jimpact.scene import (
     Scene,
+    dense_mass,
     gap_velocity,
     kinetic_norm,
     momentum,
@@ -218,8 +219,8 @@ def check_independent(scene: Scene) -> None:
     fixed = _directions(scene)
     if is_traced((fixed.normals, fixed.mass)):
         return
-    normals, mass = np.asarray(fixed.normals), np.asarray(fixed.mass)
-    gram = normals.T @ np.linalg.solve(np.diag(mass) if mass.ndim == 1 else mass, normals)
+    normals = np.asarray(fixed.normals, float)
+    gram = normals.T @ np.linalg.solve(dense_mass(fixed), normals)
     norm = np.sqrt(np.diag(gram))
     smallest = np.linalg.eigvalsh(gram / np.outer(norm, norm))[0]
     if smallest < _SINGULAR * np.finfo(gram.dtype).eps * len(gram):

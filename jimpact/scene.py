@@ -210,6 +210,12 @@ def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
     return 0.5 * v @ momentum(scene, v)
 
 
+def dense_mass(scene: Scene) -> np.ndarray:
+    """M (n, n) on the host, in double precision."""
+    mass = np.asarray(scene.mass, float)
+    return np.diag(mass) if mass.ndim == 1 else mass
+
+
 def _solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
     """`M^-1 right`, with the reactions of bilateral constraints where the scene has some."""
     if scene.mass.ndim == 1:

@@ -17,8 +17,6 @@ from jimpact.sampling.study_table import arguments
 from jimpact.scene import Scene
 from jimpact.scenes import chain
 
-BUNDLED = "three_balls.toml"
-
 _TABLES = ("title", "scene", "law", "fit", "data", "monte_carlo")
 _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 _FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")

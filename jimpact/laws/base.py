@@ -11,6 +11,11 @@ from jimpact.numerics.tridiagonal import Symmetric
 from jimpact.scene import Scene
 
 
+def no_tangential_impulse(scene: Scene, dtype: jnp.dtype) -> jax.Array:
+    """p_t of a law without friction: one 0 for each tangent of the scene."""
+    return jnp.zeros(0 if scene.tangents is None else scene.tangents.shape[1], dtype)
+
+
 class Law(eqx.Module):
     """An impact law. A law is a pytree: grad of a law is a law, vmap over a law is a batch.
 
@@ -33,8 +38,7 @@ class Law(eqx.Module):
         For laws that need more of the scene than W and gamma-: its gaps, its tangents.
         """
         p, code = self.impulse(delassus, gap_velocity)
-        count = 0 if scene.tangents is None else scene.tangents.shape[1]
-        return p, jnp.zeros(count, p.dtype), code
+        return p, no_tangential_impulse(scene, p.dtype), code
 
     def stored_energy(self, contacts: int) -> jax.Array:
         """Energy (m,) [J] stored in the contacts before the impact."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
-from jimpact.laws.base import Law
+from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics import collisions
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
@@ -106,8 +106,7 @@ class Binary(Law):
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Impulses of all collisions; the gaps of the scene matter in the order 'earliest'."""
         p, end = self._solve(delassus, gap_velocity, scene.gaps)
-        count = 0 if scene.tangents is None else scene.tangents.shape[1]
-        return p, jnp.zeros(count, p.dtype), end.code
+        return p, no_tangential_impulse(scene, p.dtype), end.code
 
     def _cycle(self, m: int) -> tuple[int, ...] | None:
         if isinstance(self.order, tuple):

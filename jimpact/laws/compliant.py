@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import check_per_contact, check_values
-from jimpact.laws.base import Law
+from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS, default_rtol
 from jimpact.numerics.dimensionless import solve, to_dimensionless
 from jimpact.numerics.flow import Viscous
@@ -81,8 +81,7 @@ class Compliant(Law):
         """Impulses over the whole encounter, gaps included."""
         gaps = jnp.zeros_like(gap_velocity) if scene.gaps is None else scene.gaps
         p, code = self._solve(delassus, gap_velocity, gaps)
-        count = 0 if scene.tangents is None else scene.tangents.shape[1]
-        return p, jnp.zeros(count, p.dtype), code
+        return p, no_tangential_impulse(scene, p.dtype), code
 
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Impulses of contacts that touch."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values, is_traced
-from jimpact.laws.base import Law
+from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics.linear import solve_symmetric
 from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 from jimpact.quasi import check_independent, quasi_basis
@@ -115,8 +115,7 @@ class RestitutionMatrix(Law):
         if self.matrix.shape[0] == m:
             required = jnp.where(scene.closed, _change(self.matrix, gap_velocity / norm), 0.0)
             p, code = _normal_impulse(delassus, norm, required)
-            count = 0 if scene.tangents is None else scene.tangents.shape[1]
-            return p, jnp.zeros(count, p.dtype), code
+            return p, no_tangential_impulse(scene, p.dtype), code
         assert scene.tangents is not None  # see `check_options`
         _, basis = quasi_basis(scene)
         quasi = jnp.concatenate([gap_velocity / norm, basis.T @ momentum(scene, velocity)])

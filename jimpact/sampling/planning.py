@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
+from jimpact.impacts import in_common_dtype
 from jimpact.laws.base import Law
 from jimpact.sampling.distributions import Rows, as_source
 from jimpact.sampling.drawing import Sources, is_random
@@ -89,9 +90,7 @@ def _sources(given: Sources, scene: Scene) -> Sources:
     drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
     if not isinstance(drawn, Law):
         raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
-    leaves = [x for x in jax.tree.leaves((sources, scene, drawn)) if eqx.is_inexact_array(x)]
-    dtype = jnp.result_type(*leaves)
-    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, sources)
+    return in_common_dtype(sources, scene, drawn)[0]
 
 
 def _varies(value: Any) -> bool:
