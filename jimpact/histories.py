@@ -16,6 +16,7 @@ from jimpact.numerics.dimensionless import (
     Units,
     control_of,
     flow_of,
+    indentation,
     reclosing,
     status_of,
     to_dimensionless,
@@ -127,9 +128,10 @@ def _setup(
         law.rtol or default_rtol("time", v.dtype),
         scene.gaps if gapped else None,
     )
-    flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal), gapped)
+    flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal))
     control = control_of(inputs, 1.0, law.max_steps, "time")._replace(closed_form=False)
-    start = stepper.begin(flow, control, inputs.gamma, inputs.x)
+    x = indentation(inputs, flow.exponent)
+    start = stepper.begin(flow, control, inputs.gamma, x)
     # nothing happens: over before it begins
     return flow, control, start._replace(done=start.done | ~happens), units
 
@@ -137,7 +139,7 @@ def _setup(
 @eqx.filter_jit
 def _passes(law: Sampled, scene: Scene, v: jax.Array) -> jax.Array:
     flow, control, start, _ = _setup(law, scene, v)
-    return stepper.run(flow, control, start).passes
+    return stepper.run(flow, control, start).passes[0]
 
 
 @eqx.filter_jit
@@ -151,19 +153,19 @@ def _history(law: Sampled, scene: Scene, v: jax.Array, samples: int, records: in
 
     end, rest = jax.lax.scan(keep, start, None, length=records)
     kept = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, rest)
-    times = jnp.linspace(0.0, 1.0, samples, dtype=v.dtype) * end.state.t
+    times = jnp.linspace(0.0, 1.0, samples, dtype=v.dtype) * end.state.t[0]
     at = jax.lax.stop_gradient(
-        jnp.clip(jnp.searchsorted(kept.state.t, times, side="right") - 1, 0, records)
+        jnp.clip(jnp.searchsorted(kept.state.t[:, 0], times, side="right") - 1, 0, records)
     )
 
     def sample(index: jax.Array, t: jax.Array) -> tuple[State, jax.Array]:
         carry = jax.tree.map(lambda a: a[index], kept)
-        return _between(flow, control, carry, t)
+        return _between(flow, control, carry, t[None])
 
     states, gammas = jax.vmap(sample)(at, times)
     omega_force = units.velocity / (units.root * units.time)  # dp/dt: dimensionless -> SI
     eta = _contact(law).exponent
-    rates = factor(eta, v.dtype) * flow.omega
+    rates = factor(eta, flow.omega) * flow.omega
 
     def force(x: jax.Array) -> jax.Array:
         return rates * power(x, eta) * omega_force
@@ -180,7 +182,7 @@ def _history(law: Sampled, scene: Scene, v: jax.Array, samples: int, records: in
         impulse=impulse,
         gap_velocity=gammas * (units.velocity * units.root)[None, :],
         velocity=jax.vmap(lambda p: v + velocity_change(scene, p))(impulse),
-        duration=end.state.t * units.time,
+        duration=end.state.t[0] * units.time,
         maximum_force=jnp.max(jax.vmap(force)(kept.state.x), axis=0),
         status=status_of(end, reclosing(end, control.tolerance)).astype(jnp.int32),
     )

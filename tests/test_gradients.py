@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 import jimpact as ji
 
@@ -76,7 +77,7 @@ def test_forward_equals_reverse_in_every_parameter():
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-12)
     # and both equal central differences of the tightened solve
     tight = jax.jit(lambda law, m, v: everything(law, m, v))
-    flat, rebuild = jax.flatten_util.ravel_pytree(args)
+    flat, rebuild = ravel_pytree(args)
     sharp = ji.LZB(law.restitution, law.stiffness, law.exponent, law.initial_energy, rtol=1e-12)
 
     def value(x):
@@ -89,7 +90,7 @@ def test_forward_equals_reverse_in_every_parameter():
     differences = [
         (value(flat + step * d) - value(flat - step * d)) / (2 * step) for d in jnp.eye(flat.size)
     ]
-    exact, _ = jax.flatten_util.ravel_pytree(reverse)
+    exact, _ = ravel_pytree(reverse)
     np.testing.assert_allclose(exact, differences, rtol=0, atol=1e-6)
 
 

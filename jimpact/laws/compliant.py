@@ -106,7 +106,7 @@ class Compliant(Law):
         if not isinstance(force, Bistiffness):
             speed = units.velocity * units.root
             viscous = Viscous(force, units.indentation, speed, momentum / units.time)
-        p, code = solve(inputs, exponent, chain, self.max_steps, gapped=True, viscous=viscous)
+        p, code = solve(inputs, exponent, chain, self.max_steps, viscous=viscous)
         return p * momentum, code
 
 

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import impulse_form, stepper
-from jimpact.numerics.flow import Exponent, Flow, Viscous
+from jimpact.numerics.contacts import along_contacts, any_of
+from jimpact.numerics.flow import Exponent, Flow, Viscous, apply
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
@@ -25,18 +26,25 @@ METHODS = ("time", "propagator", "impulse")
 GRADIENT_TIGHTENING = 0.01
 ROUNDING_FLOOR = 16  # the local tolerance is at least so many eps
 RIDGE = 64  # eps on the diagonal of G: redundant contacts are singular, the remainder is tiny
+DENSE_IN_BATCHES = 4  # contacts
 ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
 
 
 class Inputs(NamedTuple):
-    """What the dimensionless outcome depends on; `coupling` holds the entries beside 1 of G."""
+    """What the dimensionless outcome depends on; contacts are the first axis of all of it.
+
+    `coupling` holds the entries beside the diagonal of G. What is perturbed costs a tangent an
+    entry: a common restitution or exponent stays one entry, and energies that are not perturbed
+    are kept instead of the indentations they make.
+    """
 
     coupling: jax.Array
     omega: jax.Array
     restitution: jax.Array
     exponent: jax.Array | None
     gamma: jax.Array
-    x: jax.Array
+    energy: jax.Array  # x^(eta + 1) of contacts loaded beforehand
+    gap: jax.Array | None  # in units of the indentation
     tolerance: jax.Array
 
 
@@ -72,35 +80,46 @@ def to_dimensionless(
     # tolerance is asked of velocities: where W_jj is large, impulses must be finer
     fastest = jnp.max(jnp.maximum(-gamma, jnp.sqrt(2 * stored) * root))
     weight = jax.lax.stop_gradient(jnp.maximum(1.0, q * root / fastest))
-    loaded = stored > 0
-    x = jnp.where(loaded, (2 * jnp.where(loaded, stored, 1.0) / q**2) ** (1 / (eta + 1)), 0.0)
-    if gaps is not None:
-        x = -gaps / x_ref  # at 0 too: its derivative there is the one-sided one
     g = scaled(delassus, 1 / root)
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     inputs = Inputs(
         coupling=beside,
         omega=time / t_ref,
-        restitution=jnp.broadcast_to(restitution, (m,)),
-        exponent=exponent if isinstance(exponent, jax.Array) else None,
+        restitution=jnp.atleast_1d(restitution),
+        exponent=jnp.atleast_1d(exponent) if isinstance(exponent, jax.Array) else None,
         gamma=qn / q,
-        x=x,
+        energy=2 * stored / q**2,
+        gap=None if gaps is None else gaps / x_ref,
         tolerance=rtol * min(1.0, 2 / m) / weight,  # errors of many contacts add up
     )
     return inputs, Units(q, time, root, x_ref)
 
 
-def flow_of(inputs: Inputs, exponent: Exponent, chain: bool, gapped: bool = False) -> Flow:
+def indentation(inputs: Inputs, exponent: Exponent) -> jax.Array:
+    """x (m,) before the impact; negative where a gap is open."""
+    if inputs.gap is not None:
+        return -inputs.gap  # at 0 too: its derivative there is the one-sided one
+    loaded = inputs.energy > 0
+    energy = jnp.where(loaded, inputs.energy, 1.0)
+    eta = along_contacts(jnp.asarray(exponent, energy.dtype), energy)
+    return jnp.where(loaded, energy ** (1 / (eta + 1)), 0.0)
+
+
+def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
     """The flow of these inputs; `exponent` is the static one where `inputs` hold none."""
-    m = inputs.gamma.shape[0]
-    if chain:
+    m, batch = inputs.gamma.shape[0], inputs.gamma.shape[1:]
+    # the product with a small dense matrix vectorizes better than shifts by one contact
+    if chain and not (batch and m <= DENSE_IN_BATCHES):
         coupling: Symmetric = Tridiagonal(jnp.ones_like(inputs.gamma), inputs.coupling)
     else:
         i, j = jnp.triu_indices(m, 1)
-        upper = jnp.zeros((m, m), inputs.gamma.dtype).at[i, j].set(inputs.coupling)
-        coupling = jnp.eye(m, dtype=inputs.gamma.dtype) + upper + upper.T
+        if chain:
+            i, j = jnp.arange(m - 1), jnp.arange(1, m)
+        upper = jnp.zeros((m, m, *batch), inputs.gamma.dtype).at[i, j].set(inputs.coupling)
+        unit = jnp.eye(m, dtype=inputs.gamma.dtype).reshape((m, m) + (1,) * len(batch))
+        coupling = unit + upper + jnp.swapaxes(upper, 0, 1)
     eta = exponent if inputs.exponent is None else inputs.exponent
-    return Flow(coupling, inputs.omega, inputs.restitution, eta, gapped)
+    return Flow(coupling, inputs.omega, inputs.restitution, eta, inputs.gap is not None)
 
 
 def control_of(inputs: Inputs, tighten: float, max_steps: int, method: str) -> stepper.Control:
@@ -118,7 +137,6 @@ def solve(
     chain: bool,
     max_steps: int,
     method: str = "time",
-    gapped: bool = False,
     viscous: Viscous | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """Dimensionless impulses and status, differentiable in both modes."""
@@ -128,30 +146,35 @@ def solve(
         both: tuple[Inputs, Viscous | None], differentiated: bool
     ) -> tuple[jax.Array, jax.Array]:
         given, force = both
-        flow = flow_of(given, static, chain, gapped)._replace(viscous=force)  # type: ignore[arg-type]
+        flow = flow_of(given, static, chain)._replace(viscous=force)  # type: ignore[arg-type]
+        x = indentation(given, flow.exponent)
         if method == "impulse":
             return _walk(flow, given, max_steps)
         tighten = GRADIENT_TIGHTENING if differentiated else 1.0
         control = control_of(given, tighten, max_steps, method)
         control = control._replace(closed_form=force is None)
-        end = stepper.run(flow, control, stepper.begin(flow, control, given.gamma, given.x))
+        end = stepper.run(flow, control, stepper.begin(flow, control, given.gamma, x))
         at_rest = reclosing(end, given.tolerance)
         p = end.state.p + plastic_remainder(flow, given.gamma, end.state.p, at_rest)
         # errors of many closings add up: contacts beside them may be left with an approach
         beside = (
-            jnp.any(at_rest) & _quiet(end, given.tolerance) & (given.gamma + flow.coupling @ p < 0)
+            any_of(at_rest)
+            & _quiet(end, given.tolerance)
+            & (given.gamma + apply(flow.coupling, p) < 0)
         )
         p = p + plastic_remainder(flow, given.gamma, p, at_rest | beside)
         return p, status_of(end, at_rest)
 
-    return both_modes(run)((inputs, viscous))
+    # a batch of its own order of axes; a user's force knows but one impact
+    columns = method == "time" and viscous is None
+    return both_modes(run, columns)((inputs, viscous))
 
 
 def reclosing(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
     """Contacts (m,) as good as at rest where some re-closed again and again."""
     quiet = _quiet(end, tolerance)
     endless = quiet & (end.closures >= ENDLESS)
-    return end.done & (endless | (jnp.any(endless) & quiet & (end.state.g < 0)))
+    return end.done & (endless | (any_of(endless) & quiet & (end.state.g < 0)))
 
 
 def _quiet(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
@@ -160,23 +183,25 @@ def _quiet(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
 
 def status_of(end: stepper.Carry, at_rest: jax.Array) -> jax.Array:
     """Status code of a finished or interrupted run."""
-    code = jnp.where(jnp.any(at_rest), CODE["plastic_limit"], CODE["ok"])
-    return jnp.where(end.done, code, CODE["max_steps"])
+    code = jnp.where(any_of(at_rest), CODE["plastic_limit"], CODE["ok"])
+    return jnp.where(end.done, code, CODE["max_steps"])[0]
 
 
 def plastic_remainder(flow: Flow, gamma: jax.Array, p: jax.Array, at_rest: jax.Array) -> jax.Array:
     """Impulses that bring the contacts `at_rest` to exactly gamma+ = 0: the limit they approach."""
     g = as_matrix(flow.coupling)
     both = at_rest[:, None] & at_rest[None, :]
-    unit = jnp.eye(g.shape[0], dtype=g.dtype)
+    unit = jnp.eye(g.shape[0], dtype=g.dtype).reshape(g.shape[:2] + (1,) * (g.ndim - 2))
     ridge = RIDGE * float(jnp.finfo(g.dtype).eps)
-    missing = jnp.where(at_rest, -(gamma + flow.coupling @ p), 0.0)
-    return jnp.linalg.solve(jnp.where(both, g, unit) + ridge * unit, missing)
+    missing = jnp.where(at_rest, -(gamma + apply(flow.coupling, p)), 0.0)
+    matrix = jnp.where(both, g, unit) + ridge * unit
+    if g.ndim == 2:
+        return jnp.linalg.solve(matrix, missing)
+    return jnp.linalg.solve(jnp.moveaxis(matrix, 2, 0), missing.T[..., None])[..., 0].T
 
 
 def _walk(flow: Flow, given: Inputs, max_steps: int) -> tuple[jax.Array, jax.Array]:
-    eta = jnp.asarray(flow.exponent, given.x.dtype)
-    energy = 0.5 * jnp.where(given.x > 0, jnp.where(given.x > 0, given.x, 1.0) ** (eta + 1), 0.0)
+    energy = 0.5 * given.energy
     dp = jax.lax.stop_gradient(jnp.min(given.tolerance))
     end = impulse_form.solve(flow, dp, max_steps, given.gamma, energy)
     return end.p, jnp.where(impulse_form.at_work(end), CODE["max_steps"], CODE["ok"])

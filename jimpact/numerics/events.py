@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.numerics.contacts import any_of, first_least, least
 from jimpact.numerics.flow import (
     COMPRESSION,
     EXPANSION,
@@ -19,10 +20,12 @@ from jimpact.numerics.flow import (
     ZERO_G,
     Flow,
     State,
+    apply,
     field,
     lands,
     plus_one,
     power,
+    rates_of,
 )
 
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
@@ -85,23 +88,23 @@ def find(
     at_g = jnp.where(crossed_g, _crossing(before.g, after.g, slope.g * span), jnp.inf)
     at_x = jnp.where(crossed_x, _crossing(before.x, after.x, slope.x * span), jnp.inf)
     at_dip = jnp.where(dipped, _dip_at(before.g, after.g, slope.g * span), jnp.inf)
-    by_opening = jnp.min(at_x) <= jnp.min(at_g)
-    crossing = jnp.minimum(jnp.min(at_x), jnp.min(at_g))
-    soonest = jnp.where(by_opening, jnp.argmin(at_x), jnp.argmin(at_g))
-    next_target = jnp.arange(phase.shape[0]) == soonest
+    soonest_x, soonest_g, dip = least(at_x), least(at_g), least(at_dip)
+    by_opening = soonest_x <= soonest_g
+    crossing = jnp.minimum(soonest_x, soonest_g)
+    next_target = first_least(jnp.where(by_opening, at_x, at_g))
     heads_x = next_target & (slope.x < 0)
     heads_g = next_target & (slope.g < 0) & (before.g > snap)
     return Events(
-        inside=jnp.any(crossed_g | crossed_x | dipped),
+        inside=any_of(crossed_g | crossed_x | dipped),
         at_once=at_once,
         opens=(phase == EXPANSION)
         & jnp.where(at_once, crossed_x, target & ((kind == ROOT_X) | (kind == ONSET))),
-        first=jnp.minimum(crossing, jnp.min(at_dip)),
+        first=jnp.minimum(crossing, dip),
         by_opening=by_opening,
         target=next_target,
-        monotone=jnp.any(jnp.where(by_opening, heads_x, heads_g))
+        monotone=any_of(jnp.where(by_opening, heads_x, heads_g))
         & jnp.isfinite(crossing)
-        & (crossing <= jnp.min(at_dip)),
+        & (crossing <= dip),
     )
 
 
@@ -146,16 +149,16 @@ def jumped(flow: Flow, state: State, closed: jax.Array) -> State:
     rate = jnp.where(moves, -flow.omega * state.g, 1.0)
     push = flow.viscous.push(state.x, state.g)  # type: ignore[union-attr]
     dp = jnp.where(moves, push * ahead / rate, 0.0)
-    return state._replace(g=state.g + flow.coupling @ dp, p=state.p + dp)
+    return state._replace(g=state.g + apply(flow.coupling, dp), p=state.p + dp)
 
 
 def next_opening(flow: Flow, phase: jax.Array, state: State) -> tuple[jax.Array, jax.Array]:
     """Expected time to the next opening, and its contact (m,) one-hot."""
-    dx, _, _, _ = field(flow, phase, state.x, state.g)
+    dx = rates_of(flow, phase).closing * state.g
     expanding = (phase == EXPANSION) & (dx < 0)
     x = jnp.maximum(state.x, 0.0)
     due = jnp.where(expanding, x / jnp.where(expanding, -dx, 1.0), jnp.inf)
-    return jnp.min(due), jnp.arange(due.shape[0]) == jnp.argmin(due)
+    return least(due), first_least(due)
 
 
 def _signs(phase: jax.Array) -> jax.Array:
@@ -178,7 +181,7 @@ def _margins(
 
 
 def _slopes(flow: Flow, phase: jax.Array, slack: jax.Array, state: State) -> Margin:
-    dx, dg, _, _ = field(flow, phase, state.x, state.g)
+    dx, dg, _ = field(flow, phase, rates_of(flow, phase), state.x, state.g)
     if flow.gapped:
         rate = jnp.where(phase == OPEN, -dx, dx)
         if flow.slackens:

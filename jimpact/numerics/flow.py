@@ -24,21 +24,26 @@ A `viscous` force replaces the power law; it is never tensile, so that a contact
 with x_j > 0.
 
 with r = 2 where 2 eta is known to be whole, else 8.
+
+Contacts are the first axis of all arrays; what is one number an impact has length 1 there, and
+further axes are batches (see `contacts.py`).
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.numerics.tableaux import DOP853
-from jimpact.numerics.tridiagonal import Symmetric
+from jimpact.numerics.contacts import along_contacts, first_least, of
+from jimpact.numerics.tableaux import DOP853, Tableau
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 
 TIME, START, ZERO_G, ROOT_X, FROM_GAP, ONSET = 0, 1, 2, 3, 4, 5  # variable of a step
 OPEN, COMPRESSION, EXPANSION = 0, 1, 2  # phase of a contact
 
-_DENSE_A = np.array([[*row, *[0.0] * (len(DOP853.c) - len(row))] for row in DOP853.a])
+UNROLLED = 8  # products with a matrix of this size are written out, without a reduction
 
 Exponent = float | tuple[float, ...] | jax.Array
 
@@ -62,7 +67,7 @@ class Viscous(NamedTuple):
 
 
 class Flow(NamedTuple):
-    """Parameters of the dimensionless law, all (m,) but the unit-diagonal matrix `coupling` G."""
+    """Parameters (m,) or (1,) of the dimensionless law, and the unit-diagonal `coupling` G."""
 
     coupling: Symmetric
     omega: jax.Array
@@ -87,12 +92,20 @@ def frozen(flow: Flow) -> Flow:
 
 
 class State(NamedTuple):
-    """Indentation x, scaled gap velocity g, impulse p (all (m,)) and impact time t ()."""
+    """Indentation x, scaled gap velocity g, impulse p (all (m,)) and impact time t (1,)."""
 
     x: jax.Array
     g: jax.Array
     p: jax.Array
     t: jax.Array
+
+
+class Slopes(NamedTuple):
+    """What the stages of a step keep of x, g and p, or what follows from them: an error."""
+
+    x: jax.Array
+    g: jax.Array
+    p: jax.Array
 
 
 def lands(kind: jax.Array) -> jax.Array:
@@ -113,7 +126,7 @@ def power(x: jax.Array, exponent: Exponent) -> jax.Array:
             return x * x
         if exponent == 1.5:
             return x * jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
-    eta = jnp.asarray(exponent, x.dtype)
+    eta = along_contacts(jnp.asarray(exponent, x.dtype), x)
     return jnp.where(positive, jnp.exp(eta * jnp.log(jnp.where(positive, x, 1.0))), 0.0)
 
 
@@ -129,32 +142,56 @@ def root_order(exponent: Exponent) -> int:
     return 2 if np.all(2 * etas == np.round(2 * etas)) else 8
 
 
-def factor(exponent: Exponent, dtype: jnp.dtype) -> jax.Array:
-    """`(eta + 1) / 2`."""
-    return (jnp.asarray(exponent, dtype) + 1) / 2
+def factor(exponent: Exponent, like: jax.Array) -> jax.Array:
+    """`(eta + 1) / 2`, to multiply values (m, ...) such as `like`."""
+    return along_contacts((jnp.asarray(exponent, like.dtype) + 1) / 2, like)
+
+
+def apply(matrix: Symmetric, vector: jax.Array) -> jax.Array:
+    """`matrix @ vector`, where a dense matrix (m, m, ...) may have the batch axes of the vector."""
+    if isinstance(matrix, Tridiagonal) or matrix.ndim == 2:
+        return matrix @ vector
+    if matrix.shape[0] > UNROLLED:
+        return jnp.sum(matrix * vector[None], axis=1)
+    columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[0])]
+    return functools.reduce(jnp.add, columns)
+
+
+class Rates(NamedTuple):
+    """What of the field does not change while the phases last."""
+
+    unit: jax.Array  # (1,) time unit s*
+    ratio: jax.Array  # (m,) s* / s_j
+    closing: jax.Array  # (m,) x' / g
+    stiffness: jax.Array  # (m,) force / x^eta
 
 
 def scales(flow: Flow, phase: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`s_j` with `gamma_j = s_j g_j`, the time unit `s*`, and `s* / s_j` (0/0 = 1)."""
-    s = jnp.where(phase == EXPANSION, flow.restitution, 1.0)
-    unit = s[jnp.argmin(s)]  # not min(): its derivative is shared among ties
+    s = jnp.where(phase == EXPANSION, flow.restitution, jnp.ones_like(flow.restitution))
+    unit = of(first_least(s), s)  # not min(): its derivative is shared among ties
     ratio = jnp.where(s > 0, unit / jnp.where(s > 0, s, 1.0), 1.0)
     return s, unit, ratio
 
 
-def field(flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array) -> tuple[jax.Array, ...]:
-    """`(x', g', p', t')` with respect to time in units of `s*`, phases frozen."""
+def rates_of(flow: Flow, phase: jax.Array) -> Rates:
+    """The constants of the field while these phases last."""
     _, unit, ratio = scales(flow, phase)
-    if flow.viscous is None:
-        force = factor(flow.exponent, x.dtype) * flow.omega * power(x, flow.exponent)
-    else:
-        force = flow.viscous.push(x, g)
+    closing, stiffness = -ratio * flow.omega, factor(flow.exponent, flow.omega) * flow.omega
     if flow.gapped:
-        force = jnp.where(phase == OPEN, 0.0, force)
-    closing = -ratio * flow.omega
-    if not flow.gapped:
-        closing = jnp.where(phase == OPEN, 0.0, closing)
-    return closing * g, ratio * (flow.coupling @ force), unit * force, unit
+        return Rates(unit, ratio, closing, jnp.where(phase == OPEN, 0.0, stiffness))
+    return Rates(unit, ratio, jnp.where(phase == OPEN, 0.0, closing), stiffness)
+
+
+def field(
+    flow: Flow, phase: jax.Array, rates: Rates, x: jax.Array, g: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`(x', g', p')` with respect to time in units of `s*`, phases frozen."""
+    if flow.viscous is None:
+        force = rates.stiffness * power(x, flow.exponent)
+    else:
+        force = jnp.where(phase == OPEN, 0.0, flow.viscous.push(x, g))
+    return rates.closing * g, rates.ratio * apply(flow.coupling, force), rates.unit * force
 
 
 def step(
@@ -165,52 +202,61 @@ def step(
     target: jax.Array,
     start: jax.Array,
     length: jax.Array,
-) -> tuple[State, State, State]:
-    """One DOP853 step of `length` in the variable `kind`, which begins at `start`.
+    tableau: Tableau = DOP853,
+) -> tuple[State, Slopes, Slopes]:
+    """One Runge-Kutta step of `length` in the variable `kind`, which begins at `start`.
 
     `target` (m,) is one-hot: the contact whose event ends a ZERO_G or ROOT_X step. Returns the
     end state and the two error estimates. The stages are a loop of matrix products: unrolled,
     the derivative takes seven times as long to compile.
     """
-    m, dtype, r = state.x.shape[0], state.x.dtype, root_order(flow.exponent)
-    a, c = jnp.asarray(_DENSE_A, dtype), jnp.asarray(DOP853.c, dtype)
+    dtype, r, count = state.x.dtype, root_order(flow.exponent), len(tableau.c)
+    dense = np.array([[*row, *[0.0] * (count - len(row))] for row in tableau.a])
+    a, b, c = (jnp.asarray(z, dtype) for z in (dense, tableau.b, tableau.c))
     known_x = target & ((kind == ROOT_X) | (kind == FROM_GAP))
     known_g = target & (kind == ZERO_G)
-    y = jnp.concatenate([state.x, state.g])
+    rates = rates_of(flow, phase)
 
-    def stage(i: jax.Array, slopes: jax.Array) -> jax.Array:
-        at = y + length * (a[i] @ slopes[:, : 2 * m])
+    def stage(i: jax.Array, carried: tuple[Slopes, jax.Array]) -> tuple[Slopes, jax.Array]:
+        slopes, elapsed = carried
+        row = jax.lax.dynamic_index_in_dim(a, i, keepdims=False)
         xi = start + c[i] * length
         # the variable of the step is known exactly at every stage
-        x = jnp.where(known_x, jnp.where(kind == FROM_GAP, xi, xi**r), at[:m])
-        g = jnp.where(known_g, xi, at[m:])
-        rates = field(flow, phase, x, g)
-        row = jnp.concatenate([*rates[:3], rates[3][None]])
-        dx, dg = rates[:2]
+        x = state.x + length * jnp.tensordot(row, slopes.x, axes=1)
+        x = jnp.where(known_x, jnp.where(kind == FROM_GAP, xi, xi**r), x)
+        g = jnp.where(known_g, xi, state.g + length * jnp.tensordot(row, slopes.g, axes=1))
+        dx, dg, dp = field(flow, phase, rates, x, g)
+        turning = dx
         if flow.slackens:
             turning = jax.jvp(flow.viscous.onset, (x, g), (dx, dg))[1]  # type: ignore[union-attr]
-            dx = jnp.where(kind == ONSET, turning, dx)
-        return slopes.at[i].set(row * _stretch(kind, target, xi, (dx, dg), r))
+            turning = jnp.where(kind == ONSET, turning, dx)
+        dt = _stretch(kind, target, xi, turning, dg, r)
+        kept = zip(slopes, (dx * dt, dg * dt, dp * dt))
+        rows = (jax.lax.dynamic_update_index_in_dim(all_, new, i, 0) for all_, new in kept)
+        return Slopes(*rows), elapsed + b[i] * dt
 
-    slopes = jax.lax.fori_loop(0, len(c), stage, jnp.zeros((len(c), 3 * m + 1), dtype))
-    weights = jnp.asarray([DOP853.b, DOP853.error_high, DOP853.error_low], dtype)
-    change, high, low = (
-        State(row[:m], row[m : 2 * m], row[2 * m : 3 * m], row[3 * m])
-        for row in length * (weights @ slopes)
+    none = jnp.zeros((count, *state.x.shape), dtype)
+    slopes, elapsed = jax.lax.fori_loop(
+        0, count, stage, (Slopes(none, none, none), jnp.zeros_like(start))
     )
-    end = State(*(before + by for before, by in zip(state, change)))
-    end = end._replace(
-        x=jnp.where(known_x, 0.0, end.x), g=jnp.where(known_g, start + length, end.g)
+    weights = jnp.asarray([tableau.b, tableau.error_high, tableau.error_low], dtype)
+    change, high, low = (
+        Slopes(*(length * jnp.tensordot(w, rows, axes=1) for rows in slopes)) for w in weights
+    )
+    end = State(
+        jnp.where(known_x, 0.0, state.x + change.x),
+        jnp.where(known_g, start + length, state.g + change.g),
+        state.p + change.p,
+        state.t + length * rates.unit * elapsed,
     )
     return end, high, low
 
 
 def _stretch(
-    kind: jax.Array, target: jax.Array, xi: jax.Array, rates: tuple[jax.Array, ...], r: int
+    kind: jax.Array, target: jax.Array, xi: jax.Array, dx: jax.Array, dg: jax.Array, r: int
 ) -> jax.Array:
     """`dt / dxi`."""
-    dx, dg = (jnp.sum(jnp.where(target, rate, 0.0)) for rate in rates[:2])
-    rate = jnp.where(kind == ZERO_G, dg, jnp.where(lands(kind), dx, 1.0))
+    rate = jnp.where(kind == ZERO_G, of(target, dg), jnp.where(lands(kind), of(target, dx), 1.0))
     numerator = jnp.where((kind == START) | (kind == ROOT_X), r * xi ** (r - 1), 1.0)
     safe = jnp.where(rate == 0, 1.0, rate)
     return jnp.where(rate == 0, jnp.nan, 1.0) * numerator / safe

@@ -7,8 +7,9 @@ A contact j that works alone keeps `x_j^(eta_j+1) + g_j^2`, so its rebound is
 import jax
 import jax.numpy as jnp
 
+from jimpact.numerics.contacts import any_of
 from jimpact.numerics.events import matters
-from jimpact.numerics.flow import OPEN, Flow, State, plus_one, power, scales
+from jimpact.numerics.flow import OPEN, Flow, State, apply, plus_one, power, scales
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 
 RESIDUAL = 1.0  # loads and velocities below this part of the tolerance end the impact
@@ -26,9 +27,9 @@ def finish(
     rebound = flow.restitution * jnp.sqrt(jnp.where(at_work, total, 1.0))
     dp = jnp.where(at_work, rebound - gamma, 0.0)
     strength, pull = _beside(flow.coupling)
-    coupled = at_work & (strength @ at_work.astype(gamma.dtype) > 0)
-    pressed = ~at_work & (gamma + pull @ dp < -RESIDUAL * tolerance)
-    alone = ~jnp.any(coupled | pressed) if closed_form else ~jnp.any(at_work)
+    coupled = at_work & (apply(strength, at_work.astype(gamma.dtype)) > 0)
+    pressed = ~at_work & (gamma + apply(pull, dp) < -RESIDUAL * tolerance)
+    alone = ~any_of(coupled | pressed) if closed_form else ~any_of(at_work)
     end = State(
         x=jnp.zeros_like(state.x),
         g=jnp.where(at_work, rebound, gamma),
@@ -43,5 +44,6 @@ def _beside(coupling: Symmetric) -> tuple[Symmetric, Symmetric]:
     if isinstance(coupling, Tridiagonal):
         none, off = jnp.zeros_like(coupling.diagonal), coupling.off_diagonal
         return Tridiagonal(none, jnp.abs(off)), Tridiagonal(none, jnp.minimum(off, 0.0))
-    off = coupling * (1 - jnp.eye(coupling.shape[0], dtype=coupling.dtype))
+    beside = 1 - jnp.eye(coupling.shape[0], dtype=coupling.dtype)
+    off = coupling * beside.reshape(beside.shape + (1,) * (coupling.ndim - 2))
     return jnp.abs(off), jnp.minimum(off, 0.0)

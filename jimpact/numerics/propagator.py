@@ -8,7 +8,17 @@ where frequencies coincide. Events are roots of that polynomial.
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics.flow import ROOT_X, START, TIME, Flow, State, field
+from jimpact.numerics.flow import (
+    ROOT_X,
+    START,
+    Flow,
+    Rates,
+    Slopes,
+    State,
+    field,
+    lands,
+    rates_of,
+)
 from jimpact.numerics.tridiagonal import as_matrix
 
 TERMS = 26  # 2^26 / 26! < 2e-19: beyond rounding for steps up to REACH
@@ -27,12 +37,12 @@ def propagate(
     length: jax.Array,
     due: jax.Array,
     tolerance: jax.Array,
-) -> tuple[State, State, State]:
+) -> tuple[State, Slopes, Slopes]:
     """As `flow.step`, for exponent 1; the "error" only keeps the step within REACH."""
     coefficients = _series(flow, phase, state)
-    landing = (kind != TIME) & (kind != START)
-    row = jnp.where(kind == ROOT_X, coefficients.x, coefficients.g)
-    event = jnp.sum(jnp.where(target, row, 0.0), axis=1)
+    landing = lands(kind)
+    row = jnp.where((kind == ROOT_X)[None], coefficients.x, coefficients.g)
+    event = jnp.sum(jnp.where(target[None], row, 0.0), axis=1, keepdims=True)
     event = event.at[0].add(jnp.where(kind == ROOT_X, 0.0, -(start + length)))
     h = jnp.where(kind == START, (start + length) ** 2 - start**2, length)
     h = jnp.where(landing, _root(event, due), h)
@@ -45,17 +55,17 @@ def propagate(
     frequency = jnp.sqrt(strength * jnp.max(flow.omega))
     missed = landing & ~((h > 0) & (jnp.abs(_evaluate(event, h)) < LANDED))
     size = jnp.where(missed, jnp.nan, (h * frequency / REACH) ** 8)
-    error = State(jnp.zeros_like(end.x), jnp.zeros_like(end.g), size * tolerance, size * 0)
-    return end, error, error._replace(p=jnp.zeros_like(end.p))
+    none = jnp.zeros_like(end.x)
+    return end, Slopes(none, none, size * tolerance), Slopes(none, none, none)
 
 
 def _series(flow: Flow, phase: jax.Array, state: State) -> State:
     """Taylor coefficients (TERMS, m) of x, g, p and (TERMS,) of t in the length of the step."""
-    still = field(flow, phase, 0 * state.x, 0 * state.g)[3]
+    rates = rates_of(flow, phase)
 
     def following(carry: State, order: jax.Array) -> tuple[State, State]:
-        dx, dg, dp, _ = field_linear(flow, phase, carry.x, carry.g)
-        dt = jnp.where(order == 1, still, 0.0)
+        dx, dg, dp = _linear(flow, phase, rates, carry.x, carry.g)
+        dt = jnp.where(order == 1, rates.unit, 0.0)
         after = State(dx / order, dg / order, dp / order, dt)
         return after, after
 
@@ -64,11 +74,13 @@ def _series(flow: Flow, phase: jax.Array, state: State) -> State:
     return State(*(jnp.concatenate([a[None], b]) for a, b in zip(first, rest)))
 
 
-def field_linear(flow: Flow, phase: jax.Array, x: jax.Array, g: jax.Array) -> tuple[jax.Array, ...]:
+def _linear(
+    flow: Flow, phase: jax.Array, rates: Rates, x: jax.Array, g: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`flow.field` continued to x < 0, as a coefficient of a series may be."""
-    up = field(flow, phase, x, g)
-    down = field(flow, phase, -x, -g)
-    return up[0], up[1] - down[1], up[2] - down[2], up[3]
+    up = field(flow, phase, rates, x, g)
+    down = field(flow, phase, rates, -x, -g)
+    return up[0], up[1] - down[1], up[2] - down[2]
 
 
 def _evaluate(series: jax.Array, h: jax.Array) -> jax.Array:
@@ -83,7 +95,7 @@ def _evaluate(series: jax.Array, h: jax.Array) -> jax.Array:
 def _root(event: jax.Array, guess: jax.Array) -> jax.Array:
     """Root of the event polynomial near `guess`, differentiable by one more Newton step."""
     fixed = jax.lax.stop_gradient(event)
-    slopes = fixed[1:] * jnp.arange(1, TERMS, dtype=fixed.dtype)
+    slopes = fixed[1:] * jnp.arange(1, TERMS, dtype=fixed.dtype)[:, None]
 
     def newton(_: int, h: jax.Array) -> jax.Array:
         return h - _evaluate(fixed, h) / _evaluate(slopes, h)

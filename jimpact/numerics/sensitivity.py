@@ -11,43 +11,63 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
-from jax.flatten_util import ravel_pytree
+
+from jimpact.numerics.columns import in_columns
 
 
 def both_modes(
-    solve: Callable[..., tuple[Any, Any]],
+    solve: Callable[..., tuple[Any, Any]], columns: bool = False
 ) -> Callable[[Any], tuple[Any, Any]]:
     """`solve(inputs, differentiated)` -> (outputs, integers), made differentiable in both modes.
 
     `differentiated` is True in the run whose derivatives are taken: it may then work at a
-    tighter tolerance. Inputs that are not perturbed cost nothing.
+    tighter tolerance. Inputs that are not perturbed cost nothing. With `columns` the solver takes
+    batches in the last axis of all its inputs (see `columns.py`).
     """
+    batched = in_columns if columns else lambda function: function
 
     @jax.custom_jvp
     def differentiable(inputs: Any) -> tuple[Any, Any]:
-        return solve(inputs, False)
+        return batched(lambda given: solve(given, False))(inputs)
 
     def rule(primals: Any, tangents: Any) -> Any:
         leaves, tree = jax.tree.flatten(primals[0])
         rates = jax.tree.leaves(tangents[0], is_leaf=lambda t: isinstance(t, SymbolicZero))
         moving = [i for i, rate in enumerate(rates) if not isinstance(rate, SymbolicZero)]
-        flat, restore = ravel_pytree([leaves[i] for i in moving])
-        flat_rate, _ = ravel_pytree([rates[i] for i in moving])
 
-        def outputs_of(values: jax.Array) -> tuple[Any, Any]:
-            moved = dict(zip(moving, restore(values)))
-            at = [moved.get(i, leaf) for i, leaf in enumerate(leaves)]
-            return solve(jax.tree.unflatten(tree, at), True)
+        def with_jacobian(at: list[jax.Array]) -> tuple[Any, Any, Any]:
+            def outputs_of(values: list[jax.Array]) -> tuple[Any, Any]:
+                moved = dict(zip(moving, values))
+                given = [moved.get(i, leaf) for i, leaf in enumerate(at)]
+                return solve(jax.tree.unflatten(tree, given), True)
 
-        def push(direction: jax.Array) -> tuple[Any, Any, Any]:
-            return jax.jvp(outputs_of, (flat,), (direction,), has_aux=True)
+            values = [at[i] for i in moving]
 
-        out, jacobian, aux = jax.vmap(push, out_axes=(None, 0, None))(
-            jnp.eye(flat.shape[0], dtype=flat.dtype)
-        )
-        rate = jax.tree.map(lambda columns: jnp.tensordot(flat_rate, columns, axes=1), jacobian)
+            def push(directions: list[jax.Array]) -> tuple[Any, Any, Any]:
+                return jax.jvp(outputs_of, (values,), (directions,), has_aux=True)
+
+            return jax.vmap(push, out_axes=(None, 0, None))(_directions(values, columns))
+
+        out, jacobian, aux = batched(with_jacobian)(leaves)
+        along = jnp.concatenate([jnp.ravel(rates[i]) for i in moving])
+        rate = jax.tree.map(lambda rows: jnp.tensordot(along, rows, axes=1), jacobian)
         still = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), jax.dtypes.float0), aux)
         return (out, aux), (rate, still)
 
     differentiable.defjvp(rule, symbolic_zeros=True)
     return differentiable
+
+
+def _directions(values: list[jax.Array], columns: bool) -> list[jax.Array]:
+    """Unit perturbations (d, ...) of each entry in turn; in columns, of a whole row at once."""
+    counts = [x.shape[0] if columns else x.size for x in values]
+    unit, first, found = jnp.eye(sum(counts), dtype=values[0].dtype), 0, []
+    for x, count in zip(values, counts):
+        rows = unit[:, first : first + count]
+        if columns:
+            rows = rows.reshape(rows.shape + (1,) * (x.ndim - 1))
+        else:
+            rows = rows.reshape(-1, *x.shape)
+        found.append(jnp.broadcast_to(rows, (sum(counts), *x.shape)))
+        first += count
+    return found

@@ -7,13 +7,14 @@ from each other and press no other contact, the rest follows from the energy in 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import events, isolated
 from jimpact.numerics import flow as flows
+from jimpact.numerics.contacts import all_of, any_of, first_least, largest, least, of
 from jimpact.numerics.flow import (
     COMPRESSION,
     EXPANSION,
@@ -25,9 +26,10 @@ from jimpact.numerics.flow import (
     TIME,
     ZERO_G,
     Flow,
+    Slopes,
     State,
-    field,
     lands,
+    rates_of,
     root_order,
 )
 
@@ -40,6 +42,9 @@ NEAR_OPENING = 1.0  # an expansion expected to end within so many steps is lande
 PATIENCE = 2000  # passes per contact after which an impact is let end at WIDENED tolerances
 WIDENED = 100.0
 CUT_SHORT = 0.7  # part of the way to an event that a step stops at where it cannot land
+
+
+Result = TypeVar("Result")
 
 
 class Carry(NamedTuple):
@@ -68,7 +73,7 @@ def explicit_step(
     length: jax.Array,
     due: jax.Array,
     tolerance: jax.Array,
-) -> tuple[State, State, State]:
+) -> tuple[State, Slopes, Slopes]:
     """`flow.step`, which needs neither the expected time of the event nor the tolerance."""
     return flows.step(flow, phase, state, kind, target, start, length)
 
@@ -78,13 +83,12 @@ class Control(NamedTuple):
 
     tolerance: jax.Array
     max_steps: int
-    step: Callable[..., tuple[State, State, State]] = explicit_step
+    step: Callable[..., tuple[State, Slopes, Slopes]] = explicit_step
     closed_form: bool = True
 
 
 def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry:
     """State before the impact; a touching contact at rest starts in compression."""
-    m, dtype = gamma.shape[0], gamma.dtype
     phase = jnp.where((gamma <= 0) | (x > 0), COMPRESSION, OPEN).astype(jnp.int32)
     phase = jnp.where(x < 0, OPEN, phase)
     phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
@@ -93,34 +97,38 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
     phase, x = jnp.where(spent, OPEN, phase), jnp.where(spent, 0.0, x)
     s = jnp.where(phase == EXPANSION, flow.restitution, 1.0)
     g = gamma / s
-    zero, no = jnp.zeros((), dtype), jnp.zeros((), bool)
-    state = State(x, g, jnp.zeros(m, dtype), zero)
+    zero, no = jnp.zeros_like(gamma[:1]), jnp.zeros(gamma[:1].shape, bool)
+    state = State(x, g, jnp.zeros_like(gamma), zero)
     if flow.slackens:
         state = events.jumped(flow, state, (x == 0) & (gamma < 0))
-    first = jnp.asarray(FIRST_TIME ** (1 / root_order(flow.exponent)), dtype)
+    first = FIRST_TIME ** (1 / root_order(flow.exponent))
     carry = Carry(
         state=state,
         phase=phase,
-        kind=jnp.asarray(START, jnp.int32),
-        target=jnp.zeros(m, bool),
-        h=first,
+        kind=jnp.full(no.shape, START, jnp.int32),
+        target=jnp.zeros(gamma.shape, bool),
+        h=jnp.full_like(zero, first),
         due=zero,
         begun=zero,
         retargeted=no,
-        passes=jnp.zeros((), jnp.int32),
-        closures=jnp.zeros(m, jnp.int32),
+        passes=jnp.zeros(no.shape, jnp.int32),
+        closures=jnp.zeros(gamma.shape, jnp.int32),
         done=no,
     )
     return _finish(flow, control, _fly(flow, carry) if flow.gapped else carry)
 
 
 def run(flow: Flow, control: Control, carry: Carry) -> Carry:
-    """Run an impact from `begin` to its end, or to the pass limit."""
-    return jax.lax.while_loop(
-        lambda c: ~c.done & (c.passes < control.max_steps),
-        lambda c: advance(flow, control, c),
-        carry,
-    )
+    """Run impacts from `begin` to their end, or to the pass limit."""
+
+    def active(c: Carry) -> jax.Array:
+        return ~c.done & (c.passes < control.max_steps)
+
+    def body(c: Carry) -> Carry:
+        after, goes_on = advance(flow, control, c), active(c)
+        return jax.tree.map(lambda a, b: jnp.where(goes_on, a, b), after, c)
+
+    return jax.lax.while_loop(lambda c: jnp.any(active(c)), body, carry)
 
 
 def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
@@ -128,53 +136,108 @@ def advance(flow: Flow, control: Control, carry: Carry) -> Carry:
     # where events lie and how long steps are is decided, not differentiated
     h, due, begun = jax.lax.stop_gradient((carry.h, carry.due, carry.begun))
     carry = carry._replace(h=h, due=due, begun=begun)
-    phase, kind, target = carry.phase, carry.kind, carry.target
+    reached, error = by_itself(lambda: _try(flow, control, carry), carry)
+    verdict = by_itself(lambda: _judge(flow, control, carry, reached, error), carry)
+    moved, new_phase, closed = by_itself(lambda: _move(flow, carry, reached, verdict), carry)
+    out = by_itself(
+        lambda: _next_step(flow, carry, verdict, error, moved, new_phase, closed), carry
+    )
+    return by_itself(lambda: _finish(flow, control, _fly(flow, out) if flow.gapped else out), carry)
+
+
+def by_itself(function: Callable[[], Result], carry: Carry) -> Result:
+    """`function()`; in a batch as a computation of its own.
+
+    XLA would compute its results again in each operation that uses them, ten times over in all.
+    """
+    if carry.phase.ndim == 1:
+        return function()
+    shapes = jax.eval_shape(function)
+    always = jnp.any(carry.passes >= 0)
+    return jax.lax.cond(
+        always, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    )
+
+
+class Verdict(NamedTuple):
+    """What becomes of a trial step."""
+
+    found: events.Events
+    span: jax.Array
+    flips: jax.Array  # phases change where the step begins: nothing is gained by shortening it
+    inside: jax.Array  # an event lies inside
+    accept: jax.Array
+    broken: jax.Array  # however short the step, the force has no value
+
+
+def _try(flow: Flow, control: Control, carry: Carry) -> tuple[State, jax.Array]:
+    """State at the end of a trial step, and its error in tolerances."""
     start, length = _interval(flow, control, carry)
     reached, high, low = control.step(
-        flow, phase, carry.state, kind, target, start, length, due, control.tolerance
+        flow,
+        carry.phase,
+        carry.state,
+        carry.kind,
+        carry.target,
+        start,
+        length,
+        carry.due,
+        control.tolerance,
     )
-    state, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
-    error = _error(control, jnp.minimum(state.x, new.x), high, low)
+    old, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
+    return reached, _error(control, jnp.minimum(old.x, new.x), high, low)
+
+
+def _judge(flow: Flow, control: Control, carry: Carry, reached: State, error: jax.Array) -> Verdict:
+    state, new = jax.lax.stop_gradient((carry.state, reached))
     span = _span(flow, carry)
     found = events.find(
-        flows.frozen(flow), control.tolerance, phase, kind, target, span, state, new
+        flows.frozen(flow),
+        control.tolerance,
+        carry.phase,
+        carry.kind,
+        carry.target,
+        span,
+        state,
+        new,
     )
-    exact = jnp.isfinite(error) & (error <= 1)
-    flips = exact & jnp.any(found.at_once)
-    inside = exact & ~flips & found.inside
-    accept = exact & ~flips & ~found.inside
+    finite = jnp.isfinite(error)
+    exact = finite & (error <= 1)
+    flips = exact & any_of(found.at_once)
+    return Verdict(
+        found=found,
+        span=span,
+        flips=flips,
+        inside=exact & ~flips & found.inside,
+        accept=exact & ~flips & ~found.inside,
+        broken=~finite & ~lands(carry.kind) & (span < events.SHORTEST),
+    )
 
-    landing = lands(kind)
-    arrived = jnp.where(flips, found.at_once, accept & landing & target)
+
+def _move(
+    flow: Flow, carry: Carry, reached: State, verdict: Verdict
+) -> tuple[State, jax.Array, jax.Array]:
+    """State, phases and which contacts closed, once the step is accepted or refused."""
+    found, accept, landing = verdict.found, verdict.accept, lands(carry.kind)
+    arrived = jnp.where(verdict.flips, found.at_once, accept & landing & carry.target)
     moved = State(*(jnp.where(accept, b, a) for a, b in zip(carry.state, reached)))
-    moved, new_phase, closed = events.change_phase(flow, phase, moved, arrived, found.opens)
-    following = _next_step(flow, carry, found, error, span, flips, inside, accept, closed)
-    # however short the step, the force has no value: given up, for the status to say
-    broken = ~jnp.isfinite(error) & ~landing & (span < events.SHORTEST)
-    out = following._replace(
-        state=moved._replace(p=jnp.where(broken, jnp.nan, moved.p)),
-        phase=new_phase,
-        passes=carry.passes + 1,
-        closures=carry.closures + closed.astype(jnp.int32),
-        done=carry.done | broken,
-    )
-    out = _aim_at_opening(flow, out, accept)
-    return _finish(flow, control, _fly(flow, out) if flow.gapped else out)
+    # given up, for the status to say
+    moved = moved._replace(p=jnp.where(verdict.broken, jnp.nan, moved.p))
+    return events.change_phase(flow, carry.phase, moved, arrived, found.opens)
 
 
 def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, jax.Array]:
     """Start and length of the next step in its own variable."""
-    x = jnp.sum(jnp.where(carry.target, carry.state.x, 0.0))
-    g = jnp.sum(jnp.where(carry.target, carry.state.g, 0.0))
+    x, g = of(carry.target, carry.state.x), of(carry.target, carry.state.g)
     closing = carry.target & (carry.phase == OPEN)  # closes once its approach matters
-    g_end = -events.NEGLIGIBLE * jnp.sum(jnp.where(closing, control.tolerance, 0.0))
+    g_end = -events.NEGLIGIBLE * of(closing, control.tolerance)
     safe = jnp.where(x > 0, x, 1.0)
     root = jnp.sqrt(safe) if root_order(flow.exponent) == 2 else jnp.sqrt(jnp.sqrt(jnp.sqrt(safe)))
     root = jnp.where(x > 0, root, 0.0)
     onset = jnp.zeros_like(x)
     if flow.slackens:
         values = flow.viscous.onset(carry.state.x, carry.state.g)  # type: ignore[union-attr]
-        onset = jnp.sum(jnp.where(carry.target, values, 0.0))
+        onset = of(carry.target, values)
     kinds = [carry.kind == kind for kind in (START, ZERO_G, ROOT_X, FROM_GAP, ONSET)]
     start = jnp.select(kinds, [carry.begun, g, root, x, onset], 0.0)
     length = jnp.select(kinds, [carry.h, g_end - g, -root, -x, -onset], carry.h)
@@ -189,15 +252,15 @@ def _span(flow: Flow, carry: Carry) -> jax.Array:
     return jnp.select([landing, carry.kind == START], [carry.due, in_start], carry.h)
 
 
-def _error(control: Control, least: jax.Array, high: State, low: State) -> jax.Array:
+def _error(control: Control, least: jax.Array, high: Slopes, low: Slopes) -> jax.Array:
     """Hairer's combination of the two estimates, in units of the tolerance; `least` x: gaps."""
     gap = jnp.where(least < 0, -least, 0.0)
     rounding = WIDE_GAP * float(jnp.finfo(gap.dtype).eps) * gap
 
-    def size(estimate: State) -> jax.Array:
+    def size(estimate: Slopes) -> jax.Array:
         x = jnp.abs(estimate.x) / (control.tolerance + rounding)
         rest = jnp.maximum(jnp.abs(estimate.g), jnp.abs(estimate.p)) / control.tolerance
-        return jnp.max(jnp.maximum(x, rest))
+        return largest(jnp.maximum(x, rest))
 
     fifth, third = size(high), size(low)
     scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
@@ -207,25 +270,25 @@ def _error(control: Control, least: jax.Array, high: State, low: State) -> jax.A
 def _next_step(
     flow: Flow,
     carry: Carry,
-    found: events.Events,
+    verdict: Verdict,
     error: jax.Array,
-    span: jax.Array,
-    flips: jax.Array,
-    inside: jax.Array,
-    accept: jax.Array,
+    moved: State,
+    phase: jax.Array,
     closed: jax.Array,
 ) -> Carry:
     """Variable, target and length of the next step."""
+    found, span, flips, inside, accept, broken = verdict
     h, kind, begun, r = carry.h, carry.kind, carry.begun, root_order(flow.exponent)
     landing = lands(kind)
     starting = kind == START
-    factor = jnp.clip(SAFETY * (error + LEAST_ERROR) ** (-1 / 8), SHRINK, GROWTH)
+    eighth_root = jnp.sqrt(jnp.sqrt(jnp.sqrt(error + LEAST_ERROR)))
+    factor = jnp.clip(SAFETY / eighth_root, SHRINK, GROWTH)
     factor = jnp.where(jnp.isfinite(error), factor, SHRINK)
     # START ends with the first event; until then h is a step of xi
     land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
     leaves = starting & inside & (begun > 0)
     short = CUT_SHORT * found.first
-    gap_closes = jnp.any(found.target & (carry.phase == OPEN) & (carry.state.x <= 0))
+    gap_closes = any_of(found.target & (carry.phase == OPEN) & (carry.state.x <= 0))
     in_x = jnp.where(gap_closes, FROM_GAP, ONSET if flow.slackens else ROOT_X)
     cases = [
         (flips | (accept & landing), h),
@@ -245,12 +308,17 @@ def _next_step(
     # x ~ t^2 after a closing, so t^(2 eta) is smooth enough where 2 eta is whole; but a gap closes
     # with x ~ t
     if r > 2 or flow.gapped:
-        begins = jnp.any(closed)
+        begins = any_of(closed)
         next_kind = jnp.where(begins, START, next_kind)
         fresh = jnp.minimum(RESTART * span, FIRST_TIME)
         next_h = jnp.where(begins, fresh ** (1 / r), next_h)
         begun = jnp.where(begins, 0.0, begun)
-    return carry._replace(
+    out = carry._replace(
+        state=moved,
+        phase=phase,
+        passes=carry.passes + 1,
+        closures=carry.closures + closed.astype(jnp.int32),
+        done=carry.done | broken,
         kind=next_kind.astype(jnp.int32),
         target=found.target & land,
         h=next_h,
@@ -258,6 +326,7 @@ def _next_step(
         begun=begun,
         retargeted=land & landing,
     )
+    return _aim_at_opening(flow, out, accept)
 
 
 def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
@@ -277,14 +346,14 @@ def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
 def _fly(flow: Flow, carry: Carry) -> Carry:
     """While all contacts are open, go to the next closing in one step, however far it is."""
     state = jax.lax.stop_gradient(carry.state)
-    dx, _, _, _ = field(flows.frozen(flow), carry.phase, state.x, state.g)
+    dx = rates_of(flows.frozen(flow), carry.phase).closing * state.g
     closing = (carry.phase == OPEN) & (state.x < 0) & (dx > 0)
     due = jnp.where(closing, -state.x / jnp.where(closing, dx, 1.0), jnp.inf)
-    flies = jnp.all(carry.phase == OPEN) & jnp.any(closing)
+    flies = all_of(carry.phase == OPEN) & any_of(closing)
     return carry._replace(
         kind=jnp.where(flies, FROM_GAP, carry.kind).astype(jnp.int32),
-        target=jnp.where(flies, jnp.arange(due.shape[0]) == jnp.argmin(due), carry.target),
-        due=jnp.where(flies, jnp.min(due), carry.due),
+        target=jnp.where(flies, first_least(due), carry.target),
+        due=jnp.where(flies, least(due), carry.due),
         retargeted=carry.retargeted & ~flies,
     )
 

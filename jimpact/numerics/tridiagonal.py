@@ -16,15 +16,20 @@ class Tridiagonal(eqx.Module):
     regular: bool = eqx.field(static=True, default=False)
 
     def __matmul__(self, vector: jax.Array) -> jax.Array:
-        """Matrix-vector product in O(m)."""
-        lower = jnp.pad(self.off_diagonal * vector[:-1], (1, 0))
-        upper = jnp.pad(self.off_diagonal * vector[1:], (0, 1))
+        """Matrix-vector product in O(m); batches in further axes of all three."""
+        none = jnp.zeros_like(vector[:1])
+        lower = jnp.concatenate([none, self.off_diagonal * vector[:-1]])
+        upper = jnp.concatenate([self.off_diagonal * vector[1:], none])
         return self.diagonal * vector + lower + upper
 
     def as_matrix(self) -> jax.Array:
         """The dense (m, m) matrix."""
-        off = self.off_diagonal
-        return jnp.diag(self.diagonal) + jnp.diag(off, 1) + jnp.diag(off, -1)
+        m = self.diagonal.shape[0]
+        i = jnp.arange(m)
+        dense = jnp.zeros((m, m, *self.diagonal.shape[1:]), self.diagonal.dtype)
+        dense = dense.at[i, i].set(self.diagonal)
+        dense = dense.at[i[:-1], i[1:]].set(self.off_diagonal)
+        return dense.at[i[1:], i[:-1]].set(self.off_diagonal)
 
     def scaled(self, scale: jax.Array) -> "Tridiagonal":
         """`diag(scale) A diag(scale)`."""
