@@ -103,6 +103,92 @@ class MonteCarloCommand:
 
 
 @dataclasses.dataclass(frozen=True)
+class ChartCommand:
+    """Speed against accuracy: methods of integration and laws on one scene."""
+
+    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
+        "three_balls.toml"
+    )
+    """Study file, or the name of a bundled one; its [data] may be missing."""
+    velocity: tuple[float, ...] | None = None
+    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
+    shot: int = 1
+    """Which measured shot, counted from 1."""
+    methods: tuple[str, ...] | None = None
+    """Methods by name; default: those that the scene allows and that compile fast."""
+    full: bool = False
+    """The methods that compile slowly, too."""
+    no_gradients: bool = False
+    """Leave out the errors of the derivatives."""
+    batch: int = 256
+    """Impacts solved side by side."""
+    repeats: int = 5
+    """Timings of each entry, taken in turn."""
+    out: Path = Path("jimpact-chart.png")
+    """Picture (.png, .pdf, .svg), or a directory for it."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def run(self) -> int:
+        """Measure, print, draw."""
+        from jimpact.chart_command import run
+
+        return run(**vars(self))
+
+
+@dataclasses.dataclass(frozen=True)
+class StabilityCommand:
+    """Where methods of integration are right, wrong, gain energy or do not end."""
+
+    methods: tuple[str, ...] | None = None
+    """Methods by name; default: all that run in batches."""
+    full: bool = False
+    """All pairs of axes and 300 points over all of them besides."""
+    out: Path = Path("jimpact-stability.png")
+    """Picture (.png, .pdf, .svg), or a directory for it; pairs go beside it."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def run(self) -> int:
+        """Map, print, draw."""
+        from jimpact.stability_command import run
+
+        return run(**vars(self))
+
+
+@dataclasses.dataclass(frozen=True)
+class AdviseCommand:
+    """The simplest law and method that a scene needs, with the evidence."""
+
+    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
+        "three_balls.toml"
+    )
+    """Study file, or the name of a bundled one; its [data] may be missing."""
+    velocity: tuple[float, ...] | None = None
+    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
+    shot: int = 1
+    """Which measured shot, counted from 1."""
+    tolerance: float = 1e-2
+    """Model error that is allowed, over the largest velocity before."""
+    stiffness_range: tuple[float, float] | None = None
+    """Factors by which each stiffness may be off; default 0.1 10."""
+    samples: int = 128
+    """Draws of the unknown stiffnesses."""
+    seed: int = 0
+    """Seed of the draws."""
+    out: Path = Path("jimpact-advise.png")
+    """Picture (.png, .pdf, .svg), or a directory for it."""
+    json: bool = False
+    """Print JSON instead of text."""
+
+    def run(self) -> int:
+        """Advise, print, draw."""
+        from jimpact.advise_command import run
+
+        return run(**vars(self))
+
+
+@dataclasses.dataclass(frozen=True)
 class LawsCommand:
     """List the laws: what they say, when they are right and when they fail."""
 
@@ -139,6 +225,9 @@ Command = (
     Annotated[FitCommand, tyro.conf.subcommand("fit")]
     | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
     | Annotated[MonteCarloCommand, tyro.conf.subcommand("montecarlo")]
+    | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
+    | Annotated[StabilityCommand, tyro.conf.subcommand("stability")]
+    | Annotated[AdviseCommand, tyro.conf.subcommand("advise")]
     | Annotated[LawsCommand, tyro.conf.subcommand("laws")]
 )
 

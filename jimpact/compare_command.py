@@ -36,7 +36,7 @@ def run(
     try:
         path = picture_path(out, PICTURE)
         given = read_study(study)
-        before, measured = _velocities(given, velocity, shot)
+        before, measured = velocities(given, velocity, shot)
         found = compare(given.scene, before, registered_laws(given.parameters))
         fits = _fits(given) if fit else {}
         _draw(found, measured, given.title, path)
@@ -52,7 +52,7 @@ def run(
     return 0
 
 
-def _velocities(
+def velocities(
     study: Study, velocity: tuple[float, ...] | None, shot: int
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """Velocities before the impact, and after it where they were measured."""

@@ -1,0 +1,1 @@
+"""Hand-written and third-party loops that jimpact is compared with."""
