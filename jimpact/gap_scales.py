@@ -133,7 +133,7 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
     >>> from jimpact.gap_scales import crossover
     >>> balls = ji.chain([0.25, 1.0, 0.25])
     >>> found = crossover(balls, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0, -1.0], [-9.0, 0.0, 9.0])
-    >>> (found.velocity + 0.0).round(4).tolist()  # one by one, both at once, the mirror image
+    >>> (found.velocity.round(4) + 0.0).tolist()  # one by one, both at once, the mirror image
     [[-0.6, -0.16, 1.24], [-1.0, 0.0, 1.0], [-1.24, 0.16, 0.6]]
     """
     if scene.contacts != 2:

@@ -9,7 +9,7 @@ from jimpact.laws.lzb import LZB
 from jimpact.methods import METHODS
 from jimpact.methods.base import Method, outcome
 from jimpact.scenes import chain
-from jimpact.stability_causes import frequencies
+from jimpact.stability_causes import RECLOSING, frequencies
 from jimpact.stability_points import AXES, chain_of
 from jimpact.stability_runs import DEFAULT, Found, runner
 from jimpact.status import CODE
@@ -64,8 +64,7 @@ def references(points: np.ndarray, runners: Runners) -> tuple[list[np.ndarray], 
     for at, balls, linear in groups(points):
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
-        method = METHODS["propagator"] if linear else DEFAULT
-        found = runners.run(method, balls, linear, rows, REFERENCE_RTOL)
+        found = runners.run(DEFAULT, balls, linear, rows, REFERENCE_RTOL)
         ended = (found.code == CODE["ok"]) | (found.code == CODE["plastic_limit"])
         velocity = np.where(ended[:, None], found.velocity, np.nan)
         for i, k in zip(at, np.ravel(back)):
@@ -89,7 +88,9 @@ def _confirm(points: np.ndarray, exact: list[np.ndarray]) -> Confirmation:
 
 def _is_quick(point: np.ndarray) -> bool:
     highest, apart = frequencies(point)
-    return highest * apart < QUICK_UP_TO and point[AXES.index("balls")] <= QUICK_BALLS
+    parts = point[AXES.index("restitution")] >= RECLOSING  # else scipy may end it too early
+    few = point[AXES.index("balls")] <= QUICK_BALLS
+    return bool(parts and few and highest * apart < QUICK_UP_TO)
 
 
 def _by_scipy(point: np.ndarray) -> np.ndarray:

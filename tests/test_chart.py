@@ -21,6 +21,8 @@ from jimpact.methods import METHODS, outcome, time_scale
 from jimpact.plot_chart import plot_work_precision
 from jimpact.status import STATUS
 
+pytestmark = pytest.mark.slow  # compiles every method
+
 BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 HERTZ = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.5)
 HERTZ_AFTER = [-0.0086153561548806457087, 0.10414279851550412011, 0.9044725576393765256]

@@ -128,6 +128,16 @@ def test_known_silent_failure_after_many_steps(point):
     assert is_right_or_flagged(point, MANY_STEPS)
 
 
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="error 1e-3 with status ok: middle balls lighter than 0.003")
+def test_known_silent_failure_of_the_propagator():
+    law = ji.LZB(0.9, 1.0, 1.0, method="propagator")
+    out = ji.impact(law, ji.chain([1.0, 1e-3, 1.0]), [1.0, 0.0, 0.0])
+    expected = [0.07522166001736, 0.74823140950437, 0.92403010857313]
+    right = np.abs(np.asarray(out.velocity) - expected).max() < HONEST * RTOL
+    assert right or STATUS[int(out.status)].failure
+
+
 def test_points_are_those_of_the_script():
     assert len(HELD["points"]) == 300
     np.testing.assert_allclose(HELD["points"], stability_reference.points(), rtol=1e-12)
@@ -228,6 +238,7 @@ THIRTY = {  # the first three and the last three
 }
 
 
+@pytest.mark.slow
 def test_ten_balls():
     """Right where Siconos ends with 981 times the energy; long chains re-close below e = 0.5."""
 
@@ -359,6 +370,7 @@ def small_map():
     return stability_map(("rk4", "verlet"), axes, slices="pairs", samples=3, max_steps=2000)
 
 
+@pytest.mark.slow
 def test_map():
     found = small_map()
     assert found.methods == ("rk4", "verlet")
