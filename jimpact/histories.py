@@ -147,8 +147,7 @@ def _history(law: Sampled, scene: Scene, v: jax.Array, samples: int, records: in
     flow, control, start, units = _setup(law, scene, v)
 
     def keep(carry: stepper.Carry, _: None) -> tuple[stepper.Carry, stepper.Carry]:
-        after = stepper.advance(flow, control, carry)
-        after = jax.tree.map(lambda a, b: jnp.where(carry.done, a, b), carry, after)
+        after = stepper.advance(flow, control, carry, ~carry.done)
         return after, after
 
     end, rest = jax.lax.scan(keep, start, None, length=records)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
@@ -21,8 +20,7 @@ from jimpact.numerics.dimensionless import (
     control_of,
     flow_of,
     indentation,
-    plastic_remainder,
-    reclosing,
+    settled,
     status_of,
 )
 from jimpact.numerics.propagator import TERMS
@@ -51,22 +49,13 @@ def _solver(
             end = stepper.run(flow, control, start)
             whole = control._replace(closed_form=False)
             last = stepper.run(flow, whole, stepper.begin(flow, whole, inputs.gamma, x))
-            p, at_rest = _settled(flow, inputs, end)
+            p, at_rest = settled(flow, inputs.gamma, inputs.tolerance, end)
             return (p, last.state.t[0]), (status_of(end, at_rest), end.passes[0])
 
         (p, t), (code, passes) = both_modes(run)(given.inputs)
         return in_si(given, p, t, evaluations * passes, code)
 
     return solve
-
-
-def _settled(flow: stepper.Flow, inputs: Inputs, end: stepper.Carry) -> tuple[jax.Array, jax.Array]:
-    """Impulses with what is left of endless closings, as `dimensionless.solve` has them."""
-    at_rest = reclosing(end, inputs.tolerance)
-    p = end.state.p + plastic_remainder(flow, inputs.gamma, end.state.p, at_rest)
-    quiet = jnp.abs(end.state.g) <= 2 * stepper.WIDENED * inputs.tolerance
-    beside = jnp.any(at_rest) & quiet & (inputs.gamma + flow.coupling @ p < 0)
-    return p + plastic_remainder(flow, inputs.gamma, p, at_rest | beside), at_rest
 
 
 def _linear_only(law: Law, scene: Scene) -> str | None:

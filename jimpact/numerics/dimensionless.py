@@ -17,7 +17,7 @@ from jimpact.numerics.contacts import along_contacts, any_of
 from jimpact.numerics.flow import Exponent, Flow, Viscous, apply
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
 METHODS = ("time", "propagator", "impulse")
@@ -154,20 +154,29 @@ def solve(
         control = control_of(given, tighten, max_steps, method)
         control = control._replace(closed_form=force is None)
         end = stepper.run(flow, control, stepper.begin(flow, control, given.gamma, x))
-        at_rest = reclosing(end, given.tolerance)
-        p = end.state.p + plastic_remainder(flow, given.gamma, end.state.p, at_rest)
-        # errors of many closings add up: contacts beside them may be left with an approach
-        beside = (
-            any_of(at_rest)
-            & _quiet(end, given.tolerance)
-            & (given.gamma + apply(flow.coupling, p) < 0)
-        )
-        p = p + plastic_remainder(flow, given.gamma, p, at_rest | beside)
+        p, at_rest = settled(flow, given.gamma, given.tolerance, end)
         return p, status_of(end, at_rest)
 
     # a batch of its own order of axes; a user's force knows but one impact
     columns = method == "time" and viscous is None
     return both_modes(run, columns)((inputs, viscous))
+
+
+def settled(
+    flow: Flow, gamma: jax.Array, tolerance: jax.Array, end: stepper.Carry
+) -> tuple[jax.Array, jax.Array]:
+    """Impulses once endless re-closing has come to its limit, and the contacts left at rest."""
+    at_rest = reclosing(end, tolerance)
+
+    def come_to_rest(p: jax.Array) -> jax.Array:
+        p = p + plastic_remainder(flow, gamma, p, at_rest)
+        # errors of many closings add up: contacts beside them may be left with an approach
+        approaching = gamma + apply(flow.coupling, p) < 0
+        beside = any_of(at_rest) & _quiet(end, tolerance) & approaching
+        return p + plastic_remainder(flow, gamma, p, at_rest | beside)
+
+    p = jax.lax.cond(jnp.any(at_rest), come_to_rest, lambda p: p, end.state.p)
+    return p, at_rest
 
 
 def reclosing(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
@@ -189,11 +198,15 @@ def status_of(end: stepper.Carry, at_rest: jax.Array) -> jax.Array:
 
 def plastic_remainder(flow: Flow, gamma: jax.Array, p: jax.Array, at_rest: jax.Array) -> jax.Array:
     """Impulses that bring the contacts `at_rest` to exactly gamma+ = 0: the limit they approach."""
-    g = as_matrix(flow.coupling)
+    g, none = flow.coupling, jnp.zeros_like(p)
+    missing = jnp.where(at_rest, -(gamma + apply(g, p)), none)
+    ridge = RIDGE * float(jnp.finfo(p.dtype).eps)
+    if isinstance(g, Tridiagonal):
+        both = at_rest[1:] & at_rest[:-1]
+        off = jnp.where(both, g.off_diagonal, none[1:])
+        return Tridiagonal(none + 1 + ridge, off).solve(missing)
     both = at_rest[:, None] & at_rest[None, :]
     unit = jnp.eye(g.shape[0], dtype=g.dtype).reshape(g.shape[:2] + (1,) * (g.ndim - 2))
-    ridge = RIDGE * float(jnp.finfo(g.dtype).eps)
-    missing = jnp.where(at_rest, -(gamma + apply(flow.coupling, p)), 0.0)
     matrix = jnp.where(both, g, unit) + ridge * unit
     if g.ndim == 2:
         return jnp.linalg.solve(matrix, missing)

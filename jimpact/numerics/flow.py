@@ -43,6 +43,7 @@ from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 TIME, START, ZERO_G, ROOT_X, FROM_GAP, ONSET = 0, 1, 2, 3, 4, 5  # variable of a step
 OPEN, COMPRESSION, EXPANSION = 0, 1, 2  # phase of a contact
 
+LARGE = 6.0  # exponents below it that are whole or half are products
 UNROLLED = 8  # products with a matrix of this size are written out, without a reduction
 
 Exponent = float | tuple[float, ...] | jax.Array
@@ -114,18 +115,17 @@ def lands(kind: jax.Array) -> jax.Array:
 
 
 def power(x: jax.Array, exponent: Exponent) -> jax.Array:
-    """`max(x, 0)^exponent` with finite derivatives at 0; fast for static 1, 1.5 and 2."""
+    """`max(x, 0)^exponent` with finite derivatives at 0; fast for static halves."""
     if isinstance(exponent, tuple) and len(set(exponent)) == 1:
         exponent = exponent[0]
     if isinstance(exponent, float) and exponent == 1.0:
         return jnp.where(x >= 0, x, 0.0)  # at 0 the derivative of a contact that closes
     positive = x > 0
     x = jnp.where(positive, x, 0.0)
-    if isinstance(exponent, float):
-        if exponent == 2.0:
-            return x * x
-        if exponent == 1.5:
-            return x * jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+    if isinstance(exponent, float) and exponent < LARGE and (2 * exponent).is_integer():
+        root = jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+        whole = [x] * int(exponent)
+        return functools.reduce(jnp.multiply, whole if exponent.is_integer() else [*whole, root])
     eta = along_contacts(jnp.asarray(exponent, x.dtype), x)
     return jnp.where(positive, jnp.exp(eta * jnp.log(jnp.where(positive, x, 1.0))), 0.0)
 
@@ -183,14 +183,18 @@ def rates_of(flow: Flow, phase: jax.Array) -> Rates:
     return Rates(unit, ratio, jnp.where(phase == OPEN, 0.0, closing), stiffness)
 
 
+def push(flow: Flow, phase: jax.Array, rates: Rates, x: jax.Array, g: jax.Array) -> jax.Array:
+    """Force, without `unit`: p' = unit * push with respect to time in units of `s*`."""
+    if flow.viscous is None:
+        return rates.stiffness * power(x, flow.exponent)
+    return jnp.where(phase == OPEN, 0.0, flow.viscous.push(x, g))
+
+
 def field(
     flow: Flow, phase: jax.Array, rates: Rates, x: jax.Array, g: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`(x', g', p')` with respect to time in units of `s*`, phases frozen."""
-    if flow.viscous is None:
-        force = rates.stiffness * power(x, flow.exponent)
-    else:
-        force = jnp.where(phase == OPEN, 0.0, flow.viscous.push(x, g))
+    force = push(flow, phase, rates, x, g)
     return rates.closing * g, rates.ratio * apply(flow.coupling, force), rates.unit * force
 
 
@@ -208,41 +212,45 @@ def step(
 
     `target` (m,) is one-hot: the contact whose event ends a ZERO_G or ROOT_X step. Returns the
     end state and the two error estimates. The stages are a loop of matrix products: unrolled,
-    the derivative takes seven times as long to compile.
+    the derivative takes seven times as long to compile. They keep x' and the force only: g' is
+    linear in the force.
     """
-    dtype, r, count = state.x.dtype, root_order(flow.exponent), len(tableau.c)
+    dtype, r, count, m = state.x.dtype, root_order(flow.exponent), len(tableau.c), state.x.shape[0]
     dense = np.array([[*row, *[0.0] * (count - len(row))] for row in tableau.a])
     a, b, c = (jnp.asarray(z, dtype) for z in (dense, tableau.b, tableau.c))
     known_x = target & ((kind == ROOT_X) | (kind == FROM_GAP))
     known_g = target & (kind == ZERO_G)
     rates = rates_of(flow, phase)
 
-    def stage(i: jax.Array, carried: tuple[Slopes, jax.Array]) -> tuple[Slopes, jax.Array]:
+    def stage(i: jax.Array, carried: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         slopes, elapsed = carried
-        row = jax.lax.dynamic_index_in_dim(a, i, keepdims=False)
         xi = start + c[i] * length
+        row = jax.lax.dynamic_index_in_dim(a, i, keepdims=False)
+        change = length * jnp.tensordot(row, slopes, axes=1)
         # the variable of the step is known exactly at every stage
-        x = state.x + length * jnp.tensordot(row, slopes.x, axes=1)
+        x = state.x + change[:m]
         x = jnp.where(known_x, jnp.where(kind == FROM_GAP, xi, xi**r), x)
-        g = jnp.where(known_g, xi, state.g + length * jnp.tensordot(row, slopes.g, axes=1))
-        dx, dg, dp = field(flow, phase, rates, x, g)
+        g = state.g + rates.ratio * apply(flow.coupling, change[m:])
+        g = jnp.where(known_g, xi, g)
+        force = push(flow, phase, rates, x, g)
+        dx, dg = rates.closing * g, rates.ratio * apply(flow.coupling, force)
         turning = dx
         if flow.slackens:
             turning = jax.jvp(flow.viscous.onset, (x, g), (dx, dg))[1]  # type: ignore[union-attr]
             turning = jnp.where(kind == ONSET, turning, dx)
         dt = _stretch(kind, target, xi, turning, dg, r)
-        kept = zip(slopes, (dx * dt, dg * dt, dp * dt))
-        rows = (jax.lax.dynamic_update_index_in_dim(all_, new, i, 0) for all_, new in kept)
-        return Slopes(*rows), elapsed + b[i] * dt
+        new = jnp.concatenate([dx * dt, force * dt])
+        return jax.lax.dynamic_update_index_in_dim(slopes, new, i, 0), elapsed + b[i] * dt
 
-    none = jnp.zeros((count, *state.x.shape), dtype)
-    slopes, elapsed = jax.lax.fori_loop(
-        0, count, stage, (Slopes(none, none, none), jnp.zeros_like(start))
-    )
+    none = jnp.zeros((count, 2 * m, *state.x.shape[1:]), dtype)
+    slopes, elapsed = jax.lax.fori_loop(0, count, stage, (none, jnp.zeros_like(start)))
     weights = jnp.asarray([tableau.b, tableau.error_high, tableau.error_low], dtype)
-    change, high, low = (
-        Slopes(*(length * jnp.tensordot(w, rows, axes=1) for rows in slopes)) for w in weights
-    )
+
+    def sums(row: jax.Array) -> Slopes:
+        x, q = length * row[:m], length * row[m:]
+        return Slopes(x, rates.ratio * apply(flow.coupling, q), rates.unit * q)
+
+    change, high, low = (sums(row) for row in jnp.tensordot(weights, slopes, axes=1))
     end = State(
         jnp.where(known_x, 0.0, state.x + change.x),
         jnp.where(known_g, start + length, state.g + change.g),

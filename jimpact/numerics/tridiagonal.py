@@ -22,6 +22,31 @@ class Tridiagonal(eqx.Module):
         upper = jnp.concatenate([self.off_diagonal * vector[1:], none])
         return self.diagonal * vector + lower + upper
 
+    def solve(self, vector: jax.Array) -> jax.Array:
+        """`A^-1 vector` for a positive definite matrix, in O(m)."""
+        none = jnp.zeros_like(vector[:1])
+        first = jnp.ones_like(none), none, none
+
+        def eliminate(
+            row: tuple[jax.Array, ...], given: tuple[jax.Array, ...]
+        ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+            pivot, right, before = row  # of the row above, and its off-diagonal entry
+            diagonal, known, after = (x[None] for x in given)
+            factor = before / pivot
+            reduced = diagonal - factor * before, known - factor * right, after
+            return reduced, reduced
+
+        after = jnp.concatenate([self.off_diagonal, none])
+        _, (pivot, right, after) = jax.lax.scan(eliminate, first, (self.diagonal, vector, after))
+
+        def substitute(found: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+            pivot, right, after = row
+            found = (right - after * found) / pivot
+            return found, found
+
+        rows = pivot, right, after
+        return jax.lax.scan(substitute, none, rows, reverse=True)[1].reshape(vector.shape)
+
     def as_matrix(self) -> jax.Array:
         """The dense (m, m) matrix."""
         m = self.diagonal.shape[0]
