@@ -129,7 +129,7 @@ def _setup(
         scene.gaps if gapped else None,
     )
     flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal))
-    control = control_of(inputs, 1.0, law.max_steps, "time")._replace(closed_form=False)
+    control = control_of(inputs, law.max_steps, "time")._replace(closed_form=False)
     x = indentation(inputs, flow.exponent)
     start = stepper.begin(flow, control, inputs.gamma, x)
     # nothing happens: over before it begins

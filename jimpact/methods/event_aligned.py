@@ -15,7 +15,6 @@ from jimpact.laws.lzb import LZB
 from jimpact.methods.base import Method, MethodResult, in_si, lzb_only, problem
 from jimpact.numerics import stepper
 from jimpact.numerics.dimensionless import (
-    GRADIENT_TIGHTENING,
     Inputs,
     control_of,
     flow_of,
@@ -42,8 +41,7 @@ def _solver(
 
         def run(inputs: Inputs, differentiated: bool) -> tuple[Any, Any]:
             flow = flow_of(inputs, static, given.chain)  # type: ignore[arg-type]
-            tighten = GRADIENT_TIGHTENING if differentiated else 1.0
-            control = control_of(inputs, tighten, given.max_steps, name)._replace(**options)
+            control = control_of(inputs, given.max_steps, name, differentiated)._replace(**options)
             x = indentation(inputs, flow.exponent)
             start = stepper.begin(flow, control, inputs.gamma, x)
             end = stepper.run(flow, control, start)

@@ -6,11 +6,13 @@ a core's cache; each piece ends with its own slowest member.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
+
+Result = TypeVar("Result")
 
 CHUNK = 1024  # impacts solved side by side on a CPU: their stages fill about half a megabyte
 
@@ -51,6 +53,20 @@ def in_columns(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return _marked(out, True)
 
     return alone
+
+
+def by_itself(function: Callable[[], Result], like: jax.Array) -> Result:
+    """`function()`; where `like` (k, B) is a batch, as a computation of its own.
+
+    XLA would compute its results again in each operation that uses them, ten times over in all.
+    """
+    if like.ndim == 1:
+        return function()
+    shapes = jax.eval_shape(function)
+    always = jnp.any(like != jnp.inf)  # the compiler cannot know
+    return jax.lax.cond(
+        always, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    )
 
 
 def _all(size: int, mapped: tuple[Any], inputs: Any) -> Any:

@@ -122,13 +122,16 @@ def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
     return Flow(coupling, inputs.omega, inputs.restitution, eta, inputs.gap is not None)
 
 
-def control_of(inputs: Inputs, tighten: float, max_steps: int, method: str) -> stepper.Control:
-    """Local tolerances, not below rounding."""
+def control_of(
+    inputs: Inputs, max_steps: int, method: str, differentiated: bool = False
+) -> stepper.Control:
+    """How to step; local tolerances are not below rounding."""
     floor = ROUNDING_FLOOR * float(jnp.finfo(inputs.gamma.dtype).eps)
+    tighten = GRADIENT_TIGHTENING if differentiated else 1.0
     tolerance = jnp.maximum(tighten * inputs.tolerance, floor)
-    return stepper.Control(
-        tolerance, max_steps, step=propagate if method == "propagator" else stepper.explicit_step
-    )
+    explicit = stepper.differentiated_step if differentiated else stepper.explicit_step
+    step = propagate if method == "propagator" else explicit
+    return stepper.Control(tolerance, max_steps, step, halving=not differentiated)
 
 
 def solve(
@@ -150,8 +153,7 @@ def solve(
         x = indentation(given, flow.exponent)
         if method == "impulse":
             return _walk(flow, given, max_steps)
-        tighten = GRADIENT_TIGHTENING if differentiated else 1.0
-        control = control_of(given, tighten, max_steps, method)
+        control = control_of(given, max_steps, method, differentiated)
         control = control._replace(closed_form=force is None)
         end = stepper.run(flow, control, stepper.begin(flow, control, given.gamma, x))
         p, at_rest = settled(flow, given.gamma, given.tolerance, end)

@@ -7,13 +7,14 @@ from each other and press no other contact, the rest follows from the energy in 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import events, isolated, side_by_side
 from jimpact.numerics import flow as flows
+from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import all_of, any_of, first_least, largest, least, of
 from jimpact.numerics.flow import (
     COMPRESSION,
@@ -43,9 +44,6 @@ PATIENCE = 2000  # passes per contact after which an impact is let end at WIDENE
 WIDENED = 100.0
 WORTH_HALVING = 600  # impacts of a batch: fewer gain less than a second loop takes to compile
 CUT_SHORT = 0.7  # part of the way to an event that a step stops at where it cannot land
-
-
-Result = TypeVar("Result")
 
 
 class Carry(NamedTuple):
@@ -79,6 +77,11 @@ def explicit_step(
     return flows.step(flow, phase, state, kind, target, start, length)
 
 
+def differentiated_step(*given: Any) -> tuple[State, Slopes, Slopes]:
+    """`explicit_step` for derivatives in batches."""
+    return flows.step(*given[:7], apart=given[0].omega.ndim > 1)
+
+
 class Control(NamedTuple):
     """Local tolerance (m,) of each contact, pass limit, and how to step and to finish."""
 
@@ -86,6 +89,7 @@ class Control(NamedTuple):
     max_steps: int
     step: Callable[..., tuple[State, Slopes, Slopes]] = explicit_step
     closed_form: bool = True
+    halving: bool = True
 
 
 def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry:
@@ -134,7 +138,7 @@ def run(flow: Flow, control: Control, carry: Carry) -> Carry:
         )
 
     batch = carry.h.shape[1:]
-    if not batch or batch[0] < WORTH_HALVING:
+    if not batch or batch[0] < WORTH_HALVING or not control.halving:
         return passes(flow, control, carry, 0)
     # half of a batch takes a third longer than the other one, which does not wait for it
     size, half = batch[0], batch[0] // 2
@@ -155,32 +159,18 @@ def advance(flow: Flow, control: Control, carry: Carry, active: jax.Array) -> Ca
     # where events lie and how long steps are is decided, not differentiated
     h, due, begun = jax.lax.stop_gradient((carry.h, carry.due, carry.begun))
     carry = carry._replace(h=h, due=due, begun=begun)
-    reached, error = by_itself(lambda: _try(flow, control, carry), carry)
-    verdict = by_itself(lambda: _judge(flow, control, carry, reached, error), carry)
-    moved, new_phase, closed = by_itself(lambda: _move(flow, carry, reached, verdict), carry)
+    reached, error = by_itself(lambda: _try(flow, control, carry), carry.h)
+    verdict = by_itself(lambda: _judge(flow, control, carry, reached, error), carry.h)
+    moved, new_phase, closed = by_itself(lambda: _move(flow, carry, reached, verdict), carry.h)
     out = by_itself(
-        lambda: _next_step(flow, carry, verdict, error, moved, new_phase, closed), carry
+        lambda: _next_step(flow, carry, verdict, error, moved, new_phase, closed), carry.h
     )
 
     def end() -> Carry:
         after = _finish(flow, control, _fly(flow, out) if flow.gapped else out)
         return jax.tree.map(lambda a, b: jnp.where(active, a, b), after, before)
 
-    return by_itself(end, carry)
-
-
-def by_itself(function: Callable[[], Result], carry: Carry) -> Result:
-    """`function()`; in a batch as a computation of its own.
-
-    XLA would compute its results again in each operation that uses them, ten times over in all.
-    """
-    if carry.phase.ndim == 1:
-        return function()
-    shapes = jax.eval_shape(function)
-    always = jnp.any(carry.passes >= 0)
-    return jax.lax.cond(
-        always, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    )
+    return by_itself(end, carry.h)
 
 
 class Verdict(NamedTuple):
