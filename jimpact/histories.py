@@ -21,7 +21,7 @@ from jimpact.numerics.dimensionless import (
     status_of,
     to_dimensionless,
 )
-from jimpact.numerics.flow import START, TIME, State, factor, plus_one, power, root_order, scales
+from jimpact.numerics.flow import START, TIME, State, factor, plus_one, power, scales
 from jimpact.numerics.tridiagonal import Tridiagonal
 from jimpact.rheology import Bistiffness
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
@@ -128,7 +128,7 @@ def _setup(
         law.rtol or default_rtol("time", v.dtype),
         scene.gaps if gapped else None,
     )
-    flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal))
+    flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal), differentiated=True)
     control = control_of(inputs, law.max_steps, "time")._replace(closed_form=False)
     x = indentation(inputs, flow.exponent)
     start = stepper.begin(flow, control, inputs.gamma, x)
@@ -192,7 +192,7 @@ def _between(
 ) -> tuple[State, jax.Array]:
     """State and gap velocities at time `t`, by one step from the record before it."""
     s, unit, _ = scales(flow, carry.phase)
-    r = root_order(flow.exponent)
+    r = flow.root
     starting = carry.kind == START
     xi = jnp.where(starting, carry.begun, 0.0)
     ahead = jnp.where(unit > 0, (t - carry.state.t) / jnp.where(unit > 0, unit, 1.0), 0.0)

@@ -31,7 +31,7 @@ from jimpact.numerics.flow import (
     State,
     lands,
     rates_of,
-    root_order,
+    root_of,
 )
 
 FIRST_TIME = 0.05  # of the fastest contact's time scale: no contact can turn around so soon
@@ -106,7 +106,7 @@ def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry
     state = State(x, g, jnp.zeros_like(gamma), zero)
     if flow.slackens:
         state = events.jumped(flow, state, (x == 0) & (gamma < 0))
-    first = FIRST_TIME ** (1 / root_order(flow.exponent))
+    first = FIRST_TIME ** (1 / flow.root)
     carry = Carry(
         state=state,
         phase=phase,
@@ -246,7 +246,7 @@ def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, ja
     closing = carry.target & (carry.phase == OPEN)  # closes once its approach matters
     g_end = -events.NEGLIGIBLE * of(closing, control.tolerance)
     safe = jnp.where(x > 0, x, 1.0)
-    root = jnp.sqrt(safe) if root_order(flow.exponent) == 2 else jnp.sqrt(jnp.sqrt(jnp.sqrt(safe)))
+    root = root_of(safe, flow.root)
     root = jnp.where(x > 0, root, 0.0)
     onset = jnp.zeros_like(x)
     if flow.slackens:
@@ -260,7 +260,7 @@ def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, ja
 
 def _span(flow: Flow, carry: Carry) -> jax.Array:
     """Time the step takes, or is expected to take."""
-    r = root_order(flow.exponent)
+    r = flow.root
     in_start = (carry.begun + carry.h) ** r - carry.begun**r
     landing = lands(carry.kind)
     return jnp.select([landing, carry.kind == START], [carry.due, in_start], carry.h)
@@ -292,7 +292,7 @@ def _next_step(
 ) -> Carry:
     """Variable, target and length of the next step."""
     found, span, flips, inside, accept, broken = verdict
-    h, kind, begun, r = carry.h, carry.kind, carry.begun, root_order(flow.exponent)
+    h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.root
     landing = lands(kind)
     starting = kind == START
     eighth_root = jnp.sqrt(jnp.sqrt(jnp.sqrt(error + LEAST_ERROR)))
