@@ -13,7 +13,7 @@ import jax
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.base import Method, MethodResult, in_si, lzb_only, problem
-from jimpact.numerics import stepper
+from jimpact.numerics import stepper, windows
 from jimpact.numerics.dimensionless import (
     Inputs,
     control_of,
@@ -44,9 +44,9 @@ def _solver(
             control = control_of(inputs, given.max_steps, name, differentiated)._replace(**options)
             x = indentation(inputs, flow.exponent)
             start = stepper.begin(flow, control, inputs.gamma, x)
-            end = stepper.run(flow, control, start)
+            end = windows.run(flow, control, start)
             whole = control._replace(closed_form=False)
-            last = stepper.run(flow, whole, stepper.begin(flow, whole, inputs.gamma, x))
+            last = windows.run(flow, whole, stepper.begin(flow, whole, inputs.gamma, x))
             p, at_rest = settled(flow, inputs.gamma, inputs.tolerance, end)
             return (p, last.state.t[0]), (status_of(end, at_rest), end.passes[0])
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics import impulse_form, stepper
+from jimpact.numerics import impulse_form, stepper, windows
 from jimpact.numerics.contacts import along_contacts, any_of
 from jimpact.numerics.flow import Exponent, Flow, Viscous, apply, root_order
 from jimpact.numerics.propagator import propagate
@@ -156,7 +156,7 @@ def solve(
             return _walk(flow, given, max_steps)
         control = control_of(given, max_steps, method, differentiated)
         control = control._replace(closed_form=force is None)
-        end = stepper.run(flow, control, stepper.begin(flow, control, given.gamma, x))
+        end = windows.run(flow, control, stepper.begin(flow, control, given.gamma, x))
         p, at_rest = settled(flow, given.gamma, given.tolerance, end)
         return p, status_of(end, at_rest)
 

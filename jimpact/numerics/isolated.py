@@ -15,24 +15,42 @@ from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 RESIDUAL = 1.0  # loads and velocities below this part of the tolerance end the impact
 
 
+def at_work(
+    flow: Flow, tolerance: jax.Array, phase: jax.Array, state: State, part: float
+) -> jax.Array:
+    """Contacts (m,) loaded or approaching by more than `part` of the tolerance."""
+    s, _, _ = scales(flow, phase)
+    loaded = (state.x > 0) & (phase != OPEN)  # a slack contact is not
+    return (loaded | (s * state.g < 0)) & matters(flow, tolerance, state, part)
+
+
 def finish(
-    flow: Flow, tolerance: jax.Array, phase: jax.Array, state: State, closed_form: bool
+    flow: Flow,
+    tolerance: jax.Array,
+    phase: jax.Array,
+    state: State,
+    closed_form: bool,
+    beyond: jax.Array | None = None,
 ) -> tuple[jax.Array, State]:
-    """Whether the rest follows in closed form (False: only where nothing is left), and the end."""
+    """Whether the rest follows in closed form (False: only where nothing is left), and the end.
+
+    Contacts marked `beyond` (m,) may press others that are not among these.
+    """
     s, _, _ = scales(flow, phase)
     gamma = s * state.g
-    loaded = (state.x > 0) & (phase != OPEN)  # a slack contact is not
-    at_work = (loaded | (gamma < 0)) & matters(flow, tolerance, state, RESIDUAL)
+    works = at_work(flow, tolerance, phase, state, RESIDUAL)
     total = power(state.x, plus_one(flow.exponent)) + state.g**2
-    rebound = flow.restitution * jnp.sqrt(jnp.where(at_work, total, 1.0))
-    dp = jnp.where(at_work, rebound - gamma, 0.0)
+    rebound = flow.restitution * jnp.sqrt(jnp.where(works, total, 1.0))
+    dp = jnp.where(works, rebound - gamma, 0.0)
     strength, pull = _beside(flow.coupling)
-    coupled = at_work & (apply(strength, at_work.astype(gamma.dtype)) > 0)
-    pressed = ~at_work & (gamma + apply(pull, dp) < -RESIDUAL * tolerance)
-    alone = ~any_of(coupled | pressed) if closed_form else ~any_of(at_work)
+    coupled = works & (apply(strength, works.astype(gamma.dtype)) > 0)
+    if beyond is not None:
+        coupled |= works & beyond
+    pressed = ~works & (gamma + apply(pull, dp) < -RESIDUAL * tolerance)
+    alone = ~any_of(coupled | pressed) if closed_form else ~any_of(works)
     end = State(
         x=jnp.zeros_like(state.x),
-        g=jnp.where(at_work, rebound, gamma),
+        g=jnp.where(works, rebound, gamma),
         p=state.p + dp,
         t=state.t,
     )

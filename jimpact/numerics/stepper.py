@@ -79,7 +79,9 @@ def explicit_step(
 
 def differentiated_step(*given: Any) -> tuple[State, Slopes, Slopes]:
     """`explicit_step` for derivatives in batches."""
-    return flows.step(*given[:7], apart=given[0].omega.ndim > 1)
+    flow, phase, state, kind, target, start, length, *_ = given
+    apart = length.ndim > 1
+    return flows.step(flow, phase, state, kind, target, start, length, apart=apart)
 
 
 class Control(NamedTuple):
@@ -90,6 +92,7 @@ class Control(NamedTuple):
     step: Callable[..., tuple[State, Slopes, Slopes]] = explicit_step
     closed_form: bool = True
     halving: bool = True
+    beyond: jax.Array | None = None  # contacts whose neighbours are left out (`windows.py`)
 
 
 def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry:
@@ -380,8 +383,9 @@ def _patience(carry: Carry) -> jax.Array:
 
 def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
     """End the impact if nothing is left to integrate."""
+    tolerance = control.tolerance * _patience(carry)
     alone, end = isolated.finish(
-        flow, control.tolerance * _patience(carry), carry.phase, carry.state, control.closed_form
+        flow, tolerance, carry.phase, carry.state, control.closed_form, control.beyond
     )
     over = ~carry.done & alone
     return carry._replace(

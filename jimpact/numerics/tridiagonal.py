@@ -4,6 +4,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+Triple = tuple[jax.Array, jax.Array, jax.Array]
+
 
 class Tridiagonal(eqx.Module):
     """Symmetric tridiagonal matrix: `diagonal` (m,), `off_diagonal` (m - 1,).
@@ -27,11 +29,9 @@ class Tridiagonal(eqx.Module):
         none = jnp.zeros_like(vector[:1])
         first = jnp.ones_like(none), none, none
 
-        def eliminate(
-            row: tuple[jax.Array, ...], given: tuple[jax.Array, ...]
-        ) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]:
+        def eliminate(row: Triple, given: Triple) -> tuple[Triple, Triple]:
             pivot, right, before = row  # of the row above, and its off-diagonal entry
-            diagonal, known, after = (x[None] for x in given)
+            diagonal, known, after = given[0][None], given[1][None], given[2][None]
             factor = before / pivot
             reduced = diagonal - factor * before, known - factor * right, after
             return reduced, reduced
