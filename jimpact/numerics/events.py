@@ -153,11 +153,18 @@ def jumped(flow: Flow, state: State, closed: jax.Array) -> State:
 
 
 def next_opening(flow: Flow, phase: jax.Array, state: State) -> tuple[jax.Array, jax.Array]:
-    """Expected time to the next opening, and its contact (m,) one-hot."""
-    dx = rates_of(flow, phase).closing * state.g
-    expanding = (phase == EXPANSION) & (dx < 0)
+    """Expected time to the next opening, and its contact (m,) one-hot.
+
+    By a parabola: a contact that only creeps towards its opening, as behind a wave, has no root.
+    """
+    rates = rates_of(flow, phase)
+    dx, dg, _ = field(flow, phase, rates, state.x, state.g)
     x = jnp.maximum(state.x, 0.0)
-    due = jnp.where(expanding, x / jnp.where(expanding, -dx, 1.0), jnp.inf)
+    left = dx**2 - 2 * x * rates.closing * dg
+    opens = (phase == EXPANSION) & (dx < 0) & (left >= 0)
+    due = jnp.where(
+        opens, 2 * x / jnp.where(opens, jnp.sqrt(jnp.where(opens, left, 1)) - dx, 1), jnp.inf
+    )
     return least(due), first_least(due)
 
 
