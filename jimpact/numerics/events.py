@@ -30,6 +30,7 @@ from jimpact.numerics.flow import (
 
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
 NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact
+CREEP = 0.5  # part of its indentation that a contact loses at most before a foreseen turning
 SHORTEST = 1e-13  # a step this small cannot be resolved: the pending event is taken at once
 
 
@@ -152,20 +153,27 @@ def jumped(flow: Flow, state: State, closed: jax.Array) -> State:
     return state._replace(g=state.g + apply(flow.coupling, dp), p=state.p + dp)
 
 
-def next_opening(flow: Flow, phase: jax.Array, state: State) -> tuple[jax.Array, jax.Array]:
-    """Expected time to the next opening, and its contact (m,) one-hot.
+def ahead(
+    flow: Flow, tolerance: jax.Array, phase: jax.Array, state: State
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Expected time to the next event, its contact (m,) one-hot, and whether it is an opening.
 
-    By a parabola: a contact that only creeps towards its opening, as behind a wave, has no root.
+    Openings by a parabola: a contact that only creeps towards its own, as behind a wave, has none.
     """
     rates = rates_of(flow, phase)
     dx, dg, _ = field(flow, phase, rates, state.x, state.g)
     x = jnp.maximum(state.x, 0.0)
     left = dx**2 - 2 * x * rates.closing * dg
     opens = (phase == EXPANSION) & (dx < 0) & (left >= 0)
-    due = jnp.where(
-        opens, 2 * x / jnp.where(opens, jnp.sqrt(jnp.where(opens, left, 1)) - dx, 1), jnp.inf
-    )
-    return least(due), first_least(due)
+    speed = jnp.sqrt(jnp.where(opens, left, 1.0)) - dx
+    at_x = jnp.where(opens, 2 * x / jnp.where(opens, speed, 1.0), jnp.inf)
+    margin, slope = _signs(phase) * state.g, _signs(phase) * dg
+    # the indentation is to change little until then: a contact that creeps has no turning either
+    turns = (margin > tolerance) & (slope < 0) & (margin * jnp.abs(dx) < -CREEP * slope * x)
+    at_g = jnp.where(turns, margin / jnp.where(turns, -slope, 1.0), jnp.inf)
+    by_opening = least(at_x) <= least(at_g)
+    due = jnp.where(by_opening, at_x, at_g)
+    return least(due), first_least(due), by_opening
 
 
 def _signs(phase: jax.Array) -> jax.Array:

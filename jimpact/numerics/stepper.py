@@ -39,7 +39,7 @@ RESTART = 0.1  # first START step after a closing, as a part of the step before 
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 LEAST_ERROR = 1e-10  # in tolerances; keeps the growth factor finite
 WIDE_GAP = 64  # eps of a gap: its error estimate is no more than rounding
-NEAR_OPENING = 1.0  # an expansion expected to end within so many steps is landed on
+NEAR = 1.0  # an event expected within so many steps is landed on
 PATIENCE = 2000  # passes per contact after which an impact is let end at WIDENED tolerances
 WIDENED = 100.0
 WORTH_HALVING = 600  # impacts of a batch: fewer gain less than a second loop takes to compile
@@ -166,7 +166,7 @@ def advance(flow: Flow, control: Control, carry: Carry, active: jax.Array) -> Ca
     verdict = by_itself(lambda: _judge(flow, control, carry, reached, error), carry.h)
     moved, new_phase, closed = by_itself(lambda: _move(flow, carry, reached, verdict), carry.h)
     out = by_itself(
-        lambda: _next_step(flow, carry, verdict, error, moved, new_phase, closed), carry.h
+        lambda: _next_step(flow, control, carry, verdict, error, moved, new_phase, closed), carry.h
     )
 
     def end() -> Carry:
@@ -286,6 +286,7 @@ def _error(control: Control, least: jax.Array, high: Slopes, low: Slopes) -> jax
 
 def _next_step(
     flow: Flow,
+    control: Control,
     carry: Carry,
     verdict: Verdict,
     error: jax.Array,
@@ -343,18 +344,21 @@ def _next_step(
         begun=begun,
         retargeted=land & landing,
     )
-    return _aim_at_opening(flow, out, accept)
+    return _aim(flow, control, out, accept)
 
 
-def _aim_at_opening(flow: Flow, carry: Carry, accepted: jax.Array) -> Carry:
-    """Turn the next step into a landing on the opening that is about to come."""
+def _aim(flow: Flow, control: Control, carry: Carry, accepted: jax.Array) -> Carry:
+    """Turn the next step into a landing on the event that is about to come."""
     if flow.slackens:
         return carry
     state = jax.lax.stop_gradient(carry.state)
-    due, target = events.next_opening(flows.frozen(flow), carry.phase, state)
-    aim = accepted & (carry.kind == TIME) & (due < NEAR_OPENING * carry.h)
+    due, target, by_opening = events.ahead(
+        flows.frozen(flow), control.tolerance, carry.phase, state
+    )
+    aim = accepted & (carry.kind == TIME) & (due < NEAR * carry.h)
+    aimed_at = jnp.where(by_opening, ROOT_X, ZERO_G)
     return carry._replace(
-        kind=jnp.where(aim, ROOT_X, carry.kind).astype(jnp.int32),
+        kind=jnp.where(aim, aimed_at, carry.kind).astype(jnp.int32),
         target=jnp.where(aim, target, carry.target),
         due=jnp.where(aim, due, carry.due),
     )
