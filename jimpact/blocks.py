@@ -18,7 +18,7 @@ from jimpact.status import CODE
 # Groups of unequal size are filled up to the largest of them: compiling one program more takes
 # longer than many impacts. A second one for the smaller groups must save this factor of entries
 # of W.
-WORTH_A_PROGRAM = 2
+WORTH_A_PROGRAM = 4
 
 # Contact indices (count, size), one array for each program; where a group is smaller, m plus
 # one of its contacts fills its row up. They are data, not structure: scenes whose groups differ in
