@@ -20,9 +20,10 @@ from jimpact.status import CODE
 # of W.
 WORTH_A_PROGRAM = 4
 
-# Contact indices (count, size), one array for each program; where a group is smaller, m plus
-# one of its contacts fills its row up. They are data, not structure: scenes whose groups differ in
-# their members only share the compiled impact.
+# Contact indices (count, size), one array for each program; where a group is smaller, m plus one of
+# its contacts fills its row up (one of its own: stored energy there is on the group's scale). They
+# are data, not structure: scenes whose groups differ in their members only share the compiled
+# impact.
 Groups = tuple[np.ndarray, ...]
 
 

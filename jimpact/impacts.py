@@ -40,6 +40,9 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
 
     Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
 
+    Contacts that no coordinate joins (two pairs of balls in one scene) are solved apart where the
+    scene is known, not traced, and the law allows it (`Law.by_blocks`); the outcome is the same.
+
     Args:
         law: its parameters are scalars or have one entry per contact.
         scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
