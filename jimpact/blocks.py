@@ -115,12 +115,12 @@ def solve_groups(
         return jnp.where(solved, p, 0.0), jnp.where(solved, code, CODE["ok"])
 
     for filled in groups:
-        index = filled % len(gamma)
+        index = jnp.asarray(filled % len(gamma))
         there = (filled < len(gamma)) & scene.closed[index]  # the others are like open contacts
         w = jnp.einsum("nca,ncb->cab", normals[:, index], moved[:, index])
         keep = (there[:, :, None] & there[:, None, :]) | jnp.eye(index.shape[1], dtype=bool)[None]
-        of_groups = (jnp.where(there, x[index], 0.0) for x in (gamma, stored))
-        given = index, jnp.where(keep, w, 0.0), *of_groups
+        own = (jnp.where(there, x[index], 0.0) for x in (gamma, stored))
+        given: list[jax.Array] = [index, jnp.where(keep, w, 0.0), *own]
         if len(index) == 1:
             part, code = of_group(*(x[0] for x in given))
         else:
