@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.laws.base import Law
+from jimpact.blocks import Groups, coupled_groups, solve_groups
+from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
 from jimpact.status import CODE, STATUS
@@ -39,6 +40,9 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
 
     Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
 
+    Contacts that no coordinate joins (two pairs of balls in one scene) are solved apart where the
+    scene is known, not traced, and the law allows it (`Law.by_blocks`); the outcome is the same.
+
     Args:
         law: its parameters are scalars or have one entry per contact.
         scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
@@ -61,12 +65,13 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
     check_values("velocity", v)
     _check_constrained(scene, v)
+    groups = coupled_groups(scene) if law.by_blocks() else None
     law, scene, v = in_common_dtype(law, scene, v)
     for name, value in vars(law).items():
         if isinstance(value, jax.Array) and value.ndim == 1 and len(value) != scene.contacts:
             check_shape(name, value, (scene.contacts,), "one entry per contact, or a scalar")
     law.check_options(v.dtype, scene)
-    return _impact(law, scene, v)
+    return _impact(law, scene, v, groups)
 
 
 def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
@@ -108,27 +113,32 @@ def without_open_contacts(
 
 
 @eqx.filter_jit
-def _impact(law: Law, scene: Scene, v: jax.Array) -> Impact:
-    w_all = delassus_matrix(scene)
+def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None) -> Impact:
     gamma_all = gap_velocity(scene, v)
-    w, gamma = (
-        (w_all, gamma_all) if law.uses_gaps else without_open_contacts(scene, w_all, gamma_all)
-    )
     taking_part = jnp.ones_like(scene.closed) if law.uses_gaps else scene.closed
+    gamma = jnp.where(taking_part, gamma_all, 0.0)
     stored = jnp.where(taking_part, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
     happens = jnp.any(gamma < 0) | jnp.any(stored > 0) | ~jnp.all(jnp.isfinite(gamma))
-    # where nothing happens the law sees a harmless approach, so that its gradients stay finite
-    approach = jnp.where(happens, gamma, -jnp.ones_like(gamma))
-    p, tangential, code = law.all_impulses(scene, w, approach, v)
+    if groups is None:
+        w_all = delassus_matrix(scene)
+        w = w_all if law.uses_gaps else without_open_contacts(scene, w_all, gamma)[0]
+        # where nothing happens the law sees a harmless approach, so its gradients stay finite
+        approach = jnp.where(happens, gamma, -jnp.ones_like(gamma))
+        p, tangential, code = law.all_impulses(scene, w, approach, v)
+        w_diagonal = diagonal(w)
+    else:
+        p, code, w_diagonal = solve_groups(law, scene, groups, gamma, stored, happens)
+        tangential = no_tangential_impulse(scene, p.dtype)
     p, tangential = jnp.where(happens, p, 0.0), jnp.where(happens, tangential, 0.0)
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
-    gamma_plus = gamma_all + (w_all @ p if tangential.size == 0 else gap_velocity(scene, jump))
+    by_delassus = groups is None and tangential.size == 0
+    gamma_plus = gamma_all + (w_all @ p if by_delassus else gap_velocity(scene, jump))
     change = 0.5 * jnp.sum((gamma_all + gamma_plus) * p)
     if scene.tangents is not None:
         change = change + 0.5 * jnp.sum((scene.tangents.T @ (v + v_plus)) * tangential)
     code = jnp.where(happens, code, CODE["ok"])
-    code = jnp.maximum(code, _signs(diagonal(w), gamma, gamma_plus, p, change, stored, taking_part))
+    code = jnp.maximum(code, _signs(w_diagonal, gamma, gamma_plus, p, change, stored, taking_part))
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     code = jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32)
     return Impact(v_plus, p, tangential, change, jnp.sum(stored), code)

@@ -216,7 +216,7 @@ def dense_mass(scene: Scene) -> np.ndarray:
     return np.diag(mass) if mass.ndim == 1 else mass
 
 
-def _solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
+def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
     """`M^-1 right`, with the reactions of bilateral constraints where the scene has some."""
     if scene.mass.ndim == 1:
         shape = (-1,) + (1,) * (right.ndim - 1)
@@ -226,7 +226,7 @@ def _solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
     if scene.constraints is None:
         return free
     h = scene.constraints
-    m_inv_h = _solve_mass(without_constraints(scene), h)
+    m_inv_h = solve_mass(without_constraints(scene), h)
     return free - m_inv_h @ jnp.linalg.solve(h.T @ m_inv_h, h.T @ free)
 
 
@@ -238,7 +238,7 @@ def velocity_change(
         push = scene.normals @ impulse
         if scene.tangents is not None and tangential is not None:
             push = push + scene.tangents @ tangential
-        return _solve_mass(scene, push)
+        return solve_mass(scene, push)
     left, right = scene.walls
     padded = jnp.pad(impulse, (int(not left), int(not right)))
     return -jnp.diff(padded) / scene.mass
@@ -254,7 +254,7 @@ def delassus_matrix(scene: Scene) -> Symmetric:
     [1.5, 1.0]
     """
     if scene.walls is None:
-        return scene.normals.T @ _solve_mass(scene, scene.normals)
+        return scene.normals.T @ solve_mass(scene, scene.normals)
     left, right = scene.walls
     inverse = 1 / scene.mass
     padded = jnp.pad(inverse, (int(left), int(right)))

@@ -25,6 +25,7 @@ class Law(eqx.Module):
     """
 
     uses_gaps: ClassVar[bool] = False
+    pulls: ClassVar[bool] = False  # separating contacts, too, if anything happens anywhere
 
     @abc.abstractmethod
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -39,6 +40,14 @@ class Law(eqx.Module):
         """
         p, code = self.impulse(delassus, gap_velocity)
         return p, no_tangential_impulse(scene, p.dtype), code
+
+    def by_blocks(self) -> bool:
+        """Whether contacts that W does not couple may be solved apart, `impulse` group by group.
+
+        True promises that the law itself couples no contacts, needs nothing but `impulse`, and
+        that its arrays (m,) hold one entry per contact.
+        """
+        return False
 
     def stored_energy(self, contacts: int) -> jax.Array:
         """Energy (m,) [J] stored in the contacts before the impact."""

@@ -159,6 +159,10 @@ class LZB(Law):
                 f"but has value {self.rtol:g}: enable jax_enable_x64 for finer tolerances."
             )
 
+    def by_blocks(self) -> bool:
+        """Contacts feel each other through W only; a tuple of exponents belongs to all of them."""
+        return not isinstance(self.exponent_static, tuple)
+
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Impulses at the end of the impact dynamics."""
         m = gap_velocity.shape[0]

@@ -48,6 +48,10 @@ class Moreau(Law):
             check_square("restitution", self.restitution)
             check_values("restitution", self.restitution)
 
+    def by_blocks(self) -> bool:
+        """Contacts feel each other through W only, unless by a matrix E."""
+        return self.restitution.ndim < 2
+
     def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
         """A matrix must have one row and one column per contact."""
         if self.restitution.ndim == 2:

@@ -1,6 +1,6 @@
 """Newton's law: the diagonal kinematic law `gamma+ = -e gamma-`, contact by contact."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -31,11 +31,17 @@ class Newton(Law):
     [0.25, 0.75]
     """
 
+    pulls: ClassVar[bool] = True
+
     restitution: jax.Array
 
     def __init__(self, restitution: Any):
         self.restitution = as_float_array("restitution", restitution)
         check_values("restitution", self.restitution, low=0.0, high=1.0)
+
+    def by_blocks(self) -> bool:
+        """Contacts feel each other through W only."""
+        return True
 
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """`p = -W^-1 (1 + e) gamma-`."""

@@ -51,6 +51,10 @@ class Poisson(Law):
         """Values a fit may give the coefficients."""
         return {"restitution": (0.0, np.inf)} if self.allow_above_one else {}
 
+    def by_blocks(self) -> bool:
+        """Contacts feel each other through W only."""
+        return True
+
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Two linear complementarity problems."""
         w, regular = as_matrix(delassus), is_regular(delassus)

@@ -46,7 +46,8 @@ def in_columns(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
             return _marked(_in_chunks(function, inputs), False)
         # (size, k, B) -> (k, B * size)
         wide = jax.tree.map(
-            lambda x: jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], -1), _all(size, mapped, inputs)
+            lambda x: jnp.moveaxis(x, 0, -1).reshape(*x.shape[1:-1], x.shape[-1] * size),
+            _all(size, mapped, inputs),
         )
         out = side_by_side(wide)
         out = jax.tree.map(lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size), -1, 0), out)

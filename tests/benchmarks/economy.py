@@ -72,14 +72,16 @@ def open_contacts():
     ]
 
 
+def beside(balls, count):
+    """`count` separate chains of `balls` equal balls in one scene, each struck at its end."""
+    one = np.asarray(ji.chain(jnp.ones(balls)).normals)
+    scene = ji.Scene(jnp.ones(balls * count), np.kron(np.eye(count), one))
+    return scene, jnp.tile(struck(balls), count)
+
+
 def independent_pairs(batch, pairs):
     """`pairs` pairs of balls in one scene; the same as single pairs in a batch."""
-    n = 2 * pairs
-    normals = np.zeros((n, pairs))
-    normals[np.arange(0, n, 2), np.arange(pairs)] = -1.0
-    normals[np.arange(1, n, 2), np.arange(pairs)] = 1.0
-    scene, v = ji.Scene(jnp.ones(n), jnp.asarray(normals)), jnp.tile(jnp.array([1.0, 0.0]), pairs)
-    together, single = batched(scene, v), batched(ji.chain(jnp.ones(2)), struck(2))
+    together, single = batched(*beside(2, pairs)), batched(ji.chain(jnp.ones(2)), struck(2))
     coupled = batched(dense(pairs + 1), struck(pairs + 1))
     k = stiffnesses(batch, pairs)
     each = k.reshape(-1, 1)
@@ -96,6 +98,25 @@ def independent_pairs(batch, pairs):
             lambda: coupled(k[:1]),
             "> 1",
         ),
+    ]
+
+
+def by_groups(balls, count):
+    """Separate chains in one scene: group by group, and whole as where the scene is traced."""
+
+    def both(name, make):
+        scene, v = beside(balls, count)
+        k = stiffnesses(FEW, scene.contacts)
+        run = jax.vmap(lambda k, s: ji.impact(make(k), s, v).velocity, in_axes=(0, None))
+        apart, whole = jax.jit(lambda k: run(k, scene)), jax.jit(run)
+        np.testing.assert_allclose(apart(k), whole(k, scene), atol=1e-6)
+        row = f"{count} chains of {balls}, {name}: by groups / whole"
+        return row, lambda: apart(k), lambda: whole(k, scene), "> 1"
+
+    return [
+        both("LZB", lambda k: ji.LZB(E, k, 1.5)),
+        both("Newton", lambda k: ji.Newton(E + 0.0 * k)),
+        both("Moreau", lambda k: ji.Moreau(E + 0.0 * k)),
     ]
 
 
@@ -220,6 +241,7 @@ def main():
     batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if quick else (BATCH, REPEATS)
     long = 8 if quick else 100
     cases = contact_space(batch) + open_contacts() + independent_pairs(batch, long)
+    cases += by_groups(2, long) + by_groups(3, 2 if quick else 20)
     cases += isolated_contact(batch) + single_contact(batch) + tridiagonal(long)
     rows = compared(cases + not_asked_for(batch), repeats)
     closed, whole = passes(batch)
