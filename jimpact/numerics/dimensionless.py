@@ -24,9 +24,9 @@ METHODS = ("time", "propagator", "impulse")
 # Derivatives are one or two digits worse than values at the same tolerance; at order 8 two digits
 # more cost a third more steps.
 GRADIENT_TIGHTENING = 0.01
-ROUNDING_FLOOR = 16  # the local tolerance is at least so many eps
 RIDGE = 64  # eps on the diagonal of G: redundant contacts are singular, the remainder is tiny
 DENSE_IN_BATCHES = 4  # contacts
+QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
 ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
 
 
@@ -124,7 +124,7 @@ def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
 
 def control_of(inputs: Inputs, tighten: float, max_steps: int, method: str) -> stepper.Control:
     """Local tolerances, not below rounding."""
-    floor = ROUNDING_FLOOR * float(jnp.finfo(inputs.gamma.dtype).eps)
+    floor = stepper.FINEST * float(jnp.finfo(inputs.gamma.dtype).eps)
     tolerance = jnp.maximum(tighten * inputs.tolerance, floor)
     return stepper.Control(
         tolerance, max_steps, step=propagate if method == "propagator" else stepper.explicit_step
@@ -187,7 +187,8 @@ def reclosing(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
 
 
 def _quiet(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
-    return jnp.abs(end.state.g) <= 2 * stepper.WIDENED * tolerance
+    # no wider than what ended the impact: a ball of a long chain may be as slow as WIDENED allows
+    return jnp.abs(end.state.g) <= QUIET * stepper.patience(end) * tolerance
 
 
 def status_of(end: stepper.Carry, at_rest: jax.Array) -> jax.Array:

@@ -161,7 +161,8 @@ def next_opening(flow: Flow, phase: jax.Array, state: State) -> tuple[jax.Array,
     return least(due), first_least(due)
 
 
-def _signs(phase: jax.Array) -> jax.Array:
+def margin_signs(phase: jax.Array) -> jax.Array:
+    """`g` times it is the distance to a change of phase by gap velocity."""
     return jnp.where(phase == COMPRESSION, -1.0, 1.0)
 
 
@@ -169,14 +170,14 @@ def _margins(
     flow: Flow, tolerance: jax.Array, phase: jax.Array, slack: jax.Array, state: State
 ) -> Margin:
     if flow.gapped:
-        g = jnp.where(phase == OPEN, 1.0, _signs(phase) * state.g)
+        g = jnp.where(phase == OPEN, 1.0, margin_signs(phase) * state.g)
         x = jnp.where(phase == OPEN, -state.x, state.x)
         if flow.slackens:
             onset = flow.viscous.onset(state.x, state.g)  # type: ignore[union-attr]
             x = jnp.where(phase == EXPANSION, onset, jnp.where(slack, -onset, x))
         return Margin(jnp.where(phase == COMPRESSION, 1.0, x), g)
     slack = jnp.where(phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
-    g = _signs(phase) * state.g + slack
+    g = margin_signs(phase) * state.g + slack
     return Margin(jnp.where(phase == EXPANSION, state.x, 1.0), g)
 
 
@@ -189,8 +190,8 @@ def _slopes(flow: Flow, phase: jax.Array, slack: jax.Array, state: State) -> Mar
             turning = jax.jvp(onset, (state.x, state.g), (dx, dg))[1]
             rate = jnp.where(phase == EXPANSION, turning, jnp.where(slack, -turning, rate))
         rate = jnp.where(phase == COMPRESSION, 0.0, rate)
-        return Margin(rate, jnp.where(phase == OPEN, 0.0, _signs(phase) * dg))
-    return Margin(jnp.where(phase == EXPANSION, dx, 0.0), _signs(phase) * dg)
+        return Margin(rate, jnp.where(phase == OPEN, 0.0, margin_signs(phase) * dg))
+    return Margin(jnp.where(phase == EXPANSION, dx, 0.0), margin_signs(phase) * dg)
 
 
 def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
