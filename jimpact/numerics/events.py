@@ -30,6 +30,7 @@ from jimpact.numerics.flow import (
 
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
 NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact
+IN_DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
 SHORTEST = 1e-13  # a step this small cannot be resolved: the pending event is taken at once
 
 
@@ -206,7 +207,7 @@ def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
 
 
 def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.Array) -> jax.Array:
-    """Whether the cubic through both ends falls below zero between them and returns."""
+    """Whether the cubic through both ends may fall below zero between them and return."""
     candidates = (d0 < 0) & (d1 > 0) & (f0 > snap) & (f1 >= -snap)
     u = _dip_at(f0, f1, d0)
     value = (
@@ -215,7 +216,9 @@ def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.
         + f1 * u**2 * (3 - 2 * u)
         + d1 * u**2 * (u - 1)
     )
-    return candidates & (value < -snap)
+    # an error of the cubic: curvature times (omega h)^2 / 384, with steps up to omega h = 2
+    doubt = IN_DOUBT * jnp.where(candidates, d1 - d0, 0.0)
+    return candidates & (value < doubt - snap)
 
 
 def _dip_at(f0: jax.Array, f1: jax.Array, d0: jax.Array) -> jax.Array:
