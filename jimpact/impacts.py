@@ -16,6 +16,7 @@ from jimpact.status import CODE, STATUS
 # A sign is violated only beyond these multiples of the impact's own scale: rounding and the
 # solver's tolerance stay below (float64: 1e-7; float32: about 2e-3).
 SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
+ROUNDINGS = 4  # of the largest terms that cancel: each is rounded a few times
 
 
 def sign_tolerance(dtype: jnp.dtype) -> float:
@@ -128,10 +129,22 @@ def _impact(law: Law, scene: Scene, v: jax.Array) -> Impact:
     if scene.tangents is not None:
         change = change + 0.5 * jnp.sum((scene.tangents.T @ (v + v_plus)) * tangential)
     code = jnp.where(happens, code, CODE["ok"])
-    code = jnp.maximum(code, _signs(diagonal(w), gamma, gamma_plus, p, change, stored, taking_part))
+    rounding = _rounding(w_all, gamma_all, p)
+    code = jnp.maximum(
+        code, _signs(diagonal(w), gamma, gamma_plus, p, change, stored, taking_part, rounding)
+    )
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     code = jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32)
     return Impact(v_plus, p, tangential, change, jnp.sum(stored), code)
+
+
+def _rounding(w: Symmetric, gamma: jax.Array, p: jax.Array) -> jax.Array:
+    """Rounding (m,) of gamma+: terms of W p may be large and cancel, as beside a light ball."""
+    if isinstance(w, Tridiagonal):
+        size = Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(p)
+    else:
+        size = jnp.abs(w) @ jnp.abs(p)
+    return ROUNDINGS * float(jnp.finfo(p.dtype).eps) * (jnp.abs(gamma) + size)
 
 
 def _signs(
@@ -142,6 +155,7 @@ def _signs(
     change: jax.Array,
     stored: jax.Array,
     closed: jax.Array,
+    rounding: jax.Array,
 ) -> jax.Array:
     """The gravest of negative_impulse, inadmissible_velocity, energy_gain; 0 if none."""
     tolerance = sign_tolerance(p.dtype)
@@ -149,8 +163,9 @@ def _signs(
     # size of the impact in sqrt(energy): what approaches and what is stored
     size = jnp.sqrt(jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2) + 2 * jnp.sum(stored))
     pull = jnp.any(p * root < -tolerance * size)
-    approach = jnp.any(closed & (gamma_plus / root < -tolerance * size))
-    gain = change > jnp.sum(stored) + tolerance * size**2
+    approach = jnp.any(closed & ((gamma_plus + rounding) / root < -tolerance * size))
+    rounded_work = 0.5 * jnp.sum(rounding * jnp.abs(p))
+    gain = change > jnp.sum(stored) + tolerance * size**2 + rounded_work
     code = jnp.where(gain, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(approach, CODE["inadmissible_velocity"], code)
     return jnp.where(pull, CODE["negative_impulse"], code)
