@@ -30,8 +30,10 @@ def plot_work_precision(found: WorkPrecision, title: str = "") -> Figure:
     if gradients:
         (left, right), (below, corner) = figure.subplots(2, 2)
     else:
-        below, panels = None, figure.subplot_mosaic([["left", "right"], ["corner", "corner"]])
-        left, right, corner = (panels[name] for name in ("left", "right", "corner"))
+        below = None
+        (left, right), (corner, other) = figure.subplots(2, 2)
+        other.remove()
+        corner.set_subplotspec(corner.get_gridspec()[1, :])
     handles: dict[str, Any] = {}
     for number, (name, row) in enumerate(found.points.items()):
         style = _style(name, number, row)
