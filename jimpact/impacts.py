@@ -11,12 +11,13 @@ from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.blocks import Groups, coupled_groups, solve_groups
 from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
-from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
+from jimpact.scene import Scene, delassus_matrix, gap_velocity, solve_mass, velocity_change
 from jimpact.status import CODE, STATUS
 
 # A sign is violated only beyond these multiples of the impact's own scale: rounding and the
 # solver's tolerance stay below (float64: 1e-7; float32: about 2e-3).
 SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
+ROUNDINGS = 4  # of the largest terms that cancel: each is rounded a few times
 
 
 def sign_tolerance(dtype: jnp.dtype) -> float:
@@ -118,6 +119,7 @@ def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None) -> Impa
     taking_part = jnp.ones_like(scene.closed) if law.uses_gaps else scene.closed
     gamma = jnp.where(taking_part, gamma_all, 0.0)
     stored = jnp.where(taking_part, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
+    law = law.with_stored(stored)
     happens = jnp.any(gamma < 0) | jnp.any(stored > 0) | ~jnp.all(jnp.isfinite(gamma))
     if groups is None:
         w_all = delassus_matrix(scene)
@@ -138,10 +140,24 @@ def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None) -> Impa
     if scene.tangents is not None:
         change = change + 0.5 * jnp.sum((scene.tangents.T @ (v + v_plus)) * tangential)
     code = jnp.where(happens, code, CODE["ok"])
-    code = jnp.maximum(code, _signs(w_diagonal, gamma, gamma_plus, p, change, stored, taking_part))
+    summands = _summands(scene, w_all if groups is None else None, p)
+    rounding = ROUNDINGS * float(jnp.finfo(p.dtype).eps) * (jnp.abs(gamma_all) + summands)
+    code = jnp.maximum(
+        code, _signs(w_diagonal, gamma, gamma_plus, p, change, stored, taking_part, rounding)
+    )
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     code = jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32)
     return Impact(v_plus, p, tangential, change, jnp.sum(stored), code)
+
+
+def _summands(scene: Scene, w: Symmetric | None, p: jax.Array) -> jax.Array:
+    """Size (m,) of the terms of W p: they may be large and cancel, as beside a light ball."""
+    if w is None:
+        moved = solve_mass(scene, scene.normals)
+        return jnp.abs(scene.normals).T @ (jnp.abs(moved) @ jnp.abs(p))
+    if isinstance(w, Tridiagonal):
+        return Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(p)
+    return jnp.abs(w) @ jnp.abs(p)
 
 
 def _signs(
@@ -152,6 +168,7 @@ def _signs(
     change: jax.Array,
     stored: jax.Array,
     closed: jax.Array,
+    rounding: jax.Array,
 ) -> jax.Array:
     """The gravest of negative_impulse, inadmissible_velocity, energy_gain; 0 if none."""
     tolerance = sign_tolerance(p.dtype)
@@ -159,8 +176,9 @@ def _signs(
     # size of the impact in sqrt(energy): what approaches and what is stored
     size = jnp.sqrt(jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2) + 2 * jnp.sum(stored))
     pull = jnp.any(p * root < -tolerance * size)
-    approach = jnp.any(closed & (gamma_plus / root < -tolerance * size))
-    gain = change > jnp.sum(stored) + tolerance * size**2
+    approach = jnp.any(closed & ((gamma_plus + rounding) / root < -tolerance * size))
+    rounded_work = 0.5 * jnp.sum(rounding * jnp.abs(p))
+    gain = change > jnp.sum(stored) + tolerance * size**2 + rounded_work
     code = jnp.where(gain, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(approach, CODE["inadmissible_velocity"], code)
     return jnp.where(pull, CODE["negative_impulse"], code)

@@ -18,7 +18,7 @@ _OWN = ("dop853", "dop5", "propagator")  # jimpact's own methods: thick lines
 
 
 def plot_work_precision(found: WorkPrecision, title: str = "") -> Figure:
-    """Three panels: error of v+ against time and against evaluations, and that of the gradient.
+    """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
 
     Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker is
     a failure by status; laws are stars at their model error; below the grey band's edge the
@@ -26,7 +26,14 @@ def plot_work_precision(found: WorkPrecision, title: str = "") -> Figure:
     """
     figure = Figure(figsize=(11.5, 8.5))
     figure.set_layout_engine("constrained")
-    (left, right), (below, corner) = figure.subplots(2, 2)
+    gradients = any(point.gradient is not None for row in found.points.values() for point in row)
+    if gradients:
+        (left, right), (below, corner) = figure.subplots(2, 2)
+    else:
+        below = None
+        (left, right), (corner, other) = figure.subplots(2, 2)
+        other.remove()
+        corner.set_subplotspec(corner.get_gridspec()[1, :])
     handles: dict[str, Any] = {}
     for number, (name, row) in enumerate(found.points.items()):
         style = _style(name, number, row)
@@ -35,6 +42,8 @@ def plot_work_precision(found: WorkPrecision, title: str = "") -> Figure:
             (right, "velocity", lambda point: (point.evaluations, None)),
             (below, "gradient", lambda point: _times(point.gradient)),
         ):
+            if axes is None:
+                continue
             drawn = _draw(axes, row, quantity, place, style)
             if drawn is not None:
                 handles.setdefault(row[0].label, drawn)
@@ -44,7 +53,8 @@ def plot_work_precision(found: WorkPrecision, title: str = "") -> Figure:
         (below, "gradient", "time per impact with its gradient [µs]", "error of ∂v⁺/∂(ln k, e)"),
     )
     for axes, quantity, x, y in labels:
-        _finish(axes, found.reference.uncertainty[quantity], x, y)
+        if axes is not None:
+            _finish(axes, found.reference.uncertainty[quantity], x, y)
     corner.axis("off")
     corner.legend(
         handles.values(),

@@ -1,5 +1,6 @@
 """Methods of integration converge to known values; speed against accuracy as record and picture."""
 
+import dataclasses
 import json
 import math
 from itertools import pairwise
@@ -263,6 +264,19 @@ def test_table_json_and_picture(found):
     assert len(figure.axes) == 4
     labels = [text.get_text() for text in figure.axes[3].get_legend().get_texts()]
     assert labels == [row[0].label for row in found.points.values()]
+
+
+def test_picture_without_gradients(found):
+    """No empty panel."""
+    points = {
+        name: tuple(dataclasses.replace(point, gradient=None) for point in row)
+        for name, row in found.points.items()
+    }
+    figure = plot_work_precision(dataclasses.replace(found, points=points))
+    left, right, legend = figure.axes
+    assert all(axes.lines for axes in (left, right))
+    assert "gradient" not in left.get_xlabel() + right.get_xlabel()
+    assert legend.get_legend() is not None
 
 
 def test_turns():

@@ -53,6 +53,10 @@ class Law(eqx.Module):
         """Energy (m,) [J] stored in the contacts before the impact."""
         return jnp.zeros(contacts)
 
+    def with_stored(self, energy: jax.Array) -> "Law":
+        """The same law with these stored energies (m,), if it knows any: 0 at open contacts."""
+        return self
+
     def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
         """Raise where an option does not fit the floating-point precision or the scene."""
 

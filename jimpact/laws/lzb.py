@@ -148,6 +148,10 @@ class LZB(Law):
         """`U_0` (m,) [J]."""
         return jnp.broadcast_to(self.initial_energy, (contacts,))
 
+    def with_stored(self, energy: jax.Array) -> "LZB":
+        """Open contacts store nothing."""
+        return eqx.tree_at(lambda law: law.initial_energy, self, energy)
+
     def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
         """A tolerance finer than the precision can hold is an error."""
         if isinstance(self.exponent_static, tuple):

@@ -29,6 +29,7 @@ from jimpact.methods.base import (
     problem,
 )
 from jimpact.numerics import impulse_form
+from jimpact.numerics.dimensionless import impulse_step
 from jimpact.numerics.flow import Flow, power
 from jimpact.numerics.impulse_form import EMPTY, Walk, force
 from jimpact.scene import Scene
@@ -60,7 +61,7 @@ def _start(given: Problem) -> tuple[jax.Array, jax.Array, jax.Array]:
     x = given.x
     eta = jnp.asarray(given.flow.exponent, x.dtype)
     energy = 0.5 * jnp.where(x > 0, jnp.where(x > 0, x, 1.0) ** (eta + 1), 0.0)
-    return given.inputs.gamma, energy, jax.lax.stop_gradient(jnp.min(given.inputs.tolerance))
+    return given.inputs.gamma, energy, impulse_step(given.inputs)
 
 
 def _result(given: Problem, end: Walk, stages: int) -> MethodResult:

@@ -24,9 +24,11 @@ METHODS = ("time", "propagator", "impulse")
 # Derivatives are one or two digits worse than values at the same tolerance; at order 8 two digits
 # more cost a third more steps.
 GRADIENT_TIGHTENING = 0.01
-ROUNDING_FLOOR = 16  # the local tolerance is at least so many eps
 RIDGE = 64  # eps on the diagonal of G: redundant contacts are singular, the remainder is tiny
 DENSE_IN_BATCHES = 4  # contacts
+QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
+# Contacts so many times slower than the fastest see as many of its periods, whose errors add up.
+WIDE_SPREAD = 5.0
 ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
 
 
@@ -80,19 +82,31 @@ def to_dimensionless(
     # tolerance is asked of velocities: where W_jj is large, impulses must be finer
     fastest = jnp.max(jnp.maximum(-gamma, jnp.sqrt(2 * stored) * root))
     weight = jax.lax.stop_gradient(jnp.maximum(1.0, q * root / fastest))
+    omega = time / t_ref
     g = scaled(delassus, 1 / root)
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     inputs = Inputs(
         coupling=beside,
-        omega=time / t_ref,
+        omega=omega,
         restitution=jnp.atleast_1d(restitution),
         exponent=jnp.atleast_1d(exponent) if isinstance(exponent, jax.Array) else None,
         gamma=qn / q,
         energy=2 * stored / q**2,
         gap=None if gaps is None else gaps / x_ref,
-        tolerance=rtol * min(1.0, 2 / m) / weight,  # errors of many contacts add up
+        # errors of many contacts add up
+        tolerance=rtol * min(1.0, 2 / m) * _closeness(omega) / weight,
     )
     return inputs, Units(q, time, root, x_ref)
+
+
+def _closeness(omega: jax.Array) -> jax.Array:
+    """1, or less where some contact is much slower than the fastest."""
+    return jax.lax.stop_gradient(jnp.minimum(1.0, WIDE_SPREAD * jnp.min(omega)))
+
+
+def impulse_step(inputs: Inputs) -> jax.Array:
+    """Step of the impulse form: the tolerance itself, whatever the stiffnesses."""
+    return jax.lax.stop_gradient(jnp.min(inputs.tolerance / _closeness(inputs.omega)))
 
 
 def indentation(inputs: Inputs, exponent: Exponent) -> jax.Array:
@@ -127,12 +141,13 @@ def control_of(
     inputs: Inputs, max_steps: int, method: str, differentiated: bool = False
 ) -> stepper.Control:
     """How to step; local tolerances are not below rounding."""
-    floor = ROUNDING_FLOOR * float(jnp.finfo(inputs.gamma.dtype).eps)
+    floor = stepper.FINEST * float(jnp.finfo(inputs.gamma.dtype).eps)
     tighten = GRADIENT_TIGHTENING if differentiated else 1.0
     tolerance = jnp.maximum(tighten * inputs.tolerance, floor)
     explicit = stepper.differentiated_step if differentiated else stepper.explicit_step
     step = propagate if method == "propagator" else explicit
-    return stepper.Control(tolerance, max_steps, step, halving=not differentiated)
+    contacts = inputs.gamma.shape[0]
+    return stepper.Control(tolerance, max_steps, contacts, step, halving=not differentiated)
 
 
 def solve(
@@ -190,7 +205,8 @@ def reclosing(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
 
 
 def _quiet(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
-    return jnp.abs(end.state.g) <= 2 * stepper.WIDENED * tolerance
+    # no wider than what ended the impact: a ball of a long chain may be as slow as WIDENED allows
+    return jnp.abs(end.state.g) <= QUIET * stepper.patience(end, end.phase.shape[0]) * tolerance
 
 
 def status_of(end: stepper.Carry, at_rest: jax.Array) -> jax.Array:
@@ -218,6 +234,5 @@ def plastic_remainder(flow: Flow, gamma: jax.Array, p: jax.Array, at_rest: jax.A
 
 def _walk(flow: Flow, given: Inputs, max_steps: int) -> tuple[jax.Array, jax.Array]:
     energy = 0.5 * given.energy
-    dp = jax.lax.stop_gradient(jnp.min(given.tolerance))
-    end = impulse_form.solve(flow, dp, max_steps, given.gamma, energy)
+    end = impulse_form.solve(flow, impulse_step(given), max_steps, given.gamma, energy)
     return end.p, jnp.where(impulse_form.at_work(end), CODE["max_steps"], CODE["ok"])

@@ -31,6 +31,7 @@ from jimpact.numerics.flow import (
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
 NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact
 CREEP = 0.5  # part of its indentation that a contact loses at most before a foreseen turning
+IN_DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
 SHORTEST = 1e-13  # a step this small cannot be resolved: the pending event is taken at once
 
 
@@ -167,7 +168,7 @@ def ahead(
     opens = (phase == EXPANSION) & (dx < 0) & (left >= 0)
     speed = jnp.sqrt(jnp.where(opens, left, 1.0)) - dx
     at_x = jnp.where(opens, 2 * x / jnp.where(opens, speed, 1.0), jnp.inf)
-    margin, slope = _signs(phase) * state.g, _signs(phase) * dg
+    margin, slope = margin_signs(phase) * state.g, margin_signs(phase) * dg
     # the indentation is to change little until then: a contact that creeps has no turning either
     turns = (margin > tolerance) & (slope < 0) & (margin * jnp.abs(dx) < -CREEP * slope * x)
     at_g = jnp.where(turns, margin / jnp.where(turns, -slope, 1.0), jnp.inf)
@@ -176,7 +177,8 @@ def ahead(
     return least(due), first_least(due), by_opening
 
 
-def _signs(phase: jax.Array) -> jax.Array:
+def margin_signs(phase: jax.Array) -> jax.Array:
+    """`g` times it is the distance to a change of phase by gap velocity."""
     return jnp.where(phase == COMPRESSION, -1.0, 1.0)
 
 
@@ -184,14 +186,14 @@ def _margins(
     flow: Flow, tolerance: jax.Array, phase: jax.Array, slack: jax.Array, state: State
 ) -> Margin:
     if flow.gapped:
-        g = jnp.where(phase == OPEN, 1.0, _signs(phase) * state.g)
+        g = jnp.where(phase == OPEN, 1.0, margin_signs(phase) * state.g)
         x = jnp.where(phase == OPEN, -state.x, state.x)
         if flow.slackens:
             onset = flow.viscous.onset(state.x, state.g)  # type: ignore[union-attr]
             x = jnp.where(phase == EXPANSION, onset, jnp.where(slack, -onset, x))
         return Margin(jnp.where(phase == COMPRESSION, 1.0, x), g)
     slack = jnp.where(phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
-    g = _signs(phase) * state.g + slack
+    g = margin_signs(phase) * state.g + slack
     return Margin(jnp.where(phase == EXPANSION, state.x, 1.0), g)
 
 
@@ -204,8 +206,8 @@ def _slopes(flow: Flow, phase: jax.Array, slack: jax.Array, state: State) -> Mar
             turning = jax.jvp(onset, (state.x, state.g), (dx, dg))[1]
             rate = jnp.where(phase == EXPANSION, turning, jnp.where(slack, -turning, rate))
         rate = jnp.where(phase == COMPRESSION, 0.0, rate)
-        return Margin(rate, jnp.where(phase == OPEN, 0.0, _signs(phase) * dg))
-    return Margin(jnp.where(phase == EXPANSION, dx, 0.0), _signs(phase) * dg)
+        return Margin(rate, jnp.where(phase == OPEN, 0.0, margin_signs(phase) * dg))
+    return Margin(jnp.where(phase == EXPANSION, dx, 0.0), margin_signs(phase) * dg)
 
 
 def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
@@ -220,7 +222,7 @@ def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
 
 
 def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.Array) -> jax.Array:
-    """Whether the cubic through both ends falls below zero between them and returns."""
+    """Whether the cubic through both ends may fall below zero between them and return."""
     candidates = (d0 < 0) & (d1 > 0) & (f0 > snap) & (f1 >= -snap)
     u = _dip_at(f0, f1, d0)
     value = (
@@ -229,7 +231,9 @@ def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.
         + f1 * u**2 * (3 - 2 * u)
         + d1 * u**2 * (u - 1)
     )
-    return candidates & (value < -snap)
+    # an error of the cubic: curvature times (omega h)^2 / 384, with steps up to omega h = 2
+    doubt = IN_DOUBT * jnp.where(candidates, d1 - d0, 0.0)
+    return candidates & (value < doubt - snap)
 
 
 def _dip_at(f0: jax.Array, f1: jax.Array, d0: jax.Array) -> jax.Array:

@@ -8,6 +8,7 @@ where frequencies coincide. Events are roots of that polynomial.
 import jax
 import jax.numpy as jnp
 
+from jimpact.numerics.events import SNAP, margin_signs
 from jimpact.numerics.flow import (
     ROOT_X,
     START,
@@ -21,10 +22,12 @@ from jimpact.numerics.flow import (
 )
 from jimpact.numerics.tridiagonal import as_matrix
 
-TERMS = 26  # 2^26 / 26! < 2e-19: beyond rounding for steps up to REACH
-REACH = 2.0  # step length times the largest frequency
+TERMS = 20  # 1 / 20! < 1e-18: beyond rounding for steps up to REACH
+REACH = 1.0  # step length times the largest frequency
 NEWTON_STEPS = 8  # from the parabola's root, quadratic convergence leaves rounding only
 LANDED = 1e-12  # |event variable| that counts as on the event
+DIP_STEPS = 5  # Newton steps to a minimum inside a step, from the parabola's
+SHORTEST_PART = 1e-3  # of a step, up to a minimum inside it: any less shortens it as much
 
 
 def propagate(
@@ -55,8 +58,30 @@ def propagate(
     frequency = jnp.sqrt(strength * jnp.max(flow.omega))
     missed = landing & ~((h > 0) & (jnp.abs(_evaluate(event, h)) < LANDED))
     size = jnp.where(missed, jnp.nan, (h * frequency / REACH) ** 8)
+    size = jnp.maximum(size, _dip(margin_signs(phase)[None] * coefficients.g, h, SNAP * tolerance))
     none = jnp.zeros_like(end.x)
     return end, Slopes(none, none, size * tolerance), Slopes(none, none, none)
+
+
+def _dip(margins: jax.Array, h: jax.Array, snap: jax.Array) -> jax.Array:
+    """An "error" that shortens a step to the first minimum below zero that no end of it shows."""
+    margins, h = jax.lax.stop_gradient((margins, h))
+    orders = jnp.arange(1, TERMS, dtype=margins.dtype)
+    slopes = margins[1:] * orders[:, None]
+    curvatures = slopes[1:] * orders[:-1, None]
+    begin, end = slopes[0], _evaluate(slopes, h)
+    turns = (begin < 0) & (end > 0)
+
+    def newton(_: int, at: jax.Array) -> jax.Array:
+        curvature = _evaluate(curvatures, at)
+        down = _evaluate(slopes, at) / jnp.where(curvature > 0, curvature, jnp.inf)
+        return jnp.clip(at - down, 0.0, h)
+
+    secant = h * begin / jnp.where(turns, begin - end, 1.0)
+    at = jax.lax.fori_loop(0, DIP_STEPS, newton, jnp.where(turns, secant, 0.0))
+    hidden = turns & (_evaluate(margins, at) < -snap)
+    part = jnp.min(jnp.where(hidden, at, h), keepdims=True) / jnp.where(h > 0, h, 1.0)
+    return jnp.where(jnp.any(hidden), (1 / jnp.maximum(part, SHORTEST_PART)) ** 8, 0.0)
 
 
 def _series(flow: Flow, phase: jax.Array, state: State) -> State:

@@ -37,11 +37,15 @@ from jimpact.numerics.flow import (
 FIRST_TIME = 0.05  # of the fastest contact's time scale: no contact can turn around so soon
 RESTART = 0.1  # first START step after a closing, as a part of the step before it
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
+FINEST = 16  # eps: a local tolerance below it asks for less than rounding
 LEAST_ERROR = 1e-10  # in tolerances; keeps the growth factor finite
 WIDE_GAP = 64  # eps of a gap: its error estimate is no more than rounding
 NEAR = 1.0  # an event expected within so many steps is landed on
 PATIENCE = 2000  # passes per contact after which an impact is let end at WIDENED tolerances
 WIDENED = 100.0
+# Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
+# with the number of passes, or the errors of N steps would add up to N tolerances.
+FULL = 30
 WORTH_HALVING = 600  # impacts of a batch: fewer gain less than a second loop takes to compile
 CUT_SHORT = 0.7  # part of the way to an event that a step stops at where it cannot land
 
@@ -89,6 +93,7 @@ class Control(NamedTuple):
 
     tolerance: jax.Array
     max_steps: int
+    contacts: int  # of the impact; those that are stepped may be fewer
     step: Callable[..., tuple[State, Slopes, Slopes]] = explicit_step
     closed_form: bool = True
     halving: bool = True
@@ -190,6 +195,7 @@ class Verdict(NamedTuple):
 def _try(flow: Flow, control: Control, carry: Carry) -> tuple[State, jax.Array]:
     """State at the end of a trial step, and its error in tolerances."""
     start, length = _interval(flow, control, carry)
+    control = control._replace(tolerance=_shrunk(control, carry))
     reached, high, low = control.step(
         flow,
         carry.phase,
@@ -203,6 +209,14 @@ def _try(flow: Flow, control: Control, carry: Carry) -> tuple[State, jax.Array]:
     )
     old, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
     return reached, _error(control, jnp.minimum(old.x, new.x), high, low)
+
+
+def _shrunk(control: Control, carry: Carry) -> jax.Array:
+    """Local tolerance of the next step, not below rounding."""
+    full, tolerance = FULL * control.contacts, control.tolerance
+    passes = jnp.maximum(carry.passes, full).astype(tolerance.dtype)
+    finest = FINEST * float(jnp.finfo(tolerance.dtype).eps)
+    return jnp.maximum(tolerance * (full / passes), jnp.minimum(tolerance, finest))
 
 
 def _judge(flow: Flow, control: Control, carry: Carry, reached: State, error: jax.Array) -> Verdict:
@@ -379,15 +393,15 @@ def _fly(flow: Flow, carry: Carry) -> Carry:
     )
 
 
-def _patience(carry: Carry) -> jax.Array:
+def patience(carry: Carry, contacts: int) -> jax.Array:
     """Widens what counts as nothing left once an impact drags on."""
-    drags = carry.passes > PATIENCE * carry.phase.shape[0]
+    drags = carry.passes > PATIENCE * contacts
     return jnp.where(drags, WIDENED, 1.0).astype(carry.h.dtype)
 
 
 def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
     """End the impact if nothing is left to integrate."""
-    tolerance = control.tolerance * _patience(carry)
+    tolerance = control.tolerance * patience(carry, control.contacts)
     alone, end = isolated.finish(
         flow, tolerance, carry.phase, carry.state, control.closed_form, control.beyond
     )
