@@ -226,8 +226,7 @@ HARD = st.floats(-6, 6)
         "poisson",
         "restitution-matrix",
         "binary-fastest",
-        "lzb-hertz",
-        pytest.param("lzb-linear", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("lzb-hertz", "lzb-linear")),
     ],
 )
 def test_extreme_input_is_right_or_flagged(name, e, logk, logm, v):

@@ -89,6 +89,7 @@ print(*[digest(run(Devices(jax.devices()[:count]))) for count in (1, 2, 4)])
 """
 
 
+@pytest.mark.slow
 def test_one_two_and_four_devices(wanted):
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}
     done = subprocess.run(

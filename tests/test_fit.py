@@ -226,6 +226,7 @@ def test_masks_groups_and_held_contacts():
     assert masked.law.restitution[1] == 0.9
 
 
+@pytest.mark.slow
 def test_a_free_exponent():
     truth = ji.LZB(0.9, exponent=1.3)
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))

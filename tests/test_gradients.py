@@ -174,6 +174,7 @@ def test_batched_gradients_equal_single_ones():
     np.testing.assert_allclose(batched, [jax.jit(grad)(k) for k in kappas], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_history_is_differentiable():
     def duration(k):
         return ji.history(ji.LZB(1.0, k, 1.0), ji.chain([1.0], wall=True), [1.0]).duration

@@ -21,7 +21,7 @@ def test_linear_contact_is_half_a_sine():
 
 
 @pytest.mark.parametrize("e", [0.0, 0.4, 0.9, 1.0])
-@pytest.mark.parametrize("exponent", [1.5, 1.3])
+@pytest.mark.parametrize("exponent", [1.5, pytest.param(1.3, marks=pytest.mark.slow)])
 def test_energy_ledger_and_final_state(e, exponent):
     scene, v = ji.chain([1.0, 2.0, 1.5], wall=True), [1.0, 0.5, 0.2]
     law = ji.LZB([e, 0.8, 0.6], [1.0, 3.0, 2.0], exponent)
@@ -45,7 +45,10 @@ def test_samples_are_as_accurate_as_the_steps():
     np.testing.assert_allclose(got.duration, exact.duration, rtol=1e-7)
 
 
-@pytest.mark.parametrize(("beads", "newton"), [(1, 51.66), (2, 52.90), (5, 52.90)])
+@pytest.mark.parametrize(
+    ("beads", "newton"),
+    [(1, 51.66), (2, 52.90), pytest.param(5, 52.90, marks=pytest.mark.slow)],
+)
 def test_bead_column_maximum_wall_force(beads, newton):
     """Falcon's column: 3.1 mm drop, steel beads; the wall force hardly depends on their number."""
     column = ji.column(np.full(beads, 2.05e-3))

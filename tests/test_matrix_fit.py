@@ -165,6 +165,7 @@ def test_one_shot_is_always_reproduced():
         assert any("Nothing keeps this matrix consistent" in line for line in found.warnings)
 
 
+@pytest.mark.slow
 def test_too_few_shots_say_which_entries_are_undetermined():
     """Only contact 1 approaches: the second column of E has no effect."""
     data = shots(E_TRUE, pre=np.tile([1.0, 0.0, 0.0], (4, 1)))
@@ -178,6 +179,7 @@ def test_too_few_shots_say_which_entries_are_undetermined():
     assert np.isfinite(found.standard_error[[0, 2]]).all()
 
 
+@pytest.mark.slow
 def test_several_simulated_shots_recover_the_matrix():
     found = fitted(shots(E_TRUE))
     np.testing.assert_allclose(found.law.matrix, E_TRUE, atol=1e-9)
@@ -242,7 +244,9 @@ class Watched(RestitutionMatrix):
         return super().all_impulses(scene, delassus, gap_velocity, velocity)
 
 
-@pytest.mark.parametrize("method", ["levenberg-marquardt", "adam"])
+@pytest.mark.parametrize(
+    "method", ["levenberg-marquardt", pytest.param("adam", marks=pytest.mark.slow)]
+)
 def test_every_iterate_is_admissible(method):
     """... and gradient descent ends where Levenberg-Marquardt does."""
     data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)

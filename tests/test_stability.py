@@ -126,6 +126,7 @@ def test_hard_points_after_many_steps(point):
     check_right(point, MANY_STEPS)
 
 
+@pytest.mark.slow
 def test_propagator_sees_events_that_no_end_of_a_step_shows():
     """Light or stiff balls: contacts turn back twice within one period of the fastest."""
     rng = np.random.default_rng(1)
@@ -410,6 +411,7 @@ def test_map():
     assert json.loads(json.dumps(found.to_dict()))["methods"]["rk4"]["counts"]["right"] > 3
 
 
+@pytest.mark.slow
 def test_pictures(tmp_path):
     from jimpact.stability_command import draw
 
