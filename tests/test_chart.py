@@ -98,6 +98,14 @@ def test_event_aligned_is_what_impact_does(aligned):
     assert (np.asarray(result.evaluations) % 12 == 0).all()
 
 
+def test_the_pair_of_order_five_takes_more_for_less(aligned):
+    result, out = solved("dop5", TOLERANCES)
+    assert (errors(out) < 50 * np.array(TOLERANCES)).all()
+    growth = np.asarray(result.evaluations)[-1] / np.asarray(result.evaluations)[1]
+    assert growth > 1.5 * np.asarray(aligned[0].evaluations)[-1] / aligned[0].evaluations[1]
+    assert float(result.duration[-1]) == pytest.approx(float(aligned[0].duration[-1]), rel=1e-9)
+
+
 def test_scipy_and_durations(aligned):
     settings = [1e-4, 1e-6, 1e-8]
     result, out = solved("scipy_dop853", settings)

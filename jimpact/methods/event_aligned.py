@@ -22,9 +22,10 @@ from jimpact.numerics.dimensionless import (
     settled,
     status_of,
 )
+from jimpact.numerics.flow import step
 from jimpact.numerics.propagator import TERMS
 from jimpact.numerics.sensitivity import both_modes
-from jimpact.numerics.tableaux import DOP853
+from jimpact.numerics.tableaux import DOP853, DOPRI5
 from jimpact.scene import Scene
 
 RTOL = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
@@ -56,6 +57,11 @@ def _solver(
     return solve
 
 
+def _dopri5(*given: Any) -> Any:
+    flow, phase, state, kind, target, start, length, *_ = given
+    return step(flow, phase, state, kind, target, start, length, tableau=DOPRI5)
+
+
 def _linear_only(law: Law, scene: Scene) -> str | None:
     reason = lzb_only(law, scene)
     if reason is None and law.exponent_static != 1.0:
@@ -73,6 +79,16 @@ DOP853_ALIGNED = Method(
     solve=_solver("time", len(DOP853.c)),
     duration_apart=True,
 )
+DOPRI5_ALIGNED = Method(
+    name="dop5",
+    label="event-aligned Dormand-Prince 5",
+    setting="rtol",
+    ladder=RTOL,
+    jax=True,
+    supports=lzb_only,
+    solve=_solver("time", len(DOPRI5.c), step=_dopri5, order=DOPRI5.order),
+    duration_apart=True,
+)
 PROPAGATOR = Method(
     name="propagator",
     label="exact propagator",
@@ -84,5 +100,4 @@ PROPAGATOR = Method(
     solve=_solver("propagator", 2 * (TERMS - 1)),
     duration_apart=True,
 )
-# another pair of formulas: `_solver("time", len(PAIR.c), tableau=PAIR)`
-METHODS = (DOP853_ALIGNED, PROPAGATOR)
+METHODS = (DOP853_ALIGNED, DOPRI5_ALIGNED, PROPAGATOR)

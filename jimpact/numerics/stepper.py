@@ -97,6 +97,7 @@ class Control(NamedTuple):
     step: Callable[..., tuple[State, Slopes, Slopes]] = explicit_step
     closed_form: bool = True
     halving: bool = True
+    order: int = 8
     beyond: jax.Array | None = None  # contacts whose neighbours are left out (`windows.py`)
 
 
@@ -313,8 +314,9 @@ def _next_step(
     h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.root
     landing = lands(kind)
     starting = kind == START
-    eighth_root = jnp.sqrt(jnp.sqrt(jnp.sqrt(error + LEAST_ERROR)))
-    factor = jnp.clip(SAFETY / eighth_root, SHRINK, GROWTH)
+    error = error + LEAST_ERROR
+    root = root_of(error, 8) if control.order == 8 else error ** (1 / control.order)
+    factor = jnp.clip(SAFETY / root, SHRINK, GROWTH)
     factor = jnp.where(jnp.isfinite(error), factor, SHRINK)
     # START ends with the first event; until then h is a step of xi
     land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
