@@ -128,7 +128,7 @@ def _setup(
         law.rtol or default_rtol("time", v.dtype),
         scene.gaps if gapped else None,
     )
-    flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal), differentiated=True)
+    flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal))
     control = control_of(inputs, law.max_steps, "time")._replace(closed_form=False)
     x = indentation(inputs, flow.exponent)
     start = stepper.begin(flow, control, inputs.gamma, x)

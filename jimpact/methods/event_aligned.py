@@ -41,7 +41,7 @@ def _solver(
         static = None if isinstance(given.exponent, jax.Array) else given.exponent
 
         def run(inputs: Inputs, differentiated: bool) -> tuple[Any, Any]:
-            flow = flow_of(inputs, static, given.chain, differentiated)  # type: ignore[arg-type]
+            flow = flow_of(inputs, static, given.chain)  # type: ignore[arg-type]
             control = control_of(inputs, given.max_steps, name, differentiated)._replace(**options)
             x = indentation(inputs, flow.exponent)
             start = stepper.begin(flow, control, inputs.gamma, x)

@@ -119,7 +119,7 @@ def indentation(inputs: Inputs, exponent: Exponent) -> jax.Array:
     return jnp.where(loaded, energy ** (1 / (eta + 1)), 0.0)
 
 
-def flow_of(inputs: Inputs, exponent: Exponent, chain: bool, differentiated: bool = False) -> Flow:
+def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
     """The flow of these inputs; `exponent` is the static one where `inputs` hold none."""
     m, batch = inputs.gamma.shape[0], inputs.gamma.shape[1:]
     # the product with a small dense matrix vectorizes better than shifts by one contact
@@ -133,7 +133,7 @@ def flow_of(inputs: Inputs, exponent: Exponent, chain: bool, differentiated: boo
         unit = jnp.eye(m, dtype=inputs.gamma.dtype).reshape((m, m) + (1,) * len(batch))
         coupling = unit + upper + jnp.swapaxes(upper, 0, 1)
     eta = exponent if inputs.exponent is None else inputs.exponent
-    root = root_order(eta, differentiated)
+    root = root_order(eta)
     return Flow(coupling, inputs.omega, inputs.restitution, eta, inputs.gap is not None, root)
 
 
@@ -165,7 +165,7 @@ def solve(
         both: tuple[Inputs, Viscous | None], differentiated: bool
     ) -> tuple[jax.Array, jax.Array]:
         given, force = both
-        flow = flow_of(given, static, chain, differentiated)._replace(viscous=force)  # type: ignore[arg-type]
+        flow = flow_of(given, static, chain)._replace(viscous=force)  # type: ignore[arg-type]
         x = indentation(given, flow.exponent)
         if method == "impulse":
             return _walk(flow, given, max_steps)

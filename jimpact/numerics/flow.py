@@ -23,7 +23,7 @@ closes when that returns to 0; without, geometry is frozen and it closes when ga
 A `viscous` force replaces the power law; it is never tensile, so that a contact may be open (slack)
 with x_j > 0.
 
-with r = 2 where 2 eta is known to be whole, else 4 or 8 (`root_order`).
+with r = 2 where 2 eta is known to be whole, else 8.
 
 Contacts are the first axis of all arrays; what is one number an impact has length 1 there, and
 further axes are batches (see `contacts.py`).
@@ -137,19 +137,19 @@ def plus_one(exponent: Exponent) -> Exponent:
     return tuple(e + 1 for e in exponent) if isinstance(exponent, tuple) else exponent + 1
 
 
-def root_order(exponent: Exponent, differentiated: bool) -> int:
+def root_order(exponent: Exponent) -> int:
     """`r` of the START and ROOT_X variables: powers `xi^(r eta)` are then smooth enough.
 
-    Other than whole and half exponents take twice the steps at 8 that they take at 4. Derivatives
-    need it: those in eta bring logarithms, and a step's error is that of its value only.
+    At 4 other than whole and half exponents take half the steps, but the errors of many closings
+    reach 100 tolerances.
     """
     known = isinstance(exponent, (float, tuple))
     etas = np.atleast_1d(np.asarray(exponent)) if known else np.array([0.1])
-    return 2 if np.all(2 * etas == np.round(2 * etas)) else 8 if differentiated else 4
+    return 2 if np.all(2 * etas == np.round(2 * etas)) else 8
 
 
 def root_of(x: jax.Array, order: int) -> jax.Array:
-    """`x^(1/order)` of x > 0, for the orders 2, 4 and 8."""
+    """`x^(1/order)` of x > 0, for orders that are powers of 2."""
     return x if order == 1 else root_of(jnp.sqrt(x), order // 2)
 
 

@@ -223,13 +223,16 @@ def _shrunk(control: Control, carry: Carry) -> jax.Array:
 def _judge(flow: Flow, control: Control, carry: Carry, reached: State, error: jax.Array) -> Verdict:
     state, new = jax.lax.stop_gradient((carry.state, reached))
     span = _span(flow, carry)
+    unit = rates_of(flows.frozen(flow), carry.phase).unit
+    timed = lands(carry.kind) & (unit > 0)  # a landing takes other than the time expected
+    took = jnp.where(timed, (new.t - state.t) / jnp.where(timed, unit, 1.0), span)
     found = events.find(
         flows.frozen(flow),
         control.tolerance,
         carry.phase,
         carry.kind,
         carry.target,
-        span,
+        took,
         state,
         new,
     )
