@@ -11,7 +11,14 @@ from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.blocks import Groups, coupled_groups, solve_groups
 from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
-from jimpact.scene import Scene, delassus_matrix, gap_velocity, solve_mass, velocity_change
+from jimpact.scene import (
+    Scene,
+    delassus_matrix,
+    gap_velocity,
+    momentum,
+    solve_mass,
+    velocity_change,
+)
 from jimpact.status import CODE, STATUS
 
 # A sign is violated only beyond these multiples of the impact's own scale: rounding and the
@@ -136,12 +143,10 @@ def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None) -> Impa
     v_plus = v + jump
     by_delassus = groups is None and tangential.size == 0
     gamma_plus = gamma_all + (w_all @ p if by_delassus else gap_velocity(scene, jump))
-    change = 0.5 * jnp.sum((gamma_all + gamma_plus) * p)
-    if scene.tangents is not None:
-        change = change + 0.5 * jnp.sum((scene.tangents.T @ (v + v_plus)) * tangential)
+    # `(gamma+ + gamma-)^T p / 2`, summed over bodies: beside a light one terms of W p cancel
+    change = 0.5 * momentum(scene, jump) @ (v + v_plus)
     code = jnp.where(happens, code, CODE["ok"])
-    summands = _summands(scene, w_all if groups is None else None, p)
-    rounding = ROUNDINGS * float(jnp.finfo(p.dtype).eps) * (jnp.abs(gamma_all) + summands)
+    rounding = gap_velocity_rounding(scene, w_all if groups is None else None, gamma_all, p)
     code = jnp.maximum(
         code, _signs(w_diagonal, gamma, gamma_plus, p, change, stored, taking_part, rounding)
     )
@@ -150,14 +155,18 @@ def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None) -> Impa
     return Impact(v_plus, p, tangential, change, jnp.sum(stored), code)
 
 
-def _summands(scene: Scene, w: Symmetric | None, p: jax.Array) -> jax.Array:
-    """Size (m,) of the terms of W p: they may be large and cancel, as beside a light ball."""
+def gap_velocity_rounding(
+    scene: Scene, w: Symmetric | None, gamma: jax.Array, p: jax.Array
+) -> jax.Array:
+    """Rounding (m,) of gamma+: terms of W p may be large and cancel, as beside a light ball."""
     if w is None:
         moved = solve_mass(scene, scene.normals)
-        return jnp.abs(scene.normals).T @ (jnp.abs(moved) @ jnp.abs(p))
-    if isinstance(w, Tridiagonal):
-        return Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(p)
-    return jnp.abs(w) @ jnp.abs(p)
+        size = jnp.abs(scene.normals).T @ (jnp.abs(moved) @ jnp.abs(p))
+    elif isinstance(w, Tridiagonal):
+        size = Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(p)
+    else:
+        size = jnp.abs(w) @ jnp.abs(p)
+    return ROUNDINGS * float(jnp.finfo(p.dtype).eps) * (jnp.abs(gamma) + size)
 
 
 def _signs(
@@ -177,8 +186,7 @@ def _signs(
     size = jnp.sqrt(jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2) + 2 * jnp.sum(stored))
     pull = jnp.any(p * root < -tolerance * size)
     approach = jnp.any(closed & ((gamma_plus + rounding) / root < -tolerance * size))
-    rounded_work = 0.5 * jnp.sum(rounding * jnp.abs(p))
-    gain = change > jnp.sum(stored) + tolerance * size**2 + rounded_work
+    gain = change > jnp.sum(stored) + tolerance * size**2
     code = jnp.where(gain, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(approach, CODE["inadmissible_velocity"], code)
     return jnp.where(pull, CODE["negative_impulse"], code)
