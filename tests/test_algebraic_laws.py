@@ -145,6 +145,7 @@ def test_gradients_at_a_kink_are_one_sided():
     assert min(abs(float(slope(0.5)) - side) for side in (-2 / 3, 0.0)) < 1e-12
 
 
+@pytest.mark.slow
 def test_redundant_and_contradictory_contacts():
     between = ji.Scene([1.0], [[1.0, -1.0]])  # a body in a slot, both walls touching
     plastic = ji.impact(ji.Moreau(0.0), between, [1.0])
@@ -171,6 +172,7 @@ def test_unequal_restitution_can_gain_energy_and_is_flagged():
     assert ji.STATUS[int(out.status)].failure
 
 
+@pytest.mark.slow
 def test_inclusion():
     """(6.65): the closed-form projection, and Newton's law for one contact."""
     gbar, metric = [[1.0, 0.3], [0.3, 1.0]], [[2.0, 0.5], [0.5, 1.0]]

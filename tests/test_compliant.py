@@ -109,6 +109,7 @@ def test_exact_derivatives():
         np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_touching_elastic_linear_balls_are_lzb():
     ratio = np.array([0.25, 0.5, 1, 2, 2.7, 5, 10])
     expected = [
@@ -361,6 +362,7 @@ def test_nothing_approaches():
     assert int(out.status) == 0
 
 
+@pytest.mark.slow
 def test_one_sided_derivative_at_a_touching_contact():
     """The derivative in a gap at 0 is the limit from above, not 0."""
 

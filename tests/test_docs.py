@@ -14,7 +14,10 @@ import jimpact
 
 ROOT = Path(__file__).parent.parent
 MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(jimpact.__path__, "jimpact."))]
-LONG = ("jimpact.calibration", "jimpact.plot_rheology")  # all rheologies are compiled
+LONG = {  # all rheologies, laws or methods are compiled
+    f"jimpact.{name}"
+    for name in ("calibration", "plot_rheology", "validity", "stability", "advice", "chart")
+}
 OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
@@ -37,6 +40,7 @@ def test_docstrings_run(name, tmp_path, monkeypatch):
     assert doctest.testmod(importlib.import_module(name), optionflags=OPTIONS).failed == 0
 
 
+@pytest.mark.slow
 def test_readme_runs():
     result = doctest.testfile(str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS)
     assert result.attempted > 10

@@ -200,6 +200,7 @@ def test_the_unseen_combination_is_really_unseen(rank_2_of_3):
     assert np.abs(change).max() < 0.05 * np.abs(seen).max()
 
 
+@pytest.mark.slow
 def test_known_parameters_are_recovered_from_varied_shots():
     truth = ji.LZB([0.9, 0.7], [1.0, 2.0])
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))

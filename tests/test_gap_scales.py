@@ -112,6 +112,7 @@ def test_bead_column_wall_force(number):
     assert figure.axes[0].get_ylabel() == "force [N]"
 
 
+@pytest.mark.slow
 def test_history_across_gaps():
     scene, v = chain(jnp.ones(3), gaps=jnp.array([0.3, 4.0])), jnp.array([1.0, 0.0, 0.0])
     law = Compliant(Hertz(1.0))

@@ -33,7 +33,7 @@ def outcome(exponent, kappa, e1, e2, **options):
     return ji.impact(law, BALLS, V).velocity
 
 
-@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("jacobian", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_held_derivatives(jacobian):
     got = jax.jit(jacobian(lambda *a: outcome(1.0, *a), argnums=(0, 1, 2)))(1.0, 0.9, 0.9)
     np.testing.assert_allclose(got, LINEAR, rtol=0, atol=1e-7)
@@ -94,6 +94,7 @@ def test_forward_equals_reverse_in_every_parameter():
     np.testing.assert_allclose(exact, differences, rtol=0, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_dense_scene_differentiates_in_normals_and_mass():
     def f(normals, mass):
         return ji.impact(ji.LZB(0.8), ji.Scene(mass, normals), jnp.array([0.3, -1.0])).velocity
@@ -122,6 +123,7 @@ def test_single_contact_equals_newton_with_its_derivatives(e, exponent):
         np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_derivative_at_zero_restitution_is_the_one_sided_limit():
     scene, v = ji.chain([3.0, 1.0, 2.0]), [1.0, 0.0, -0.5]
 
@@ -212,8 +214,8 @@ def _descend(law, state, rule, gradient):
     "law",
     [
         ji.LZB(0.8, [1.0, 1.0]),
-        ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8)),
-        ji.Compliant(ji.LinearSpring(1.0)),
+        pytest.param(ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8)), marks=pytest.mark.slow),
+        pytest.param(ji.Compliant(ji.LinearSpring(1.0)), marks=pytest.mark.slow),
         ji.Compliant(ji.KelvinVoigt(1.0, 0.1)),
     ],
     ids=["lzb", "bistiffness", "linear", "kelvin-voigt"],

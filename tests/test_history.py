@@ -37,6 +37,7 @@ def test_energy_ledger_and_final_state(e, exponent):
     assert (np.asarray(h.maximum_force) >= np.asarray(h.force).max(axis=0) - 1e-9).all()
 
 
+@pytest.mark.slow
 def test_samples_are_as_accurate_as_the_steps():
     scene, v = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
     got, exact = (ji.history(ji.LZB(0.9, rtol=rtol), scene, v) for rtol in (None, 1e-12))

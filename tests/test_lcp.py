@@ -117,6 +117,7 @@ def test_not_symmetric():
         np.testing.assert_allclose(found.w[k], w, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_every_order():
     """z = (1, a) / (1 - a^2) for A = [[1, -a], [-a, 1]], q = (-1, 0)."""
 

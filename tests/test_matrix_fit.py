@@ -189,6 +189,7 @@ def test_several_simulated_shots_recover_the_matrix():
     assert found.names == ("matrix[1,1]", "matrix[1,2]", "matrix[2,1]", "matrix[2,2]")
 
 
+@pytest.mark.slow
 def test_a_sparsity_pattern_is_kept():
     sparse = np.array([[0.3, 0.0], [0.5, 0.4]])
     found = fitted(shots(sparse), free=np.array([[True, False], [True, True]]))

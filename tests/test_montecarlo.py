@@ -474,6 +474,7 @@ monte_carlo(ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25]), [1.0,
 # ----------------------------------------------------------------- sensitivity
 
 
+@pytest.mark.slow
 def test_the_linearization_beside_monte_carlo():
     law = Compliant(Hertz(1.0))  # indentations of about 0.5 m: metre-sized gaps
     sampler = {"law": law, "samples": 256, "bins": 50}

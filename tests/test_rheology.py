@@ -181,6 +181,7 @@ def test_same_pair_restitution_other_chain():
     assert len(figure.axes[0].lines) == 5
 
 
+@pytest.mark.slow
 def test_user_force_is_the_built_in_one():
     gaps = jnp.array([0.0, 0.2])
     user = UserForce(lambda x, rate, p: p["k"] * x + p["c"] * rate, {"k": 1.0, "c": 0.3})

@@ -111,6 +111,7 @@ def test_redundant_contacts():
     assert float(gradient) == pytest.approx(1.0, abs=1e-10)
 
 
+@pytest.mark.slow
 def test_ball_between_two_walls_comes_to_rest():
     out = ji.impact(ji.LZB(0.5), ji.chain([1.0], wall="both"), [1.0])
     assert int(out.status) in (0, 3)
