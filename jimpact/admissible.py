@@ -176,7 +176,7 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
 
     >>> import jimpact as ji
     >>> found = admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
-    >>> (found.conserving_arc(2) + 0.0).round(4).tolist()
+    >>> (found.conserving_arc(2).round(4) + 0.0).tolist()
     [[0.0, 0.0, 1.0], [-0.3333, 0.6667, 0.6667]]
     >>> found.contains([0.1, 0.3, 0.6]), found.contains([0.5, 0.25, 0.25])
     (True, False)
