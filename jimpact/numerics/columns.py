@@ -14,6 +14,7 @@ from jax.custom_batching import custom_vmap
 
 Result = TypeVar("Result")
 
+WORTH_APART = 64  # impacts of a batch: with fewer, compilation counts
 CHUNK = 1024  # impacts solved side by side on a CPU: their stages fill about half a megabyte
 
 
@@ -61,7 +62,7 @@ def by_itself(function: Callable[[], Result], like: jax.Array) -> Result:
 
     XLA would compute its results again in each operation that uses them, ten times over in all.
     """
-    if like.ndim == 1:
+    if like.ndim == 1 or like.shape[-1] < WORTH_APART:
         return function()
     shapes = jax.eval_shape(function)
     always = jnp.any(like != jnp.inf)  # the compiler cannot know
