@@ -1,5 +1,6 @@
 """Host-side argument checks with one error template; tracers pass unchecked."""
 
+import operator
 from typing import Any
 
 import jax
@@ -57,6 +58,13 @@ def check_values(
     raise ValueError(
         f"Argument `{name}` must {allowed}, but has value {np.atleast_1d(entries)[index]:g}{where}."
     )
+
+
+def as_whole(name: str, value: Any, low: int) -> int:
+    """`value` as an int; raise a ValueError unless it is one of at least `low`."""
+    if isinstance(value, bool) or not hasattr(value, "__index__") or operator.index(value) < low:
+        raise ValueError(f"Argument `{name}` must be an int >= {low}, but has value {value!r}.")
+    return operator.index(value)
 
 
 def check_shape(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> None:

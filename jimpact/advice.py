@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_float_array, as_whole, check_shape, check_values
 from jimpact.advice_evidence import (
     Candidate,
     Outcomes,
@@ -19,7 +19,6 @@ from jimpact.advice_evidence import (
 )
 from jimpact.advice_input import (
     check_tolerance,
-    check_whole,
     missing_stiffness,
     parameters_of,
     span_of,
@@ -97,8 +96,8 @@ def advise(
     span = span_of(stiffness_range, known)
     rtol = default_rtol("time", v.dtype)
     check_tolerance(tolerance, FINEST_TOLERANCE * rtol)
-    check_whole("samples", samples, 1)
-    check_whole("seed", seed, 0)
+    as_whole("samples", samples, 1)
+    as_whole("seed", seed, 0)
     at = situation(scene, np.asarray(v))
     mixed = len(np.unique(np.asarray(parameters["exponent"], float))) > 1
     absolute = bool(at.gapped.any()) or (mixed and bool(at.coupled))

@@ -1,7 +1,6 @@
 """The evidence of `advise`: every law on the scene, against the reference over unknown ratios."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,12 +19,13 @@ from jimpact.laws.lzb import LZB
 from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
 from jimpact.laws.poisson import Poisson
+from jimpact.parameters import with_entries
 from jimpact.rheology import Bistiffness
 from jimpact.sampling.bars import sample_bar
 from jimpact.scene import Scene, velocity_change
+from jimpact.scenes import with_gaps
 from jimpact.status import CODE, STATUS
 
-SIMPLEST_FIRST = ("newton", "moreau", "poisson", "binary", "lzb", "compliant")
 CHUNK = 64  # rows computed together
 CHEAP = 8  # contacts up to which a chunk is always full
 LANES = 2048  # impacts of a batch, over m^2, of the laws that take no time
@@ -88,20 +88,12 @@ def candidates(at: Situation, parameters: dict[str, Any]) -> dict[str, tuple[Law
     return found
 
 
-def with_stiffness(law: Law, stiffness: jax.Array) -> Law:
-    """The LZB or Compliant law with another stiffness."""
-    place: Callable[[Any], Any] = (
-        (lambda z: z.force.stiffness) if isinstance(law, Compliant) else (lambda z: z.stiffness)
-    )
-    return eqx.tree_at(place, law, stiffness)
-
-
 @eqx.filter_jit
 def _batch(
     law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | None
 ) -> tuple[jax.Array, ...]:
     def one(v: jax.Array, k: jax.Array | None) -> tuple[jax.Array, ...]:
-        out = impact(law if k is None else with_stiffness(law, k), scene, v)
+        out = impact(law if k is None else with_entries(law, ("stiffness",), k), scene, v)
         return out.velocity, out.impulse, out.status
 
     return jax.vmap(one)(velocity, stiffness)
@@ -137,7 +129,7 @@ def _with_gaps(scene: Scene) -> Scene:
     if scene.gaps is not None:
         return scene
     none = jnp.zeros(scene.contacts, scene.mass.dtype)
-    return eqx.tree_at(lambda s: s.gaps, scene, none, is_leaf=lambda x: x is None)
+    return with_gaps(scene, none)
 
 
 def one_outcome(law: Law, at: Situation, scene: Scene) -> Outcomes:

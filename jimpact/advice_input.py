@@ -1,6 +1,5 @@
 """What `advise` is given: checks, defaults, and what is known of the stiffnesses."""
 
-import operator
 from typing import Any
 
 import numpy as np
@@ -60,12 +59,6 @@ def check_tolerance(tolerance: Any, finest: float) -> None:
     """A number between what the reference can resolve and 1."""
     check_shape("tolerance", tolerance, (), "one number")
     check_values("tolerance", tolerance, low=finest, high=1.0)
-
-
-def check_whole(name: str, value: Any, low: int) -> None:
-    """A whole number of at least `low`."""
-    if isinstance(value, bool) or not hasattr(value, "__index__") or operator.index(value) < low:
-        raise ValueError(f"Argument `{name}` must be an int >= {low}, but has value {value!r}.")
 
 
 def missing_stiffness(at: Situation) -> str:

@@ -3,11 +3,12 @@
 import itertools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.blocks import components
 from jimpact.scene import Scene, gap_velocity, kinetic_angles
+from jimpact.scenes import with_gaps
 
 # cos(kinetic angle) below so many roundings is 0: the rounding of normals and of M^-1
 DECOUPLED_IN_EPS = 64
@@ -66,7 +67,9 @@ def situation(scene: Scene, velocity: np.ndarray) -> Situation:
     angle = np.degrees(np.asarray(kinetic_angles(scene)))
     rounding = DECOUPLED_IN_EPS * np.finfo(angle.dtype).eps
     touch = np.abs(np.cos(np.radians(angle))) > rounding
-    blocks = tuple(_block(members, gamma, angle, touch) for members in _components(touch))
+    label = components(touch | np.eye(len(gamma), dtype=bool))
+    together = [tuple(np.flatnonzero(label == first).tolist()) for first in np.unique(label)]
+    blocks = tuple(_block(members, gamma, angle, touch) for members in together)
     opened = ~np.asarray(scene.closed)
     acting = np.zeros(len(gamma), bool)
     gapped = np.zeros(len(gamma), bool)
@@ -77,23 +80,8 @@ def situation(scene: Scene, velocity: np.ndarray) -> Situation:
     touching = scene
     if scene.gaps is not None:
         gaps = jnp.where(jnp.asarray(acting), 0.0, scene.gaps).astype(scene.gaps.dtype)
-        touching = eqx.tree_at(lambda s: s.gaps, scene, gaps)
+        touching = with_gaps(scene, gaps)
     return Situation(scene, touching, np.asarray(velocity), gamma, blocks, gapped)
-
-
-def _components(touch: np.ndarray) -> list[tuple[int, ...]]:
-    """Connected sets of contacts, in the order of their first one."""
-    left, found = set(range(len(touch))), []
-    while left:
-        members, front = set(), [min(left)]
-        while front:
-            j = front.pop()
-            if j in left:
-                left.remove(j)
-                members.add(j)
-                front += [int(i) for i in np.flatnonzero(touch[j])]
-        found.append(tuple(sorted(members)))
-    return found
 
 
 def _block(

@@ -55,12 +55,12 @@ def coupled_groups(scene: Scene) -> Groups | None:
         touched.append(np.asarray(scene.mass))
     if scene.constraints is not None:
         touched.append(np.asarray(scene.constraints))
-    label = _components(np.concatenate(touched, axis=1) != 0)[: len(members)]
+    label = components(np.concatenate(touched, axis=1) != 0)[: len(members)]
     groups = [members[label == first] for first in np.unique(label)]
     return None if len(groups[0]) == m else _by_size(groups, m)
 
 
-def _components(touches: np.ndarray) -> np.ndarray:
+def components(touches: np.ndarray) -> np.ndarray:
     """For each column of a boolean matrix the first of the columns it hangs together with."""
     none = touches.shape[1]
     label = np.arange(none)

@@ -13,6 +13,7 @@ from rich.table import Table
 
 from jimpact.chart import work_precision
 from jimpact.chart_record import Point, Timing, WorkPrecision
+from jimpact.compare_command import velocities
 from jimpact.laws import REGISTRY
 from jimpact.laws.lzb import LZB
 from jimpact.methods import METHODS
@@ -41,7 +42,7 @@ def run(
         path = picture_path(out, PICTURE)
         given = read_study(study)
         law = _law(given)
-        before = _velocity(given, velocity, shot)
+        before, _ = velocities(given, velocity, shot)
         names = methods or _able(law, given, full)
         found = work_precision(
             given.scene,
@@ -80,18 +81,6 @@ def _able(law: LZB, study: Study, full: bool) -> tuple[str, ...]:
         for name, method in METHODS.items()
         if name not in left_out and method.supports(law, study.scene) is None
     )
-
-
-def _velocity(study: Study, velocity: tuple[float, ...] | None, shot: int) -> np.ndarray:
-    """Velocities before the impact: given, or those of a measured shot."""
-    if velocity is not None:
-        return np.asarray(velocity, float)
-    if study.experiments is None:
-        raise ValueError("--velocity must be given, because the study has no [data].")
-    shots = len(study.experiments.shots)
-    if not 1 <= shot <= shots:
-        raise ValueError(f"--shot must lie in [1, {shots}], but is {shot}.")
-    return np.asarray(study.experiments.pre[shot - 1])
 
 
 def _draw(found: WorkPrecision, title: str, path: Path) -> None:

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from jimpact.impacts import Impact, impact
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
 from jimpact.methods import UNCOUNTED, Method, outcome
+from jimpact.parameters import with_entries
 from jimpact.scene import Scene
 
 HOST_BATCH = 4  # impacts that a method without vmap does for its time in a batch: a plain loop
@@ -41,7 +41,7 @@ class Case(NamedTuple):
 
     def at(self, row: int) -> LZB:
         """The law with a row's stiffness."""
-        return with_stiffness(self.law, self.stiffness[row])
+        return with_entries(self.law, ("stiffness",), self.stiffness[row])
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,6 @@ class Programs:
     account: Callable[[Any], Answer]
     gradient: Callable[[Any], Any] | None
     compile_time: dict[str, float]
-
-
-def with_stiffness(law: LZB, stiffness: jax.Array) -> LZB:
-    """The same law with another stiffness (m,)."""
-    return eqx.tree_at(lambda old: old.stiffness, law, stiffness)
 
 
 def _told(out: Impact, duration: jax.Array, evaluations: jax.Array) -> Answer:
@@ -111,7 +106,7 @@ def _functions(method: Method) -> tuple[Callable[..., Any], ...]:
     """The whole answer, what is timed of it, and the Jacobian of v+, of one impact."""
 
     def whole(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Answer:
-        law = with_stiffness(law, k)
+        law = with_entries(law, ("stiffness",), k)
         found = method.solve(law, scene, v, setting)
         return _told(outcome(law, scene, v, found), found.duration, found.evaluations)
 
@@ -121,7 +116,7 @@ def _functions(method: Method) -> tuple[Callable[..., Any], ...]:
 
     def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
         def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
-            moved = eqx.tree_at(lambda old: old.restitution, law, e)
+            moved = with_entries(law, ("restitution",), e)
             return fast(k * jnp.exp(stretch), moved, scene, v, setting).velocity
 
         both = jax.jacfwd(velocity, argnums=(0, 1))(jnp.zeros_like(k), law.restitution)
@@ -140,7 +135,7 @@ def _counter(method: Method, program: Callable[..., Callable[[Any], Any]]) -> Ca
 
     def counted(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
         assert method.counting is not None
-        return method.counting(tally)(with_stiffness(law, k), scene, v, setting).code
+        return method.counting(tally)(with_entries(law, ("stiffness",), k), scene, v, setting).code
 
     run = program("count", counted, None)
 

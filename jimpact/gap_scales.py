@@ -15,6 +15,7 @@ from jimpact.laws.lzb import LZB
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.rheology import Bistiffness
 from jimpact.scene import Scene, delassus_matrix, gap_velocity
+from jimpact.scenes import with_gaps
 
 NEARLY_TOUCHING, WIDE = 0.1, 2.0  # gaps below and above so many delta_c are told in these words
 
@@ -156,8 +157,7 @@ def _crossover(
     law: Compliant, scene: Scene, v: jax.Array, offset: jax.Array, gaps: jax.Array
 ) -> Crossover:
     def at(g: jax.Array) -> tuple[jax.Array, jax.Array]:
-        moved = eqx.tree_at(lambda s: s.gaps, scene, g, is_leaf=lambda z: z is None)
-        out = impact(law, moved, v)
+        out = impact(law, with_gaps(scene, g), v)
         return out.velocity, out.status
 
     velocity, status = jax.vmap(at)(gaps)

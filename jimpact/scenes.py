@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -107,3 +108,8 @@ def scene_from_gaps(
     normals = jax.jacobian(lambda x: jnp.atleast_1d(gap_function(x)))(q).T
     gaps = jnp.where(f > closed_below, f, 0.0)
     return Scene(mass(q) if callable(mass) else mass, normals, gaps=gaps)
+
+
+def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
+    """The scene with these gaps (m,)."""
+    return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
+from jimpact._checks import as_float_array, as_whole, check_per_contact, check_shape, check_values
 from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics import collisions
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
@@ -71,7 +71,7 @@ class Binary(Law):
         self.restitution = as_float_array("restitution", restitution)
         check_values("restitution", self.restitution, low=0.0, high=1.0)
         self.order = _checked_order(order)
-        self.max_collisions = _positive_int("max_collisions", max_collisions)
+        self.max_collisions = as_whole("max_collisions", max_collisions, 1)
 
     def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
         """An order that names no such contact, or leaves one out, is an error."""
@@ -197,12 +197,6 @@ def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
 
 
 _collide = eqx.filter_jit(collisions.collide)
-
-
-def _positive_int(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not hasattr(value, "__index__") or operator.index(value) < 1:
-        raise ValueError(f"Argument `{name}` must be an int >= 1, but has value {value!r}.")
-    return operator.index(value)
 
 
 def _checked_order(order: Any) -> str | tuple[int, ...]:

@@ -67,7 +67,7 @@ def _directions(values: list[jax.Array], columns: bool) -> list[jax.Array]:
         if columns:
             rows = rows.reshape(rows.shape + (1,) * (x.ndim - 1))
         else:
-            rows = rows.reshape(-1, *x.shape)
+            rows = rows.reshape(len(rows), *x.shape)
         found.append(jnp.broadcast_to(rows, (sum(counts), *x.shape)))
         first += count
     return found

@@ -16,6 +16,7 @@ from jimpact.laws.base import Law
 from jimpact.parameters import DOMAIN
 from jimpact.sampling.distributions import Distribution, Source, parameter_paths
 from jimpact.scene import Scene
+from jimpact.scenes import with_gaps
 from jimpact.status import STATUS
 
 # Further outcomes of a sample: it never reached the law.
@@ -108,8 +109,3 @@ def _in_domain(law: Law) -> jax.Array:
         low, high = DOMAIN.get(name, (-jnp.inf, jnp.inf))
         fine = fine & jnp.all(jnp.isfinite(value) & (value >= low) & (value <= high))
     return fine
-
-
-def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
-    """The scene with these gaps (m,)."""
-    return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)

@@ -17,8 +17,9 @@ import numpy as np
 
 from jimpact.laws.base import Law
 from jimpact.sampling.chunks import Chunk, Task, reduced
-from jimpact.sampling.drawing import Drawn, Sources, draw, impacts, with_gaps
+from jimpact.sampling.drawing import Drawn, Sources, draw, impacts
 from jimpact.scene import Scene
+from jimpact.scenes import with_gaps
 
 
 @dataclass(frozen=True)
