@@ -101,8 +101,8 @@ def test_event_aligned_is_what_impact_does(aligned):
 def test_the_pair_of_order_five_takes_more_for_less(aligned):
     result, out = solved("dop5", TOLERANCES)
     assert (errors(out) < 50 * np.array(TOLERANCES)).all()
-    growth = np.asarray(result.evaluations)[-1] / np.asarray(result.evaluations)[1]
-    assert growth > 1.5 * np.asarray(aligned[0].evaluations)[-1] / aligned[0].evaluations[1]
+    few, many = (np.asarray(found.evaluations) for found in (aligned[0], result))
+    assert many[-1] / many[1] > 1.5 * few[-1] / few[1]
     assert float(result.duration[-1]) == pytest.approx(float(aligned[0].duration[-1]), rel=1e-9)
 
 
