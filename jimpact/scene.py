@@ -262,6 +262,23 @@ def delassus_matrix(scene: Scene) -> Symmetric:
     return Tridiagonal(padded[:-1] + padded[1:], -shared, scene.contacts <= scene.size)
 
 
+def tangential_delassus(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, ...]:
+    """`N^T M^-1 H` (m, t), `H^T M^-1 H` (t, t) and slip velocities `H^T v` (t,).
+
+    Rows of open contacts are 0, but for the diagonal.
+    """
+    assert scene.tangents is not None
+    m, t = scene.contacts, scene.tangents.shape[1]
+    moved = solve_mass(scene, scene.tangents)
+    across, along = scene.normals.T @ moved, scene.tangents.T @ moved
+    if scene.gaps is not None:
+        rows = jnp.repeat(scene.closed, t // m)
+        across = jnp.where(scene.closed[:, None] & rows[None, :], across, 0.0)
+        keep = (rows[:, None] & rows[None, :]) | jnp.eye(t, dtype=bool)
+        along = jnp.where(keep, along, 0.0)
+    return across, along, scene.tangents.T @ velocity
+
+
 def without_constraints(scene: Scene) -> Scene:
     """The scene as if it had no bilateral constraints."""
     return scene if scene.constraints is None else eqx.tree_at(_CONSTRAINTS, scene, None)

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.laws.base import Law
+from jimpact.numerics import friction
 from jimpact.numerics.dimensionless import METHODS, solve, to_dimensionless
 from jimpact.numerics.flow import Exponent
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
-from jimpact.scene import Scene
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix
+from jimpact.scene import Scene, tangential_delassus
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself
@@ -94,6 +95,7 @@ class LZB(Law):
     restitution: jax.Array
     stiffness: jax.Array
     initial_energy: jax.Array
+    friction: jax.Array | None
     exponent_array: jax.Array | None
     exponent_static: float | tuple[float, ...] | None = eqx.field(static=True)
     rtol: float | None = eqx.field(static=True)
@@ -107,6 +109,7 @@ class LZB(Law):
         exponent: Any = 1.5,
         initial_energy: Any = 0.0,
         *,
+        friction: Any = None,
         rtol: float | None = None,
         max_steps: int = 100_000,
         method: str = "time",
@@ -114,6 +117,7 @@ class LZB(Law):
         self.restitution = as_float_array("restitution", restitution)
         self.stiffness = as_float_array("stiffness", stiffness)
         self.initial_energy = as_float_array("initial_energy", initial_energy)
+        self.friction = None if friction is None else as_float_array("friction", friction)
         if isinstance(exponent, (int, float)):
             self.exponent_static, self.exponent_array = float(exponent), None
         elif isinstance(exponent, tuple) and not is_traced(exponent):
@@ -125,6 +129,8 @@ class LZB(Law):
         check_values("restitution", self.restitution, low=0.0, high=1.0)
         check_values("stiffness", self.stiffness, low=0.0, open_low=True)
         check_values("initial_energy", self.initial_energy, low=0.0)
+        if self.friction is not None:
+            check_values("friction", self.friction, low=0.0)
         check_values("exponent", self.exponent, low=1.0)
         if rtol is not None:
             check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
@@ -136,6 +142,10 @@ class LZB(Law):
             raise ValueError(
                 "Argument `exponent` must be the float 1.0 for method='propagator', "
                 f"but has value {self.exponent}."
+            )
+        if method != "time" and friction is not None:
+            raise ValueError(
+                f"Argument `method` must be 'time' with friction, but has value {method!r}."
             )
 
     @property
@@ -162,10 +172,14 @@ class LZB(Law):
                 f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
                 f"but has value {self.rtol:g}: enable jax_enable_x64 for finer tolerances."
             )
+        if self.friction is not None and scene.tangents is None:
+            raise ValueError(
+                "Argument `scene` must have tangents for a law with `friction`, but has none."
+            )
 
     def by_blocks(self) -> bool:
         """Contacts feel each other through W only; a tuple of exponents belongs to all of them."""
-        return not isinstance(self.exponent_static, tuple)
+        return self.friction is None and not isinstance(self.exponent_static, tuple)
 
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Impulses at the end of the impact dynamics."""
@@ -182,3 +196,25 @@ class LZB(Law):
         chain = isinstance(delassus, Tridiagonal)
         p, code = solve(inputs, self.exponent, chain, self.max_steps, self.method)
         return p * units.velocity / units.root, code
+
+    def all_impulses(
+        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Impulses with friction, where the law has some."""
+        if self.friction is None:
+            return super().all_impulses(scene, delassus, gap_velocity, velocity)
+        m = gap_velocity.shape[0]
+        inputs, units = to_dimensionless(
+            as_matrix(delassus),
+            gap_velocity,
+            self.restitution,
+            self.stiffness,
+            self.exponent,
+            self.stored_energy(m),
+            self.rtol or default_rtol(self.method, gap_velocity.dtype),
+        )
+        w_nt, w_tt, slip = tangential_delassus(scene, velocity)
+        side = friction.to_dimensionless(w_nt, w_tt, self.friction, slip, units)
+        (p, p_t), code = friction.solve(inputs, side, self.exponent, self.max_steps)
+        root = jnp.repeat(units.root, p_t.shape[0] // m)
+        return p * units.velocity / units.root, p_t * units.velocity / root, code

@@ -80,7 +80,7 @@ def find(
     landing = lands(kind)
     crossed_g = ~(target & (kind == ZERO_G)) & (after.g < -snap)
     crossed_x = ~(target & landing & (kind != ZERO_G)) & (after.x < -snap)
-    dipped = ~(target & landing) & _dips(
+    dipped = ~(target & landing) & dips(
         before.g, after.g, slope.g * span, slope_end.g * span, snap
     )
     idle = ~matters(flow, tolerance, state) & ~matters(flow, tolerance, new)
@@ -89,9 +89,9 @@ def find(
     )
     if flow.gapped:  # gaps that close together
         at_once |= crossed_x & (phase == OPEN) & (before.x <= snap) & (slope.x <= 0)
-    at_g = jnp.where(crossed_g, _crossing(before.g, after.g, slope.g * span), jnp.inf)
-    at_x = jnp.where(crossed_x, _crossing(before.x, after.x, slope.x * span), jnp.inf)
-    at_dip = jnp.where(dipped, _dip_at(before.g, after.g, slope.g * span), jnp.inf)
+    at_g = jnp.where(crossed_g, crossing_at(before.g, after.g, slope.g * span), jnp.inf)
+    at_x = jnp.where(crossed_x, crossing_at(before.x, after.x, slope.x * span), jnp.inf)
+    at_dip = jnp.where(dipped, dip_at(before.g, after.g, slope.g * span), jnp.inf)
     soonest_x, soonest_g, dip = least(at_x), least(at_g), least(at_dip)
     by_opening = soonest_x <= soonest_g
     crossing = jnp.minimum(soonest_x, soonest_g)
@@ -212,7 +212,7 @@ def _slopes(flow: Flow, phase: jax.Array, slack: jax.Array, state: State) -> Mar
     return Margin(jnp.where(phase == EXPANSION, dx, 0.0), margin_signs(phase) * dg)
 
 
-def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
+def crossing_at(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
     """First root in (0, 1] of the parabola through f0 >= 0, its slope there, and f1 < 0."""
     f0 = jnp.maximum(f0, 0.0)
     a = f1 - f0 - slope
@@ -223,10 +223,10 @@ def _crossing(f0: jax.Array, f1: jax.Array, slope: jax.Array) -> jax.Array:
     return jnp.clip(jnp.where(slope <= 0, falling, rising), 0.0, 1.0)
 
 
-def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.Array) -> jax.Array:
+def dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.Array) -> jax.Array:
     """Whether the cubic through both ends may fall below zero between them and return."""
     candidates = (d0 < 0) & (d1 > 0) & (f0 > snap) & (f1 >= -snap)
-    u = _dip_at(f0, f1, d0)
+    u = dip_at(f0, f1, d0)
     value = (
         f0 * (1 + 2 * u) * (1 - u) ** 2
         + d0 * u * (1 - u) ** 2
@@ -238,7 +238,7 @@ def _dips(f0: jax.Array, f1: jax.Array, d0: jax.Array, d1: jax.Array, snap: jax.
     return candidates & (value < doubt - snap)
 
 
-def _dip_at(f0: jax.Array, f1: jax.Array, d0: jax.Array) -> jax.Array:
+def dip_at(f0: jax.Array, f1: jax.Array, d0: jax.Array) -> jax.Array:
     """Minimum of the parabola through f0, its slope d0 < 0, and f1."""
     a = f1 - f0 - d0
     return jnp.clip(-d0 / jnp.where(a == 0, 1.0, 2 * a), 0.0, 1.0)

@@ -1,0 +1,243 @@
+"""Event-aligned integration of the frictional flow: no step straddles a change of modes.
+
+A pass tries one step. It is accepted, or shows an event that the next one lands on, or is
+shortened: as in `stepper.py`, without what makes that one fast in batches.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics import friction_events as events
+from jimpact.numerics.contacts import all_of, any_of, largest
+from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, matters
+from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN, rates_of
+from jimpact.numerics.friction_flow import (
+    MARGIN,
+    ROOT_X,
+    START,
+    TIME,
+    Frictional,
+    Modes,
+    State,
+    field,
+    size,
+    step,
+    still,
+)
+from jimpact.numerics.stepper import (
+    CUT_SHORT,
+    FIRST_TIME,
+    GROWTH,
+    LEAST_ERROR,
+    PATIENCE,
+    RESTART,
+    SAFETY,
+    SHRINK,
+    WIDENED,
+)
+
+
+class Carry(NamedTuple):
+    """What one pass hands to the next; one number an impact has shape (1,)."""
+
+    state: State
+    modes: Modes
+    kind: jax.Array
+    target: jax.Array  # (4 m,) one-hot
+    h: jax.Array  # step to try, in its variable
+    due: jax.Array  # expected time to the event of a landing step
+    begun: jax.Array  # xi reached by START steps
+    retargeted: jax.Array
+    passes: jax.Array
+    closures: jax.Array  # (m,)
+    done: jax.Array
+
+
+def begin(
+    flow: Frictional, tolerance: jax.Array, gamma: jax.Array, slip: jax.Array, x: jax.Array
+) -> Carry:
+    """State before the impact."""
+    phase = jnp.where((gamma <= 0) | (x > 0), COMPRESSION, OPEN)
+    phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase).astype(jnp.int32)
+    restitution = jnp.broadcast_to(flow.normal.restitution, gamma.shape)
+    # loaded, separating and e = 0: it opens at once and returns nothing
+    spent = (phase == EXPANSION) & (restitution == 0)
+    phase, x = jnp.where(spent, OPEN, phase), jnp.where(spent, 0.0, x)
+    s = jnp.where(phase == EXPANSION, restitution, 1.0)
+    none, no = jnp.zeros_like(gamma), jnp.zeros(gamma.shape, bool)
+    zero = jnp.zeros_like(gamma[:1])
+    state = State(x, gamma / s, slip, none, jnp.zeros_like(slip), zero)
+    sign = jnp.sign(slip) if flow.rows == 1 else none
+    modes = Modes(phase, no, jax.lax.stop_gradient(sign))
+    closed = phase != OPEN
+    state, modes = events.decided(flow, modes, tolerance, state, no, closed)
+    return _over(
+        flow,
+        tolerance,
+        Carry(
+            state=state,
+            modes=modes,
+            kind=jnp.full(zero.shape, START, jnp.int32),
+            target=jnp.tile(no, (4,) + (1,) * (gamma.ndim - 1)),
+            h=jnp.full_like(zero, FIRST_TIME ** (1 / flow.normal.root)),
+            due=zero,
+            begun=zero,
+            retargeted=no[:1],
+            passes=jnp.zeros(zero.shape, jnp.int32),
+            closures=jnp.zeros(gamma.shape, jnp.int32),
+            done=no[:1],
+        ),
+    )
+
+
+def run(flow: Frictional, tolerance: jax.Array, max_steps: int, carry: Carry) -> Carry:
+    """To the end, or to the limit of passes."""
+
+    def active(c: Carry) -> jax.Array:
+        return ~c.done & (c.passes < max_steps)
+
+    def body(c: Carry) -> Carry:
+        after = advance(flow, tolerance, c)
+        return jax.tree.map(lambda a, b: jnp.where(active(c), a, b), after, c)
+
+    return jax.lax.while_loop(lambda c: jnp.any(active(c)), body, carry)
+
+
+def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
+    """One pass."""
+    # where events lie and how long steps are is decided, not differentiated
+    h, due, begun = jax.lax.stop_gradient((carry.h, carry.due, carry.begun))
+    carry = carry._replace(h=h, due=due, begun=begun)
+    fixed = still(flow)
+
+    def margins(state: State, known: Frictional = flow) -> jax.Array:
+        return events.margins(known, carry.modes, tolerance, state)
+
+    start, length = _interval(flow, carry, margins(carry.state))
+    reached, high, low = step(
+        flow, carry.modes, margins, carry.state, carry.kind, carry.target, start, length
+    )
+    old, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
+    error = _error(flow, tolerance, high, low)
+    unit = rates_of(fixed.normal, carry.modes.phase).unit
+    span = _span(flow, carry, unit, new.t - old.t)
+    before, slope = _along(fixed, carry.modes, margins, old)
+    after, slope_end = _along(fixed, carry.modes, margins, new)
+    found = events.find(
+        fixed, carry.modes, tolerance, carry.target, span, (old, new),
+        (before, slope, after, slope_end),
+    )  # fmt: skip
+    exact = jnp.isfinite(error) & (error <= 1)
+    flips = exact & any_of(found.at_once)
+    inside, accept = exact & ~flips & found.inside, exact & ~flips & ~found.inside
+    broken = ~jnp.isfinite(error) & (carry.kind < ROOT_X) & (span < SHORTEST)
+    landing = carry.kind >= ROOT_X
+    arrived = jnp.where(flips, found.at_once, accept & landing & carry.target)
+    moved = State(*(jnp.where(accept, b, a) for a, b in zip(carry.state, reached)))
+    moved = moved._replace(p=jnp.where(broken, jnp.nan, moved.p))
+    state, modes, closed = events.change(flow, carry.modes, tolerance, moved, arrived)
+    out = _next(flow, carry, found, (inside, accept, flips), error, span, closed)
+    out = out._replace(state=state, modes=modes, done=carry.done | broken)
+    return _over(flow, tolerance, out)
+
+
+def _along(
+    flow: Frictional, modes: Modes, margins: events.Margins, state: State
+) -> tuple[jax.Array, jax.Array]:
+    """Margins and their slopes in time."""
+    rates = field(flow, modes, rates_of(flow.normal, modes.phase), state)
+    return jax.jvp(lambda y: margins(y, flow), (state,), (rates,))  # type: ignore[call-arg]
+
+
+def _interval(
+    flow: Frictional, carry: Carry, margins: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Start and length of the next step in its own variable."""
+    at = jnp.sum(jnp.where(carry.target, margins, 0.0), axis=0, keepdims=True)
+    positive = at > 0
+    root = jnp.where(positive, jnp.where(positive, at, 1.0) ** (1 / flow.normal.root), 0.0)
+    kinds = [carry.kind == START, carry.kind == ROOT_X, carry.kind == MARGIN]
+    start = jnp.select(kinds, [carry.begun, root, at], 0.0)
+    return start, jnp.select(kinds, [carry.h, -root, -at], carry.h)
+
+
+def _span(flow: Frictional, carry: Carry, unit: jax.Array, took: jax.Array) -> jax.Array:
+    """Time the step takes in units of `s*`; where that is 0 what a landing was expected to."""
+    r = flow.normal.root
+    in_start = (carry.begun + carry.h) ** r - carry.begun**r
+    timed = unit > 0
+    landed = jnp.where(timed, took / jnp.where(timed, unit, 1.0), carry.due)
+    return jnp.select([carry.kind >= ROOT_X, carry.kind == START], [landed, in_start], carry.h)
+
+
+def _error(flow: Frictional, tolerance: jax.Array, high: State, low: State) -> jax.Array:
+    """Hairer's combination of the two estimates, in units of the tolerance."""
+
+    def measure(estimate: State) -> jax.Array:
+        slip = size(estimate.u, flow.rows)
+        both = jnp.maximum(jnp.abs(estimate.x), jnp.maximum(jnp.abs(estimate.g), slip))
+        return largest(jnp.maximum(both, jnp.abs(estimate.p)) / tolerance)
+
+    fifth, third = measure(high), measure(low)
+    scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
+    return jnp.where(scale > 0, fifth**2 / jnp.where(scale > 0, scale, 1.0), fifth)
+
+
+def _next(
+    flow: Frictional,
+    carry: Carry,
+    found: events.Found,
+    verdict: tuple[jax.Array, jax.Array, jax.Array],
+    error: jax.Array,
+    span: jax.Array,
+    closed: jax.Array,
+) -> Carry:
+    """Variable, target and length of the next step."""
+    inside, accept, flips = verdict
+    h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.normal.root
+    landing, starting = kind >= ROOT_X, kind == START
+    grown = jnp.clip(SAFETY / (error + LEAST_ERROR) ** (1 / 8), SHRINK, GROWTH)
+    grown = jnp.where(jnp.isfinite(error), grown, SHRINK)
+    land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
+    leaves = starting & inside & (begun > 0)
+    short = CUT_SHORT * found.first
+    cases = [
+        (flips | (accept & landing), h),
+        (accept, grown * h),
+        (land, jnp.where(leaves, span, h)),
+        (inside & starting & ~leaves, short * h),
+        (inside, short * span),
+        (landing, 0.5 * jnp.where(jnp.isfinite(span) & (span > 0), span, carry.due)),
+    ]
+    next_h = jnp.select([case for case, _ in cases], [value for _, value in cases], grown * h)
+    opens = any_of(found.target[: len(closed)])
+    next_kind = jnp.where(starting & ~leaves, START, TIME)
+    next_kind = jnp.where(land, jnp.where(opens, ROOT_X, MARGIN), next_kind)
+    begun = begun + jnp.where(accept & starting, h, 0.0)
+    if r > 2:
+        begins = any_of(closed)
+        fresh = jnp.minimum(RESTART * span, FIRST_TIME)
+        next_kind = jnp.where(begins, START, next_kind)
+        next_h = jnp.where(begins, fresh ** (1 / r), next_h)
+        begun = jnp.where(begins, 0.0, begun)
+    return carry._replace(
+        kind=next_kind.astype(jnp.int32),
+        target=found.target & land,
+        h=next_h,
+        due=jnp.where(land, found.first * span, 0.0),
+        begun=begun,
+        retargeted=land & landing,
+        passes=carry.passes + 1,
+        closures=carry.closures + closed.astype(jnp.int32),
+    )
+
+
+def _over(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
+    """Whether nothing is left to integrate."""
+    drags = carry.passes > PATIENCE * len(carry.closures)
+    wide = tolerance * jnp.where(drags, WIDENED, 1.0).astype(tolerance.dtype)
+    loaded = matters(flow.normal, wide, carry.state, NEGLIGIBLE)  # type: ignore[arg-type]
+    return carry._replace(done=carry.done | all_of((carry.modes.phase == OPEN) | ~loaded))
+
