@@ -22,6 +22,10 @@ from jimpact.numerics.sensitivity import both_modes
 from jimpact.numerics.stepper import FINEST
 from jimpact.status import CODE
 
+# Passes a contact after which an impact is given up: wedged by friction, contacts may vibrate
+# for very long while their velocities fall to 0.
+PASSES = 1000
+
 
 class Tangential(NamedTuple):
     """What friction adds to `Inputs`: K_nt (m t,), K_tt above and on its diagonal, mu, u-."""
@@ -63,7 +67,8 @@ def solve(
         tolerance = jnp.maximum(tighten * given.tolerance, floor)
         x = indentation(given, flow.normal.exponent)
         start = stepper.begin(flow, tolerance, given.gamma, side.slip, x)
-        end = stepper.run(flow, tolerance, max_steps, start)
+        most = min(max_steps, PASSES * len(given.gamma))
+        end = stepper.run(flow, tolerance, most, start)
         quiet = jnp.abs(end.state.g) <= QUIET * given.tolerance
         endless = any_of((end.closures >= ENDLESS) & quiet)
         code = jnp.where(endless, CODE["plastic_limit"], CODE["ok"])
