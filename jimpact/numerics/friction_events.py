@@ -33,12 +33,17 @@ from jimpact.numerics.friction_flow import (
     per_row,
     size,
     tangential_force,
+    times,
 )
 from jimpact.numerics.friction_modes import who_sticks
 
 AT_REST = 0.5  # part of the tolerance below which a spatial slip velocity counts as 0
 NEW_SLIP = 2 * AT_REST  # with which it begins, along its direction
 BROKEN = 1e-7  # part of mu F within which contacts that stick together break loose together
+
+# A spatial direction of slip turns at a rate ~ 1 / |u|. Values hide when an explicit step is longer
+# than its stability allows, derivatives do not: the steps are bounded. (The bound of order 8 is 6.)
+STABLE = 4.0
 
 Margins = Callable[[State], jax.Array]
 
@@ -84,10 +89,11 @@ def find(
     span: jax.Array,
     ends: tuple[State, State],
     values: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
+    turning: jax.Array,
 ) -> Found:
     """Events between two states; the one a landing step ends on is not among them.
 
-    `values` are margins and their slopes at both ends.
+    `values` are margins and their slopes at both ends, `turning` is that of `turning`.
     """
     snap = SNAP * jnp.tile(tolerance, (4,) + (1,) * (tolerance.ndim - 1))
     before, slope, after, slope_end = values
@@ -100,6 +106,9 @@ def find(
     dip = least(jnp.where(dipped, dip_at(before, after, slope * span), jnp.inf))
     soonest, mark = least(at), first_least(at)
     heads = mark & (slope < 0) & (before > snap)
+    if flow.rows == 2:  # a stop is approached step by step where the direction turns
+        smooth = turning * least(at) * span <= STABLE * AT_REST * tolerance
+        heads = heads & jnp.concatenate([*[jnp.ones_like(smooth)] * 2, smooth, smooth | True])
     return Found(
         inside=any_of(crossed | dipped),
         at_once=at_once,
@@ -107,6 +116,23 @@ def find(
         target=mark,
         monotone=any_of(heads) & jnp.isfinite(soonest) & (soonest <= dip),
     )
+
+
+def turning(flow: Frictional, modes: Modes, state: State, rates: State) -> jax.Array:
+    """How fast (m,) the direction of spatial slip turns, times |u|; `rates` of the state."""
+    m = len(state.x)
+    force = normal_force(flow, modes, state.x)
+    side, most = tangential_force(flow, modes, force, state.u)
+    unit = rates.t
+    found = []
+    for j in range(m):
+        at = slice(2 * j, 2 * j + 2)
+        k = flow.along[at, at]
+        others = rates.u[at] - unit * times(k, side[at])
+        spread = jnp.sqrt((k[0, 0] - k[1, 1]) ** 2 + 4 * k[0, 1] ** 2)
+        found.append(size(others, 2) + unit * spread * most[j : j + 1])
+    slips = ~modes.stick & (modes.phase != OPEN)
+    return jnp.where(slips, jnp.concatenate(found), 0.0)
 
 
 def change(

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import friction_events as events
-from jimpact.numerics.contacts import all_of, any_of, largest
+from jimpact.numerics.contacts import all_of, any_of, largest, of
 from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, matters
 from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN, rates_of
 from jimpact.numerics.friction_flow import (
@@ -123,11 +123,15 @@ def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     error = _error(flow, tolerance, high, low)
     unit = rates_of(fixed.normal, carry.modes.phase).unit
     span = _span(flow, carry, unit, new.t - old.t)
-    before, slope = _along(fixed, carry.modes, margins, old)
-    after, slope_end = _along(fixed, carry.modes, margins, new)
+    before, slope, turns = _along(fixed, carry.modes, margins, old)
+    after, slope_end, turns_end = _along(fixed, carry.modes, margins, new)
+    if flow.rows == 2:
+        slow = jnp.minimum(size(old.u, 2), size(new.u, 2))
+        angle = span * jnp.maximum(turns, turns_end) / jnp.where(slow > 0, slow, 1.0)
+        error = jnp.maximum(error, largest((angle / events.STABLE) ** 8))
     found = events.find(
         fixed, carry.modes, tolerance, carry.target, span, (old, new),
-        (before, slope, after, slope_end),
+        (before, slope, after, slope_end), turns,
     )  # fmt: skip
     exact = jnp.isfinite(error) & (error <= 1)
     flips = exact & any_of(found.at_once)
@@ -137,18 +141,39 @@ def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     arrived = jnp.where(flips, found.at_once, accept & landing & carry.target)
     moved = State(*(jnp.where(accept, b, a) for a, b in zip(carry.state, reached)))
     moved = moved._replace(p=jnp.where(broken, jnp.nan, moved.p))
+    moved = _on_event(flow, carry.modes, margins, moved, arrived)
     state, modes, closed = events.change(flow, carry.modes, tolerance, moved, arrived)
     out = _next(flow, carry, found, (inside, accept, flips), error, span, closed)
     out = out._replace(state=state, modes=modes, done=carry.done | broken)
     return _over(flow, tolerance, out)
 
 
+def _on_event(
+    flow: Frictional, modes: Modes, margins: events.Margins, state: State, arrived: jax.Array
+) -> State:
+    """The state with the derivatives it has where slip ends: forces jump there.
+
+    A step that was aimed at the event has them; one that came to lie on it has not.
+    """
+    m = len(state.x)
+    stops = arrived.at[: 2 * m].set(False).at[3 * m :].set(False)
+    mark = stops & (jnp.cumsum(stops, axis=0) == 1)
+    rates = field(flow, modes, rates_of(flow.normal, modes.phase), state)
+    value, slope = jax.jvp(margins, (state,), (rates,))
+    slope = jax.lax.stop_gradient(of(mark, slope))
+    missed = of(mark, value - jax.lax.stop_gradient(value))
+    wait = jnp.where(slope == 0, 0.0, -missed / jnp.where(slope == 0, 1.0, slope))
+    return State(*(y + jnp.where(any_of(mark), wait * dy, 0.0) for y, dy in zip(state, rates)))
+
+
 def _along(
     flow: Frictional, modes: Modes, margins: events.Margins, state: State
-) -> tuple[jax.Array, jax.Array]:
-    """Margins and their slopes in time."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Margins, their slopes in time, and how fast directions of slip turn."""
     rates = field(flow, modes, rates_of(flow.normal, modes.phase), state)
-    return jax.jvp(lambda y: margins(y, flow), (state,), (rates,))  # type: ignore[call-arg]
+    values, slopes = jax.jvp(lambda y: margins(y, flow), (state,), (rates,))  # type: ignore[call-arg]
+    turns = events.turning(flow, modes, state, rates) if flow.rows == 2 else state.x
+    return values, slopes, turns
 
 
 def _interval(
