@@ -80,9 +80,7 @@ def find(
     landing = lands(kind)
     crossed_g = ~(target & (kind == ZERO_G)) & (after.g < -snap)
     crossed_x = ~(target & landing & (kind != ZERO_G)) & (after.x < -snap)
-    dipped = ~(target & landing) & dips(
-        before.g, after.g, slope.g * span, slope_end.g * span, snap
-    )
+    dipped = ~(target & landing) & dips(before.g, after.g, slope.g * span, slope_end.g * span, snap)
     idle = ~matters(flow, tolerance, state) & ~matters(flow, tolerance, new)
     at_once = (crossed_g & (before.g <= snap) & (slope.g <= 0)) | (
         (crossed_g | crossed_x) & ((span < SHORTEST) | idle)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics.contacts import any_of, first_least, least
+from jimpact.numerics.contacts import any_of, first_least, largest, least
 from jimpact.numerics.events import (
     NEGLIGIBLE,
     SHORTEST,
@@ -26,6 +26,7 @@ from jimpact.numerics.events import (
 )
 from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN
 from jimpact.numerics.friction_flow import (
+    HOLDING,
     Frictional,
     Modes,
     State,
@@ -39,7 +40,10 @@ from jimpact.numerics.friction_modes import who_sticks
 
 AT_REST = 0.5  # part of the tolerance below which a spatial slip velocity counts as 0
 NEW_SLIP = 2 * AT_REST  # with which it begins, along its direction
-BROKEN = 1e-7  # part of mu F within which contacts that stick together break loose together
+# Forces are continuous where a contact breaks loose: a landing beside it by part delta of the stick
+# costs delta^2. This part of the square root of the tolerance.
+BESIDE = 0.01
+BROKEN = 1e-7  # of mu F, beside that: what holds contacts that break loose together
 
 # A spatial direction of slip turns at a rate ~ 1 / |u|. Values hide when an explicit step is longer
 # than its stability allows, derivatives do not: the steps are bounded. (The bound of order 8 is 6.)
@@ -81,27 +85,37 @@ def margins(flow: Frictional, modes: Modes, tolerance: jax.Array, state: State) 
     )
 
 
+def tile(values: jax.Array) -> jax.Array:
+    """Values (m, ...) of contacts for all their margins (4 m, ...)."""
+    return jnp.concatenate([values] * 4)
+
+
+def beside(tolerance: jax.Array) -> jax.Array:
+    """How far (4 m,) from the end of stick a landing may be."""
+    return BESIDE * jnp.sqrt(tile(tolerance))
+
+
 def find(
     flow: Frictional,
     modes: Modes,
     tolerance: jax.Array,
-    target: jax.Array,
+    landing: tuple[jax.Array, jax.Array],
     span: jax.Array,
     ends: tuple[State, State],
     values: tuple[jax.Array, jax.Array, jax.Array, jax.Array],
     turning: jax.Array,
 ) -> Found:
-    """Events between two states; the one a landing step ends on is not among them.
+    """Events between two states; the one a step is `landing` on (kind, target) is not among them.
 
     `values` are margins and their slopes at both ends, `turning` is that of `turning`.
     """
-    snap = SNAP * jnp.tile(tolerance, (4,) + (1,) * (tolerance.ndim - 1))
+    kind, target = landing
+    snap = SNAP * tile(tolerance)
     before, slope, after, slope_end = values
-    crossed = ~target & (after < -snap)
+    crossed = jnp.where(target, (kind == HOLDING) & (after < -beside(tolerance)), after < -snap)
     dipped = ~target & dips(before, after, slope * span, slope_end * span, snap)
     idle = ~matters(flow.normal, tolerance, ends[0]) & ~matters(flow.normal, tolerance, ends[1])  # type: ignore[arg-type]
-    idle = jnp.tile(idle, (4,) + (1,) * (idle.ndim - 1))
-    at_once = crossed & (((before <= snap) & (slope <= 0)) | (span < SHORTEST) | idle)
+    at_once = crossed & (((before <= snap) & (slope <= 0)) | (span < SHORTEST) | tile(idle))
     at = jnp.where(crossed, crossing_at(before, after, slope * span), jnp.inf)
     dip = least(jnp.where(dipped, dip_at(before, after, slope * span), jnp.inf))
     soonest, mark = least(at), first_least(at)
@@ -155,7 +169,8 @@ def change(
     state = state._replace(x=jnp.where(new == OPEN, 0.0, state.x), g=g)
     force = normal_force(flow, modes, state.x)
     side, most = tangential_force(flow, modes, force, state.u)
-    together = modes.stick & (most - size(side, flow.rows) <= BROKEN * most)
+    spare = 1 - size(side, flow.rows) / jnp.where(most > 0, most, 1.0)
+    together = modes.stick & (spare <= largest(jnp.where(broke, spare, -jnp.inf)) + BROKEN)
     loose = broke | (any_of(broke) & together)
     state, modes = _slip(flow, modes._replace(phase=new), tolerance, state, loose, side)
     state, modes = decided(flow, modes, tolerance, state, stopped, closed)

@@ -17,10 +17,10 @@ contact, further axes are batches. A step advances in one of the variables
 
     TIME, START   as in `flow.py`
     ROOT_X        xi = x_j^(1/r) to 0: an opening
-    MARGIN        xi = a margin of an event to 0 (see `friction_events.py`): Henon's trick
+    MARGIN        xi = |gamma_j| or |u_j| to 0 (see `friction_events.py`): Henon's trick
+    HOLDING       time, to where a contact breaks loose
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -28,12 +28,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.numerics.contacts import along_contacts, of
+from jimpact.numerics.events import margin_signs
 from jimpact.numerics.flow import OPEN, START, TIME, Flow, Rates, frozen, power, rates_of
 from jimpact.numerics.tableaux import DOP853
 
-__all__ = ["MARGIN", "ROOT_X", "START", "TIME"]
+__all__ = ["HOLDING", "MARGIN", "ROOT_X", "START", "TIME"]
 
-ROOT_X, MARGIN = 2, 3  # kinds of steps that land on an event
+ROOT_X, MARGIN, HOLDING = 2, 3, 4  # kinds of steps that land on an event
 
 # Stick forces minimize sum lambda^2 / (mu F) with this weight beside K_tt: it decides where K_tt
 # is singular only, and refinements remove what it changes elsewhere.
@@ -163,13 +164,21 @@ def field(flow: Frictional, modes: Modes, rates: Rates, state: State) -> State:
     """Rates of all of the state, with respect to time in units of `s*`; modes frozen."""
     force = normal_force(flow, modes, state.x)
     side, _ = tangential_force(flow, modes, force, state.u)
-    pull = times(flow.normal.coupling, force) + times(flow.across, side)  # type: ignore[arg-type]
+    pull = times(flow.normal.coupling, force) + times(flow.across, side)
     slip = times(jnp.swapaxes(flow.across, 0, 1), force) + times(flow.along, side)
     slip = jnp.where(per_row(modes.stick, flow.rows), 0.0, slip)
     unit = rates.unit
     return State(
         rates.closing * state.g, rates.ratio * pull, unit * slip, unit * force, unit * side, unit
     )
+
+
+def slowing(flow: Frictional, modes: Modes, u: jax.Array, rate: jax.Array) -> jax.Array:
+    """Rate (m,) of the speed of slip."""
+    along = direction(flow, modes, u) * rate
+    if flow.rows == 1:
+        return along
+    return jnp.sum(along.reshape(-1, 2, *u.shape[1:]), axis=1)
 
 
 def flat(state: State) -> jax.Array:
@@ -187,7 +196,6 @@ def unflat(flow: Frictional, y: jax.Array) -> State:
 def step(
     flow: Frictional,
     modes: Modes,
-    margins: Callable[[State], jax.Array],
     state: State,
     kind: jax.Array,
     target: jax.Array,
@@ -196,8 +204,7 @@ def step(
 ) -> tuple[State, State, State]:
     """One step of order 8 and its two error estimates.
 
-    `margins(state)` are the distances (4 m,) to events; `target` (4 m,), one-hot, is the one on
-    which a ROOT_X or MARGIN step ends.
+    `target` (4 m,), one-hot, is the event on which a ROOT_X or MARGIN step ends.
     """
     dtype, count, m = state.x.dtype, len(DOP853.c), state.x.shape[0]
     dense = np.array([[*row, *[0.0] * (count - len(row))] for row in DOP853.a])
@@ -213,7 +220,8 @@ def step(
         y = unflat(flow, first + length * jnp.tensordot(row, slopes, axes=1))
         y = y._replace(x=jnp.where(known, xi**r, y.x))
         dy = field(flow, modes, rates, y)
-        nears = of(target, jax.jvp(margins, (y,), (dy,))[1])
+        nears = of(target[m : 2 * m], margin_signs(modes.phase) * dy.g)
+        nears = nears + of(target[2 * m : 3 * m], slowing(flow, modes, y.u, dy.u))
         rate = jnp.where(kind == ROOT_X, of(known, dy.x), jnp.where(kind == MARGIN, nears, 1.0))
         rooted = (kind == START) | (kind == ROOT_X)
         numerator = jnp.where(rooted, r * xi ** (r - 1), 1.0)

@@ -28,6 +28,8 @@ SWEEPS = 200  # of the projected Gauss-Seidel iteration
 SETTLED = 1e-13  # change of a sweep, in the largest friction, with which it ends
 INSIDE = 1e-9  # part of mu F below which a force is inside the disc
 
+Sweep = tuple[jax.Array, jax.Array, jax.Array]  # forces, whether they move, count
+
 
 def who_sticks(
     flow: Frictional, modes: Modes, state: State, asked_of: jax.Array
@@ -60,7 +62,7 @@ def _gauss_seidel(
     m = len(asked_of)
     tolerance = SETTLED * jnp.max(most, axis=0, keepdims=True)
 
-    def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+    def sweep(carry: Sweep) -> Sweep:
         side, _, count = carry
         before = side
         for j in range(m):

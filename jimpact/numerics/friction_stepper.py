@@ -11,9 +11,10 @@ import jax.numpy as jnp
 
 from jimpact.numerics import friction_events as events
 from jimpact.numerics.contacts import all_of, any_of, largest, of
-from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, matters
+from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, margin_signs, matters
 from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN, rates_of
 from jimpact.numerics.friction_flow import (
+    HOLDING,
     MARGIN,
     ROOT_X,
     START,
@@ -23,6 +24,7 @@ from jimpact.numerics.friction_flow import (
     State,
     field,
     size,
+    slowing,
     step,
     still,
 )
@@ -112,25 +114,22 @@ def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     carry = carry._replace(h=h, due=due, begun=begun)
     fixed = still(flow)
 
-    def margins(state: State, known: Frictional = flow) -> jax.Array:
-        return events.margins(known, carry.modes, tolerance, state)
-
-    start, length = _interval(flow, carry, margins(carry.state))
+    start, length = _interval(flow, carry, tolerance)
     reached, high, low = step(
-        flow, carry.modes, margins, carry.state, carry.kind, carry.target, start, length
+        flow, carry.modes, carry.state, carry.kind, carry.target, start, length
     )
     old, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
     error = _error(flow, tolerance, high, low)
     unit = rates_of(fixed.normal, carry.modes.phase).unit
     span = _span(flow, carry, unit, new.t - old.t)
-    before, slope, turns = _along(fixed, carry.modes, margins, old)
-    after, slope_end, turns_end = _along(fixed, carry.modes, margins, new)
+    rates, before, slope, turns = _along(fixed, carry.modes, tolerance, old)
+    rates_end, after, slope_end, turns_end = _along(fixed, carry.modes, tolerance, new)
     if flow.rows == 2:
         slow = jnp.minimum(size(old.u, 2), size(new.u, 2))
         angle = span * jnp.maximum(turns, turns_end) / jnp.where(slow > 0, slow, 1.0)
         error = jnp.maximum(error, largest((angle / events.STABLE) ** 8))
     found = events.find(
-        fixed, carry.modes, tolerance, carry.target, span, (old, new),
+        fixed, carry.modes, tolerance, (carry.kind, carry.target), span, (old, new),
         (before, slope, after, slope_end), turns,
     )  # fmt: skip
     exact = jnp.isfinite(error) & (error <= 1)
@@ -138,10 +137,12 @@ def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     inside, accept = exact & ~flips & found.inside, exact & ~flips & ~found.inside
     broken = ~jnp.isfinite(error) & (carry.kind < ROOT_X) & (span < SHORTEST)
     landing = carry.kind >= ROOT_X
-    arrived = jnp.where(flips, found.at_once, accept & landing & carry.target)
+    there = (carry.kind != HOLDING) | (jnp.abs(after) <= events.beside(tolerance))
+    arrived = jnp.where(flips, found.at_once, accept & landing & there & carry.target)
     moved = State(*(jnp.where(accept, b, a) for a, b in zip(carry.state, reached)))
     moved = moved._replace(p=jnp.where(broken, jnp.nan, moved.p))
-    moved = _on_event(flow, carry.modes, margins, moved, arrived)
+    rates = State(*(jnp.where(accept, b, a) for a, b in zip(rates, rates_end)))
+    moved = _on_event(flow, carry.modes, moved, rates, arrived)
     state, modes, closed = events.change(flow, carry.modes, tolerance, moved, arrived)
     out = _next(flow, carry, found, (inside, accept, flips), error, span, closed)
     out = out._replace(state=state, modes=modes, done=carry.done | broken)
@@ -149,43 +150,50 @@ def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
 
 
 def _on_event(
-    flow: Frictional, modes: Modes, margins: events.Margins, state: State, arrived: jax.Array
+    flow: Frictional, modes: Modes, state: State, rates: State, arrived: jax.Array
 ) -> State:
     """The state with the derivatives it has where slip ends: forces jump there.
 
     A step that was aimed at the event has them; one that came to lie on it has not.
     """
     m = len(state.x)
-    stops = arrived.at[: 2 * m].set(False).at[3 * m :].set(False)
+    stops = arrived[2 * m : 3 * m]
     mark = stops & (jnp.cumsum(stops, axis=0) == 1)
-    rates = field(flow, modes, rates_of(flow.normal, modes.phase), state)
-    value, slope = jax.jvp(margins, (state,), (rates,))
-    slope = jax.lax.stop_gradient(of(mark, slope))
-    missed = of(mark, value - jax.lax.stop_gradient(value))
+    slope = of(
+        mark, slowing(flow, jax.lax.stop_gradient(modes), jax.lax.stop_gradient(state.u), rates.u)
+    )
+    speed = modes.sign * state.u if flow.rows == 1 else size(state.u, 2)
+    missed = of(mark, speed - jax.lax.stop_gradient(speed))
     wait = jnp.where(slope == 0, 0.0, -missed / jnp.where(slope == 0, 1.0, slope))
-    return State(*(y + jnp.where(any_of(mark), wait * dy, 0.0) for y, dy in zip(state, rates)))
+    return State(*(y + wait * dy for y, dy in zip(state, rates)))
 
 
 def _along(
-    flow: Frictional, modes: Modes, margins: events.Margins, state: State
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Margins, their slopes in time, and how fast directions of slip turn."""
+    flow: Frictional, modes: Modes, tolerance: jax.Array, state: State
+) -> tuple[State, jax.Array, jax.Array, jax.Array]:
+    """Rates of the state, margins and their slopes, and how fast directions of slip turn."""
     rates = field(flow, modes, rates_of(flow.normal, modes.phase), state)
-    values, slopes = jax.jvp(lambda y: margins(y, flow), (state,), (rates,))  # type: ignore[call-arg]
+    values, slopes = jax.jvp(
+        lambda y: events.margins(flow, modes, tolerance, y), (state,), (rates,)
+    )
     turns = events.turning(flow, modes, state, rates) if flow.rows == 2 else state.x
-    return values, slopes, turns
+    return rates, values, slopes, turns
 
 
-def _interval(
-    flow: Frictional, carry: Carry, margins: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def _interval(flow: Frictional, carry: Carry, tolerance: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Start and length of the next step in its own variable."""
-    at = jnp.sum(jnp.where(carry.target, margins, 0.0), axis=0, keepdims=True)
-    positive = at > 0
-    root = jnp.where(positive, jnp.where(positive, at, 1.0) ** (1 / flow.normal.root), 0.0)
-    kinds = [carry.kind == START, carry.kind == ROOT_X, carry.kind == MARGIN]
-    start = jnp.select(kinds, [carry.begun, root, at], 0.0)
-    return start, jnp.select(kinds, [carry.h, -root, -at], carry.h)
+    state, modes = carry.state, carry.modes
+    opens, turns, stops, _ = jnp.split(carry.target, 4)
+    x = of(opens, state.x)
+    positive = x > 0
+    root = jnp.where(positive, jnp.where(positive, x, 1.0) ** (1 / flow.normal.root), 0.0)
+    speed = modes.sign * state.u if flow.rows == 1 else size(state.u, 2)
+    end = events.AT_REST * of(stops, tolerance) if flow.rows == 2 else 0.0
+    margin = of(turns, margin_signs(modes.phase) * state.g) + of(stops, speed) - end
+    kinds = [carry.kind == kind for kind in (START, ROOT_X, MARGIN)]
+    start = jnp.select(kinds, [carry.begun, root, margin], 0.0)
+    kinds = [*kinds, carry.kind == HOLDING]
+    return start, jnp.select(kinds, [carry.h, -root, -margin, carry.due], carry.h)
 
 
 def _span(flow: Frictional, carry: Carry, unit: jax.Array, took: jax.Array) -> jax.Array:
@@ -194,7 +202,8 @@ def _span(flow: Frictional, carry: Carry, unit: jax.Array, took: jax.Array) -> j
     in_start = (carry.begun + carry.h) ** r - carry.begun**r
     timed = unit > 0
     landed = jnp.where(timed, took / jnp.where(timed, unit, 1.0), carry.due)
-    return jnp.select([carry.kind >= ROOT_X, carry.kind == START], [landed, in_start], carry.h)
+    kinds = [carry.kind == HOLDING, carry.kind >= ROOT_X, carry.kind == START]
+    return jnp.select(kinds, [carry.due, landed, in_start], carry.h)
 
 
 def _error(flow: Frictional, tolerance: jax.Array, high: State, low: State) -> jax.Array:
@@ -237,9 +246,9 @@ def _next(
         (landing, 0.5 * jnp.where(jnp.isfinite(span) & (span > 0), span, carry.due)),
     ]
     next_h = jnp.select([case for case, _ in cases], [value for _, value in cases], grown * h)
-    opens = any_of(found.target[: len(closed)])
-    next_kind = jnp.where(starting & ~leaves, START, TIME)
-    next_kind = jnp.where(land, jnp.where(opens, ROOT_X, MARGIN), next_kind)
+    opens, breaks = (any_of(jnp.split(found.target, 4)[i]) for i in (0, 3))
+    aimed = jnp.where(opens, ROOT_X, jnp.where(breaks, HOLDING, MARGIN))
+    next_kind = jnp.where(land, aimed, jnp.where(starting & ~leaves, START, TIME))
     begun = begun + jnp.where(accept & starting, h, 0.0)
     if r > 2:
         begins = any_of(closed)
@@ -265,4 +274,3 @@ def _over(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     wide = tolerance * jnp.where(drags, WIDENED, 1.0).astype(tolerance.dtype)
     loaded = matters(flow.normal, wide, carry.state, NEGLIGIBLE)  # type: ignore[arg-type]
     return carry._replace(done=carry.done | all_of((carry.modes.phase == OPEN) | ~loaded))
-
