@@ -43,6 +43,8 @@ NEW_SLIP = 2 * AT_REST  # with which it begins, along its direction
 # Forces are continuous where a contact breaks loose: a landing beside it by part delta of the stick
 # costs delta^2. This part of the square root of the tolerance.
 BESIDE = 0.01
+EARLY = 10.0  # slopes, in those parts, of the slip of a contact that was let go as much too early
+RETRY = 0.1  # part of a step after which an event at its very beginning is looked for again
 BROKEN = 1e-7  # of mu F, beside that: what holds contacts that break loose together
 
 # A spatial direction of slip turns at a rate ~ 1 / |u|. Values hide when an explicit step is longer
@@ -115,8 +117,14 @@ def find(
     crossed = jnp.where(target, (kind == HOLDING) & (after < -beside(tolerance)), after < -snap)
     dipped = ~target & dips(before, after, slope * span, slope_end * span, snap)
     idle = ~matters(flow.normal, tolerance, ends[0]) & ~matters(flow.normal, tolerance, ends[1])  # type: ignore[arg-type]
-    at_once = crossed & (((before <= snap) & (slope <= 0)) | (span < SHORTEST) | tile(idle))
+    # a contact that broke loose a little early is pulled back for as little
+    m = len(tolerance)
+    falls = slope <= jnp.where(jnp.arange(4 * m) < 2 * m, 0.0, -1.0).reshape(
+        (4 * m,) + (1,) * (slope.ndim - 1)
+    ) * EARLY * beside(tolerance)
+    at_once = crossed & (((before <= snap) & falls) | (span < SHORTEST) | tile(idle))
     at = jnp.where(crossed, crossing_at(before, after, slope * span), jnp.inf)
+    at = jnp.maximum(at, jnp.where(before <= snap, RETRY, 0.0))
     dip = least(jnp.where(dipped, dip_at(before, after, slope * span), jnp.inf))
     soonest, mark = least(at), first_least(at)
     heads = mark & (slope < 0) & (before > snap)
