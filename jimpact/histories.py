@@ -84,6 +84,8 @@ def history(
             "Bistiffness force (others have no impact dynamics that are sampled), "
             f"but is {law!r}."
         )
+    if isinstance(law, LZB) and law.friction is not None:
+        raise TypeError("Argument `law` must have no friction: its history is not sampled yet.")
     if samples < 2:
         raise ValueError(f"Argument `samples` must be at least 2, but has value {samples}.")
     v = as_float_array("velocity", velocity)

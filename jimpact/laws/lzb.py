@@ -71,16 +71,21 @@ class LZB(Law):
         exponent: eta_j >= 1: 1 linear, 1.5 Hertz. A float or a tuple is static (fast for 1, 1.5,
             2); an array is a parameter to differentiate and fit.
         initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression.
+        friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents (planar or spatial);
+            None: none. While contacts slip `lambda = -mu F u / |u|`, while they stick their slip
+            velocity is exactly 0 and `|lambda| <= mu F` (see `docs/friction.md`).
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
         max_steps: passes of the integrator (or steps, method 'impulse') before it gives up.
         method: 'time' (default), event-aligned, order 8; 'propagator', exact, exponent 1 only;
             'impulse', the published scheme in the impulse of a primary contact, order 1.
 
-    Status: `plastic_limit` where contacts re-close without end, `max_steps`.
+    Status: `plastic_limit` where contacts re-close without end; `max_steps`, also where large
+    friction wedges contacts that then vibrate for long.
 
     Derivatives, forward and reverse, in all parameters, W and gamma-; one-sided at e = 0 and
     e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three equal
-    linear balls). In `initial_energy` at 0 the true slope may be infinite; 0 is returned.
+    linear balls), and where slip stops just as a contact opens. In `initial_energy` at 0 the true
+    slope may be infinite; 0 is returned.
 
     Source: Liu, Zhao and Brogliato, Proc. R. Soc. A 464 (2008) 3193 and 465 (2009) 1;
     Brogliato, Nonsmooth Mechanics (2016), (6.67)-(6.73) with the errata of `docs/equations.md`.

@@ -89,6 +89,8 @@ class Problem(NamedTuple):
 
 def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
     """The impact in units of its own, open contacts left out."""
+    if law.friction is not None:
+        raise TypeError("Argument `law` must have no friction: these methods have none.")
     v = as_float_array("velocity", velocity)
     law, scene, v = in_common_dtype(law, scene, v)
     w, gamma = without_open_contacts(scene, delassus_matrix(scene), gap_velocity(scene, v))

@@ -24,7 +24,7 @@ from jimpact.status import CODE
 
 # Passes a contact after which an impact is given up: wedged by friction, contacts may vibrate
 # for very long while their velocities fall to 0.
-PASSES = 1000
+PASSES = 2000
 
 
 class Tangential(NamedTuple):

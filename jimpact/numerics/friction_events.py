@@ -39,7 +39,7 @@ from jimpact.numerics.friction_flow import (
 from jimpact.numerics.friction_modes import who_sticks
 
 AT_REST = 0.5  # part of the tolerance below which a spatial slip velocity counts as 0
-NEW_SLIP = 2 * AT_REST  # with which it begins, along its direction
+NEW_SLIP = 4.0  # tolerances, with which it begins along its direction: the less the stiffer
 # Forces are continuous where a contact breaks loose: a landing beside it by part delta of the stick
 # costs delta^2. This part of the square root of the tolerance.
 BESIDE = 0.01
@@ -151,7 +151,7 @@ def turning(flow: Frictional, modes: Modes, state: State, rates: State) -> jax.A
         at = slice(2 * j, 2 * j + 2)
         k = flow.along[at, at]
         others = rates.u[at] - unit * times(k, side[at])
-        spread = jnp.sqrt((k[0, 0] - k[1, 1]) ** 2 + 4 * k[0, 1] ** 2)
+        spread = jnp.sqrt((k[0, 0] - k[1, 1]) ** 2 + 4 * k[0, 1] ** 2)[None]
         found.append(size(others, 2) + unit * spread * most[j : j + 1])
     slips = ~modes.stick & (modes.phase != OPEN)
     return jnp.where(slips, jnp.concatenate(found), 0.0)

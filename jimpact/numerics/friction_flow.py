@@ -155,8 +155,8 @@ def _inverse(matrix: jax.Array) -> jax.Array:
     both = jnp.concatenate([matrix, jnp.broadcast_to(unit, matrix.shape)], axis=1)
     rows = [both[i] for i in range(n)]
     for k in range(n):
-        rows[k] = rows[k] / rows[k][k]
-        rows = [row if i == k else row - row[k] * rows[k] for i, row in enumerate(rows)]
+        rows[k] = rows[k] / rows[k][k][None]
+        rows = [row if i == k else row - row[k][None] * rows[k] for i, row in enumerate(rows)]
     return jnp.stack([row[n:] for row in rows])
 
 
@@ -230,7 +230,7 @@ def step(
 
     slopes = jax.lax.fori_loop(0, count, stage, jnp.zeros((count, *first.shape), dtype))
     weights = jnp.asarray([DOP853.b, DOP853.error_high, DOP853.error_low], dtype)
-    change, high, low = length * jnp.tensordot(weights, slopes, axes=1)
-    end = unflat(flow, first + change)
+    change, high, low = jnp.tensordot(weights, slopes, axes=1)
+    end = unflat(flow, first + length * change)
     end = end._replace(x=jnp.where(known, 0.0, end.x))
-    return end, unflat(flow, high), unflat(flow, low)
+    return end, unflat(flow, length * high), unflat(flow, length * low)

@@ -68,8 +68,8 @@ def _gauss_seidel(
         for j in range(m):
             at = slice(rows * j, rows * (j + 1))
             rate = times(k[at], side) + b[at]
-            stiffness = sum((k[rows * j + i, rows * j + i] for i in range(rows)), 0.0)
-            tried = side[at] - rate / stiffness
+            stiffness = jnp.trace(k[at, at])
+            tried = side[at] - rate / stiffness[None]
             length = size(tried, rows)
             allowed = most[j : j + 1]
             shrink = jnp.where(length > allowed, allowed / jnp.where(length > 0, length, 1.0), 1.0)
