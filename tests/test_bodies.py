@@ -51,11 +51,11 @@ def test_kinetic_angles_of_dimers():
     scene = ji.dimer(radius=5 / 24, length=1.0)
     assert abs(float(ji.normalized_delassus(scene)[0, 1]) + 13 / 89) < 1e-14
 
-    def angle(ratio):
-        return ji.kinetic_angles(ji.dimer(ratio, 1.0))[0, 1]
+    def cosine(ratio):
+        return ji.normalized_delassus(ji.dimer(ratio, 1.0))[0, 1]  # -cos(theta_12)
 
-    # least at R / L = 5/24: the slope vanishes and rises
-    slope = jax.jit(jax.vmap(jax.grad(angle)))(jnp.array([0.2, 5 / 24, 0.22]))
+    # least angle at R / L = 5/24: the slope vanishes and rises
+    slope = jax.jit(jax.vmap(jax.grad(cosine)))(jnp.array([0.2, 5 / 24, 0.22]))
     assert abs(float(slope[1])) < 1e-12
     assert float(slope[0]) < -1e-3 < 1e-3 < float(slope[2])
 

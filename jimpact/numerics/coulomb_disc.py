@@ -1,0 +1,172 @@
+"""Coulomb impulses in space, at impulse level: the friction disc |p_t| <= mu p, not a polygon.
+
+The problem of `coulomb`, with two tangents a contact: P_i = -mu_i p_i s_i / |s_i| where contact i
+slides, |P_i| <= mu_i p_i where it sticks. Projected Gauss-Seidel sweeps find which contacts take
+part, stick or slide; Newton's method on that pattern finishes; both are repeated with finer sweeps
+until the outcome satisfies the law. Two more Newton steps, with derivatives switched on, give
+derivatives up to the third.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.coulomb import Impulses
+from jimpact.status import CODE
+
+_SWEEPS = 2000  # at each of the tolerances
+_COARSEST, _FINER = 1e-4, 1e-3  # change of x in a sweep that ends them, and its steps
+_LEVELS = 4  # float32: the later ones end at its rounding
+_STEPS = 8  # of Newton's method on a pattern
+_POWER = 2 / 3  # what a solve may gather in rounding, as in `lcp`: m eps^(2/3)
+_SINGULAR = 100.0  # singular values below this times eps m, of the largest, are zero
+
+
+class DiscProblem(NamedTuple):
+    """A (3 m, 3 m) over x = (p (m,), p_t (2 m,) contact-major); a (m,), b (2 m,), mu (m,)."""
+
+    matrix: jax.Array
+    normal: jax.Array
+    tangential: jax.Array
+    friction: jax.Array
+    complementary: bool  # 0 <= r _|_ p >= 0, else r = 0
+
+    @property
+    def contacts(self) -> int:
+        """Number m of contacts."""
+        return self.normal.shape[0]
+
+    @property
+    def given(self) -> jax.Array:
+        """(a, b)."""
+        return jnp.concatenate([self.normal, self.tangential])
+
+
+class _State(NamedTuple):
+    x: jax.Array
+    taking: jax.Array
+    sticks: jax.Array
+    done: jax.Array
+    level: jax.Array
+
+
+def solve_disc(problem: DiscProblem) -> Impulses:
+    """p (m,), p_t (2 m,) of the law; code `max_steps` where no solution was found.
+
+    `impulse_not_unique` where sticking contacts share what they do.
+    """
+    m = problem.contacts
+    end = _search(DiscProblem(*jax.lax.stop_gradient(problem[:-1]), problem.complementary))
+    x = end.x
+    for _ in range(2):
+        x, values = _newton(problem, end, x)
+        x = jnp.where(end.done, x, end.x)
+    floor = _SINGULAR * float(jnp.finfo(x.dtype).eps) * m
+    singular = values[-1] <= floor * values[0]
+    code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
+    return Impulses(x[:m], x[m:], jnp.where(end.done, code, CODE["max_steps"]))
+
+
+def _size(problem: DiscProblem, x: jax.Array) -> jax.Array:
+    given = jnp.abs(problem.given).max()
+    return jnp.where(given > 0, given, 1.0) + jnp.abs(x).max()
+
+
+def _in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
+    """The point of the disc next to `side` (..., 2)."""
+    length = jnp.sqrt(jnp.sum(side**2, axis=-1))
+    shrink = jnp.where(length > radius, radius / jnp.where(length > 0, length, 1.0), 1.0)
+    return side * shrink[..., None]
+
+
+def _search(problem: DiscProblem) -> _State:
+    m, eps = problem.contacts, float(jnp.finfo(problem.matrix.dtype).eps)
+
+    def refine(state: _State) -> _State:
+        level = state.level.astype(problem.matrix.dtype)
+        tolerance = jnp.maximum(_COARSEST * _FINER**level, 4 * eps)
+        x = _sweeps(problem, state.x, tolerance)
+        rate = problem.given + problem.matrix @ x
+        room = 10 * tolerance * _size(problem, x)
+        pushes = x[:m] > room
+        taking = pushes if problem.complementary else jnp.ones(m, bool)
+        length = jnp.sqrt(jnp.sum(x[m:].reshape(m, 2) ** 2, axis=1))
+        slip = jnp.sqrt(jnp.sum(rate[m:].reshape(m, 2) ** 2, axis=1))
+        bound = problem.friction * jnp.maximum(x[:m], 0.0)
+        sticks = pushes & (slip <= room) & (length <= bound + room)
+        found = _State(x, taking, sticks, jnp.asarray(False), state.level + 1)
+        better = jax.lax.fori_loop(0, _STEPS, lambda _, y: _newton(problem, found, y)[0], x)
+        good = _misfit(problem, better) <= m * eps**_POWER
+        return found._replace(x=jnp.where(good, better, x), done=good)
+
+    none = jnp.zeros(m, bool)
+    start = _State(jnp.zeros_like(problem.given), none, none, jnp.asarray(False), jnp.asarray(0))
+    return jax.lax.while_loop(lambda s: ~s.done & (s.level < _LEVELS), refine, start)
+
+
+def _sweeps(problem: DiscProblem, x: jax.Array, tolerance: jax.Array) -> jax.Array:
+    """Projected Gauss-Seidel, contact by contact, until x changes by less than the tolerance."""
+    m, matrix, given = problem.contacts, problem.matrix, problem.given
+    first = m + 2 * jnp.arange(m)
+    xx, yy, xy = matrix[first, first], matrix[first + 1, first + 1], matrix[first, first + 1]
+    stiffest = 0.5 * (xx + yy) + jnp.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
+    stiffest = jnp.where(stiffest > 0, stiffest, 1.0)
+
+    def contact(i: jax.Array, x: jax.Array) -> jax.Array:
+        p = x[i] - (given[i] + matrix[i] @ x) / matrix[i, i]
+        x = x.at[i].set(jnp.maximum(p, 0.0) if problem.complementary else p)
+        at = (m + 2 * i, jnp.zeros_like(i))
+        rows = jax.lax.dynamic_slice(matrix, at, (2, 3 * m))
+        rate = jax.lax.dynamic_slice(given, at[:1], (2,)) + rows @ x
+        side = jax.lax.dynamic_slice(x, at[:1], (2,)) - rate / stiffest[i]
+        side = _in_disc(side, problem.friction[i] * jnp.maximum(x[i], 0.0))
+        return jax.lax.dynamic_update_slice(x, side, at[:1])
+
+    def going(state: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
+        x, change, count = state
+        return (change > tolerance * _size(problem, x)) & (count < _SWEEPS)
+
+    def sweep(
+        state: tuple[jax.Array, jax.Array, jax.Array],
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        x, _, count = state
+        new = jax.lax.fori_loop(0, m, contact, x)
+        return new, jnp.abs(new - x).max(), count + 1
+
+    start = (x, jnp.full((), jnp.inf, x.dtype), jnp.asarray(0))
+    return jax.lax.while_loop(going, sweep, start)[0]
+
+
+def _newton(problem: DiscProblem, pattern: _State, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """One step (of least norm) on the equations of a pattern; singular values of their matrix."""
+    m, mu = problem.contacts, problem.friction
+
+    def equations(x: jax.Array) -> jax.Array:
+        rate = problem.given + problem.matrix @ x
+        side, slip = x[m:].reshape(m, 2), rate[m:].reshape(m, 2)
+        square = jnp.sum(slip**2, axis=1)
+        moves = ~pattern.sticks & (square > 0)
+        length = jnp.sqrt(jnp.where(moves, square, 1.0))
+        bound = jnp.where(moves, mu * jnp.maximum(x[:m], 0.0), 0.0)
+        scale = jax.lax.stop_gradient(length + bound)
+        slides = (side * length[:, None] + slip * bound[:, None]) / scale[:, None]
+        normal = jnp.where(pattern.taking, rate[:m], x[:m])
+        tangential = jnp.where(pattern.sticks[:, None], slip, slides)
+        return jnp.concatenate([normal, tangential.reshape(-1)])
+
+    matrix = jax.jacfwd(equations)(x)
+    values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
+    floor = _SINGULAR * float(jnp.finfo(x.dtype).eps) * m
+    return x - jnp.linalg.pinv(matrix, rtol=floor) @ equations(x), values
+
+
+def _misfit(problem: DiscProblem, x: jax.Array) -> jax.Array:
+    """How far x is from what the law makes of it, in parts of its size."""
+    m = problem.contacts
+    rate = problem.given + problem.matrix @ x
+    p, side, slip = x[:m], x[m:].reshape(m, 2), rate[m:].reshape(m, 2)
+    normal = p - jnp.maximum(p - rate[:m], 0.0) if problem.complementary else rate[:m]
+    bound = problem.friction * jnp.maximum(p, 0.0)
+    tangential = side - _in_disc(side - slip, bound)
+    return jnp.maximum(jnp.abs(normal).max(), jnp.abs(tangential).max()) / _size(problem, x)
