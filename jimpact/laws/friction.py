@@ -4,8 +4,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jimpact._checks import as_float_array, check_values
+from jimpact._checks import as_float_array, check_values, is_traced
 from jimpact.laws.base import Law
 from jimpact.numerics.coulomb import Impulses, Problem, solve_complementary, solve_prescribed
 from jimpact.numerics.coulomb_disc import DiscProblem, solve_disc
@@ -16,22 +17,18 @@ def friction_fields(
     friction: Any, tangential_restitution: Any
 ) -> tuple[jax.Array | None, jax.Array | None]:
     """`(mu, e_t)` as arrays, or `(None, None)` without friction."""
+    if friction is None:
+        if is_traced(tangential_restitution) or np.any(np.asarray(tangential_restitution) != 0):
+            raise ValueError(
+                "Argument `tangential_restitution` must be 0 without `friction`: then nothing acts "
+                f"along the contacts, but has value {tangential_restitution!r}."
+            )
+        return None, None
+    mu = as_float_array("friction", friction)
     e_t = as_float_array("tangential_restitution", tangential_restitution)
+    check_values("friction", mu, low=0.0)
     check_values("tangential_restitution", e_t, low=-1.0, high=1.0)
-    if friction is not None:
-        mu = as_float_array("friction", friction)
-        check_values("friction", mu, low=0.0)
-        return mu, e_t
-    if e_t.ndim or not _is_zero(e_t):
-        raise ValueError(
-            "Argument `tangential_restitution` must be 0 without `friction`: then nothing acts "
-            f"along the contacts, but has value {tangential_restitution!r}."
-        )
-    return None, None
-
-
-def _is_zero(value: jax.Array) -> bool:
-    return not isinstance(value, jax.core.Tracer) and float(value) == 0.0
+    return mu, e_t
 
 
 def check_friction(law: Law, scene: Scene) -> None:
@@ -79,4 +76,5 @@ def frictional_impulses(
         found = solve_disc(DiscProblem(*parts, complementary))
     else:
         found = (solve_complementary if complementary else solve_prescribed)(Problem(*parts))
-    return Impulses(found.normal / norm, found.tangential * scale[m:], found.code)
+    p = jnp.where(closed, found.normal / norm, 0.0)  # exactly
+    return Impulses(p, jnp.where(there[m:], found.tangential * scale[m:], 0.0), found.code)

@@ -5,12 +5,14 @@ With D = [N, H_t] scaled to unit normals, A = D^T M^-1 D and x = (p, p_t) the pr
     normal      r = a + A_nn p + A_nt p_t:  r = 0, or  0 <= r _|_ p >= 0
     tangential  s = b + A_tn p + A_tt p_t,  p_t,i in -mu_i max(p_i, 0) Sgn(s_i)
 
-Which contacts take part, stick or slide is found with derivatives switched off; one linear solve
-on that pattern then gives values and derivatives. A_tt may be singular (both corners of a block
-lying flat slide alike): of all p_t that of least norm is given, where friction allows it.
+Which contacts take part, stick or slide, and x itself, are found with derivatives switched off;
+chord steps on the equations of that pattern then carry derivatives up to the third. A_tt may be
+singular (both corners of a block lying flat slide alike): of all p_t that of least norm is given,
+where friction allows it; derivatives hold the null space.
 """
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -44,7 +46,7 @@ class Problem(NamedTuple):
     def size(self) -> jax.Array:
         """The largest given velocity, 1 where there is none."""
         given = jnp.abs(jnp.concatenate([self.normal, self.tangential])).max()
-        return jax.lax.stop_gradient(jnp.where(given > 0, given, 1.0))
+        return jnp.where(given > 0, given, 1.0)
 
 
 class Pattern(NamedTuple):
@@ -62,6 +64,14 @@ class Impulses(NamedTuple):
     code: jax.Array
 
 
+class _Solved(NamedTuple):
+    """x of least norm for a pattern, the pseudoinverse of its equations, whether it is singular."""
+
+    x: jax.Array
+    inverse: jax.Array
+    singular: jax.Array
+
+
 def solve_prescribed(problem: Problem) -> Impulses:
     """Impulses with r = 0 at every contact: the normal velocities are prescribed.
 
@@ -72,9 +82,8 @@ def solve_prescribed(problem: Problem) -> Impulses:
     at: `max_steps` where none was found, and no `several_outcomes`.
     """
     choose = _enumerate if problem.contacts <= ENUMERATED else _search
-    pattern, code = choose(jax.lax.stop_gradient(problem))
-    x, singular = _on_pattern(problem, pattern)
-    return _split(x, jnp.maximum(code, _not_unique(singular)))
+    pattern, solved, code = choose(jax.lax.stop_gradient(problem))
+    return _finish(problem, pattern, solved, code)
 
 
 def solve_complementary(problem: Problem) -> Impulses:
@@ -83,20 +92,44 @@ def solve_complementary(problem: Problem) -> Impulses:
     Code: `infeasible` where it ends on a ray. That needs impulses which move nothing, N p + H p_t
     = 0 (jamming): otherwise there is a solution for every mu.
     """
-    vertex, code = _by_lemke(problem)
-    p, side = vertex[: problem.contacts], vertex[problem.contacts :]
-    found = jax.lax.stop_gradient((problem, p, side))
-    rate, _ = _rates(found[0], jnp.concatenate(found[1:]))
-    return _least(problem, vertex, code, rate <= _tolerance(problem) * problem.size)
+    fixed = jax.lax.stop_gradient(problem)
+    vertex, code = _by_lemke(fixed)
+    rate, slip = _rates(fixed, vertex)
+    taking = rate <= _tolerance(problem) * problem.size
+    slides = jnp.abs(slip) > _tolerance(problem) * (problem.size + jnp.abs(vertex).max())
+    pattern = Pattern(taking, jnp.where(slides, jnp.sign(slip), 0.0))
+    solved = _on_pattern(fixed, pattern)
+    allowed = _violation(fixed, pattern, solved.x) <= _tolerance(problem)
+    x = jnp.where(allowed, solved.x, vertex)
+    x = jnp.where(jnp.concatenate([taking, taking]), x, 0.0)
+    return _finish(problem, pattern, solved._replace(x=x), code)
 
 
-def _split(x: jax.Array, code: jax.Array) -> Impulses:
-    m = x.shape[0] // 2
-    return Impulses(x[:m], x[m:], code)
+def chord_steps(
+    equations: Callable[[jax.Array], jax.Array], inverse: jax.Array, x: jax.Array
+) -> jax.Array:
+    """x, with the derivatives (up to the third) of the solution that it is."""
+    x, inverse = jax.lax.stop_gradient((x, inverse))
+    for _ in range(3):
+        x = x - inverse @ equations(x)
+    return x
 
 
-def _not_unique(singular: jax.Array) -> jax.Array:
-    return jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
+def pseudoinverse(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The pseudoinverse of a square matrix with entries of order 1, and whether it is singular."""
+    left, values, right = jnp.linalg.svd(matrix)
+    floor = _SINGULAR * float(jnp.finfo(matrix.dtype).eps) * len(values) * values[0]
+    kept = values > floor
+    inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1.0), 0.0)
+    return (right.T * inverse[None, :]) @ left.T, ~jnp.all(kept)
+
+
+def _finish(problem: Problem, pattern: Pattern, solved: _Solved, code: jax.Array) -> Impulses:
+    matrix, right = _equations(problem, pattern)
+    x = chord_steps(lambda x: matrix @ x - right, solved.inverse, solved.x)
+    shared = jnp.where(solved.singular, CODE["impulse_not_unique"], CODE["ok"])
+    m = problem.contacts
+    return Impulses(x[:m], x[m:], jnp.maximum(code, shared))
 
 
 def _tolerance(problem: Problem) -> float:
@@ -123,12 +156,10 @@ def _equations(problem: Problem, pattern: Pattern) -> tuple[jax.Array, jax.Array
     return matrix, jnp.where(use, -given, 0.0)
 
 
-def _on_pattern(problem: Problem, pattern: Pattern) -> tuple[jax.Array, jax.Array]:
-    """x of least norm for this pattern, and whether there are several."""
+def _on_pattern(problem: Problem, pattern: Pattern) -> _Solved:
     matrix, right = _equations(problem, pattern)
-    floor = _SINGULAR * float(jnp.finfo(matrix.dtype).eps) * problem.contacts
-    values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
-    return jnp.linalg.pinv(matrix, rtol=floor) @ right, values[-1] <= floor * values[0]
+    inverse, singular = pseudoinverse(matrix)
+    return _Solved(inverse @ right, inverse, singular)
 
 
 def _violation(problem: Problem, pattern: Pattern, x: jax.Array) -> jax.Array:
@@ -144,30 +175,32 @@ def _violation(problem: Problem, pattern: Pattern, x: jax.Array) -> jax.Array:
     return jnp.maximum(missed, wrong.max()) / (problem.size + jnp.abs(x).max())
 
 
-def _enumerate(problem: Problem) -> tuple[Pattern, jax.Array]:
-    """The consistent pattern with most sticking contacts, and the code."""
+def _enumerate(problem: Problem) -> tuple[Pattern, _Solved, jax.Array]:
+    """The consistent pattern with most sticking contacts, its x, and the code."""
     m = problem.contacts
-    slips = sorted(itertools.product((0.0, 1.0, -1.0, _PULLS), repeat=m), key=np.count_nonzero)
+    slips = itertools.product((0.0, 1.0, -1.0, _PULLS), repeat=m)
+    ordered = sorted(slips, key=np.count_nonzero)
     taking = jnp.ones(m, bool)
 
-    def candidate(slip: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def candidate(slip: jax.Array) -> tuple[jax.Array, jax.Array, _Solved]:
         pattern = Pattern(taking, slip)
-        x, _ = _on_pattern(problem, pattern)
-        return problem.matrix @ x, _violation(problem, pattern, x)
+        solved = _on_pattern(problem, pattern)
+        return problem.matrix @ solved.x, _violation(problem, pattern, solved.x), solved
 
-    table = jnp.asarray(np.array(slips), problem.matrix.dtype)
-    moved, violation = jax.vmap(candidate)(table)
+    table = jnp.asarray(np.array(ordered), problem.matrix.dtype)
+    moved, violation, solved = jax.vmap(candidate)(table)
     good = violation <= _tolerance(problem)
     best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.argmin(violation))
     apart = jnp.abs(moved - moved[best][None, :]).max(axis=1)
     scale = problem.size + jnp.abs(moved[best]).max()
     several = jnp.any(good & (apart > jnp.sqrt(jnp.finfo(moved.dtype).eps) * scale))
     code = jnp.where(several, CODE["several_outcomes"], CODE["ok"])
-    return Pattern(taking, table[best]), jnp.where(jnp.any(good), code, CODE["infeasible"])
+    code = jnp.where(jnp.any(good), code, CODE["infeasible"])
+    return Pattern(taking, table[best]), jax.tree.map(lambda x: x[best], solved), code
 
 
-def _search(problem: Problem) -> tuple[Pattern, jax.Array]:
-    """A consistent pattern by changing what is inconsistent, from sticking everywhere, and code.
+def _search(problem: Problem) -> tuple[Pattern, _Solved, jax.Array]:
+    """A consistent pattern by changing what is inconsistent, from sticking everywhere.
 
     All inconsistent contacts change at once; later, lest it cycles, only the first of them.
     """
@@ -182,7 +215,7 @@ def _search(problem: Problem) -> tuple[Pattern, jax.Array]:
     def change(state: State) -> State:
         slip, _, count = state
         pattern = Pattern(taking, slip)
-        x, _ = _on_pattern(problem, pattern)
+        x = _on_pattern(problem, pattern).x
         p, side = x[:m], x[m:]
         _, rate = _rates(problem, x)
         room = _tolerance(problem) * (problem.size + jnp.abs(x).max())
@@ -199,7 +232,9 @@ def _search(problem: Problem) -> tuple[Pattern, jax.Array]:
 
     start = (jnp.zeros(m, dtype), jnp.asarray(False), jnp.asarray(0))
     slip, consistent, _ = jax.lax.while_loop(going, change, start)
-    return Pattern(taking, slip), jnp.where(consistent, CODE["ok"], CODE["max_steps"])
+    found = Pattern(taking, slip)
+    code = jnp.where(consistent, CODE["ok"], CODE["max_steps"])
+    return found, _on_pattern(problem, found), code
 
 
 def _by_lemke(problem: Problem) -> tuple[jax.Array, jax.Array]:
@@ -222,15 +257,3 @@ def _by_lemke(problem: Problem) -> tuple[jax.Array, jax.Array]:
     found = solve_lcp(whole, jnp.concatenate([a, b, -b, jnp.zeros_like(a)]), symmetric=False)
     z = found.z.reshape(4, m)
     return jnp.concatenate([z[0], z[1] - z[2]]), found.code
-
-
-def _least(problem: Problem, vertex: jax.Array, code: jax.Array, taking: jax.Array) -> Impulses:
-    """The impulses of least norm with the outcome of `vertex`, if the law allows them."""
-    fixed, x = jax.lax.stop_gradient((problem, vertex))
-    _, rate = _rates(fixed, x)
-    slides = jnp.abs(rate) > _tolerance(problem) * (problem.size + jnp.abs(x).max())
-    pattern = Pattern(taking, jnp.where(slides, jnp.sign(rate), 0.0))
-    least, singular = _on_pattern(problem, pattern)
-    worst = _violation(fixed, pattern, least)
-    allowed = jax.lax.stop_gradient(worst) <= _tolerance(problem)
-    return _split(jnp.where(allowed, least, vertex), jnp.maximum(code, _not_unique(singular)))

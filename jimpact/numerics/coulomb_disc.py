@@ -3,8 +3,7 @@
 The problem of `coulomb`, with two tangents a contact: P_i = -mu_i p_i s_i / |s_i| where contact i
 slides, |P_i| <= mu_i p_i where it sticks. Projected Gauss-Seidel sweeps find which contacts take
 part, stick or slide; Newton's method on that pattern finishes; both are repeated with finer sweeps
-until the outcome satisfies the law. Two more Newton steps, with derivatives switched on, give
-derivatives up to the third.
+until the outcome satisfies the law. Chord steps then carry derivatives up to the third.
 """
 
 from typing import NamedTuple
@@ -12,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics.coulomb import Impulses
+from jimpact.numerics.coulomb import Impulses, chord_steps, pseudoinverse
 from jimpact.status import CODE
 
 _SWEEPS = 2000  # at each of the tolerances
@@ -20,7 +19,6 @@ _COARSEST, _FINER = 1e-4, 1e-3  # change of x in a sweep that ends them, and its
 _LEVELS = 4  # float32: the later ones end at its rounding
 _STEPS = 8  # of Newton's method on a pattern
 _POWER = 2 / 3  # what a solve may gather in rounding, as in `lcp`: m eps^(2/3)
-_SINGULAR = 100.0  # singular values below this times eps m, of the largest, are zero
 
 
 class DiscProblem(NamedTuple):
@@ -57,13 +55,12 @@ def solve_disc(problem: DiscProblem) -> Impulses:
     `impulse_not_unique` where sticking contacts share what they do.
     """
     m = problem.contacts
-    end = _search(DiscProblem(*jax.lax.stop_gradient(problem[:-1]), problem.complementary))
-    x = end.x
-    for _ in range(2):
-        x, values = _newton(problem, end, x)
-        x = jnp.where(end.done, x, end.x)
-    floor = _SINGULAR * float(jnp.finfo(x.dtype).eps) * m
-    singular = values[-1] <= floor * values[0]
+    still = DiscProblem(*jax.lax.stop_gradient(problem[:-1]), problem.complementary)
+    end = _search(still)
+    fixed = jax.lax.stop_gradient(end.x)
+    inverse, singular = pseudoinverse(jax.jacfwd(lambda x: _equations(still, end, x))(fixed))
+    x = chord_steps(lambda x: _equations(problem, end, x), inverse, fixed)
+    x = jnp.where(end.done, x, end.x)
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
     return Impulses(x[:m], x[m:], jnp.where(end.done, code, CODE["max_steps"]))
 
@@ -96,7 +93,7 @@ def _search(problem: DiscProblem) -> _State:
         bound = problem.friction * jnp.maximum(x[:m], 0.0)
         sticks = pushes & (slip <= room) & (length <= bound + room)
         found = _State(x, taking, sticks, jnp.asarray(False), state.level + 1)
-        better = jax.lax.fori_loop(0, _STEPS, lambda _, y: _newton(problem, found, y)[0], x)
+        better = jax.lax.fori_loop(0, _STEPS, lambda _, y: _newton(problem, found, y), x)
         good = _misfit(problem, better) <= m * eps**_POWER
         return found._replace(x=jnp.where(good, better, x), done=good)
 
@@ -138,27 +135,26 @@ def _sweeps(problem: DiscProblem, x: jax.Array, tolerance: jax.Array) -> jax.Arr
     return jax.lax.while_loop(going, sweep, start)[0]
 
 
-def _newton(problem: DiscProblem, pattern: _State, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """One step (of least norm) on the equations of a pattern; singular values of their matrix."""
-    m, mu = problem.contacts, problem.friction
+def _newton(problem: DiscProblem, pattern: _State, x: jax.Array) -> jax.Array:
+    """One step (of least norm) on the equations of a pattern."""
+    inverse, _ = pseudoinverse(jax.jacfwd(lambda x: _equations(problem, pattern, x))(x))
+    return x - inverse @ _equations(problem, pattern, x)
 
-    def equations(x: jax.Array) -> jax.Array:
-        rate = problem.given + problem.matrix @ x
-        side, slip = x[m:].reshape(m, 2), rate[m:].reshape(m, 2)
-        square = jnp.sum(slip**2, axis=1)
-        moves = ~pattern.sticks & (square > 0)
-        length = jnp.sqrt(jnp.where(moves, square, 1.0))
-        bound = jnp.where(moves, mu * jnp.maximum(x[:m], 0.0), 0.0)
-        scale = jax.lax.stop_gradient(length + bound)
-        slides = (side * length[:, None] + slip * bound[:, None]) / scale[:, None]
-        normal = jnp.where(pattern.taking, rate[:m], x[:m])
-        tangential = jnp.where(pattern.sticks[:, None], slip, slides)
-        return jnp.concatenate([normal, tangential.reshape(-1)])
 
-    matrix = jax.jacfwd(equations)(x)
-    values = jnp.linalg.svd(jax.lax.stop_gradient(matrix), compute_uv=False)
-    floor = _SINGULAR * float(jnp.finfo(x.dtype).eps) * m
-    return x - jnp.linalg.pinv(matrix, rtol=floor) @ equations(x), values
+def _equations(problem: DiscProblem, pattern: _State, x: jax.Array) -> jax.Array:
+    """r or p; s where a contact sticks, P |s| + mu p s (in parts of |s| + mu p) where it slides."""
+    m = problem.contacts
+    rate = problem.given + problem.matrix @ x
+    side, slip = x[m:].reshape(m, 2), rate[m:].reshape(m, 2)
+    square = jnp.sum(slip**2, axis=1)
+    moves = ~pattern.sticks & (square > 0)
+    length = jnp.sqrt(jnp.where(moves, square, 1.0))
+    bound = jnp.where(moves, problem.friction * jnp.maximum(x[:m], 0.0), 0.0)
+    scale = jax.lax.stop_gradient(length + bound)
+    slides = (side * length[:, None] + slip * bound[:, None]) / scale[:, None]
+    normal = jnp.where(pattern.taking, rate[:m], x[:m])
+    tangential = jnp.where(pattern.sticks[:, None], slip, slides)
+    return jnp.concatenate([normal, tangential.reshape(-1)])
 
 
 def _misfit(problem: DiscProblem, x: jax.Array) -> jax.Array:
