@@ -8,51 +8,48 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.quasi import from_quasi_velocities
 from jimpact.status import CODE
 
 MASS, RADIUS, INERTIA = 2.0, 0.5, 0.2
 DISK = ji.Scene(
     [MASS, MASS, INERTIA], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [RADIUS]]
 )  # (x, y, turn) of a disk on the ground
-PARTICLE = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+PARTICLE = ji.Scene(DISK.mass, DISK.normals, tangents=[[1.0], [0.0], [0.0]])  # turns freely
 FLAT = ji.rocking_block(width=1.5, height=1.0, mass=2.0)
 
 
+def number(x):
+    """Always of the same type, so that impacts of the same sizes share one compiled program."""
+    return jnp.asarray(x, float)
+
+
 def moreau(e, mu, e_t=0.0):
-    return ji.Moreau(e, friction=mu, tangential_restitution=e_t)
+    return ji.Moreau(number(e), friction=number(mu), tangential_restitution=number(e_t))
 
 
 def newton(e, mu, e_t=0.0):
-    return ji.Newton(e, friction=mu, tangential_restitution=e_t)
+    return ji.Newton(number(e), friction=number(mu), tangential_restitution=number(e_t))
 
 
 def matrix(e, mu, e_t=0.0):
     return ji.RestitutionMatrix(
-        jnp.atleast_2d(jnp.asarray(e)), friction=mu, tangential_restitution=e_t
+        jnp.atleast_2d(number(e)), friction=number(mu), tangential_restitution=number(e_t)
     )
 
 
 LAWS = {"newton": newton, "moreau": moreau, "matrix": matrix}
+SLOW = pytest.mark.slow
 close = np.testing.assert_allclose
 
 
-def mapped(make, axes):
-    """One compiled impact for all scenes and parameters of these shapes."""
-
-    @jax.jit
-    def run(scene, v, e, mu, e_t):
-        return jax.vmap(lambda scene, v, e, mu, e_t: ji.impact(make(e, mu, e_t), scene, v), axes)(
-            scene, v, e, mu, e_t
-        )
-
-    return run
+def stacked(outcomes):
+    return jax.tree.map(lambda *x: np.stack(x), *outcomes)
 
 
 # ---------------------------------------------------------------------------- one contact
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", ["newton", "moreau", pytest.param("matrix", marks=SLOW)])
 def test_disk_closed_form(name):
     """Sticking needs `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of it."""
     grid = np.array(
@@ -61,7 +58,8 @@ def test_disk_closed_form(name):
     mu, e_t, x_rate, turn = grid.T
     e, y_rate = 0.6, -1.3
     v = np.stack([x_rate, np.full_like(mu, y_rate), turn], axis=1)
-    out = mapped(LAWS[name], (None, 0, None, 0, 0))(DISK, v, e, mu, e_t)
+    rows = zip(mu, e_t, v, strict=True)
+    out = stacked([ji.impact(LAWS[name](e, m, t), DISK, v) for m, t, v in rows])
     slip = x_rate + RADIUS * turn
     w_tt = 1 / MASS + RADIUS**2 / INERTIA
     p = MASS * (1 + e) * 1.3
@@ -79,39 +77,35 @@ def test_disk_closed_form(name):
 
 def test_particle_example():
     """Example 6.2: e = 0.5, mu = 0.3; the bound is sufficient, yet a particle always dissipates."""
-    bounds = ji.friction_bounds(PARTICLE, [[0.5]], 0.3)
-    close(bounds.least_ratio, 2 * 0.3 / (1 - 0.5 - 0.3**2 * (1 + 0.5)), atol=1e-14)
-    close(bounds.least_ratio, 1.64383561643835616, rtol=1e-14)
+    bound = 2 * 0.3 / (1 - 0.5 - 0.3**2 * (1 + 0.5))
+    close(bound, 1.64383561643835616, rtol=1e-14)
     ratio = np.array([0.01, 0.4, 1.0, 1.6, 1.65, 3.0, 40.0])
-    v = np.stack([np.ones(7), -ratio], axis=1)
-    mu, zero = np.full(7, 0.3), np.zeros(7)
-    out = mapped(matrix, (None, 0, None, 0, 0))(PARTICLE, v, 0.5, mu, zero)
-    p, side = out.impulse[4], out.tangential_impulse[4]
-    close(ji.friction_energy_change(PARTICLE, v[4], p, side), out.energy_change[4], atol=1e-12)
+    v = np.stack([np.ones(7), -ratio, np.zeros(7)], axis=1)
+    out = stacked([ji.impact(matrix(0.5, 0.3), PARTICLE, x) for x in v])
+    after = np.asarray(out.velocity)
+    close(out.energy_change, np.sum(after**2 - v**2, axis=1), rtol=1e-13)
     assert (np.asarray(out.energy_change) < 0).all()
-    for i, promised in ((3, False), (4, True)):
-        assert bounds.dissipates(PARTICLE, v[i]) == promised
+    assert (ratio > bound).any()
+    assert (ratio < bound).any()
     # the law slides where friction does not suffice to stop: mu (1 + e) |y'| < |x'|
     slides = 0.3 * 1.5 * ratio < 1
-    close(out.velocity[:, 0], np.where(slides, 1 - 0.45 * ratio, 0.0), atol=1e-14)
+    close(after[:, 0], np.where(slides, 1 - 0.45 * ratio, 0.0), atol=1e-14)
 
 
+@SLOW
 def test_given_slip_agrees_with_the_law():
     """(6.54)-(6.57) with xi = 1: the law finds that slip by itself, and the same impulses."""
-    e, mu = np.array([[0.5, 0.1], [0.2, 0.3]]), np.array([0.2, 0.3])
-    v = from_quasi_velocities(FLAT, [-1.0, -0.3], [2.5])
-    assert float((FLAT.tangents.T @ v)[0]) > 0
-    out = ji.impact(matrix(e, mu), FLAT, v)
-    p, side = ji.friction_impulses(FLAT, e, mu, 1.0, v)
+    e, mu = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2
+    fast, slow = np.array([2.0, -0.6, -0.3]), np.array([0.1, -0.6, -0.3])
+    out, stuck = (ji.impact(matrix(e, mu), FLAT, v) for v in (fast, slow))
+    p, side = ji.friction_impulses(FLAT, e, mu, 1.0, fast)
     assert float((FLAT.tangents.T @ out.velocity)[0]) > 0  # still sliding: xi = 1 was right
     close(out.impulse, p, rtol=1e-12)
     close(out.tangential_impulse, side, rtol=1e-12)
-    close(out.energy_change, ji.friction_energy_change(FLAT, v, p, side), rtol=1e-12)
-    # with less speed the block stops: the given slip no longer agrees, the law sticks
-    slow = from_quasi_velocities(FLAT, [-1.0, -0.3], [0.2])
+    assert int(out.status) == 0
+    # with less speed the given slip would turn back: there the law sticks
     p, side = ji.friction_impulses(FLAT, e, mu, 1.0, slow)
     assert float((FLAT.tangents.T @ (slow + ji.velocity_change(FLAT, p, side)))[0]) < 0
-    stuck = ji.impact(matrix(e, mu), FLAT, slow)
     close(FLAT.tangents.T @ stuck.velocity, 0, atol=1e-14)
     assert int(stuck.status) == CODE["impulse_not_unique"]
 
@@ -124,9 +118,8 @@ def test_block_lying_flat(name):
     """W_tt is singular: v+ is unique, p_t is shared where friction allows it."""
     e, e_t, v = 0.5, np.array([0.0, 0.2, 0.2]), np.array([0.5, -1.0, -1.0])
     mu = np.array([0.0, 10.0, 0.2])
-    run = mapped(LAWS[name], (None, None, None, 0, 0))
-    out = run(FLAT, v, e, mu, e_t)
-    free = ji.impact(ji.Newton(e), FLAT, v)
+    out = stacked([ji.impact(LAWS[name](e, *x), FLAT, v) for x in zip(mu, e_t, strict=True)])
+    free = ji.impact(ji.Newton(e), FLAT, v)  # without friction
     close(out.velocity[0], free.velocity, atol=1e-14)
     close(out.impulse[0], free.impulse, atol=1e-14)
     slip = np.asarray(FLAT.tangents.T @ v)
@@ -192,7 +185,6 @@ def misfit(scene, v, out, e, e_t, mu, complementary):
     return max(np.abs(normal).max(), cone.max(), np.abs(power).max() / size) / size
 
 
-SLOW = pytest.mark.slow
 RANDOM = [
     pytest.param("moreau", 4, 3, 1, id="moreau"),
     pytest.param("newton", 4, 2, 1, id="newton"),
@@ -270,11 +262,13 @@ def test_existence_is_reported():
         np.ones(3),
         [[-1.0, 3.0], [1.0, 1.0], [-1.0, 2.0]],
         tangents=[[-2.0, -2.0], [-3.0, -3.0], [-1.0, 2.0]],
+        gaps=np.zeros(2),
     )
     several = ji.Scene(
         np.ones(3),
         [[-1.0, 1.0], [-3.0, 1.0], [-2.0, -3.0]],
         tangents=[[0.0, -2.0], [3.0, 2.0], [-3.0, 2.0]],
+        gaps=np.zeros(2),
     )
     law = newton(0.5, 1.0)
     out = ji.impact(law, none, [-1.0, -1.0, 1.0])
@@ -284,10 +278,16 @@ def test_existence_is_reported():
     out = ji.impact(law, several, [1.0, 0.0, 1.0])
     assert int(out.status) == CODE["several_outcomes"]
     close(np.asarray(several.normals).T @ out.velocity, [1.5, 1.0], atol=1e-12)
-    # a particle between two walls with unequal e cannot move
+
+
+@SLOW
+def test_unequal_walls_jam():
+    """A particle between two walls: it cannot leave one as the other one would have it."""
     walls = ji.Scene(np.ones(2), [[1.0, -1.0], [0.0, 0.0]], tangents=[[0.0, 0.0], [1.0, 1.0]])
-    out = ji.impact(moreau(jnp.array([0.8, 0.2]), 0.5), walls, [-1.0, 0.3])
+    out = ji.impact(moreau([0.8, 0.2], 0.5), walls, [-1.0, 0.3])
     assert int(out.status) == CODE["infeasible"]
+    out = ji.impact(moreau([0.2, 0.2], 0.5), walls, [-1.0, 0.3])
+    close(out.velocity[0], 0.2, atol=1e-14)
 
 
 # --------------------------------------------------------------------------------- in space
@@ -299,14 +299,13 @@ def test_dimer_in_space():
     planar, v = ji.dimer(0.2, 1.0, angle=angle), np.array([0.9, -1.0, 0.4])
     expected = ji.impact(moreau(e, mu), planar, v)
 
-    @jax.jit
     def turned(yaw, along, across, spin):
         scene = ji.dimer_3d(0.2, 1.0, angle=angle, yaw=yaw)
-        c, s = jnp.cos(yaw), jnp.sin(yaw)
-        v = jnp.stack([along * c - across * s, along * s + across * c, -1.0, 0.3, 0.4, spin])
+        c, s = np.cos(yaw), np.sin(yaw)
+        v = np.array([along * c - across * s, along * s + across * c, -1.0, 0.3, 0.4, spin])
         out = ji.impact(moreau(e, mu), scene, v)
-        x, y = out.velocity[0], out.velocity[1]
-        return out, jnp.concatenate([jnp.stack([c * x + s * y, c * y - s * x]), out.velocity[2:]])
+        x, y = out.velocity[:2]
+        return out, np.array([c * x + s * y, c * y - s * x, *out.velocity[2:]])
 
     # the planar dimer turns about -y: theta' > 0 is a positive pitch rate
     scene = ji.dimer_3d(0.2, 1.0, angle=angle)
@@ -325,7 +324,8 @@ def test_dimer_in_space():
     fixed = ji.impact(moreau(e, 1e3), scene, [0.9, 0.7, -1.0, 0.3, 0.4, 2.0])
     close(scene.tangents.T @ fixed.velocity, 0, atol=1e-10)
     bare = ji.impact(moreau(e, 0.0), scene, [0.9, 0.7, -1.0, 0.3, 0.4, 2.0])
-    close(bare.velocity, ji.impact(ji.Newton(e), scene, [0.9, 0.7, -1.0, 0.3, 0.4, 2.0]).velocity)
+    close(np.asarray(bare.velocity)[[2, 4]], [e, -e * 0.4], atol=1e-12)  # gamma+ = -e gamma-
+    close(np.asarray(bare.velocity)[[0, 1, 3, 5]], [0.9, 0.7, 0.3, 2.0], atol=1e-12)
 
 
 # ------------------------------------------------------------- derivatives, fields, arguments
@@ -335,27 +335,30 @@ SLIDING = (0.3, np.array([0.9, -1.0, 0.4]))
 STICKING = (3.0, np.array([0.2, -1.0, 0.4]))
 
 
-@pytest.mark.parametrize("name", ["newton", "moreau"])
+@pytest.mark.parametrize("name", ["moreau", pytest.param("newton", marks=SLOW)])
 def test_derivatives(name):
-    """In (e, mu, e_t, width): reverse and forward mode against differences, sliding, sticking."""
+    """In (e, mu, e_t, width), forward and reverse, against differences, sliding and sticking."""
 
     def outcome(x, v):
         scene = ji.rocking_block(x[3], 1.0, mass=2.0)
         out = ji.impact(LAWS[name](x[0], x[1], x[2]), scene, v)
         return jnp.concatenate([out.velocity, out.energy_change[None]])
 
-    run, step = jax.jit(jax.vmap(outcome, (0, None))), 1e-6 * np.eye(4)
-    forward = jax.jit(jax.jacfwd(outcome))
-    reverse = jax.jit(jax.grad(lambda x, v: outcome(x, v)[-1]))
+    def energy(x, v):
+        return outcome(x, v)[-1]
+
+    slope_of = jax.jit(jax.jacfwd(outcome) if name == "newton" else jax.grad(energy))
     for mu, v in (SLIDING, STICKING):
         x = np.array([0.5, mu, 0.2, 1.3])
-        differences = (run(x + step, v) - run(x - step, v)).T / 2e-6
-        slope = forward(x, v)
-        close(slope, differences, rtol=1e-7, atol=1e-8)
-        close(reverse(x, v), slope[-1], atol=1e-12)
-        assert (np.abs(slope[:, 1]).max() > 0.1) == (mu == SLIDING[0])  # sticking: mu is no matter
+        step = 1e-6 * np.eye(4)
+        differences = np.stack([outcome(x + d, v) - outcome(x - d, v) for d in step], axis=1) / 2e-6
+        slope = slope_of(x, v)
+        close(slope, differences if name == "newton" else differences[-1], rtol=1e-7, atol=1e-8)
+        in_mu = np.abs(np.atleast_2d(slope)[:, 1]).max()
+        assert (in_mu > 0.1) == (mu == SLIDING[0])  # sticking: mu is no matter
 
 
+@SLOW
 def test_derivatives_in_space():
     def outcome(x, v):
         out = ji.impact(moreau(x[0], x[1], x[2]), ji.dimer_3d(x[3], 1.0, yaw=0.4), v)
@@ -376,10 +379,11 @@ def test_without_friction_nothing_changes():
         assert len(jax.tree.leaves(law)) == 1
     assert ji.Newton(0.5).by_blocks()
     assert not newton(0.5, 0.3).by_blocks()
-    out = ji.impact(ji.Newton(0.5), FLAT, [0.5, -1.0, 0.0])
+    out = ji.impact(ji.Newton(0.5), FLAT, np.array([0.5, -1.0, 0.0]))
     assert out.tangential_impulse.tolist() == [0.0, 0.0]
 
 
+@SLOW
 def test_float32():
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), FLAT)
     law = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), moreau(0.5, 0.2))

@@ -191,10 +191,14 @@ def _enumerate(problem: Problem) -> tuple[Pattern, _Solved, jax.Array]:
     moved, violation, solved = jax.vmap(candidate)(table)
     good = violation <= _tolerance(problem)
     best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.argmin(violation))
-    apart = jnp.abs(moved - moved[best][None, :]).max(axis=1)
-    scale = problem.size + jnp.abs(moved[best]).max()
-    several = jnp.any(good & (apart > jnp.sqrt(jnp.finfo(moved.dtype).eps) * scale))
-    code = jnp.where(several, CODE["several_outcomes"], CODE["ok"])
+
+    def differ(x: jax.Array) -> jax.Array:
+        apart = jnp.abs(x - x[best][None, :]).max(axis=1)
+        scale = problem.size + jnp.abs(x[best]).max()
+        return jnp.any(good & (apart > jnp.sqrt(jnp.finfo(x.dtype).eps) * scale))
+
+    code = jnp.where(differ(solved.x), CODE["impulse_not_unique"], CODE["ok"])
+    code = jnp.where(differ(moved), CODE["several_outcomes"], code)
     code = jnp.where(jnp.any(good), code, CODE["infeasible"])
     return Pattern(taking, table[best]), jax.tree.map(lambda x: x[best], solved), code
 
