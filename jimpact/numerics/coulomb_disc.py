@@ -16,7 +16,10 @@ from jimpact.status import CODE
 
 _SWEEPS = 2000  # at each of the tolerances
 _COARSEST, _FINER = 1e-4, 1e-3  # change of x in a sweep that ends them, and its steps
-_LEVELS = 4  # float32: the later ones end at its rounding
+_LEVELS = 8  # each tolerance twice, with either room; float32: the later ones end at its rounding
+# What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
+# contacts that reach their cone while others hold them: sweeps bring those to rest slowly.
+_ROOM, _SLOW_ROOM = 10.0, 100.0
 _STEPS = 8  # of Newton's method on a pattern
 _POWER = 2 / 3  # what a solve may gather in rounding, as in `lcp`: m eps^(2/3)
 
@@ -61,8 +64,9 @@ def solve_disc(problem: DiscProblem) -> Impulses:
     inverse, singular = pseudoinverse(jax.jacfwd(lambda x: _equations(still, end, x))(fixed))
     x = chord_steps(lambda x: _equations(problem, end, x), inverse, fixed)
     x = jnp.where(end.done, x, end.x)
+    solved = _misfit(still, jax.lax.stop_gradient(x)) <= m * float(jnp.finfo(x.dtype).eps) ** _POWER
     code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
-    return Impulses(x[:m], x[m:], jnp.where(end.done, code, CODE["max_steps"]))
+    return Impulses(x[:m], x[m:], jnp.where(solved, code, CODE["max_steps"]))
 
 
 def _size(problem: DiscProblem, x: jax.Array) -> jax.Array:
@@ -79,23 +83,26 @@ def _in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
 
 def _search(problem: DiscProblem) -> _State:
     m, eps = problem.contacts, float(jnp.finfo(problem.matrix.dtype).eps)
+    enough = m * eps**_POWER
 
     def refine(state: _State) -> _State:
-        level = state.level.astype(problem.matrix.dtype)
+        level = (state.level // 2).astype(problem.matrix.dtype)
         tolerance = jnp.maximum(_COARSEST * _FINER**level, 4 * eps)
         x = _sweeps(problem, state.x, tolerance)
         rate = problem.given + problem.matrix @ x
-        room = 10 * tolerance * _size(problem, x)
-        pushes = x[:m] > room
+        size = _size(problem, x)
+        pushes = x[:m] > _ROOM * tolerance * size
         taking = pushes if problem.complementary else jnp.ones(m, bool)
-        length = jnp.sqrt(jnp.sum(x[m:].reshape(m, 2) ** 2, axis=1))
         slip = jnp.sqrt(jnp.sum(rate[m:].reshape(m, 2) ** 2, axis=1))
-        bound = problem.friction * jnp.maximum(x[:m], 0.0)
-        sticks = pushes & (slip <= room) & (length <= bound + room)
+        room = jnp.where(state.level % 2 == 0, _ROOM, _SLOW_ROOM)
+        sticks = pushes & (slip <= room.astype(x.dtype) * tolerance * size)
         found = _State(x, taking, sticks, jnp.asarray(False), state.level + 1)
-        better = jax.lax.fori_loop(0, _STEPS, lambda _, y: _newton(problem, found, y), x)
-        good = _misfit(problem, better) <= m * eps**_POWER
-        return found._replace(x=jnp.where(good, better, x), done=good)
+        better = _polish(problem, found, enough)
+        good = _misfit(problem, better) <= enough
+        # or x itself, on the edge of its pattern
+        off = jnp.abs(_equations(problem, found, x)).max() / size
+        as_swept = jnp.maximum(_misfit(problem, x), off) <= enough
+        return found._replace(x=jnp.where(good, better, x), done=good | as_swept)
 
     none = jnp.zeros(m, bool)
     start = _State(jnp.zeros_like(problem.given), none, none, jnp.asarray(False), jnp.asarray(0))
@@ -133,6 +140,21 @@ def _sweeps(problem: DiscProblem, x: jax.Array, tolerance: jax.Array) -> jax.Arr
 
     start = (x, jnp.full((), jnp.inf, x.dtype), jnp.asarray(0))
     return jax.lax.while_loop(going, sweep, start)[0]
+
+
+def _polish(problem: DiscProblem, pattern: _State, enough: float) -> jax.Array:
+    """Newton's method on a pattern, until the law is satisfied or the steps are used up."""
+
+    def going(state: tuple[jax.Array, jax.Array]) -> jax.Array:
+        x, count = state
+        return (_misfit(problem, x) > enough) & (count < _STEPS)
+
+    def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        return _newton(problem, pattern, state[0]), state[1] + 1
+
+    # one more step than needed brings x from within the tolerance to rounding
+    x, _ = jax.lax.while_loop(going, step, (pattern.x, jnp.asarray(0)))
+    return _newton(problem, pattern, x)
 
 
 def _newton(problem: DiscProblem, pattern: _State, x: jax.Array) -> jax.Array:
