@@ -74,6 +74,11 @@ def _size(problem: DiscProblem, x: jax.Array) -> jax.Array:
     return jnp.where(given > 0, given, 1.0) + jnp.abs(x).max()
 
 
+def _lengths(pairs: jax.Array) -> jax.Array:
+    """Of the vectors (m, 2) in an array (2 m,)."""
+    return jnp.sqrt(jnp.sum(pairs.reshape(-1, 2) ** 2, axis=1))
+
+
 def _in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
     """The point of the disc next to `side` (..., 2)."""
     length = jnp.sqrt(jnp.sum(side**2, axis=-1))
@@ -93,12 +98,15 @@ def _search(problem: DiscProblem) -> _State:
         size = _size(problem, x)
         pushes = x[:m] > _ROOM * tolerance * size
         taking = pushes if problem.complementary else jnp.ones(m, bool)
-        slip = jnp.sqrt(jnp.sum(rate[m:].reshape(m, 2) ** 2, axis=1))
+        slip = _lengths(rate[m:])
         room = jnp.where(state.level % 2 == 0, _ROOM, _SLOW_ROOM)
         sticks = pushes & (slip <= room.astype(x.dtype) * tolerance * size)
         found = _State(x, taking, sticks, jnp.asarray(False), state.level + 1)
         better = _polish(problem, found, enough)
         good = _misfit(problem, better) <= enough
+        # the equations of sliding also hold at rest: such a contact sticks
+        rest = _lengths((problem.given + problem.matrix @ better)[m:])
+        found = found._replace(sticks=sticks | (good & pushes & (rest <= enough * size)))
         # or x itself, on the edge of its pattern
         off = jnp.abs(_equations(problem, found, x)).max() / size
         as_swept = jnp.maximum(_misfit(problem, x), off) <= enough
