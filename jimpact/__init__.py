@@ -25,6 +25,11 @@ _WHERE = {
         "normalized_delassus normalized_gap_velocity velocity_change"
     ),
     "scenes": "chain column scene_from_gaps",
+    "systems": "System",
+    "bodies": "Block Dimer dimer rocking_block",
+    "spatial": "SpatialDimer dimer_3d",
+    "planar": "Corner DiskBalls corner disk_balls",
+    "pendulums": "PendulumCradle pendulum_cradle",
     "laws": "REGISTRY",
     "laws.base": "Law",
     "laws.newton": "Newton",

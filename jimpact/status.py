@@ -16,6 +16,7 @@ STATUS = (
     Status("ok", "the impact is resolved within tolerance", False),
     Status("impulse_not_unique", "v+ is determined, the impulses are one of many", False),
     Status("order_dependent", "the outcome depends on the order of adjacent collisions", False),
+    Status("several_outcomes", "the law allows several velocities, these are one of them", False),
     Status("plastic_limit", "contacts re-close without end; finished in the plastic limit", False),
     Status("energy_gain", "the outcome holds more energy than was there before", True),
     Status("inadmissible_velocity", "a contact still approaches after the impact", True),

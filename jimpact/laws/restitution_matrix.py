@@ -9,6 +9,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_values, is_traced
 from jimpact.laws.base import Law, no_tangential_impulse
+from jimpact.laws.friction import check_friction, friction_fields, frictional_impulses
 from jimpact.numerics.linear import solve_symmetric
 from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 from jimpact.quasi import check_independent, quasi_basis
@@ -31,13 +32,16 @@ class RestitutionMatrix(Law):
     `jimpact.quasi.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the scene's
     tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t where several do),
     `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn = 0, E_tt = -I.)
-    Bilateral constraints distort G and n_q as in (6.35).
+    Bilateral constraints distort G and n_q as in (6.35). With friction, and E (m, m),
+    `qn+ = -E qn-` and `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
 
     Args:
         matrix: E, (m, m) or (m + k, m + k), without dimension. Diagonal, it is `Newton`.
         admissible: whether `fit` keeps an (m, m) matrix consistent for all approach velocities
             `qn- <= 0`: `E >= 0` and `G^-1 (I + E) >= 0` elementwise, `G^-1 - E^T G^-1 E`
             copositive. An impact takes E as it is, whatever this says.
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
+        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `v_t+ = -e_t v_t-`.
 
     Open contacts take no part: their rows and columns of E count as zero; an
     (m + k, m + k) matrix needs closed contacts (ValueError; `infeasible` if traced).
@@ -45,13 +49,16 @@ class RestitutionMatrix(Law):
     Status: `negative_impulse`, `inadmissible_velocity`, `energy_gain` where E contradicts
     unilateral contact or energy at this velocity; `infeasible` where contacts are redundant and
     contradict each other, or no tangential impulses give the change of qt; `impulse_not_unique`
-    for redundant contacts.
+    for redundant contacts. With friction `infeasible`, too, where normal and tangential directions
+    couple so that neither sticking nor sliding is consistent, `several_outcomes` where more than
+    one is (found for up to 3 contacts; of them that which sticks most is given), and
+    `impulse_not_unique` where p_t is not determined (a block lying flat).
 
     Raises:
         ValueError: E not square, not finite, or not of a size that fits the scene; tangential
-            blocks for a scene without tangents.
+            blocks, or friction, for a scene without tangents; both together.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53).
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)-(6.57).
 
     >>> import jimpact as ji
     >>> from jimpact.laws.restitution_matrix import RestitutionMatrix
@@ -62,9 +69,17 @@ class RestitutionMatrix(Law):
     """
 
     matrix: jax.Array
+    friction: jax.Array | None
+    tangential_restitution: jax.Array | None
     admissible: bool = eqx.field(static=True)
 
-    def __init__(self, matrix: Any, admissible: bool = True):
+    def __init__(
+        self,
+        matrix: Any,
+        admissible: bool = True,
+        friction: Any = None,
+        tangential_restitution: Any = 0.0,
+    ):
         self.matrix = as_float_array("matrix", matrix)
         shape = self.matrix.shape
         if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
@@ -74,10 +89,20 @@ class RestitutionMatrix(Law):
             )
         check_values("matrix", self.matrix)
         self.admissible = bool(admissible)
+        self.friction, self.tangential_restitution = friction_fields(
+            friction, tangential_restitution
+        )
 
     def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
         """Raise where E does not fit the scene."""
         m, size = scene.contacts, self.matrix.shape[0]
+        if self.friction is not None:
+            check_friction(self, scene)
+            if size != m:
+                raise ValueError(
+                    f"Argument `matrix` must have shape ({m}, {m}) with `friction`, which decides "
+                    f"about the tangential velocities itself, but has shape {self.matrix.shape}."
+                )
         if size == m:
             return
         held = 0 if scene.constraints is None else scene.constraints.shape[1]
@@ -114,6 +139,9 @@ class RestitutionMatrix(Law):
         norm, m = kinetic_norm(scene), scene.contacts
         if self.matrix.shape[0] == m:
             required = jnp.where(scene.closed, _change(self.matrix, gap_velocity / norm), 0.0)
+            if self.friction is not None and self.tangential_restitution is not None:
+                mu, e_t = self.friction, self.tangential_restitution
+                return frictional_impulses(scene, velocity, -required * norm, mu, e_t, False)
             p, code = _normal_impulse(delassus, norm, required)
             return p, no_tangential_impulse(scene, p.dtype), code
         assert scene.tangents is not None  # see `check_options`

@@ -1,0 +1,80 @@
+"""Coulomb friction of the kinematic laws: their fields, checks, and the impulses of a scene."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_values, is_traced
+from jimpact.laws.base import Law
+from jimpact.numerics.coulomb import Impulses, Problem, solve_complementary, solve_prescribed
+from jimpact.numerics.coulomb_disc import DiscProblem, solve_disc
+from jimpact.scene import Scene, solve_mass
+
+
+def friction_fields(
+    friction: Any, tangential_restitution: Any
+) -> tuple[jax.Array | None, jax.Array | None]:
+    """`(mu, e_t)` as arrays, or `(None, None)` without friction."""
+    if friction is None:
+        if is_traced(tangential_restitution) or np.any(np.asarray(tangential_restitution) != 0):
+            raise ValueError(
+                "Argument `tangential_restitution` must be 0 without `friction`: then nothing acts "
+                f"along the contacts, but has value {tangential_restitution!r}."
+            )
+        return None, None
+    mu = as_float_array("friction", friction)
+    e_t = as_float_array("tangential_restitution", tangential_restitution)
+    check_values("friction", mu, low=0.0)
+    check_values("tangential_restitution", e_t, low=-1.0, high=1.0)
+    return mu, e_t
+
+
+def check_friction(law: Law, scene: Scene) -> None:
+    """Raise where a law with friction meets a scene without tangents."""
+    if scene.tangents is None:
+        raise ValueError(
+            f"Argument `scene` must have tangents for a {type(law).__name__} with `friction`: "
+            "give Scene(..., tangents=...), or friction=None."
+        )
+
+
+def frictional_impulses(
+    scene: Scene,
+    velocity: jax.Array,
+    normal: jax.Array,
+    friction: jax.Array,
+    tangential_restitution: jax.Array,
+    complementary: bool,
+) -> Impulses:
+    """p (m,) and p_t (m,) or (2 m,) with `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
+
+    `normal` (m,) [m/s] is what gamma+ - gamma- must make up for: `gamma+ - gamma- + normal` is 0,
+    or (`complementary`) >= 0 and 0 where p > 0.
+    """
+    assert scene.tangents is not None  # see `check_friction`
+    m, closed = scene.contacts, scene.closed
+    each = scene.tangents.shape[1] // m
+    both = jnp.concatenate([scene.normals, scene.tangents], axis=1)
+    matrix = both.T @ solve_mass(scene, both)
+    norm = jnp.sqrt(jnp.diagonal(matrix)[:m])
+    scale = jnp.concatenate([1 / norm, jnp.repeat(1 / norm, each)])
+    there = jnp.concatenate([closed, jnp.repeat(closed, each)])
+    matrix = matrix * scale[:, None] * scale[None, :]
+    unit = jnp.eye(len(scale), dtype=norm.dtype)
+    matrix = jnp.where(there[:, None] & there[None, :], matrix, unit)
+    e_t = jnp.repeat(tangential_restitution * jnp.ones_like(norm), each)
+    slip = (1 + e_t) * (scene.tangents.T @ velocity) * scale[m:]
+    parts = (
+        matrix,
+        jnp.where(closed, normal / norm, 0.0),
+        jnp.where(there[m:], slip, 0.0),
+        jnp.where(closed, friction * jnp.ones_like(norm), 0.0),
+    )
+    if each == 2:
+        found = solve_disc(DiscProblem(*parts, complementary))
+    else:
+        found = (solve_complementary if complementary else solve_prescribed)(Problem(*parts))
+    p = jnp.where(closed, found.normal / norm, 0.0)  # exactly
+    return Impulses(p, jnp.where(there[m:], found.tangential * scale[m:], 0.0), found.code)
