@@ -1,0 +1,201 @@
+"""`simulate`: the public function, its checks on the host."""
+
+from functools import partial
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, as_whole, check_shape, check_values, is_traced
+from jimpact.laws.base import Law
+from jimpact.motion.dynamics import gaps, mass_at
+from jimpact.motion.event_driven import event_driven
+from jimpact.motion.flight import Settings
+from jimpact.motion.record import Motion
+from jimpact.motion.system import System
+from jimpact.scene import check_mass
+
+CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
+RTOL, ATOL = 1e-10, 1e-12  # of the flights
+SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
+MAX_EVENTS, MAX_STEPS = 500, 100_000
+METHODS = ("events", "time_stepping")
+_BASE_LOOKS = 64  # times at which the base is looked at before the motion starts
+
+
+def simulate(
+    system: System,
+    law: Law,
+    q0: Any,
+    v0: Any,
+    t_end: Any,
+    *,
+    t_start: Any = 0.0,
+    samples: int = 201,
+    method: str = "events",
+    step: float | None = None,
+    max_events: int = MAX_EVENTS,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+    closed_below: float = CLOSED_BELOW,
+    slow: float = SLOW,
+    max_steps: int = MAX_STEPS,
+    solver: diffrax.AbstractERK | None = None,
+) -> Motion:
+    """The whole motion of a system: flights, impacts by `law`, persistent contact.
+
+    Equation: between impacts that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at contacts that
+    are closed and at rest; at an impact `v+` of `ji.impact` in the frame of the base.
+
+    Args:
+        system: gaps, mass, forces, base.
+        law: any impact law. If it has a field `friction`, persistent contacts stick and slide
+            with it, where the system has a `tangent_function`.
+        q0: (n,) at the start, without penetration.
+        v0: (n,).
+        t_end: [s] > t_start.
+        t_start: [s].
+        samples: number of equally spaced instants in the record, both ends included.
+        method: 'events' (flights by diffrax up to located events), or 'time_stepping'
+            (Moreau-Jean, for many contacts; needs `step` [s]).
+        step: of the time stepping [s].
+        max_events: rows for events; one more ends the motion with the status `max_events`.
+        rtol, atol: tolerances of the flights.
+        closed_below: contacts with smaller gaps [m] take part in an impact.
+        slow: accumulations are passed: a contact that leaves slower than this share of the largest
+            gap velocity of the motion, and would be pressed back, stays closed.
+        max_steps: of the integrator, between two events.
+        solver: any explicit Runge-Kutta method of diffrax; default `Dopri8`.
+
+    Returns:
+        `Motion`. Pure: jit, vmap, and forward derivatives (jvp, jacfwd) in everything that is an
+        array, event times included. A bad motion of a batch ends alone, with its status.
+
+    Raises:
+        ValueError: shapes, t_end <= t_start, penetration, a base or a mass that is not a number, on
+            the host; inside jit only the status speaks (`raise_on_failed_motion`).
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
+
+    >>> import jimpact as ji
+    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.8), [1.0], [0.0], 5.0)
+    >>> [round(float(t), 6) for t in motion.event_times()[:3]]
+    [0.451601, 1.174162, 1.752211]
+    >>> [round(float(t), 6) for t in motion.events.accumulation_end[motion.events.count - 1 :][:1]]
+    [4.064407]
+    """
+    q, v = as_float_array("q0", q0), as_float_array("v0", v0)
+    dtype = jnp.result_type(q, v)
+    start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))
+    _check(system, q, v, start, end, closed_below)
+    count = as_whole("samples", samples, 2)
+    as_whole("max_events", max_events, 1)
+    as_whole("max_steps", max_steps, 1)
+    for name, value in (("rtol", rtol), ("atol", atol), ("closed_below", closed_below)):
+        check_values(name, value, low=0.0, open_low=True)
+    check_values("slow", slow, low=0.0, high=1.0)
+    if method not in METHODS:
+        raise ValueError(f"Argument `method` must be one of {METHODS}, but has value {method!r}.")
+    friction = system.tangent_function is not None and getattr(law, "friction", None) is not None
+    settings = Settings(
+        rtol,
+        atol,
+        jnp.asarray(closed_below, dtype),
+        max_steps,
+        friction,
+        diffrax.Dopri8(scan_kind="lax") if solver is None else solver,
+        jnp.asarray(slow, dtype),
+    )
+    q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
+    if method == "time_stepping":
+        raise NotImplementedError
+    return _events(system, law, settings, q, v, start, end, count, max_events)
+
+
+@eqx.filter_jit
+def _events(
+    system: System,
+    law: Law,
+    settings: Settings,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    samples: int,
+    max_events: int,
+) -> Motion:
+    times = equal_times(start, end, samples)
+    mu = None
+    if settings.friction:
+        m = gaps(system, q, start).shape[0]
+        mu = jnp.broadcast_to(law.friction, (m,))  # type: ignore[attr-defined]
+    return event_driven(system, law, mu, settings, q, v, times, max_events)
+
+
+def equal_times(start: jax.Array, end: jax.Array, samples: int) -> jax.Array:
+    """`samples` instants from start to end."""
+    share = jnp.arange(samples, dtype=start.dtype) / (samples - 1)
+    return start + share * (end - start)
+
+
+def _check(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    closed_below: float,
+) -> None:
+    if q.ndim != 1:
+        raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
+    check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
+        check_values(name, value)
+    check_shape("t_start", start, (), "a time")
+    check_shape("t_end", end, (), "a time")
+    if not is_traced((start, end)) and not float(end) > float(start):
+        raise ValueError(
+            f"Argument `t_end` must be larger than `t_start` = {float(start):g}, "
+            f"but has value {float(end):g}."
+        )
+    _check_system(system, q, v, start, end, closed_below)
+
+
+def _check_system(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    closed_below: float,
+) -> None:
+    n = q.shape[0]
+    mass = jax.eval_shape(partial(mass_at, system), q)
+    if mass.shape not in ((n,), (n, n)):
+        raise ValueError(
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `q0` has {n} "
+            f"coordinates, but has one of shape {mass.shape}."
+        )
+    if is_traced((system, q, v, start, end)):
+        return
+    if callable(system.mass):
+        check_mass(mass_at(system, q))
+    if system.base is not None:
+        looks = np.linspace(float(start), float(end), _BASE_LOOKS)
+        base = jax.vmap(lambda t: jnp.atleast_1d(system.base(t)))(jnp.asarray(looks, q.dtype))
+        bad = ~np.isfinite(np.asarray(base)).all(axis=1)
+        if bad.any():
+            raise ValueError(
+                "Argument `system` must have a finite base motion, but base(t) has value "
+                f"{np.asarray(base)[bad][0]} at t = {looks[bad][0]:g} s."
+            )
+    f = np.asarray(gaps(system, q, start))
+    if not (f >= -closed_below).all():
+        worst = int(np.argmin(f))
+        raise ValueError(
+            f"Argument `q0` must have no penetration (f >= -{closed_below:g} m), "
+            f"but gap {worst} has value {f[worst]:g} m."
+        )

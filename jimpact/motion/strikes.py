@@ -1,0 +1,204 @@
+"""What happens at an event: the impact, the end of an accumulation, new modes of contact."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.impacts import impact
+from jimpact.laws.base import Law
+from jimpact.motion.contact_forces import Modes, constraint_impulse, contacts_at, no_modes
+from jimpact.motion.dynamics import base_velocity, gaps, kinematics, mass_at, seen_from_base
+from jimpact.motion.flight import Scales, Settings, State
+from jimpact.motion.modes import REST_ACCELERATION, choose, pressed_together
+from jimpact.motion.record import KIND_CODE, MOTION_CODE
+from jimpact.motion.system import System
+from jimpact.scene import Scene
+from jimpact.status import CODE, STATUS
+
+# Gap velocities below this share of the largest of the motion are 0: laws are no more exact.
+REST_SPEED = 1e-9
+_FAILS = tuple(row.failure for row in STATUS)
+
+
+class Blow(NamedTuple):
+    """What the contacts do to the velocities at one event; all impulses [N s]."""
+
+    v: jax.Array
+    impulse: jax.Array  # (m,)
+    tangential: jax.Array  # (m,)
+    energy: jax.Array  # (2, m): change by each contact, normal and tangential
+    base_work: jax.Array
+    code: jax.Array  # of the law
+
+
+class Outcome(NamedTuple):
+    """State, modes and what is to be written down after an event."""
+
+    state: State
+    modes: Modes
+    scales: Scales
+    struck: jax.Array  # (2, m) times of the last two impacts of each contact
+    blow: Blow
+    kind: jax.Array
+    contacts: jax.Array  # (m,)
+    accumulation_end: jax.Array
+    status: jax.Array
+
+
+def resolve(
+    system: System,
+    law: Law,
+    mu: jax.Array | None,
+    settings: Settings,
+    t: jax.Array,
+    state: State,
+    before: Modes,
+    fired: jax.Array,
+    scales: Scales,
+    struck: jax.Array,
+) -> Outcome:
+    """Impact if a closed contact approaches; contacts come to rest; new modes.
+
+    A closed contact stays closed if it leaves by no more than rounding, or slower than
+    `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
+    impacts is then passed at once (its gap velocity is set to 0, energy is lost).
+    """
+    m = before.active.shape[0]
+    given = contacts_at(system, state.q, state.v, t, settings.friction)
+    closed = given.normal.value <= settings.closed_below
+    rates = [given.normal.rate] if given.tangent is None else [given.normal.rate, given.tangent.rate]
+    scales = jax.lax.stop_gradient(_grown(scales, jnp.concatenate(rates), given.approach[:m]))
+    rest = REST_SPEED * scales.speed
+    strikes = jnp.any(closed & (given.normal.rate < -rest))
+    blow = jax.lax.cond(
+        strikes,
+        lambda: _struck(system, law, t, state, closed),
+        lambda: _no_blow(state, m),
+    )
+    given = contacts_at(system, state.q, blow.v, t, settings.friction)
+    gamma = given.normal.rate
+    slow = closed & (gamma <= settings.accumulation * scales.speed)
+    tight = closed & (jnp.abs(gamma) <= rest)
+    slack = REST_ACCELERATION * scales.acceleration
+    pressed, _ = pressed_together(given, slow, slack)
+    held = tight | (slow & pressed)
+    blow, carried = _brought_to_rest(system, given, mu, held, blow, t)
+    tangent = given.tangent
+    if tangent is not None:
+        tangent = tangent._replace(rate=tangent.gradient.T @ (blow.v - carried))
+        given = given._replace(tangent=tangent)
+    sliding = jnp.zeros(m, bool) if tangent is None else jnp.abs(tangent.rate) > rest
+    held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
+    released = fired & held_before & ~strikes
+    choice = choose(given, mu, held, released, sliding, scales.acceleration)
+    # a contact accumulates if it was brought to rest from more than rounding
+    ends = held & ~tight & strikes
+    fails = jnp.asarray(_FAILS)[blow.code]
+    status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
+    status = jnp.where(fails, MOTION_CODE["law_failed"], status)
+    took = jnp.where(strikes, blow.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
+    work = State(
+        state.q,
+        blow.v,
+        state.work,
+        state.base_work + blow.base_work,
+        state.contact_work + blow.energy,
+    )
+    return Outcome(
+        work,
+        choice.modes,
+        scales,
+        jnp.where(took & strikes, jnp.stack([jnp.full(m, t), struck[0]]), struck),
+        blow,
+        _kind(strikes, jnp.any(ends), released, fired, m),
+        took,
+        _accumulation_end(t, struck, ends),
+        status,
+    )
+
+
+def _grown(scales: Scales, rates: jax.Array, accelerations: jax.Array) -> Scales:
+    speed = jnp.maximum(scales.speed, jnp.abs(rates).max())
+    return Scales(speed, jnp.maximum(scales.acceleration, jnp.abs(accelerations).max()))
+
+
+def _no_blow(state: State, m: int) -> Blow:
+    zero = jnp.zeros_like(state.work)
+    none = jnp.zeros(m, state.v.dtype)
+    return Blow(state.v, none, none, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
+
+
+def scene_now(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
+    """The scene that a law sees: normals and tangents at q, gaps 0 where `closed`."""
+    normal = kinematics(system, q, v, t)
+    tangents = None
+    if system.tangent_function is not None:
+        tangents = jax.jacfwd(
+            lambda x: jnp.atleast_1d(system.tangent_function(x))  # type: ignore[misc]
+        )(seen_from_base(system, q, t)).T
+    open_gaps = jnp.where(closed, 0.0, jnp.maximum(gaps(system, q, t), 0.0))
+    return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
+
+
+def _struck(system: System, law: Law, t: jax.Array, state: State, closed: jax.Array) -> Blow:
+    """`impact` in the frame of the base."""
+    m = closed.shape[0]
+    scene = scene_now(system, state.q, state.v, t, closed)
+    carried = base_velocity(system, t)
+    carried = jnp.zeros_like(state.v) if carried is None else carried
+    relative = state.v - carried
+    out = impact(law, scene, relative)
+    mean = 0.5 * (out.velocity + relative)
+    push = scene.normals @ out.impulse
+    normal = (scene.normals.T @ mean) * out.impulse
+    tangential, side = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
+    if scene.tangents is not None:
+        tangential = out.tangential_impulse
+        side = (scene.tangents.T @ mean) * tangential
+        push = push + scene.tangents @ tangential
+    energy = jnp.stack([normal, side])
+    return Blow(
+        out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status
+    )
+
+
+def _brought_to_rest(
+    system: System, given, mu: jax.Array | None, held: jax.Array, blow: Blow, t: jax.Array
+) -> tuple[Blow, jax.Array]:
+    """The gap velocities of `held` contacts set to 0, and the velocity of the base."""
+    m = held.shape[0]
+    alone = no_modes(m, blow.v.dtype)._replace(active=held)
+    p = constraint_impulse(given, mu, alone, given.normal.rate)
+    carried = base_velocity(system, t)
+    carried = jnp.zeros_like(blow.v) if carried is None else carried
+    energy = 0.5 * p[:m] * given.normal.rate
+    push = given.directions @ p
+    blow = blow._replace(
+        v=blow.v + given.moved @ p,
+        impulse=blow.impulse + p[:m],
+        energy=blow.energy.at[0].add(energy),
+        base_work=blow.base_work + push @ carried,
+    )
+    return blow, carried
+
+
+def _kind(
+    strikes: jax.Array, ends: jax.Array, released: jax.Array, fired: jax.Array, m: int
+) -> jax.Array:
+    """The kind of event, `none` at a beginning without impact."""
+    kind = jnp.where(jnp.any(fired[:m]), KIND_CODE["contact"], KIND_CODE["none"])
+    kind = jnp.where(jnp.any(fired[m:]), KIND_CODE["friction"], kind)
+    kind = jnp.where(jnp.any(released[:m]), KIND_CODE["detachment"], kind)
+    hit = jnp.where(ends, KIND_CODE["accumulation"], KIND_CODE["impact"])
+    return jnp.where(strikes, hit, kind).astype(jnp.int32)
+
+
+def _accumulation_end(t: jax.Array, struck: jax.Array, ends: jax.Array) -> jax.Array:
+    """`t + d r / (1 - r)`: the limit of a geometric series with the last two intervals' ratio."""
+    last, previous = t - struck[0], struck[0] - struck[1]
+    known = ends & jnp.isfinite(previous) & (last < previous) & (last > 0)
+    safe_last, safe_previous = jnp.where(known, last, 0.0), jnp.where(known, previous, 1.0)
+    r = safe_last / safe_previous
+    end = t + jnp.max(safe_last * r / (1 - r))
+    return jnp.where(jnp.any(ends), end, jnp.nan)
