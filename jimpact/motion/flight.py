@@ -6,6 +6,7 @@ remainder is a Newton step whose derivative is that of the event time: `dt = -g 
 lengths themselves are no part of the derivative.
 """
 
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ LANDED = 1e-8  # of the step: a landing this near is finished by one Newton step
 LANDINGS = 25  # trials to land on a crossing; it was none if that fails (the gap only grazes 0)
 SAFETY, SHRINK, GROW = 0.9, 0.2, 5.0  # step-size control, as usual
 SMALLEST_STEP = 1e-15  # of the time: below it the step does not move time any more
-ROUNDING_GAP = 1e-3  # of the gap that counts as closed: below it a gap is rounding
+ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is rounding
 
 
 class State(NamedTuple):
@@ -122,11 +123,19 @@ def fly(
     return jax.lax.while_loop(going, one, begin)
 
 
+class _Seen(NamedTuple):
+    """Watched values (k,), their rates, and the rates of the state."""
+
+    value: jax.Array
+    rate: jax.Array
+    slope: State
+
+
 class _At(NamedTuple):
     """Functions of (t, state) for one set of modes."""
 
     rates: Callable[[jax.Array, State], State]
-    watch: Callable[[jax.Array, State], tuple[jax.Array, jax.Array]]  # values, rates
+    watch: Callable[[jax.Array, State], "_Seen"]
     project: Callable[[jax.Array, State], State]
 
 
@@ -144,9 +153,10 @@ def _at(
         per_contact = jnp.stack([jnp.zeros_like(friction), friction])
         return State(y.v, found.acceleration, power, base, per_contact)
 
-    def watch(t: jax.Array, y: State) -> tuple[jax.Array, jax.Array]:
-        along = (jnp.ones_like(t), rates(t, y))
-        return jax.jvp(lambda t, y: watched(contacts(t, y), mu, modes, scales), (t, y), along)
+    def watch(t: jax.Array, y: State) -> _Seen:
+        slope = rates(t, y)
+        see = lambda t, y: watched(contacts(t, y), mu, modes, scales)  # noqa: E731
+        return _Seen(*jax.jvp(see, (t, y), (jnp.ones_like(t), slope)), slope)
 
     def project(t: jax.Array, y: State) -> State:
         given = contacts(t, y)
@@ -184,10 +194,12 @@ def _trial(
     h = jnp.where(at_sample, remaining, free)
     new, error = _step(system, at, settings, t, h, y)
     new = at.project(t + h, new)
-    after = at.watch(t + h, new)
-    plain = jax.lax.stop_gradient((h, at.watch(t, y), after, error))
+    both = jax.tree.map(lambda *x: jnp.stack(x), (t, y), (t + h, new))
+    seen = jax.vmap(at.watch)(*both)  # one program for both ends
+    before, after = (jax.tree.map(operator.itemgetter(i), seen) for i in (0, 1))
+    plain = jax.lax.stop_gradient((h, before[:2], after[:2], error))
     verdict = _judge(settings, flight, plain, rounding, at_sample)
-    kept = _taken(at, flight, verdict, t + h, new, after, at_sample, targets)
+    kept = _taken(flight, verdict, t + h, new, after, at_sample, targets)
     span = jnp.abs(t) + jnp.abs(targets[-1])
     tiny = verdict.again & (verdict.step < SMALLEST_STEP * span)
     steps = flight.steps + 1
@@ -212,8 +224,9 @@ def _judge(
     near = LANDED * length + SMALLEST_STEP * jnp.abs(flight.t)
     seen = crossing.found & (crossing.time < length - near)
     unseen = crossing.unseen & ~crossing.found & (length > near)
-    short = aiming & ~crossing.found & (ahead <= 2 * length)
-    arrived = short & (jnp.abs(ahead) <= near)
+    short = aiming & ~crossing.found & (ahead < jnp.inf)
+    zero = jnp.abs(g) <= jnp.sum(jnp.where(flight.aimed, rounding, 0.0))
+    arrived = short & ((jnp.abs(ahead) <= near) | zero)
     missed = short & ~arrived & ~at_sample
     again = coarse | ((seen | unseen | missed) & (flight.landings < LANDINGS))
     lands = ~again & ((crossing.found & ~seen) | arrived)
@@ -222,28 +235,27 @@ def _judge(
     clipped = (length < flight.step) & ~coarse
     step = jnp.where(clipped, jnp.maximum(flight.step, factor * length), factor * length)
     step = jnp.where(again & ~coarse, flight.step, step)
-    aim = jnp.where(seen, crossing.time, jnp.where(unseen, length * SHRINK, length + ahead))
+    longer = length + jnp.minimum(ahead, length)
+    aim = jnp.where(seen, crossing.time, jnp.where(unseen, length * SHRINK, longer))
     aim = jnp.where(again & ~coarse, aim, jnp.inf)
     which = jnp.where(crossing.found, crossing.which, flight.aimed & short)
     return _Verdict(again, lands, which, step, aim)
 
 
 def _taken(
-    at: _At,
     flight: Flight,
     verdict: _Verdict,
     t: jax.Array,
     new: State,
-    after: tuple[jax.Array, jax.Array],
+    after: _Seen,
     at_sample: jax.Array,
     targets: jax.Array,
 ) -> Flight:
     """The flight after the trial: moved by the last remainder where it lands on an event."""
     again, lands, which = verdict.again, verdict.lands, verdict.which
-    g, rate = (jnp.sum(jnp.where(which, x, 0.0)) for x in after)
+    g, rate = (jnp.sum(jnp.where(which, x, 0.0)) for x in after[:2])
     left = jnp.where(lands & (rate < 0), -g / jnp.where(rate < 0, rate, 1.0), 0.0)
-    slope = at.rates(t, new)
-    moved = jax.tree.map(lambda x, d: x + left * d, new, slope)
+    moved = jax.tree.map(lambda x, d: x + left * d, new, after.slope)
     state = jax.tree.map(lambda a, b: jnp.where(again, a, b), flight.state, moved)
     sampled = ~again & at_sample & ~lands
     row = (jnp.arange(targets.shape[0], dtype=flight.sample.dtype) == flight.sample) & sampled

@@ -21,31 +21,27 @@ class Choice(NamedTuple):
     consistent: jax.Array
 
 
-def choose(
+def choose_with_friction(
     given: Contacts,
-    mu: jax.Array | None,
+    mu: jax.Array,
     touching: jax.Array,
     released: jax.Array,
     sliding: jax.Array,
-    acceleration_scale: jax.Array,
+    slack: jax.Array,
 ) -> Choice:
     """Modes of the contacts that touch at rest.
 
     Args:
         given: contact space.
-        mu: coefficients of friction (m,), or None.
+        mu: coefficients of friction (m,).
         touching: (m,) gap and gap velocity are 0.
-        released: (k,) what has just let go: it is held again only by a force, not by rounding.
+        released: (2 m,) what has just let go: it is held again only by a force, not by rounding.
         sliding: (m,) whether the tangential velocity is not 0.
-        acceleration_scale: largest gap acceleration of the motion so far.
+        slack: gap accelerations below it are rounding.
     """
     given, mu = jax.lax.stop_gradient((given, mu))
+    assert given.tangent is not None
     m = touching.shape[0]
-    slack = REST_ACCELERATION * acceleration_scale
-    if given.tangent is None or mu is None:
-        pressed, resting = pressed_together(given, touching, slack)
-        no, zero = jnp.zeros(m, bool), jnp.zeros(m, given.free.dtype)
-        return Choice(Modes(pressed | (resting & ~released), no, zero), jnp.asarray(True))
     sign = jnp.sign(given.tangent.rate)
     broken = released[m:]  # sticking that broke: its sliding begins against its last force
     start = Modes(touching & ~released[:m], ~sliding & ~broken, sign)
@@ -69,7 +65,8 @@ def pressed_together(
     w, b = given.delassus[:m, :m], jnp.where(touching, given.approach[:m], 0.0)
     both = touching[:, None] & touching[None, :]
     eye = jnp.eye(m, dtype=w.dtype)
-    found = solve_lcp(jnp.where(both, w, eye), b)
+    # redundant contacts: any of the solutions will do
+    found = solve_lcp(jnp.where(both, w, eye), b, regular=True)
     pressed = touching & (found.z * jnp.diagonal(w) > slack)
     return pressed, touching & ~pressed & (found.w <= slack)
 

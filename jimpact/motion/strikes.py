@@ -7,10 +7,15 @@ import jax.numpy as jnp
 
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
-from jimpact.motion.contact_forces import Modes, constraint_impulse, contacts_at, no_modes
+from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
 from jimpact.motion.dynamics import base_velocity, gaps, kinematics, mass_at, seen_from_base
 from jimpact.motion.flight import Scales, Settings, State
-from jimpact.motion.modes import REST_ACCELERATION, choose, pressed_together
+from jimpact.motion.modes import (
+    REST_ACCELERATION,
+    Choice,
+    choose_with_friction,
+    pressed_together,
+)
 from jimpact.motion.record import KIND_CODE, MOTION_CODE
 from jimpact.motion.system import System
 from jimpact.scene import Scene
@@ -81,17 +86,16 @@ def resolve(
     slow = closed & (gamma <= settings.accumulation * scales.speed)
     tight = closed & (jnp.abs(gamma) <= rest)
     slack = REST_ACCELERATION * scales.acceleration
-    pressed, _ = pressed_together(given, slow, slack)
+    pressed, resting = pressed_together(given, slow, slack)
     held = tight | (slow & pressed)
     blow, carried = _brought_to_rest(system, given, mu, held, blow, t)
-    tangent = given.tangent
-    if tangent is not None:
-        tangent = tangent._replace(rate=tangent.gradient.T @ (blow.v - carried))
-        given = given._replace(tangent=tangent)
-    sliding = jnp.zeros(m, bool) if tangent is None else jnp.abs(tangent.rate) > rest
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strikes
-    choice = choose(given, mu, held, released, sliding, scales.acceleration)
+    if mu is None:
+        active = pressed | (tight & resting & ~released)
+        choice = Choice(no_modes(m, gamma.dtype)._replace(active=active), jnp.asarray(True))
+    else:
+        choice = _with_friction(given, mu, held, released, blow.v - carried, rest, slack)
     # a contact accumulates if it was brought to rest from more than rounding
     ends = held & ~tight & strikes
     fails = jnp.asarray(_FAILS)[blow.code]
@@ -116,6 +120,21 @@ def resolve(
         _accumulation_end(t, struck, ends),
         status,
     )
+
+
+def _with_friction(
+    given: Contacts,
+    mu: jax.Array,
+    held: jax.Array,
+    released: jax.Array,
+    relative: jax.Array,
+    rest: jax.Array,
+    slack: jax.Array,
+) -> Choice:
+    assert given.tangent is not None
+    rate = given.tangent.gradient.T @ relative
+    now = given._replace(tangent=given.tangent._replace(rate=rate))
+    return choose_with_friction(now, mu, held, released, jnp.abs(rate) > rest, slack)
 
 
 def _grown(scales: Scales, rates: jax.Array, accelerations: jax.Array) -> Scales:
@@ -164,7 +183,7 @@ def _struck(system: System, law: Law, t: jax.Array, state: State, closed: jax.Ar
 
 
 def _brought_to_rest(
-    system: System, given, mu: jax.Array | None, held: jax.Array, blow: Blow, t: jax.Array
+    system: System, given: Contacts, mu: jax.Array | None, held: jax.Array, blow: Blow, t: jax.Array
 ) -> tuple[Blow, jax.Array]:
     """The gap velocities of `held` contacts set to 0, and the velocity of the base."""
     m = held.shape[0]
