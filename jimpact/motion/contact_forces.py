@@ -24,6 +24,7 @@ from jimpact.numerics.linear import solve_definite
 
 # singular values below this share of the largest are rounding: redundant sticking contacts
 _REDUNDANT = 1e-12
+_LEAST_SHARE = 1e-6  # of the pressing force: keeps the weights of contacts without load regular
 
 
 class Modes(NamedTuple):
@@ -93,7 +94,13 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     k = jnp.where(held[:, None], given.delassus, coupled)
     # columns of open contacts multiply forces that are 0
     right = jnp.where(held, -given.approach, 0.0)
-    both = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right
+    first = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right
+    # redundant sticking contacts share the load by what presses them: least sum of
+    # lambda_t^2 / lambda_n, which is in the cone wherever a solution is for equal mu
+    press = jnp.maximum(first[:m], 0.0)
+    share = jnp.maximum(press / jnp.maximum(jnp.max(press), jnp.finfo(k.dtype).tiny), _LEAST_SHARE)
+    weight = jax.lax.stop_gradient(jnp.concatenate([jnp.ones(m, k.dtype), jnp.sqrt(share)]))
+    both = weight * (jnp.linalg.pinv(k * weight[None, :], rtol=_REDUNDANT) @ right)
     return Forces(both[:m], both[m:], given.free + given.moved @ both)
 
 

@@ -49,7 +49,7 @@ def event_driven(
     start = _Course(
         begin,
         no_modes(m, q0.dtype),
-        Scales(zero, zero),
+        Scales(zero, zero, zero),
         jnp.full((2, m), -jnp.inf, q0.dtype),
         events,
         status,

@@ -57,9 +57,10 @@ class Settings(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """Largest gap velocity and gap acceleration of the motion so far."""
+    """Largest values of the motion so far."""
 
-    speed: jax.Array
+    gap_velocity: jax.Array
+    speed: jax.Array  # gap velocity that all kinetic energy could give a contact
     acceleration: jax.Array
 
 

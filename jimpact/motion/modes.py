@@ -24,6 +24,7 @@ class Choice(NamedTuple):
 def choose_with_friction(
     given: Contacts,
     mu: jax.Array,
+    before: Modes,
     touching: jax.Array,
     released: jax.Array,
     sliding: jax.Array,
@@ -34,6 +35,7 @@ def choose_with_friction(
     Args:
         given: contact space.
         mu: coefficients of friction (m,).
+        before: modes up to now.
         touching: (m,) gap and gap velocity are 0.
         released: (2 m,) what has just let go: it is held again only by a force, not by rounding.
         sliding: (m,) whether the tangential velocity is not 0.
@@ -42,13 +44,18 @@ def choose_with_friction(
     given, mu = jax.lax.stop_gradient((given, mu))
     assert given.tangent is not None
     m = touching.shape[0]
-    sign = jnp.sign(given.tangent.rate)
-    broken = released[m:]  # sticking that broke: its sliding begins against its last force
-    start = Modes(touching & ~released[:m], ~sliding & ~broken, sign)
+    slid = before.active & ~before.stick
+    broken = released[m:] & before.stick
+    ended = jnp.any(released[m:] & slid)
+    # where sticking breaks at one contact of a body, those that began to slide before go on
+    goes_on = slid & jnp.any(broken) & ~ended & ~sliding
+    start = Modes(touching & ~released[:m], ~sliding & ~broken & ~goes_on, before.sign)
+    # sliding begins against the last force of sticking
     held = forces(given, mu, start._replace(stick=start.stick | (broken & ~sliding)))
     assert held.tangential is not None
-    begun = jnp.where(held.tangential > 0, -1.0, 1.0)
-    start = start._replace(sign=jnp.where(sliding, sign, begun))
+    begun = jnp.where(goes_on, before.sign, jnp.where(held.tangential > 0, -1.0, 1.0))
+    sign = jnp.where(sliding, jnp.sign(given.tangent.rate), begun)
+    start = start._replace(sign=sign)
     return _pivot(given, mu, start, touching, sliding, slack)
 
 

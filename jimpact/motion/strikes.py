@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
-from jimpact.motion.dynamics import base_velocity, gaps, kinematics, mass_at, seen_from_base
+from jimpact.motion.dynamics import base_velocity, gaps, kinematics, kinetic, mass_at, seen_from_base
 from jimpact.motion.flight import Scales, Settings, State
 from jimpact.motion.modes import (
     REST_ACCELERATION,
@@ -21,7 +21,7 @@ from jimpact.motion.system import System
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
 
-# Gap velocities below this share of the largest of the motion are 0: laws are no more exact.
+# Gap velocities below this share of what the kinetic energy could give are 0: rounding.
 REST_SPEED = 1e-9
 _FAILS = tuple(row.failure for row in STATUS)
 
@@ -72,8 +72,7 @@ def resolve(
     m = before.active.shape[0]
     given = contacts_at(system, state.q, state.v, t, settings.friction)
     closed = given.normal.value <= settings.closed_below
-    rates = [given.normal.rate] if given.tangent is None else [given.normal.rate, given.tangent.rate]
-    scales = jax.lax.stop_gradient(_grown(scales, jnp.concatenate(rates), given.approach[:m]))
+    scales = jax.lax.stop_gradient(_grown(system, scales, given, t, state))
     rest = REST_SPEED * scales.speed
     strikes = jnp.any(closed & (given.normal.rate < -rest))
     blow = jax.lax.cond(
@@ -83,7 +82,7 @@ def resolve(
     )
     given = contacts_at(system, state.q, blow.v, t, settings.friction)
     gamma = given.normal.rate
-    slow = closed & (gamma <= settings.accumulation * scales.speed)
+    slow = closed & (gamma <= settings.accumulation * scales.gap_velocity)
     tight = closed & (jnp.abs(gamma) <= rest)
     slack = REST_ACCELERATION * scales.acceleration
     pressed, resting = pressed_together(given, slow, slack)
@@ -95,7 +94,7 @@ def resolve(
         active = pressed | (tight & resting & ~released)
         choice = Choice(no_modes(m, gamma.dtype)._replace(active=active), jnp.asarray(True))
     else:
-        choice = _with_friction(given, mu, held, released, blow.v - carried, rest, slack)
+        choice = _with_friction(given, mu, before, held, released, blow.v - carried, rest, slack)
     # a contact accumulates if it was brought to rest from more than rounding
     ends = held & ~tight & strikes
     fails = jnp.asarray(_FAILS)[blow.code]
@@ -125,6 +124,7 @@ def resolve(
 def _with_friction(
     given: Contacts,
     mu: jax.Array,
+    before: Modes,
     held: jax.Array,
     released: jax.Array,
     relative: jax.Array,
@@ -134,12 +134,22 @@ def _with_friction(
     assert given.tangent is not None
     rate = given.tangent.gradient.T @ relative
     now = given._replace(tangent=given.tangent._replace(rate=rate))
-    return choose_with_friction(now, mu, held, released, jnp.abs(rate) > rest, slack)
+    return choose_with_friction(now, mu, before, held, released, jnp.abs(rate) > rest, slack)
 
 
-def _grown(scales: Scales, rates: jax.Array, accelerations: jax.Array) -> Scales:
-    speed = jnp.maximum(scales.speed, jnp.abs(rates).max())
-    return Scales(speed, jnp.maximum(scales.acceleration, jnp.abs(accelerations).max()))
+def _grown(
+    system: System, scales: Scales, given: Contacts, t: jax.Array, state: State
+) -> Scales:
+    m = given.normal.rate.shape[0]
+    carried = base_velocity(system, t)
+    seen = state.v if carried is None else state.v - carried
+    energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, seen))
+    now = Scales(
+        jnp.abs(given.normal.rate).max(),
+        jnp.sqrt(2 * energy * jnp.max(jnp.diagonal(given.delassus))),
+        jnp.abs(given.approach[:m]).max(),
+    )
+    return jax.tree.map(jnp.maximum, scales, now)
 
 
 def _no_blow(state: State, m: int) -> Blow:
