@@ -40,7 +40,7 @@ def event_driven(
     n = q0.shape[0]
     m = gaps(system, q0, times[0]).shape[0]
     begin = _begin(settings, q0, v0, times, m)
-    events = _no_events(max_events, n, m, q0.dtype)
+    events = no_events(max_events, n, m, q0.dtype)
     zero = jnp.zeros((), q0.dtype)
     penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
@@ -62,7 +62,7 @@ def event_driven(
         return _next_event(system, law, mu, settings, times, max_events, course)
 
     end = jax.lax.while_loop(going, one, start)
-    return _record(system, times, end)
+    return energies(system, times, end.flight.samples, end.events, end.flight.steps, end.status)
 
 
 def _begin(
@@ -134,7 +134,8 @@ def _why_stuck(system: System, flight: Flight) -> jax.Array:
     return jnp.where(~(least > _SINGULAR), MOTION_CODE["singular_mass"], code)
 
 
-def _no_events(size: int, n: int, m: int, dtype: Any) -> Events:
+def no_events(size: int, n: int, m: int, dtype: Any) -> Events:
+    """An empty table of events."""
     def blank(*shape: int) -> jax.Array:
         return jnp.full((size, *shape), jnp.nan, dtype)
 
@@ -176,8 +177,15 @@ def _written(events: Events, flight: Flight, found: Outcome) -> Events:
     return Events(count=events.count + fits.astype(jnp.int32), **new)
 
 
-def _record(system: System, times: jax.Array, end: _Course) -> Motion:
-    samples = end.flight.samples
+def energies(
+    system: System,
+    times: jax.Array,
+    samples: State,
+    events: Events,
+    steps: jax.Array,
+    status: jax.Array,
+) -> Motion:
+    """The record of sampled states, with their energies and gaps."""
     return Motion(
         time=times,
         q=samples.q,
@@ -188,7 +196,7 @@ def _record(system: System, times: jax.Array, end: _Course) -> Motion:
         base_work=samples.base_work,
         contact_work=samples.contact_work,
         gaps=jax.vmap(lambda q, t: gaps(system, q, t))(samples.q, times),
-        events=end.events,
-        steps=end.flight.steps,
-        status=end.status,
+        events=events,
+        steps=steps,
+        status=status,
     )

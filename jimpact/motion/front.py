@@ -16,6 +16,7 @@ from jimpact.motion.event_driven import event_driven
 from jimpact.motion.flight import Settings
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
+from jimpact.motion.time_stepping import time_stepping
 from jimpact.scene import check_mass
 
 CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
@@ -37,6 +38,7 @@ def simulate(
     samples: int = 201,
     method: str = "events",
     step: float | None = None,
+    friction: Any = None,
     max_events: int = MAX_EVENTS,
     rtol: float = RTOL,
     atol: float = ATOL,
@@ -52,8 +54,7 @@ def simulate(
 
     Args:
         system: gaps, mass, forces, base.
-        law: any impact law. If it has a field `friction`, persistent contacts stick and slide
-            with it, where the system has a `tangent_function`.
+        law: any impact law.
         q0: (n,) at the start, without penetration.
         v0: (n,).
         t_end: [s] > t_start.
@@ -62,12 +63,15 @@ def simulate(
         method: 'events' (flights by diffrax up to located events), or 'time_stepping'
             (Moreau-Jean, for many contacts; needs `step` [s]).
         step: of the time stepping [s].
+        friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
+            `tangent_function`; None: that of the law, if it has a field `friction`. Not in time
+            stepping.
         max_events: rows for events; one more ends the motion with the status `max_events`.
         rtol, atol: tolerances of the flights.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed.
-        max_steps: of the integrator, between two events.
+        max_steps: of the integrator, in all.
         solver: any explicit Runge-Kutta method of diffrax; default `Dopri8`.
 
     Returns:
@@ -99,26 +103,55 @@ def simulate(
     check_values("slow", slow, low=0.0, high=1.0)
     if method not in METHODS:
         raise ValueError(f"Argument `method` must be one of {METHODS}, but has value {method!r}.")
-    friction = system.tangent_function is not None and getattr(law, "friction", None) is not None
+    mu = _friction(system, law, friction, q)
     settings = Settings(
         rtol,
         atol,
         jnp.asarray(closed_below, dtype),
         max_steps,
-        friction,
+        mu is not None,
         diffrax.Dopri8(scan_kind="lax") if solver is None else solver,
         jnp.asarray(slow, dtype),
     )
     q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     if method == "time_stepping":
-        raise NotImplementedError
-    return _events(system, law, settings, q, v, start, end, count, max_events)
+        substeps = _substeps(step, start, end, count)
+        closed = settings.closed_below
+        return _stepped(system, law, q, v, start, end, count, substeps, closed, max_events)
+    return _events(system, law, mu, settings, q, v, start, end, count, max_events)
+
+
+def _friction(system: System, law: Law, given: Any, q: jax.Array) -> jax.Array | None:
+    """mu (m,), None without friction."""
+    mu = getattr(law, "friction", None) if given is None else given
+    if mu is None or (system.tangent_function is None and given is None):
+        return None
+    if system.tangent_function is None:
+        raise ValueError("Argument `friction` needs a system with a `tangent_function`.")
+    mu = as_float_array("friction", mu)
+    check_values("friction", mu, low=0.0)
+    m = jax.eval_shape(lambda x: gaps(system, x, jnp.zeros((), x.dtype)), q).shape[0]
+    if mu.shape not in ((), (m,)):
+        raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
+    return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
+
+
+def _substeps(step: Any, start: jax.Array, end: jax.Array, samples: int) -> int:
+    """Steps between two samples, none longer than `step`."""
+    if step is None or is_traced(step):
+        raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
+    check_values("step", step, low=0.0, open_low=True)
+    if is_traced((start, end)):
+        raise ValueError("Arguments `t_start`, `t_end` must not be traced in time stepping.")
+    between = float(end - start) / (samples - 1)
+    return max(1, int(np.ceil(between / float(step) * (1 - 1e-9))))
 
 
 @eqx.filter_jit
 def _events(
     system: System,
     law: Law,
+    mu: jax.Array | None,
     settings: Settings,
     q: jax.Array,
     v: jax.Array,
@@ -128,11 +161,24 @@ def _events(
     max_events: int,
 ) -> Motion:
     times = equal_times(start, end, samples)
-    mu = None
-    if settings.friction:
-        m = gaps(system, q, start).shape[0]
-        mu = jnp.broadcast_to(law.friction, (m,))  # type: ignore[attr-defined]
     return event_driven(system, law, mu, settings, q, v, times, max_events)
+
+
+@eqx.filter_jit
+def _stepped(
+    system: System,
+    law: Law,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    samples: int,
+    substeps: int,
+    closed_below: jax.Array,
+    max_events: int,
+) -> Motion:
+    times = equal_times(start, end, samples)
+    return time_stepping(system, law, q, v, times, substeps, closed_below, max_events)
 
 
 def equal_times(start: jax.Array, end: jax.Array, samples: int) -> jax.Array:

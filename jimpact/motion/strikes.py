@@ -23,7 +23,8 @@ from jimpact.status import CODE, STATUS
 
 # Gap velocities below this share of what the kinetic energy could give are 0: rounding.
 REST_SPEED = 1e-9
-_FAILS = tuple(row.failure for row in STATUS)
+# A contact that still approaches is no failure: it has another impact at the same instant.
+FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STATUS)
 
 
 class Blow(NamedTuple):
@@ -77,17 +78,20 @@ def resolve(
     strikes = jnp.any(closed & (given.normal.rate < -rest))
     blow = jax.lax.cond(
         strikes,
-        lambda: _struck(system, law, t, state, closed),
-        lambda: _no_blow(state, m),
+        lambda: blow_of(system, law, t, state, closed),
+        lambda: no_blow(state, m),
     )
     given = contacts_at(system, state.q, blow.v, t, settings.friction)
     gamma = given.normal.rate
-    slow = closed & (gamma <= settings.accumulation * scales.gap_velocity)
+    slowly = settings.accumulation * scales.gap_velocity
+    slow = closed & (gamma <= slowly)
     tight = closed & (jnp.abs(gamma) <= rest)
     slack = REST_ACCELERATION * scales.acceleration
     pressed, resting = pressed_together(given, slow, slack)
     held = tight | (slow & pressed)
-    blow, carried = _brought_to_rest(system, given, mu, held, blow, t)
+    carried = base_velocity(system, t)
+    carried = jnp.zeros_like(blow.v) if carried is None else carried
+    blow = _brought_to_rest(given, mu, held, slowly, carried, blow)
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strikes
     if mu is None:
@@ -97,7 +101,7 @@ def resolve(
         choice = _with_friction(given, mu, before, held, released, blow.v - carried, rest, slack)
     # a contact accumulates if it was brought to rest from more than rounding
     ends = held & ~tight & strikes
-    fails = jnp.asarray(_FAILS)[blow.code]
+    fails = jnp.asarray(FAILS)[blow.code]
     status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
     status = jnp.where(fails, MOTION_CODE["law_failed"], status)
     took = jnp.where(strikes, blow.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
@@ -152,7 +156,8 @@ def _grown(
     return jax.tree.map(jnp.maximum, scales, now)
 
 
-def _no_blow(state: State, m: int) -> Blow:
+def no_blow(state: State, m: int) -> Blow:
+    """Nothing happens."""
     zero = jnp.zeros_like(state.work)
     none = jnp.zeros(m, state.v.dtype)
     return Blow(state.v, none, none, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
@@ -170,7 +175,7 @@ def scene_now(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: 
     return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
 
 
-def _struck(system: System, law: Law, t: jax.Array, state: State, closed: jax.Array) -> Blow:
+def blow_of(system: System, law: Law, t: jax.Array, state: State, closed: jax.Array) -> Blow:
     """`impact` in the frame of the base."""
     m = closed.shape[0]
     scene = scene_now(system, state.q, state.v, t, closed)
@@ -193,23 +198,30 @@ def _struck(system: System, law: Law, t: jax.Array, state: State, closed: jax.Ar
 
 
 def _brought_to_rest(
-    system: System, given: Contacts, mu: jax.Array | None, held: jax.Array, blow: Blow, t: jax.Array
-) -> tuple[Blow, jax.Array]:
-    """The gap velocities of `held` contacts set to 0, and the velocity of the base."""
+    given: Contacts,
+    mu: jax.Array | None,
+    held: jax.Array,
+    slowly: jax.Array,
+    carried: jax.Array,
+    blow: Blow,
+) -> Blow:
+    """Gap velocities of `held` contacts set to 0, and with friction what slides as slowly."""
     m = held.shape[0]
-    alone = no_modes(m, blow.v.dtype)._replace(active=held)
-    p = constraint_impulse(given, mu, alone, given.normal.rate)
-    carried = base_velocity(system, t)
-    carried = jnp.zeros_like(blow.v) if carried is None else carried
-    energy = 0.5 * p[:m] * given.normal.rate
-    push = given.directions @ p
-    blow = blow._replace(
+    modes, rates = no_modes(m, blow.v.dtype)._replace(active=held), given.normal.rate
+    if given.tangent is not None:
+        modes = modes._replace(stick=jnp.abs(given.tangent.rate) <= slowly)
+        rates = jnp.concatenate([rates, given.tangent.rate])
+    p = constraint_impulse(given, mu, modes, rates)
+    # work at the mean velocity: half of that before, 0 after
+    energy = jnp.pad(0.5 * p * rates, (0, 2 * m - p.shape[0])).reshape(2, m)
+    side = jnp.pad(p, (0, 2 * m - p.shape[0]))[m:]
+    return blow._replace(
         v=blow.v + given.moved @ p,
         impulse=blow.impulse + p[:m],
-        energy=blow.energy.at[0].add(energy),
-        base_work=blow.base_work + push @ carried,
+        tangential=blow.tangential + side,
+        energy=blow.energy + energy,
+        base_work=blow.base_work + (given.directions @ p) @ carried,
     )
-    return blow, carried
 
 
 def _kind(
