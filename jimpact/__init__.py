@@ -83,9 +83,7 @@ _WHERE = {
     "motion.front": "simulate",
     "motion.system": "System gravity",
     "motion.record": "Motion raise_on_failed_motion",
-    "motion.ready_systems": (
-        "ball_system block_system column_system cradle_system dimer_system"
-    ),
+    "motion.ready_systems": ("ball_system block_system column_system cradle_system dimer_system"),
 }
 _MODULE = {name: module for module, names in _WHERE.items() for name in names.split()}
 

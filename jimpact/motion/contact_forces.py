@@ -107,8 +107,9 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
 def constraint_impulse(
     given: Contacts, mu: jax.Array | None, modes: Modes, rates: jax.Array
 ) -> jax.Array:
-    """Impulses p (k,) that take `rates` (k,) to 0 where the modes hold them, the least ones.
+    """Impulses p that take `rates` to 0 where the modes hold them, the least ones.
 
+    Rates and impulses are (k,) or (k, columns); of normals alone, rates may have m rows.
     `given.moved @ p` is the change of velocity; of position, if `rates` are gaps (first order).
     """
     friction = given.tangent is not None and mu is not None
@@ -119,9 +120,10 @@ def constraint_impulse(
     both = held[:, None] & held[None, :]
     size = held.shape[0]
     k = jnp.where(both, given.delassus[:size, :size], jnp.eye(size, dtype=rates.dtype))
-    right = jnp.where(held, -rates, 0.0)
+    right = jnp.where(held if rates.ndim == 1 else held[:, None], -rates, 0.0)
     p = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right if friction else solve_definite(k, right)
-    return jnp.pad(p, (0, given.delassus.shape[0] - size))
+    rest = given.delassus.shape[0] - size
+    return jnp.pad(p, ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
 
 
 def powers(

@@ -65,9 +65,7 @@ def event_driven(
     return energies(system, times, end.flight.samples, end.events, end.flight.steps, end.status)
 
 
-def _begin(
-    settings: Settings, q0: jax.Array, v0: jax.Array, times: jax.Array, m: int
-) -> Flight:
+def _begin(settings: Settings, q0: jax.Array, v0: jax.Array, times: jax.Array, m: int) -> Flight:
     samples = times.shape[0]
     zero = jnp.zeros((), q0.dtype)
     state = State(q0, v0, zero, zero, jnp.zeros((2, m), q0.dtype))
@@ -136,6 +134,7 @@ def _why_stuck(system: System, flight: Flight) -> jax.Array:
 
 def no_events(size: int, n: int, m: int, dtype: Any) -> Events:
     """An empty table of events."""
+
     def blank(*shape: int) -> jax.Array:
         return jnp.full((size, *shape), jnp.nan, dtype)
 

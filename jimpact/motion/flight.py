@@ -81,9 +81,7 @@ class Flight(NamedTuple):
     undefined: jax.Array  # the last trial was not a number
 
 
-def watched(
-    given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales
-) -> jax.Array:
+def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales) -> jax.Array:
     """What must stay positive (k,): gaps or normal forces, then friction."""
     m = modes.active.shape[0]
     found = forces(given, mu, modes)
@@ -161,11 +159,13 @@ def _at(
 
     def project(t: jax.Array, y: State) -> State:
         given = contacts(t, y)
-        rate = given.normal.rate
-        if given.tangent is not None:
+        value, rate = given.normal.value, given.normal.rate
+        if given.tangent is not None:  # tangentially only velocities drift
+            value = jnp.concatenate([value, jnp.zeros_like(value)])
             rate = jnp.concatenate([rate, given.tangent.rate])
-        q = y.q + given.moved @ constraint_impulse(given, mu, modes, given.normal.value)
-        return y._replace(q=q, v=y.v + given.moved @ constraint_impulse(given, mu, modes, rate))
+        p = constraint_impulse(given, mu, modes, jnp.stack([value, rate], axis=1))
+        move = given.moved @ p
+        return y._replace(q=y.q + move[:, 0], v=y.v + move[:, 1])
 
     return _At(rates, watch, project)
 

@@ -8,7 +8,14 @@ import jax.numpy as jnp
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
-from jimpact.motion.dynamics import base_velocity, gaps, kinematics, kinetic, mass_at, seen_from_base
+from jimpact.motion.dynamics import (
+    base_velocity,
+    gaps,
+    kinematics,
+    kinetic,
+    mass_at,
+    seen_from_base,
+)
 from jimpact.motion.flight import Scales, Settings, State
 from jimpact.motion.modes import (
     REST_ACCELERATION,
@@ -141,9 +148,7 @@ def _with_friction(
     return choose_with_friction(now, mu, before, held, released, jnp.abs(rate) > rest, slack)
 
 
-def _grown(
-    system: System, scales: Scales, given: Contacts, t: jax.Array, state: State
-) -> Scales:
+def _grown(system: System, scales: Scales, given: Contacts, t: jax.Array, state: State) -> Scales:
     m = given.normal.rate.shape[0]
     carried = base_velocity(system, t)
     seen = state.v if carried is None else state.v - carried
@@ -192,9 +197,7 @@ def blow_of(system: System, law: Law, t: jax.Array, state: State, closed: jax.Ar
         side = (scene.tangents.T @ mean) * tangential
         push = push + scene.tangents @ tangential
     energy = jnp.stack([normal, side])
-    return Blow(
-        out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status
-    )
+    return Blow(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
 
 
 def _brought_to_rest(
