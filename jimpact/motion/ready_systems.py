@@ -17,10 +17,13 @@ def _checked(name: str, value: Any, *, zero: bool = False) -> jax.Array:
     return array
 
 
-class _ColumnGaps(eqx.Module):
+class ColumnGaps(eqx.Module):
+    """Gaps of balls above one another."""
+
     radii: jax.Array
 
     def __call__(self, q: jax.Array) -> jax.Array:
+        """Its values at q."""
         bottom = q - self.radii
         top_below = jnp.concatenate([jnp.zeros(1, q.dtype), (q + self.radii)[:-1]])
         return bottom - top_below
@@ -51,7 +54,7 @@ def column_system(
     radius = jnp.broadcast_to(_checked("radii", radii, zero=True), mass.shape).astype(mass.dtype)
     directions = None if base is None else jnp.ones((mass.shape[0], 1), mass.dtype)
     return System(
-        _ColumnGaps(radius),
+        ColumnGaps(radius),
         mass,
         potential=gravity(mass, acceleration),
         base=base,
@@ -74,12 +77,15 @@ def ball_system(
     return column_system(jnp.atleast_1d(as_float_array("mass", mass)), 0.0, acceleration, base)
 
 
-class _CradleGaps(eqx.Module):
+class CradleGaps(eqx.Module):
+    """Gaps between pendulums."""
+
     length: jax.Array
     spacing: jax.Array
     diameter: jax.Array
 
     def __call__(self, q: jax.Array) -> jax.Array:
+        """Its values at q."""
         x = self.length * jnp.sin(q) + self.spacing * jnp.arange(q.shape[0], dtype=q.dtype)
         y = -self.length * jnp.cos(q)
         return jnp.hypot(jnp.diff(x), jnp.diff(y)) - self.diameter
@@ -89,6 +95,7 @@ class _PendulumPotential(eqx.Module):
     weight_length: jax.Array
 
     def __call__(self, q: jax.Array) -> jax.Array:
+        """Its values at q."""
         return self.weight_length @ (1 - jnp.cos(q))
 
 
@@ -121,11 +128,11 @@ def cradle_system(
     between = _checked("gap", gap, zero=True).astype(mass.dtype)
     g = jnp.asarray(acceleration, mass.dtype)
     return System(
-        _CradleGaps(l, d + between, d), mass * l**2, potential=_PendulumPotential(mass * l * g)
+        CradleGaps(l, d + between, d), mass * l**2, potential=_PendulumPotential(mass * l * g)
     )
 
 
-class _Tips(eqx.Module):
+class Tips(eqx.Module):
     """Points of a body with q = (x, y, theta): heights, or horizontal positions."""
 
     along: jax.Array  # (m,) position in the body, along its axis at theta = 0
@@ -134,6 +141,7 @@ class _Tips(eqx.Module):
     horizontal: bool = eqx.field(static=True)
 
     def __call__(self, q: jax.Array) -> jax.Array:
+        """Its values at q."""
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         if self.horizontal:
             return q[0] + c * self.along - s * self.across + self.radius * q[2]
@@ -151,10 +159,10 @@ def _body_system(
 ) -> System:
     up = jnp.stack([jnp.zeros_like(mass), mass, jnp.zeros_like(mass)])
     return System(
-        _Tips(along, across, radius, False),
+        Tips(along, across, radius, False),
         jnp.stack([mass, mass, inertia]),
         potential=gravity(up, acceleration),
-        tangent_function=_Tips(along, across, radius, True),
+        tangent_function=Tips(along, across, radius, True),
         base=base,
         base_directions=None if base is None else jnp.eye(3, 2, dtype=mass.dtype),
     )
