@@ -83,6 +83,7 @@ _WHERE = {
     "motion.front": "simulate",
     "plot_motions": "animate_motion plot_motion plot_phase_portrait",
     "motion.system": "System gravity",
+    "motion.bases": "HarmonicBase",
     "motion.record": "Motion raise_on_failed_motion",
     "motion.ready_systems": ("ball_system block_system column_system cradle_system dimer_system"),
 }
