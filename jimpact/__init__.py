@@ -84,6 +84,7 @@ _WHERE = {
     "plot_motions": "animate_motion plot_motion plot_phase_portrait",
     "motion.system": "System gravity",
     "motion.bases": "HarmonicBase",
+    "motion.fitting_motion": "MotionFit fit_motion",
     "motion.record": "Motion raise_on_failed_motion",
     "motion.ready_systems": ("ball_system block_system column_system cradle_system dimer_system"),
 }

@@ -116,7 +116,9 @@ def plot_phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") ->
     time = np.concatenate([motion.time, *(2 * [np.asarray(motion.events.time)[rows]])])
     position = np.concatenate([motion.q[:, coordinate], jumps[0], jumps[0]])
     speed = np.concatenate([motion.velocity[:, coordinate], jumps[1], jumps[2]])
-    event = np.concatenate([np.zeros(len(motion.time)), np.ones(rows.sum()), np.full(rows.sum(), 2)])
+    event = np.concatenate(
+        [np.zeros(len(motion.time)), np.ones(rows.sum()), np.full(rows.sum(), 2)]
+    )
     order = np.lexsort((event, time))
     position, speed, event = position[order], speed[order], event[order]
     cut = np.flatnonzero(event == 2)
@@ -155,7 +157,7 @@ def animate_motion(
 
     >>> import jimpact as ji
     >>> ball = ji.ball_system()
-    >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=5)
+    >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
     >>> ji.animate_motion(ball, motion, "ball.gif").name
     'ball.gif'
     """
@@ -174,7 +176,9 @@ def animate_motion(
     figure = Figure(figsize=(4.8, 4.8), layout="constrained", dpi=80)
     axes = figure.subplots()
     _limits(axes, curves, ground)
-    lines = [axes.plot([], [], color=COLOURS[i // 2 % len(COLOURS)])[0] for i in range(len(curves[0]))]
+    lines = [
+        axes.plot([], [], color=COLOURS[i // 2 % len(COLOURS)])[0] for i in range(len(curves[0]))
+    ]
     floor = axes.plot([], [], color=_GREY, lw=2)[0]
 
     def draw(k: int) -> list[Any]:

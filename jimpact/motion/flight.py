@@ -155,7 +155,8 @@ def _at(
     def watch(t: jax.Array, y: State) -> _Seen:
         slope = rates(t, y)
         see = lambda t, y: watched(contacts(t, y), mu, modes, scales)  # noqa: E731
-        return _Seen(*jax.jvp(see, (t, y), (jnp.ones_like(t), slope)), slope)
+        value, rate = jax.jvp(see, (t, y), (jnp.ones_like(t), slope))
+        return _Seen(value, rate, slope)
 
     def project(t: jax.Array, y: State) -> State:
         given = contacts(t, y)

@@ -85,7 +85,7 @@ def simulate(
     Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
 
     >>> import jimpact as ji
-    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.8), [1.0], [0.0], 5.0)
+    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21)
     >>> [round(float(t), 6) for t in motion.event_times()[:3]]
     [0.451601, 1.174162, 1.752211]
     >>> [round(float(t), 6) for t in motion.events.accumulation_end[motion.events.count - 1 :][:1]]
@@ -231,7 +231,8 @@ def _check_system(
         check_mass(mass_at(system, q))
     if system.base is not None:
         looks = np.linspace(float(start), float(end), _BASE_LOOKS)
-        base = jax.vmap(lambda t: jnp.atleast_1d(system.base(t)))(jnp.asarray(looks, q.dtype))
+        moved = system.base
+        base = jax.vmap(lambda t: jnp.atleast_1d(moved(t)))(jnp.asarray(looks, q.dtype))
         bad = ~np.isfinite(np.asarray(base)).all(axis=1)
         if bad.any():
             raise ValueError(

@@ -70,7 +70,7 @@ def ball_system(
     """A ball (a point at height q) above a floor or a vibrating plate.
 
     >>> import jimpact as ji
-    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0)
+    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
     >>> round(float(motion.events.time[0]), 6)
     0.451601
     """

@@ -130,7 +130,7 @@ class Motion(eqx.Module):
 
 def _plain(value: np.ndarray) -> Any:
     if value.dtype.kind == "f":
-        return np.where(np.isfinite(value), value, None).tolist()
+        return np.where(np.isfinite(value), value.astype(object), None).tolist()
     return value.tolist()
 
 
@@ -145,7 +145,7 @@ def raise_on_failed_motion(motion: Motion) -> Motion:
 
     >>> import jimpact as ji
     >>> system = ji.ball_system()
-    >>> motion = ji.simulate(system, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=5)
+    >>> motion = ji.simulate(system, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
     >>> ji.raise_on_failed_motion(motion) is motion
     True
     """
