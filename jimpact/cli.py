@@ -195,7 +195,7 @@ class SimulateCommand:
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
         "cradle_motion.toml"
     )
-    """Study with [system] and [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml)."""
+    """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml)."""
     t_end: float | None = None
     """End of the motion [s]; default: the study's."""
     samples: int | None = None

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from jimpact.motion.dynamics import seen_from_base
 from jimpact.motion.outlines import Outlines, outlines_of
-from jimpact.motion.record import KIND_CODE, Motion
+from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.plots import COLOURS
 
@@ -193,7 +193,7 @@ def animate_motion(
 
     path.parent.mkdir(parents=True, exist_ok=True)
     shown = FuncAnimation(figure, draw, frames=len(q))
-    shown.save(path, writer=PillowWriter(fps=int(round(frames_per_second))))
+    shown.save(path, writer=PillowWriter(fps=round(frames_per_second)))
     return path
 
 

@@ -143,7 +143,8 @@ def fit_motion(
         system, law, arguments, observe or _positions, given, parameters, limits
     )
     state = _solve(problem, box, y, max_passes)
-    return _report(problem, state, parameters, here, np.linalg.norm(weight), sigma is not None)
+    size = float(np.linalg.norm(weight))
+    return _report(problem, state, parameters, here, size, sigma is not None)
 
 
 def _positions(motion: Motion) -> jax.Array:

@@ -53,6 +53,7 @@ class Settings(NamedTuple):
     max_steps: int
     friction: bool
     solver: Any
+    duration: jax.Array
     accumulation: jax.Array  # gap velocity that counts as slow, over the largest of the motion
 
 

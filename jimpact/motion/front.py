@@ -104,6 +104,7 @@ def simulate(
     if method not in METHODS:
         raise ValueError(f"Argument `method` must be one of {METHODS}, but has value {method!r}.")
     mu = _friction(system, law, friction, q)
+    q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     settings = Settings(
         rtol,
         atol,
@@ -111,9 +112,9 @@ def simulate(
         max_steps,
         mu is not None,
         diffrax.Dopri8(scan_kind="lax") if solver is None else solver,
+        end - start,
         jnp.asarray(slow, dtype),
     )
-    q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     if method == "time_stepping":
         substeps = _substeps(step, start, end, count)
         closed = settings.closed_below

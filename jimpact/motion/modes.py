@@ -108,7 +108,10 @@ def _pivot(
         # sliding from rest must move the way it was assumed to
         back = modes.active & ~modes.stick & ~sliding
         returns = jnp.where(back, -modes.sign * rate[m:], 0.0)
-        return jnp.stack([pulls, sinks, breaks, returns]), found.tangential
+        # what pulls or sinks is settled first: cones of pulling contacts mean nothing
+        settled = ~jnp.any(jnp.maximum(pulls, sinks) > slack)
+        sides = jnp.where(settled, jnp.stack([breaks, returns]), 0.0)
+        return jnp.concatenate([jnp.stack([pulls, sinks]), sides]), found.tangential
 
     def one(state: _Search) -> _Search:
         modes = state.modes

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.motion.ready_systems import CradleGaps, ColumnGaps, Tips
+from jimpact.motion.ready_systems import ColumnGaps, CradleGaps, Tips
 from jimpact.motion.system import System
 
 # q (n,) -> curves (k, 2) of points (x, y) in metres

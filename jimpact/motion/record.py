@@ -130,7 +130,9 @@ class Motion(eqx.Module):
 
 def _plain(value: np.ndarray) -> Any:
     if value.dtype.kind == "f":
-        return np.where(np.isfinite(value), value.astype(object), None).tolist()
+        plain = value.astype(object)
+        plain[~np.isfinite(value)] = None
+        return plain.tolist()
     return value.tolist()
 
 

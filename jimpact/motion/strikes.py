@@ -30,6 +30,7 @@ from jimpact.status import CODE, STATUS
 
 # Gap velocities below this share of what the kinetic energy could give are 0: rounding.
 REST_SPEED = 1e-9
+ROUNDINGS = 64  # of the time: velocities that arise within them are 0
 # A contact that still approaches is no failure: it has another impact at the same instant.
 FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STATUS)
 
@@ -81,7 +82,8 @@ def resolve(
     given = contacts_at(system, state.q, state.v, t, settings.friction)
     closed = given.normal.value <= settings.closed_below
     scales = jax.lax.stop_gradient(_grown(system, scales, given, t, state))
-    rest = REST_SPEED * scales.speed
+    rounding = ROUNDINGS * float(jnp.finfo(t.dtype).eps) * jnp.abs(settings.duration)
+    rest = jax.lax.stop_gradient(REST_SPEED * scales.speed + rounding * scales.acceleration)
     strikes = jnp.any(closed & (given.normal.rate < -rest))
     blow = jax.lax.cond(
         strikes,
