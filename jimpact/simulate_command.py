@@ -65,7 +65,8 @@ def _told(what: str) -> Iterator[None]:
 def _draw(
     study: MotionStudy, motion: Motion, pictures: dict[str, Path | None], coordinate: int
 ) -> None:
-    from jimpact.plot_motions import animate_motion, plot_motion, plot_phase_portrait
+    from jimpact.animation import animate_motion  # matplotlib, late
+    from jimpact.plot_motions import plot_motion, plot_phase_portrait
 
     path, portrait, gif = (pictures[k] for k in ("picture", "portrait", "animation"))
     assert path is not None

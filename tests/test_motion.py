@@ -266,6 +266,7 @@ def test_time_stepping_of_many_beads_comes_to_rest():
         ({"max_events": 0}, "`max_events` must be an int >= 1"),
         ({"method": "euler"}, "`method` must be one of"),
         ({"method": "time_stepping"}, "`step` must be given"),
+        ({"rtol": 1e-16}, "`rtol` must be at least 16 roundings of float64"),
         ({"rtol": 0.0}, r"`rtol` must lie in \(0"),
         ({"friction": 0.3}, "needs a system with a `tangent_function`"),
         ({"slow": 2.0}, "`slow` must lie in"),
@@ -293,6 +294,27 @@ def test_bad_systems():
         )
     with pytest.raises(ValueError, match="`mass` must lie in"):
         ji.simulate(ji.System(lambda q: q, lambda q: 1 - q), ji.Newton(0.5), [2.0], [0.0], 1.0)
+
+
+@pytest.mark.slow
+def test_contacts_that_still_approach_have_another_impact_at_once():
+    """Moreau's law lets a separating contact close: the next impact is at the same instant."""
+    system = ji.column_system([1.0, 1.0, 1.0])
+    motion = ji.simulate(system, ji.Moreau(0.5), [0.0] * 3, [-1.0, -0.2, -0.2], 0.01, samples=2)
+    assert int(motion.status) == 0
+    times = np.asarray(motion.events.time)[: int(motion.events.count)]
+    assert len(times) > 1
+    assert (times[:2] == 0).all()
+    assert (np.asarray(motion.gaps) > -1e-12).all()
+    pulls = ji.simulate(
+        ji.column_system([1.0, 1.0]), ji.Newton(0.5), [0.0] * 2, [0.0, 1.0], 0.01, samples=2
+    )
+    assert int(pulls.status) == 0
+    assert int(pulls.events.count) == 0
+    squeezed = ji.simulate(system, ji.Newton(0.9), [0.0] * 3, [-1.0, 5.0, 5.0], 0.01, samples=2)
+    assert int(squeezed.status) == MOTION_CODE["law_failed"]
+    with pytest.raises(RuntimeError, match="law_failed"):
+        ji.raise_on_failed_motion(squeezed)
 
 
 @pytest.mark.slow

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jimpact.laws.base import Law
 from jimpact.motion.contact_forces import Modes, no_modes
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
-from jimpact.motion.flight import Flight, Scales, Settings, State, fly
+from jimpact.motion.flight import fly
+from jimpact.motion.flight_records import Flight, Scales, Settings, State
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, Motion
 from jimpact.motion.strikes import Outcome, resolve
 from jimpact.motion.system import System

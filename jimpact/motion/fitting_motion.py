@@ -11,8 +11,8 @@ import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
 from jimpact.laws.base import Law
-from jimpact.motion.front import simulate
 from jimpact.motion.record import MOTION_STATUS, Motion
+from jimpact.motion.simulation import simulate
 from jimpact.motion.system import System
 from jimpact.numerics.least_squares import Box, State, advance, begin
 from jimpact.parameters import LOGARITHMIC, Parameters, bounds_of, entries, free_parameters

@@ -7,23 +7,17 @@ lengths themselves are no part of the derivative.
 """
 
 import operator
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
 
-from jimpact.motion.contact_forces import (
-    Contacts,
-    Modes,
-    constraint_impulse,
-    contacts_at,
-    forces,
-    powers,
-)
+from jimpact.motion.along import Along, Seen, along
+from jimpact.motion.contact_forces import Modes
 from jimpact.motion.crossings import first_crossing
-from jimpact.motion.dynamics import definite, mass_at, user_force
+from jimpact.motion.dynamics import definite, mass_at
+from jimpact.motion.flight_records import Flight, Scales, Settings, State
 from jimpact.motion.modes import REST_ACCELERATION
 from jimpact.motion.system import System
 
@@ -32,69 +26,6 @@ LANDINGS = 25  # trials to land on a crossing; it was none if that fails (the ga
 SAFETY, SHRINK, GROW = 0.9, 0.2, 5.0  # step-size control, as usual
 SMALLEST_STEP = 1e-15  # of the time: below it the step does not move time any more
 ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is rounding
-
-
-class State(NamedTuple):
-    """What is integrated: q, v, work of forces, of the base, of each contact [J]."""
-
-    q: jax.Array
-    v: jax.Array
-    work: jax.Array  # ()
-    base_work: jax.Array  # ()
-    contact_work: jax.Array  # (2, m): normal (impacts), tangential
-
-
-class Settings(NamedTuple):
-    """Tolerances of a motion."""
-
-    rtol: float
-    atol: float
-    closed_below: jax.Array
-    max_steps: int
-    friction: bool
-    solver: Any
-    duration: jax.Array
-    accumulation: jax.Array  # gap velocity that counts as slow, over the largest of the motion
-
-
-class Scales(NamedTuple):
-    """Largest values of the motion so far."""
-
-    gap_velocity: jax.Array
-    speed: jax.Array  # gap velocity that all kinetic energy could give a contact
-    acceleration: jax.Array
-
-
-class Flight(NamedTuple):
-    """A flight under way."""
-
-    t: jax.Array
-    state: State
-    step: jax.Array  # of the error control
-    aim: jax.Array  # length of the next trial where it is aimed at something, else inf
-    aimed: jax.Array  # (k,) one-hot: what the trial is to land on
-    landings: jax.Array
-    event: jax.Array  # (k,) one-hot: what has happened
-    sample: jax.Array  # number of samples reached
-    samples: State
-    steps: jax.Array
-    stuck: jax.Array
-    undefined: jax.Array  # the last trial was not a number
-
-
-def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales) -> jax.Array:
-    """What must stay positive (k,): gaps or normal forces, then friction."""
-    m = modes.active.shape[0]
-    found = forces(given, mu, modes)
-    w = jnp.diagonal(given.delassus)
-    slack = REST_ACCELERATION * scales.acceleration
-    normal = jnp.where(modes.active, found.normal * w[:m] + slack, given.normal.value)
-    if given.tangent is None or mu is None or found.tangential is None:
-        return normal
-    cone = (mu * found.normal - jnp.abs(found.tangential)) * w[m:] + slack
-    slip = modes.sign * given.tangent.rate
-    side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)
-    return jnp.concatenate([normal, side])
 
 
 def fly(
@@ -108,7 +39,7 @@ def fly(
 ) -> Flight:
     """Integrate until something watched crosses zero, or to the last of `targets` (S,)."""
     n_targets, m = targets.shape[0], modes.active.shape[0]
-    at = _at(system, mu, settings, modes, scales)
+    at = along(system, mu, settings, modes, scales)
     floor = ROUNDING_GAP * settings.closed_below
     small = jnp.where(modes.active, 0.0, jnp.broadcast_to(floor, (m,)))
     slip_rounding = jnp.full(m, REST_ACCELERATION) * scales.speed
@@ -123,55 +54,6 @@ def fly(
     return jax.lax.while_loop(going, one, begin)
 
 
-class _Seen(NamedTuple):
-    """Watched values (k,), their rates, and the rates of the state."""
-
-    value: jax.Array
-    rate: jax.Array
-    slope: State
-
-
-class _At(NamedTuple):
-    """Functions of (t, state) for one set of modes."""
-
-    rates: Callable[[jax.Array, State], State]
-    watch: Callable[[jax.Array, State], "_Seen"]
-    project: Callable[[jax.Array, State], State]
-
-
-def _at(
-    system: System, mu: jax.Array | None, settings: Settings, modes: Modes, scales: Scales
-) -> _At:
-    def contacts(t: jax.Array, y: State) -> Contacts:
-        return contacts_at(system, y.q, y.v, t, settings.friction)
-
-    def rates(t: jax.Array, y: State, args: Any = None) -> State:
-        given = contacts(t, y)
-        found = forces(given, mu, modes)
-        friction, base = powers(system, given, found, t)
-        power = user_force(system, y.q, y.v, t) @ y.v
-        per_contact = jnp.stack([jnp.zeros_like(friction), friction])
-        return State(y.v, found.acceleration, power, base, per_contact)
-
-    def watch(t: jax.Array, y: State) -> _Seen:
-        slope = rates(t, y)
-        see = lambda t, y: watched(contacts(t, y), mu, modes, scales)  # noqa: E731
-        value, rate = jax.jvp(see, (t, y), (jnp.ones_like(t), slope))
-        return _Seen(value, rate, slope)
-
-    def project(t: jax.Array, y: State) -> State:
-        given = contacts(t, y)
-        value, rate = given.normal.value, given.normal.rate
-        if given.tangent is not None:  # tangentially only velocities drift
-            value = jnp.concatenate([value, jnp.zeros_like(value)])
-            rate = jnp.concatenate([rate, given.tangent.rate])
-        p = constraint_impulse(given, mu, modes, jnp.stack([value, rate], axis=1))
-        move = given.moved @ p
-        return y._replace(q=y.q + move[:, 0], v=y.v + move[:, 1])
-
-    return _At(rates, watch, project)
-
-
 class _Verdict(NamedTuple):
     """What becomes of a trial."""
 
@@ -184,7 +66,7 @@ class _Verdict(NamedTuple):
 
 def _trial(
     system: System,
-    at: _At,
+    at: Along,
     settings: Settings,
     targets: jax.Array,
     rounding: jax.Array,
@@ -250,7 +132,7 @@ def _taken(
     verdict: _Verdict,
     t: jax.Array,
     new: State,
-    after: _Seen,
+    after: Seen,
     at_sample: jax.Array,
     targets: jax.Array,
 ) -> Flight:
@@ -284,7 +166,7 @@ def _taken(
 
 
 def _step(
-    system: System, at: _At, settings: Settings, t: jax.Array, h: jax.Array, y: State
+    system: System, at: Along, settings: Settings, t: jax.Array, h: jax.Array, y: State
 ) -> tuple[State, jax.Array]:
     """One step of the solver, and its error over what is allowed."""
     term = diffrax.ODETerm(at.rates)

@@ -8,7 +8,6 @@ from typing import Any
 
 from jimpact.laws.base import Law
 from jimpact.motion.bases import HarmonicBase
-from jimpact.motion.front import simulate
 from jimpact.motion.ready_systems import (
     ball_system,
     block_system,
@@ -17,6 +16,7 @@ from jimpact.motion.ready_systems import (
     dimer_system,
 )
 from jimpact.motion.record import Motion
+from jimpact.motion.simulation import simulate
 from jimpact.motion.system import System
 from jimpact.study import check_keys, law_table, locate
 

@@ -18,12 +18,12 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.laws.base import Law
+from jimpact.motion.blows import FAILS, Blow, blow_of, no_blow
 from jimpact.motion.contact_forces import contacts_at
 from jimpact.motion.dynamics import base_velocity, gaps, user_force
 from jimpact.motion.event_driven import energies, no_events
-from jimpact.motion.flight import State
+from jimpact.motion.flight_records import State
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, Motion
-from jimpact.motion.strikes import FAILS, Blow, blow_of, no_blow
 from jimpact.motion.system import System
 from jimpact.numerics.lcp import solve_lcp
 

@@ -1,30 +1,27 @@
-"""`simulate`: the public function, its checks on the host."""
+"""`simulate`: whole motions."""
 
-from functools import partial
 from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jimpact._checks import as_float_array, as_whole, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, as_whole, check_values
 from jimpact.laws.base import Law
-from jimpact.motion.dynamics import gaps, mass_at
+from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.event_driven import event_driven
-from jimpact.motion.flight import Settings
+from jimpact.motion.flight_records import Settings
+from jimpact.motion.motion_input import check_motion, friction_of, substeps_of
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.motion.time_stepping import time_stepping
-from jimpact.scene import check_mass
 
 CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
 RTOL, ATOL = 1e-10, 1e-12  # of the flights
 SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
 MAX_EVENTS, MAX_STEPS = 500, 100_000
 METHODS = ("events", "time_stepping")
-_BASE_LOOKS = 64  # times at which the base is looked at before the motion starts
 
 
 def simulate(
@@ -94,7 +91,7 @@ def simulate(
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
     dtype = jnp.result_type(q, v)
     start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))
-    _check(system, q, v, start, end, closed_below)
+    check_motion(system, q, v, start, end, closed_below)
     count = as_whole("samples", samples, 2)
     as_whole("max_events", max_events, 1)
     as_whole("max_steps", max_steps, 1)
@@ -103,7 +100,12 @@ def simulate(
     check_values("slow", slow, low=0.0, high=1.0)
     if method not in METHODS:
         raise ValueError(f"Argument `method` must be one of {METHODS}, but has value {method!r}.")
-    mu = _friction(system, law, friction, q)
+    if method == "events" and rtol < FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps):
+        raise ValueError(
+            f"Argument `rtol` must be at least {FINEST_RTOL_IN_EPS} roundings of {dtype}, but has "
+            f"value {rtol:g}: enable jax_enable_x64, or give a coarser one."
+        )
+    mu = friction_of(system, law, friction, q)
     q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     settings = Settings(
         rtol,
@@ -116,36 +118,10 @@ def simulate(
         jnp.asarray(slow, dtype),
     )
     if method == "time_stepping":
-        substeps = _substeps(step, start, end, count)
+        substeps = substeps_of(step, start, end, count)
         closed = settings.closed_below
         return _stepped(system, law, q, v, start, end, count, substeps, closed, max_events)
     return _events(system, law, mu, settings, q, v, start, end, count, max_events)
-
-
-def _friction(system: System, law: Law, given: Any, q: jax.Array) -> jax.Array | None:
-    """mu (m,), None without friction."""
-    mu = getattr(law, "friction", None) if given is None else given
-    if mu is None or (system.tangent_function is None and given is None):
-        return None
-    if system.tangent_function is None:
-        raise ValueError("Argument `friction` needs a system with a `tangent_function`.")
-    mu = as_float_array("friction", mu)
-    check_values("friction", mu, low=0.0)
-    m = jax.eval_shape(lambda x: gaps(system, x, jnp.zeros((), x.dtype)), q).shape[0]
-    if mu.shape not in ((), (m,)):
-        raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
-    return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
-
-
-def _substeps(step: Any, start: jax.Array, end: jax.Array, samples: int) -> int:
-    """Steps between two samples, none longer than `step`."""
-    if step is None or is_traced(step):
-        raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
-    check_values("step", step, low=0.0, open_low=True)
-    if is_traced((start, end)):
-        raise ValueError("Arguments `t_start`, `t_end` must not be traced in time stepping.")
-    between = float(end - start) / (samples - 1)
-    return max(1, int(np.ceil(between / float(step) * (1 - 1e-9))))
 
 
 @eqx.filter_jit
@@ -186,64 +162,3 @@ def equal_times(start: jax.Array, end: jax.Array, samples: int) -> jax.Array:
     """`samples` instants from start to end."""
     share = jnp.arange(samples, dtype=start.dtype) / (samples - 1)
     return start + share * (end - start)
-
-
-def _check(
-    system: System,
-    q: jax.Array,
-    v: jax.Array,
-    start: jax.Array,
-    end: jax.Array,
-    closed_below: float,
-) -> None:
-    if q.ndim != 1:
-        raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
-    check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
-    for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
-        check_values(name, value)
-    check_shape("t_start", start, (), "a time")
-    check_shape("t_end", end, (), "a time")
-    if not is_traced((start, end)) and not float(end) > float(start):
-        raise ValueError(
-            f"Argument `t_end` must be larger than `t_start` = {float(start):g}, "
-            f"but has value {float(end):g}."
-        )
-    _check_system(system, q, v, start, end, closed_below)
-
-
-def _check_system(
-    system: System,
-    q: jax.Array,
-    v: jax.Array,
-    start: jax.Array,
-    end: jax.Array,
-    closed_below: float,
-) -> None:
-    n = q.shape[0]
-    mass = jax.eval_shape(partial(mass_at, system), q)
-    if mass.shape not in ((n,), (n, n)):
-        raise ValueError(
-            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `q0` has {n} "
-            f"coordinates, but has one of shape {mass.shape}."
-        )
-    if is_traced((system, q, v, start, end)):
-        return
-    if callable(system.mass):
-        check_mass(mass_at(system, q))
-    if system.base is not None:
-        looks = np.linspace(float(start), float(end), _BASE_LOOKS)
-        moved = system.base
-        base = jax.vmap(lambda t: jnp.atleast_1d(moved(t)))(jnp.asarray(looks, q.dtype))
-        bad = ~np.isfinite(np.asarray(base)).all(axis=1)
-        if bad.any():
-            raise ValueError(
-                "Argument `system` must have a finite base motion, but base(t) has value "
-                f"{np.asarray(base)[bad][0]} at t = {looks[bad][0]:g} s."
-            )
-    f = np.asarray(gaps(system, q, start))
-    if not (f >= -closed_below).all():
-        worst = int(np.argmin(f))
-        raise ValueError(
-            f"Argument `q0` must have no penetration (f >= -{closed_below:g} m), "
-            f"but gap {worst} has value {f[worst]:g} m."
-        )
