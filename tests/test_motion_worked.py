@@ -93,7 +93,7 @@ def test_free_rocking_to_rest():
 
 @pytest.mark.slow
 def test_overturning_on_a_harmonic_base():
-    """It stands still below a = g w / h, rocks above, and overturns on a much stronger base."""
+    """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
     law = ji.RestitutionMatrix(rocking_matrix(0.85))
 
     @jax.jit
@@ -103,13 +103,13 @@ def test_overturning_on_a_harmonic_base():
         start = base(jnp.zeros(()))[0]
         q0 = jnp.stack([start, jnp.full((), 0.3), jnp.zeros(())])
         return ji.simulate(
-            ji.block_system(0.2, 0.6, base=base), law, q0, jnp.zeros(3), 1.5, friction=5.0
+            ji.block_system(0.2, 0.6, base=base), law, q0, jnp.zeros(3), 2.0, friction=5.0
         )
 
-    motion = shake(jnp.array([0.32, 0.35, 1.5]))
+    motion = shake(jnp.array([0.33, 0.4, 0.6]))
     still, rocks, falls = np.nanmax(np.abs(np.asarray(motion.q)[..., 2]), axis=1)
     assert still < 1e-10
-    assert 1e-4 < rocks < np.pi / 2 < falls
+    assert 0.1 < rocks < np.pi / 2 < falls
     np.testing.assert_allclose(motion.ledger_residual[:2], 0, atol=1e-9)
 
 

@@ -95,12 +95,12 @@ def friction_of(system: System, law: Law, given: Any, q: jax.Array) -> jax.Array
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
 
 
-def substeps_of(step: Any, start: jax.Array, end: jax.Array, samples: int) -> int:
+def substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
     """Steps between two samples, none longer than `step`."""
     if step is None or is_traced(step):
         raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
     check_values("step", step, low=0.0, open_low=True)
     if is_traced((start, end)):
         raise ValueError("Arguments `t_start`, `t_end` must not be traced in time stepping.")
-    between = float(end - start) / (samples - 1)
+    between = (float(end) - float(start)) / (samples - 1)
     return max(1, int(np.ceil(between / float(step) * (1 - 1e-9))))

@@ -118,7 +118,7 @@ def simulate(
         jnp.asarray(slow, dtype),
     )
     if method == "time_stepping":
-        substeps = substeps_of(step, start, end, count)
+        substeps = substeps_of(step, t_start, t_end, count)
         closed = settings.closed_below
         return _stepped(system, law, q, v, start, end, count, substeps, closed, max_events)
     return _events(system, law, mu, settings, q, v, start, end, count, max_events)
