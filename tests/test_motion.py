@@ -230,6 +230,17 @@ def test_time_stepping_is_of_first_order():
 
 
 @pytest.mark.slow
+def test_time_stepping_has_both_derivatives():
+    def last(e):
+        given = (ji.ball_system(), ji.Newton(e), [1.0], [0.0], 1.0)
+        return ji.simulate(*given, method="time_stepping", step=1e-3, samples=5).q[-1, 0]
+
+    forward, reverse = jax.jit(jax.jacfwd(last))(0.8), jax.jit(jax.jacrev(last))(0.8)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-12)
+    np.testing.assert_allclose(forward, jax.grad(height)(0.8, 1.0), rtol=0.01)
+
+
+@pytest.mark.slow
 def test_time_stepping_of_many_beads_comes_to_rest():
     n = 20
     q = 0.01 + 0.02 * np.arange(n) + 0.05
