@@ -25,7 +25,7 @@ _WHERE = {
         "normalized_delassus normalized_gap_velocity velocity_change"
     ),
     "scenes": "chain column scene_from_gaps",
-    "systems": "System",
+    "mechanisms": "Mechanism",
     "bodies": "Block Dimer dimer rocking_block",
     "spatial": "SpatialDimer dimer_3d",
     "planar": "Corner DiskBalls corner disk_balls",
@@ -85,6 +85,14 @@ _WHERE = {
     "plot_validity": "plot_advice plot_validity_map",
     "experiments": "Experiments read_experiments",
     "fitting": "Fit fit",
+    "motion.simulation": "simulate",
+    "plot_motions": "plot_motion plot_phase_portrait",
+    "animation": "animate_motion",
+    "motion.system": "System gravity",
+    "motion.bases": "HarmonicBase",
+    "motion.fitting_motion": "MotionFit fit_motion",
+    "motion.record": "Motion raise_on_failed_motion",
+    "motion.ready_systems": ("ball_system block_system column_system cradle_system dimer_system"),
 }
 _MODULE = {name: module for module, names in _WHERE.items() for name in names.split()}
 

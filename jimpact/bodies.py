@@ -5,11 +5,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jimpact.mechanisms import Mechanism, number, positive
 from jimpact.scene import Scene
-from jimpact.systems import System, number, positive
 
 
-class Block(System):
+class Block(Mechanism):
     """A rigid rectangle over the ground; q = (x, y, theta) of its centre, counter-clockwise.
 
     Equation: `f_{1,2} = y - (l/2) cos(theta) +/- (L/2) sin(theta)`, width L, height l; contact 1
@@ -67,7 +67,7 @@ class Block(System):
         return _touching(self, angle)
 
 
-class Dimer(System):
+class Dimer(Mechanism):
     """Two equal spheres on the ends of a rod, in a vertical plane; q = (x, y, theta).
 
     Equation: `f_{1,2} = y +/- (L/2 + R) sin(theta) - R`, contact 1 the right sphere. The lowest

@@ -189,6 +189,36 @@ class AdviseCommand:
 
 
 @dataclasses.dataclass(frozen=True)
+class SimulateCommand:
+    """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
+
+    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
+        "cradle_motion.toml"
+    )
+    """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml)."""
+    t_end: float | None = None
+    """End of the motion [s]; default: the study's."""
+    samples: int | None = None
+    """Instants in the record; default: the study's, or 201."""
+    gif: Path | None = None
+    """Animation (.gif), one frame a sample."""
+    portrait: Path | None = None
+    """Phase portrait (.png, .pdf, .svg)."""
+    coordinate: int = 1
+    """Coordinate of the phase portrait, counted from 1."""
+    out: Path = Path("jimpact-simulate.png")
+    """Picture (.png, .pdf, .svg), or a directory for it."""
+    json: bool = False
+    """Print JSON instead of a report."""
+
+    def run(self) -> int:
+        """Simulate, print, draw."""
+        from jimpact.simulate_command import run
+
+        return run(**vars(self))
+
+
+@dataclasses.dataclass(frozen=True)
 class LawsCommand:
     """List the laws: what they say, when they are right and when they fail."""
 
@@ -228,6 +258,7 @@ Command = (
     | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
     | Annotated[StabilityCommand, tyro.conf.subcommand("stability")]
     | Annotated[AdviseCommand, tyro.conf.subcommand("advise")]
+    | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
     | Annotated[LawsCommand, tyro.conf.subcommand("laws")]
 )
 

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.mechanisms import Mechanism, positive, positives
 from jimpact.scene import Scene
-from jimpact.systems import System, positive, positives
 
 
-class PendulumCradle(System):
+class PendulumCradle(Mechanism):
     """Balls on parallel strings, side by side; q = the angles of the strings, to the right > 0.
 
     Equation: ball i at `(s_i + l sin(q_i), -l cos(q_i))`, `f_j = |c_{j+1} - c_j| - R_j - R_{j+1}`,

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.mechanisms import Mechanism, number, positive, positives
 from jimpact.scene import Scene
-from jimpact.systems import System, number, positive, positives
 
 
-class Corner(System):
+class Corner(Mechanism):
     """A particle between two walls that meet at the origin; q = (x, y).
 
     Equation: `f_1 = y`, `f_2 = x sin(angle) - y cos(angle)`: wall 1 along +x, wall 2 along
@@ -60,7 +60,7 @@ class Corner(System):
         return jnp.zeros(2, self.angle.dtype)
 
 
-class DiskBalls(System):
+class DiskBalls(Mechanism):
     """A disk with balls around its rim, in a plane; q = (x, y, turn) of the disk, then each ball.
 
     Equation: `f_i = |c_i - c_0| - R - r_i`; at rest `W_ij = cos(phi_i - phi_j) / m_0 + delta_ij /

@@ -139,7 +139,7 @@ def _check_scene(scene: Scene) -> None:
     check_values("normals", normals)
     if not is_traced(normals) and not np.abs(np.asarray(normals)).sum(axis=0).all():
         raise ValueError("Argument `normals` must have no zero column: such a contact has no body.")
-    _check_mass(mass)
+    check_mass(mass)
     if scene.gaps is not None:
         check_shape("gaps", scene.gaps, (m,), "one gap per contact")
         check_values("gaps", scene.gaps, low=0.0)
@@ -171,7 +171,8 @@ def _check_independent(constraints: jax.Array) -> None:
         )
 
 
-def _check_mass(mass: jax.Array) -> None:
+def check_mass(mass: jax.Array) -> None:
+    """Raise a ValueError unless M is (n,) > 0, or (n, n) symmetric positive definite."""
     if mass.ndim == 1:
         check_values("mass", mass, low=0.0, open_low=True)
         return

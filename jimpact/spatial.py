@@ -7,11 +7,11 @@ import jax.numpy as jnp
 
 from jimpact._checks import check_values
 from jimpact.bodies import Dimer
+from jimpact.mechanisms import Mechanism, number, positive
 from jimpact.scene import Scene
-from jimpact.systems import System, number, positive
 
 
-class SpatialDimer(System):
+class SpatialDimer(Mechanism):
     """Two equal spheres on the ends of a rod over a plane; q = (x, y, z, yaw, pitch, spin).
 
     Equation: with the rod's axis `a = (cos p cos w, cos p sin w, sin p)`, pitch p, yaw w,

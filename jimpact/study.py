@@ -74,7 +74,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     >>> read_study("three_balls.toml").title
     'Three equal hard balls, one shot'
     """
-    path = _locate(Path(path))
+    path = locate(Path(path))
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -85,26 +85,27 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
         raise ValueError(f"{path}: {error}") from None
 
 
-def _locate(path: Path) -> Path:
+def locate(path: Path, table: str = "[scene]") -> Path:
+    """The file, or the bundled study of this name; studies of a kind have this `table`."""
     if path.is_file():
         return path
     bundled = Path(str(files("jimpact") / "data" / path.name))
     if path.parent == Path() and bundled.is_file():
         return bundled
     tables = sorted(bundled.parent.glob("*.toml"))
-    names = ", ".join(p.name for p in tables if "[scene]" in p.read_text(encoding="utf-8"))
+    names = ", ".join(p.name for p in tables if table in p.read_text(encoding="utf-8"))
     raise FileNotFoundError(f"Study '{path}' does not exist; bundled studies are {names}.")
 
 
 def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Study:
-    _check_keys("the study", tables, _TABLES, required=("scene", "law"))
+    check_keys("the study", tables, _TABLES, required=("scene", "law"))
     for name in ("scene", "law", "fit", "data", "monte_carlo"):
         if not isinstance(tables.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
     scene = _scene(tables["scene"])
     options = dict(tables.get("fit", {}))
-    _check_keys("[fit]", options, _FIT_KEYS)
-    row, values, bounds = _law_table(tables["law"], other_law)
+    check_keys("[fit]", options, _FIT_KEYS)
+    row, values, bounds = law_table(tables["law"], other_law)
     free = options.pop("free", ["restitution"])
     free = free if isinstance(free, dict) else dict.fromkeys(_as_names(free), True)
     if other_law is not None:
@@ -121,7 +122,7 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
 
 
 def _experiments(table: Mapping[str, Any], path: Path, scene: Scene) -> Experiments:
-    _check_keys("[data]", table, _DATA_KEYS, required=("file",))
+    check_keys("[data]", table, _DATA_KEYS, required=("file",))
     experiments = read_experiments(path.parent / table["file"])
     experiments.scene_of(scene, 0)
     corrected = table.get("momentum_corrected", False)
@@ -129,19 +130,19 @@ def _experiments(table: Mapping[str, Any], path: Path, scene: Scene) -> Experime
 
 
 def _scene(table: Mapping[str, Any]) -> Scene:
-    _check_keys("[scene]", table, _SCENE_KEYS, required=("masses_kg",))
+    check_keys("[scene]", table, _SCENE_KEYS, required=("masses_kg",))
     wall = table.get("wall", False)
     if not isinstance(wall, bool | str):
         raise ValueError(f"`wall` must be true, false or a side, but is {wall!r}.")
     return chain(table["masses_kg"], wall, table.get("gaps_m"))
 
 
-def _law_table(
+def law_table(
     table: Mapping[str, Any], other: str | None
 ) -> tuple[Row, dict[str, Any], dict[str, Any]]:
     """Registry row, start values and bounds; of another law only what both have is kept."""
     table = dict(table)
-    _check_keys("[law]", table, tuple(table), required=("name",))
+    check_keys("[law]", table, tuple(table), required=("name",))
     own = str(table.pop("name")).lower()
     name = (other or own).lower()
     for key in (own, name):
@@ -150,8 +151,8 @@ def _law_table(
     row = REGISTRY[name]
     bounds = table.pop("bounds", {})
     options = _LAW_OPTIONS.get(own, ())
-    _check_keys("[law]", table, (*REGISTRY[own].parameters, "name", "bounds", *options))
-    _check_keys("[law.bounds]", bounds, REGISTRY[own].parameters)
+    check_keys("[law]", table, (*REGISTRY[own].parameters, "name", "bounds", *options))
+    check_keys("[law.bounds]", bounds, REGISTRY[own].parameters)
     taken = (*row.parameters, *_LAW_OPTIONS.get(name, ()))
     kept = {k: v for k, v in table.items() if k in taken}
     return row, kept, {k: v for k, v in bounds.items() if k in row.parameters}
@@ -163,9 +164,10 @@ def _as_names(free: Any) -> list[str]:
     raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
 
 
-def _check_keys(
+def check_keys(
     where: str, table: Mapping[str, Any], allowed: tuple[str, ...], required: tuple[str, ...] = ()
 ) -> None:
+    """Raise a ValueError for unknown or missing keys of a table."""
     for key in required:
         if key not in table:
             raise ValueError(f"{where} must have the key `{key}`, but has {', '.join(table)}.")

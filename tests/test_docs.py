@@ -17,7 +17,7 @@ MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(jimpact.__path__, 
 LONG = {  # all rheologies, laws or methods are compiled
     f"jimpact.{name}"
     for name in ("calibration", "plot_rheology", "validity", "stability", "advice", "chart")
-}
+} | {"jimpact.motion.fitting_motion"}
 OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 

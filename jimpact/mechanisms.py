@@ -14,7 +14,7 @@ from jimpact.scenes import CLOSED_BELOW
 _ROUNDINGS = 16  # of the largest coordinate: a gap that small is zero, in float32 too
 
 
-class System(eqx.Module):
+class Mechanism(eqx.Module):
     """What a motion needs of a system with contacts; at one instant it is a `Scene`.
 
     Equation: gaps `f(q)`, normals `N = grad f`, tangents `H_t`, mass matrix `M(q)`.
@@ -76,16 +76,18 @@ class System(eqx.Module):
 
 
 @eqx.filter_jit
-def _at(system: System, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
+def _at(
+    system: Mechanism, q: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
     tangents = None if _frictionless(system) else system.tangents(q)
     normals = jax.jacobian(system.gap_function)(q).T
     return system.mass_matrix(q), normals, tangents, system.gap_function(q)
 
 
-def _frictionless(system: System) -> bool:
+def _frictionless(system: Mechanism) -> bool:
     kind = type(system)
-    own = kind.tangents is not System.tangents
-    return not own and kind.tangent_function is System.tangent_function
+    own = kind.tangents is not Mechanism.tangents
+    return not own and kind.tangent_function is Mechanism.tangent_function
 
 
 def positive(name: str, value: Any, low_allowed: bool = False) -> jax.Array:

@@ -1,0 +1,1 @@
+"""Whole motions: flights between impacts, impacts by any law, persistent contact."""

@@ -1,0 +1,139 @@
+"""Forces of persistent contact, for given modes: open, sliding, sticking.
+
+The modes are frozen between events, so that forces are one linear solve: `rate' = 0` at every
+active contact, and at sticking ones tangentially, too; `lambda_t = -sign mu lambda_n` at sliding
+ones. Which modes hold is decided in `modes.py`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.motion.dynamics import (
+    Kinematics,
+    base_velocity,
+    free_acceleration,
+    kinematics,
+    mass_at,
+    solve_mass,
+    user_force,
+)
+from jimpact.motion.system import System
+from jimpact.numerics.linear import solve_definite
+
+# singular values below this share of the largest are rounding: redundant sticking contacts
+_REDUNDANT = 1e-12
+_LEAST_SHARE = 1e-6  # of the pressing force: keeps the weights of contacts without load regular
+
+
+class Modes(NamedTuple):
+    """Of the m contacts: `active` (persistent), `stick`, `sign` (of sliding: -1, 0, 1)."""
+
+    active: jax.Array
+    stick: jax.Array
+    sign: jax.Array
+
+
+class Contacts(NamedTuple):
+    """Contact space at one instant: normals first, then tangents where there is friction."""
+
+    normal: Kinematics
+    tangent: Kinematics | None
+    directions: jax.Array  # [N, H] (n, k)
+    moved: jax.Array  # M^-1 [N, H] (n, k)
+    delassus: jax.Array  # (k, k)
+    free: jax.Array  # M^-1 F: q'' without contacts (n,)
+    approach: jax.Array  # (k,) second derivatives of gaps and displacements without contacts
+
+
+class Forces(NamedTuple):
+    """Contact forces (m,) [N], q'' (n,)."""
+
+    normal: jax.Array
+    tangential: jax.Array | None
+    acceleration: jax.Array
+
+
+def no_modes(m: int, dtype: jnp.dtype) -> Modes:
+    """All contacts open."""
+    return Modes(jnp.zeros(m, bool), jnp.zeros(m, bool), jnp.zeros(m, dtype))
+
+
+def contacts_at(
+    system: System, q: jax.Array, v: jax.Array, t: jax.Array, friction: bool
+) -> Contacts:
+    """Contact space of the system at (q, v, t)."""
+    mass = mass_at(system, q)
+    normal = kinematics(system, q, v, t)
+    tangent = kinematics(system, q, v, t, of_tangents=True) if friction else None
+    directions, drift = normal.gradient, normal.drift
+    if tangent is not None:
+        directions = jnp.concatenate([directions, tangent.gradient], axis=1)
+        drift = jnp.concatenate([drift, tangent.drift])
+    moved = solve_mass(mass, directions)
+    free = free_acceleration(system, q, v, user_force(system, q, v, t), mass)
+    return Contacts(
+        normal, tangent, directions, moved, directions.T @ moved, free, directions.T @ free + drift
+    )
+
+
+def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
+    """The forces that keep the modes, and the acceleration with them."""
+    m = given.normal.value.shape[0]
+    if given.tangent is None or mu is None:
+        both = modes.active[:, None] & modes.active[None, :]
+        k = jnp.where(both, given.delassus, jnp.eye(m, dtype=given.free.dtype))
+        normal = solve_definite(k, jnp.where(modes.active, -given.approach, 0.0))
+        return Forces(normal, None, given.free + given.moved @ normal)
+    held = jnp.concatenate([modes.active, modes.active & modes.stick])
+    eye = jnp.eye(2 * m, dtype=given.free.dtype)
+    sliding = modes.active & ~modes.stick
+    drag = jnp.where(sliding, modes.sign * mu, 0.0)
+    coupled = eye.at[jnp.arange(m) + m, jnp.arange(m)].set(drag)
+    k = jnp.where(held[:, None], given.delassus, coupled)
+    # columns of open contacts multiply forces that are 0
+    right = jnp.where(held, -given.approach, 0.0)
+    first = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right
+    # redundant sticking contacts share the load by what presses them: least sum of
+    # lambda_t^2 / lambda_n, which is in the cone wherever a solution is for equal mu
+    press = jnp.maximum(first[:m], 0.0)
+    share = jnp.maximum(press / jnp.maximum(jnp.max(press), jnp.finfo(k.dtype).tiny), _LEAST_SHARE)
+    weight = jax.lax.stop_gradient(jnp.concatenate([jnp.ones(m, k.dtype), jnp.sqrt(share)]))
+    both = weight * (jnp.linalg.pinv(k * weight[None, :], rtol=_REDUNDANT) @ right)
+    return Forces(both[:m], both[m:], given.free + given.moved @ both)
+
+
+def constraint_impulse(
+    given: Contacts, mu: jax.Array | None, modes: Modes, rates: jax.Array
+) -> jax.Array:
+    """Impulses p that take `rates` to 0 where the modes hold them, the least ones.
+
+    Rates and impulses are (k,) or (k, columns); of normals alone, rates may have m rows.
+    `given.moved @ p` is the change of velocity; of position, if `rates` are gaps (first order).
+    """
+    friction = given.tangent is not None and mu is not None
+    held = modes.active
+    if friction:
+        held = jnp.concatenate([modes.active, modes.active & modes.stick])
+    held = held[: rates.shape[0]]
+    both = held[:, None] & held[None, :]
+    size = held.shape[0]
+    k = jnp.where(both, given.delassus[:size, :size], jnp.eye(size, dtype=rates.dtype))
+    right = jnp.where(held if rates.ndim == 1 else held[:, None], -rates, 0.0)
+    p = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right if friction else solve_definite(k, right)
+    rest = given.delassus.shape[0] - size
+    return jnp.pad(p, ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
+
+
+def powers(
+    system: System, given: Contacts, found: Forces, t: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Power of friction at every contact (m,) and of the base () [W]."""
+    friction = jnp.zeros_like(found.normal)
+    push = given.normal.gradient @ found.normal
+    if given.tangent is not None and found.tangential is not None:
+        friction = found.tangential * given.tangent.rate
+        push = push + given.tangent.gradient @ found.tangential
+    carried = base_velocity(system, t)
+    return friction, jnp.zeros_like(t) if carried is None else push @ carried

@@ -1,0 +1,116 @@
+"""Gaps, their rates and accelerations, and the acceleration that forces alone give."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.motion.system import System
+
+
+class Kinematics(NamedTuple):
+    """Of the m contacts at one instant; `rate' = grad^T q'' + drift`."""
+
+    value: jax.Array  # (m,) gaps, or tangential displacements
+    rate: jax.Array  # (m,) as seen from the base
+    drift: jax.Array  # (m,) second derivative for q'' = 0
+    gradient: jax.Array  # (n, m)
+
+
+def base_velocity(system: System, t: jax.Array) -> jax.Array | None:
+    """`B y_b'(t)` (n,), None without a base."""
+    if system.base is None:
+        return None
+    return jax.jvp(lambda s: _carried(system, s), (t,), (jnp.ones_like(t),))[1]
+
+
+def _carried(system: System, t: jax.Array) -> jax.Array:
+    assert system.base is not None
+    assert system.base_directions is not None
+    return system.base_directions @ jnp.atleast_1d(system.base(t))
+
+
+def seen_from_base(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
+    """`q - B y_b(t)`."""
+    return q if system.base is None else q - _carried(system, t)
+
+
+def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
+    """f (m,) [m]."""
+    return jnp.atleast_1d(system.gap_function(seen_from_base(system, q, t)))
+
+
+def tangential(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
+    """Tangential displacements h (m,) [m]."""
+    assert system.tangent_function is not None
+    return jnp.atleast_1d(system.tangent_function(seen_from_base(system, q, t)))
+
+
+def kinematics(
+    system: System, q: jax.Array, v: jax.Array, t: jax.Array, *, of_tangents: bool = False
+) -> Kinematics:
+    """Value, rate, drift and gradient of the gaps, or of the tangential displacements."""
+    function = tangential if of_tangents else gaps
+
+    def moved(s: jax.Array) -> jax.Array:
+        return function(system, q + s * v, t + s)
+
+    def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.jvp(moved, (s,), (jnp.ones_like(s),))
+
+    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
+    (value, rate), (_, drift) = jax.jvp(rates, (zero,), (one,))
+    return Kinematics(value, rate, drift, jax.jacfwd(function, argnums=1)(system, q, t).T)
+
+
+def mass_at(system: System, q: jax.Array) -> jax.Array:
+    """M (n,) or (n, n)."""
+    return jnp.asarray(system.mass(q) if callable(system.mass) else system.mass)
+
+
+def solve_mass(mass: jax.Array, right: jax.Array) -> jax.Array:
+    """`M^-1 right`, (n,) or (n, k)."""
+    if mass.ndim == 1:
+        return right / (mass if right.ndim == 1 else mass[:, None])
+    return jax.scipy.linalg.solve(mass, right, assume_a="pos")
+
+
+def definite(mass: jax.Array) -> jax.Array:
+    """Whether M is positive definite."""
+    if mass.ndim == 1:
+        return jnp.all(mass > 0)
+    return jnp.all(jnp.isfinite(jnp.linalg.cholesky(jax.lax.stop_gradient(mass))))
+
+
+def kinetic(system: System, q: jax.Array, v: jax.Array) -> jax.Array:
+    """`T = v^T M v / 2` [J]."""
+    mass = mass_at(system, q)
+    return 0.5 * v @ (mass * v if mass.ndim == 1 else mass @ v)
+
+
+def potential(system: System, q: jax.Array) -> jax.Array:
+    """V [J]."""
+    return jnp.zeros((), q.dtype) if system.potential is None else system.potential(q)
+
+
+def user_force(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> jax.Array:
+    """F (n,) without the forces of the potential."""
+    return jnp.zeros_like(q) if system.force is None else jnp.asarray(system.force(q, v, t))
+
+
+def free_acceleration(
+    system: System, q: jax.Array, v: jax.Array, force: jax.Array, mass: jax.Array
+) -> jax.Array:
+    """q'' (n,) without contact forces: `M q'' = F - grad V - M' v + grad(v^T M v) / 2`."""
+    total = force
+    if system.potential is not None:
+        total = total - jax.grad(system.potential)(q)
+    if callable(system.mass):
+        total = total + jax.grad(lambda x: kinetic(system, x, v))(q)
+
+        def momentum(x: jax.Array) -> jax.Array:
+            m = mass_at(system, x)
+            return m * v if m.ndim == 1 else m @ v
+
+        total = total - jax.jvp(momentum, (q,), (v,))[1]
+    return solve_mass(mass, total)

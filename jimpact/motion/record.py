@@ -1,0 +1,164 @@
+"""The record of a motion: samples, events, energy ledger, status."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class MotionStatus(NamedTuple):
+    """One row of the table; `failure` marks motions that end before t_end."""
+
+    name: str
+    message: str
+    failure: bool
+
+
+# the code is the row number
+MOTION_STATUS = (
+    MotionStatus("ok", "the motion reaches t_end", False),
+    MotionStatus("law_failed", "the law fails at an impact (see `event_status`)", True),
+    MotionStatus("no_contact_force", "persistent contact with friction has no solution", True),
+    MotionStatus("max_events", "more events than `max_events`: an accumulation without end?", True),
+    MotionStatus("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
+    MotionStatus("penetration", "a gap is negative at the start", True),
+    MotionStatus("singular_mass", "the mass matrix is not positive definite on the way", True),
+    MotionStatus("not_finite", "the motion or its input is NaN or infinite", True),
+)
+MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
+
+EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction")
+KIND_CODE = {name: code for code, name in enumerate(EVENT_KINDS)}
+
+
+class Events(eqx.Module):
+    """Rows of events, in time; rows beyond `count` are NaN or 0.
+
+    `kind` is an index of `jimpact.motion.record.EVENT_KINDS`: an `accumulation` is the impact at
+    which the rest of an infinite sequence is passed; `accumulation_end` says when that sequence
+    would end. `energy` (2, m) is what each contact gave (< 0: took), normally and tangentially.
+    """
+
+    count: jax.Array
+    time: jax.Array  # (E,)
+    kind: jax.Array  # (E,)
+    contacts: jax.Array  # (E, m) that take part
+    q: jax.Array  # (E, n)
+    velocity_before: jax.Array
+    velocity_after: jax.Array
+    impulse: jax.Array  # (E, m)
+    tangential_impulse: jax.Array  # (E, m), 0 without tangents
+    energy: jax.Array  # (E, 2, m)
+    status: jax.Array  # (E,) of the law, see `jimpact.STATUS`
+    accumulation_end: jax.Array  # (E,)
+
+
+class Motion(eqx.Module):
+    """A motion: samples at equal times, events, energies, status.
+
+    Samples that were not reached are NaN. The ledger
+    `T + V - (T + V)(t_0) = force_work + base_work + sum contact_work` holds at every sample.
+    """
+
+    time: jax.Array  # (S,)
+    q: jax.Array  # (S, n)
+    velocity: jax.Array  # (S, n)
+    kinetic_energy: jax.Array  # (S,) [J]
+    potential_energy: jax.Array
+    force_work: jax.Array
+    base_work: jax.Array
+    contact_work: jax.Array  # (S, 2, m): normal, tangential; <= 0 where contacts dissipate
+    gaps: jax.Array  # (S, m)
+    events: Events
+    steps: jax.Array
+    status: jax.Array
+
+    @property
+    def energy(self) -> jax.Array:
+        """T + V (S,) [J]."""
+        return self.kinetic_energy + self.potential_energy
+
+    @property
+    def ledger_residual(self) -> jax.Array:
+        """(S,) [J]: what the ledger leaves unexplained."""
+        given = self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
+        return self.energy - self.energy[..., :1] - given
+
+    def event_times(self, kind: str = "impact") -> np.ndarray:
+        """Times of the events of a kind, on the host, of one motion."""
+        if kind not in EVENT_KINDS:
+            raise ValueError(f"Argument `kind` must be one of {EVENT_KINDS}, but is {kind!r}.")
+        return np.asarray(self.events.time)[np.asarray(self.events.kind) == KIND_CODE[kind]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, ready for JSON (NaN: None)."""
+        n = int(self.events.count)
+        rows = {
+            name: _plain(np.asarray(value)[:n])
+            for name, value in vars(self.events).items()
+            if name not in ("count", "kind")
+        }
+        kinds = [EVENT_KINDS[k] for k in np.asarray(self.events.kind)[:n]]
+        told = {k: _plain(np.asarray(v)) for k, v in vars(self).items() if k != "events"}
+        told["status"] = MOTION_STATUS[int(self.status)].name
+        return told | {"events": rows | {"kind": kinds}}
+
+    def __str__(self) -> str:
+        if np.ndim(self.status):
+            return _batch_report(self)
+        kinds = np.asarray(self.events.kind)
+        counts = [f"{int((kinds == i).sum())} {name}" for i, name in enumerate(EVENT_KINDS) if i]
+        row = MOTION_STATUS[int(self.status)]
+        reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
+        last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
+        lost = -np.asarray(self.contact_work)[max(last, 0)].sum(axis=0)
+        lines = [
+            f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: {row.name}"
+            + (f" ({row.message})" if row.failure else ""),
+            f"  events: {', '.join(counts)}",
+            f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
+            f" at {reached[-1] if len(reached) else np.nan:g} s",
+            "  taken by the contacts: " + ", ".join(f"{x:.4g}" for x in lost) + " J",
+            f"  work of forces {float(self.force_work[last]):.6g} J, "
+            f"of the base {float(self.base_work[last]):.6g} J",
+            f"  ledger closes to {np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J",
+        ]
+        return "\n".join(lines)
+
+
+def _plain(value: np.ndarray) -> Any:
+    if value.dtype.kind == "f":
+        plain = value.astype(object)
+        plain[~np.isfinite(value)] = None
+        return plain.tolist()
+    return value.tolist()
+
+
+def _batch_report(motion: Motion) -> str:
+    codes, counts = np.unique(np.asarray(motion.status), return_counts=True)
+    told = ", ".join(f"{n} {MOTION_STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
+    return f"{np.size(motion.status)} motions: {told}"
+
+
+def raise_on_failed_motion(motion: Motion) -> Motion:
+    """Raise a RuntimeError naming every failed motion (batched or not); else return it.
+
+    >>> import jimpact as ji
+    >>> system = ji.ball_system()
+    >>> motion = ji.simulate(system, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
+    >>> ji.raise_on_failed_motion(motion) is motion
+    True
+    """
+    codes = np.atleast_1d(np.asarray(motion.status))
+    lines = []
+    for code in np.unique(codes):
+        row = MOTION_STATUS[code]
+        if row.failure:
+            at = np.flatnonzero(codes.ravel() == code)
+            where = f" at {', '.join(map(str, at[:5]))}" if codes.size > 1 else ""
+            lines.append(f"{row.name}: {row.message} ({len(at)}{where})")
+    if lines:
+        raise RuntimeError(f"Failed motions among {codes.size}:\n  " + "\n  ".join(lines))
+    return motion

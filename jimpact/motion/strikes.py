@@ -1,0 +1,189 @@
+"""What happens at an event: the impact, the end of an accumulation, new modes of contact."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.laws.base import Law
+from jimpact.motion.blows import FAILS, Blow, blow_of, no_blow
+from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
+from jimpact.motion.dynamics import base_velocity, kinetic
+from jimpact.motion.flight_records import Scales, Settings, State
+from jimpact.motion.modes import (
+    REST_ACCELERATION,
+    Choice,
+    choose_with_friction,
+    pressed_together,
+)
+from jimpact.motion.record import KIND_CODE, MOTION_CODE
+from jimpact.motion.system import System
+
+# Gap velocities below this share of what the kinetic energy could give are 0: rounding.
+REST_SPEED = 1e-9
+ROUNDINGS = 64  # of the time: velocities that arise within them are 0
+
+
+class Outcome(NamedTuple):
+    """State, modes and what is to be written down after an event."""
+
+    state: State
+    modes: Modes
+    scales: Scales
+    struck: jax.Array  # (2, m) times of the last two impacts of each contact
+    blow: Blow
+    kind: jax.Array
+    contacts: jax.Array  # (m,)
+    accumulation_end: jax.Array
+    status: jax.Array
+
+
+def resolve(
+    system: System,
+    law: Law,
+    mu: jax.Array | None,
+    settings: Settings,
+    t: jax.Array,
+    state: State,
+    before: Modes,
+    fired: jax.Array,
+    scales: Scales,
+    struck: jax.Array,
+) -> Outcome:
+    """Impact if a closed contact approaches; contacts come to rest; new modes.
+
+    A closed contact stays closed if it leaves by no more than rounding, or slower than
+    `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
+    impacts is then passed at once (its gap velocity is set to 0, energy is lost).
+    """
+    m = before.active.shape[0]
+    given = contacts_at(system, state.q, state.v, t, settings.friction)
+    closed = given.normal.value <= settings.closed_below
+    scales = jax.lax.stop_gradient(_grown(system, scales, given, t, state))
+    rounding = ROUNDINGS * float(jnp.finfo(t.dtype).eps) * jnp.abs(settings.duration)
+    rest = jax.lax.stop_gradient(REST_SPEED * scales.speed + rounding * scales.acceleration)
+    strikes = jnp.any(closed & (given.normal.rate < -rest))
+    blow = jax.lax.cond(
+        strikes,
+        lambda: blow_of(system, law, t, state, closed),
+        lambda: no_blow(state, m),
+    )
+    given = contacts_at(system, state.q, blow.v, t, settings.friction)
+    gamma = given.normal.rate
+    slowly = settings.accumulation * scales.gap_velocity
+    slow = closed & (gamma <= slowly)
+    tight = closed & (jnp.abs(gamma) <= rest)
+    slack = REST_ACCELERATION * scales.acceleration
+    pressed, resting = pressed_together(given, slow, slack)
+    held = tight | (slow & pressed)
+    carried = base_velocity(system, t)
+    carried = jnp.zeros_like(blow.v) if carried is None else carried
+    blow = _brought_to_rest(given, mu, held, slowly, carried, blow)
+    held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
+    released = fired & held_before & ~strikes
+    if mu is None:
+        active = pressed | (tight & resting & ~released)
+        choice = Choice(no_modes(m, gamma.dtype)._replace(active=active), jnp.asarray(True))
+    else:
+        choice = _with_friction(given, mu, before, held, released, blow.v - carried, rest, slack)
+    # a contact accumulates if it was brought to rest from more than rounding
+    ends = held & ~tight & strikes
+    fails = jnp.asarray(FAILS)[blow.code]
+    status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
+    status = jnp.where(fails, MOTION_CODE["law_failed"], status)
+    took = jnp.where(strikes, blow.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
+    work = State(
+        state.q,
+        blow.v,
+        state.work,
+        state.base_work + blow.base_work,
+        state.contact_work + blow.energy,
+    )
+    return Outcome(
+        work,
+        choice.modes,
+        scales,
+        jnp.where(took & strikes, jnp.stack([jnp.full(m, t), struck[0]]), struck),
+        blow,
+        _kind(strikes, jnp.any(ends), released, fired, m),
+        took,
+        _accumulation_end(t, struck, ends),
+        status,
+    )
+
+
+def _with_friction(
+    given: Contacts,
+    mu: jax.Array,
+    before: Modes,
+    held: jax.Array,
+    released: jax.Array,
+    relative: jax.Array,
+    rest: jax.Array,
+    slack: jax.Array,
+) -> Choice:
+    assert given.tangent is not None
+    rate = given.tangent.gradient.T @ relative
+    now = given._replace(tangent=given.tangent._replace(rate=rate))
+    return choose_with_friction(now, mu, before, held, released, jnp.abs(rate) > rest, slack)
+
+
+def _grown(system: System, scales: Scales, given: Contacts, t: jax.Array, state: State) -> Scales:
+    m = given.normal.rate.shape[0]
+    carried = base_velocity(system, t)
+    seen = state.v if carried is None else state.v - carried
+    energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, seen))
+    now = Scales(
+        jnp.abs(given.normal.rate).max(),
+        jnp.sqrt(2 * energy * jnp.max(jnp.diagonal(given.delassus))),
+        jnp.abs(given.approach[:m]).max(),
+    )
+    return jax.tree.map(jnp.maximum, scales, now)
+
+
+def _brought_to_rest(
+    given: Contacts,
+    mu: jax.Array | None,
+    held: jax.Array,
+    slowly: jax.Array,
+    carried: jax.Array,
+    blow: Blow,
+) -> Blow:
+    """Gap velocities of `held` contacts set to 0, and with friction what slides as slowly."""
+    m = held.shape[0]
+    modes, rates = no_modes(m, blow.v.dtype)._replace(active=held), given.normal.rate
+    if given.tangent is not None:
+        modes = modes._replace(stick=jnp.abs(given.tangent.rate) <= slowly)
+        rates = jnp.concatenate([rates, given.tangent.rate])
+    p = constraint_impulse(given, mu, modes, rates)
+    # work at the mean velocity: half of that before, 0 after
+    energy = jnp.pad(0.5 * p * rates, (0, 2 * m - p.shape[0])).reshape(2, m)
+    side = jnp.pad(p, (0, 2 * m - p.shape[0]))[m:]
+    return blow._replace(
+        v=blow.v + given.moved @ p,
+        impulse=blow.impulse + p[:m],
+        tangential=blow.tangential + side,
+        energy=blow.energy + energy,
+        base_work=blow.base_work + (given.directions @ p) @ carried,
+    )
+
+
+def _kind(
+    strikes: jax.Array, ends: jax.Array, released: jax.Array, fired: jax.Array, m: int
+) -> jax.Array:
+    """The kind of event, `none` at a beginning without impact."""
+    kind = jnp.where(jnp.any(fired[:m]), KIND_CODE["contact"], KIND_CODE["none"])
+    kind = jnp.where(jnp.any(fired[m:]), KIND_CODE["friction"], kind)
+    kind = jnp.where(jnp.any(released[:m]), KIND_CODE["detachment"], kind)
+    hit = jnp.where(ends, KIND_CODE["accumulation"], KIND_CODE["impact"])
+    return jnp.where(strikes, hit, kind).astype(jnp.int32)
+
+
+def _accumulation_end(t: jax.Array, struck: jax.Array, ends: jax.Array) -> jax.Array:
+    """`t + d r / (1 - r)`: the limit of a geometric series with the last two intervals' ratio."""
+    last, previous = t - struck[0], struck[0] - struck[1]
+    known = ends & jnp.isfinite(previous) & (last < previous) & (last > 0)
+    safe_last, safe_previous = jnp.where(known, last, 0.0), jnp.where(known, previous, 1.0)
+    r = safe_last / safe_previous
+    end = t + jnp.max(safe_last * r / (1 - r))
+    return jnp.where(jnp.any(ends), end, jnp.nan)

@@ -1,0 +1,164 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3 (ipykernel)
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Whole motions: between impacts, through them, and to rest
+#
+# An impact law is one instant of a motion. `simulate` puts it back in: flights, impacts at located
+# times, contacts that stay closed, and a ledger of the energy.
+
+# %%
+# %matplotlib inline
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+
+import jimpact as ji
+from jimpact.rocking import housner_restitution, rocking_matrix
+
+# %% [markdown]
+# ## Newton's cradle over fifty swings
+#
+# One of three touching balls is lifted. At first the last one flies out; but e < 1, and impacts keep
+# only the momentum: in the end all balls swing in phase, with a third of the energy.
+
+# %%
+cradle = ji.cradle_system([0.1, 0.1, 0.1], length=0.15, diameter=0.025)
+period = 2 * np.pi * np.sqrt(0.15 / 9.80665)
+law = ji.LZB(0.95, exponent=1.5)
+motion = ji.simulate(cradle, law, [-0.3, 0, 0], [0.0, 0, 0], 50 * period, samples=1501)
+print(motion)
+
+# %%
+ji.plot_motion(motion, "Newton's cradle, 50 swings", ["ball 1", "ball 2", "ball 3"])
+
+# %% [markdown]
+# ## A bouncing ball: exact event times, and their derivative
+#
+# Infinitely many bounces in finite time: the sum is passed, and its end is known.
+
+# %%
+ball = ji.ball_system()
+
+
+def bounce(e):
+    motion = ji.simulate(ball, ji.Newton(e), [1.0], [0.0], 5.0)
+    return motion.events.time[:20], motion
+
+
+(times, motion), (slopes, _) = jax.jit(lambda e: jax.jvp(bounce, (e,), (1.0,)))(0.8)
+first = np.sqrt(2 / 9.80665)
+k = np.arange(20)
+exact = first + 2 * first * np.cumsum(np.where(k > 0, 0.8**k, 0))
+exact_slope = 2 * first * np.cumsum(np.where(k > 0, k * 0.8 ** (k - 1.0), 0))
+print("event times off by", np.abs(times - exact).max(), "s")
+print("their derivative in e by", np.abs(slopes - exact_slope).max(), "s")
+end = motion.events.accumulation_end[motion.events.count - 1]
+print("accumulation ends at", float(end), "exact", first * 1.8 / 0.2)
+
+# %%
+ji.plot_phase_portrait(motion, title="Bouncing ball, e = 0.8")
+
+# %% [markdown]
+# ## A block rocks to rest
+#
+# A block on one corner falls back, hits with the other corner, and keeps Housner's share of its
+# angular velocity. It must not slip: friction at rest is part of the motion.
+
+# %%
+block = ji.block_system(0.2, 0.6)
+e = housner_restitution(3.0)
+theta = 0.15
+corner = [0.0, 0.1 * np.sin(theta) + 0.3 * np.cos(theta), theta]
+rocks = ji.simulate(
+    block, ji.RestitutionMatrix(rocking_matrix(e)), corner, [0.0, 0, 0], 3.0, friction=5.0
+)
+print(rocks)
+ji.plot_phase_portrait(rocks, 2, "Free rocking, angle")
+
+# %% [markdown]
+# ## A block on a shaken base: does it overturn?
+#
+# The base swings with 2 Hz and a given acceleration, in multiples of g. Below width / height nothing
+# happens. A batch answers for many accelerations at once. (Overturned means beyond pi / 2: the
+# other two corners are no contacts of this system.)
+
+
+# %%
+@jax.jit
+@jax.vmap
+def shake(acceleration):
+    amplitude = -acceleration * 9.80665 / (4 * jnp.pi) ** 2
+    base = ji.HarmonicBase(amplitude, 2.0, jnp.pi / 2, "horizontal")
+    start = jnp.stack([amplitude, jnp.asarray(0.3), jnp.asarray(0.0)])
+    law = ji.RestitutionMatrix(rocking_matrix(e))
+    shaken = ji.block_system(0.2, 0.6, base=base)
+    return ji.simulate(shaken, law, start, jnp.zeros(3), 2.0, friction=5.0)
+
+
+levels = np.array([0.3, 0.4, 0.6, 0.8, 1.0, 1.4])
+shaken = shake(levels)
+for level, angle in zip(levels, np.nanmax(np.abs(shaken.q[..., 2]), axis=1)):
+    told = "overturns" if angle > np.pi / 2 else f"at most {np.degrees(angle):.2f} degrees"
+    print(f"{level:.1f} g: {told}")
+
+# %% [markdown]
+# ## A basketball and a tennis ball: the gap decides
+#
+# Dropped together. With a gap between them they collide one after another, without it at once: LZB
+# then asks for the ratio of stiffnesses.
+
+# %%
+pair = ji.column_system([0.6, 0.06], [0.12, 0.033])
+
+
+@jax.jit
+@jax.vmap
+def speed(gap):
+    start = jnp.stack([jnp.asarray(1.12), 1.12 + 0.153 + gap])
+    motion = ji.simulate(pair, ji.LZB([0.9, 0.9], stiffness=[1.0, 1.0]), start, jnp.zeros(2), 0.9)
+    return jnp.nanmax(motion.velocity[:, 1])
+
+
+for gap, v in zip([0, 1e-5, 1e-3, 1e-2], speed(jnp.array([0, 1e-5, 1e-3, 1e-2]))):
+    print(f"gap {1000 * gap:7.3f} mm: the tennis ball leaves with {v:.3f} m/s")
+
+# %% [markdown]
+# ## A dimer on a vibrating plate
+#
+# The bundled study; `jimpact simulate shaken_dimer.toml --gif dimer.gif` animates it.
+
+# %%
+from jimpact.motion.study_motion import read_motion_study
+
+study = read_motion_study("shaken_dimer.toml")
+dimer = study.run(samples=201)
+print(dimer)
+ji.plot_motion(dimer, study.title, ["x", "y", "angle"])
+
+# %% [markdown]
+# ## Parameters from a motion
+#
+# The record is simulated here, with noise added: angles of a cradle, 81 instants over 2 s, 1 mrad.
+# Restitutions and the ratio of stiffnesses follow with their errors.
+
+# %%
+true = ji.LZB([0.95, 0.9], stiffness=[1.0, 2.0], exponent=1.5)
+given = ([-0.5, 0.0, 0.0], [0.0, 0.0, 0.0], 2.0)
+seen = np.asarray(ji.simulate(cradle, true, *given, samples=81).q)
+noisy = seen + 1e-3 * np.random.default_rng(0).normal(size=seen.shape)
+guess = ji.LZB([0.9, 0.9], stiffness=[1.0, 1.0], exponent=1.5)
+print(ji.fit_motion(cradle, guess, noisy, *given, ("restitution", "stiffness"), sigma=1e-3))

@@ -1,0 +1,269 @@
+"""Worked motions: cradle, rocking block, shaken base, two balls; fits; pictures; the command."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+import jimpact as ji
+from jimpact.cli import main
+from jimpact.motion.record import EVENT_KINDS, MOTION_CODE
+from jimpact.motion.study_motion import read_motion_study
+from jimpact.rocking import housner_restitution, rocking_matrix
+
+G = 9.80665
+
+
+def kinds(motion):
+    return [EVENT_KINDS[k] for k in np.asarray(motion.events.kind)[: int(motion.events.count)]]
+
+
+@pytest.mark.slow
+def test_cradle_over_fifty_swings():
+    """Repeatable, energy monotone, the ledger closes, and in the end all swing in phase."""
+    system = ji.cradle_system([0.1] * 3, length=0.1, diameter=0.02)
+    period = 2 * np.pi * np.sqrt(0.1 / G)
+    law = ji.LZB(0.95, exponent=1.5)
+
+    def swing():
+        return ji.simulate(system, law, [-0.3, 0, 0], [0.0] * 3, 50 * period, samples=1001)
+
+    motion, again = swing(), swing()
+    assert int(motion.status) == MOTION_CODE["ok"]
+    for a, b in zip(jax.tree.leaves(motion), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+    energy = np.asarray(motion.energy)
+    assert np.diff(energy).max() < 1e-11 * energy[0]
+    assert energy[-1] < 0.4 * energy[0]
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9 * energy[0])
+    assert int(motion.events.count) > 200
+    q = np.asarray(motion.q)
+    spread = np.ptp(q, axis=1)
+    assert spread[-100:].max() < 0.01 * np.abs(q[-100:]).max() < spread[:100].max()
+    # inelastic impacts keep the momentum: a third of it is left in phase, a ninth of the energy each
+    np.testing.assert_allclose(energy[-1] / energy[0], 1 / 3, atol=0.01)
+
+
+def upright(theta, width=0.2, height=0.6):
+    """A block standing on one corner."""
+    half = abs(np.sin(theta)) * width / 2 + np.cos(theta) * height / 2
+    return [0.0, half, theta]
+
+
+@pytest.mark.slow
+def test_free_rocking_to_rest():
+    """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
+    e = float(housner_restitution(3.0))
+    motion = ji.simulate(
+        ji.block_system(0.2, 0.6),
+        ji.RestitutionMatrix(rocking_matrix(e)),
+        upright(0.15),
+        [0.0] * 3,
+        4.0,
+        friction=5.0,
+        samples=81,
+    )
+    assert int(motion.status) == MOTION_CODE["ok"]
+    last = int(motion.events.count) - 1
+    assert kinds(motion) == ["impact"] * last + ["accumulation"]
+    turning = np.abs(np.asarray(motion.events.velocity_after)[:20, 2])
+    before = np.abs(np.asarray(motion.events.velocity_before)[:20, 2])
+    np.testing.assert_allclose(turning / before, e, rtol=1e-9)
+    # I_o theta'^2 / 2 = m g R (cos(alpha - theta_0) - cos(alpha - theta)) until theta = 0
+    alpha, radius = np.arctan(1 / 3), np.hypot(0.1, 0.3)
+    p = G * radius / (4 / 3 * radius**2)
+
+    def slowness(s, top):  # theta = top (1 - s^2) takes out the root at the turning point
+        theta = top * (1 - s * s)
+        if s == 0:
+            return np.sqrt(4 * top / (2 * p * np.sin(alpha - top)))
+        fall = 4 * p * np.sin(alpha - (top + theta) / 2) * np.sin(top * s * s / 2)
+        return 2 * top * s / np.sqrt(fall)
+
+    first = quad(slowness, 0, 1, args=(0.15,), epsabs=1e-12, epsrel=1e-12)[0]
+    np.testing.assert_allclose(motion.events.time[0], first, atol=1e-8)
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
+    np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-12)
+    assert float(motion.events.time[last]) < float(motion.events.accumulation_end[last]) < 3
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_overturning_on_a_harmonic_base():
+    """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
+    law = ji.RestitutionMatrix(rocking_matrix(0.85))
+
+    @jax.jit
+    @jax.vmap
+    def shake(acceleration):
+        base = ji.HarmonicBase(-acceleration * G / (4 * jnp.pi) ** 2, 2.0, jnp.pi / 2, "horizontal")
+        start = base(jnp.zeros(()))[0]
+        q0 = jnp.stack([start, jnp.full((), 0.3), jnp.zeros(())])
+        return ji.simulate(
+            ji.block_system(0.2, 0.6, base=base), law, q0, jnp.zeros(3), 2.0, friction=5.0
+        )
+
+    motion = shake(jnp.array([0.33, 0.4, 0.6]))
+    still, rocks, falls = np.nanmax(np.abs(np.asarray(motion.q)[..., 2]), axis=1)
+    assert still < 1e-10
+    assert 0.1 < rocks < np.pi / 2 < falls
+    np.testing.assert_allclose(motion.ledger_residual[:2], 0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_basketball_and_tennis_ball():
+    """With a gap between them they collide one after another: v2 = ((1+e)^2 mu - 1) v."""
+    mass, e = jnp.array([0.6, 0.06]), 0.9
+    system = ji.column_system(mass, [0.12, 0.033])
+
+    def rebound(gap):
+        q0 = jnp.stack([jnp.full((), 1.12), 1.12 + 0.12 + 0.033 + gap])
+        motion = ji.simulate(system, ji.LZB(e, exponent=1.5), q0, jnp.zeros(2), 0.6, samples=13)
+        return motion.q[-1], motion.events.velocity_after[:2], motion.status
+
+    q, after, status = jax.jit(jax.vmap(rebound))(jnp.array([0.0, 1e-6, 1e-3]))
+    assert (status == 0).all()
+    v = np.sqrt(2 * G)
+    binary = ((1 + e) ** 2 * 10 / 11 - 1) * v
+    np.testing.assert_allclose(after[1, 1, 1], binary, rtol=1e-5)
+    np.testing.assert_allclose(after[2, 1, 1], binary, rtol=1e-2)
+    together = ji.impact(ji.LZB(e, exponent=1.5), ji.column(mass[::-1]), [v, v]).velocity
+    np.testing.assert_allclose(after[0, 0], -together[::-1], rtol=1e-7)
+    assert float(abs(q[0, 1] - q[1, 1])) > 0.01
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_motion_against_differences():
+    """Two pendulums, curved paths: e, length and start, against a tightened solver."""
+
+    def run(x, rtol=1e-10):
+        system = ji.cradle_system([0.1, 0.15], length=x[1], diameter=0.02)
+        motion = ji.simulate(
+            system, ji.Newton(x[0]), jnp.stack([x[2], 0 * x[2]]), jnp.zeros(2), 1.5, samples=4,
+            rtol=rtol, atol=rtol / 100,
+        )  # fmt: skip
+        return jnp.concatenate([motion.q[-1], motion.velocity[-1], motion.events.time[:3]])
+
+    x, step = jnp.array([0.7, 0.2, -0.6]), 1e-4
+    slope = jax.jit(jax.jacfwd(run))(x)
+    moves = jnp.concatenate([k * step * jnp.eye(3) for k in (1, -1, 2, -2)])
+    fine = jax.jit(jax.vmap(lambda x: run(x, 1e-12)))(x[None] + moves).reshape(4, 3, -1)
+    differences = (8 * (fine[0] - fine[1]) - (fine[2] - fine[3])) / (12 * step)
+    np.testing.assert_allclose(slope, differences.T, rtol=1e-9, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_fit_through_a_simulated_motion():
+    """Restitutions and stiffness ratio of a cradle, from angles with (simulated) noise."""
+    system = ji.cradle_system([0.1] * 3, length=0.15, diameter=0.025)
+    true = ji.LZB([0.95, 0.9], stiffness=[1.0, 2.0], exponent=1.5)
+    start = ([-0.5, 0, 0], [0.0] * 3, 2.0)
+    seen = np.asarray(ji.simulate(system, true, *start, samples=81).q)
+    noisy = seen + 1e-3 * np.random.default_rng(0).normal(size=seen.shape)
+    guess = ji.LZB([0.9, 0.9], stiffness=[1.0, 1.0], exponent=1.5)
+    free = ("restitution", "stiffness")
+    found = ji.fit_motion(system, guess, noisy, *start, free, sigma=1e-3)
+    assert found.converged
+    assert found.rank == 3
+    assert found.names == ("restitution[1]", "restitution[2]", "stiffness[2]")
+    error = np.abs(found.value - [0.95, 0.9, 2.0])
+    assert (error < 3 * found.standard_error).all()
+    assert (found.standard_error < [3e-3, 3e-3, 0.03]).all()
+    np.testing.assert_allclose(found.residual.std(), 1e-3, rtol=0.15)
+    assert "stiffness[2] = 2" in str(found)
+
+
+@pytest.mark.slow
+def test_fit_of_event_times_and_bad_fits():
+    ball = ji.ball_system()
+    first = np.sqrt(2 / G)
+    times = first + 2 * first * np.cumsum(np.r_[0, 0.75 ** np.arange(1, 6)])
+    given = (ball, ji.Newton(0.7), times, [1.0], [0.0], 3.0)
+    found = ji.fit_motion(*given, observe=lambda m: m.events.time[:6], sigma=1e-3)
+    np.testing.assert_allclose(found.value, 0.75, atol=1e-9)
+    before = ji.fit_motion(
+        ball, ji.Newton(0.7), [[1.0], [0.9]], [1.0], [0.0], 0.1, bounds={"restitution": (0.1, 0.9)}
+    )
+    assert before.rank == 0
+    assert np.isinf(before.standard_error[0])
+    assert "cannot see restitution" in str(before)
+
+
+def test_bad_fits():
+    ball = ji.ball_system()
+    with pytest.raises(ValueError, match=r"`measured` must have shape \(S, 1\)"):
+        ji.fit_motion(ball, ji.Newton(0.7), [1.0, 2.0], [1.0], [0.0], 1.0)
+    with pytest.raises(ValueError, match="at least one value"):
+        ji.fit_motion(ball, ji.Newton(0.7), [[np.nan]], [1.0], [0.0], 1.0)
+    with pytest.raises(ValueError, match="must name parameters of Newton"):
+        ji.fit_motion(ball, ji.Newton(0.7), [[1.0]], [1.0], [0.0], 1.0, "stiffness")
+
+
+STUDY = """
+[system]
+kind = "block"
+width_m = 0.2
+height_m = 0.6
+[base]
+amplitude_m = 0.01
+frequency_hz = 1.0
+direction = "horizontal"
+[law]
+name = "moreau"
+restitution = 0.5
+[motion]
+q0 = [0.0, 0.3, 0.0]
+v0 = [0.0, 0.0, 0.0]
+t_end_s = 0.2
+samples = 5
+"""
+
+
+def test_motion_studies(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY)
+    study = read_motion_study(path)
+    assert study.title == "study"
+    assert study.arguments["t_end"] == 0.2
+    assert study.system.base(0.25).tolist() == [0.01, 0.0]
+    for old, new, message in (
+        ('kind = "block"', 'kind = "car"', "`kind` must be one of ball, column"),
+        ("width_m", "width", "may have the keys kind, width_m"),
+        ('"horizontal"', '"line"', "`direction` of a block must be vertical or horizontal"),
+        ("t_end_s", "t_end", "must have the key `t_end_s`"),
+        ("[law]", "[laws]", "must have the key `law`"),
+        ("0.2\nheight", "-0.2\nheight", "`width` must lie in"),
+    ):
+        path.write_text(STUDY.replace(old, new))
+        with pytest.raises(ValueError, match=message.replace("[", r"\[")):
+            read_motion_study(path)
+    with pytest.raises(FileNotFoundError, match=r"cradle_motion\.toml, shaken_dimer\.toml"):
+        read_motion_study("nothing.toml")
+
+
+@pytest.mark.slow
+def test_simulate_command(tmp_path, capsys):
+    out, gif, portrait = (tmp_path / name for name in ("m.png", "m.gif", "p.svg"))
+    options = ["--out", str(out), "--gif", str(gif), "--portrait", str(portrait), "--json"]
+    short = ["--t-end", "0.3", "--samples", "11", "--coordinate", "3"]
+    assert main(["simulate", "shaken_dimer.toml", *options, *short]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["status"] == "ok"
+    assert np.shape(told["q"]) == (11, 3)
+    assert set(told["events"]["kind"]) <= set(EVENT_KINDS)
+    assert len(told["events"]["time"]) == told["events"]["kind"].count("impact") > 3
+    assert out.stat().st_size > 10_000
+    assert gif.read_bytes().startswith(b"GIF89a")
+    assert "svg" in portrait.read_text()[:200]
+
+
+def test_simulate_command_refuses(tmp_path, capsys):
+    path = tmp_path / "study.toml"
+    path.write_text(STUDY.replace("0.3, 0.0]", "0.2, 0.0]"))
+    assert main(["simulate", str(path), "--out", str(tmp_path)]) == 2
+    assert "must have no penetration" in capsys.readouterr().err
+    assert main(["simulate", "--out", "picture.jpg"]) == 2
+    assert "--out must end in .png" in capsys.readouterr().err
