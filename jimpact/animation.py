@@ -11,10 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jimpact.motion.dynamics import seen_from_base
-from jimpact.motion.outlines import Outlines, outlines_of
-from jimpact.motion.ready_systems import CradleGaps
+from jimpact.motion.outlines import Outlines, mechanism, outlines_of
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
+from jimpact.pendulums import PendulumCradle
 from jimpact.plot_motions import one_motion
 from jimpact.plots import COLOURS
 
@@ -84,7 +84,7 @@ def animate_motion(
 
 def _grounds(system: System, q: np.ndarray, time: np.ndarray) -> np.ndarray | None:
     """Where the base is (S, 2); None for a system that hangs."""
-    if isinstance(system.gap_function, CradleGaps):
+    if isinstance(mechanism(system), PendulumCradle):
         return None
     moved = q - np.asarray(
         jax.vmap(lambda x, t: seen_from_base(system, x, t))(jnp.asarray(q), jnp.asarray(time))

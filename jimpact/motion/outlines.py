@@ -5,8 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.motion.ready_systems import ColumnGaps, CradleGaps, Tips
+from jimpact.bodies import Block, Dimer
+from jimpact.motion.ready_systems import ColumnGaps
 from jimpact.motion.system import System
+from jimpact.pendulums import PendulumCradle
 
 # q (n,) -> curves (k, 2) of points (x, y) in metres
 Outlines = Callable[[np.ndarray], Sequence[np.ndarray]]
@@ -29,33 +31,39 @@ def outlines_of(system: System, q: np.ndarray) -> Outlines:
         shown = np.where(radii > 0, radii, point)
         lift = np.where(radii > 0, 0.0, point)
         return lambda q: [r * _CIRCLE + (0, y + d) for r, y, d in zip(shown, q, lift, strict=True)]
-    if isinstance(gaps, CradleGaps):
-        return lambda q: _cradle(gaps, q)
-    if isinstance(gaps, Tips):
-        return lambda q: _body(gaps, q)
+    body = mechanism(system)
+    if isinstance(body, PendulumCradle):
+        return lambda q: _cradle(body, q)
+    if isinstance(body, Block | Dimer):
+        return lambda q: _body(body, q)
     raise TypeError(
         "Argument `outlines` must be given for a system that is none of the ready ones."
     )
 
 
-def _cradle(gaps: CradleGaps, q: np.ndarray) -> list[np.ndarray]:
-    length, spacing, diameter = (float(x) for x in (gaps.length, gaps.spacing, gaps.diameter))
+def mechanism(system: System) -> Any:
+    """What a ready system's gaps are those of."""
+    return getattr(system.gap_function, "__self__", None)
+
+
+def _cradle(cradle: PendulumCradle, q: np.ndarray) -> list[np.ndarray]:
+    length, radius = float(cradle.length), np.asarray(cradle.radius)
+    between = radius[:-1] + radius[1:] + np.asarray(cradle.gaps)
     curves = []
-    for j, angle in enumerate(q):
-        pivot = np.array([j * spacing, 0.0])
+    for x, r, angle in zip(np.cumsum([0.0, *between]), radius, q):
+        pivot = np.array([x, 0.0])
         centre = pivot + length * np.array([np.sin(angle), -np.cos(angle)])
-        curves += [np.stack([pivot, centre]), centre + diameter / 2 * _CIRCLE]
+        curves += [np.stack([pivot, centre]), centre + r * _CIRCLE]
     return curves
 
 
-def _body(gaps: Tips, q: np.ndarray) -> list[np.ndarray]:
+def _body(body: Block | Dimer, q: np.ndarray) -> list[np.ndarray]:
     c, s = np.cos(q[2]), np.sin(q[2])
     turn = np.array([[c, -s], [s, c]])
-    along, across = np.asarray(gaps.along), np.asarray(gaps.across)
-    tips = np.stack([along, across], axis=1)
-    radius = float(gaps.radius)
-    if radius > 0:
-        ends = q[:2] + tips @ turn.T
+    if isinstance(body, Dimer):
+        radius, arm = float(body.radius), float(body.arm)
+        ends = q[:2] + np.array([[arm, 0.0], [-arm, 0.0]]) @ turn.T
         return [ends, *(end + radius * _CIRCLE for end in ends)]
-    corners = np.concatenate([tips, -tips, tips[:1]])
+    w, h = float(body.width) / 2, float(body.height) / 2
+    corners = np.array([[w, -h], [-w, -h], [-w, h], [w, h], [w, -h]])
     return [q[:2] + corners @ turn.T]

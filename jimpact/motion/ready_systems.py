@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.bodies import Block
+from jimpact.bodies import Block, Dimer
 from jimpact.motion.system import STANDARD_GRAVITY, System, gravity
+from jimpact.pendulums import PendulumCradle
 
 
 def _checked(name: str, value: Any, *, zero: bool = False) -> jax.Array:
@@ -78,20 +79,6 @@ def ball_system(
     return column_system(jnp.atleast_1d(as_float_array("mass", mass)), 0.0, acceleration, base)
 
 
-class CradleGaps(eqx.Module):
-    """Gaps between pendulums."""
-
-    length: jax.Array
-    spacing: jax.Array
-    diameter: jax.Array
-
-    def __call__(self, q: jax.Array) -> jax.Array:
-        """Its values at q."""
-        x = self.length * jnp.sin(q) + self.spacing * jnp.arange(q.shape[0], dtype=q.dtype)
-        y = -self.length * jnp.cos(q)
-        return jnp.hypot(jnp.diff(x), jnp.diff(y)) - self.diameter
-
-
 class _PendulumPotential(eqx.Module):
     weight_length: jax.Array
 
@@ -123,47 +110,25 @@ def cradle_system(
     >>> float(ji.cradle_system([1.0, 1.0]).gap_function(jnp.zeros(2))[0])
     0.0
     """
-    mass = _checked("masses", masses)
-    l, d = (_checked(k, x) for k, x in (("length", length), ("diameter", diameter)))
-    l, d = l.astype(mass.dtype), d.astype(mass.dtype)
-    between = _checked("gap", gap, zero=True).astype(mass.dtype)
-    g = jnp.asarray(acceleration, mass.dtype)
-    return System(
-        CradleGaps(l, d + between, d), mass * l**2, potential=_PendulumPotential(mass * l * g)
-    )
+    cradle = PendulumCradle(masses, length, _checked("diameter", diameter) / 2, gap)
+    moment = cradle.mass_matrix(jnp.zeros(cradle.coordinates, cradle.masses.dtype))
+    weights = moment / cradle.length * jnp.asarray(acceleration, moment.dtype)
+    return System(cradle.gap_function, moment, potential=_PendulumPotential(weights))
 
 
-class Tips(eqx.Module):
-    """Points of a body with q = (x, y, theta): heights, or horizontal positions."""
-
-    along: jax.Array  # (m,) position in the body, along its axis at theta = 0
-    across: jax.Array  # (m,)
-    radius: jax.Array
-    horizontal: bool = eqx.field(static=True)
-
-    def __call__(self, q: jax.Array) -> jax.Array:
-        """Its values at q."""
-        c, s = jnp.cos(q[2]), jnp.sin(q[2])
-        if self.horizontal:
-            return q[0] + c * self.along - s * self.across + self.radius * q[2]
-        return q[1] + s * self.along + c * self.across - self.radius
-
-
-def _body_system(
-    along: jax.Array,
-    across: jax.Array,
-    radius: jax.Array,
-    mass: jax.Array,
-    inertia: jax.Array,
+def _on_ground(
+    body: Block | Dimer,
     acceleration: Any,
     base: Callable[[jax.Array], jax.Array] | None,
 ) -> System:
-    up = jnp.stack([jnp.zeros_like(mass), mass, jnp.zeros_like(mass)])
+    """A body with q = (x, y, theta)."""
+    mass = body.mass_matrix(jnp.zeros(3))
+    up = jnp.array([0.0, 1.0, 0.0], mass.dtype)
     return System(
-        Tips(along, across, radius, False),
-        jnp.stack([mass, mass, inertia]),
-        potential=gravity(up, acceleration),
-        tangent_function=Tips(along, across, radius, True),
+        body.gap_function,
+        mass,
+        potential=gravity(mass * up, acceleration),
+        tangent_function=body.tangent_function,
         base=base,
         base_directions=None if base is None else jnp.eye(3, 2, dtype=mass.dtype),
     )
@@ -191,44 +156,31 @@ def block_system(
     >>> ji.block_system(1.0, 2.0).gap_function(jnp.array([0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0]
     """
-    block = Block(width, height, mass)
-    weight = jnp.array([0.0, 1.0, 0.0]) * block.mass
-    return System(
-        block.gap_function,
-        block.mass_matrix(jnp.zeros(3, weight.dtype)),
-        potential=gravity(weight, acceleration),
-        tangent_function=block.tangent_function,
-        base=base,
-        base_directions=None if base is None else jnp.eye(3, 2, dtype=weight.dtype),
-    )
+    return _on_ground(Block(width, height, mass), acceleration, base)
 
 
 def dimer_system(
-    length: Any,
     radius: Any,
-    mass: Any = 1.0,
+    length: Any,
+    sphere_mass: Any = 1.0,
+    rod_mass: Any = 1.0,
     acceleration: Any = STANDARD_GRAVITY,
     base: Callable[[jax.Array], jax.Array] | None = None,
 ) -> System:
-    """Two equal balls on a massless rod above a plate: q = (x, y, theta); contact 1 is the right.
+    """A planar dimer above a plate: q = (x, y, theta); contact 1 is the right sphere.
 
-    Equation: `f = y +- (l/2) sin theta - R`.
+    Equation: `f = y +- (L/2 + R) sin theta - R`, see `Dimer`.
 
     Args:
-        length: l between the centres [m].
-        radius: R of the balls [m].
-        mass: of both together [kg]; the balls are solid spheres.
+        radius: R of the spheres [m].
+        length: L of the rod between their surfaces [m].
+        sphere_mass: of one sphere [kg].
+        rod_mass: of the rod [kg], 0 for a massless one.
         acceleration: of gravity [m/s^2].
         base: t -> (x_b, y_b) [m], how the plate moves.
 
     >>> import jimpact as ji, jax.numpy as jnp
-    >>> ji.dimer_system(1.0, 0.1).gap_function(jnp.array([0.0, 0.1, 0.0])).tolist()
+    >>> ji.dimer_system(0.1, 1.0).gap_function(jnp.array([0.0, 0.1, 0.0])).tolist()
     [0.0, 0.0]
     """
-    l, r, m = (
-        _checked(k, x).astype(float)
-        for k, x in (("length", length), ("radius", radius), ("mass", mass))
-    )
-    along, across = jnp.stack([l / 2, -l / 2]), jnp.zeros(2, l.dtype)
-    inertia = m * (l**2 / 4 + 0.4 * r**2)
-    return _body_system(along, across, r, m, inertia, acceleration, base)
+    return _on_ground(Dimer(radius, length, sphere_mass, rod_mass), acceleration, base)

@@ -29,7 +29,15 @@ _SYSTEMS: dict[str, tuple[Any, dict[str, str]]] = {
         {"masses_kg": "masses", "length_m": "length", "diameter_m": "diameter", "gap_m": "gap"},
     ),
     "block": (block_system, {"width_m": "width", "height_m": "height", "mass_kg": "mass"}),
-    "dimer": (dimer_system, {"length_m": "length", "radius_m": "radius", "mass_kg": "mass"}),
+    "dimer": (
+        dimer_system,
+        {
+            "radius_m": "radius",
+            "length_m": "length",
+            "sphere_mass_kg": "sphere_mass",
+            "rod_mass_kg": "rod_mass",
+        },
+    ),
 }
 _MOTION = {
     "q0": "q0",
