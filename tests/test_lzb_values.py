@@ -10,6 +10,7 @@ import pytest
 import reference
 
 import jimpact as ji
+from jimpact.status import CODE
 
 VALUES = json.loads((Path(__file__).parent / "data" / "lzb_check_values.json").read_text())
 
@@ -231,32 +232,41 @@ def _random_scenes(bodies, wall, count, seed):
     return masses, k, e, v
 
 
+TOLERANCES = (1e-6, 1e-8, 1e-10)
+FEWER = ((3, False), (4, True))  # bodies and wall at the tolerances beside the default
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
-def test_honest_tolerance_over_random_scenes(rtol):
+def test_honest_tolerance_over_random_scenes():
     """99 % within 10 rtol; the worst within 100 rtol or flagged."""
-    errors = []
+    errors = {rtol: [] for rtol in TOLERANCES}
     for seed, (bodies, wall) in enumerate(
         [(2, True), (3, False), (4, True), (5, False), (6, True)]
     ):
         for exponent in (1.0, 1.3, 1.5, 2.0):
             args = _random_scenes(bodies, wall, 26, seed)
 
-            def outcome(masses, k, e, v, tolerance, exponent=exponent, wall=wall):
-                law = ji.LZB(e, k, exponent, rtol=tolerance)
-                return ji.impact(law, ji.chain(masses, wall=wall), v)
+            def outcome(rtol, exponent=exponent, wall=wall, args=args):
+                def one(masses, k, e, v):
+                    law = ji.LZB(e, k, exponent, rtol=rtol)
+                    return ji.impact(law, ji.chain(masses, wall=wall), v)
 
-            got, exact = (
-                jax.jit(jax.vmap(lambda *a, t=t: outcome(*a, t)))(*args) for t in (rtol, 1e-13)
-            )
-            error = np.abs(got.velocity - exact.velocity).max(axis=1) / np.abs(args[3]).max(axis=1)
-            flagged = (np.asarray(got.status) > 0) | (np.asarray(exact.status) > 0)
-            assert (np.asarray(got.status) < 4).all()
-            errors += list(error[~flagged] / rtol)
-    quantiles = np.quantile(errors, [0.5, 0.9, 0.99, 1.0])
-    print(f"error/rtol over {len(errors)} scenes at {rtol:g}: 50/90/99/100 % {quantiles}")
-    assert quantiles[2] < 10
-    assert quantiles[3] < 100
+                return jax.jit(jax.vmap(one))(*args)
+
+            exact = outcome(1e-13)
+            for rtol in TOLERANCES:
+                if rtol != 1e-8 and ((bodies, wall) not in FEWER or exponent in (1.0, 2.0)):
+                    continue
+                got = outcome(rtol)
+                error = np.abs(got.velocity - exact.velocity).max(axis=1)
+                flagged = (np.asarray(got.status) > 0) | (np.asarray(exact.status) > 0)
+                assert (np.asarray(got.status) < CODE["energy_gain"]).all()
+                errors[rtol] += list((error / np.abs(args[3]).max(axis=1) / rtol)[~flagged])
+    for rtol, found in errors.items():
+        quantiles = np.quantile(found, [0.5, 0.9, 0.99, 1.0])
+        print(f"error/rtol over {len(found)} scenes at {rtol:g}: 50/90/99/100 % {quantiles}")
+        assert quantiles[2] < 10
+        assert quantiles[3] < 100
 
 
 def test_loaded_separating_contact_without_restitution_opens_at_once():
