@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import friction_events as events
+from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import all_of, any_of, largest, of
 from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, margin_signs, matters
 from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN, rates_of
@@ -107,46 +108,82 @@ def run(flow: Frictional, tolerance: jax.Array, max_steps: int, carry: Carry) ->
     return jax.lax.while_loop(lambda c: jnp.any(active(c)), body, carry)
 
 
+class Verdict(NamedTuple):
+    """What becomes of a trial step."""
+
+    found: events.Found
+    error: jax.Array
+    span: jax.Array
+    inside: jax.Array  # an event lies inside
+    accept: jax.Array
+    flips: jax.Array  # events happen where the step begins
+    broken: jax.Array  # however short the step, the force has no value
+    arrived: jax.Array  # (4 m,) events that happen now
+    rates: State  # where the accepted step ends, or the refused one began
+
+
 def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     """One pass."""
     # where events lie and how long steps are is decided, not differentiated
     h, due, begun = jax.lax.stop_gradient((carry.h, carry.due, carry.begun))
     carry = carry._replace(h=h, due=due, begun=begun)
-    fixed = still(flow)
 
-    start, length = _interval(flow, carry, tolerance)
-    reached, high, low = step(
-        flow, carry.modes, carry.state, carry.kind, carry.target, start, length
-    )
-    old, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
+    def attempt() -> tuple[State, State, State]:
+        start, length = _interval(flow, carry, tolerance)
+        return step(flow, carry.modes, carry.state, carry.kind, carry.target, start, length)
+
+    tried = by_itself(attempt, h)
+    verdict = by_itself(lambda: _judge(still(flow), tolerance, carry, tried), h)
+
+    def move() -> tuple[State, Modes, jax.Array]:
+        moved = State(*(jnp.where(verdict.accept, b, a) for a, b in zip(carry.state, tried[0])))
+        moved = moved._replace(p=jnp.where(verdict.broken, jnp.nan, moved.p))
+        moved = _on_event(flow, carry.modes, moved, verdict.rates, verdict.arrived)
+        return events.change(flow, carry.modes, tolerance, moved, verdict.arrived)
+
+    state, modes, closed = by_itself(move, h)
+
+    def following() -> Carry:
+        out = _next(flow, carry, verdict, closed)
+        out = out._replace(state=state, modes=modes, done=carry.done | verdict.broken)
+        return _over(flow, tolerance, out)
+
+    return by_itself(following, h)
+
+
+def _judge(
+    flow: Frictional, tolerance: jax.Array, carry: Carry, tried: tuple[State, State, State]
+) -> Verdict:
+    old = jax.lax.stop_gradient(carry.state)
+    new, high, low = jax.lax.stop_gradient(tried)
     error = _error(flow, tolerance, high, low)
-    unit = rates_of(fixed.normal, carry.modes.phase).unit
+    unit = rates_of(flow.normal, carry.modes.phase).unit
     span = _span(flow, carry, unit, new.t - old.t)
-    rates, before, slope, turns = _along(fixed, carry.modes, tolerance, old)
-    rates_end, after, slope_end, turns_end = _along(fixed, carry.modes, tolerance, new)
+    rates, before, slope, turns = _along(flow, carry.modes, tolerance, old)
+    rates_end, after, slope_end, turns_end = _along(flow, carry.modes, tolerance, new)
     if flow.rows == 2:
         slow = jnp.minimum(size(old.u, 2), size(new.u, 2))
         angle = span * jnp.maximum(turns, turns_end) / jnp.where(slow > 0, slow, 1.0)
         error = jnp.maximum(error, largest((angle / events.STABLE) ** 8))
-    found = events.find(
-        fixed, carry.modes, tolerance, (carry.kind, carry.target), span, (old, new),
-        (before, slope, after, slope_end), turns,
-    )  # fmt: skip
+    values = (before, slope, after, slope_end)
+    landing = (carry.kind, carry.target)
+    found = events.find(flow, carry.modes, tolerance, landing, span, (old, new), values, turns)
     exact = jnp.isfinite(error) & (error <= 1)
     flips = exact & any_of(found.at_once)
-    inside, accept = exact & ~flips & found.inside, exact & ~flips & ~found.inside
-    broken = ~jnp.isfinite(error) & (carry.kind < ROOT_X) & (span < SHORTEST)
-    landing = carry.kind >= ROOT_X
+    accept = exact & ~flips & ~found.inside
     there = (carry.kind != HOLDING) | (jnp.abs(after) <= events.beside(tolerance))
-    arrived = jnp.where(flips, found.at_once, accept & landing & there & carry.target)
-    moved = State(*(jnp.where(accept, b, a) for a, b in zip(carry.state, reached)))
-    moved = moved._replace(p=jnp.where(broken, jnp.nan, moved.p))
-    rates = State(*(jnp.where(accept, b, a) for a, b in zip(rates, rates_end)))
-    moved = _on_event(flow, carry.modes, moved, rates, arrived)
-    state, modes, closed = events.change(flow, carry.modes, tolerance, moved, arrived)
-    out = _next(flow, carry, found, (inside, accept, flips), error, span, closed)
-    out = out._replace(state=state, modes=modes, done=carry.done | broken)
-    return _over(flow, tolerance, out)
+    ends = accept & (carry.kind >= ROOT_X) & there & carry.target
+    return Verdict(
+        found=found,
+        error=error,
+        span=span,
+        inside=exact & ~flips & found.inside,
+        accept=accept,
+        flips=flips,
+        broken=~jnp.isfinite(error) & (carry.kind < ROOT_X) & (span < SHORTEST),
+        arrived=jnp.where(flips, found.at_once, ends),
+        rates=State(*(jnp.where(accept, b, a) for a, b in zip(rates, rates_end))),
+    )
 
 
 def _on_event(
@@ -222,14 +259,11 @@ def _error(flow: Frictional, tolerance: jax.Array, high: State, low: State) -> j
 def _next(
     flow: Frictional,
     carry: Carry,
-    found: events.Found,
-    verdict: tuple[jax.Array, jax.Array, jax.Array],
-    error: jax.Array,
-    span: jax.Array,
+    verdict: Verdict,
     closed: jax.Array,
 ) -> Carry:
     """Variable, target and length of the next step."""
-    inside, accept, flips = verdict
+    found, error, span, inside, accept, flips, *_ = verdict
     h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.normal.root
     landing, starting = kind >= ROOT_X, kind == START
     grown = jnp.clip(SAFETY / (error + LEAST_ERROR) ** (1 / 8), SHRINK, GROWTH)
