@@ -33,9 +33,9 @@ def plot_rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure
             axes.plot(theta, size[:, j, k], color=colour, lw=1.6, label=f"e = {e:g}")
         axes.axvline(_critical(found, j), color="black", ls=":", lw=1)
         axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
-        axes.set_ylim(bottom=0)
         axes.grid(lw=0.4, alpha=0.5)
         axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylim(bottom=0)  # shared by all, so last
     panels[0].set_ylabel(r"$|\dot y_A^+ / \dot y_B^-|$")
     handles = panels[0].get_legend_handles_labels()[0]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)

@@ -44,7 +44,13 @@ found = ji.rocking_dispersion(shapes, mu, e)
 print(found)
 
 # %%
+# |d| = |y_A'+ / y_B'-|
 ji.plot_rocking_dispersion(found, "Velocity of A after over velocity of B before, by LZB")
+
+# %% [markdown]
+# It is a V around its tip. Two things bend it: the kink on the right (mu = 0.3, 112 degrees) is where B
+# begins to stick; and on the left, for e up to about 0.3, A hits back late and weakly in very wide
+# blocks, so the curve turns down again.
 
 # %% [markdown]
 # ## The tip of the V is a critical angle, and friction alone decides it
@@ -79,7 +85,7 @@ for j, m in enumerate(mu):
 # around the critical angle, and most hits set both corners free for a moment.
 
 # %%
-levels = np.linspace(0.01, 0.23, 12)
+levels = np.linspace(0.02, 0.24, 12)
 field = ji.rocking_dispersion(np.linspace(0.6, 2.5, 40), [0.0, 0.3, 0.8], levels)
 print(field)
 ji.plot_rocking_outcomes(field, "What the block does after the hit")
@@ -131,12 +137,13 @@ for row in rocking_ratios():
 # %%
 system, theta = ji.block_system(0.2, 0.6), 0.15
 start = [0.0, 0.1 * np.sin(theta) + 0.3 * np.cos(theta), theta]
-motions = {}
-for e_n in (0.0, 0.1):
-    motions[e_n] = ji.simulate(
-        system, ji.LZB(e_n, friction=0.8), start, [0.0] * 3, 3.0, samples=601
-    )
-    print(f"e = {e_n:g}:", motions[e_n])
+law = {e_n: ji.LZB(e_n, friction=0.8) for e_n in (0.0, 0.1)}
+motions = {
+    e_n: ji.simulate(system, law[e_n], start, [0.0] * 3, t_end, samples=601)
+    for e_n, t_end in ((0.0, 3.0), (0.1, 1.0))
+}
+for e_n, motion in motions.items():
+    print(f"e = {e_n:g}:", motion)
 
 events = motions[0.0].events
 ratios = -events.velocity_after[:4, 2] / -events.velocity_before[:4, 2]
