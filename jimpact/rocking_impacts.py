@@ -66,7 +66,8 @@ def rocking_dispersion(
         rtol: as in `LZB`.
 
     Returns:
-        `RockingDispersion` over all combinations (A, B, C).
+        `RockingDispersion` over all combinations (A, B, C); NaN where LZB fails: `max_steps`, for a
+        few wide blocks left of the critical angle with e below about 0.1.
 
     Raises:
         ValueError: arguments out of range or with more than one axis.

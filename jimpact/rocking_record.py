@@ -108,7 +108,7 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
 
     >>> import jimpact as ji
     >>> [round(float(ji.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
-    [1.5708, 1.3843, 1.231]
+    [1.5708, 1.3862, 1.231]
     """
     mu = as_float_array("friction", friction)
     check_values("friction", mu, low=0.0)
