@@ -34,12 +34,13 @@ from jimpact.numerics.stepper import (
     FIRST_TIME,
     GROWTH,
     LEAST_ERROR,
-    PATIENCE,
     RESTART,
     SAFETY,
     SHRINK,
     WIDENED,
 )
+
+PATIENCE = 200  # passes a contact after which what is left may be WIDENED times larger
 
 
 class Carry(NamedTuple):
