@@ -278,7 +278,7 @@ def _next(
         (land, jnp.where(leaves, span, h)),
         (inside & starting & ~leaves, short * h),
         (inside, short * span),
-        (landing, 0.5 * jnp.where(jnp.isfinite(span) & (span > 0), span, carry.due)),
+        (landing, 0.5 * carry.due),
     ]
     next_h = jnp.select([case for case, _ in cases], [value for _, value in cases], grown * h)
     opens, breaks = (any_of(jnp.split(found.target, 4)[i]) for i in (0, 3))
