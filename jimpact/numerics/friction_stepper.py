@@ -227,7 +227,9 @@ def _interval(flow: Frictional, carry: Carry, tolerance: jax.Array) -> tuple[jax
     root = jnp.where(positive, jnp.where(positive, x, 1.0) ** (1 / flow.normal.root), 0.0)
     speed = modes.sign * state.u if flow.rows == 1 else size(state.u, 2)
     end = events.AT_REST * of(stops, tolerance) if flow.rows == 2 else 0.0
-    margin = of(turns, margin_signs(modes.phase) * state.g) + of(stops, speed) - end
+    turning = margin_signs(modes.phase) * state.g
+    turning = turning + jnp.where(modes.phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
+    margin = of(turns, turning) + of(stops, speed) - end
     kinds = [carry.kind == kind for kind in (START, ROOT_X, MARGIN)]
     start = jnp.select(kinds, [carry.begun, root, margin], 0.0)
     kinds = [*kinds, carry.kind == HOLDING]
