@@ -45,7 +45,7 @@ CAUSES = (
     ),
     Cause(
         "many contacts at once",
-        "a loss in every contact of a long chain leaves a cluster: work grows like N^2.4",
+        "a loss in every contact of a long chain leaves a cluster that re-closes again and again",
         "more steps (`max_steps`)",
     ),
     Cause(

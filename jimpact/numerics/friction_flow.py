@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import along_contacts, of
 from jimpact.numerics.events import margin_signs
 from jimpact.numerics.flow import OPEN, START, TIME, Flow, Rates, frozen, power, rates_of
@@ -219,14 +220,19 @@ def step(
         row = jax.lax.dynamic_index_in_dim(a, i, keepdims=False)
         y = unflat(flow, first + length * jnp.tensordot(row, slopes, axes=1))
         y = y._replace(x=jnp.where(known, xi**r, y.x))
-        dy = field(flow, modes, rates, y)
-        nears = of(target[m : 2 * m], margin_signs(modes.phase) * dy.g)
-        nears = nears + of(target[2 * m : 3 * m], slowing(flow, modes, y.u, dy.u))
-        rate = jnp.where(kind == ROOT_X, of(known, dy.x), jnp.where(kind == MARGIN, nears, 1.0))
-        rooted = (kind == START) | (kind == ROOT_X)
-        numerator = jnp.where(rooted, r * xi ** (r - 1), 1.0)
-        dt = jnp.where(rate == 0, jnp.nan, numerator) / jnp.where(rate == 0, 1.0, rate)
-        return jax.lax.dynamic_update_index_in_dim(slopes, flat(dy) * dt, i, 0)
+
+        def derivatives() -> jax.Array:
+            dy = field(flow, modes, rates, y)
+            nears = of(target[m : 2 * m], margin_signs(modes.phase) * dy.g)
+            nears = nears + of(target[2 * m : 3 * m], slowing(flow, modes, y.u, dy.u))
+            rate = jnp.where(kind == ROOT_X, of(known, dy.x), jnp.where(kind == MARGIN, nears, 1.0))
+            rooted = (kind == START) | (kind == ROOT_X)
+            numerator = jnp.where(rooted, r * xi ** (r - 1), 1.0)
+            dt = jnp.where(rate == 0, jnp.nan, numerator) / jnp.where(rate == 0, 1.0, rate)
+            return flat(dy) * dt
+
+        new = by_itself(derivatives, length)
+        return jax.lax.dynamic_update_index_in_dim(slopes, new, i, 0)
 
     slopes = jax.lax.fori_loop(0, count, stage, jnp.zeros((count, *first.shape), dtype))
     weights = jnp.asarray([DOP853.b, DOP853.error_high, DOP853.error_low], dtype)
