@@ -4,22 +4,18 @@ A pass tries one step. It is accepted, or shows an event that the next one lands
 shortened: as in `stepper.py`, without what makes that one fast in batches.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import friction_events as events
 from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import all_of, any_of, largest, of
-from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, margin_signs, matters
+from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, matters
 from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN, rates_of
 from jimpact.numerics.friction_flow import (
     HOLDING,
-    MARGIN,
     ROOT_X,
     START,
-    TIME,
     Frictional,
     Modes,
     State,
@@ -29,34 +25,13 @@ from jimpact.numerics.friction_flow import (
     step,
     still,
 )
+from jimpact.numerics.friction_steps import Carry, Verdict, error_of, interval, next_step, time_span
 from jimpact.numerics.stepper import (
-    CUT_SHORT,
     FIRST_TIME,
-    GROWTH,
-    LEAST_ERROR,
-    RESTART,
-    SAFETY,
-    SHRINK,
     WIDENED,
 )
 
 PATIENCE = 200  # passes a contact after which what is left may be WIDENED times larger
-
-
-class Carry(NamedTuple):
-    """What one pass hands to the next; one number an impact has shape (1,)."""
-
-    state: State
-    modes: Modes
-    kind: jax.Array
-    target: jax.Array  # (4 m,) one-hot
-    h: jax.Array  # step to try, in its variable
-    due: jax.Array  # expected time to the event of a landing step
-    begun: jax.Array  # xi reached by START steps
-    retargeted: jax.Array
-    passes: jax.Array
-    closures: jax.Array  # (m,)
-    done: jax.Array
 
 
 def begin(
@@ -109,20 +84,6 @@ def run(flow: Frictional, tolerance: jax.Array, max_steps: int, carry: Carry) ->
     return jax.lax.while_loop(lambda c: jnp.any(active(c)), body, carry)
 
 
-class Verdict(NamedTuple):
-    """What becomes of a trial step."""
-
-    found: events.Found
-    error: jax.Array
-    span: jax.Array
-    inside: jax.Array  # an event lies inside
-    accept: jax.Array
-    flips: jax.Array  # events happen where the step begins
-    broken: jax.Array  # however short the step, the force has no value
-    arrived: jax.Array  # (4 m,) events that happen now
-    rates: State  # where the accepted step ends, or the refused one began
-
-
 def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     """One pass."""
     # where events lie and how long steps are is decided, not differentiated
@@ -130,7 +91,7 @@ def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     carry = carry._replace(h=h, due=due, begun=begun)
 
     def attempt() -> tuple[State, State, State]:
-        start, length = _interval(flow, carry, tolerance)
+        start, length = interval(flow, carry, tolerance)
         return step(flow, carry.modes, carry.state, carry.kind, carry.target, start, length)
 
     tried = by_itself(attempt, h)
@@ -145,7 +106,7 @@ def advance(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
     state, modes, closed = by_itself(move, h)
 
     def following() -> Carry:
-        out = _next(flow, carry, verdict, closed)
+        out = next_step(flow, carry, verdict, closed)
         out = out._replace(state=state, modes=modes, done=carry.done | verdict.broken)
         return _over(flow, tolerance, out)
 
@@ -157,9 +118,9 @@ def _judge(
 ) -> Verdict:
     old = jax.lax.stop_gradient(carry.state)
     new, high, low = jax.lax.stop_gradient(tried)
-    error = _error(flow, tolerance, high, low)
+    error = error_of(flow, tolerance, high, low)
     unit = rates_of(flow.normal, carry.modes.phase).unit
-    span = _span(flow, carry, unit, new.t - old.t)
+    span = time_span(flow, carry, unit, new.t - old.t)
     rates, before, slope, turns = _along(flow, carry.modes, tolerance, old)
     rates_end, after, slope_end, turns_end = _along(flow, carry.modes, tolerance, new)
     if flow.rows == 2:
@@ -216,93 +177,6 @@ def _along(
     )
     turns = events.turning(flow, modes, state, rates) if flow.rows == 2 else state.x
     return rates, values, slopes, turns
-
-
-def _interval(flow: Frictional, carry: Carry, tolerance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Start and length of the next step in its own variable."""
-    state, modes = carry.state, carry.modes
-    opens, turns, stops, _ = jnp.split(carry.target, 4)
-    x = of(opens, state.x)
-    positive = x > 0
-    root = jnp.where(positive, jnp.where(positive, x, 1.0) ** (1 / flow.normal.root), 0.0)
-    speed = modes.sign * state.u if flow.rows == 1 else size(state.u, 2)
-    end = events.AT_REST * of(stops, tolerance) if flow.rows == 2 else 0.0
-    turning = margin_signs(modes.phase) * state.g
-    turning = turning + jnp.where(modes.phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
-    margin = of(turns, turning) + of(stops, speed) - end
-    kinds = [carry.kind == kind for kind in (START, ROOT_X, MARGIN)]
-    start = jnp.select(kinds, [carry.begun, root, margin], 0.0)
-    kinds = [*kinds, carry.kind == HOLDING]
-    return start, jnp.select(kinds, [carry.h, -root, -margin, carry.due], carry.h)
-
-
-def _span(flow: Frictional, carry: Carry, unit: jax.Array, took: jax.Array) -> jax.Array:
-    """Time the step takes in units of `s*`; where that is 0 what a landing was expected to."""
-    r = flow.normal.root
-    in_start = (carry.begun + carry.h) ** r - carry.begun**r
-    timed = unit > 0
-    landed = jnp.where(timed, took / jnp.where(timed, unit, 1.0), carry.due)
-    kinds = [carry.kind == HOLDING, carry.kind >= ROOT_X, carry.kind == START]
-    return jnp.select(kinds, [carry.due, landed, in_start], carry.h)
-
-
-def _error(flow: Frictional, tolerance: jax.Array, high: State, low: State) -> jax.Array:
-    """Hairer's combination of the two estimates, in units of the tolerance."""
-
-    def measure(estimate: State) -> jax.Array:
-        slip = size(estimate.u, flow.rows)
-        both = jnp.maximum(jnp.abs(estimate.x), jnp.maximum(jnp.abs(estimate.g), slip))
-        return largest(jnp.maximum(both, jnp.abs(estimate.p)) / tolerance)
-
-    fifth, third = measure(high), measure(low)
-    scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
-    return jnp.where(scale > 0, fifth**2 / jnp.where(scale > 0, scale, 1.0), fifth)
-
-
-def _next(
-    flow: Frictional,
-    carry: Carry,
-    verdict: Verdict,
-    closed: jax.Array,
-) -> Carry:
-    """Variable, target and length of the next step."""
-    found, error, span, inside, accept, flips, *_ = verdict
-    h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.normal.root
-    landing, starting = kind >= ROOT_X, kind == START
-    grown = jnp.clip(SAFETY / (error + LEAST_ERROR) ** (1 / 8), SHRINK, GROWTH)
-    grown = jnp.where(jnp.isfinite(error), grown, SHRINK)
-    land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
-    leaves = starting & inside & (begun > 0)
-    short = CUT_SHORT * found.first
-    cases = [
-        (flips | (accept & landing), h),
-        (accept, grown * h),
-        (land, jnp.where(leaves, span, h)),
-        (inside & starting & ~leaves, short * h),
-        (inside, short * span),
-        (landing, 0.5 * carry.due),
-    ]
-    next_h = jnp.select([case for case, _ in cases], [value for _, value in cases], grown * h)
-    opens, breaks = (any_of(jnp.split(found.target, 4)[i]) for i in (0, 3))
-    aimed = jnp.where(opens, ROOT_X, jnp.where(breaks, HOLDING, MARGIN))
-    next_kind = jnp.where(land, aimed, jnp.where(starting & ~leaves, START, TIME))
-    begun = begun + jnp.where(accept & starting, h, 0.0)
-    if r > 2:
-        begins = any_of(closed)
-        fresh = jnp.minimum(RESTART * span, FIRST_TIME)
-        next_kind = jnp.where(begins, START, next_kind)
-        next_h = jnp.where(begins, fresh ** (1 / r), next_h)
-        begun = jnp.where(begins, 0.0, begun)
-    return carry._replace(
-        kind=next_kind.astype(jnp.int32),
-        target=found.target & land,
-        h=next_h,
-        due=jnp.where(land, found.first * span, 0.0),
-        begun=begun,
-        retargeted=land & landing,
-        passes=carry.passes + 1,
-        closures=carry.closures + closed.astype(jnp.int32),
-    )
 
 
 def _over(flow: Frictional, tolerance: jax.Array, carry: Carry) -> Carry:
