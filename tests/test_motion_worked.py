@@ -92,6 +92,28 @@ def test_free_rocking_to_rest():
 
 
 @pytest.mark.slow
+def test_a_corner_hops_while_the_other_is_the_pivot():
+    """Short hops of one corner, in the steps in which the other strikes: none is missed."""
+    motion = ji.simulate(
+        ji.block_system(0.2, 0.6),
+        ji.LZB(0.3, friction=0.8),
+        upright(0.15),
+        [0.0] * 3,
+        3.0,
+        samples=61,
+        max_events=1000,
+    )
+    assert int(motion.status) == MOTION_CODE["ok"]
+    assert int(motion.steps) < 10 * int(motion.events.count)
+    energy = np.asarray(motion.energy)
+    assert np.diff(energy).max() < 1e-11 * energy[0]
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
+    assert np.asarray(motion.gaps).min() > -1e-9
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
+    np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-12)
+
+
+@pytest.mark.slow
 def test_overturning_on_a_harmonic_base():
     """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
     law = ji.RestitutionMatrix(rocking_matrix(0.85))

@@ -60,8 +60,9 @@ def first_crossing(
     flat = tuple(x[0] for x in ends)
     for _ in range(_POLISH):
         value, slope = jax.jvp(lambda x: cubic(x, h, flat), (at,), (jnp.ones_like(at),))
-        newton = at - value / jnp.where(slope < 0, slope, -jnp.inf)
-        at = jnp.clip(newton, low, high)
+        falls = slope < 0  # before the top of a short hop Newton has no direction
+        newton = at - value / jnp.where(falls, slope, -1.0)
+        at = jnp.clip(jnp.where(falls, newton, 0.5 * (at + high)), low, high)
     at = jnp.where(at_once, 0.0, at)
     when = jnp.where(found, at * h, jnp.inf)
     which = (index == jnp.argmin(when)) & jnp.any(found)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.laws.base import Law
+from jimpact.motion.along import along
 from jimpact.motion.contact_forces import Modes, no_modes
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
 from jimpact.motion.flight import fly
@@ -92,6 +93,9 @@ def _next_event(
 ) -> _Course:
     """Resolve the event that ended the last flight (or the beginning), then fly to the next."""
     flight = course.flight
+    at = along(system, mu, settings, course.modes, course.scales)
+    # the last remainder before an event leaves the constraints, by its square
+    flight = flight._replace(state=at.project(flight.t, flight.state))
     found = resolve(
         system,
         law,

@@ -108,7 +108,8 @@ def _judge(
     coarse = ~(error <= 1)  # not a number, too
     near = LANDED * length + SMALLEST_STEP * jnp.abs(flight.t)
     seen = crossing.found & (crossing.time < length - near)
-    unseen = crossing.unseen & ~crossing.found & (length > near)
+    # what fell between the looks fell early: before anything that was found later in the step
+    unseen = crossing.unseen & (length > near)
     short = aiming & ~crossing.found & (ahead < jnp.inf)
     zero = jnp.abs(g) <= jnp.sum(jnp.where(flight.aimed, rounding, 0.0))
     arrived = short & ((jnp.abs(ahead) <= near) | zero)
@@ -121,7 +122,7 @@ def _judge(
     step = jnp.where(clipped, jnp.maximum(flight.step, factor * length), factor * length)
     step = jnp.where(again & ~coarse, flight.step, step)
     longer = length + jnp.minimum(ahead, length)
-    aim = jnp.where(seen, crossing.time, jnp.where(unseen, length * SHRINK, longer))
+    aim = jnp.where(unseen, length * SHRINK, jnp.where(seen, crossing.time, longer))
     aim = jnp.where(again & ~coarse, aim, jnp.inf)
     which = jnp.where(crossing.found, crossing.which, flight.aimed & short)
     return _Verdict(again, lands, which, step, aim)
