@@ -9,6 +9,7 @@ from jimpact.laws.base import Law
 from jimpact.motion.blows import FAILS, Blow, blow_of, no_blow
 from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
 from jimpact.motion.dynamics import base_velocity, kinetic
+from jimpact.motion.flight import ROUNDING_GAP
 from jimpact.motion.flight_records import Scales, Settings, State
 from jimpact.motion.modes import (
     REST_ACCELERATION,
@@ -71,6 +72,9 @@ def resolve(
     given = contacts_at(system, state.q, blow.v, t, settings.friction)
     gamma = given.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
+    # a hop below the rounding of gaps is none: it would strike faster than it left
+    floor = ROUNDING_GAP * settings.closed_below
+    slowly = jnp.maximum(slowly, jnp.sqrt(2 * scales.acceleration * floor))
     slow = closed & (gamma <= slowly)
     tight = closed & (jnp.abs(gamma) <= rest)
     slack = REST_ACCELERATION * scales.acceleration
