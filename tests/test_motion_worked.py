@@ -202,6 +202,20 @@ def test_fit_through_a_simulated_motion():
 
 
 @pytest.mark.slow
+def test_friction_is_fitted_through_a_motion():
+    """A dimer that is thrown; positions with (simulated) noise."""
+    dimer, start = ji.dimer_system(0.01, 0.04), ([0.0, 0.1, 0.2], [0.5, 0.0, 0.0], 0.25)
+    seen = np.asarray(ji.simulate(dimer, ji.Moreau(0.8, friction=0.2), *start, samples=41).q)
+    noisy = seen + 1e-4 * np.random.default_rng(0).normal(size=seen.shape)
+    free = ("restitution", "friction")
+    guess = ji.Moreau(0.7, friction=0.3)
+    found = ji.fit_motion(dimer, guess, noisy, *start, free, sigma=1e-4)
+    assert found.converged
+    assert (np.abs(found.value - [0.8, 0.2]) < 3 * found.standard_error).all()
+    assert (found.standard_error < 1e-3).all()
+
+
+@pytest.mark.slow
 def test_fit_of_event_times_and_bad_fits():
     ball = ji.ball_system()
     first = np.sqrt(2 / G)
