@@ -16,7 +16,15 @@ ROOT = Path(__file__).parent.parent
 MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(jimpact.__path__, "jimpact."))]
 LONG = {  # all rheologies, laws or methods are compiled
     f"jimpact.{name}"
-    for name in ("calibration", "plot_rheology", "validity", "stability", "advice", "chart")
+    for name in (
+        "calibration",
+        "plot_rheology",
+        "validity",
+        "plot_validity",
+        "stability",
+        "advice",
+        "chart",
+    )
 } | {"jimpact.motion.fitting_motion"}
 OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 

@@ -135,6 +135,7 @@ def test_random_scenes_hold_what_is_promised(planar):
     np.testing.assert_allclose(faster.velocity[good] / 1e3, out.velocity[good], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_limits_of_friction(planar):
     scenes = random_scenes(COUNT, seed=8)
     none = planar(*scenes[:6], np.zeros((COUNT, 2)))

@@ -76,6 +76,7 @@ def test_too_few_records_are_flagged():
     assert ji.STATUS[int(h.status)].name == "max_steps"
 
 
+@pytest.mark.slow
 def test_inside_jit():
     def peak(e):
         return ji.history(ji.LZB(e), ji.chain([1.0] * 3), [1.0, 0.0, 0.0], records=64).maximum_force
