@@ -84,7 +84,7 @@ def test_against_the_oracle(row):
     for scene in (ji.chain(masses, wall=wall), ji.Scene(mass, normals)):
         out = ji.impact(law, scene, v)
         np.testing.assert_allclose(out.velocity, expected, rtol=0, atol=2e-9)
-        assert int(out.status) in (0, 3)
+        assert int(out.status) in (CODE["ok"], CODE["plastic_limit"])
         if int(out.status) == 0 or np.linalg.matrix_rank(normals) == len(p):
             # (a jammed chain keeps an internal squeeze that depends on the cut-off, W dp = 0)
             np.testing.assert_allclose(out.impulse, p, rtol=0, atol=2e-8)
@@ -233,7 +233,7 @@ def _random_scenes(bodies, wall, count, seed):
 
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
-FEWER = ((3, False), (4, True))  # bodies and wall at the tolerances beside the default
+FEWER = ((3, False, 1.3), (4, True, 1.5))  # chains at the tolerances beside the default
 
 
 @pytest.mark.slow
@@ -243,8 +243,8 @@ def test_honest_tolerance_over_random_scenes():
     for seed, (bodies, wall) in enumerate(
         [(2, True), (3, False), (4, True), (5, False), (6, True)]
     ):
-        for exponent in (1.0, 1.3, 1.5, 2.0):
-            args = _random_scenes(bodies, wall, 26, seed)
+        for exponent in (1.0, 1.5) if seed % 2 == 0 else (1.3, 2.0):
+            args = _random_scenes(bodies, wall, 52, seed)
 
             def outcome(rtol, exponent=exponent, wall=wall, args=args):
                 def one(masses, k, e, v):
@@ -255,7 +255,7 @@ def test_honest_tolerance_over_random_scenes():
 
             exact = outcome(1e-13)
             for rtol in TOLERANCES:
-                if rtol != 1e-8 and ((bodies, wall) not in FEWER or exponent in (1.0, 2.0)):
+                if rtol != 1e-8 and (bodies, wall, exponent) not in FEWER:
                     continue
                 got = outcome(rtol)
                 error = np.abs(got.velocity - exact.velocity).max(axis=1)

@@ -8,6 +8,7 @@ import reference
 
 import jimpact as ji
 from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.status import CODE
 
 
 @pytest.mark.parametrize("wall", [False, True, "left", "right", "both"])
@@ -114,7 +115,7 @@ def test_redundant_contacts():
 @pytest.mark.slow
 def test_ball_between_two_walls_comes_to_rest():
     out = ji.impact(ji.LZB(0.5), ji.chain([1.0], wall="both"), [1.0])
-    assert int(out.status) in (0, 3)
+    assert int(out.status) in (CODE["ok"], CODE["plastic_limit"])
     assert abs(float(out.velocity[0])) < 1e-7
     stuck = ji.impact(ji.LZB(1.0, max_steps=300), ji.chain([1.0], wall="both"), [1.0])
     assert ji.STATUS[int(stuck.status)].name == "max_steps"  # elastic: it never ends

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.laws.base import Law
+from jimpact.laws.friction import check_friction
 from jimpact.numerics import friction
-from jimpact.numerics.dimensionless import METHODS, solve, to_dimensionless
+from jimpact.numerics.dimensionless import METHODS, Inputs, Units, solve, to_dimensionless
 from jimpact.numerics.flow import Exponent
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix
 from jimpact.scene import Scene, tangential_delassus
@@ -177,10 +178,8 @@ class LZB(Law):
                 f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
                 f"but has value {self.rtol:g}: enable jax_enable_x64 for finer tolerances."
             )
-        if self.friction is not None and scene.tangents is None:
-            raise ValueError(
-                "Argument `scene` must have tangents for a law with `friction`, but has none."
-            )
+        if self.friction is not None:
+            check_friction(self, scene)
 
     def by_blocks(self) -> bool:
         """Contacts feel each other through W only; a tuple of exponents belongs to all of them."""
@@ -188,16 +187,7 @@ class LZB(Law):
 
     def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Impulses at the end of the impact dynamics."""
-        m = gap_velocity.shape[0]
-        inputs, units = to_dimensionless(
-            delassus,
-            gap_velocity,
-            self.restitution,
-            self.stiffness,
-            self.exponent,
-            self.stored_energy(m),
-            self.rtol or default_rtol(self.method, gap_velocity.dtype),
-        )
+        inputs, units = self._dimensionless(delassus, gap_velocity)
         chain = isinstance(delassus, Tridiagonal)
         p, code = solve(inputs, self.exponent, chain, self.max_steps, self.method)
         return p * units.velocity / units.root, code
@@ -208,18 +198,20 @@ class LZB(Law):
         """Impulses with friction, where the law has some."""
         if self.friction is None:
             return super().all_impulses(scene, delassus, gap_velocity, velocity)
-        m = gap_velocity.shape[0]
-        inputs, units = to_dimensionless(
-            as_matrix(delassus),
+        inputs, units = self._dimensionless(as_matrix(delassus), gap_velocity)
+        w_nt, w_tt, slip = tangential_delassus(scene, velocity)
+        side = friction.to_dimensionless(w_nt, w_tt, self.friction, slip, units)
+        (p, p_t), code = friction.solve(inputs, side, self.exponent, self.max_steps)
+        root = jnp.repeat(units.root, p_t.shape[0] // p.shape[0])
+        return p * units.velocity / units.root, p_t * units.velocity / root, code
+
+    def _dimensionless(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[Inputs, Units]:
+        return to_dimensionless(
+            delassus,
             gap_velocity,
             self.restitution,
             self.stiffness,
             self.exponent,
-            self.stored_energy(m),
+            self.stored_energy(gap_velocity.shape[0]),
             self.rtol or default_rtol(self.method, gap_velocity.dtype),
         )
-        w_nt, w_tt, slip = tangential_delassus(scene, velocity)
-        side = friction.to_dimensionless(w_nt, w_tt, self.friction, slip, units)
-        (p, p_t), code = friction.solve(inputs, side, self.exponent, self.max_steps)
-        root = jnp.repeat(units.root, p_t.shape[0] // m)
-        return p * units.velocity / units.root, p_t * units.velocity / root, code

@@ -1,31 +1,24 @@
 """The record of a motion: samples, events, energy ledger, status."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.status import Status
 
-class MotionStatus(NamedTuple):
-    """One row of the table; `failure` marks motions that end before t_end."""
-
-    name: str
-    message: str
-    failure: bool
-
-
-# the code is the row number
+# of these rows `failure` marks motions that end before t_end; the code is the row number
 MOTION_STATUS = (
-    MotionStatus("ok", "the motion reaches t_end", False),
-    MotionStatus("law_failed", "the law fails at an impact (see `event_status`)", True),
-    MotionStatus("no_contact_force", "persistent contact with friction has no solution", True),
-    MotionStatus("max_events", "more events than `max_events`: an accumulation without end?", True),
-    MotionStatus("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
-    MotionStatus("penetration", "a gap is negative at the start", True),
-    MotionStatus("singular_mass", "the mass matrix is not positive definite on the way", True),
-    MotionStatus("not_finite", "the motion or its input is NaN or infinite", True),
+    Status("ok", "the motion reaches t_end", False),
+    Status("law_failed", "the law fails at an impact (see `event_status`)", True),
+    Status("no_contact_force", "persistent contact with friction has no solution", True),
+    Status("max_events", "more events than `max_events`: an accumulation without end?", True),
+    Status("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
+    Status("penetration", "a gap is negative at the start", True),
+    Status("singular_mass", "the mass matrix is not positive definite on the way", True),
+    Status("not_finite", "the motion or its input is NaN or infinite", True),
 )
 MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 

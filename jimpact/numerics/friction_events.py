@@ -33,6 +33,7 @@ from jimpact.numerics.friction_flow import (
     normal_force,
     per_row,
     size,
+    speed_of,
     tangential_force,
     times,
 )
@@ -70,10 +71,9 @@ def margins(flow: Frictional, modes: Modes, tolerance: jax.Array, state: State) 
     is_open = modes.phase == OPEN
     slack = jnp.where(is_open, NEGLIGIBLE * tolerance, 0.0)
     slips = ~modes.stick & ~is_open
-    if flow.rows == 1:
-        ahead = modes.sign * state.u
-    else:
-        ahead = size(state.u, 2) - AT_REST * tolerance
+    ahead = speed_of(flow, modes, state.u)
+    if flow.rows == 2:
+        ahead = ahead - AT_REST * tolerance
     force = normal_force(flow, modes, state.x)
     side, most = tangential_force(flow, modes, force, state.u)
     holds = most - size(side, flow.rows)

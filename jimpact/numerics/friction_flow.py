@@ -174,6 +174,11 @@ def field(flow: Frictional, modes: Modes, rates: Rates, state: State) -> State:
     )
 
 
+def speed_of(flow: Frictional, modes: Modes, u: jax.Array) -> jax.Array:
+    """Speed (m,) of slip; planar along its sign, negative once it has passed 0."""
+    return modes.sign * u if flow.rows == 1 else size(u, 2)
+
+
 def slowing(flow: Frictional, modes: Modes, u: jax.Array, rate: jax.Array) -> jax.Array:
     """Rate (m,) of the speed of slip."""
     along = direction(flow, modes, u) * rate

@@ -36,7 +36,7 @@ def who_sticks(
 ) -> tuple[jax.Array, jax.Array]:
     """Of the contacts `asked_of` (m,): whether they stick, else the direction (t,) of slip."""
     flow, state = still(flow), jax.lax.stop_gradient(state)
-    rows, m = flow.rows, len(asked_of)
+    rows = flow.rows
     rates = rates_of(flow.normal, modes.phase)
     soon = jnp.maximum(state.x + AHEAD * rates.closing * state.g, 0.0)
     force = normal_force(flow, modes, soon)
@@ -51,7 +51,6 @@ def who_sticks(
     scale = jnp.max(jnp.abs(b), axis=0, keepdims=True)
     stick = (size(side, rows) < (1 - INSIDE) * most) | (size(rate, rows) <= INSIDE * scale)
     pushed = per_row(size(side, rows) > 0, rows)
-    assert side.shape[0] == rows * m
     return asked_of & stick, jnp.where(pushed, -side, rate)
 
 

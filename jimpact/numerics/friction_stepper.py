@@ -22,14 +22,12 @@ from jimpact.numerics.friction_flow import (
     field,
     size,
     slowing,
+    speed_of,
     step,
     still,
 )
 from jimpact.numerics.friction_steps import Carry, Verdict, error_of, interval, next_step, time_span
-from jimpact.numerics.stepper import (
-    FIRST_TIME,
-    WIDENED,
-)
+from jimpact.numerics.stepper import FIRST_TIME, WIDENED
 
 PATIENCE = 200  # passes a contact after which what is left may be WIDENED times larger
 
@@ -161,7 +159,7 @@ def _on_event(
     slope = of(
         mark, slowing(flow, jax.lax.stop_gradient(modes), jax.lax.stop_gradient(state.u), rates.u)
     )
-    speed = modes.sign * state.u if flow.rows == 1 else size(state.u, 2)
+    speed = speed_of(flow, modes, state.u)
     missed = of(mark, speed - jax.lax.stop_gradient(speed))
     wait = jnp.where(slope == 0, 0.0, -missed / jnp.where(slope == 0, 1.0, slope))
     return State(*(y + wait * dy for y, dy in zip(state, rates)))

@@ -19,16 +19,9 @@ from jimpact.numerics.friction_flow import (
     Modes,
     State,
     size,
+    speed_of,
 )
-from jimpact.numerics.stepper import (
-    CUT_SHORT,
-    FIRST_TIME,
-    GROWTH,
-    LEAST_ERROR,
-    RESTART,
-    SAFETY,
-    SHRINK,
-)
+from jimpact.numerics.stepper import CUT_SHORT, FIRST_TIME, RESTART, combined, growth
 
 
 class Carry(NamedTuple):
@@ -68,7 +61,7 @@ def interval(flow: Frictional, carry: Carry, tolerance: jax.Array) -> tuple[jax.
     x = of(opens, state.x)
     positive = x > 0
     root = jnp.where(positive, jnp.where(positive, x, 1.0) ** (1 / flow.normal.root), 0.0)
-    speed = modes.sign * state.u if flow.rows == 1 else size(state.u, 2)
+    speed = speed_of(flow, modes, state.u)
     end = events.AT_REST * of(stops, tolerance) if flow.rows == 2 else 0.0
     turning = margin_signs(modes.phase) * state.g
     turning = turning + jnp.where(modes.phase == OPEN, NEGLIGIBLE * tolerance, 0.0)
@@ -97,9 +90,7 @@ def error_of(flow: Frictional, tolerance: jax.Array, high: State, low: State) ->
         both = jnp.maximum(jnp.abs(estimate.x), jnp.maximum(jnp.abs(estimate.g), slip))
         return largest(jnp.maximum(both, jnp.abs(estimate.p)) / tolerance)
 
-    fifth, third = measure(high), measure(low)
-    scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
-    return jnp.where(scale > 0, fifth**2 / jnp.where(scale > 0, scale, 1.0), fifth)
+    return combined(measure(high), measure(low))
 
 
 def next_step(
@@ -112,8 +103,7 @@ def next_step(
     found, error, span, inside, accept, flips, *_ = verdict
     h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.normal.root
     landing, starting = kind >= ROOT_X, kind == START
-    grown = jnp.clip(SAFETY / (error + LEAST_ERROR) ** (1 / 8), SHRINK, GROWTH)
-    grown = jnp.where(jnp.isfinite(error), grown, SHRINK)
+    grown = growth(error)
     land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
     leaves = starting & inside & (begun > 0)
     short = CUT_SHORT * found.first

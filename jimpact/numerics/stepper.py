@@ -297,9 +297,21 @@ def _error(control: Control, least: jax.Array, high: Slopes, low: Slopes) -> jax
         rest = jnp.maximum(jnp.abs(estimate.g), jnp.abs(estimate.p)) / control.tolerance
         return largest(jnp.maximum(x, rest))
 
-    fifth, third = size(high), size(low)
+    return combined(size(high), size(low))
+
+
+def combined(fifth: jax.Array, third: jax.Array) -> jax.Array:
+    """Hairer's error of DOP853 from the two estimates."""
     scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
     return jnp.where(scale > 0, fifth**2 / jnp.where(scale > 0, scale, 1.0), fifth)
+
+
+def growth(error: jax.Array, order: int = 8) -> jax.Array:
+    """By what a step of this error, in tolerances, is lengthened or shortened."""
+    error = error + LEAST_ERROR
+    root = root_of(error, 8) if order == 8 else error ** (1 / order)
+    factor = jnp.clip(SAFETY / root, SHRINK, GROWTH)
+    return jnp.where(jnp.isfinite(error), factor, SHRINK)
 
 
 def _next_step(
@@ -317,10 +329,7 @@ def _next_step(
     h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.root
     landing = lands(kind)
     starting = kind == START
-    error = error + LEAST_ERROR
-    root = root_of(error, 8) if control.order == 8 else error ** (1 / control.order)
-    factor = jnp.clip(SAFETY / root, SHRINK, GROWTH)
-    factor = jnp.where(jnp.isfinite(error), factor, SHRINK)
+    factor = growth(error, control.order)
     # START ends with the first event; until then h is a step of xi
     land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
     leaves = starting & inside & (begun > 0)
