@@ -83,7 +83,7 @@ _WHERE = {
     "stability_results": "StabilityMap",
     "plot_stability": "plot_stability_map plot_stability_pairs",
     "advice": "advise",
-    "advice_record": "Advice",
+    "advice_report": "Advice",
     "validity": "ValidityMap validity_map",
     "plot_validity": "plot_advice plot_validity_map",
     "experiments": "Experiments read_experiments",

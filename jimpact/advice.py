@@ -23,7 +23,8 @@ from jimpact.advice_input import (
     parameters_of,
     span_of,
 )
-from jimpact.advice_record import Advice, Effect
+from jimpact.advice_record import Effect
+from jimpact.advice_report import Advice
 from jimpact.advice_structure import NUDGE, Block, Rows, Situation, rows, situation, unknowns
 from jimpact.gap_scales import gap_scale
 from jimpact.impacts import impact

@@ -1,11 +1,11 @@
 """What `advise` found, in words with the numbers of the scene."""
 
 import math
-from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
+from jimpact.advice_record import Findings
 from jimpact.gap_scales import NEARLY_TOUCHING, WIDE
 from jimpact.laws import REGISTRY
 from jimpact.laws.base import Law
@@ -13,9 +13,6 @@ from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB
 from jimpact.laws.newton import Newton
-
-if TYPE_CHECKING:
-    from jimpact.advice_record import Advice
 
 _TOLD = 4  # stiffness ratios named one by one
 _PERCENT_FROM = 1e-4
@@ -68,7 +65,7 @@ def _rtol(rtol: float | None) -> str:
     return "" if rtol is None else f", rtol={rtol:g}"
 
 
-def structure(found: "Advice") -> str:
+def structure(found: Findings) -> str:
     """Which contacts are coupled: one sentence a block of several, one for all others."""
     told = []
     for block in found.blocks:
@@ -94,7 +91,7 @@ def structure(found: "Advice") -> str:
     return "; ".join(told)
 
 
-def effects(found: "Advice") -> str:
+def effects(found: Findings) -> str:
     """What each unknown stiffness does by itself, the strongest first."""
     strongest = sorted(found.effects, key=lambda effect: -effect.alone)[:_TOLD]
     told = [
@@ -105,7 +102,7 @@ def effects(found: "Advice") -> str:
     return f"alone they move v+ by: {', '.join(told)}"
 
 
-def agreeing(found: "Advice") -> str:
+def agreeing(found: Findings) -> str:
     """Other laws, not more complex than the reference, that keep the tolerance too."""
     others = [
         title(name)
@@ -118,7 +115,7 @@ def agreeing(found: "Advice") -> str:
     return f"within {share(found.tolerance)}: {', '.join(others)}" if others else ""
 
 
-def ratios(found: "Advice") -> str:
+def ratios(found: Findings) -> str:
     """The stiffness ratios this advice is about."""
     coupled = [b for b in found.blocks if b.approaches and len(b.contacts) > 1]
     if found.unknown:
@@ -137,7 +134,7 @@ def ratios(found: "Advice") -> str:
     return f"stiffness ratio{'s' * (len(pairs) > 1)} {', '.join(names)} = {', '.join(values)}{more}"
 
 
-def reason(found: "Advice") -> str:
+def reason(found: Findings) -> str:
     """Why this law, in one sentence or two."""
     if not any(block.approaches for block in found.blocks):
         slowest = float(found.gap_velocity.min())
@@ -147,7 +144,7 @@ def reason(found: "Advice") -> str:
     return f"{head}; {closest}" if closest else head
 
 
-def _head(found: "Advice") -> str:
+def _head(found: Findings) -> str:
     name, worst = found.name, share(found.candidates[found.name].worst)
     at_work = [block for block in found.blocks if block.approaches]
     if all(len(block.contacts) == 1 for block in at_work):
@@ -173,7 +170,7 @@ def _head(found: "Advice") -> str:
     return f"{ratios(found)}{_idle(found)}: {title(name)} is within {worst}"
 
 
-def _idle(found: "Advice") -> str:
+def _idle(found: Findings) -> str:
     """Where unknown ratios make no difference, and where angles above 90 degrees explain it."""
     if not found.effects or max(effect.alone for effect in found.effects) > _NONE:
         return ""
@@ -184,7 +181,7 @@ def _idle(found: "Advice") -> str:
     return f" make{'s' * (len(found.effects) == 1)} no difference{why}"
 
 
-def _gaps(found: "Advice", worst: str) -> str:
+def _gaps(found: Findings, worst: str) -> str:
     """Where gaps matter: how wide they are, and what that allows."""
     assert found.gap_ratio is not None
     low, high = (float(f(found.gap_ratio)) for f in (np.min, np.max))
@@ -199,7 +196,7 @@ def _gaps(found: "Advice", worst: str) -> str:
     return f"gaps of {both} delta_c: {verb}"
 
 
-def _undecided(found: "Advice") -> str:
+def _undecided(found: Findings) -> str:
     """Nothing is within tolerance, because the stiffnesses are not known."""
     moved, bound = share(found.candidates[found.name].worst), share(found.tolerance)
     many = len(found.effects) > 1
@@ -215,7 +212,7 @@ def _undecided(found: "Advice") -> str:
     return told
 
 
-def _closest_simpler(found: "Advice") -> str:
+def _closest_simpler(found: Findings) -> str:
     """How far off the best of the simpler laws is, or what it breaks."""
     names = list(found.candidates)
     simpler = names[: names.index(found.name)]

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 
 from jimpact.advice import advise
-from jimpact.advice_record import Advice
+from jimpact.advice_report import Advice
 from jimpact.compare_command import velocities
 from jimpact.pictures import picture_path
 from jimpact.study import Study, read_study

@@ -21,7 +21,8 @@ from jimpact.numerics.dimensionless import (
     status_of,
     to_dimensionless,
 )
-from jimpact.numerics.flow import START, TIME, State, factor, plus_one, power, scales
+from jimpact.numerics.flow import START, TIME, Flow, State, factor, plus_one, power, scales
+from jimpact.numerics.steps import Carry, Control, explicit_step
 from jimpact.numerics.tridiagonal import Tridiagonal
 from jimpact.rheology import Bistiffness
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
@@ -111,9 +112,7 @@ def _contact(law: Sampled) -> Bistiffness:
     return Bistiffness(law.stiffness, law.exponent, law.restitution)
 
 
-def _setup(
-    law: Sampled, scene: Scene, v: jax.Array
-) -> tuple[stepper.Flow, stepper.Control, stepper.Carry, Units]:
+def _setup(law: Sampled, scene: Scene, v: jax.Array) -> tuple[Flow, Control, Carry, Units]:
     w, gamma = delassus_matrix(scene), gap_velocity(scene, v)
     gapped, contact = isinstance(law, Compliant), _contact(law)
     if not gapped:
@@ -148,7 +147,7 @@ def _passes(law: Sampled, scene: Scene, v: jax.Array) -> jax.Array:
 def _history(law: Sampled, scene: Scene, v: jax.Array, samples: int, records: int) -> History:
     flow, control, start, units = _setup(law, scene, v)
 
-    def keep(carry: stepper.Carry, _: None) -> tuple[stepper.Carry, stepper.Carry]:
+    def keep(carry: Carry, _: None) -> tuple[Carry, Carry]:
         after = stepper.advance(flow, control, carry, ~carry.done)
         return after, after
 
@@ -189,9 +188,7 @@ def _history(law: Sampled, scene: Scene, v: jax.Array, samples: int, records: in
     )
 
 
-def _between(
-    flow: stepper.Flow, control: stepper.Control, carry: stepper.Carry, t: jax.Array
-) -> tuple[State, jax.Array]:
+def _between(flow: Flow, control: Control, carry: Carry, t: jax.Array) -> tuple[State, jax.Array]:
     """State and gap velocities at time `t`, by one step from the record before it."""
     s, unit, _ = scales(flow, carry.phase)
     r = flow.root
@@ -204,7 +201,7 @@ def _between(
     length = jnp.where(starting, root - xi, ahead)
     kind = jnp.where(starting, START, TIME)
     none = jnp.zeros_like(carry.target)
-    state, _, _ = stepper.explicit_step(
+    state, _, _ = explicit_step(
         flow, carry.phase, carry.state, kind, none, xi, length, ahead, control.tolerance
     )
     return state._replace(x=jnp.maximum(state.x, 0.0)), s * state.g

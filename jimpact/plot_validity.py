@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from jimpact.advice_record import Advice
+from jimpact.advice_report import Advice
 from jimpact.advice_words import as_code, share
 from jimpact.plots import COLOURS
 from jimpact.validity import ValidityMap

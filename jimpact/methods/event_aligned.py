@@ -5,6 +5,7 @@ duration needs that stroke integrated too, by a second run (which the compiler l
 the duration is not used). Evaluations: stages of all passes, rejected ones included.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -22,12 +23,13 @@ from jimpact.numerics.dimensionless import (
     settled,
     status_of,
 )
-from jimpact.numerics.flow import step
 from jimpact.numerics.propagator import TERMS
 from jimpact.numerics.sensitivity import both_modes
+from jimpact.numerics.steps import explicit_step
 from jimpact.numerics.tableaux import DOP853, DOPRI5
 from jimpact.scene import Scene
 
+_DOPRI5_STEP = functools.partial(explicit_step, tableau=DOPRI5)
 RTOL = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 
 
@@ -57,11 +59,6 @@ def _solver(
     return solve
 
 
-def _dopri5(*given: Any) -> Any:
-    flow, phase, state, kind, target, start, length, *_ = given
-    return step(flow, phase, state, kind, target, start, length, tableau=DOPRI5)
-
-
 def _linear_only(law: Law, scene: Scene) -> str | None:
     reason = lzb_only(law, scene)
     if reason is None and law.exponent_static != 1.0:
@@ -86,7 +83,7 @@ DOPRI5_ALIGNED = Method(
     ladder=RTOL,
     jax=True,
     supports=lzb_only,
-    solve=_solver("time", len(DOPRI5.c), step=_dopri5, order=DOPRI5.order),
+    solve=_solver("time", len(DOPRI5.c), step=_DOPRI5_STEP, order=DOPRI5.order),
     duration_apart=True,
 )
 PROPAGATOR = Method(

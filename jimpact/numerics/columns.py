@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 
 Result = TypeVar("Result")
+Tree = TypeVar("Tree")
 
 WORTH_APART = 64  # impacts of a batch: with fewer, compilation counts
 CHUNK = 1024  # impacts solved side by side on a CPU: their stages fill about half a megabyte
@@ -68,6 +69,27 @@ def by_itself(function: Callable[[], Result], like: jax.Array) -> Result:
     always = jnp.any(like != jnp.inf)  # the compiler cannot know
     return jax.lax.cond(
         always, function, lambda: jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    )
+
+
+def take(tree: Tree, index: jax.Array, size: int) -> Tree:
+    """The impacts `index` of a tree whose arrays have a last axis of `size`, or none."""
+
+    def some(x: jax.Array) -> jax.Array:
+        has_batch = isinstance(x, jax.Array) and x.ndim > 1 and x.shape[-1] == size
+        return x.take(index, axis=-1, mode="clip") if has_batch else x
+
+    return jax.tree.map(some, tree)
+
+
+def put(tree: Tree, some: Tree, order: jax.Array) -> Tree:
+    """`tree` with the impacts `order[: s]` replaced by those of `some`, which has s of them."""
+    place = jnp.argsort(order)
+    size = jax.tree.leaves(some)[0].shape[-1]
+    return jax.tree.map(
+        lambda old, new: jnp.where(place < size, new.take(place, axis=-1, mode="clip"), old),
+        tree,
+        some,
     )
 
 

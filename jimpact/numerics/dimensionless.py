@@ -7,6 +7,7 @@ With Q the largest normalized approach velocity (or stored energy) of the impact
 and omega_j = T / t_ref,j with T the smallest t_ref: the flow of `numerics/flow.py`.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jimpact.numerics.contacts import along_contacts, any_of
 from jimpact.numerics.flow import Exponent, Flow, Viscous, apply, root_order
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
+from jimpact.numerics.steps import FINEST, Carry, Control, explicit_step, patience
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
@@ -139,15 +141,15 @@ def flow_of(inputs: Inputs, exponent: Exponent, chain: bool) -> Flow:
 
 def control_of(
     inputs: Inputs, max_steps: int, method: str, differentiated: bool = False
-) -> stepper.Control:
+) -> Control:
     """How to step; local tolerances are not below rounding."""
-    floor = stepper.FINEST * float(jnp.finfo(inputs.gamma.dtype).eps)
+    floor = FINEST * float(jnp.finfo(inputs.gamma.dtype).eps)
     tighten = GRADIENT_TIGHTENING if differentiated else 1.0
     tolerance = jnp.maximum(tighten * inputs.tolerance, floor)
-    explicit = stepper.differentiated_step if differentiated else stepper.explicit_step
+    explicit = functools.partial(explicit_step, apart=differentiated)
     step = propagate if method == "propagator" else explicit
     contacts = inputs.gamma.shape[0]
-    return stepper.Control(tolerance, max_steps, contacts, step, halving=not differentiated)
+    return Control(tolerance, max_steps, contacts, step, halving=not differentiated)
 
 
 def solve(
@@ -181,7 +183,7 @@ def solve(
 
 
 def settled(
-    flow: Flow, gamma: jax.Array, tolerance: jax.Array, end: stepper.Carry
+    flow: Flow, gamma: jax.Array, tolerance: jax.Array, end: Carry
 ) -> tuple[jax.Array, jax.Array]:
     """Impulses once endless re-closing has come to its limit, and the contacts left at rest."""
     at_rest = reclosing(end, tolerance)
@@ -197,19 +199,19 @@ def settled(
     return p, at_rest
 
 
-def reclosing(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
+def reclosing(end: Carry, tolerance: jax.Array) -> jax.Array:
     """Contacts (m,) as good as at rest where some re-closed again and again."""
     quiet = _quiet(end, tolerance)
     endless = quiet & (end.closures >= ENDLESS)
     return end.done & (endless | (any_of(endless) & quiet & (end.state.g < 0)))
 
 
-def _quiet(end: stepper.Carry, tolerance: jax.Array) -> jax.Array:
+def _quiet(end: Carry, tolerance: jax.Array) -> jax.Array:
     # no wider than what ended the impact: a ball of a long chain may be as slow as WIDENED allows
-    return jnp.abs(end.state.g) <= QUIET * stepper.patience(end, end.phase.shape[0]) * tolerance
+    return jnp.abs(end.state.g) <= QUIET * patience(end, end.phase.shape[0]) * tolerance
 
 
-def status_of(end: stepper.Carry, at_rest: jax.Array) -> jax.Array:
+def status_of(end: Carry, at_rest: jax.Array) -> jax.Array:
     """Status code of a finished or interrupted run."""
     code = jnp.where(any_of(at_rest), CODE["plastic_limit"], CODE["ok"])
     return jnp.where(end.done, code, CODE["max_steps"])[0]

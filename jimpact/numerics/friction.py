@@ -19,7 +19,7 @@ from jimpact.numerics.dimensionless import (
 from jimpact.numerics.flow import Exponent
 from jimpact.numerics.friction_flow import Frictional
 from jimpact.numerics.sensitivity import both_modes
-from jimpact.numerics.stepper import FINEST
+from jimpact.numerics.steps import FINEST
 from jimpact.status import CODE
 
 # Passes a contact after which an impact is given up: wedged by friction, contacts may vibrate

@@ -27,7 +27,7 @@ from jimpact.numerics.friction_flow import (
     still,
 )
 from jimpact.numerics.friction_steps import Carry, Verdict, error_of, interval, next_step, time_span
-from jimpact.numerics.stepper import FIRST_TIME, WIDENED
+from jimpact.numerics.steps import FIRST_TIME, WIDENED
 
 PATIENCE = 200  # passes a contact after which what is left may be WIDENED times larger
 

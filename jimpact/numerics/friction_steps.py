@@ -21,7 +21,7 @@ from jimpact.numerics.friction_flow import (
     size,
     speed_of,
 )
-from jimpact.numerics.stepper import CUT_SHORT, FIRST_TIME, RESTART, combined, growth
+from jimpact.numerics.steps import CUT_SHORT, FIRST_TIME, RESTART, combined, growth
 
 
 class Carry(NamedTuple):

@@ -6,99 +6,38 @@ it, or its error is too large and it is shortened. As soon as the contacts at wo
 from each other and press no other contact, the rest follows from the energy in closed form.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
-
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics import events, isolated, side_by_side
+from jimpact.numerics import columns, events, isolated
 from jimpact.numerics import flow as flows
 from jimpact.numerics.columns import by_itself
-from jimpact.numerics.contacts import all_of, any_of, first_least, largest, least, of
+from jimpact.numerics.contacts import all_of, any_of, first_least, least
 from jimpact.numerics.flow import (
     COMPRESSION,
     EXPANSION,
     FROM_GAP,
-    ONSET,
     OPEN,
-    ROOT_X,
     START,
-    TIME,
-    ZERO_G,
     Flow,
-    Slopes,
     State,
     lands,
     rates_of,
-    root_of,
+)
+from jimpact.numerics.steps import (
+    FIRST_TIME,
+    Carry,
+    Control,
+    Verdict,
+    error_of,
+    interval,
+    local_tolerance,
+    next_step,
+    patience,
+    time_span,
 )
 
-FIRST_TIME = 0.05  # of the fastest contact's time scale: no contact can turn around so soon
-RESTART = 0.1  # first START step after a closing, as a part of the step before it
-GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
-FINEST = 16  # eps: a local tolerance below it asks for less than rounding
-LEAST_ERROR = 1e-10  # in tolerances; keeps the growth factor finite
-WIDE_GAP = 64  # eps of a gap: its error estimate is no more than rounding
-NEAR = 1.0  # an event expected within so many steps is landed on
-PATIENCE = 2000  # passes per contact after which an impact is let end at WIDENED tolerances
-WIDENED = 100.0
-# Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
-# with the number of passes, or the errors of N steps would add up to N tolerances.
-FULL = 30
 WORTH_HALVING = 600  # impacts of a batch: fewer gain less than a second loop takes to compile
-CUT_SHORT = 0.7  # part of the way to an event that a step stops at where it cannot land
-
-
-class Carry(NamedTuple):
-    """What one pass hands to the next."""
-
-    state: State
-    phase: jax.Array  # (m,)
-    kind: jax.Array  # variable of the next step
-    target: jax.Array  # (m,) one-hot: event it lands on
-    h: jax.Array  # time step to try; in START a step of xi
-    due: jax.Array  # estimated time to the event of a landing step
-    begun: jax.Array  # xi reached by START steps
-    retargeted: jax.Array
-    passes: jax.Array
-    closures: jax.Array  # (m,)
-    done: jax.Array
-
-
-def explicit_step(
-    flow: Flow,
-    phase: jax.Array,
-    state: State,
-    kind: jax.Array,
-    target: jax.Array,
-    start: jax.Array,
-    length: jax.Array,
-    due: jax.Array,
-    tolerance: jax.Array,
-) -> tuple[State, Slopes, Slopes]:
-    """`flow.step`, which needs neither the expected time of the event nor the tolerance."""
-    return flows.step(flow, phase, state, kind, target, start, length)
-
-
-def differentiated_step(*given: Any) -> tuple[State, Slopes, Slopes]:
-    """`explicit_step` for derivatives in batches."""
-    flow, phase, state, kind, target, start, length, *_ = given
-    apart = length.ndim > 1
-    return flows.step(flow, phase, state, kind, target, start, length, apart=apart)
-
-
-class Control(NamedTuple):
-    """Local tolerance (m,) of each contact, pass limit, and how to step and to finish."""
-
-    tolerance: jax.Array
-    max_steps: int
-    contacts: int  # of the impact; those that are stepped may be fewer
-    step: Callable[..., tuple[State, Slopes, Slopes]] = explicit_step
-    closed_form: bool = True
-    halving: bool = True
-    order: int = 8
-    beyond: jax.Array | None = None  # contacts whose neighbours are left out (`windows.py`)
 
 
 def begin(flow: Flow, control: Control, gamma: jax.Array, x: jax.Array) -> Carry:
@@ -153,13 +92,13 @@ def run(flow: Flow, control: Control, carry: Carry) -> Carry:
     size, half = batch[0], batch[0] // 2
     carry = passes(flow, control, carry, half)
     order = jnp.argsort(~active(carry)[0])
-    tolerance = side_by_side.take(control.tolerance, order[:half], size)
+    tolerance = columns.take(control.tolerance, order[:half], size)
     rest = run(
-        side_by_side.take(flow, order[:half], size),
+        columns.take(flow, order[:half], size),
         control._replace(tolerance=tolerance),
-        side_by_side.take(carry, order[:half], size),
+        columns.take(carry, order[:half], size),
     )
-    return side_by_side.put(carry, rest, order)
+    return columns.put(carry, rest, order)
 
 
 def advance(flow: Flow, control: Control, carry: Carry, active: jax.Array) -> Carry:
@@ -172,7 +111,7 @@ def advance(flow: Flow, control: Control, carry: Carry, active: jax.Array) -> Ca
     verdict = by_itself(lambda: _judge(flow, control, carry, reached, error), carry.h)
     moved, new_phase, closed = by_itself(lambda: _move(flow, carry, reached, verdict), carry.h)
     out = by_itself(
-        lambda: _next_step(flow, control, carry, verdict, error, moved, new_phase, closed), carry.h
+        lambda: next_step(flow, control, carry, verdict, error, moved, new_phase, closed), carry.h
     )
 
     def end() -> Carry:
@@ -182,21 +121,10 @@ def advance(flow: Flow, control: Control, carry: Carry, active: jax.Array) -> Ca
     return by_itself(end, carry.h)
 
 
-class Verdict(NamedTuple):
-    """What becomes of a trial step."""
-
-    found: events.Events
-    span: jax.Array
-    flips: jax.Array  # phases change where the step begins: nothing is gained by shortening it
-    inside: jax.Array  # an event lies inside
-    accept: jax.Array
-    broken: jax.Array  # however short the step, the force has no value
-
-
 def _try(flow: Flow, control: Control, carry: Carry) -> tuple[State, jax.Array]:
     """State at the end of a trial step, and its error in tolerances."""
-    start, length = _interval(flow, control, carry)
-    control = control._replace(tolerance=_shrunk(control, carry))
+    start, length = interval(flow, control, carry)
+    control = control._replace(tolerance=local_tolerance(control, carry))
     reached, high, low = control.step(
         flow,
         carry.phase,
@@ -209,20 +137,12 @@ def _try(flow: Flow, control: Control, carry: Carry) -> tuple[State, jax.Array]:
         control.tolerance,
     )
     old, new, high, low = jax.lax.stop_gradient((carry.state, reached, high, low))
-    return reached, _error(control, jnp.minimum(old.x, new.x), high, low)
-
-
-def _shrunk(control: Control, carry: Carry) -> jax.Array:
-    """Local tolerance of the next step, not below rounding."""
-    full, tolerance = FULL * control.contacts, control.tolerance
-    passes = jnp.maximum(carry.passes, full).astype(tolerance.dtype)
-    finest = FINEST * float(jnp.finfo(tolerance.dtype).eps)
-    return jnp.maximum(tolerance * (full / passes), jnp.minimum(tolerance, finest))
+    return reached, error_of(control, jnp.minimum(old.x, new.x), high, low)
 
 
 def _judge(flow: Flow, control: Control, carry: Carry, reached: State, error: jax.Array) -> Verdict:
     state, new = jax.lax.stop_gradient((carry.state, reached))
-    span = _span(flow, carry)
+    span = time_span(flow, carry)
     unit = rates_of(flows.frozen(flow), carry.phase).unit
     timed = lands(carry.kind) & (unit > 0)  # a landing takes other than the time expected
     took = jnp.where(timed, (new.t - state.t) / jnp.where(timed, unit, 1.0), span)
@@ -261,137 +181,6 @@ def _move(
     return events.change_phase(flow, carry.phase, moved, arrived, found.opens)
 
 
-def _interval(flow: Flow, control: Control, carry: Carry) -> tuple[jax.Array, jax.Array]:
-    """Start and length of the next step in its own variable."""
-    x, g = of(carry.target, carry.state.x), of(carry.target, carry.state.g)
-    closing = carry.target & (carry.phase == OPEN)  # closes once its approach matters
-    g_end = -events.NEGLIGIBLE * of(closing, control.tolerance)
-    safe = jnp.where(x > 0, x, 1.0)
-    root = root_of(safe, flow.root)
-    root = jnp.where(x > 0, root, 0.0)
-    onset = jnp.zeros_like(x)
-    if flow.slackens:
-        values = flow.viscous.onset(carry.state.x, carry.state.g)  # type: ignore[union-attr]
-        onset = of(carry.target, values)
-    kinds = [carry.kind == kind for kind in (START, ZERO_G, ROOT_X, FROM_GAP, ONSET)]
-    start = jnp.select(kinds, [carry.begun, g, root, x, onset], 0.0)
-    length = jnp.select(kinds, [carry.h, g_end - g, -root, -x, -onset], carry.h)
-    return start, length
-
-
-def _span(flow: Flow, carry: Carry) -> jax.Array:
-    """Time the step takes, or is expected to take."""
-    r = flow.root
-    in_start = (carry.begun + carry.h) ** r - carry.begun**r
-    landing = lands(carry.kind)
-    return jnp.select([landing, carry.kind == START], [carry.due, in_start], carry.h)
-
-
-def _error(control: Control, least: jax.Array, high: Slopes, low: Slopes) -> jax.Array:
-    """Hairer's combination of the two estimates, in units of the tolerance; `least` x: gaps."""
-    gap = jnp.where(least < 0, -least, 0.0)
-    rounding = WIDE_GAP * float(jnp.finfo(gap.dtype).eps) * gap
-
-    def size(estimate: Slopes) -> jax.Array:
-        x = jnp.abs(estimate.x) / (control.tolerance + rounding)
-        rest = jnp.maximum(jnp.abs(estimate.g), jnp.abs(estimate.p)) / control.tolerance
-        return largest(jnp.maximum(x, rest))
-
-    return combined(size(high), size(low))
-
-
-def combined(fifth: jax.Array, third: jax.Array) -> jax.Array:
-    """Hairer's error of DOP853 from the two estimates."""
-    scale = jnp.sqrt(fifth**2 + 0.01 * third**2)
-    return jnp.where(scale > 0, fifth**2 / jnp.where(scale > 0, scale, 1.0), fifth)
-
-
-def growth(error: jax.Array, order: int = 8) -> jax.Array:
-    """By what a step of this error, in tolerances, is lengthened or shortened."""
-    error = error + LEAST_ERROR
-    root = root_of(error, 8) if order == 8 else error ** (1 / order)
-    factor = jnp.clip(SAFETY / root, SHRINK, GROWTH)
-    return jnp.where(jnp.isfinite(error), factor, SHRINK)
-
-
-def _next_step(
-    flow: Flow,
-    control: Control,
-    carry: Carry,
-    verdict: Verdict,
-    error: jax.Array,
-    moved: State,
-    phase: jax.Array,
-    closed: jax.Array,
-) -> Carry:
-    """Variable, target and length of the next step."""
-    found, span, flips, inside, accept, broken = verdict
-    h, kind, begun, r = carry.h, carry.kind, carry.begun, flow.root
-    landing = lands(kind)
-    starting = kind == START
-    factor = growth(error, control.order)
-    # START ends with the first event; until then h is a step of xi
-    land = inside & found.monotone & ~(starting & (begun == 0)) & ~carry.retargeted
-    leaves = starting & inside & (begun > 0)
-    short = CUT_SHORT * found.first
-    gap_closes = any_of(found.target & (carry.phase == OPEN) & (carry.state.x <= 0))
-    in_x = jnp.where(gap_closes, FROM_GAP, ONSET if flow.slackens else ROOT_X)
-    cases = [
-        (flips | (accept & landing), h),
-        (accept, factor * h),
-        (land, jnp.where(leaves, span, h)),
-        (inside & starting & ~leaves, short * h),
-        (inside, short * span),
-        (landing, 0.5 * span),
-    ]
-    next_h = jnp.select([case for case, _ in cases], [value for _, value in cases], factor * h)
-    next_kind = jnp.where(
-        land,
-        jnp.where(found.by_opening, in_x, ZERO_G),
-        jnp.where(starting & ~leaves, START, TIME),
-    )
-    begun = begun + jnp.where(accept & starting, h, 0.0)
-    # x ~ t^2 after a closing, so t^(2 eta) is smooth enough where 2 eta is whole; but a gap closes
-    # with x ~ t
-    if r > 2 or flow.gapped:
-        begins = any_of(closed)
-        next_kind = jnp.where(begins, START, next_kind)
-        fresh = jnp.minimum(RESTART * span, FIRST_TIME)
-        next_h = jnp.where(begins, fresh ** (1 / r), next_h)
-        begun = jnp.where(begins, 0.0, begun)
-    out = carry._replace(
-        state=moved,
-        phase=phase,
-        passes=carry.passes + 1,
-        closures=carry.closures + closed.astype(jnp.int32),
-        done=carry.done | broken,
-        kind=next_kind.astype(jnp.int32),
-        target=found.target & land,
-        h=next_h,
-        due=jnp.where(land, found.first * span, 0.0),
-        begun=begun,
-        retargeted=land & landing,
-    )
-    return _aim(flow, control, out, accept)
-
-
-def _aim(flow: Flow, control: Control, carry: Carry, accepted: jax.Array) -> Carry:
-    """Turn the next step into a landing on the event that is about to come."""
-    if flow.slackens:
-        return carry
-    state = jax.lax.stop_gradient(carry.state)
-    due, target, by_opening = events.ahead(
-        flows.frozen(flow), control.tolerance, carry.phase, state
-    )
-    aim = accepted & (carry.kind == TIME) & (due < NEAR * carry.h)
-    aimed_at = jnp.where(by_opening, ROOT_X, ZERO_G)
-    return carry._replace(
-        kind=jnp.where(aim, aimed_at, carry.kind).astype(jnp.int32),
-        target=jnp.where(aim, target, carry.target),
-        due=jnp.where(aim, due, carry.due),
-    )
-
-
 def _fly(flow: Flow, carry: Carry) -> Carry:
     """While all contacts are open, go to the next closing in one step, however far it is."""
     state = jax.lax.stop_gradient(carry.state)
@@ -405,12 +194,6 @@ def _fly(flow: Flow, carry: Carry) -> Carry:
         due=jnp.where(flies, least(due), carry.due),
         retargeted=carry.retargeted & ~flies,
     )
-
-
-def patience(carry: Carry, contacts: int) -> jax.Array:
-    """Widens what counts as nothing left once an impact drags on."""
-    drags = carry.passes > PATIENCE * contacts
-    return jnp.where(drags, WIDENED, 1.0).astype(carry.h.dtype)
 
 
 def _finish(flow: Flow, control: Control, carry: Carry) -> Carry:
