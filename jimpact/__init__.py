@@ -17,19 +17,19 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# module -> public names, imported on first use so that `jimpact --help` stays fast. No module is
-# named like a public name: importing it would put the module in the function's place.
+# module -> public names, imported on first use so that `jimpact --help` stays fast. No module
+# here is named like a public name: importing it would put the module in the function's place.
 _WHERE = {
     "scene": (
         "Scene delassus_matrix gap_velocity kinetic_angles kinetic_energy momentum "
         "normalized_delassus normalized_gap_velocity velocity_change"
     ),
     "scenes": "chain column scene_from_gaps",
-    "mechanisms": "Mechanism",
-    "bodies": "Block Dimer dimer rocking_block",
-    "spatial": "SpatialDimer dimer_3d",
-    "planar": "Corner DiskBalls corner disk_balls",
-    "pendulums": "PendulumCradle pendulum_cradle",
+    "mechanisms.base": "Mechanism",
+    "mechanisms.bodies": "Block Dimer dimer rocking_block",
+    "mechanisms.spatial": "SpatialDimer dimer_3d",
+    "mechanisms.planar": "Corner DiskBalls corner disk_balls",
+    "mechanisms.pendulums": "PendulumCradle pendulum_cradle",
     "laws": "REGISTRY",
     "laws.base": "Law",
     "laws.newton": "Newton",
@@ -37,18 +37,19 @@ _WHERE = {
     "laws.poisson": "Poisson",
     "laws.binary": "Binary",
     "laws.compliant": "Compliant",
-    "rheology": (
+    "compliance.rheology": (
         "Bistiffness Force Hertz HuntCrossley KelvinVoigt KuwabaraKono LinearSpring PowerLaw "
         "UserForce"
     ),
-    "gap_scales": "Crossover GapScale crossover gap_scale",
-    "calibration": "calibrate compare_rheologies measured_restitution",
-    "materials": "hertz_stiffness sphere_mass",
-    "linear_chain": "bilateral_motion newby_ratio",
-    "turning": "TurningImpact block_gaps turning_impact",
-    "plot_rheology": "plot_forces plot_rheologies",
-    "montecarlo": "monte_carlo",
+    "compliance.gap_scales": "Crossover GapScale crossover gap_scale",
+    "compliance.calibration": "calibrate compare_rheologies measured_restitution",
+    "compliance.materials": "hertz_stiffness sphere_mass",
+    "compliance.linear_chain": "bilateral_motion newby_ratio",
+    "compliance.turning": "TurningImpact block_gaps turning_impact",
+    "pictures.rheology": "plot_forces plot_rheologies",
+    "sampling.montecarlo": "monte_carlo",
     "sampling.results": "MonteCarlo",
+    "pictures.montecarlo": "plot_monte_carlo",
     "sampling.gap_sensitivities": "GapSensitivity gap_sensitivity",
     "sampling.store": "read_samples",
     "sampling.distributions": "Normal RandomLaw Uniform",
@@ -58,39 +59,43 @@ _WHERE = {
     "status": "STATUS",
     "consistency": "Audit audit summary",
     "histories": "History history",
+    "pictures.comparison": "plot_comparison",
     "comparison": "Comparison compare dispersion_index energy_ratio",
-    "restitution_audit": "MatrixAudit audit_matrix carnot_energy_loss dissipation_matrix",
-    "friction_consistency": (
+    "kinematics.restitution_audit": (
+        "MatrixAudit audit_matrix carnot_energy_loss dissipation_matrix"
+    ),
+    "kinematics.friction_consistency": (
         "FrictionBounds friction_bounds friction_energy_change friction_impulses"
     ),
-    "admissible": "AdmissibleSet admissible_set",
-    "plot_admissible": "plot_admissible_set",
+    "kinematics.admissible": "AdmissibleSet admissible_set",
+    "pictures.admissible": "plot_admissible_set",
     "numerics.copositive": "Copositivity copositivity",
-    "quasi": (
+    "kinematics.quasi": (
         "ContactPower contact_power from_quasi_velocities kinetic_energy_split quasi_basis "
         "to_quasi_velocities"
     ),
     "laws.restitution_matrix": "RestitutionMatrix",
-    "rocking": "RockingRatio housner_restitution rocking_matrix rocking_ratios",
-    "rocking_impacts": "rocking_dispersion search_critical_angle",
-    "rocking_record": "RockingDispersion critical_kinetic_angle rocking_kinetic_angle",
-    "plot_rocking": "plot_rocking_dispersion plot_rocking_outcomes",
-    "inclusion": "InclusionOutcome contact_coupling restitution_inclusion",
-    "chart": "work_precision",
-    "chart_record": "WorkPrecision",
-    "plot_chart": "plot_work_precision",
-    "stability": "stability_map",
-    "stability_results": "StabilityMap",
-    "plot_stability": "plot_stability_map plot_stability_pairs",
-    "advice": "advise",
-    "advice_report": "Advice",
-    "validity": "ValidityMap validity_map",
-    "plot_validity": "plot_advice plot_validity_map",
+    "rocking.ratios": "RockingRatio housner_restitution rocking_matrix rocking_ratios",
+    "rocking.impacts": "rocking_dispersion search_critical_angle",
+    "rocking.record": "RockingDispersion critical_kinetic_angle rocking_kinetic_angle",
+    "pictures.rocking": "plot_rocking_dispersion plot_rocking_outcomes",
+    "kinematics.inclusion": "InclusionOutcome contact_coupling restitution_inclusion",
+    "charts.chart": "work_precision",
+    "charts.record": "WorkPrecision",
+    "pictures.chart": "plot_work_precision",
+    "stability.mapping": "stability_map",
+    "stability.results": "StabilityMap",
+    "pictures.stability": "plot_stability_map plot_stability_pairs",
+    "advice.advising": "advise",
+    "advice.report": "Advice",
+    "advice.validity": "ValidityMap validity_map",
+    "pictures.validity": "plot_advice plot_validity_map",
     "experiments": "Experiments read_experiments",
-    "fitting": "Fit fit",
+    "fits.fitting": "Fit fit",
+    "pictures.fits": "plot_fit",
     "motion.simulation": "simulate",
-    "plot_motions": "plot_motion plot_phase_portrait",
-    "animation": "animate_motion",
+    "pictures.motions": "plot_motion plot_phase_portrait",
+    "pictures.animation": "animate_motion",
     "motion.system": "System gravity",
     "motion.bases": "HarmonicBase",
     "motion.fitting_motion": "MotionFit fit_motion",

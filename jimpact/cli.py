@@ -39,7 +39,7 @@ class FitCommand:
 
     def run(self) -> int:
         """Fit, print, draw."""
-        from jimpact.fit_command import run
+        from jimpact.commands.fit import run
 
         return run(**vars(self))
 
@@ -65,7 +65,7 @@ class CompareCommand:
 
     def run(self) -> int:
         """Compare, print, draw."""
-        from jimpact.compare_command import run
+        from jimpact.commands.compare import run
 
         return run(**vars(self))
 
@@ -97,7 +97,7 @@ class MonteCarloCommand:
 
     def run(self) -> int:
         """Sample, print, draw."""
-        from jimpact.montecarlo_command import run
+        from jimpact.commands.montecarlo import run
 
         return run(**vars(self))
 
@@ -131,7 +131,7 @@ class ChartCommand:
 
     def run(self) -> int:
         """Measure, print, draw."""
-        from jimpact.chart_command import run
+        from jimpact.commands.chart import run
 
         return run(**vars(self))
 
@@ -151,7 +151,7 @@ class StabilityCommand:
 
     def run(self) -> int:
         """Map, print, draw."""
-        from jimpact.stability_command import run
+        from jimpact.commands.stability import run
 
         return run(**vars(self))
 
@@ -183,7 +183,7 @@ class AdviseCommand:
 
     def run(self) -> int:
         """Advise, print, draw."""
-        from jimpact.advise_command import run
+        from jimpact.commands.advise import run
 
         return run(**vars(self))
 
@@ -213,7 +213,7 @@ class SimulateCommand:
 
     def run(self) -> int:
         """Simulate, print, draw."""
-        from jimpact.simulate_command import run
+        from jimpact.commands.simulate import run
 
         return run(**vars(self))
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.compliance.rheology import Bistiffness
 from jimpact.impacts import in_common_dtype, without_open_contacts
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
@@ -24,7 +25,6 @@ from jimpact.numerics.dimensionless import (
 from jimpact.numerics.flow import START, TIME, Flow, State, factor, plus_one, power, scales
 from jimpact.numerics.steps import Carry, Control, explicit_step
 from jimpact.numerics.tridiagonal import Tridiagonal
-from jimpact.rheology import Bistiffness
 from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
 
 TRACED_RECORDS = 512  # passes kept when the number needed cannot be looked up (inside jit, grad)

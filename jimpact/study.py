@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jimpact.experiments import Experiments, read_experiments
-from jimpact.fitting import Fit, fit
+from jimpact.fits.fitting import Fit, fit
 from jimpact.laws import REGISTRY, Row
 from jimpact.laws.base import Law
 from jimpact.sampling.study_table import arguments

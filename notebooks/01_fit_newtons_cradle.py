@@ -32,7 +32,6 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jimpact as ji
-from jimpact.plots import plot_fit
 
 began = time.perf_counter()
 balls = ji.chain([1.0, 1.0, 1.0])
@@ -79,7 +78,7 @@ for name, fit in (("LZB", lzb), ("LZB, corrected", lzb_corrected), ("Newton", ne
 # energy. (Grey crosses.)
 
 # %%
-plot_fit(lzb, {"Newton fitted": newton}, title="Three balls, one shot")
+ji.plot_fit(lzb, {"Newton fitted": newton}, title="Three balls, one shot")
 
 # %% [markdown]
 # ## What one shot cannot tell

@@ -80,9 +80,8 @@ found = ji.monte_carlo(law, balls, v, gaps=gaps, samples=20_000, key=0)
 print(found)
 
 # %%
-from jimpact.plot_montecarlo import plot_monte_carlo
 
-plot_monte_carlo(found, "gaps uniform up to four gap scales")
+ji.plot_monte_carlo(found, "gaps uniform up to four gap scales")
 
 # %% [markdown]
 # ## Where a linearization fails

@@ -27,13 +27,6 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 
 import jimpact as ji
-from jimpact.advice import advise
-from jimpact.chart import work_precision
-from jimpact.plot_chart import plot_work_precision
-from jimpact.plot_stability import plot_stability_map
-from jimpact.plot_validity import plot_advice, plot_validity_map
-from jimpact.stability import stability_map
-from jimpact.validity import validity_map
 
 balls, v = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 
@@ -45,11 +38,11 @@ balls, v = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 # be measured.
 
 # %%
-cradle = advise(balls, v, 0.01)
+cradle = ji.advise(balls, v, 0.01)
 print(cradle)
 
 # %%
-plot_advice(cradle, "Three equal balls, stiffness ratio unknown")
+ji.plot_advice(cradle, "Three equal balls, stiffness ratio unknown")
 
 # %% [markdown]
 # With a known ratio it is another matter. Stiffness that falls steeply lets the balls collide one
@@ -58,7 +51,7 @@ plot_advice(cradle, "Three equal balls, stiffness ratio unknown")
 
 # %%
 for ratio in (0.01, 1.0, 50.0, 1000.0):
-    found = advise(balls, v, 0.02, stiffness=[1.0, ratio], timing=False)
+    found = ji.advise(balls, v, 0.02, stiffness=[1.0, ratio], timing=False)
     print(f"{found.name:8s} {found.reason}")
 
 # %% [markdown]
@@ -72,7 +65,7 @@ for scene, velocity, options in (
     (corner, [-1.0, -2.0], {"restitution": 0.5}),
     (steel, v, {"stiffness": 1.2e10, "tolerance": 1e-3}),
 ):
-    found = advise(scene, velocity, timing=False, **options)
+    found = ji.advise(scene, velocity, timing=False, **options)
     print(f"{found.name:8s} {found.reason}")
 
 # %% [markdown]
@@ -83,9 +76,9 @@ for scene, velocity, options in (
 # exponent, the further right the change; and Moreau's law is approached in waves.
 
 # %%
-valid = validity_map(balls, v)
+valid = ji.validity_map(balls, v)
 print(valid)
-plot_validity_map(valid)
+ji.plot_validity_map(valid)
 
 # %% [markdown]
 # ## Speed against accuracy
@@ -97,13 +90,13 @@ plot_validity_map(valid)
 law = ji.LZB(0.9, [1.0, 1.0], 1.5)
 ladder = {"dop853": [1e-4, 1e-6, 1e-8], "rk4": [0.1, 0.03, 0.01]}
 laws = {"moreau": ji.Moreau(0.9), "binary": ji.Binary(0.9)}
-chart = work_precision(
+chart = ji.work_precision(
     balls, v, law, list(ladder), ladder, laws, batch=64, repeats=3, gradients=False
 )
 print(chart)
 
 # %%
-plot_work_precision(chart)
+ji.plot_work_precision(chart)
 
 # %% [markdown]
 # ## Where methods fail
@@ -115,8 +108,8 @@ axes = {
     "restitution": [0.0, 1e-3, 0.05, 0.3, 0.9, 1.0],
     "stiffness_ratio": np.logspace(-6, 6, 7),
 }
-stable = stability_map(["default", "rk4"], axes, max_steps=3000)
+stable = ji.stability_map(["default", "rk4"], axes, max_steps=3000)
 print(stable)
 
 # %%
-plot_stability_map(stable)
+ji.plot_stability_map(stable)

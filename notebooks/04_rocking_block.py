@@ -27,7 +27,6 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 
 import jimpact as ji
-from jimpact.rocking import housner_restitution, rocking_matrix, rocking_ratios
 
 # %% [markdown]
 # ## Dispersion is a V over the kinetic angle
@@ -104,12 +103,12 @@ print("   a   Housner   e_theta by LZB, mu = 0, 0.1, 0.8")
 for i in range(0, 480, 80):
     a = float(plastic.aspect[i])
     ratios = np.asarray(plastic.angular_ratio[i, :, 0])
-    print(f"{a:5.2f} {float(housner_restitution(a)):8.4f}     {ratios.round(4)}")
+    print(f"{a:5.2f} {float(ji.housner_restitution(a)):8.4f}     {ratios.round(4)}")
 
 before = [1.5, -0.5, -1.0]  # a = 3: rotating about A, corner B comes down with 1
 block = ji.rocking_block(width=1.0, height=3.0)
-out = ji.impact(ji.RestitutionMatrix(rocking_matrix(housner_restitution(3.0))), block, before)
-print(rocking_matrix(housner_restitution(3.0)))
+out = ji.impact(ji.RestitutionMatrix(ji.rocking_matrix(ji.housner_restitution(3.0))), block, before)
+print(ji.rocking_matrix(ji.housner_restitution(3.0)))
 print(
     "by the matrix, velocity after:",
     out.velocity,
@@ -122,7 +121,7 @@ print(
 # published numbers, not fits.
 
 # %%
-for row in rocking_ratios():
+for row in ji.rocking_ratios():
     print(f"a = {row.aspect:g}, {row.material}: e_theta = {row.restitution:.3f}, ", end="")
     print(f"{row.measured_over_housner:g} of Housner's value")
 
@@ -148,7 +147,7 @@ for e_n, motion in motions.items():
 events = motions[0.0].events
 ratios = -events.velocity_after[:4, 2] / -events.velocity_before[:4, 2]
 print("e = 0, angular velocity kept by the first four hits:", np.asarray(ratios))
-print("Housner's value:", float(housner_restitution(3.0)))
+print("Housner's value:", float(ji.housner_restitution(3.0)))
 top = {e_n: np.nanmax(-np.asarray(m.q[:, 2])) for e_n, m in motions.items()}
 print("largest angle on the other side, e = 0 and 0.1:", np.degrees(list(top.values())), "degrees")
 

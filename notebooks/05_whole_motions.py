@@ -27,7 +27,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.rocking import housner_restitution, rocking_matrix
 
 # %% [markdown]
 # ## Newton's cradle over fifty swings
@@ -80,11 +79,11 @@ ji.plot_phase_portrait(motion, title="Bouncing ball, e = 0.8")
 
 # %%
 block = ji.block_system(0.2, 0.6)
-e = housner_restitution(3.0)
+e = ji.housner_restitution(3.0)
 theta = 0.15
 corner = [0.0, 0.1 * np.sin(theta) + 0.3 * np.cos(theta), theta]
 rocks = ji.simulate(
-    block, ji.RestitutionMatrix(rocking_matrix(e)), corner, [0.0, 0, 0], 3.0, friction=5.0
+    block, ji.RestitutionMatrix(ji.rocking_matrix(e)), corner, [0.0, 0, 0], 3.0, friction=5.0
 )
 print(rocks)
 ji.plot_phase_portrait(rocks, 2, "Free rocking, angle")
@@ -104,7 +103,7 @@ def shake(acceleration):
     amplitude = -acceleration * 9.80665 / (4 * jnp.pi) ** 2
     base = ji.HarmonicBase(amplitude, 2.0, jnp.pi / 2, "horizontal")
     start = jnp.stack([amplitude, jnp.asarray(0.3), jnp.asarray(0.0)])
-    law = ji.RestitutionMatrix(rocking_matrix(e))
+    law = ji.RestitutionMatrix(ji.rocking_matrix(e))
     shaken = ji.block_system(0.2, 0.6, base=base)
     return ji.simulate(shaken, law, start, jnp.zeros(3), 2.0, friction=5.0)
 

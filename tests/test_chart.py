@@ -14,12 +14,12 @@ import pytest
 
 import jimpact as ji
 import jimpact.methods.base
-from jimpact.chart import work_precision
-from jimpact.chart_command import run
-from jimpact.chart_record import QUANTITIES
-from jimpact.chart_timing import in_turns
+from jimpact.charts.chart import work_precision
+from jimpact.charts.record import QUANTITIES
+from jimpact.charts.timing import in_turns
+from jimpact.commands.chart import run
 from jimpact.methods import METHODS, outcome, time_scale
-from jimpact.plot_chart import plot_work_precision
+from jimpact.pictures.chart import plot_work_precision
 from jimpact.status import STATUS
 
 pytestmark = pytest.mark.slow  # compiles every method
@@ -307,7 +307,7 @@ def test_command(capsys, tmp_path, monkeypatch, found):
         asked.append((*given, options))
         return found
 
-    monkeypatch.setattr("jimpact.chart_command.work_precision", same)
+    monkeypatch.setattr("jimpact.commands.chart.work_precision", same)
     out = tmp_path / "chart.svg"
     assert run(**OPTIONS, methods=None, out=out, json=True) == 0
     told = json.loads(capsys.readouterr().out)

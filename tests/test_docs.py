@@ -17,15 +17,16 @@ MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(jimpact.__path__, 
 LONG = {  # all rheologies, laws or methods are compiled
     f"jimpact.{name}"
     for name in (
-        "calibration",
-        "plot_rheology",
-        "validity",
-        "plot_validity",
-        "stability",
-        "advice",
-        "chart",
+        "compliance.calibration",
+        "pictures.rheology",
+        "advice.validity",
+        "pictures.validity",
+        "stability.mapping",
+        "advice.advising",
+        "charts.chart",
+        "motion.fitting_motion",
     )
-} | {"jimpact.motion.fitting_motion"}
+}
 OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 

@@ -8,9 +8,9 @@ import pytest
 from scipy.optimize import minimize
 
 import jimpact as ji
-from jimpact.fitting import fit
+from jimpact.fits.fitting import fit
+from jimpact.fits.matrix_fit import matrix_region
 from jimpact.laws.restitution_matrix import RestitutionMatrix
-from jimpact.matrix_fit import matrix_region
 from jimpact.numerics.copositive import margin
 from jimpact.numerics.tridiagonal import as_matrix
 from jimpact.scene import normalized_delassus

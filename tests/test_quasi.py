@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.quasi import (
+from jimpact.kinematics.quasi import (
     contact_power,
     from_quasi_velocities,
     kinetic_energy_split,

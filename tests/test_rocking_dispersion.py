@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.rocking import housner_restitution
-from jimpact.rocking_record import OUTCOMES, RockingDispersion
+from jimpact.rocking.ratios import housner_restitution
+from jimpact.rocking.record import OUTCOMES, RockingDispersion
 from jimpact.status import CODE
 
 MU = np.array([0.0, 0.3, 1.0])

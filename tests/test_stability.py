@@ -17,10 +17,10 @@ import pytest
 
 import jimpact as ji
 from jimpact.methods import METHODS
-from jimpact.stability import stability_map
-from jimpact.stability_causes import frequencies
-from jimpact.stability_points import chain_of, setting_of
-from jimpact.stability_runs import CLASSES
+from jimpact.stability.causes import frequencies
+from jimpact.stability.mapping import stability_map
+from jimpact.stability.points import chain_of, setting_of
+from jimpact.stability.runs import CLASSES
 from jimpact.status import STATUS
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
@@ -413,7 +413,7 @@ def test_map():
 
 @pytest.mark.slow
 def test_pictures(tmp_path):
-    from jimpact.stability_command import draw
+    from jimpact.commands.stability import draw
 
     written = draw(small_map(), tmp_path / "a.png")
     assert [path.name for path in written] == ["a.png", "a-rk4.png", "a-verlet.png"]

@@ -49,8 +49,7 @@ class Binary(Law):
     Towne and Hadlock, Am. J. Phys. 45 (1977) 255 (number of collisions).
 
     >>> import jimpact as ji
-    >>> from jimpact.laws.binary import Binary
-    >>> out = ji.impact(Binary([0.9, 0.8]), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0])
+    >>> out = ji.impact(ji.Binary([0.9, 0.8]), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0])
     >>> [round(float(v), 6) for v in out.velocity]
     [-0.266667, -0.050667, 0.456]
     """
@@ -139,8 +138,7 @@ class Binary(Law):
         have `N = ceil(pi / arccos z) - 1`.
 
         >>> import jimpact as ji
-        >>> from jimpact.laws.binary import Binary
-        >>> int(Binary(0.5).collisions(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]))
+        >>> int(ji.Binary(0.5).collisions(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]))
         3
         """
         law, scene, v = self._prepared(scene, velocity)
@@ -154,9 +152,8 @@ class Binary(Law):
         A host function, for looking at; it does not stop at a plastic limit.
 
         >>> import jimpact as ji
-        >>> from jimpact.laws.binary import Binary
         >>> balls = ji.chain([1.0, 1.0, 1.0])
-        >>> for contact, _, v in Binary(0.5).sequence(balls, [1.0, 0.0, 0.0]):
+        >>> for contact, _, v in ji.Binary(0.5).sequence(balls, [1.0, 0.0, 0.0]):
         ...     print(contact, v.round(6))
         0 [0.25 0.75 0.  ]
         1 [0.25   0.1875 0.5625]

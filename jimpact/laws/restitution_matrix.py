@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values, is_traced
+from jimpact.kinematics.quasi import check_independent, quasi_basis
 from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.laws.friction import check_friction, friction_fields, frictional_impulses
 from jimpact.numerics.linear import solve_symmetric
 from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
-from jimpact.quasi import check_independent, quasi_basis
 from jimpact.scene import (
     Scene,
     kinetic_norm,
@@ -29,9 +29,9 @@ class RestitutionMatrix(Law):
     Equation: with E (m, m): `qn+ = -E qn-`, `qn_j = gamma_j / |grad f_j|`, hence
     `pbar = -G^-1 (I + E) qn-`, `p_j = pbar_j / |grad f_j|`; tangential velocities are conserved.
     With E (m + k, m + k), k = n - m - b: `(qn+, qt+) = -E (qn-, qt-)` in the basis of
-    `jimpact.quasi.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the scene's
-    tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t where several do),
-    `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn = 0, E_tt = -I.)
+    `jimpact.kinematics.quasi.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
+    scene's tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t where
+    several do), `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn = 0, E_tt = -I.)
     Bilateral constraints distort G and n_q as in (6.35). With friction, and E (m, m),
     `qn+ = -E qn-` and `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
 
@@ -61,8 +61,7 @@ class RestitutionMatrix(Law):
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)-(6.57).
 
     >>> import jimpact as ji
-    >>> from jimpact.laws.restitution_matrix import RestitutionMatrix
-    >>> law = RestitutionMatrix([[0.1, 0.0], [0.8, 0.5]])  # the striker's impact moves ball 3
+    >>> law = ji.RestitutionMatrix([[0.1, 0.0], [0.8, 0.5]])  # the striker's impact moves ball 3
     >>> out = ji.impact(law, ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
     >>> [round(float(v), 6) for v in out.velocity]
     [0.0, 0.1, 0.9]

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
+from jimpact.fits.parameters import LOGARITHMIC, Parameters, bounds_of, entries, free_parameters
+from jimpact.fits.parameters import with_entries as law_with
+from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.laws.base import Law
 from jimpact.motion.record import MOTION_STATUS, Motion
 from jimpact.motion.simulation import simulate
 from jimpact.motion.system import System
 from jimpact.numerics.least_squares import Box, State, advance, begin
-from jimpact.parameters import LOGARITHMIC, Parameters, bounds_of, entries, free_parameters
-from jimpact.parameters import with_entries as law_with
-from jimpact.uncertainty import RANK_TOLERANCE, uncertainty
 
 Observe = Callable[[Motion], jax.Array]
 

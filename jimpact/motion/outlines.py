@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.bodies import Block, Dimer
+from jimpact.mechanisms.bodies import Block, Dimer
+from jimpact.mechanisms.pendulums import PendulumCradle
 from jimpact.motion.ready_systems import ColumnGaps
 from jimpact.motion.system import System
-from jimpact.pendulums import PendulumCradle
 
 # q (n,) -> curves (k, 2) of points (x, y) in metres
 Outlines = Callable[[np.ndarray], Sequence[np.ndarray]]

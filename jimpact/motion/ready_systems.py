@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.bodies import Block, Dimer
+from jimpact.mechanisms.bodies import Block, Dimer
+from jimpact.mechanisms.pendulums import PendulumCradle
 from jimpact.motion.system import STANDARD_GRAVITY, System, gravity
-from jimpact.pendulums import PendulumCradle
 
 
 def _checked(name: str, value: Any, *, zero: bool = False) -> jax.Array:

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.fits.parameters import DOMAIN
 from jimpact.laws.base import Law
-from jimpact.parameters import DOMAIN
 
 OVERLAP = (
     "a negative gap is an overlap, that is a precompressed contact: give LZB the energy stored in "
@@ -36,8 +36,7 @@ class Uniform(Distribution):
     """Independent and uniform between `low` and `high`, scalars or one per entry (m,).
 
     >>> import jimpact as ji
-    >>> from jimpact.sampling.distributions import Uniform
-    >>> Uniform(0.0, [1e-6, 2e-6])
+    >>> ji.Uniform(0.0, [1e-6, 2e-6])
     Uniform(low=0, high=[1e-06, 2e-06])
     """
 
@@ -75,8 +74,7 @@ class Normal(Distribution):
     larger mean and a smaller spread than `mean` and `std` say where these are comparable.
 
     >>> import jimpact as ji
-    >>> from jimpact.sampling.distributions import Normal
-    >>> Normal(1e-5, 1e-6)
+    >>> ji.Normal(1e-5, 1e-6)
     Normal(mean=1e-05, std=1e-06)
     """
 
@@ -142,8 +140,8 @@ class RandomLaw(eqx.Module):
             where the domain is bounded; a function `key -> Law` may do anything).
 
     >>> import jax, jimpact as ji
-    >>> from jimpact.sampling.distributions import RandomLaw, Uniform
-    >>> drawn = RandomLaw(ji.Newton(0.5), restitution=Uniform(0.8, 0.9))(jax.random.key(0))
+    >>> import jimpact as ji
+    >>> drawn = ji.RandomLaw(ji.Newton(0.5), restitution=ji.Uniform(0.8, 0.9))(jax.random.key(0))
     >>> 0.8 <= float(drawn.restitution) <= 0.9
     True
     """

@@ -11,9 +11,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
+from jimpact.fits.parameters import DOMAIN
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
-from jimpact.parameters import DOMAIN
 from jimpact.sampling.distributions import Distribution, Source, parameter_paths
 from jimpact.scene import Scene
 from jimpact.scenes import with_gaps

@@ -102,9 +102,8 @@ def gap_sensitivity(
         sampled: a run of `monte_carlo` with random gaps to compare with.
 
     >>> import jimpact as ji
-    >>> from jimpact.sampling.gap_sensitivities import gap_sensitivity
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25])
-    >>> gap_sensitivity(law, balls, [1.0, 0.0, -1.0], [1e-6, 2e-6]).velocity.round(6).tolist()
+    >>> ji.gap_sensitivity(law, balls, [1.0, 0.0, -1.0], [1e-6, 2e-6]).velocity.round(6).tolist()
     [-0.6, -0.16, 1.24]
     """
     at, v = as_float_array("gaps", gaps), as_float_array("velocity", velocity)

@@ -107,14 +107,12 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
         FileNotFoundError: no run there. ValueError: a damaged file, or chunks without samples.
 
     >>> import tempfile, jimpact as ji
-    >>> from jimpact.montecarlo import monte_carlo
-    >>> from jimpact.sampling.distributions import Uniform
-    >>> from jimpact.sampling.store import read_samples
+    >>> import jimpact as ji
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     options = {"samples": 30, "chunk": 20, "folder": folder, "keep_samples": True}
-    ...     speeds = Uniform([1.0, 0.0], [2.0, 0.0])
-    ...     _ = monte_carlo(ji.Newton(0.5), ji.chain([1.0, 1.0]), speeds, **options)
-    ...     [part["velocity"].shape for part in read_samples(folder)]
+    ...     speeds = ji.Uniform([1.0, 0.0], [2.0, 0.0])
+    ...     _ = ji.monte_carlo(ji.Newton(0.5), ji.chain([1.0, 1.0]), speeds, **options)
+    ...     [part["velocity"].shape for part in ji.read_samples(folder)]
     [(20, 2), (10, 2)]
     """
     folder = Path(folder)

@@ -1,0 +1,1 @@
+"""The simplest law that a scene needs."""

@@ -1,0 +1,137 @@
+"""`jimpact compare`: every law on one scene; a table, a picture."""
+
+import sys
+from dataclasses import replace
+from json import dumps
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from jimpact.commands.picture_path import picture_path
+from jimpact.comparison import (
+    Comparison,
+    compare,
+    dispersion_index,
+    energy_ratio,
+    registered_laws,
+    verdict,
+)
+from jimpact.fits.fitting import Fit
+from jimpact.study import Study, read_study
+
+PICTURE = "jimpact-compare.png"
+
+
+def run(
+    study: Path, velocity: tuple[float, ...] | None, shot: int, fit: bool, out: Path, json: bool
+) -> int:
+    """Run the command with the options of `CompareCommand`; 2 for bad input, told on stderr."""
+    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
+    try:
+        path = picture_path(out, PICTURE)
+        given = read_study(study)
+        before, measured = velocities(given, velocity, shot)
+        found = compare(given.scene, before, registered_laws(given.parameters))
+        fits = _fits(given) if fit else {}
+        _draw(found, measured, given.title, path)
+    except (ValueError, TypeError, OSError) as error:
+        print(f"jimpact compare: {error}", file=sys.stderr)
+        return 2
+    if json:
+        told: dict[str, Any] = {"title": given.title, "velocity": before.tolist()}
+        told |= {"laws": found.to_dict(), "fits": {n: f.to_dict() for n, f in fits.items()}}
+        print(dumps(told | {"picture": str(path)}, indent=2))
+    else:
+        _print(given, found, measured, fits, path)
+    return 0
+
+
+def velocities(
+    study: Study, velocity: tuple[float, ...] | None, shot: int
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Velocities before the impact, and after it where they were measured."""
+    if velocity is not None:
+        return np.asarray(velocity, float), None
+    data = study.experiments
+    if data is None:
+        raise ValueError("--velocity must be given, because the study has no [data].")
+    if not 1 <= shot <= len(data.shots):
+        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {shot}.")
+    return np.asarray(data.pre[shot - 1]), np.asarray(data.post[shot - 1])
+
+
+def _fits(study: Study) -> dict[str, Fit]:
+    """Every law with restitution coefficients at its best, one for all contacts and one each."""
+    start = {**study.parameters, "restitution": 0.9}
+    each = {**start, "restitution": np.full(study.scene.contacts, 0.9)}
+    fits = {}
+    for label, values in (("one e", start), ("e per contact", each)):
+        for name, law in registered_laws(values).items():
+            if hasattr(law, "restitution") and (label == "one e" or study.scene.contacts > 1):
+                own = replace(study, law=law, free={"restitution": True}, bounds={})
+                fits[f"{name}, {label}"] = own.run()
+    return fits
+
+
+def _draw(found: Comparison, measured: np.ndarray | None, title: str, path: Path) -> None:
+    from jimpact.pictures.comparison import plot_comparison  # matplotlib, late
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_comparison(found, measured, title).savefig(path, dpi=150)
+
+
+def _print(
+    study: Study,
+    found: Comparison,
+    measured: np.ndarray | None,
+    fits: dict[str, Fit],
+    path: Path,
+) -> None:
+    console = Console(highlight=False)
+    before = ", ".join(f"{v:g}" for v in found.velocity)
+    console.print(f"[bold]{escape(study.title)}[/bold]: v- = ({before}) m/s", soft_wrap=True)
+    console.print(_table(study, found, measured))
+    if fits:
+        console.print(_fit_table(fits))
+    told = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
+    console.print(f"Parameters: {escape(told)}.", soft_wrap=True)
+    console.print(
+        "Dispersion: 0 all energy in one body, 1 equal shares. Time: one compiled call, its "
+        "argument checks included.",
+        soft_wrap=True,
+    )
+    console.print(f"Picture: {escape(str(path))}", soft_wrap=True)
+
+
+def _table(study: Study, found: Comparison, measured: np.ndarray | None) -> Table:
+    table = Table("law", box=box.SIMPLE_HEAD, pad_edge=False)
+    for i in range(study.scene.size):
+        table.add_column(f"v{i + 1}+", justify="right")
+    for title in ("T+/T-", "dispersion", "µs"):
+        table.add_column(title, justify="right")
+    table.add_column("audit")
+    for name, entry in found.entries.items():
+        v = [f"{x:.4f}" for x in np.asarray(entry.outcome.velocity)]
+        numbers = [f"{entry.energy_ratio:.4f}", f"{entry.dispersion_index:.3f}"]
+        table.add_row(name, *v, *numbers, f"{1e6 * entry.time:.0f}", verdict(entry))
+    if measured is not None:
+        whole = bool(np.isfinite(measured).all())
+        v = [f"{x:.4f}" if np.isfinite(x) else "" for x in measured]
+        ratio = f"{float(energy_ratio(study.scene, found.velocity, measured)):.4f}" if whole else ""
+        spread = f"{float(dispersion_index(study.scene, measured)):.3f}" if whole else ""
+        table.add_row("measured", *v, ratio, spread, "", "", style="bold")
+    return table
+
+
+def _fit_table(fits: dict[str, Fit]) -> Table:
+    table = Table("fitted law", "restitution", box=box.SIMPLE_HEAD, pad_edge=False)
+    table.add_column("rms [m/s]", justify="right")
+    for name, fit in fits.items():
+        table.add_row(name, ", ".join(f"{x:.4f}" for x in fit.value), f"{fit.rms:.4f}")
+    return table

@@ -1,0 +1,85 @@
+"""`jimpact montecarlo`: random gaps, the statistics of the outcome, a picture."""
+
+import sys
+import warnings
+from json import dumps
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jimpact.commands.picture_path import picture_path
+from jimpact.executors import Executor, as_executor
+from jimpact.sampling.montecarlo import monte_carlo
+from jimpact.sampling.results import MonteCarlo
+from jimpact.study import Study, read_study
+
+PICTURE = "jimpact-montecarlo.png"
+INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
+
+
+def run(study: Path, out: Path, json: bool, **options: Any) -> int:
+    """Run the command with the options of `MonteCarloCommand`; told in one line on stderr: 2 for
+    bad input, 1 where nothing could be used, 130 after ctrl-C.
+    """
+    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
+    try:
+        path = picture_path(out, PICTURE)
+        given = read_study(study)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            found = monte_carlo(**_arguments(given, study, **options))
+        _draw(found, given.title, path)
+    except KeyboardInterrupt as stop:
+        print(f"jimpact montecarlo: {stop or 'stopped.'}", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        print(f"jimpact montecarlo: {error}", file=sys.stderr)
+        return 2
+    except RuntimeError as error:
+        print(f"jimpact montecarlo: {error}", file=sys.stderr)
+        return 1
+    for warning in caught:
+        print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
+    if json:
+        told = {"title": given.title} | found.to_dict() | {"picture": str(path)}
+        print(dumps(told, indent=2))
+    else:
+        print(f"{given.title}\n{found}\n\nPicture: {path}")
+    return 0
+
+
+def _arguments(
+    study: Study,
+    path: Path,
+    samples: int | None,
+    seed: int | None,
+    executor: str,
+    scheduler: str | None,
+    folder: Path | None,
+    keep_samples: bool,
+) -> dict[str, Any]:
+    """Of `monte_carlo`: those of the study, or in their place those of the command line."""
+    if not study.monte_carlo:
+        raise ValueError(f"the study '{path}' must have a [monte_carlo] table.")
+    given = {"samples": samples, "key": seed}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    own = {"folder": folder, "keep_samples": keep_samples}
+    return study.monte_carlo | chosen | own | {"executor": _executor(executor, scheduler)}
+
+
+def _executor(name: str, scheduler: str | None) -> Executor:
+    if scheduler is None:
+        return as_executor(name)
+    if name != "dask":
+        raise ValueError(f"--scheduler needs --executor dask, but it is {name}.")
+    from jimpact.executors.dask_cluster import DaskExecutor
+
+    return DaskExecutor(scheduler)
+
+
+def _draw(found: MonteCarlo, title: str, path: Path) -> None:
+    from jimpact.pictures.montecarlo import plot_monte_carlo  # matplotlib, late
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    plot_monte_carlo(found, title).savefig(path, dpi=150)

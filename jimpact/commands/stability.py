@@ -1,0 +1,70 @@
+"""`jimpact stability`: where methods of integration are right, and where they are not; pictures."""
+
+import sys
+from json import dumps
+from pathlib import Path
+
+import jax
+
+from jimpact.commands.picture_path import picture_path
+from jimpact.stability.mapping import stability_map
+from jimpact.stability.results import StabilityMap
+
+PICTURE = "jimpact-stability.png"
+QUICK_RESOLUTION, QUICK_STEPS = 7, 5_000
+FULL_RESOLUTION, FULL_STEPS, FULL_SAMPLES = 9, 5_000, 300
+INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
+
+
+def run(methods: tuple[str, ...] | None, full: bool, out: Path, json: bool) -> int:
+    """Run the command with the options of `StabilityCommand`; 2 for bad input, 1 where a method
+    broke down, 130 after ctrl-C, told on stderr.
+    """
+    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
+    try:
+        path = picture_path(out, PICTURE)
+        if full:
+            found = stability_map(
+                methods,
+                resolution=FULL_RESOLUTION,
+                slices="pairs",
+                samples=FULL_SAMPLES,
+                max_steps=FULL_STEPS,
+            )
+        else:
+            found = stability_map(methods, resolution=QUICK_RESOLUTION, max_steps=QUICK_STEPS)
+        pictures = draw(found, path)
+    except KeyboardInterrupt:
+        print("jimpact stability: stopped.", file=sys.stderr)
+        return INTERRUPTED
+    except (ValueError, TypeError, OSError) as error:
+        print(f"jimpact stability: {error}", file=sys.stderr)
+        return 2
+    except RuntimeError as error:  # of a method's own code
+        print(f"jimpact stability: {error}", file=sys.stderr)
+        return 1
+    told = [str(picture) for picture in pictures]
+    if json:
+        print(dumps(found.to_dict() | {"pictures": told}, indent=2))
+    else:
+        print(f"{found}\n\nPictures: {', '.join(told)}")
+    return 0
+
+
+def draw(found: StabilityMap, path: Path) -> list[Path]:
+    """Write the picture over single axes to `path`; where the map has pairs, one more a method."""
+    from jimpact.pictures.stability import (  # matplotlib, late
+        plot_stability_map,
+        plot_stability_pairs,
+    )
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    title = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
+    plot_stability_map(found, title).savefig(path, dpi=150)
+    written = [path]
+    if any(len(each.axes) == 2 for each in found.slices[found.methods[0]]):
+        for name in found.methods:
+            beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
+            plot_stability_pairs(found, name).savefig(beside, dpi=110)
+            written.append(beside)
+    return written

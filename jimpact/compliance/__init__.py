@@ -1,0 +1,1 @@
+"""Contact forces, their scales and parameters."""

@@ -1,0 +1,234 @@
+"""Force-indentation laws of a compliant contact, for `Compliant`.
+
+Each gives the force [N] at indentation x >= 0 [m] and indentation rate x' [m/s], contact by
+contact: parameters are scalars or (m,). Forces never pull: where a damper would, the contact is
+slack until the force returns.
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import as_float_array, check_values
+
+_SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
+_BISECTIONS = 50  # of them, to about 1e-13 decades
+
+
+class Force(eqx.Module):
+    """A contact force; `force` and, where it may slacken, `onset` (of the same sign, smooth)."""
+
+    slackens: ClassVar[bool] = False
+
+    def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """Force (m,) [N] at indentation x > 0 (m,) [m] and rate x' (m,) [m/s]."""
+        raise NotImplementedError
+
+    def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """Sign of the force."""
+        return self.force(x, rate)
+
+    def indentation_scale(self, energy: jax.Array) -> jax.Array:
+        """Indentation (m,) [m] at which about `energy` (m,) [J] is stored: x F(x, 0) = 2 energy."""
+
+        def excess(log_x: jax.Array) -> jax.Array:
+            x = 10.0**log_x
+            return x * self.force(x, jnp.zeros_like(x)) - 2 * energy
+
+        low, high = (jnp.full_like(energy, end) for end in _SEARCH)
+
+        def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            middle = 0.5 * (ends[0] + ends[1])
+            above = excess(middle) > 0
+            return jnp.where(above, ends[0], middle), jnp.where(above, middle, ends[1])
+
+        low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (low, high))
+        return jax.lax.stop_gradient(10.0 ** (0.5 * (low + high)))
+
+
+class Bistiffness(Force):
+    """Elastic-plastic contact of `LZB`: loading `k x^eta`, unloading steeper, to a residual x.
+
+    Equation: loading `F = k x^eta`; unloading from (x_c, F_c) along
+    `F = F_c ((x - x_r) / (x_c - x_r))^eta` with the residual indentation `x_r = (1 - e^2) x_c`,
+    where the surface then stays. The pair's restitution coefficient is e, whatever the speed.
+
+    Args:
+        stiffness: k > 0 [N / m^eta].
+        exponent: eta >= 1; a float (or a tuple) is static, an array is differentiable.
+        restitution: e in [0, 1].
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.1, (6.67).
+    """
+
+    stiffness: jax.Array
+    restitution: jax.Array
+    exponent_array: jax.Array | None
+    exponent_static: float | tuple[float, ...] | None = eqx.field(static=True)
+
+    def __init__(self, stiffness: Any, exponent: Any = 1.5, restitution: Any = 1.0):
+        self.stiffness = as_float_array("stiffness", stiffness)
+        self.restitution = as_float_array("restitution", restitution)
+        static = isinstance(exponent, (int, float, tuple))
+        self.exponent_static = (
+            None
+            if not static
+            else tuple(map(float, exponent))
+            if isinstance(exponent, tuple)
+            else float(exponent)
+        )
+        self.exponent_array = None if static else as_float_array("exponent", exponent)
+        check_values("stiffness", self.stiffness, low=0.0, open_low=True)
+        check_values("exponent", self.exponent, low=1.0)
+        check_values("restitution", self.restitution, low=0.0, high=1.0)
+
+    @property
+    def exponent(self) -> Any:
+        """The exponents as given: static float or tuple, or an array."""
+        return self.exponent_static if self.exponent_array is None else self.exponent_array
+
+    def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """Loading branch."""
+        positive = x > 0
+        power = jnp.where(positive, x, 1.0) ** jnp.asarray(self.exponent, x.dtype)
+        return self.stiffness * jnp.where(positive, power, 0.0)
+
+
+def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:
+    """Elastic contact `F = k x^eta`.
+
+    >>> import jimpact as ji
+    >>> import jax.numpy as jnp
+    >>> float(ji.PowerLaw(2.0, 1.5).force(jnp.array(4.0), jnp.array(0.0)))
+    16.0
+    """
+    return Bistiffness(stiffness, exponent)
+
+
+def Hertz(stiffness: Any) -> Bistiffness:
+    """Hertz contact `F = k x^1.5`, k in [N / m^1.5] (see `hertz_stiffness`)."""
+    return Bistiffness(stiffness, 1.5)
+
+
+def LinearSpring(stiffness: Any) -> Bistiffness:
+    """Linear spring `F = k x`."""
+    return Bistiffness(stiffness, 1.0)
+
+
+class KelvinVoigt(Force):
+    """Spring and damper in parallel: `F = k x + c x'`, cut at 0 (the damper would pull).
+
+    Args:
+        stiffness: k > 0 [N/m].
+        damping: c >= 0 [N s/m].
+
+    Its force jumps to c x' when the contact closes.
+    """
+
+    slackens: ClassVar[bool] = True
+
+    stiffness: jax.Array
+    damping: jax.Array
+
+    def __init__(self, stiffness: Any, damping: Any):
+        self.stiffness, self.damping = _checked(stiffness, damping)
+
+    def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """`k x + c x'`."""
+        return self.stiffness * x + self.damping * rate
+
+
+class HuntCrossley(Force):
+    """Damping that grows with the indentation: `F = k x^eta (1 + d x')`.
+
+    Args:
+        stiffness: k > 0 [N / m^eta].
+        damping: d >= 0 [s/m].
+        exponent: eta >= 1, a float.
+
+    Source: Hunt and Crossley (1975).
+    """
+
+    stiffness: jax.Array
+    damping: jax.Array
+    exponent: float = eqx.field(static=True)
+
+    def __init__(self, stiffness: Any, damping: Any, exponent: float = 1.5):
+        self.stiffness, self.damping = _checked(stiffness, damping)
+        check_values("exponent", exponent, low=1.0)
+        self.exponent = float(exponent)
+
+    def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """`k x^eta (1 + d x')`."""
+        positive = x > 0
+        power = jnp.where(positive, jnp.where(positive, x, 1.0) ** self.exponent, 0.0)
+        return self.stiffness * power * (1 + self.damping * rate)
+
+
+class KuwabaraKono(Force):
+    """Viscoelastic Hertz spheres: `F = k (x^1.5 + 1.5 A sqrt(x) x')`, cut at 0.
+
+    Args:
+        stiffness: k > 0 [N / m^1.5].
+        damping: A >= 0 [s], the dissipative time.
+
+    Source: Kuwabara and Kono (1987); Brilliantov, Spahn, Hertzsch and Poeschel (1996).
+    """
+
+    slackens: ClassVar[bool] = True
+
+    stiffness: jax.Array
+    damping: jax.Array
+
+    def __init__(self, stiffness: Any, damping: Any):
+        self.stiffness, self.damping = _checked(stiffness, damping)
+
+    def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """`k sqrt(x) (x + 1.5 A x')`."""
+        positive = x > 0
+        root = jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+        return self.stiffness * root * (x + 1.5 * self.damping * rate)
+
+    def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """`k (x + 1.5 A x') sqrt(x_1)`: without the root, whose slope at 0 is infinite."""
+        return self.stiffness * (x + 1.5 * self.damping * rate)
+
+
+class UserForce(Force):
+    """A force of your own: `function(x, rate, parameters)`, for arrays (m,); cut at 0.
+
+    Args:
+        function: smooth for x > 0; it must push at x > 0, rate = 0.
+        parameters: any pytree; its arrays are differentiable.
+
+    >>> import jimpact as ji
+    >>> soft = ji.UserForce(lambda x, rate, k: k * x * (1 + x), 3.0)
+    >>> out = ji.impact(ji.Compliant(soft), ji.chain([1.0, 1.0]), [1.0, 0.0])
+    >>> [round(float(v), 6) for v in out.velocity]
+    [0.0, 1.0]
+    """
+
+    slackens: ClassVar[bool] = True
+
+    function: Callable[[jax.Array, jax.Array, Any], jax.Array] = eqx.field(static=True)
+    parameters: Any
+
+    def __init__(self, function: Callable[..., jax.Array], parameters: Any = None):
+        if not callable(function):
+            raise TypeError(f"Argument `function` must be callable, but has value {function!r}.")
+        self.function = function
+        self.parameters = jax.tree.map(lambda leaf: as_float_array("parameters", leaf), parameters)
+
+    def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """`function(x, rate, parameters)`."""
+        return self.function(x, rate, self.parameters)
+
+
+def _checked(stiffness: Any, damping: Any) -> tuple[jax.Array, jax.Array]:
+    k, c = as_float_array("stiffness", stiffness), as_float_array("damping", damping)
+    check_values("stiffness", k, low=0.0, open_low=True)
+    check_values("damping", c, low=0.0)
+    return k, c

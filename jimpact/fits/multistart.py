@@ -1,0 +1,216 @@
+"""Many starts at once, and the distinct minima they end in."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.fits.parameters import Parameters, entries
+from jimpact.fits.problem import Problem, advance_all, begin_all, from_scaled, to_scaled
+from jimpact.numerics.least_squares import Method, State
+from jimpact.progress import progress_bar
+
+LANES = 4  # starts that run together; those that are done make room
+PASSES = 10  # between two looks at the progress
+# A Levenberg-Marquardt start that gains less than this share in so many passes sits on a kink of
+# the law (a change in the sequence of contacts), where steps zigzag: it is given up.
+SLOW = 1e-3
+# One whose sum of squares is this far above the best must gain this share to go on.
+BEHIND, SLOW_BEHIND = 10.0, 0.1
+
+# Random starts: a stiffness within this factor of the user's, a parameter without two bounds
+# within this many natural scales of the user's.
+START_FACTOR = 20.0
+START_SCALES = 2.0
+# Random coefficients of restitution start above this: below, contacts of a chain re-close many
+# times, which takes ten times as long and hardly occurs in hard bodies. (Fits do go there.)
+START_RESTITUTION = 0.3
+
+# The law is only piecewise smooth, so that the sum of squares has side minima close to a minimum.
+# Starts around the best find lower ones; they repeat while they gain.
+ROUNDS = 5
+NEAR_SPREAD = 2.0  # standard errors
+NEAR_RCOND = 1e-10  # directions the data cannot see are not searched
+
+# Relative sums of squares, and values in natural scales, closer than this are one minimum: a
+# hundred times what solvers leave, and far below what a measurement resolves.
+SAME_COST = 1e-6
+SAME_VALUE = 1e-3
+# Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
+# tolerance of the impact.
+EXACT = {"float64": 1e-14, "float32": 1e-8}
+# A start has converged when a full Gauss-Newton step would lower the sum of squares by less than
+# this share: it is then a thousandth of a standard error away from the minimum.
+CONVERGED = 1e-6
+
+
+class Search(NamedTuple):
+    """The best end point (weighted as in `Problem`), and all distinct minima, best first."""
+
+    value: np.ndarray  # of the parameters (P,)
+    entries: np.ndarray  # of all entries (Q,) of the named fields
+    scale: np.ndarray  # natural size of a change of each parameter, at the value found
+    log: np.ndarray  # whether it is fitted in its logarithm
+    jacobian: np.ndarray  # (K n, P), of the scaled parameters
+    velocity: np.ndarray
+    status: np.ndarray
+    converged: bool
+    at_bound: np.ndarray
+    steps: int
+    minima: list[tuple[float, np.ndarray, int]]  # |r|^2, values, how many starts
+    lost: int  # starts that did not converge
+
+
+def search(
+    problem: Problem,
+    parameters: Parameters,
+    method: Method,
+    starts: int,
+    seed: int,
+    max_steps: int,
+    progress: bool | None,
+) -> Search:
+    """Run all starts to their ends, then a few near the best as long as they improve it."""
+    rng = np.random.default_rng(seed)
+    points = _start_points(problem, parameters, starts, rng)
+    with progress_bar(starts, max_steps, progress) as show:
+        states = _run(problem, points, method, max_steps, show)
+        for _ in range(ROUNDS if starts > 1 else 0):
+            best = int(np.nanargmin(states.cost))
+            least = float(states.cost[best])
+            if 2 * least <= EXACT[str(states.y.dtype)]:
+                break
+            points = _near(problem, states, best, min(starts, LANES), rng)
+            more = _run(problem, points, method, max_steps, show)
+            states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
+            if np.nanmin(more.cost) > (1 - SLOW) * least:
+                break
+    return _found(problem, parameters, states)
+
+
+def _run(
+    problem: Problem,
+    points: np.ndarray,
+    method: Method,
+    max_steps: int,
+    show: Callable[[int, int], None],
+) -> State:
+    """Solve from points (S, Q), a few at a time; the states come back to the host."""
+    starts = jnp.asarray(points, problem.pre.dtype)
+    states = jax.device_get(begin_all(problem, starts, method, max_steps))
+    active, lanes = list(range(len(points))), min(len(points), LANES)
+    while active:
+        before = states.cost.copy()
+        for batch in (active[i : i + lanes] for i in range(0, len(active), lanes)):
+            rows = [batch[min(i, len(batch) - 1)] for i in range(lanes)]
+            some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], states)
+            some = jax.device_get(advance_all(problem, some, method, max_steps, PASSES))
+            states = jax.tree.map(partial(_with_rows, rows), states, some)
+            show(len(points) - len(active), int(states.steps.max()))
+        ended = states.done | (states.steps >= max_steps)
+        if method == "levenberg-marquardt":
+            share = np.where(states.cost > BEHIND * np.nanmin(states.cost), SLOW_BEHIND, SLOW)
+            ended |= (before - states.cost <= share * before) & np.isfinite(before)
+        active = [i for i in active if not ended[i]]
+    return states
+
+
+def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray:
+    leaf = np.array(leaf)
+    leaf[rows] = new
+    return leaf
+
+
+def _found(problem: Problem, parameters: Parameters, states: State) -> Search:
+    """Pick the best end (the states are on the host)."""
+    count, first = len(parameters.names), parameters.first
+    scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
+    y = np.asarray(states.y)[:, :count]
+    squares = 2 * np.asarray(states.cost, float)
+    values = from_scaled(np.asarray(y, float), scale, log)
+    exact = EXACT[str(y.dtype)]
+    converged = (2 * np.asarray(states.gain) <= CONVERGED * squares) | (squares <= exact)
+    groups = _groups(squares, y, converged, exact)
+    best = groups[0][0]
+    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
+    # starts that did not converge have no minimum to tell, unless they are the best there is
+    ends = [[i for i in g if converged[i] or i == best] for g in groups]
+    return Search(
+        value=values[best],
+        entries=_all_entries(problem, np.asarray(states.y)[best]),
+        scale=np.where(log, values[best], scale),
+        log=log,
+        jacobian=np.asarray(states.jacobian[best][:, :count], float),
+        velocity=np.asarray(states.kept[0][best], float),
+        status=states.kept[1][best],
+        converged=bool(converged[best]),
+        at_bound=(y[best] <= low) | (y[best] >= high),
+        steps=int(np.max(states.steps)),
+        minima=[(float(squares[g[0]]), values[g[0]], len(g)) for g in ends if g],
+        lost=len(y) - sum(len(g) for g in ends),
+    )
+
+
+def _all_entries(problem: Problem, y: np.ndarray) -> np.ndarray:
+    scaled = np.asarray(problem.offset, float) + np.asarray(problem.mix, float) @ y
+    return from_scaled(scaled, np.asarray(problem.scale, float), np.asarray(problem.log))
+
+
+def _groups(
+    squares: np.ndarray, y: np.ndarray, converged: np.ndarray, exact: float
+) -> list[list[int]]:
+    """Starts that ended in the same minimum, best minimum first.
+
+    Of equally good ends a converged one comes first, then the earliest start: the first start is
+    the user's own.
+    """
+    groups: list[list[int]] = []
+    least = np.nanmin(squares)
+    equal = squares <= least + SAME_COST * least + exact
+    for i in np.lexsort((np.arange(len(y)), ~converged, np.where(equal, least, squares))):
+        for group in groups:
+            first = group[0]
+            close = abs(squares[i] - squares[first]) <= SAME_COST * squares[first] + exact
+            if close and np.abs(y[i] - y[first]).max() < SAME_VALUE:
+                group.append(int(i))
+                break
+        else:
+            groups.append([int(i)])
+    return groups
+
+
+def _near(
+    problem: Problem, states: State, best: int, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
+    jacobian = np.asarray(states.jacobian[best], float)
+    measured = int(np.sum(np.asarray(problem.weight) > 0))
+    variance = 2 * float(states.cost[best]) / measured
+    spread = np.sqrt(variance * np.diag(np.linalg.pinv(jacobian.T @ jacobian, rcond=NEAR_RCOND)))
+    y = np.asarray(states.y[best], float)
+    points = y + NEAR_SPREAD * spread * rng.normal(size=(count, len(y)))
+    return np.clip(points, np.asarray(problem.low), np.asarray(problem.high))
+
+
+def _start_points(
+    problem: Problem, parameters: Parameters, starts: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
+    first = parameters.first
+    values = entries(problem.law, parameters.fields)[first]
+    scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
+    own = to_scaled(values, scale, log)
+    low, high = (np.array(end, float)[: len(own)] for end in (problem.low, problem.high))
+    reach = np.where(log, np.log(START_FACTOR), START_SCALES)
+    low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
+    elastic = [parameters.entry_fields[i] == "restitution" for i in first]
+    low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
+    points = np.zeros((starts, len(problem.low)))
+    share = rng.random((starts, len(own)))
+    points[:, : len(own)] = low + (high - low) * share
+    points[0, : len(own)] = own
+    return points

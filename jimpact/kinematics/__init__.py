@@ -1,0 +1,1 @@
+"""The generalized kinematic law: its quasi-velocities, matrices and bounds."""

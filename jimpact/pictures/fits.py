@@ -1,0 +1,103 @@
+"""Pictures: measured against fitted velocities, with residuals."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from jimpact.fits.fitting import Fit
+
+# Okabe and Ito's palette without yellow: told apart with every common colour blindness.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+_GREY = "#777777"
+_SPREAD = 0.6  # width that the bodies of one shot take, of the distance between shots
+_LABELLED = 16  # shots up to which every one gets its label
+
+
+def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
+    """Velocities after every shot, measured and fitted, above their residuals.
+
+    Error bars are sigma where the data state it, else the estimated noise. `others` are further
+    fits of the same data, by label, drawn in grey.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.3, 0.7])
+    >>> figure = ji.plot_fit(ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data))
+    >>> len(figure.axes)
+    2
+    """
+    shots, bodies = fit.predicted.shape
+    dodge = (np.arange(bodies) - (bodies - 1) / 2) * _SPREAD / bodies
+    x = np.arange(shots)[:, None] + dodge[None, :]
+    size = float(np.clip(220 / (shots * bodies), 3, 8))
+    figure = Figure(figsize=(float(np.clip(4 + 0.35 * shots * bodies, 6.4, 12)), 6.0))
+    figure.set_layout_engine("constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
+    error = _error_bars(fit)
+    measured = np.asarray(fit.experiments.post, float)
+    for i in range(bodies):
+        colour = COLOURS[i % len(COLOURS)]
+        bars = None if error is None else error[:, i]
+        style: dict[str, Any] = {"fmt": "o", "mfc": "none", "color": colour, "ms": size, "lw": 1}
+        top.errorbar(x[:, i], measured[:, i], bars, **style)
+        top.plot(x[:, i], fit.predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
+        bottom.errorbar(x[:, i], fit.residual[:, i], bars, **style)
+    for j, other in enumerate((others or {}).values()):
+        top.plot(x, other.predicted, "x+*"[j % 3], color=_GREY, ms=0.8 * size)
+    top.set_ylabel("velocity after the impact [m/s]")
+    bottom.set_ylabel("measured − fitted [m/s]")
+    bottom.axhline(0, color=_GREY, lw=0.8)
+    _shot_axis(bottom, fit, dodge)
+    _legend(figure, fit, others or {}, error is not None)
+    top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g} m/s", loc="left")
+    for axes in (top, bottom):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", lw=0.4, alpha=0.5)
+    return figure
+
+
+def _error_bars(fit: Fit) -> np.ndarray | None:
+    if fit.experiments.sigma is not None:
+        return np.asarray(fit.experiments.sigma, float)
+    return np.full(fit.predicted.shape, fit.noise) if np.isfinite(fit.noise) else None
+
+
+def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
+    """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
+    labels = fit.experiments.shots
+    if len(labels) == 1:
+        axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
+        axes.set_xlabel("body")
+        axes.set_xlim(-_SPREAD * 0.5, _SPREAD * 0.5)
+        return
+    ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
+    longest = max(len(labels[k]) for k in ticks)
+    axes.set_xticks(list(ticks), [labels[k] for k in ticks], rotation=90 if longest > 4 else 0)
+    axes.set_xlabel("shot")
+    axes.set_xlim(-0.6, len(labels) - 0.4)
+
+
+def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
+    bars = "" if not has_bars else ", ± sigma" if fit.experiments.sigma is not None else ", ± noise"
+    plain: dict[str, Any] = {"ls": "none", "color": "black"}
+    handles = [
+        Line2D([], [], marker="o", mfc="none", label=f"measured{bars}", **plain),
+        Line2D([], [], marker="_", ms=14, mew=2, label=f"{type(fit.law).__name__} fitted", **plain),
+    ]
+    for j, label in enumerate(others):
+        handles.append(Line2D([], [], marker="x+*"[j % 3], ls="none", color=_GREY, label=label))
+    if fit.predicted.shape[0] > 1:  # of a single shot the axis names the bodies
+        for i in range(min(fit.predicted.shape[1], len(COLOURS))):
+            handles.append(
+                Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
+            )
+    figure.legend(
+        handles=handles,
+        loc="outside lower center",
+        frameon=False,
+        fontsize="small",
+        ncols=min(len(handles), 5),
+    )
