@@ -20,8 +20,9 @@ __version__ = "0.1.0"
 # module -> public names, imported on first use so that `jimpact --help` stays fast. No module
 # here is named like a public name: importing it would put the module in the function's place.
 _WHERE = {
-    "scene": (
-        "Scene delassus_matrix gap_velocity kinetic_angles kinetic_energy momentum "
+    "scene": "Scene",
+    "contact_space": (
+        "delassus_matrix gap_velocity kinetic_angles kinetic_energy momentum "
         "normalized_delassus normalized_gap_velocity velocity_change"
     ),
     "scenes": "chain column scene_from_gaps",
@@ -37,7 +38,7 @@ _WHERE = {
     "laws.poisson": "Poisson",
     "laws.binary": "Binary",
     "laws.compliant": "Compliant",
-    "compliance.rheology": (
+    "rheology": (
         "Bistiffness Force Hertz HuntCrossley KelvinVoigt KuwabaraKono LinearSpring PowerLaw "
         "UserForce"
     ),
@@ -47,7 +48,7 @@ _WHERE = {
     "compliance.linear_chain": "bilateral_motion newby_ratio",
     "compliance.turning": "TurningImpact block_gaps turning_impact",
     "pictures.rheology": "plot_forces plot_rheologies",
-    "sampling.montecarlo": "monte_carlo",
+    "montecarlo": "monte_carlo",
     "sampling.results": "MonteCarlo",
     "pictures.montecarlo": "plot_monte_carlo",
     "sampling.gap_sensitivities": "GapSensitivity gap_sensitivity",
@@ -70,7 +71,7 @@ _WHERE = {
     "kinematics.admissible": "AdmissibleSet admissible_set",
     "pictures.admissible": "plot_admissible_set",
     "numerics.copositive": "Copositivity copositivity",
-    "kinematics.quasi": (
+    "quasi": (
         "ContactPower contact_power from_quasi_velocities kinetic_energy_split quasi_basis "
         "to_quasi_velocities"
     ),

@@ -3,6 +3,7 @@
 import operator
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -90,3 +91,10 @@ def check_per_contact(name: str, value: Any, contacts: int) -> None:
             f"Argument `{name}` must be a scalar or have shape ({contacts},), one value per "
             f"contact, but has shape {tuple(np.shape(value))}."
         )
+
+
+def in_common_dtype(*trees: Any) -> Any:
+    """All of them in the widest floating type among them (Python numbers follow the arrays)."""
+    leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
+    dtype = jnp.result_type(*leaves)
+    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees)

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import is_traced
+from jimpact.contact_space import solve_mass
 from jimpact.laws.base import Law
-from jimpact.scene import Scene, solve_mass
+from jimpact.scene import Scene
 from jimpact.status import CODE
 
 # Groups of unequal size are filled up to the largest of them: compiling one program more takes

@@ -11,17 +11,23 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.consistency import Audit, audit
+from jimpact.contact_space import kinetic_energy, momentum
 from jimpact.impacts import Impact, impact
 from jimpact.laws import REGISTRY, Row
 from jimpact.laws.base import Law
-from jimpact.scene import Scene, kinetic_energy, momentum
+from jimpact.scene import Scene
 from jimpact.status import STATUS
 
 _REPEATS = 20  # of the timing; its median is told
 
 
 def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:
-    """Kinetic-energy ratio `T+ / T-`; 1 conserves, NaN where nothing moves before."""
+    """Kinetic-energy ratio `T+ / T-`; 1 conserves, NaN where nothing moves before.
+
+    >>> import jimpact as ji
+    >>> float(ji.energy_ratio(ji.chain([1.0, 1.0]), [1.0, 0.0], [0.5, 0.5]))
+    0.5
+    """
     return kinetic_energy(scene, after) / kinetic_energy(scene, before)
 
 

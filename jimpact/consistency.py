@@ -8,16 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape
-from jimpact.impacts import Impact, gap_velocity_rounding, sign_tolerance
-from jimpact.numerics.tridiagonal import diagonal
-from jimpact.scene import (
-    Scene,
+from jimpact.contact_space import (
     delassus_matrix,
     gap_velocity,
     kinetic_energy,
     momentum,
 )
-from jimpact.status import STATUS
+from jimpact.impacts import Impact, gap_velocity_rounding
+from jimpact.numerics.tridiagonal import diagonal
+from jimpact.scene import Scene
+from jimpact.status import STATUS, sign_tolerance
 
 
 class Audit(eqx.Module):

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values
+from jimpact.contact_space import dense_mass
 from jimpact.csv_shots import read_table
-from jimpact.scene import Scene, dense_mass
+from jimpact.scene import Scene
 
 
 class Experiments(eqx.Module):

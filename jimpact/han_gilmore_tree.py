@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.scene import Scene, dense_mass
+from jimpact.contact_space import dense_mass
+from jimpact.scene import Scene
 
 # Relative to the largest normalized approach velocity at the start: gap velocities and impulses
 # below are zero, velocities that differ by less are the same.

@@ -6,9 +6,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.compliance.rheology import Bistiffness
-from jimpact.impacts import in_common_dtype, without_open_contacts
+from jimpact._checks import as_float_array, check_shape, check_values, in_common_dtype, is_traced
+from jimpact.contact_space import (
+    delassus_matrix,
+    gap_velocity,
+    velocity_change,
+    without_open_contacts,
+)
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB, default_rtol
@@ -25,7 +29,8 @@ from jimpact.numerics.dimensionless import (
 from jimpact.numerics.flow import START, TIME, Flow, State, factor, plus_one, power, scales
 from jimpact.numerics.steps import Carry, Control, explicit_step
 from jimpact.numerics.tridiagonal import Tridiagonal
-from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
+from jimpact.rheology import Bistiffness
+from jimpact.scene import Scene
 
 TRACED_RECORDS = 512  # passes kept when the number needed cannot be looked up (inside jit, grad)
 

@@ -7,33 +7,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, check_shape, check_values, in_common_dtype, is_traced
 from jimpact.blocks import Groups, coupled_groups, solve_groups
-from jimpact.laws.base import Law, no_tangential_impulse
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
-from jimpact.scene import (
-    Scene,
+from jimpact.contact_space import (
     delassus_matrix,
     gap_velocity,
     momentum,
     solve_mass,
     velocity_change,
+    without_open_contacts,
 )
-from jimpact.status import CODE, STATUS
+from jimpact.laws.base import Law, no_tangential_impulse
+from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
+from jimpact.scene import Scene
+from jimpact.status import CODE, STATUS, sign_tolerance
 
-# A sign is violated only beyond these multiples of the impact's own scale: rounding and the
-# solver's tolerance stay below (float64: 1e-7; float32: about 2e-3).
-SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
 ROUNDINGS = 4  # of the largest terms that cancel: each is rounded a few times
 
 
-def sign_tolerance(dtype: jnp.dtype) -> float:
-    """Beyond which part of the impact's size a sign is violated, in this precision."""
-    return SIGN_TOLERANCE.get(str(dtype), SIGN_TOLERANCE["float32"])
-
-
 class Impact(eqx.Module):
-    """Outcome of an impact: v+ [m/s], p [N s], T+ - T- [J], initially stored energy [J], status."""
+    """Outcome of an impact; under `vmap` every field has the axes of the batch first.
+
+    `velocity` v+ (n,) [m/s]; `impulse` p (m,) [N s]; `tangential_impulse` (t,), t = 0 without
+    friction [N s]; `energy_change` T+ - T- () [J]; `initial_energy` stored before () [J]; `status`
+    () int32, a row of `jimpact.STATUS`, 0 = ok.
+    """
 
     velocity: jax.Array
     impulse: jax.Array
@@ -95,29 +93,6 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
             "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but "
             f"constraint {j + 1} has the rate {(h.T @ v)[j]:g}."
         )
-
-
-def in_common_dtype(*trees: Any) -> Any:
-    """All of them in the widest floating type among them (Python numbers follow the arrays)."""
-    leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
-    dtype = jnp.result_type(*leaves)
-    return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees)
-
-
-def without_open_contacts(
-    scene: Scene, delassus: Symmetric, gamma: jax.Array
-) -> tuple[Symmetric, jax.Array]:
-    """W with the rows of open contacts decoupled, and gamma with zeros there (so p_j = 0)."""
-    if scene.gaps is None:
-        return delassus, gamma
-    closed = scene.closed
-    gamma = jnp.where(closed, gamma, 0.0)
-    if isinstance(delassus, Tridiagonal):
-        both = closed[:-1] & closed[1:]
-        off = jnp.where(both, delassus.off_diagonal, 0.0)
-        return Tridiagonal(delassus.diagonal, off, delassus.regular), gamma
-    keep = (closed[:, None] & closed[None, :]) | jnp.eye(closed.shape[0], dtype=bool)
-    return jnp.where(keep, delassus, 0.0), gamma
 
 
 @eqx.filter_jit

@@ -1,4 +1,4 @@
-"""Scene and contact-space algebra: all that an impact needs to know of a mechanical system.
+"""Scenes: all that an impact needs to know of a mechanical system at one instant.
 
 # notation, used in every file:
 #   n, m             velocity coordinates, contacts
@@ -11,7 +11,6 @@
 #   T = v^T M v / 2  kinetic energy                              [J]
 """
 
-import operator
 from typing import Any
 
 import equinox as eqx
@@ -20,9 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
 
-_CONSTRAINTS = operator.attrgetter("constraints")
 _SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of M that rounding may cause in float32
 
 
@@ -188,131 +185,3 @@ def check_mass(mass: jax.Array) -> None:
             "Argument `mass` must be positive definite, "
             f"but its smallest eigenvalue is {smallest:.3g}."
         )
-
-
-def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
-    """Gap velocities `gamma = N^T v` (m,) [m/s]; negative on approach."""
-    v = as_float_array("velocity", velocity)
-    if scene.walls is None:
-        return scene.normals.T @ v
-    left, right = scene.walls
-    return jnp.diff(jnp.pad(v, (int(left), int(right))))
-
-
-def momentum(scene: Scene, velocity: Any) -> jax.Array:
-    """Generalized momenta `M v` (n,); for a chain without walls their sum is conserved."""
-    v = as_float_array("velocity", velocity)
-    return scene.mass * v if scene.mass.ndim == 1 else scene.mass @ v
-
-
-def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
-    """Kinetic energy `T = v^T M v / 2` [J]."""
-    v = as_float_array("velocity", velocity)
-    return 0.5 * v @ momentum(scene, v)
-
-
-def dense_mass(scene: Scene) -> np.ndarray:
-    """M (n, n) on the host, in double precision."""
-    mass = np.asarray(scene.mass, float)
-    return np.diag(mass) if mass.ndim == 1 else mass
-
-
-def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
-    """`M^-1 right`, with the reactions of bilateral constraints where the scene has some."""
-    if scene.mass.ndim == 1:
-        shape = (-1,) + (1,) * (right.ndim - 1)
-        free = right / scene.mass.reshape(shape)
-    else:
-        free = jax.scipy.linalg.solve(scene.mass, right, assume_a="pos")
-    if scene.constraints is None:
-        return free
-    h = scene.constraints
-    m_inv_h = solve_mass(without_constraints(scene), h)
-    return free - m_inv_h @ jnp.linalg.solve(h.T @ m_inv_h, h.T @ free)
-
-
-def velocity_change(
-    scene: Scene, impulse: jax.Array, tangential: jax.Array | None = None
-) -> jax.Array:
-    """`v+ - v- = M^-1 (N p + H p_t)` (n,) [m/s] of contact impulses [N s]; p_t None: 0."""
-    if scene.walls is None:
-        push = scene.normals @ impulse
-        if scene.tangents is not None and tangential is not None:
-            push = push + scene.tangents @ tangential
-        return solve_mass(scene, push)
-    left, right = scene.walls
-    padded = jnp.pad(impulse, (int(not left), int(not right)))
-    return -jnp.diff(padded) / scene.mass
-
-
-def delassus_matrix(scene: Scene) -> Symmetric:
-    """`W = N^T M^-1 N` [1/kg]: (m, m), or `Tridiagonal` for a chain.
-
-    Source: Brogliato (2016), (6.35) where bilateral constraints are present.
-
-    >>> import jimpact as ji
-    >>> ji.delassus_matrix(ji.chain([1.0, 2.0, 2.0])).diagonal.tolist()
-    [1.5, 1.0]
-    """
-    if scene.walls is None:
-        return scene.normals.T @ solve_mass(scene, scene.normals)
-    left, right = scene.walls
-    inverse = 1 / scene.mass
-    padded = jnp.pad(inverse, (int(left), int(right)))
-    shared = inverse[int(not left) : scene.size - int(not right)]
-    return Tridiagonal(padded[:-1] + padded[1:], -shared, scene.contacts <= scene.size)
-
-
-def tangential_delassus(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, ...]:
-    """`N^T M^-1 H` (m, t), `H^T M^-1 H` (t, t) and slip velocities `H^T v` (t,).
-
-    Rows of open contacts are 0, but for the diagonal.
-    """
-    assert scene.tangents is not None
-    m, t = scene.contacts, scene.tangents.shape[1]
-    moved = solve_mass(scene, scene.tangents)
-    across, along = scene.normals.T @ moved, scene.tangents.T @ moved
-    if scene.gaps is not None:
-        rows = jnp.repeat(scene.closed, t // m)
-        across = jnp.where(scene.closed[:, None] & rows[None, :], across, 0.0)
-        keep = (rows[:, None] & rows[None, :]) | jnp.eye(t, dtype=bool)
-        along = jnp.where(keep, along, 0.0)
-    return across, along, scene.tangents.T @ velocity
-
-
-def without_constraints(scene: Scene) -> Scene:
-    """The scene as if it had no bilateral constraints."""
-    return scene if scene.constraints is None else eqx.tree_at(_CONSTRAINTS, scene, None)
-
-
-def kinetic_norm(scene: Scene) -> jax.Array:
-    """`|grad f_j|` in the metric of M^-1 (m,), the square roots of the free W_jj."""
-    return jnp.sqrt(diagonal(delassus_matrix(without_constraints(scene))))
-
-
-def normalized_delassus(scene: Scene) -> Symmetric:
-    """`G = W` between unit normals: unit diagonal, `G_ij = -cos(theta_ij)`.
-
-    Bilateral constraints distort it, its diagonal included: Brogliato (2016), (6.35).
-    """
-    return scaled(delassus_matrix(scene), 1 / kinetic_norm(scene))
-
-
-def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
-    """`gamma_j / |grad f_j|` (m,), the normal quasi-velocities of Brogliato (2016), (6.24)."""
-    return gap_velocity(scene, velocity) / kinetic_norm(scene)
-
-
-def kinetic_angles(scene: Scene) -> jax.Array:
-    """Angles `theta_ij = pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
-
-    Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
-    Source: Brogliato (2016), (6.66).
-
-    >>> import jimpact as ji
-    >>> float(ji.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))
-    1.1071
-    """
-    w = delassus_matrix(scene)
-    cosine = as_matrix(scaled(w, 1 / jnp.sqrt(diagonal(w))))
-    return jnp.pi - jnp.arccos(jnp.clip(cosine, -1.0, 1.0))

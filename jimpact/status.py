@@ -1,6 +1,6 @@
 """Status codes of an impact: set on the device, worded and raised on the host."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 class Status(NamedTuple):
@@ -27,3 +27,12 @@ STATUS = (
 )
 
 CODE = {row.name: code for code, row in enumerate(STATUS)}
+
+# A sign is violated only beyond these multiples of the impact's own scale: rounding and the
+# solver's tolerance stay below (float64: 1e-7; float32: about 2e-3).
+SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
+
+
+def sign_tolerance(dtype: Any) -> float:
+    """Beyond which part of the impact's size a sign is violated, in this precision."""
+    return SIGN_TOLERANCE.get(str(dtype), SIGN_TOLERANCE["float32"])

@@ -11,10 +11,10 @@ from reference import chain_matrices
 from scipy.optimize import brentq
 
 from jimpact.compliance.linear_chain import bilateral_motion, newby_ratio
-from jimpact.compliance.rheology import Bistiffness, Hertz, LinearSpring, PowerLaw
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB
+from jimpact.rheology import Bistiffness, Hertz, LinearSpring, PowerLaw
 from jimpact.scene import Scene
 from jimpact.scenes import chain
 from jimpact.status import CODE

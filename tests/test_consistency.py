@@ -6,19 +6,24 @@ import numpy as np
 import pytest
 
 import jimpact as ji
+from jimpact.contact_space import (
+    kinetic_energy,
+    kinetic_norm,
+    normalized_delassus,
+    velocity_change,
+)
 from jimpact.kinematics.friction_consistency import (
     friction_bounds,
     friction_energy_change,
     friction_impulses,
 )
-from jimpact.kinematics.quasi import from_quasi_velocities, quasi_basis, to_quasi_velocities
 from jimpact.kinematics.restitution_audit import (
     audit_matrix,
     carnot_energy_loss,
     dissipation_matrix,
 )
 from jimpact.numerics.copositive import copositivity, margin
-from jimpact.scene import kinetic_energy, kinetic_norm, normalized_delassus, velocity_change
+from jimpact.quasi import from_quasi_velocities, quasi_basis, to_quasi_velocities
 
 MARGIN = jax.jit(margin)
 HORN = np.array(

@@ -14,9 +14,9 @@ from jimpact.executors import Executor, as_executor
 from jimpact.executors.devices import Devices
 from jimpact.executors.serial import Serial
 from jimpact.laws.binary import Binary
+from jimpact.montecarlo import monte_carlo
 from jimpact.sampling.distributions import RandomLaw, Uniform
 from jimpact.sampling.fingerprints import fingerprint
-from jimpact.sampling.montecarlo import monte_carlo
 from jimpact.scenes import chain
 
 BALLS = chain([0.25, 1.0, 0.25])

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from jimpact.compliance.gap_scales import crossover, gap_scale
-from jimpact.compliance.rheology import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, UserForce
 from jimpact.histories import history
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB
 from jimpact.laws.newton import Newton
 from jimpact.pictures.rheology import plot_forces
+from jimpact.rheology import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, UserForce
 from jimpact.scenes import chain, column
 
 

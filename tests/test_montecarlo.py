@@ -17,17 +17,17 @@ from scipy import stats
 
 from jimpact.comparison import registered_laws
 from jimpact.compliance.gap_scales import gap_scale
-from jimpact.compliance.rheology import Hertz
 from jimpact.impacts import impact
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.newton import Newton
+from jimpact.montecarlo import monte_carlo
+from jimpact.rheology import Hertz
 from jimpact.sampling import histograms, store
 from jimpact.sampling.distributions import Normal, RandomLaw, Uniform
 from jimpact.sampling.fingerprints import fingerprint
 from jimpact.sampling.gap_sensitivities import gap_sensitivity
 from jimpact.sampling.moments import merged, moments
-from jimpact.sampling.montecarlo import monte_carlo
 from jimpact.sampling.store import read_samples
 from jimpact.scenes import chain
 
@@ -447,7 +447,7 @@ def test_a_killed_process_continues_with_the_same_bits(tmp_path, whole):
     code = f"""
 import jax; jax.config.update("jax_enable_x64", True)
 import time, jimpact as ji
-from jimpact.sampling.montecarlo import monte_carlo
+from jimpact.montecarlo import monte_carlo
 from jimpact.sampling.distributions import Uniform
 class Slow:
     def run(self, plan, tasks):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.kinematics.quasi import (
+from jimpact.contact_space import kinetic_norm
+from jimpact.quasi import (
     contact_power,
     from_quasi_velocities,
     kinetic_energy_split,
     quasi_basis,
     to_quasi_velocities,
 )
-from jimpact.scene import kinetic_norm
 
 basis = jax.jit(quasi_basis)
 to_quasi = jax.jit(to_quasi_velocities)

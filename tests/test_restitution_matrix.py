@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.kinematics.quasi import from_quasi_velocities, to_quasi_velocities
+from jimpact.contact_space import kinetic_norm, normalized_delassus
 from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.quasi import from_quasi_velocities, to_quasi_velocities
 from jimpact.rocking.ratios import housner_restitution, rocking_matrix, rocking_ratios
-from jimpact.scene import kinetic_norm, normalized_delassus
 from jimpact.status import CODE
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])

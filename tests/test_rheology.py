@@ -10,7 +10,10 @@ from scipy.optimize import brentq
 
 from jimpact.compliance.calibration import calibrate, compare_rheologies, measured_restitution
 from jimpact.compliance.materials import hertz_stiffness, sphere_mass
-from jimpact.compliance.rheology import (
+from jimpact.impacts import impact
+from jimpact.laws.compliant import Compliant
+from jimpact.pictures.rheology import plot_rheologies
+from jimpact.rheology import (
     Bistiffness,
     Hertz,
     HuntCrossley,
@@ -19,9 +22,6 @@ from jimpact.compliance.rheology import (
     LinearSpring,
     UserForce,
 )
-from jimpact.impacts import impact
-from jimpact.laws.compliant import Compliant
-from jimpact.pictures.rheology import plot_rheologies
 from jimpact.scenes import chain
 from jimpact.status import CODE
 

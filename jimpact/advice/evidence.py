@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.advice.structure import Block, Rows, Situation
-from jimpact.compliance.rheology import Bistiffness
+from jimpact.contact_space import velocity_change
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
@@ -21,8 +21,9 @@ from jimpact.laws.lzb import LZB
 from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
 from jimpact.laws.poisson import Poisson
+from jimpact.rheology import Bistiffness
 from jimpact.sampling.bars import sample_bar
-from jimpact.scene import Scene, velocity_change
+from jimpact.scene import Scene
 from jimpact.scenes import with_gaps
 from jimpact.status import CODE, STATUS
 

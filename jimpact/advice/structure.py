@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.blocks import components
-from jimpact.scene import Scene, gap_velocity, kinetic_angles
+from jimpact.contact_space import gap_velocity, kinetic_angles
+from jimpact.scene import Scene
 from jimpact.scenes import with_gaps
 
 # cos(kinetic angle) below so many roundings is 0: the rounding of normals and of M^-1

@@ -7,12 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_float_array, check_shape, check_values, in_common_dtype
 from jimpact.charts.programs import Case
-from jimpact.impacts import in_common_dtype
+from jimpact.contact_space import gap_velocity
 from jimpact.laws.lzb import LZB
 from jimpact.methods import METHODS, Method, checked
-from jimpact.scene import Scene, gap_velocity
+from jimpact.scene import Scene
 
 SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
 SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from jimpact._checks import in_common_dtype
 from jimpact.charts.case import (
     SAMPLE,
     SPREAD,
@@ -18,7 +19,6 @@ from jimpact.charts.programs import Programs, of_law, of_method
 from jimpact.charts.record import Point, Timing, WorkPrecision
 from jimpact.charts.timing import in_turns, stage_bar
 from jimpact.comparison import registered_laws
-from jimpact.impacts import in_common_dtype
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
 from jimpact.methods import METHODS

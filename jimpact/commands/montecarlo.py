@@ -10,7 +10,7 @@ import jax
 
 from jimpact.commands.picture_path import picture_path
 from jimpact.executors import Executor, as_executor
-from jimpact.sampling.montecarlo import monte_carlo
+from jimpact.montecarlo import monte_carlo
 from jimpact.sampling.results import MonteCarlo
 from jimpact.study import Study, read_study
 

@@ -13,11 +13,12 @@ import optimistix as optx
 
 from jimpact._checks import as_float_array, check_per_contact, check_values
 from jimpact.comparison import Comparison, compare
-from jimpact.compliance.rheology import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
+from jimpact.contact_space import delassus_matrix, gap_velocity
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.numerics.tridiagonal import diagonal
-from jimpact.scene import Scene, delassus_matrix, gap_velocity
+from jimpact.rheology import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
+from jimpact.scene import Scene
 from jimpact.scenes import chain
 
 RTOL = {"float64": 1e-11}  # of the pair's impact; else the law's default

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.compliance.rheology import Bistiffness
+from jimpact.contact_space import delassus_matrix, gap_velocity
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB
 from jimpact.numerics.tridiagonal import diagonal
-from jimpact.scene import Scene, delassus_matrix, gap_velocity
+from jimpact.rheology import Bistiffness
+from jimpact.scene import Scene
 from jimpact.scenes import with_gaps
 
 NEARLY_TOUCHING, WIDE = 0.1, 2.0  # gaps below and above so many delta_c are told in these words

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
-from jimpact.scene import Scene, gap_velocity, velocity_change
+from jimpact.contact_space import gap_velocity, velocity_change
+from jimpact.scene import Scene
 
 
 def bilateral_motion(

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.compliance.rheology import Bistiffness, Force
+from jimpact.contact_space import delassus_matrix, gap_velocity
 from jimpact.numerics.tridiagonal import diagonal
-from jimpact.scene import delassus_matrix, gap_velocity
+from jimpact.rheology import Bistiffness, Force
 from jimpact.scenes import scene_from_gaps
 
 RTOL = 1e-9
@@ -89,6 +89,11 @@ def block_gaps(width: float, height: float) -> Callable[[jax.Array], jax.Array]:
     height l, theta counter-clockwise.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.74).
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> ji.block_gaps(width=2.0, height=1.0)(jnp.array([0.0, 0.75, 0.0])).tolist()
+    [0.25, 0.25]
     """
     check_values("width", width, low=0.0, open_low=True)
     check_values("height", height, low=0.0, open_low=True)

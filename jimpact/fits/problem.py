@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.contact_space import dense_mass
 from jimpact.experiments import Experiments
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import LOGARITHMIC, Parameters, entries, with_entries
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.numerics.least_squares import Box, Method, Region, State, advance, begin
-from jimpact.scene import Scene, dense_mass
+from jimpact.scene import Scene
 from jimpact.status import CODE
 
 # Outcomes whose velocities mean nothing. A trial that meets one gets a residual far above any

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.impacts import sign_tolerance
+from jimpact.contact_space import dense_mass, gap_velocity, kinetic_energy
 from jimpact.numerics.capped_polyhedron import (
     CappedPolyhedron,
     capped_polyhedron,
     cone_facets,
 )
-from jimpact.scene import Scene, dense_mass, gap_velocity, kinetic_energy
+from jimpact.scene import Scene
+from jimpact.status import sign_tolerance
 
 # Contacts count as redundant when the matrix of their cosines has an eigenvalue below this
 # multiple of eps * m.

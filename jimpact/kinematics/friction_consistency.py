@@ -8,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
-from jimpact.kinematics.quasi import quasi_basis, to_quasi_velocities
-from jimpact.numerics.tridiagonal import as_matrix
-from jimpact.scene import (
-    Scene,
+from jimpact.contact_space import (
     kinetic_norm,
     normalized_delassus,
     normalized_gap_velocity,
     velocity_change,
 )
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.quasi import quasi_basis, to_quasi_velocities
+from jimpact.scene import Scene
 
 
 class FrictionBounds(NamedTuple):

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.kinematics.quasi import quasi_basis
+from jimpact.contact_space import normalized_delassus
 from jimpact.numerics.lcp import solve_lcp
 from jimpact.numerics.tridiagonal import as_matrix
-from jimpact.scene import Scene, normalized_delassus
+from jimpact.quasi import quasi_basis
+from jimpact.scene import Scene
 
 
 class InclusionOutcome(NamedTuple):

@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.numerics.copositive import COPOSITIVITY_TOLERANCE, Copositivity, copositivity
-from jimpact.numerics.tridiagonal import as_matrix
-from jimpact.scene import (
-    Scene,
+from jimpact.contact_space import (
     kinetic_energy,
     kinetic_norm,
     normalized_delassus,
     normalized_gap_velocity,
     velocity_change,
 )
+from jimpact.numerics.copositive import COPOSITIVITY_TOLERANCE, Copositivity, copositivity
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.scene import Scene
 
 # G counts as singular when its smallest eigenvalue is below this multiple of eps * m * largest.
 _SINGULAR = 100.0
@@ -67,7 +67,13 @@ class MatrixAudit(NamedTuple):
 
 
 def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
-    """`Q = G^-1 - E^T G^-1 E` (m, m): the law qn+ = -E qn- loses the energy qn-^T Q qn- / 2."""
+    """`Q = G^-1 - E^T G^-1 E` (m, m): the law qn+ = -E qn- loses the energy qn-^T Q qn- / 2.
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> ji.dissipation_matrix(jnp.eye(2), jnp.diag(jnp.array([0.5, 1.0]))).tolist()
+    [[0.75, 0.0], [0.0, 0.0]]
+    """
     return jnp.linalg.inv(delassus) - matrix.T @ jnp.linalg.solve(delassus, matrix)
 
 

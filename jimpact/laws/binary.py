@@ -9,11 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, as_whole, check_per_contact, check_shape, check_values
+from jimpact._checks import (
+    as_float_array,
+    as_whole,
+    check_per_contact,
+    check_shape,
+    check_values,
+    in_common_dtype,
+)
+from jimpact.contact_space import delassus_matrix, gap_velocity, velocity_change
 from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics import collisions
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
-from jimpact.scene import Scene, delassus_matrix, gap_velocity, velocity_change
+from jimpact.scene import Scene
 
 ORDERS = ("fastest", "earliest", "left_to_right")
 
@@ -176,8 +184,6 @@ class Binary(Law):
         return steps
 
     def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
-        from jimpact.impacts import in_common_dtype  # which itself imports this package
-
         v = as_float_array("velocity", velocity)
         check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
         check_values("velocity", v)

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values, is_traced
+from jimpact.contact_space import solve_mass
 from jimpact.laws.base import Law
 from jimpact.numerics.coulomb import Impulses, Problem, solve_complementary, solve_prescribed
 from jimpact.numerics.coulomb_disc import DiscProblem, solve_disc
-from jimpact.scene import Scene, solve_mass
+from jimpact.scene import Scene
 
 
 def friction_fields(

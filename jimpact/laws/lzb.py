@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.contact_space import tangential_delassus
 from jimpact.laws.base import Law
 from jimpact.laws.friction import check_friction
 from jimpact.numerics import friction
 from jimpact.numerics.dimensionless import METHODS, Inputs, Units, solve, to_dimensionless
 from jimpact.numerics.flow import Exponent
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix
-from jimpact.scene import Scene, tangential_delassus
+from jimpact.scene import Scene
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself

@@ -14,8 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, is_traced
-from jimpact.impacts import Impact, impact, in_common_dtype, without_open_contacts
+from jimpact._checks import as_float_array, in_common_dtype, is_traced
+from jimpact.contact_space import delassus_matrix, gap_velocity, without_open_contacts
+from jimpact.impacts import Impact, impact
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
 from jimpact.numerics.dimensionless import (
@@ -27,7 +28,7 @@ from jimpact.numerics.dimensionless import (
 )
 from jimpact.numerics.flow import Exponent, Flow, factor, power
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
-from jimpact.scene import Scene, delassus_matrix, gap_velocity
+from jimpact.scene import Scene
 from jimpact.status import CODE
 
 UNCOUNTED = -1  # evaluations that the method cannot tell by itself

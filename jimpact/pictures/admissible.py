@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jimpact.contact_space import dense_mass, kinetic_norm
 from jimpact.kinematics.admissible import AdmissibleSet
-from jimpact.scene import dense_mass, kinetic_norm
 
 _GREY = "#777777"
 _FILL = "#DCE9F3"

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from jimpact.comparison import Comparison
-from jimpact.compliance.rheology import Bistiffness, Force
+from jimpact.contact_space import delassus_matrix, gap_velocity
 from jimpact.histories import History
 from jimpact.numerics.tridiagonal import diagonal
 from jimpact.pictures.fits import COLOURS
-from jimpact.scene import delassus_matrix, gap_velocity
+from jimpact.rheology import Bistiffness, Force
 
 _SPREAD = 0.6  # width that the bodies of one force take, of the distance between forces
 _SAMPLES = 120  # points of a force-indentation loop

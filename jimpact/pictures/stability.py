@@ -33,7 +33,14 @@ _TICKS = 5  # labelled values along an axis, at most
 
 
 def plot_stability_map(found: StabilityMap, title: str = "") -> Figure:
-    """One panel an axis: a row for each method, a column for each value; other axes at the base."""
+    """One panel an axis: a row for each method, a column for each value; other axes at the base.
+
+    Args:
+        found: what `stability_map` returned.
+        title: above the panels.
+
+    Example: `ji.plot_stability_map(ji.stability_map(["default", "rk4"])).savefig("map.png")`.
+    """
     names = list(found.axes)
     columns = min(3, len(names))
     rows = -(-len(names) // columns)

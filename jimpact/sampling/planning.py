@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact.impacts import in_common_dtype
+from jimpact._checks import in_common_dtype
 from jimpact.laws.base import Law
 from jimpact.sampling.distributions import Rows, as_source
 from jimpact.sampling.drawing import Sources, is_random

@@ -10,9 +10,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jimpact._checks import in_common_dtype
 from jimpact.compliance.gap_scales import gap_scale
 from jimpact.executors import Executor, as_executor
-from jimpact.impacts import in_common_dtype
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.sampling.bars import sample_bar

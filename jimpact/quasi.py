@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, is_traced
-from jimpact.numerics.tridiagonal import as_matrix
-from jimpact.scene import (
-    Scene,
+from jimpact.contact_space import (
     dense_mass,
     gap_velocity,
     kinetic_norm,
@@ -20,6 +18,8 @@ from jimpact.scene import (
     normalized_gap_velocity,
     velocity_change,
 )
+from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.scene import Scene
 
 # Normals count as dependent when the matrix of their cosines has an eigenvalue below this
 # multiple of eps times its size.
