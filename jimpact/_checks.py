@@ -68,6 +68,12 @@ def as_whole(name: str, value: Any, low: int) -> int:
     return operator.index(value)
 
 
+def check_kind(name: str, value: Any, kind: type) -> None:
+    """Raise a TypeError unless `value` is an instance of `kind`."""
+    if not isinstance(value, kind):
+        raise TypeError(f"Argument `{name}` must be of type {kind.__name__}, but is {value!r}.")
+
+
 def check_shape(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> None:
     """Raise a ValueError unless `value` has exactly this shape."""
     if np.shape(value) != shape:

@@ -7,7 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, in_common_dtype, is_traced
+from jimpact._checks import (
+    as_float_array,
+    check_kind,
+    check_shape,
+    check_values,
+    in_common_dtype,
+    is_traced,
+)
 from jimpact.blocks import Groups, coupled_groups, solve_groups
 from jimpact.contact_space import (
     delassus_matrix,
@@ -67,6 +74,8 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     >>> [round(float(v), 4) for v in out.velocity]
     [-0.0086, 0.1041, 0.9045]
     """
+    check_kind("law", law, Law)
+    check_kind("scene", scene, Scene)
     v = as_float_array("velocity", velocity)
     check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
     check_values("velocity", v)

@@ -52,6 +52,15 @@ BAD = [
         r"`rtol` must be at least 1\.9e-06 in float32, but has value 1e-08",
     ),
     (lambda: ji.history(ji.Newton(0.9), BALLS, V), r"`law` must be an LZB"),
+    (lambda: ji.impact(ji.LZB, BALLS, V), r"`law` must be of type Law"),
+    (lambda: ji.impact(ji.LZB(0.9), [1.0, 1.0, 1.0], V), r"`scene` must be of type Scene"),
+    (lambda: ji.fit(ji.LZB(0.9), BALLS, [V, V]), r"`experiments` must be of type Experiments"),
+    (
+        lambda: ji.simulate(ji.Newton(0.5), ji.ball_system(), [1.0], [0.0], 1.0),
+        r"`system` must be of type System",
+    ),
+    (lambda: ji.gap_velocity(BALLS, [1.0, 0.0]), r"`velocity` must have shape \(3,\)"),
+    (lambda: ji.velocity_change(BALLS, [1.0]), r"`impulse` must have shape \(2,\)"),
     (lambda: ji.history(ji.LZB(0.9), BALLS, V, samples=1), r"`samples`"),
     (lambda: ji.distributing_rule([-1.0, 1.0], 1.0, 1.5), r"`energy`"),
 ]

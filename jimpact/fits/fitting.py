@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from jimpact._checks import check_kind
 from jimpact.experiments import Experiments
 from jimpact.fits.multistart import Search, search
 from jimpact.fits.parameters import (
@@ -142,6 +143,8 @@ def fit(
     >>> round(float(found.law.restitution), 4)
     0.4
     """
+    check_kind("law", law, Law)
+    check_kind("experiments", experiments, Experiments)
     check_method(method)
     steps = default_steps(method) if max_steps is None else max_steps
     for name, count in (("starts", starts), ("max_steps", steps)):

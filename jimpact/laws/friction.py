@@ -36,7 +36,7 @@ def check_friction(law: Law, scene: Scene) -> None:
     """Raise where a law with friction meets a scene without tangents."""
     if scene.tangents is None:
         raise ValueError(
-            f"Argument `scene` must have tangents for a {type(law).__name__} with `friction`: "
+            f"Argument `scene` must have tangents where {type(law).__name__} has `friction`: "
             "give Scene(..., tangents=...), or friction=None."
         )
 

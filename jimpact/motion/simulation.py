@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, as_whole, check_values
+from jimpact._checks import as_float_array, as_whole, check_kind, check_values
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.event_driven import event_driven
@@ -88,6 +88,8 @@ def simulate(
     >>> [round(float(t), 6) for t in motion.events.accumulation_end[motion.events.count - 1 :][:1]]
     [4.064407]
     """
+    check_kind("system", system, System)
+    check_kind("law", law, Law)
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
     dtype = jnp.result_type(q, v)
     start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))

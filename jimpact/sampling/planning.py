@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact._checks import in_common_dtype
+from jimpact._checks import check_kind, in_common_dtype
 from jimpact.laws.base import Law
 from jimpact.sampling.distributions import Rows, as_source
 from jimpact.sampling.drawing import Sources, is_random
@@ -33,8 +33,7 @@ def planned_run(
     keep_samples: bool,
 ) -> Run:
     """The run of these arguments; raises where one of them is bad."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"Argument `scene` must be a Scene, but is {scene!r}.")
+    check_kind("scene", scene, Scene)
     sources = _sources(given, scene)
     chunk = _positive_int("chunk", chunk, LARGEST_CHUNK)
     bins = _positive_int("bins", bins)
