@@ -26,7 +26,8 @@ from jimpact.numerics.dimensionless import (
     status_of,
     to_dimensionless,
 )
-from jimpact.numerics.flow import START, TIME, Flow, State, factor, plus_one, power, scales
+from jimpact.numerics.flow import START, TIME, Flow, State, scales
+from jimpact.numerics.powers import factor, plus_one, power
 from jimpact.numerics.steps import Carry, Control, explicit_step
 from jimpact.numerics.tridiagonal import Tridiagonal
 from jimpact.rheology import Bistiffness

@@ -170,7 +170,9 @@ def check_keys(
     """Raise a ValueError for unknown or missing keys of a table."""
     for key in required:
         if key not in table:
-            raise ValueError(f"{where} must have the key `{key}`, but has {', '.join(table) or 'none'}.")
+            raise ValueError(
+                f"{where} must have the key `{key}`, but has {', '.join(table) or 'none'}."
+            )
     for key in table:
         if key not in allowed:
             raise ValueError(f"{where} may have the keys {', '.join(allowed)}, but has `{key}`.")

@@ -12,7 +12,7 @@ from jimpact.laws.base import Law
 from jimpact.laws.friction import check_friction
 from jimpact.numerics import friction
 from jimpact.numerics.dimensionless import METHODS, Inputs, Units, solve, to_dimensionless
-from jimpact.numerics.flow import Exponent
+from jimpact.numerics.powers import Exponent
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix
 from jimpact.scene import Scene
 

@@ -26,7 +26,8 @@ from jimpact.numerics.dimensionless import (
     indentation,
     to_dimensionless,
 )
-from jimpact.numerics.flow import Exponent, Flow, factor, power
+from jimpact.numerics.flow import Flow
+from jimpact.numerics.powers import Exponent, factor, power
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 from jimpact.scene import Scene
 from jimpact.status import CODE

@@ -30,8 +30,9 @@ from jimpact.methods.base import (
 )
 from jimpact.numerics import impulse_form
 from jimpact.numerics.dimensionless import impulse_step
-from jimpact.numerics.flow import Flow, power
+from jimpact.numerics.flow import Flow
 from jimpact.numerics.impulse_form import EMPTY, Walk, force
+from jimpact.numerics.powers import power
 from jimpact.scene import Scene
 from jimpact.status import CODE
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 
 from jimpact.numerics import impulse_form, stepper, windows
 from jimpact.numerics.contacts import along_contacts, any_of
-from jimpact.numerics.flow import Exponent, Flow, Viscous, apply, root_order
+from jimpact.numerics.flow import Flow, Viscous, apply
+from jimpact.numerics.powers import Exponent, root_order
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
 from jimpact.numerics.steps import FINEST, Carry, Control, explicit_step, patience

@@ -23,10 +23,9 @@ from jimpact.numerics.flow import (
     apply,
     field,
     lands,
-    plus_one,
-    power,
     rates_of,
 )
+from jimpact.numerics.powers import plus_one, power
 
 SNAP = 1e-2  # events closer than this part of the tolerance are simultaneous
 NEGLIGIBLE = 0.1  # approach below this part of the tolerance does not close a contact

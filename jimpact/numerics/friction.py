@@ -16,8 +16,8 @@ from jimpact.numerics.dimensionless import (
     flow_of,
     indentation,
 )
-from jimpact.numerics.flow import Exponent
 from jimpact.numerics.friction_flow import Frictional
+from jimpact.numerics.powers import Exponent
 from jimpact.numerics.sensitivity import both_modes
 from jimpact.numerics.steps import FINEST
 from jimpact.status import CODE

@@ -12,7 +12,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics.flow import Flow, power
+from jimpact.numerics.flow import Flow
+from jimpact.numerics.powers import power
 
 EMPTY = 1e-14  # energy below this part of the largest is rounding: the contact is unloaded
 

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 
 from jimpact.numerics.contacts import any_of
 from jimpact.numerics.events import matters
-from jimpact.numerics.flow import OPEN, Flow, State, apply, plus_one, power, scales
+from jimpact.numerics.flow import OPEN, Flow, State, apply, scales
+from jimpact.numerics.powers import plus_one, power
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 
 RESIDUAL = 1.0  # loads and velocities below this part of the tolerance end the impact

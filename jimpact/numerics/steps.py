@@ -21,8 +21,8 @@ from jimpact.numerics.flow import (
     Slopes,
     State,
     lands,
-    root_of,
 )
+from jimpact.numerics.powers import root_of
 from jimpact.numerics.tableaux import DOP853, Tableau
 
 FIRST_TIME = 0.05  # of the fastest contact's time scale: no contact can turn around so soon
