@@ -23,10 +23,11 @@ def plot_rheologies(found: Comparison, title: str = "") -> Figure:
     """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
 
     Args:
-        found: of `compare_rheologies`.
+        found: of `compare_rheologies`, or of `compare` with `Compliant` laws.
 
     >>> import jimpact as ji
-    >>> found = ji.compare_rheologies(ji.chain([1.0, 1.0]), [1.0, 0.0], 0.8)
+    >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
+    >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], laws)
     >>> len(ji.plot_rheologies(found).axes)
     2
     """
