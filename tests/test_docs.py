@@ -18,6 +18,7 @@ LONG = {  # all rheologies, laws or methods are compiled
     f"jimpact.{name}"
     for name in (
         "compliance.calibration",
+        "pictures.rheology",
         "advice.validity",
         "pictures.validity",
         "stability.mapping",
