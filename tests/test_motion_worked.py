@@ -306,3 +306,7 @@ def test_simulate_command_refuses(tmp_path, capsys):
     assert "must have no penetration" in capsys.readouterr().err
     assert main(["simulate", "--out", "picture.jpg"]) == 2
     assert "--out must end in .png" in capsys.readouterr().err
+    assert main(["simulate", "--portrait", "portrait.gif"]) == 2
+    assert "--portrait must end in .png" in capsys.readouterr().err
+    assert main(["simulate", "--gif", "motion.mp4"]) == 2
+    assert "--gif must end in .gif" in capsys.readouterr().err

@@ -10,7 +10,7 @@ import jax
 from jimpact.advice.advising import advise
 from jimpact.advice.report import Advice
 from jimpact.commands.compare import velocities
-from jimpact.commands.picture_path import picture_path
+from jimpact.commands.output import picture_path, save_picture
 from jimpact.study import Study, read_study
 
 PICTURE = "jimpact-advise.png"
@@ -75,5 +75,4 @@ def _parameters(study: Study) -> dict[str, Any]:
 def _draw(found: Advice, title: str, path: Path) -> None:
     from jimpact.pictures.validity import plot_advice  # matplotlib, late
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_advice(found, title).savefig(path, dpi=150)
+    save_picture(plot_advice(found, title), path)

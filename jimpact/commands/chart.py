@@ -14,7 +14,7 @@ from rich.table import Table
 from jimpact.charts.chart import work_precision
 from jimpact.charts.record import Point, Timing, WorkPrecision
 from jimpact.commands.compare import velocities
-from jimpact.commands.picture_path import picture_path
+from jimpact.commands.output import picture_path, save_picture
 from jimpact.laws import REGISTRY
 from jimpact.laws.lzb import LZB
 from jimpact.methods import METHODS
@@ -86,8 +86,7 @@ def _able(law: LZB, study: Study, full: bool) -> tuple[str, ...]:
 def _draw(found: WorkPrecision, title: str, path: Path) -> None:
     from jimpact.pictures.chart import plot_work_precision  # matplotlib, late
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_work_precision(found, title).savefig(path, dpi=130)
+    save_picture(plot_work_precision(found, title), path)
 
 
 def _print(study: Study, found: WorkPrecision, path: Path) -> None:

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jimpact.commands.picture_path import picture_path
+from jimpact.commands.output import picture_path, save_picture
 from jimpact.comparison import (
     Comparison,
     compare,
@@ -82,8 +82,7 @@ def _fits(study: Study) -> dict[str, Fit]:
 def _draw(found: Comparison, measured: np.ndarray | None, title: str, path: Path) -> None:
     from jimpact.pictures.comparison import plot_comparison  # matplotlib, late
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_comparison(found, measured, title).savefig(path, dpi=150)
+    save_picture(plot_comparison(found, measured, title), path)
 
 
 def _print(

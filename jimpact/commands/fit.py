@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jimpact.commands.picture_path import picture_path
+from jimpact.commands.output import picture_path, save_picture
 from jimpact.fits.fitting import Fit
 from jimpact.laws import Newton
 from jimpact.laws.lzb import LZB
@@ -54,8 +54,7 @@ def _draw(study: Study, fits: dict[str, Fit], path: Path) -> None:
     from jimpact.pictures.fits import plot_fit  # matplotlib, late: bad input is told sooner
 
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_fit(fits[RAW], others, study.title).savefig(path, dpi=150)
+    save_picture(plot_fit(fits[RAW], others, study.title), path)
 
 
 def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:

@@ -8,14 +8,13 @@ from typing import Any
 
 import jax
 
-from jimpact.commands.picture_path import picture_path
+from jimpact.commands.output import INTERRUPTED, picture_path, save_picture
 from jimpact.executors import Executor, as_executor
 from jimpact.montecarlo import monte_carlo
 from jimpact.sampling.results import MonteCarlo
 from jimpact.study import Study, read_study
 
 PICTURE = "jimpact-montecarlo.png"
-INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
 
 
 def run(study: Path, out: Path, json: bool, **options: Any) -> int:
@@ -81,5 +80,4 @@ def _executor(name: str, scheduler: str | None) -> Executor:
 def _draw(found: MonteCarlo, title: str, path: Path) -> None:
     from jimpact.pictures.montecarlo import plot_monte_carlo  # matplotlib, late
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_monte_carlo(found, title).savefig(path, dpi=150)
+    save_picture(plot_monte_carlo(found, title), path)

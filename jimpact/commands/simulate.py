@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 from rich.console import Console
 
-from jimpact.commands.picture_path import picture_path
+from jimpact.commands.output import picture_path, save_picture
 from jimpact.motion.record import Motion, raise_on_failed_motion
 from jimpact.motion.study_motion import MotionStudy, read_motion_study
 
@@ -32,6 +32,10 @@ def run(
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
     try:
         path = picture_path(out, PICTURE)
+        if portrait is not None:
+            picture_path(portrait, "", "--portrait")
+        if gif is not None and gif.suffix != ".gif":
+            raise ValueError(f"--gif must end in .gif, but is '{gif}'.")
         given = read_motion_study(study)
         with _told("compiling and simulating"):
             motion = jax.block_until_ready(given.run(t_end=t_end, samples=samples))
@@ -70,11 +74,8 @@ def _draw(
 
     path, portrait, gif = (pictures[k] for k in ("picture", "portrait", "animation"))
     assert path is not None
-    path.parent.mkdir(parents=True, exist_ok=True)
-    plot_motion(motion, study.title).savefig(path, dpi=150)
+    save_picture(plot_motion(motion, study.title), path)
     if portrait is not None:
-        picture_path(portrait, "")
-        portrait.parent.mkdir(parents=True, exist_ok=True)
-        plot_phase_portrait(motion, coordinate - 1, study.title).savefig(portrait, dpi=150)
+        save_picture(plot_phase_portrait(motion, coordinate - 1, study.title), portrait)
     if gif is not None:
         animate_motion(study.system, motion, gif, title=study.title)

@@ -6,14 +6,13 @@ from pathlib import Path
 
 import jax
 
-from jimpact.commands.picture_path import picture_path
+from jimpact.commands.output import INTERRUPTED, picture_path, save_picture
 from jimpact.stability.mapping import stability_map
 from jimpact.stability.results import StabilityMap
 
 PICTURE = "jimpact-stability.png"
 QUICK_RESOLUTION, QUICK_STEPS = 7, 5_000
 FULL_RESOLUTION, FULL_STEPS, FULL_SAMPLES = 9, 5_000, 300
-INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
 
 
 def run(methods: tuple[str, ...] | None, full: bool, out: Path, json: bool) -> int:
@@ -58,13 +57,12 @@ def draw(found: StabilityMap, path: Path) -> list[Path]:
         plot_stability_pairs,
     )
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     title = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
-    plot_stability_map(found, title).savefig(path, dpi=150)
+    save_picture(plot_stability_map(found, title), path)
     written = [path]
     if any(len(each.axes) == 2 for each in found.slices[found.methods[0]]):
         for name in found.methods:
             beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
-            plot_stability_pairs(found, name).savefig(beside, dpi=110)
+            save_picture(plot_stability_pairs(found, name), beside)
             written.append(beside)
     return written
