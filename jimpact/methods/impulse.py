@@ -82,7 +82,7 @@ def _advance(flow: Flow, dp: jax.Array, walk: Walk) -> Walk:
     first = (scale * force(flow, approach)) * jnp.where(approach > 0, 1.0, 0.0)
     begun = jnp.where(loaded, scale * f, power(first, eta + 1))
     begun = jnp.where(primary, dp, begun)
-    dp = dp * impulse_form._emptying(flow, walk, primary, begun)
+    dp = dp * impulse_form.emptying(flow, walk, primary, begun)
     fresh = begun / jnp.max(jnp.where(primary, begun, 0.0))
 
     def rates(de: jax.Array, push: jax.Array) -> tuple[jax.Array, jax.Array]:

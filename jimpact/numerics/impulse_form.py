@@ -50,7 +50,7 @@ def advance(flow: Flow, dp: jax.Array, walk: Walk) -> Walk:
     increment = jnp.where(energy > 0, scale * f, power(first, eta + 1))
     is_primary = jnp.arange(gamma.shape[0]) == primary
     increment = jnp.where(is_primary, dp, increment)
-    increment = increment * _emptying(flow, walk, is_primary, increment)
+    increment = increment * emptying(flow, walk, is_primary, increment)
     after = gamma + flow.coupling @ increment
     # exact work of the step; its error is the first-order one of the distributing rule alone
     middle = 0.5 * (gamma + after)
@@ -64,7 +64,7 @@ def advance(flow: Flow, dp: jax.Array, walk: Walk) -> Walk:
     )
 
 
-def _emptying(flow: Flow, walk: Walk, is_primary: jax.Array, increment: jax.Array) -> jax.Array:
+def emptying(flow: Flow, walk: Walk, is_primary: jax.Array, increment: jax.Array) -> jax.Array:
     """Fraction of the step at which the primary contact is unloaded; 1 if it is not.
 
     Ending there, not on a fixed step, is what the derivative of the outcome depends on.
