@@ -51,7 +51,25 @@ def rod(angle, length=1.0):
     )
 
 
-def test_one_contact_is_rouths():
+def one_contact(mass, normals, tangents, v, e, mu, stored):
+    law = ji.LZB(e, friction=mu, initial_energy=stored)
+    return ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v)
+
+
+def one_contact_by_steps(mass, normals, tangents, v, e, mu, stored):
+    """Not in closed form, since beside it there is another one, open."""
+    far = jnp.array([[0.0], [1.0], [0.0]])
+    normals, tangents = (jnp.concatenate([x, far], axis=1) for x in (normals, tangents))
+    scene = ji.Scene(mass, normals, tangents=tangents, gaps=jnp.array([0.0, 1.0]))
+    return ji.impact(ji.LZB(e, friction=mu, initial_energy=stored, rtol=1e-10), scene, v)
+
+
+@pytest.fixture(scope="module")
+def by_steps():
+    return jax.jit(jax.vmap(one_contact_by_steps))
+
+
+def test_one_contact_is_rouths(by_steps):
     cases = [
         (*rod(angle), np.array(v), e, mu)
         for angle in (0.3, 0.8, 1.2, 1.5)
@@ -61,22 +79,60 @@ def test_one_contact_is_rouths():
     ]
     mass, normals, tangents, v, e, mu = (np.stack(x) for x in zip(*cases))
 
-    def one(mass, normals, tangents, v, e, mu):
-        return outcome(mass, normals, tangents, v, e, 1.0, mu, rtol=1e-10)
-
-    out = jax.jit(jax.vmap(one))(mass, normals, tangents, v, e, mu)
     expected = np.array(
         [
             routh(ji.Scene(m, n, tangents=h), *x)
             for m, n, h, *x in zip(mass, normals, tangents, v, mu, e)
         ]
     )
-    np.testing.assert_array_equal(out.status, 0)
-    np.testing.assert_allclose(out.impulse[:, 0], expected[:, 0], atol=1e-9)
-    np.testing.assert_allclose(out.tangential_impulse[:, 0], expected[:, 1], atol=1e-9)
+    for function, allowed in ((jax.jit(jax.vmap(one_contact)), 1e-13), (by_steps, 1e-9)):
+        out = function(mass, normals, tangents, v, e, mu, np.zeros(len(v)))
+        np.testing.assert_array_equal(out.status, 0)
+        np.testing.assert_allclose(out.impulse[:, 0], expected[:, 0], atol=allowed)
+        np.testing.assert_allclose(out.tangential_impulse[:, 0], expected[:, 1], atol=allowed)
     kinds = np.abs(expected[:, 1]) < mu * expected[:, 0] - 1e-6
     assert kinds.any()
     assert not kinds.all()
+
+
+def any_state(count):
+    """Precompressed, separating, plastic."""
+    rng = np.random.default_rng(0)
+    a, normals, tangents = (rng.normal(size=(count, 3, k)) for k in (3, 1, 1))
+    mass, v = a @ a.transpose(0, 2, 1) + 0.3 * np.eye(3), rng.normal(size=(count, 3))
+    e, mu = rng.uniform(0, 1, count), 10 ** rng.uniform(-2, 1, count)
+    e[:20] = 0.0
+    stored = np.where(np.arange(count) % 2, rng.exponential(0.5, count), 0.0)
+    return mass, normals, tangents, v, e, mu, stored
+
+
+def test_one_contact_from_any_state(by_steps):
+    given = any_state(160)
+    alone, steps = jax.jit(jax.vmap(one_contact))(*given), by_steps(*given)
+    np.testing.assert_array_equal(alone.status, 0)
+    np.testing.assert_array_equal(steps.status, 0)
+    np.testing.assert_allclose(alone.velocity, steps.velocity, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_of_one_contact():
+    given = any_state(100)
+    forward, backward, steps = (
+        jax.jit(jax.vmap(jac(lambda *x, f=f: f(*x).velocity, argnums=(3, 4, 5, 6))))(*given)
+        for jac, f in (
+            (jax.jacfwd, one_contact),
+            (jax.jacrev, one_contact),
+            (jax.jacfwd, one_contact_by_steps),
+        )
+    )
+    for x, y in zip(forward, backward):
+        np.testing.assert_allclose(x, y, atol=1e-12)
+    for x, y in zip(forward[:3], steps[:3]):
+        np.testing.assert_allclose(x, y, atol=1e-6)
+    # from 0 stored energy steps of x^eta have no slope, the closed form has
+    np.testing.assert_allclose(forward[3][1::2], steps[3][1::2], atol=1e-6)
+    before, after = (one_contact(*(x[40] for x in given[:6]), u).velocity for u in (0.0, 1e-7))
+    np.testing.assert_allclose(forward[3][40], (after - before) / 1e-7, atol=1e-5)
 
 
 def test_small_steps_agree(planar):

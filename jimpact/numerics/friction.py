@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.numerics import friction_single
 from jimpact.numerics import friction_stepper as stepper
 from jimpact.numerics.contacts import any_of
 from jimpact.numerics.dimensionless import (
@@ -55,6 +56,8 @@ def solve(
     inputs: Inputs, tangential: Tangential, exponent: Exponent, max_steps: int
 ) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
     """Dimensionless impulses (p, p_t) and status, differentiable in both modes."""
+    if inputs.gamma.shape == tangential.slip.shape == (1,):
+        return _alone(inputs, tangential)
     static = None if isinstance(exponent, jax.Array) else exponent
 
     def run(
@@ -76,6 +79,17 @@ def solve(
         return (end.state.p, end.state.side), code
 
     return both_modes(run, columns=True)((inputs, tangential))
+
+
+def _alone(inputs: Inputs, tangential: Tangential) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+    """A single planar contact."""
+    contact = friction_single.Contact(
+        tangential.across, tangential.along, tangential.friction, inputs.restitution
+    )
+    p, side, done = friction_single.solve(
+        contact, inputs.gamma, tangential.slip, 0.5 * inputs.energy
+    )
+    return (p, side), jnp.where(done, CODE["ok"], CODE["max_steps"])[0]
 
 
 def _flow_of(inputs: Inputs, tangential: Tangential, exponent: Exponent) -> Frictional:

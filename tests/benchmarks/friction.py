@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
+from jimpact.status import CODE
 
 jax.config.update("jax_enable_x64", True)
 
@@ -46,7 +47,7 @@ def main():
     timings = alternating({key: lambda f=f: f(v, mu) for key, f in programs.items()}, repeats)
     rows = []
     for (scene, law), timing in timings.items():
-        failed = int((np.asarray(programs[scene, law](v, mu).status) >= 4).sum())
+        failed = int((np.asarray(programs[scene, law](v, mu).status) >= CODE["energy_gain"]).sum())
         row = {"scene": scene, "friction": law, "failed": failed}
         rows.append(row | columns(timing, batch, timings[scene, "none"]))
     keys = ("scene", "friction", "us", "us_q1", "us_q3", "ratio_q1", "ratio", "ratio_q3", "failed")
