@@ -7,14 +7,13 @@ from pathlib import Path
 import jax
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from jimpact.charts.chart import work_precision
 from jimpact.charts.record import Point, Timing, WorkPrecision
 from jimpact.commands.compare import velocities
-from jimpact.commands.output import picture_path, save_picture
+from jimpact.commands.output import console_for, picture_path, save_picture
 from jimpact.laws import REGISTRY
 from jimpact.laws.lzb import LZB
 from jimpact.methods import METHODS
@@ -90,10 +89,11 @@ def _draw(found: WorkPrecision, title: str, path: Path) -> None:
 
 
 def _print(study: Study, found: WorkPrecision, path: Path) -> None:
-    console = Console(highlight=False)
+    table = _table(found)
+    console = console_for(table)
     before = ", ".join(f"{v:g}" for v in found.velocity)
     console.print(f"[bold]{escape(study.title)}[/bold]: v- = ({before}) m/s", soft_wrap=True)
-    console.print(_table(found))
+    console.print(table)
     uncertain = ", ".join(
         f"{name} {value:.0e}" for name, value in found.reference.uncertainty.items()
     )

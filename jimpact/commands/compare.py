@@ -9,11 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jimpact.commands.output import picture_path, save_picture
+from jimpact.commands.output import console_for, picture_path, save_picture
 from jimpact.comparison import (
     Comparison,
     compare,
@@ -92,12 +91,11 @@ def _print(
     fits: dict[str, Fit],
     path: Path,
 ) -> None:
-    console = Console(highlight=False)
+    tables = [_table(study, found, measured), *([_fit_table(fits)] if fits else [])]
+    console = console_for(*tables)
     before = ", ".join(f"{v:g}" for v in found.velocity)
     console.print(f"[bold]{escape(study.title)}[/bold]: v- = ({before}) m/s", soft_wrap=True)
-    console.print(_table(study, found, measured))
-    if fits:
-        console.print(_fit_table(fits))
+    console.print(*tables)
     told = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     console.print(f"Parameters: {escape(told)}.", soft_wrap=True)
     console.print(

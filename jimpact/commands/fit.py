@@ -9,11 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from jimpact.commands.output import picture_path, save_picture
+from jimpact.commands.output import console_for, picture_path, save_picture
 from jimpact.fits.fitting import Fit
 from jimpact.laws import Newton
 from jimpact.laws.lzb import LZB
@@ -97,9 +96,10 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
 
 
 def _print_report(study: Study, fits: dict[str, Fit], path: Path) -> None:
-    console = Console(highlight=False)
+    table = _table(fits)
+    console = console_for(table)
     console.print(f"[bold]{escape(study.title)}[/bold]")
-    console.print(_table(fits))
+    console.print(table)
     if CORRECTED in fits:
         console.print("corrected: changed as little as possible so that momentum is conserved")
     everything = fits.get(ALL_FREE)
