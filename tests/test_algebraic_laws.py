@@ -230,6 +230,7 @@ def test_linear_bistiffness_transitions_coincide_with_lzb():
     np.testing.assert_allclose(out.velocity, reference, atol=2e-6)
 
 
+@pytest.mark.slow
 def test_routh_energetic_law_coincides_with_lzb_where_contacts_decouple():
     """Work along the impulse, energy e^2 returned: p = (1 + e) p_c at each contact by itself."""
     mass, e = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.8, 0.5])

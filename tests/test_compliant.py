@@ -88,6 +88,7 @@ def test_held_out_gapped_chains(n, wall, eta, e_least):
 _MADE = {}
 
 
+@pytest.mark.slow
 def test_exact_derivatives():
     """Three touching Hertz balls, e = 1: in the stiffness ratio, the exponent, and gap 2 at 0.1."""
 

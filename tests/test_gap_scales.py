@@ -92,7 +92,9 @@ def beads():
     return tomllib.loads(text)
 
 
-@pytest.mark.parametrize("number", [1, 2, pytest.param(5, marks=pytest.mark.slow), 8])
+@pytest.mark.parametrize(
+    "number", [1, 2, *(pytest.param(n, marks=pytest.mark.slow) for n in (5, 8))]
+)
 def test_bead_column_wall_force(number):
     """Elastic Hertz beads after a fall of 3.1 mm: 51.66 N for one, 52.90 N for more."""
     data = beads()

@@ -201,10 +201,8 @@ def test_forces_without_damping_are_elastic():
         np.testing.assert_allclose(three(name)(*args_of)[0][0], wanted, atol=1e-7)
 
 
-LONG = {name: pytest.mark.slow for name in list(FORCES)[1:]}
-
-
-@pytest.mark.parametrize("name", [pytest.param(name, marks=LONG.get(name, ())) for name in FORCES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORCES)
 def test_derivatives(name):
     """At a generic gapped state, in stiffness, damping, gaps and velocity; both modes."""
     k, c, mass, v, gaps = (jnp.asarray(z[3]) for z in draw())
