@@ -255,7 +255,7 @@ def test_nine_parameters_of_a_chain_before_a_wall():
     truth = ji.LZB(np.linspace(0.95, 0.8, 5), np.linspace(1.0, 3.0, 5))
     pre = np.random.default_rng(0).normal(size=(12, 5))
     data = ji.Experiments(pre, simulated(truth, scene, pre, noise=0.001, seed=1))
-    found = ji.fit(ji.LZB(np.full(5, 0.9), np.ones(5)), scene, data, starts=2)
+    found = ji.fit(ji.LZB(np.full(5, 0.9), np.ones(5)), scene, data)
     expected = np.concatenate([truth.restitution, truth.stiffness[1:]])
     assert found.rank == 9
     assert np.all(np.abs(found.value - expected) < 4 * found.standard_error)
