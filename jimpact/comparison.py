@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import check_values
 from jimpact.consistency import Audit, audit
-from jimpact.contact_space import kinetic_energy, momentum
+from jimpact.contact_space import as_velocity, kinetic_energy, momentum
 from jimpact.impacts import Impact, impact
 from jimpact.laws import REGISTRY, Row
 from jimpact.laws.base import Law
@@ -43,8 +43,7 @@ def dispersion_index(scene: Scene, velocity: Any) -> jax.Array:
     >>> round(float(ji.dispersion_index(ji.chain([1.0, 1.0, 1.0]), [-1 / 3, 2 / 3, 2 / 3])), 6)
     0.666667
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     share = 0.5 * v * momentum(scene, v)
     mean = jnp.mean(share)
     square = jnp.mean((share - mean) ** 2)
@@ -146,8 +145,7 @@ def compare(
     >>> [round(float(v), 4) for v in table.entries["moreau"].outcome.velocity]
     [-0.3333, 0.6667, 0.6667]
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     if laws is None:
         laws = registered_laws({"restitution": 1.0} | values)

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape
 from jimpact.contact_space import (
+    as_velocity,
     delassus_matrix,
     gap_velocity,
     kinetic_energy,
@@ -56,8 +56,7 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     >>> bool(ji.audit(scene, v, ji.impact(ji.Newton(0.5), scene, v)).consistent)
     True
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     delassus = delassus_matrix(scene)
     root = jnp.sqrt(diagonal(delassus))
     gamma = jnp.where(scene.closed, gap_velocity(scene, v), 0.0)

@@ -15,6 +15,13 @@ from jimpact.scene import Scene
 _CONSTRAINTS = operator.attrgetter("constraints")
 
 
+def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
+    """`velocity` as an array; raise a ValueError unless it has one entry per coordinate."""
+    v = as_float_array("velocity", velocity)
+    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    return v
+
+
 def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     """Gap velocities `gamma = N^T v` (m,) [m/s] of velocities (n,); negative on approach.
 
@@ -27,7 +34,7 @@ def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     >>> ji.gap_velocity(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.5]).tolist()
     [-1.0, 0.5]
     """
-    v = _velocity(scene, velocity)
+    v = as_velocity(scene, velocity)
     if scene.walls is None:
         return scene.normals.T @ v
     left, right = scene.walls
@@ -44,7 +51,7 @@ def momentum(scene: Scene, velocity: Any) -> jax.Array:
     >>> ji.momentum(ji.chain([1.0, 2.0]), [1.0, 0.5]).tolist()
     [1.0, 1.0]
     """
-    v = _velocity(scene, velocity)
+    v = as_velocity(scene, velocity)
     return scene.mass * v if scene.mass.ndim == 1 else scene.mass @ v
 
 
@@ -58,14 +65,8 @@ def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
     >>> float(ji.kinetic_energy(ji.chain([1.0, 2.0]), [1.0, 0.5]))
     0.75
     """
-    v = _velocity(scene, velocity)
+    v = as_velocity(scene, velocity)
     return 0.5 * v @ momentum(scene, v)
-
-
-def _velocity(scene: Scene, velocity: Any) -> jax.Array:
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
-    return v
 
 
 def dense_mass(scene: Scene) -> np.ndarray:

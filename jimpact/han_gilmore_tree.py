@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.contact_space import dense_mass
+from jimpact._checks import check_values, is_traced
+from jimpact.contact_space import as_velocity, dense_mass
 from jimpact.scene import Scene
 
 # Relative to the largest normalized approach velocity at the start: gap velocities and impulses
@@ -133,8 +133,7 @@ def _on_host(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _checked(scene: Scene, velocity: Any, max_depth: int) -> np.ndarray:
     if is_traced((scene, velocity)):
         raise TypeError("`han_gilmore` is a host function: it cannot be traced (jit, vmap, grad).")
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
         raise ValueError(f"Argument `max_depth` must be an int >= 1, but has value {max_depth!r}.")

@@ -6,8 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_shape, check_values, in_common_dtype, is_traced
+from jimpact._checks import check_values, in_common_dtype, is_traced
 from jimpact.contact_space import (
+    as_velocity,
     delassus_matrix,
     gap_velocity,
     velocity_change,
@@ -26,9 +27,9 @@ from jimpact.numerics.dimensionless import (
     status_of,
     to_dimensionless,
 )
-from jimpact.numerics.flow import START, TIME, Flow, State, scales
+from jimpact.numerics.flow import START, TIME, Flow, State, scales, step
 from jimpact.numerics.powers import factor, plus_one, power
-from jimpact.numerics.steps import Carry, Control, explicit_step
+from jimpact.numerics.steps import Carry, Control
 from jimpact.numerics.tridiagonal import Tridiagonal
 from jimpact.rheology import Bistiffness
 from jimpact.scene import Scene
@@ -95,8 +96,7 @@ def history(
         raise TypeError("Argument `law` must have no friction: its history is not sampled yet.")
     if samples < 2:
         raise ValueError(f"Argument `samples` must be at least 2, but has value {samples}.")
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     law, scene, v = in_common_dtype(law, scene, v)
     law.check_options(v.dtype, scene)
@@ -207,7 +207,7 @@ def _between(flow: Flow, control: Control, carry: Carry, t: jax.Array) -> tuple[
     length = jnp.where(starting, root - xi, ahead)
     kind = jnp.where(starting, START, TIME)
     none = jnp.zeros_like(carry.target)
-    state, _, _ = explicit_step(
+    state, _, _ = step(
         flow, carry.phase, carry.state, kind, none, xi, length, ahead, control.tolerance
     )
     return state._replace(x=jnp.maximum(state.x, 0.0)), s * state.g

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import (
-    as_float_array,
     check_kind,
     check_shape,
     check_values,
@@ -17,6 +16,7 @@ from jimpact._checks import (
 )
 from jimpact.blocks import Groups, coupled_groups, solve_groups
 from jimpact.contact_space import (
+    as_velocity,
     delassus_matrix,
     gap_velocity,
     momentum,
@@ -76,8 +76,7 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     """
     check_kind("law", law, Law)
     check_kind("scene", scene, Scene)
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     _check_constrained(scene, v)
     groups = coupled_groups(scene) if law.by_blocks() else None

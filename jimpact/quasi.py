@@ -10,6 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, is_traced
 from jimpact.contact_space import (
+    as_velocity,
     dense_mass,
     gap_velocity,
     kinetic_norm,
@@ -100,8 +101,7 @@ def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Arr
     >>> [round(float(q), 6) for q in qn], round(float(qt[0]), 6)
     ([-0.5, 0.7, 0.2], 0.919239)
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     _, tangent = quasi_basis(scene)
     return normalized_gap_velocity(scene, v), tangent.T @ momentum(scene, v)
 

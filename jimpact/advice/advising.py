@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_float_array, as_whole, check_shape, check_values
+from jimpact._checks import as_whole, check_values
 from jimpact.advice.evidence import (
     Candidate,
     Outcomes,
@@ -27,6 +27,7 @@ from jimpact.advice.inputs import (
 from jimpact.advice.report import Advice
 from jimpact.advice.structure import NUDGE, Block, Rows, Situation, rows, situation, unknowns
 from jimpact.compliance.gap_scales import gap_scale
+from jimpact.contact_space import as_velocity
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
@@ -89,8 +90,7 @@ def advise(
     >>> found.name, found.reason
     ('newton', "single contact: every law is Newton's")
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     parameters, known = parameters_of(scene, law, restitution, stiffness, exponent)
     span = span_of(stiffness_range, known)

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
+from jimpact._checks import as_float_array, check_per_contact, check_values
 from jimpact.comparison import dispersion_index
+from jimpact.contact_space import as_velocity
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.laws.binary import Binary
@@ -115,8 +116,7 @@ def validity_map(
     >>> found.velocity[0, :, 1:].round(3).tolist()  # binary, dispersed, Moreau
     [[0.0, 1.0], [0.15, 0.98], [0.666, 0.667]]
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     if not np.asarray(v).any():
         raise ValueError("Argument `velocity` must not be zero: nothing happens at rest.")

@@ -7,9 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, in_common_dtype
+from jimpact._checks import check_shape, check_values, in_common_dtype
 from jimpact.charts.programs import Case
-from jimpact.contact_space import gap_velocity
+from jimpact.contact_space import as_velocity, gap_velocity
 from jimpact.laws.lzb import LZB
 from jimpact.methods import METHODS, Method, checked
 from jimpact.scene import Scene
@@ -20,8 +20,7 @@ SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may 
 
 def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> Case:
     """The impact in double precision, one parameter per contact, with a batch around it."""
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     if not isinstance(law, LZB):
         raise TypeError(f"Argument `law` must be an LZB law, but is {type(law).__name__}.")

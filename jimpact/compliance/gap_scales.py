@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.contact_space import delassus_matrix, gap_velocity
+from jimpact._checks import as_float_array, check_values, is_traced
+from jimpact.contact_space import as_velocity, delassus_matrix, gap_velocity
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
@@ -88,8 +88,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     gap 1 is closed (delta_c = 31.4 um)
     gap 2 is 3.18 delta_c (delta_c = 31.4 um): wide, its collisions come one after another
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     if not isinstance(law, Compliant | LZB):
         raise TypeError(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
-from jimpact.contact_space import gap_velocity, velocity_change
+from jimpact.contact_space import as_velocity, gap_velocity, velocity_change
 from jimpact.scene import Scene
 
 
@@ -36,8 +36,7 @@ def bilateral_motion(
     >>> [round(abs(float(a)), 5) for a in v]  # half a period: exchanged
     [0.0, 1.0]
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     k = as_float_array("stiffness", stiffness)
     check_values("stiffness", k, low=0.0)
     check_per_contact("stiffness", k, scene.contacts)

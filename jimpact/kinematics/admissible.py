@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.contact_space import dense_mass, gap_velocity, kinetic_energy
+from jimpact._checks import as_float_array, check_values
+from jimpact.contact_space import as_velocity, dense_mass, gap_velocity, kinetic_energy
 from jimpact.numerics.capped_polyhedron import (
     CappedPolyhedron,
     capped_polyhedron,
@@ -182,8 +182,7 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
     >>> found.contains([0.1, 0.3, 0.6]), found.contains([0.5, 0.25, 0.25])
     (True, False)
     """
-    v = as_float_array("velocity", velocity)
-    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    v = as_velocity(scene, velocity)
     check_values("velocity", v)
     tolerance = sign_tolerance(scene.mass.dtype)
     start, closed = np.asarray(v, float), np.asarray(scene.closed)

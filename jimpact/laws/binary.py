@@ -13,11 +13,10 @@ from jimpact._checks import (
     as_float_array,
     as_whole,
     check_per_contact,
-    check_shape,
     check_values,
     in_common_dtype,
 )
-from jimpact.contact_space import delassus_matrix, gap_velocity, velocity_change
+from jimpact.contact_space import as_velocity, delassus_matrix, gap_velocity, velocity_change
 from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.numerics import collisions
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
@@ -184,8 +183,7 @@ class Binary(Law):
         return steps
 
     def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
-        v = as_float_array("velocity", velocity)
-        check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+        v = as_velocity(scene, velocity)
         check_values("velocity", v)
         law, scene, v = in_common_dtype(self, scene, v)
         law.check_options(v.dtype, scene)

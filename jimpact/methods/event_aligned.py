@@ -23,13 +23,13 @@ from jimpact.numerics.dimensionless import (
     settled,
     status_of,
 )
+from jimpact.numerics.flow import step
 from jimpact.numerics.propagator import TERMS
 from jimpact.numerics.sensitivity import both_modes
-from jimpact.numerics.steps import explicit_step
 from jimpact.numerics.tableaux import DOP853, DOPRI5
 from jimpact.scene import Scene
 
-_DOPRI5_STEP = functools.partial(explicit_step, tableau=DOPRI5)
+_DOPRI5_STEP = functools.partial(step, tableau=DOPRI5)
 RTOL = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)
 
 

@@ -15,11 +15,11 @@ import jax.numpy as jnp
 
 from jimpact.numerics import impulse_form, stepper, windows
 from jimpact.numerics.contacts import along_contacts, any_of
-from jimpact.numerics.flow import Flow, Viscous, apply
+from jimpact.numerics.flow import Flow, Viscous, apply, step
 from jimpact.numerics.powers import Exponent, root_order
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
-from jimpact.numerics.steps import FINEST, Carry, Control, explicit_step, patience
+from jimpact.numerics.steps import FINEST, Carry, Control, patience
 from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
@@ -147,10 +147,10 @@ def control_of(
     floor = FINEST * float(jnp.finfo(inputs.gamma.dtype).eps)
     tighten = GRADIENT_TIGHTENING if differentiated else 1.0
     tolerance = jnp.maximum(tighten * inputs.tolerance, floor)
-    explicit = functools.partial(explicit_step, apart=differentiated)
-    step = propagate if method == "propagator" else explicit
+    explicit = functools.partial(step, apart=differentiated)
+    chosen = propagate if method == "propagator" else explicit
     contacts = inputs.gamma.shape[0]
-    return Control(tolerance, max_steps, contacts, step, halving=not differentiated)
+    return Control(tolerance, max_steps, contacts, chosen, halving=not differentiated)
 
 
 def solve(

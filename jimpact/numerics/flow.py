@@ -173,10 +173,14 @@ def step(
     target: jax.Array,
     start: jax.Array,
     length: jax.Array,
+    due: jax.Array,
+    tolerance: jax.Array,
     tableau: Tableau = DOP853,
     apart: bool = False,
 ) -> tuple[State, Slopes, Slopes]:
     """One Runge-Kutta step of `length` in the variable `kind`, which begins at `start`.
+
+    It needs neither `due`, the time expected to the event, nor the tolerance: other methods do.
 
     `target` (m,) is one-hot: the contact whose event ends a ZERO_G or ROOT_X step. Returns the
     end state and the two error estimates. The stages are a loop of matrix products: unrolled,

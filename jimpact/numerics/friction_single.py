@@ -68,12 +68,11 @@ def _piece(contact: Contact, at: Progress) -> Progress:
     stop = _until(at.u * du < 0, at.u, du)
     turn = _until(at.gamma * dg < 0, at.gamma, dg)
     step = jnp.minimum(jnp.minimum(stop, turn), _end(at, e, dg, expands))
-    ends = ~((step == stop) | (step == turn)) & jnp.isfinite(step)
     goes_on = ~at.done & jnp.isfinite(step)
+    stops, turns = goes_on & (step == stop), goes_on & (step == turn)
     step = jnp.where(goes_on, step, 0.0)
     work = at.gamma * step + 0.5 * dg * step**2
     back = jnp.where(e > 0, jnp.where(e > 0, e, 1.0) ** -2, 0.0)  # e = 0: it ends at once
-    stops, turns = goes_on & (step == stop), goes_on & (step == turn)
     return Progress(
         gamma=jnp.where(turns, 0.0, at.gamma + dg * step),
         u=jnp.where(stops, 0.0, at.u + du * step),
@@ -81,7 +80,7 @@ def _piece(contact: Contact, at: Progress) -> Progress:
         p=at.p + step,
         side=at.side + ratio * step,
         energy=at.energy - jnp.where(expands, back, 1.0) * work,
-        done=at.done | ends,
+        done=at.done | (goes_on & ~stops & ~turns),
     )
 
 

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.numerics import events
-from jimpact.numerics import flow as flows
 from jimpact.numerics.contacts import any_of, largest, of
 from jimpact.numerics.flow import (
     FROM_GAP,
@@ -20,10 +19,11 @@ from jimpact.numerics.flow import (
     Flow,
     Slopes,
     State,
+    frozen,
     lands,
+    step,
 )
 from jimpact.numerics.powers import root_of
-from jimpact.numerics.tableaux import DOP853, Tableau
 
 FIRST_TIME = 0.05  # of the fastest contact's time scale: no contact can turn around so soon
 RESTART = 0.1  # first START step after a closing, as a part of the step before it
@@ -56,34 +56,13 @@ class Carry(NamedTuple):
     done: jax.Array
 
 
-def explicit_step(
-    flow: Flow,
-    phase: jax.Array,
-    state: State,
-    kind: jax.Array,
-    target: jax.Array,
-    start: jax.Array,
-    length: jax.Array,
-    due: jax.Array,
-    tolerance: jax.Array,
-    tableau: Tableau = DOP853,
-    apart: bool = False,
-) -> tuple[State, Slopes, Slopes]:
-    """`flow.step`, which needs neither the expected time of the event nor the tolerance.
-
-    `apart`: for derivatives in batches.
-    """
-    apart = apart and length.ndim > 1
-    return flows.step(flow, phase, state, kind, target, start, length, tableau, apart)
-
-
 class Control(NamedTuple):
     """Local tolerance (m,) of each contact, pass limit, and how to step and to finish."""
 
     tolerance: jax.Array
     max_steps: int
     contacts: int  # of the impact; those that are stepped may be fewer
-    step: Callable[..., tuple[State, Slopes, Slopes]] = explicit_step
+    step: Callable[..., tuple[State, Slopes, Slopes]] = step
     closed_form: bool = True
     halving: bool = True
     order: int = 8
@@ -220,9 +199,7 @@ def _aim(flow: Flow, control: Control, carry: Carry, accepted: jax.Array) -> Car
     if flow.slackens:
         return carry
     state = jax.lax.stop_gradient(carry.state)
-    due, target, by_opening = events.ahead(
-        flows.frozen(flow), control.tolerance, carry.phase, state
-    )
+    due, target, by_opening = events.ahead(frozen(flow), control.tolerance, carry.phase, state)
     aim = accepted & (carry.kind == TIME) & (due < NEAR * carry.h)
     aimed_at = jnp.where(by_opening, ROOT_X, ZERO_G)
     return carry._replace(
