@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_values
-from jimpact.consistency import Audit, audit
+from jimpact.audits import Audit, audit
 from jimpact.contact_space import as_velocity, kinetic_energy, momentum
 from jimpact.impacts import Impact, impact
 from jimpact.laws import REGISTRY, Row

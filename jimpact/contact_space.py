@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
 from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
 
 _CONSTRAINTS = operator.attrgetter("constraints")
 

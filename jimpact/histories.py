@@ -16,6 +16,7 @@ from jimpact.contact_space import (
 )
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Bistiffness
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.numerics import stepper
 from jimpact.numerics.dimensionless import (
@@ -30,9 +31,8 @@ from jimpact.numerics.dimensionless import (
 from jimpact.numerics.flow import START, TIME, Flow, State, scales, step
 from jimpact.numerics.powers import factor, plus_one, power
 from jimpact.numerics.steps import Carry, Control
-from jimpact.numerics.tridiagonal import Tridiagonal
-from jimpact.rheology import Bistiffness
 from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import Tridiagonal
 
 TRACED_RECORDS = 512  # passes kept when the number needed cannot be looked up (inside jit, grad)
 

@@ -25,8 +25,8 @@ from jimpact.contact_space import (
     without_open_contacts,
 )
 from jimpact.laws.base import Law, no_tangential_impulse
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
 from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal
 from jimpact.status import CODE, STATUS, sign_tolerance
 
 ROUNDINGS = 4  # of the largest terms that cancel: each is rounded a few times

@@ -13,7 +13,7 @@ from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.laws import REGISTRY, Row
 from jimpact.laws.base import Law
-from jimpact.sampling.study_table import arguments
+from jimpact.montecarlo.study_table import arguments
 from jimpact.scene import Scene
 from jimpact.scenes import chain
 
@@ -63,7 +63,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     values, a number for all contacts or a list with one each, and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
     to the study), momentum_corrected; without data a study can be compared, not fitted;
-    `[monte_carlo]` velocity_m_per_s, gaps_m, law, samples, seed (see `jimpact.sampling`). A name
+    `[monte_carlo]` velocity_m_per_s, gaps_m, law, samples, seed (see `jimpact.montecarlo`). A name
     of a bundled study is found where no such file is.
 
     Raises:

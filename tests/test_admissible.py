@@ -9,9 +9,9 @@ import pytest
 from scipy.optimize import minimize, nnls
 
 import jimpact as ji
-from jimpact.kinematics.admissible import admissible_set
-from jimpact.numerics.capped_polyhedron import CappedPolyhedron, cone_facets, least_squares
-from jimpact.pictures.admissible import plot_admissible_set
+from jimpact.fits.capped_polyhedron import CappedPolyhedron, cone_facets, least_squares
+from jimpact.plot.admissible import plot_admissible_set
+from jimpact.theory.admissible import admissible_set
 
 BALLS, V = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 THREE = admissible_set(BALLS, V)

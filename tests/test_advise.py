@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.advice.advising import advise
-from jimpact.advice.evidence import outcomes
-from jimpact.advice.structure import situation
-from jimpact.advice.validity import validity_map
-from jimpact.advice.words import share
 from jimpact.commands.advise import run as run_command
-from jimpact.compliance.linear_chain import newby_ratio
-from jimpact.pictures.validity import plot_advice, plot_validity_map
+from jimpact.methods.advice.advising import advise
+from jimpact.methods.advice.evidence import outcomes
+from jimpact.methods.advice.structure import situation
+from jimpact.methods.advice.validity import validity_map
+from jimpact.methods.advice.words import share
+from jimpact.plot.validity import plot_advice, plot_validity_map
+from jimpact.theory.linear_chain import newby_ratio
 
 BALLS, V = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 EQUAL = ji.LZB(jnp.ones(2), jnp.ones(2))

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-import jimpact.methods.base
-from jimpact.charts.chart import work_precision
-from jimpact.charts.record import QUANTITIES
-from jimpact.charts.timing import in_turns
+import jimpact.methods.contenders.base
 from jimpact.commands.chart import run
-from jimpact.methods import METHODS, outcome, time_scale
-from jimpact.pictures.chart import plot_work_precision
+from jimpact.methods.charts.chart import work_precision
+from jimpact.methods.charts.record import QUANTITIES
+from jimpact.methods.charts.timing import in_turns
+from jimpact.methods.contenders import METHODS, outcome, time_scale
+from jimpact.plot.chart import plot_work_precision
 from jimpact.status import STATUS
 
 pytestmark = pytest.mark.slow  # compiles every method
@@ -129,13 +129,13 @@ def test_a_linear_contact_lasts_half_a_period():
 def test_evaluations_are_those_that_happen(monkeypatch):
     """Every call of the field from inside the compiled loop is told to the host."""
     calls = []
-    real = jimpact.methods.base.power
+    real = jimpact.methods.contenders.base.power
 
     def told(*given):
         jax.debug.callback(lambda: calls.append(1))
         return real(*given)
 
-    monkeypatch.setattr(jimpact.methods.base, "power", told)
+    monkeypatch.setattr(jimpact.methods.contenders.base, "power", told)
     for name, per_evaluation in (("rk4", 1), ("tsit5", 1), ("verlet", 2)):
         method = METHODS[name]
         calls.clear()

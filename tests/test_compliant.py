@@ -10,14 +10,14 @@ from compliant_reference import elastic_plastic
 from reference import chain_matrices
 from scipy.optimize import brentq
 
-from jimpact.compliance.linear_chain import bilateral_motion, newby_ratio
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Bistiffness, Hertz, LinearSpring, PowerLaw
 from jimpact.laws.lzb import LZB
-from jimpact.rheology import Bistiffness, Hertz, LinearSpring, PowerLaw
 from jimpact.scene import Scene
 from jimpact.scenes import chain
 from jimpact.status import CODE
+from jimpact.theory.linear_chain import bilateral_motion, newby_ratio
 
 B = (-1 / 3, 2 / 3, 2 / 3)  # outcome of k2/k1 = infinity
 STRIKE = jnp.array([1.0, 0.0, 0.0])

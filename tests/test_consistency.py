@@ -12,18 +12,18 @@ from jimpact.contact_space import (
     normalized_delassus,
     velocity_change,
 )
-from jimpact.kinematics.friction_consistency import (
+from jimpact.theory.copositive import copositivity, margin
+from jimpact.theory.friction_consistency import (
     friction_bounds,
     friction_energy_change,
     friction_impulses,
 )
-from jimpact.kinematics.restitution_audit import (
+from jimpact.theory.quasi_velocities import from_quasi_velocities, quasi_basis, to_quasi_velocities
+from jimpact.theory.restitution_audit import (
     audit_matrix,
     carnot_energy_loss,
     dissipation_matrix,
 )
-from jimpact.numerics.copositive import copositivity, margin
-from jimpact.quasi import from_quasi_velocities, quasi_basis, to_quasi_velocities
 
 MARGIN = jax.jit(margin)
 HORN = np.array(

@@ -9,14 +9,14 @@ import time
 
 import pytest
 
-import jimpact.executors
-from jimpact.executors import Executor, as_executor
-from jimpact.executors.devices import Devices
-from jimpact.executors.serial import Serial
+import jimpact.montecarlo.executors
 from jimpact.laws.binary import Binary
-from jimpact.montecarlo import monte_carlo
-from jimpact.sampling.distributions import RandomLaw, Uniform
-from jimpact.sampling.fingerprints import fingerprint
+from jimpact.montecarlo.distributions import RandomLaw, Uniform
+from jimpact.montecarlo.executors import Executor, as_executor
+from jimpact.montecarlo.executors.devices import Devices
+from jimpact.montecarlo.executors.serial import Serial
+from jimpact.montecarlo.fingerprints import fingerprint
+from jimpact.montecarlo.running import monte_carlo
 from jimpact.scenes import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
@@ -44,7 +44,7 @@ def wanted():
 
 
 def test_names_and_protocol():
-    assert jimpact.executors.NAMES == ("serial", "devices", "dask")
+    assert jimpact.montecarlo.executors.NAMES == ("serial", "devices", "dask")
     assert isinstance(as_executor("serial"), Serial)
     assert isinstance(as_executor("devices"), Devices)
     own = Serial()
@@ -107,7 +107,7 @@ def test_one_two_and_four_devices(wanted):
 
 
 def dask_executor(client):
-    from jimpact.executors.dask_cluster import DaskExecutor
+    from jimpact.montecarlo.executors.dask_cluster import DaskExecutor
 
     return DaskExecutor(client)
 

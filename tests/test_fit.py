@@ -12,7 +12,7 @@ from scipy import stats
 
 import jimpact as ji
 from jimpact.laws.base import Law
-from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.status import CODE
 
 DATA = files("jimpact") / "data"

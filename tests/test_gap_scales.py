@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jimpact.compliance.gap_scales import crossover, gap_scale
 from jimpact.histories import history
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, UserForce
 from jimpact.laws.lzb import LZB
 from jimpact.laws.newton import Newton
-from jimpact.pictures.rheology import plot_forces
-from jimpact.rheology import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, UserForce
+from jimpact.montecarlo.gap_scales import crossover, gap_scale
+from jimpact.plot.rheology import plot_forces
 from jimpact.scenes import chain, column
 
 

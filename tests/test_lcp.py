@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog, nnls
 
-from jimpact.numerics.lcp import solve_lcp
+from jimpact.solvers.lcp import solve_lcp
 from jimpact.status import CODE
 
 batched = jax.jit(jax.vmap(solve_lcp))

@@ -12,8 +12,8 @@ from jimpact.contact_space import normalized_delassus
 from jimpact.fits.fitting import fit
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.laws.restitution_matrix import RestitutionMatrix
-from jimpact.numerics.copositive import margin
-from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.solvers.tridiagonal import as_matrix
+from jimpact.theory.copositive import margin
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])
 E_TRUE = np.array([[0.3, 0.1], [0.5, 0.4]])

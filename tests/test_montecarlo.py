@@ -16,19 +16,19 @@ import pytest
 from scipy import stats
 
 from jimpact.comparison import registered_laws
-from jimpact.compliance.gap_scales import gap_scale
 from jimpact.impacts import impact
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Hertz
 from jimpact.laws.newton import Newton
-from jimpact.montecarlo import monte_carlo
-from jimpact.rheology import Hertz
-from jimpact.sampling import histograms, store
-from jimpact.sampling.distributions import Normal, RandomLaw, Uniform
-from jimpact.sampling.fingerprints import fingerprint
-from jimpact.sampling.gap_sensitivities import gap_sensitivity
-from jimpact.sampling.moments import merged, moments
-from jimpact.sampling.store import read_samples
+from jimpact.montecarlo import histograms, store
+from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
+from jimpact.montecarlo.fingerprints import fingerprint
+from jimpact.montecarlo.gap_scales import gap_scale
+from jimpact.montecarlo.gap_sensitivities import gap_sensitivity
+from jimpact.montecarlo.moments import merged, moments
+from jimpact.montecarlo.running import monte_carlo
+from jimpact.montecarlo.store import read_samples
 from jimpact.scenes import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
@@ -447,8 +447,8 @@ def test_a_killed_process_continues_with_the_same_bits(tmp_path, whole):
     code = f"""
 import jax; jax.config.update("jax_enable_x64", True)
 import time, jimpact as ji
-from jimpact.montecarlo import monte_carlo
-from jimpact.sampling.distributions import Uniform
+from jimpact.montecarlo.running import monte_carlo
+from jimpact.montecarlo.distributions import Uniform
 class Slow:
     def run(self, plan, tasks):
         for task in tasks:

@@ -7,7 +7,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.contact_space import kinetic_norm
-from jimpact.quasi import (
+from jimpact.theory.quasi_velocities import (
     contact_power,
     from_quasi_velocities,
     kinetic_energy_split,

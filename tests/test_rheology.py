@@ -8,12 +8,10 @@ from compliant_reference import viscous
 from reference import chain_matrices
 from scipy.optimize import brentq
 
-from jimpact.compliance.calibration import calibrate, compare_rheologies, measured_restitution
-from jimpact.compliance.materials import hertz_stiffness, sphere_mass
 from jimpact.impacts import impact
+from jimpact.laws.calibration import calibrate, compare_rheologies, measured_restitution
 from jimpact.laws.compliant import Compliant
-from jimpact.pictures.rheology import plot_rheologies
-from jimpact.rheology import (
+from jimpact.laws.forces import (
     Bistiffness,
     Hertz,
     HuntCrossley,
@@ -22,6 +20,8 @@ from jimpact.rheology import (
     LinearSpring,
     UserForce,
 )
+from jimpact.laws.materials import hertz_stiffness, sphere_mass
+from jimpact.plot.rheology import plot_rheologies
 from jimpact.scenes import chain
 from jimpact.status import CODE
 

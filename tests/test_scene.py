@@ -7,7 +7,7 @@ import pytest
 import reference
 
 import jimpact as ji
-from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.status import CODE
 
 

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.methods import METHODS
-from jimpact.stability.causes import frequencies
-from jimpact.stability.mapping import stability_map
-from jimpact.stability.points import chain_of, setting_of
-from jimpact.stability.runs import CLASSES
+from jimpact.methods.contenders import METHODS
+from jimpact.methods.stability.causes import frequencies
+from jimpact.methods.stability.mapping import stability_map
+from jimpact.methods.stability.points import chain_of, setting_of
+from jimpact.methods.stability.runs import CLASSES
 from jimpact.status import STATUS
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))

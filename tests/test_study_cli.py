@@ -9,7 +9,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.cli import main
-from jimpact.pictures.fits import plot_fit
+from jimpact.plot.fits import plot_fit
 from jimpact.study import read_study
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.2,0.8\n2,0,0.4,1.6\n"

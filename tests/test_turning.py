@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jimpact.compliance.turning import block_gaps, turning_impact
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
-from jimpact.rheology import Bistiffness, Hertz, HuntCrossley, LinearSpring
+from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
+from jimpact.motion.turning import block_gaps, turning_impact
 from jimpact.scenes import chain, scene_from_gaps
 
 GAPS = block_gaps(1.0, 1.0)

@@ -7,10 +7,10 @@ from typing import Any
 
 import jax
 
-from jimpact.advice.advising import advise
-from jimpact.advice.report import Advice
 from jimpact.commands.compare import velocities
 from jimpact.commands.output import picture_path, save_picture
+from jimpact.methods.advice.advising import advise
+from jimpact.methods.advice.report import Advice
 from jimpact.study import Study, read_study
 
 PICTURE = "jimpact-advise.png"
@@ -73,6 +73,6 @@ def _parameters(study: Study) -> dict[str, Any]:
 
 
 def _draw(found: Advice, title: str, path: Path) -> None:
-    from jimpact.pictures.validity import plot_advice  # matplotlib, late
+    from jimpact.plot.validity import plot_advice  # matplotlib, late
 
     save_picture(plot_advice(found, title), path)

@@ -10,13 +10,13 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from jimpact.charts.chart import work_precision
-from jimpact.charts.record import Point, Timing, WorkPrecision
 from jimpact.commands.compare import velocities
 from jimpact.commands.output import console_for, picture_path, save_picture
 from jimpact.laws import REGISTRY
 from jimpact.laws.lzb import LZB
-from jimpact.methods import METHODS
+from jimpact.methods.charts.chart import work_precision
+from jimpact.methods.charts.record import Point, Timing, WorkPrecision
+from jimpact.methods.contenders import METHODS
 from jimpact.study import Study, read_study
 
 PICTURE = "jimpact-chart.png"
@@ -83,7 +83,7 @@ def _able(law: LZB, study: Study, full: bool) -> tuple[str, ...]:
 
 
 def _draw(found: WorkPrecision, title: str, path: Path) -> None:
-    from jimpact.pictures.chart import plot_work_precision  # matplotlib, late
+    from jimpact.plot.chart import plot_work_precision  # matplotlib, late
 
     save_picture(plot_work_precision(found, title), path)
 

@@ -79,7 +79,7 @@ def _fits(study: Study) -> dict[str, Fit]:
 
 
 def _draw(found: Comparison, measured: np.ndarray | None, title: str, path: Path) -> None:
-    from jimpact.pictures.comparison import plot_comparison  # matplotlib, late
+    from jimpact.plot.comparison import plot_comparison  # matplotlib, late
 
     save_picture(plot_comparison(found, measured, title), path)
 

@@ -50,7 +50,7 @@ def run(
 
 
 def _draw(study: Study, fits: dict[str, Fit], path: Path) -> None:
-    from jimpact.pictures.fits import plot_fit  # matplotlib, late: bad input is told sooner
+    from jimpact.plot.fits import plot_fit  # matplotlib, late: bad input is told sooner
 
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     save_picture(plot_fit(fits[RAW], others, study.title), path)

@@ -9,9 +9,9 @@ from typing import Any
 import jax
 
 from jimpact.commands.output import INTERRUPTED, picture_path, save_picture
-from jimpact.executors import Executor, as_executor
-from jimpact.montecarlo import monte_carlo
-from jimpact.sampling.results import MonteCarlo
+from jimpact.montecarlo.executors import Executor, as_executor
+from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.running import monte_carlo
 from jimpact.study import Study, read_study
 
 PICTURE = "jimpact-montecarlo.png"
@@ -72,12 +72,12 @@ def _executor(name: str, scheduler: str | None) -> Executor:
         return as_executor(name)
     if name != "dask":
         raise ValueError(f"--scheduler needs --executor dask, but it is {name}.")
-    from jimpact.executors.dask_cluster import DaskExecutor
+    from jimpact.montecarlo.executors.dask_cluster import DaskExecutor
 
     return DaskExecutor(scheduler)
 
 
 def _draw(found: MonteCarlo, title: str, path: Path) -> None:
-    from jimpact.pictures.montecarlo import plot_monte_carlo  # matplotlib, late
+    from jimpact.plot.montecarlo import plot_monte_carlo  # matplotlib, late
 
     save_picture(plot_monte_carlo(found, title), path)

@@ -69,8 +69,8 @@ def _told(what: str) -> Iterator[None]:
 def _draw(
     study: MotionStudy, motion: Motion, pictures: dict[str, Path | None], coordinate: int
 ) -> None:
-    from jimpact.pictures.animation import animate_motion  # matplotlib, late
-    from jimpact.pictures.motions import plot_motion, plot_phase_portrait
+    from jimpact.plot.animation import animate_motion  # matplotlib, late
+    from jimpact.plot.motions import plot_motion, plot_phase_portrait
 
     path, portrait, gif = (pictures[k] for k in ("picture", "portrait", "animation"))
     assert path is not None

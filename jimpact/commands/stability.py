@@ -7,8 +7,8 @@ from pathlib import Path
 import jax
 
 from jimpact.commands.output import INTERRUPTED, picture_path, save_picture
-from jimpact.stability.mapping import stability_map
-from jimpact.stability.results import StabilityMap
+from jimpact.methods.stability.mapping import stability_map
+from jimpact.methods.stability.results import StabilityMap
 
 PICTURE = "jimpact-stability.png"
 QUICK_RESOLUTION, QUICK_STEPS = 7, 5_000
@@ -52,7 +52,7 @@ def run(methods: tuple[str, ...] | None, full: bool, out: Path, json: bool) -> i
 
 def draw(found: StabilityMap, path: Path) -> list[Path]:
     """Write the picture over single axes to `path`; where the map has pairs, one more a method."""
-    from jimpact.pictures.stability import (  # matplotlib, late
+    from jimpact.plot.stability import (  # matplotlib, late
         plot_stability_map,
         plot_stability_pairs,
     )

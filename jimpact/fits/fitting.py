@@ -10,6 +10,7 @@ from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_kind
 from jimpact.experiments import Experiments
+from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Search, search
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
@@ -23,7 +24,6 @@ from jimpact.fits.report import report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.fits.warned import fit_warnings
 from jimpact.laws.base import Law
-from jimpact.numerics.least_squares import Method, check_method, default_steps
 from jimpact.scene import Scene
 
 

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.optimize import linprog
 
 from jimpact.contact_space import delassus_matrix, kinetic_norm, without_open_contacts
+from jimpact.fits.matrix_region import AdmissibleMatrices
 from jimpact.laws.base import Law
 from jimpact.laws.restitution_matrix import RestitutionMatrix
-from jimpact.numerics.matrix_region import AdmissibleMatrices
-from jimpact.numerics.tridiagonal import as_matrix, scaled
 from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import as_matrix, scaled
 
 # Every support of m contacts gives a condition on the energy, 2^m - 1 in all.
 LARGEST = 6

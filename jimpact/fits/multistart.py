@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.fits.least_squares import Method, State
 from jimpact.fits.parameters import Parameters, entries
 from jimpact.fits.problem import Problem, advance_all, begin_all, from_scaled, to_scaled
-from jimpact.numerics.least_squares import Method, State
 from jimpact.progress import progress_bar
 
 LANES = 4  # starts that run together; those that are done make room

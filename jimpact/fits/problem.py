@@ -9,11 +9,11 @@ import numpy as np
 
 from jimpact.contact_space import dense_mass
 from jimpact.experiments import Experiments
+from jimpact.fits.least_squares import Box, Method, Region, State, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import LOGARITHMIC, Parameters, entries, with_entries
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
-from jimpact.numerics.least_squares import Box, Method, Region, State, advance, begin
 from jimpact.scene import Scene
 from jimpact.status import CODE
 

@@ -7,8 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics.tridiagonal import Symmetric
 from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import Symmetric
 
 
 def no_tangential_impulse(scene: Scene, dtype: jnp.dtype) -> jax.Array:

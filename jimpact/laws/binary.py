@@ -18,9 +18,9 @@ from jimpact._checks import (
 )
 from jimpact.contact_space import as_velocity, delassus_matrix, gap_velocity, velocity_change
 from jimpact.laws.base import Law, no_tangential_impulse
-from jimpact.numerics import collisions
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
 from jimpact.scene import Scene
+from jimpact.solvers import collisions
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
 
 ORDERS = ("fastest", "earliest", "left_to_right")
 

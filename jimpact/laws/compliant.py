@@ -10,12 +10,12 @@ import jax.numpy as jnp
 
 from jimpact._checks import check_per_contact, check_values
 from jimpact.laws.base import Law, no_tangential_impulse
+from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS, default_rtol
 from jimpact.numerics.dimensionless import solve, to_dimensionless
 from jimpact.numerics.flow import Viscous
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal
-from jimpact.rheology import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal
 
 
 class Compliant(Law):

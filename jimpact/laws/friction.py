@@ -9,9 +9,9 @@ import numpy as np
 from jimpact._checks import as_float_array, check_values, is_traced
 from jimpact.contact_space import solve_mass
 from jimpact.laws.base import Law
-from jimpact.numerics.coulomb import Impulses, Problem, solve_complementary, solve_prescribed
-from jimpact.numerics.coulomb_disc import DiscProblem, solve_disc
 from jimpact.scene import Scene
+from jimpact.solvers.coulomb import Impulses, Problem, solve_complementary, solve_prescribed
+from jimpact.solvers.coulomb_disc import DiscProblem, solve_disc
 
 
 def friction_fields(

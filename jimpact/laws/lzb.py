@@ -13,8 +13,8 @@ from jimpact.laws.friction import check_friction
 from jimpact.numerics import friction
 from jimpact.numerics.dimensionless import METHODS, Inputs, Units, solve, to_dimensionless
 from jimpact.numerics.powers import Exponent
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, as_matrix
 from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jimpact._checks import as_float_array, check_shape, check_square, check_values
 from jimpact.laws.base import Law
 from jimpact.laws.friction import check_friction, friction_fields, frictional_impulses
-from jimpact.numerics.lcp import solve_lcp
-from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 from jimpact.scene import Scene
+from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 
 
 class Moreau(Law):

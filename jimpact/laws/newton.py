@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jimpact._checks import as_float_array, check_values
 from jimpact.laws.base import Law
 from jimpact.laws.friction import check_friction, friction_fields, frictional_impulses
-from jimpact.numerics.linear import solve_symmetric
-from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 from jimpact.scene import Scene
+from jimpact.solvers.linear import solve_symmetric
+from jimpact.solvers.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 from jimpact.status import CODE
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.laws.base import Law
-from jimpact.numerics.lcp import solve_lcp
-from jimpact.numerics.tridiagonal import Symmetric, as_matrix, is_regular
+from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.tridiagonal import Symmetric, as_matrix, is_regular
 
 
 class Poisson(Law):

@@ -16,11 +16,11 @@ from jimpact.contact_space import (
 )
 from jimpact.laws.base import Law, no_tangential_impulse
 from jimpact.laws.friction import check_friction, friction_fields, frictional_impulses
-from jimpact.numerics.linear import solve_symmetric
-from jimpact.numerics.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
-from jimpact.quasi import check_independent, quasi_basis
 from jimpact.scene import Scene
+from jimpact.solvers.linear import solve_symmetric
+from jimpact.solvers.tridiagonal import Symmetric, as_matrix, diagonal, is_regular
 from jimpact.status import CODE
+from jimpact.theory.quasi_velocities import check_independent, quasi_basis
 
 
 class RestitutionMatrix(Law):
@@ -29,7 +29,7 @@ class RestitutionMatrix(Law):
     Equation: with E (m, m): `qn+ = -E qn-`, `qn_j = gamma_j / |grad f_j|`, hence
     `pbar = -G^-1 (I + E) qn-`, `p_j = pbar_j / |grad f_j|`; tangential velocities are conserved.
     With E (m + k, m + k), k = n - m - b: `(qn+, qt+) = -E (qn-, qt-)` in the basis of
-    `jimpact.quasi.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
+    `ji.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
     scene's tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t where
     several do), `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn = 0, E_tt = -I.)
     Bilateral constraints distort G and n_q as in (6.35). With friction, and E (m, m),

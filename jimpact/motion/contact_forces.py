@@ -20,7 +20,7 @@ from jimpact.motion.dynamics import (
     user_force,
 )
 from jimpact.motion.system import System
-from jimpact.numerics.linear import solve_definite
+from jimpact.solvers.linear import solve_definite
 
 # singular values below this share of the largest are rounding: redundant sticking contacts
 _REDUNDANT = 1e-12

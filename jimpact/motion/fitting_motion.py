@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
+from jimpact.fits.least_squares import Box, State, advance, begin
 from jimpact.fits.parameters import LOGARITHMIC, Parameters, bounds_of, entries, free_parameters
 from jimpact.fits.parameters import with_entries as law_with
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
@@ -17,7 +18,6 @@ from jimpact.laws.base import Law
 from jimpact.motion.record import MOTION_STATUS, Motion
 from jimpact.motion.simulation import simulate
 from jimpact.motion.system import System
-from jimpact.numerics.least_squares import Box, State, advance, begin
 
 Observe = Callable[[Motion], jax.Array]
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.motion.contact_forces import Contacts, Modes, forces
-from jimpact.numerics.lcp import solve_lcp
+from jimpact.solvers.lcp import solve_lcp
 
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.mechanisms.bodies import Block, Dimer
-from jimpact.mechanisms.pendulums import PendulumCradle
+from jimpact.bodies.bodies import Block, Dimer
+from jimpact.bodies.pendulums import PendulumCradle
 from jimpact.motion.ready_systems import ColumnGaps
 from jimpact.motion.system import System
 

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.mechanisms.bodies import Block, Dimer
-from jimpact.mechanisms.pendulums import PendulumCradle
+from jimpact.bodies.bodies import Block, Dimer
+from jimpact.bodies.pendulums import PendulumCradle
 from jimpact.motion.system import STANDARD_GRAVITY, System, gravity
 
 

@@ -25,7 +25,7 @@ from jimpact.motion.event_driven import energies, no_events
 from jimpact.motion.flight_records import State
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, Motion
 from jimpact.motion.system import System
-from jimpact.numerics.lcp import solve_lcp
+from jimpact.solvers.lcp import solve_lcp
 
 _ROUNDING = 1e-12  # approaches below this share of the largest velocity change nothing
 

@@ -20,7 +20,7 @@ from jimpact.numerics.powers import Exponent, root_order
 from jimpact.numerics.propagator import propagate
 from jimpact.numerics.sensitivity import both_modes
 from jimpact.numerics.steps import FINEST, Carry, Control, patience
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
 METHODS = ("time", "propagator", "impulse")

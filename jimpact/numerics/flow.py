@@ -36,11 +36,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.events.tableaux import DOP853, Tableau
 from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import first_least, of
 from jimpact.numerics.powers import Exponent, factor, power
-from jimpact.numerics.tableaux import DOP853, Tableau
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
 
 TIME, START, ZERO_G, ROOT_X, FROM_GAP, ONSET = 0, 1, 2, 3, 4, 5  # variable of a step
 OPEN, COMPRESSION, EXPANSION = 0, 1, 2  # phase of a contact

@@ -37,7 +37,7 @@ from jimpact.numerics.friction_flow import (
     tangential_force,
     times,
 )
-from jimpact.numerics.friction_modes import who_sticks
+from jimpact.solvers.friction_modes import who_sticks
 
 AT_REST = 0.5  # part of the tolerance below which a spatial slip velocity counts as 0
 NEW_SLIP = 4.0  # tolerances, with which it begins along its direction: the less the stiffer

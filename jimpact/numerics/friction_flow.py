@@ -27,12 +27,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.events.tableaux import DOP853
 from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import along_contacts, of
 from jimpact.numerics.events import margin_signs
 from jimpact.numerics.flow import OPEN, START, TIME, Flow, Rates, frozen, rates_of
 from jimpact.numerics.powers import power
-from jimpact.numerics.tableaux import DOP853
 
 __all__ = ["HOLDING", "MARGIN", "ROOT_X", "START", "TIME"]
 

@@ -11,7 +11,7 @@ from jimpact.numerics.contacts import any_of
 from jimpact.numerics.events import matters
 from jimpact.numerics.flow import OPEN, Flow, State, apply, scales
 from jimpact.numerics.powers import plus_one, power
-from jimpact.numerics.tridiagonal import Symmetric, Tridiagonal
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
 
 RESIDUAL = 1.0  # loads and velocities below this part of the tolerance end the impact
 

@@ -20,7 +20,7 @@ from jimpact.numerics.flow import (
     lands,
     rates_of,
 )
-from jimpact.numerics.tridiagonal import as_matrix
+from jimpact.solvers.tridiagonal import as_matrix
 
 TERMS = 20  # 1 / 20! < 1e-18: beyond rounding for steps up to REACH
 REACH = 1.0  # step length times the largest frequency

@@ -15,7 +15,7 @@ from jimpact.numerics import isolated, stepper
 from jimpact.numerics.events import NEGLIGIBLE
 from jimpact.numerics.flow import Flow
 from jimpact.numerics.steps import Carry, Control
-from jimpact.numerics.tridiagonal import Tridiagonal
+from jimpact.solvers.tridiagonal import Tridiagonal
 
 WIDTHS = (32, 128, 512)  # contacts; the steps of one impact cost as much with 1 contact as with 32
 LONG = 2  # widths: chains below are stepped whole

@@ -28,7 +28,7 @@ from three_balls import SCENE, V, law_of, one_impact, problem, steps
 
 import jimpact as ji
 from jimpact.contact_space import velocity_change
-from jimpact.methods.event_aligned import DOP853_ALIGNED
+from jimpact.methods.contenders.event_aligned import DOP853_ALIGNED
 
 BATCH, REPEATS = 4096, 7
 POINTS = 16  # single impacts, one after the other

@@ -1,0 +1,134 @@
+"""Is an outcome admissible? Kinematic, kinetic and energetic consistency, momentum balance."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.contact_space import (
+    as_velocity,
+    delassus_matrix,
+    gap_velocity,
+    kinetic_energy,
+    momentum,
+)
+from jimpact.impacts import Impact, gap_velocity_rounding
+from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import diagonal
+from jimpact.status import STATUS, sign_tolerance
+
+
+class Audit(eqx.Module):
+    """Four answers and the numbers behind them (`worst_*`: scaled by the impact's own size)."""
+
+    kinematic: jax.Array
+    kinetic: jax.Array
+    energetic: jax.Array
+    momentum: jax.Array
+    worst_gap_velocity: jax.Array
+    worst_impulse: jax.Array
+    energy_gain: jax.Array
+    momentum_residual: jax.Array
+
+    @property
+    def consistent(self) -> jax.Array:
+        """All four hold."""
+        return self.kinematic & self.kinetic & self.energetic & self.momentum
+
+
+def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
+    """Check an outcome against what every impact must satisfy, whatever the law.
+
+    Equation: closed contacts `gamma+ >= 0` (kinematic), `p >= 0` (kinetic),
+    `T+ - T- <= sum U_0` (energetic), `M (v+ - v-) = N p` (momentum).
+
+    Args:
+        scene: the scene of the impact.
+        velocity: v- (n,) [m/s].
+        out: what `impact` returned, or an `Impact` filled by hand from measurements.
+
+    Source: Brogliato (2016), section 6.2.4.
+
+    >>> import jimpact as ji
+    >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
+    >>> bool(ji.audit(scene, v, ji.impact(ji.Newton(0.5), scene, v)).consistent)
+    True
+    """
+    v = as_velocity(scene, velocity)
+    delassus = delassus_matrix(scene)
+    root = jnp.sqrt(diagonal(delassus))
+    gamma = jnp.where(scene.closed, gap_velocity(scene, v), 0.0)
+    gamma_plus = gap_velocity(scene, out.velocity)
+    approach = jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2)
+    size = jnp.sqrt(approach + 2 * out.initial_energy)
+    size = jnp.where(size > 0, size, 1.0)
+    jump = momentum(scene, out.velocity - v)
+    change = 0.5 * jump @ (out.velocity + v)  # T+ - T- without their cancellation
+    residual = jump - scene.normals @ out.impulse
+    if scene.tangents is not None:
+        residual = residual - scene.tangents @ out.tangential_impulse
+    if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
+        basis = jnp.linalg.qr(scene.constraints)[0]
+        residual = residual - basis @ (basis.T @ residual)
+    # as `impact` judges: what is within rounding is none of the law's doing
+    rounding = gap_velocity_rounding(scene, delassus, gamma, out.impulse)
+    within = jnp.clip(gamma_plus, -rounding, 0.0)
+    least = jnp.where(scene.closed, (gamma_plus - within) / root, jnp.inf)
+    worst_gap_velocity = jnp.min(least) / size
+    worst_impulse = jnp.min(out.impulse * root) / size
+    gain = (change - out.initial_energy) / size**2
+    off = jnp.abs(residual).max() / jnp.maximum(jnp.abs(momentum(scene, v)).max(), 1e-300)
+    tolerance = sign_tolerance(out.velocity.dtype)
+    return Audit(
+        kinematic=worst_gap_velocity >= -tolerance,
+        kinetic=worst_impulse >= -tolerance,
+        energetic=gain <= tolerance,
+        momentum=off <= tolerance,
+        worst_gap_velocity=worst_gap_velocity,
+        worst_impulse=worst_impulse,
+        energy_gain=gain,
+        momentum_residual=off,
+    )
+
+
+def summary(out: Impact, scene: Scene, velocity: Any) -> str:
+    """A printable account of one impact (or, for a batch, of its status codes).
+
+    >>> import jimpact as ji
+    >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
+    >>> print(ji.summary(ji.impact(ji.Newton(0.5), scene, v), scene, v).splitlines()[0])
+    status         ok: the impact is resolved within tolerance
+    """
+    codes = np.asarray(out.status)
+    if codes.ndim:
+        counts = zip(*np.unique(codes, return_counts=True))
+        rows = [f"{STATUS[c].name:24s}{k:10d}" for c, k in counts]
+        return "\n".join([f"{codes.size} impacts by status", *rows])
+    row = STATUS[int(codes)]
+    before = float(kinetic_energy(scene, velocity))
+    kept = (before + float(out.energy_change)) / before if before else float("nan")
+    checks = audit(scene, velocity, out)
+    words = [
+        f"{name} {'ok' if bool(getattr(checks, name)) else 'VIOLATED'}"
+        for name in ("kinematic", "kinetic", "energetic", "momentum")
+    ]
+    lines = [
+        f"status         {row.name}: {row.message}",
+        f"energy         {before:.6g} J before, change {float(out.energy_change):.6g} J "
+        f"({100 * kept:.4g} % kept)",
+        f"audit          {', '.join(words)}",
+        "coordinate          v-             v+   [m/s]",
+    ]
+    pairs = zip(np.asarray(velocity, float), np.asarray(out.velocity, float))
+    lines += [f"{i + 1:10d} {a:14.6g} {b:14.6g}" for i, (a, b) in enumerate(pairs)]
+    lines.append("contact          gamma-         gamma+   [m/s]     impulse [N s]")
+    g0, g1 = (
+        np.asarray(gap_velocity(scene, velocity)),
+        np.asarray(gap_velocity(scene, out.velocity)),
+    )
+    for j, (a, b, p, closed) in enumerate(zip(g0, g1, np.asarray(out.impulse), scene.closed)):
+        note = "" if closed else "   open: takes no part" if p == 0 else "   open before"
+        lines.append(f"{j + 1:7d} {a:15.6g} {b:14.6g} {p:21.6g}{note}")
+    return "\n".join(lines)

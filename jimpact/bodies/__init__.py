@@ -1,0 +1,1 @@
+"""Bodies: gaps, tangents and mass of blocks, dimers, discs and pendulums."""

@@ -1,0 +1,93 @@
+"""Newton's cradle: a row of pendulums whose bobs are balls."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.bodies.base import Mechanism, positive, positives
+from jimpact.scene import Scene
+
+
+class PendulumCradle(Mechanism):
+    """Balls on parallel strings, side by side; q = the angles of the strings, to the right > 0.
+
+    Equation: ball i at `(s_i + l sin(q_i), -l cos(q_i))`, `f_j = |c_{j+1} - c_j| - R_j - R_{j+1}`,
+    `M = diag(m_i l^2)`: each ball hangs on two strings, so that it does not turn. The suspensions
+    s_i stand so far apart that the gaps at rest are `gaps`. At rest with closed gaps
+    `N = l N_chain`, so that W is that of `chain(masses)`, and gap velocities are `l` times those.
+
+    Args:
+        masses: (n,) > 0 [kg], n >= 2.
+        length: l > 0 of the strings, to the centres [m].
+        radius: R > 0 of the balls, scalar or (n,) [m].
+        gaps: >= 0 at rest, scalar or (n - 1,) [m].
+
+    >>> import jimpact as ji
+    >>> cradle = ji.PendulumCradle([1.0, 1.0, 1.0], length=0.3, radius=0.01)
+    >>> cradle.scene([-0.5, 0.0, 0.0]).closed.tolist()
+    [False, True]
+    """
+
+    masses: jax.Array
+    length: jax.Array
+    radius: jax.Array
+    gaps: jax.Array
+
+    def __init__(self, masses: Any, length: Any, radius: Any, gaps: Any = 0.0):
+        self.masses = positives("masses", masses)
+        n = self.masses.shape[0]
+        if n < 2:
+            raise ValueError(f"Argument `masses` must hold two balls or more, but holds {n}.")
+        self.length = positive("length", length)
+        self.radius = positives("radius", radius, n)
+        off = as_float_array("gaps", gaps)
+        self.gaps = jnp.full(n - 1, off) if off.ndim == 0 else off
+        check_shape("gaps", self.gaps, (n - 1,), "one between each two balls")
+        check_values("gaps", self.gaps, low=0.0)
+
+    @property
+    def coordinates(self) -> int:
+        """One angle for each ball."""
+        return self.masses.shape[0]
+
+    def mass_matrix(self, q: jax.Array) -> jax.Array:
+        """Its diagonal (n,): m_i l^2."""
+        return self.masses * self.length**2
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Distances between neighbouring balls."""
+        touching = self.radius[:-1] + self.radius[1:]
+        right = touching + self.gaps + self.length * jnp.diff(jnp.sin(q))
+        up = self.length * jnp.diff(jnp.cos(q))
+        # |c| - d as (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
+        across = (right - touching) * (right + touching) + up**2
+        return across / (jnp.sqrt(right**2 + up**2) + touching)
+
+
+def pendulum_cradle(
+    masses: Any, length: Any, radius: Any, gaps: Any = 0.0, angles: Any = 0.0
+) -> Scene:
+    """Scene of Newton's cradle, with the angles of its strings as coordinates.
+
+    Equation: see `PendulumCradle`. At rest its impacts are those of `chain(masses)` with v = l q'.
+
+    Args:
+        masses: (n,) > 0 [kg], n >= 2.
+        length: l > 0 of the strings, to the centres [m].
+        radius: R > 0 of the balls, scalar or (n,) [m].
+        gaps: >= 0 at rest, scalar or (n - 1,) [m].
+        angles: q of the strings [rad], scalar or (n,): to the right > 0.
+
+    Raises:
+        ValueError: numbers out of range, wrong shapes, balls that overlap at these angles.
+
+    >>> import jimpact as ji
+    >>> scene = ji.pendulum_cradle([1.0, 2.0, 2.0], length=0.3, radius=0.01)
+    >>> ji.delassus_matrix(scene)[0].round(6).tolist()
+    [1.5, -0.5]
+    """
+    cradle = PendulumCradle(masses, length, radius, gaps)
+    q = as_float_array("angles", angles)
+    return cradle.scene(jnp.full(cradle.coordinates, q) if q.ndim == 0 else q)

@@ -1,0 +1,123 @@
+"""Bodies in space: the dimer of two spheres and a rod on a horizontal plane."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import check_values
+from jimpact.bodies.base import Mechanism, number, positive
+from jimpact.bodies.bodies import Dimer
+from jimpact.scene import Scene
+
+
+class SpatialDimer(Mechanism):
+    """Two equal spheres on the ends of a rod over a plane; q = (x, y, z, yaw, pitch, spin).
+
+    Equation: with the rod's axis `a = (cos p cos w, cos p sin w, sin p)`, pitch p, yaw w,
+    `f_{1,2} = z +/- (L/2 + R) sin(p) - R`, and a sphere's lowest point slides at the horizontal
+    part of `c_i' - R omega x e_z`. The spin about the axis belongs to q: friction across the rod
+    changes it. Mass matrix: `m`, and `I |a'|^2 + I_a (omega . a)^2` with `I_a = (4/5) m_s R^2`.
+
+    These angles do not serve an upright rod (pitch pi/2): there M is singular.
+
+    Args:
+        radius: R > 0 of the spheres [m].
+        length: L > 0 of the rod between their surfaces [m].
+        sphere_mass: of one sphere, > 0 [kg].
+        rod_mass: of the thin rod, >= 0 [kg].
+
+    Source: own derivation; the planar case is Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
+
+    >>> import jimpact as ji
+    >>> body = ji.SpatialDimer(radius=1.0, length=2.0)
+    >>> body.scene(body.touching()).tangents.shape
+    (6, 4)
+    """
+
+    planar: Dimer
+
+    def __init__(self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0):
+        radius = positive("radius", radius)  # without radius no inertia about the axis
+        self.planar = Dimer(radius, length, sphere_mass, rod_mass)
+
+    @property
+    def coordinates(self) -> int:
+        """x, y, z, yaw, pitch, spin."""
+        return 6
+
+    def mass_matrix(self, q: jax.Array) -> jax.Array:
+        """M(q) (6, 6)."""
+        body = self.planar
+        about_axis = 0.8 * body.sphere_mass * body.radius**2
+        sine, cosine = jnp.sin(q[4]), jnp.cos(q[4])
+        zero, m = jnp.zeros_like(sine), body.total_mass
+        turning = [
+            [body.inertia * cosine**2 + about_axis * sine**2, zero, about_axis * sine],
+            [zero, body.inertia, zero],
+            [about_axis * sine, zero, about_axis],
+        ]
+        rows = [[*([zero] * 3), *row] for row in turning]
+        moving = [[m if i == j else zero for j in range(6)] for i in range(3)]
+        return jnp.stack([jnp.stack(row) for row in [*moving, *rows]])
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Heights of the two spheres over the plane."""
+        lift = self.planar.arm * jnp.sin(q[4])
+        return jnp.stack([q[2] + lift, q[2] - lift]) - self.planar.radius
+
+    def tangents(self, q: jax.Array) -> jax.Array:
+        """H_t (6, 4): x and y of sphere 1, x and y of sphere 2."""
+
+        def ends(q: jax.Array) -> jax.Array:
+            level = self.planar.arm * jnp.cos(q[4])
+            way = level * jnp.stack([jnp.cos(q[3]), jnp.sin(q[3])])
+            return jnp.concatenate([q[:2] + way, q[:2] - way])
+
+        # omega from the rates of yaw, pitch and spin; omega x e_z = (omega_y, -omega_x, 0)
+        sine, cosine, level = jnp.sin(q[3]), jnp.cos(q[3]), jnp.cos(q[4])
+        zero = jnp.zeros_like(sine)
+        x = jnp.stack([zero, zero, zero, zero, sine, level * cosine])
+        y = jnp.stack([zero, zero, zero, zero, -cosine, level * sine])
+        rolling = self.planar.radius * jnp.stack([-y, x], axis=1)
+        return jax.jacobian(ends)(q).T + jnp.concatenate([rolling, rolling], axis=1)
+
+    def touching(self, angle: Any = 0.0, yaw: Any = 0.0) -> jax.Array:
+        """q (6,) at the origin with this pitch, at which the lower sphere (or both) touches."""
+        pitch, turn = number("angle", angle), number("yaw", yaw)
+        check_values("angle", pitch, low=-0.5 * jnp.pi, high=0.5 * jnp.pi)
+        zero = jnp.zeros_like(pitch)
+        low = self.planar.touching(pitch)[1]
+        return jnp.stack([zero, zero, low, turn.astype(zero.dtype), pitch, zero])
+
+
+def dimer_3d(
+    radius: Any,
+    length: Any,
+    sphere_mass: Any = 1.0,
+    rod_mass: Any = 1.0,
+    angle: Any = 0.0,
+    yaw: Any = 0.0,
+) -> Scene:
+    """Scene of a dimer on a horizontal plane; velocities are the rates of q, see `SpatialDimer`.
+
+    Equation: q = (x, y, z, yaw, pitch, spin); tangents (6, 4), contact-major, along x and y.
+
+    Args:
+        radius: R > 0 of the spheres [m].
+        length: L > 0 of the rod between their surfaces [m].
+        sphere_mass: of one sphere, > 0 [kg].
+        rod_mass: of the thin rod, >= 0 [kg].
+        angle: pitch in (-pi/2, pi/2) [rad]: > 0 lifts sphere 1.
+        yaw: of the rod about the vertical [rad].
+
+    Raises:
+        ValueError: sizes or masses out of range, an upright rod.
+
+    >>> import jimpact as ji
+    >>> scene = ji.dimer_3d(radius=5 / 24, length=1.0, yaw=0.7)
+    >>> round(float(ji.kinetic_angles(scene)[0, 1]), 6)
+    1.424204
+    """
+    body = SpatialDimer(radius, length, sphere_mass, rod_mass)
+    return body.scene(body.touching(angle, yaw))

@@ -1,1 +1,0 @@
-"""Contact forces, their scales and parameters."""

@@ -1,1 +1,0 @@
-"""The generalized kinematic law: its quasi-velocities, matrices and bounds."""

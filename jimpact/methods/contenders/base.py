@@ -1,0 +1,205 @@
+"""What every way to integrate the LZB impact has in common: its problem, its result, its table row.
+
+All work on the dimensionless flow of `numerics/flow.py`. In time form, with c_j = 1 in compression
+and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2,
+
+    x_j' = -omega_j c_j gamma_j,   p_j' = (eta_j + 1)/2 omega_j x_j^eta_j,   gamma = gamma- + G p
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, in_common_dtype, is_traced
+from jimpact.contact_space import delassus_matrix, gap_velocity, without_open_contacts
+from jimpact.impacts import Impact, impact
+from jimpact.laws.base import Law
+from jimpact.laws.lzb import LZB
+from jimpact.numerics.dimensionless import (
+    Inputs,
+    Units,
+    flow_of,
+    indentation,
+    to_dimensionless,
+)
+from jimpact.numerics.flow import Flow
+from jimpact.numerics.powers import Exponent, factor, power
+from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
+from jimpact.status import CODE
+
+UNCOUNTED = -1  # evaluations that the method cannot tell by itself
+
+
+class MethodResult(NamedTuple):
+    """Impulses (m,) [N s], duration () [s] (NaN: not known), field evaluations (), status ()."""
+
+    impulse: jax.Array
+    duration: jax.Array
+    evaluations: jax.Array
+    code: jax.Array
+
+
+class Method(NamedTuple):
+    """A way to integrate an LZB impact.
+
+    `setting` says what the number handed to `solve` is: 'rtol', a tolerance on velocities relative
+    to the largest |v-|; 'step', the time step in units of `time_scale`; or 'impulse step', the
+    step in the primary impulse, in units of the impact's own. `ladder`: settings from coarse to
+    fine. `jax`: `solve(law, scene, velocity, setting)` can be jitted, vmapped and differentiated
+    forward, over the setting too; otherwise it takes concrete values. `supports(law, scene)` is
+    None or says why not. `duration_apart`: the duration takes a run of its own. `counting(tally)`:
+    where `solve` gives no evaluations, one that calls `tally()` at each (one impact at a time).
+    """
+
+    name: str
+    label: str
+    setting: str
+    ladder: tuple[float, ...]
+    jax: bool
+    supports: Callable[[Law, Scene], str | None]
+    solve: Callable[[LZB, Scene, Any, Any], MethodResult]
+    no_gradient: str | None = None  # why there is none that is meaningful
+    duration_apart: bool = False
+    counting: Callable[[Callable[[], None]], Callable[..., MethodResult]] | None = None
+
+
+class Problem(NamedTuple):
+    """The dimensionless problem of an impact; the tolerances in `inputs` are those of rtol."""
+
+    inputs: Inputs
+    units: Units
+    exponent: Exponent
+    chain: bool
+    max_steps: int
+    happens: jax.Array  # False: nothing approaches, nothing is stored; `inputs` then are a dummy
+
+    @property
+    def x(self) -> jax.Array:
+        """Indentations (m,) before the impact."""
+        return indentation(self.inputs, self.flow.exponent)
+
+    @property
+    def flow(self) -> Flow:
+        """The flow, `gamma-` and `x` of the inputs aside."""
+        return flow_of(self.inputs, self.exponent, self.chain)
+
+
+def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
+    """The impact in units of its own, open contacts left out."""
+    if law.friction is not None:
+        raise TypeError("Argument `law` must have no friction: these methods have none.")
+    v = as_float_array("velocity", velocity)
+    law, scene, v = in_common_dtype(law, scene, v)
+    w, gamma = without_open_contacts(scene, delassus_matrix(scene), gap_velocity(scene, v))
+    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
+    happens = jnp.any(gamma < 0) | jnp.any(stored > 0)
+    inputs, units = to_dimensionless(
+        w,
+        jnp.where(happens, gamma, -jnp.ones_like(gamma)),
+        law.restitution,
+        law.stiffness,
+        law.exponent,
+        stored,
+        jnp.asarray(rtol, v.dtype),  # type: ignore[arg-type]
+    )
+    return Problem(inputs, units, law.exponent, isinstance(w, Tridiagonal), law.max_steps, happens)
+
+
+def in_si(
+    given: Problem, p: jax.Array, t: jax.Array, evaluations: jax.Array, code: jax.Array
+) -> MethodResult:
+    """The result in SI units, nothing where nothing happens, `not_finite` where it is not."""
+    impulse = jnp.where(given.happens, p * given.units.velocity / given.units.root, 0.0)
+    finite = jnp.all(jnp.isfinite(impulse))
+    code = jnp.where(given.happens, code, CODE["ok"])
+    return MethodResult(
+        impulse=impulse,
+        duration=jnp.where(given.happens, t * given.units.time, 0.0),
+        evaluations=jnp.asarray(evaluations, jnp.int32),
+        code=jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32),
+    )
+
+
+def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
+    """Time [s] that 'step' settings are parts of: that of the fastest contact alone.
+
+    Equation: `min_j x_ref,j / (Q sqrt(W_jj))` (see `numerics/dimensionless.py`); a contact alone
+    with exponent 1 and e = 1 lasts pi of its own.
+
+    >>> import jimpact as ji
+    >>> from jimpact.methods.contenders import time_scale
+    >>> float(time_scale(ji.LZB(1.0, 4.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0]))
+    0.5
+    """
+    return problem(law, scene, velocity).units.time
+
+
+class _Given(Law):
+    """A "law" whose impulses are known."""
+
+    impulses: jax.Array
+    code: jax.Array
+    initial_energy: jax.Array
+
+    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return self.impulses, self.code
+
+    def stored_energy(self, contacts: int) -> jax.Array:
+        return jnp.broadcast_to(self.initial_energy, (contacts,))
+
+
+def outcome(law: LZB, scene: Scene, velocity: Any, result: MethodResult) -> Impact:
+    """Velocities, energy and full status (`impact`'s own checks included) of a method's result."""
+    return impact(_Given(result.impulse, result.code, law.initial_energy), scene, velocity)
+
+
+def time_form(
+    flow: Flow, gamma: jax.Array, x: jax.Array, p: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Rates `(x', p')` at indentations x and impulses p; `gamma`: gap velocities before."""
+    now = gamma + flow.coupling @ p
+    opening = 1 / flow.restitution**2
+    closing = -flow.omega * jnp.where(now > 0, opening, 1.0) * now
+    return closing, factor(flow.exponent, x) * flow.omega * power(x, flow.exponent)
+
+
+def held_open(x: jax.Array, closing: jax.Array) -> jax.Array:
+    """`x'` of a code that cannot clamp: an open contact keeps its x <= 0."""
+    return jnp.where((x <= 0) & (closing < 0), 0.0, closing)
+
+
+def lzb_only(law: Law, scene: Scene) -> str | None:
+    """Whether the law has LZB's dynamics, and fits the scene."""
+    if not isinstance(law, LZB):
+        return f"it integrates the LZB law, and the law is {type(law).__name__}"
+    for name in ("restitution", "stiffness"):
+        shape = np.shape(getattr(law, name))[-1:]
+        if shape not in ((), (scene.contacts,)) and not is_traced(law):
+            return f"`{name}` has {shape[0]} entries for {scene.contacts} contacts"
+    return None
+
+
+def finite_rate(law: Law, scene: Scene) -> str | None:
+    """As `lzb_only`; and the plain time form divides by e."""
+    reason = lzb_only(law, scene)
+    if reason is None and not is_traced(law) and bool(jnp.any(law.restitution == 0)):
+        return "it divides by e^2, and a restitution is 0"
+    return reason
+
+
+def checked(law: Law, scene: Scene, method: Method) -> None:
+    """Raise where the method does not support the law on this scene."""
+    reason = method.supports(law, scene)
+    if reason is not None:
+        raise ValueError(
+            f"Argument `methods` must be able to solve the impact, but has "
+            f"{method.name!r}: {reason}."
+        )
+
+
+setup = eqx.filter_jit(problem)

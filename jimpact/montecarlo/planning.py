@@ -1,0 +1,166 @@
+"""From the arguments of `monte_carlo` to a run: checked, in one precision, and named by a hash."""
+
+import operator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jimpact
+from jimpact._checks import check_kind, in_common_dtype
+from jimpact.laws.base import Law
+from jimpact.montecarlo.distributions import Rows, as_source
+from jimpact.montecarlo.drawing import Sources, is_random
+from jimpact.montecarlo.fingerprints import fingerprint
+from jimpact.montecarlo.plans import Plan, Run
+from jimpact.scene import Scene
+
+CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
+LARGEST_CHUNK = 2**31  # lanes are numbered in uint32
+SAMPLES = 100_000
+BINS = 1000
+
+
+def planned_run(
+    given: Sources,
+    scene: Scene,
+    samples: int | None,
+    key: Any,
+    chunk: int,
+    bins: int,
+    keep_samples: bool,
+) -> Run:
+    """The run of these arguments; raises where one of them is bad."""
+    check_kind("scene", scene, Scene)
+    sources = _sources(given, scene)
+    chunk = _positive_int("chunk", chunk, LARGEST_CHUNK)
+    bins = _positive_int("bins", bins)
+    rows = {
+        name: np.asarray(source.values)
+        for name in ("velocity", "gaps")
+        if isinstance(source := getattr(sources, name), Rows)
+    }
+    fewest = min((len(values) for values in rows.values()), default=None)
+    if samples is None:
+        samples = SAMPLES if fewest is None else fewest
+    samples = _positive_int("samples", samples)
+    for name, values in rows.items():
+        if len(values) < samples:
+            raise ValueError(
+                f"Argument `samples` must be at most {len(values)}, the rows of `{name}`, but has "
+                f"value {samples}."
+            )
+    data, kind = _key(key)
+    plan = Plan(
+        sources=eqx.tree_at(_row_values, sources, replace_fn=lambda x: x[:0]),
+        scene=scene,
+        key=data,
+        key_kind=kind,
+        size=chunk,
+        bins=bins,
+        keep_samples=bool(keep_samples),
+        x64=_flag("jax_enable_x64"),
+        threefry_partitionable=_flag("jax_threefry_partitionable"),
+    )
+    return Run(plan, samples, rows)
+
+
+def _row_values(sources: Sources) -> list[Any]:
+    return [s.values for s in (sources.velocity, sources.gaps) if isinstance(s, Rows)]
+
+
+def _sources(given: Sources, scene: Scene) -> Sources:
+    """Checked sources, all floating-point values in the widest type among them."""
+    law = given.law
+    if not isinstance(law, Law) and not callable(law):
+        raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
+    if given.gaps is None and not (is_random(given.law) or _varies(given.velocity)):
+        raise ValueError(
+            "Argument `gaps` must be given where neither the velocity nor the law is random: all "
+            "samples would be the same."
+        )
+    velocity = as_source("velocity", given.velocity, scene.size, non_negative=False)
+    gaps = given.gaps
+    if gaps is not None:
+        gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
+    sources = Sources(law, velocity, gaps)
+    drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
+    if not isinstance(drawn, Law):
+        raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
+    return in_common_dtype(sources, scene, drawn)[0]
+
+
+def _varies(value: Any) -> bool:
+    return (
+        callable(value)
+        or not isinstance(value, list | tuple | np.ndarray | jax.Array)
+        or (np.ndim(value) == 2)
+    )
+
+
+def identity(run: Run) -> dict[str, str]:
+    """A hash of each thing that determines the chunks; the number of samples does not."""
+    plan = run.plan
+    versions = {"jimpact": jimpact.__version__, "jax": jax.__version__}
+    parts = {
+        "law": plan.sources.law,
+        "scene": plan.scene,
+        "velocity": (plan.sources.velocity, run.rows.get("velocity")),
+        "gaps": (plan.sources.gaps, run.rows.get("gaps")),
+        "key": (plan.key, plan.key_kind, plan.threefry_partitionable),
+        "chunk": plan.size,
+        "bins": plan.bins,
+        "precision": plan.x64,
+    }
+    hashes = {name: fingerprint(value) for name, value in parts.items()}
+    return hashes | {f"version of {name}": value for name, value in versions.items()}
+
+
+def description(run: Run) -> str:
+    """The run in one line."""
+    sources, scene = run.plan.sources, run.plan.scene
+    law = sources.law
+    name = type(law).__name__ if isinstance(law, Law) else _told(law)
+    told = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
+    for what in ("gaps", "velocity"):
+        source = getattr(sources, what)
+        if is_random(source):
+            rows = run.rows.get(what)
+            told += f"; {what}: " + (_told(source) if rows is None else f"{len(rows)} given rows")
+    return told
+
+
+def _told(source: Any) -> str:
+    if isinstance(source, eqx.Module):
+        return repr(source)
+    return f"function {getattr(source, '__qualname__', type(source).__name__)}"
+
+
+def _key(key: Any) -> tuple[np.ndarray, str]:
+    """Raw data and kind of a key; an integer is a seed."""
+    if not isinstance(key, bool) and isinstance(key, int | np.integer):
+        key = jax.random.key(int(key), impl="threefry2x32")
+    elif isinstance(key, np.ndarray | jax.Array) and key.dtype == np.uint32 and key.shape == (2,):
+        key = jax.random.wrap_key_data(jnp.asarray(key), impl="threefry2x32")
+    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+        raise TypeError(f"Argument `key` must be a JAX random key or an integer, but is {key!r}.")
+    if key.shape != ():
+        raise ValueError(f"Argument `key` must be one key, but has shape {key.shape}.")
+    return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))
+
+
+def _flag(name: str) -> bool:
+    return bool(getattr(jax.config, name))
+
+
+def _positive_int(name: str, value: Any, most: int | None = None) -> int:
+    try:
+        number = -1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        raise TypeError(f"Argument `{name}` must be an integer, but has value {value!r}.") from None
+    if number < 1 or (most is not None and number > most):
+        upper = "" if most is None else f" and at most {most}"
+        raise ValueError(f"Argument `{name}` must be at least 1{upper}, but has value {value!r}.")
+    return number

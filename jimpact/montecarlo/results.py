@@ -1,0 +1,178 @@
+"""What `monte_carlo` returns, and its report in words."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+import numpy as np
+
+from jimpact._checks import check_values
+from jimpact.laws.base import Law
+from jimpact.montecarlo import histograms
+from jimpact.montecarlo.chunks import OUTCOMES
+from jimpact.montecarlo.plans import Run
+from jimpact.scene import Scene
+
+REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
+_FAILED = {name for name, _, failure in OUTCOMES if failure}
+_MESSAGE = {name: message for name, message, _ in OUTCOMES}
+
+
+@dataclass(frozen=True, eq=False)
+class BadSample:
+    """A sample that failed: its number, status, gaps (m,) [m] and velocities before (n,) [m/s].
+
+    Gaps or velocities that are the same for all samples are empty here.
+    """
+
+    index: int
+    status: str
+    gaps: np.ndarray
+    velocity: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class MonteCarlo:
+    """Statistics of the velocities after an impact; `print` gives a report.
+
+    Attributes:
+        samples, count: how many were drawn, and how many of them did not fail: only these enter.
+        mean, covariance: (n,) [m/s], (n, n) of the velocities after.
+        minimum, maximum: (n,) [m/s].
+        gap_mean, gap_covariance, cross_covariance: (m,), (m, m), (n, m) of the random gaps, and of
+            velocities with gaps; m = 0 where gaps are not random.
+        edges, counts: histograms (n, bins + 1), (n, bins + 2); the first and the last count are
+            the samples outside the edges.
+        statuses: number of samples by status.
+        bad: the first failed samples; `replay(sample.index)` gives one to run again.
+        first: the first samples, for pictures: gaps, velocity_before, velocity, status.
+        gap_scale: delta_c (m,) [m], where the law has one.
+        rate: samples computed a second [1/s]; resumed: samples that were read from the folder.
+    """
+
+    samples: int
+    count: int
+    mean: np.ndarray
+    covariance: np.ndarray
+    minimum: np.ndarray
+    maximum: np.ndarray
+    gap_mean: np.ndarray
+    gap_covariance: np.ndarray
+    cross_covariance: np.ndarray
+    edges: np.ndarray
+    counts: np.ndarray
+    statuses: dict[str, int]
+    bad: tuple[BadSample, ...]
+    first: dict[str, np.ndarray] = field(repr=False)
+    gap_scale: np.ndarray | None
+    rate: float
+    resumed: int
+    description: str
+    run: Run = field(repr=False)
+
+    @property
+    def standard_error(self) -> np.ndarray:
+        """Of the mean (n,) [m/s]."""
+        return np.sqrt(np.diag(self.covariance) / max(self.count, 1))
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviations (n,) [m/s]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def quantile_resolution(self) -> np.ndarray:
+        """Width of a histogram bin (n,) [m/s]: how far a quantile may be off."""
+        return self.edges[:, 1] - self.edges[:, 0]
+
+    def quantile(self, q: Any) -> np.ndarray:
+        """Quantiles (..., n) [m/s] of the velocities after, from the histograms; q in [0, 1]."""
+        check_values("q", q, low=0.0, high=1.0)
+        ends = self.edges[:, [0, -1]]
+        found = [
+            histograms.quantile(float(each), ends, self.counts, self.minimum, self.maximum)
+            for each in np.ravel(q)
+        ]
+        return np.reshape(found, (*np.shape(q), len(self.mean)))
+
+    def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
+        """Law, scene and velocity of sample `index`: `ji.impact(*found.replay(index))`."""
+        if not 0 <= index < self.samples:
+            raise ValueError(
+                f"Argument `index` must lie in [0, {self.samples - 1}], but has value {index}."
+            )
+        return self.run.sample(index)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but samples and run, as a JSON file can hold it."""
+        arrays = "mean covariance minimum maximum gap_mean gap_covariance cross_covariance"
+        told: dict[str, Any] = {"samples": self.samples, "count": self.count}
+        told |= {name: getattr(self, name).tolist() for name in arrays.split()}
+        told["standard_error"] = self.standard_error.tolist()
+        told["quantiles"] = {f"{q:g}": self.quantile(q).tolist() for q in REPORTED}
+        told["quantile_resolution"] = self.quantile_resolution.tolist()
+        told["histogram"] = {"edges": self.edges.tolist(), "counts": self.counts.tolist()}
+        told["statuses"] = self.statuses
+        told["bad"] = [
+            {
+                "index": bad.index,
+                "status": bad.status,
+                "gaps": [_json_number(x) for x in bad.gaps],
+                "velocity": [_json_number(x) for x in bad.velocity],
+            }
+            for bad in self.bad
+        ]
+        told["gap_scale"] = None if self.gap_scale is None else self.gap_scale.tolist()
+        return told | {"rate": self.rate, "resumed": self.resumed}
+
+    def __str__(self) -> str:
+        lines = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
+        lines += [
+            f"{'[m/s]':8s}{'mean':>12s}{'± error':>10s}{'std':>11s}"
+            + "".join(f"{f'{100 * q:g} %':>11s}" for q in REPORTED)
+            + f"{'least':>11s}{'largest':>11s}"
+        ]
+        quantiles = self.quantile(REPORTED)
+        for i in range(len(self.mean)):
+            row = [self.std[i], *quantiles[:, i], self.minimum[i], self.maximum[i]]
+            lines.append(
+                f"v{i + 1}+".ljust(8)
+                + f"{self.mean[i]:12.6f}{self.standard_error[i]:10.1g}"
+                + "".join(f"{x:11.5f}" for x in row)
+            )
+        lines += [f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.", ""]
+        return "\n".join([*lines, *self._gap_lines(), *self._status_lines()])
+
+    def _rate(self) -> str:
+        if self.resumed == self.samples:
+            return "all read from the folder"
+        told = f"{self.rate:,.0f} samples/s"
+        return told + (f", {self.resumed:,} read from the folder" if self.resumed else "")
+
+    def _gap_lines(self) -> list[str]:
+        lines = []
+        for j, mean in enumerate(self.gap_mean):
+            std = np.sqrt(self.gap_covariance[j, j])
+            line = f"gap {j + 1}: mean {mean:.4g} m, std {std:.4g} m"
+            if self.gap_scale is not None:
+                scale = self.gap_scale[j]
+                line += (
+                    f"; in gap scales of {scale:.3g} m: {mean / scale:.3g} and {std / scale:.3g}"
+                )
+            lines.append(line)
+        return lines
+
+    def _status_lines(self) -> list[str]:
+        lines = []
+        for name, count in self.statuses.items():
+            left_out = ", left out" if name in _FAILED else ""
+            lines.append(f"{name}: {count:,}{left_out} ({_MESSAGE[name]})")
+        for bad in self.bad[:5]:
+            gaps = f", gaps {np.array2string(bad.gaps, precision=6)} m" if bad.gaps.size else ""
+            lines.append(f"  sample {bad.index}: {bad.status}{gaps}; replay({bad.index})")
+        return lines
+
+
+def _json_number(value: float) -> float | str:
+    """JSON has no NaN."""
+    return float(value) if np.isfinite(value) else str(float(value))

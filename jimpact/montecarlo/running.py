@@ -1,0 +1,187 @@
+"""`monte_carlo`: the distribution of outcomes over gaps, velocities and parameters."""
+
+import time
+import warnings
+from collections.abc import Callable, Generator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jimpact._checks import in_common_dtype
+from jimpact.laws.base import Law
+from jimpact.laws.compliant import Compliant
+from jimpact.montecarlo.bars import sample_bar
+from jimpact.montecarlo.chunks import Chunk
+from jimpact.montecarlo.drawing import Sources
+from jimpact.montecarlo.executors import Executor, as_executor
+from jimpact.montecarlo.gap_scales import gap_scale
+from jimpact.montecarlo.planning import BINS, CHUNK, description, identity, planned_run
+from jimpact.montecarlo.plans import Run
+from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.store import Store
+from jimpact.montecarlo.totals import Totals
+from jimpact.scene import Scene
+
+
+def monte_carlo(
+    law: Law | Callable[[jax.Array], Law],
+    scene: Scene,
+    velocity: Any,
+    gaps: Any = None,
+    samples: int | None = None,
+    key: Any = 0,
+    *,
+    chunk: int = CHUNK,
+    executor: Any = "serial",
+    folder: str | Path | None = None,
+    keep_samples: bool = False,
+    bins: int = BINS,
+    progress: bool | None = None,
+) -> MonteCarlo:
+    """Statistics of the velocities after an impact whose gaps (velocities, law) are random.
+
+    Equation: moments are merged chunk by chunk in float64 (Chan et al. 1983); quantiles come from
+    histograms. The result is the same, bit by bit, for every executor and number of devices (on
+    machines of one kind), and after a resume; memory does not grow with `samples`.
+
+    Args:
+        law: a law, `RandomLaw`, or a function `key -> Law`.
+        scene: n coordinates, m contacts.
+        velocity: v- (n,) [m/s], or random (n entries): `Uniform`, `Normal`, a function
+            `key -> (n,)`, given samples (S, n).
+        gaps: likewise (m entries) [m], none negative: `Normal` is truncated at 0; None: the
+            scene's.
+        samples: how many; default: as many as are given, or 100 000.
+        key: a JAX random key, or an integer seed.
+        chunk: samples computed together; part of what determines the draws.
+        executor: 'serial', 'devices' (all of this process), 'dask', or `DaskExecutor(client)`.
+        folder: where every finished chunk is kept; the same call again continues there, and may
+            ask for more samples.
+        keep_samples: keep the raw samples in the folder, too (`read_samples`).
+        bins: of the histograms, between the ends of the first chunk's range plus a tenth.
+        progress: a progress bar on stderr; None: on a terminal, for long runs.
+
+    Returns:
+        `MonteCarlo`. Samples whose status is a failure are counted, listed and left out.
+
+    Raises:
+        ValueError: bad arguments, gaps that can be negative, a folder of another run.
+        RuntimeError: not one sample of the first chunk could be used.
+        OSError: the folder cannot be written; what is there is intact.
+        KeyboardInterrupt: with a message that says how to continue.
+
+    Warns: where samples failed, or a file of the folder is damaged or foreign (not used).
+
+    >>> import jimpact as ji
+    >>> balls = ji.chain([0.25, 1.0, 0.25])
+    >>> law = ji.Binary(1.0, order="earliest")
+    >>> gaps = ji.Uniform(0.0, 1e-5)
+    >>> found = ji.monte_carlo(law, balls, [1.0, 0.0, -1.0], gaps=gaps, samples=1000)
+    >>> [round(float(v), 2) for v in found.quantile(0.9)]  # one of two mirror images
+    [-0.6, 0.16, 1.24]
+    """
+    run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
+    chosen = as_executor(executor)
+    if keep_samples and folder is None:
+        raise ValueError("Argument `folder` must be given to keep samples, but is None.")
+    store = None if folder is None else Store(folder, identity(run))
+    begin = time.perf_counter()
+    totals = _totals(run, chosen, store, progress)
+    seconds = time.perf_counter() - begin
+    found = totals.result(
+        rate=(run.samples - totals.resumed) / seconds,
+        description=description(run),
+        gap_scale=_gap_scale(run.plan.sources, scene),
+    )
+    failed = found.samples - found.count
+    if failed:
+        told = ", ".join(f"{count} {name}" for name, count in found.statuses.items())
+        warnings.warn(
+            f"{failed} of {found.samples} samples failed and are left out of the statistics "
+            f"({told}); see `bad` and `replay`.",
+            stacklevel=2,
+        )
+    return found
+
+
+def _totals(run: Run, executor: Executor, store: Store | None, progress: bool | None) -> Totals:
+    """All chunks, read or computed, merged in the order of their numbers."""
+    keep = run.plan.keep_samples
+
+    def read(number: int) -> Chunk | None:
+        return store.read(number, run.task(number).count, keep) if store is not None else None
+
+    missing = [number for number in range(run.chunks) if read(number) is None]
+    known = set(range(run.chunks)).difference(missing)
+    totals = Totals(run)
+    done = sum(run.task(number).count for number in known)
+    waiting: dict[int, Chunk] = {}
+    finished = done
+    try:
+        computing = closing(_computed(run, executor, missing, read))
+        with sample_bar(run.samples, done, progress) as advance, computing as chunks:
+            for computed in chunks:
+                if store is not None:
+                    store.write(computed)
+                waiting[computed.number] = computed.without_samples()
+                finished += computed.count
+                advance(computed.count)
+                _merge_ready(totals, waiting, known, read)
+            _merge_ready(totals, waiting, known, read)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(_interrupted(run, store, finished)) from None
+    return totals
+
+
+def _merge_ready(
+    totals: Totals,
+    waiting: dict[int, Chunk],
+    known: set[int],
+    read: Callable[[int], Chunk | None],
+) -> None:
+    while totals.chunks in waiting or totals.chunks in known:
+        number = totals.chunks
+        if number in waiting:
+            totals.add(waiting.pop(number), resumed=False)
+            continue
+        chunk = read(number)
+        if chunk is None:
+            raise OSError(f"Chunk {number} of the folder changed during the run: run again.")
+        totals.add(chunk, resumed=True)
+
+
+def _computed(
+    run: Run, executor: Executor, missing: list[int], read: Callable[[int], Chunk | None]
+) -> Generator[Chunk]:
+    """The missing chunks; the first of all sets the histograms, and is computed here."""
+    if not missing:
+        return
+    if missing[0] == 0:
+        first = run.plan(run.task(0))
+        yield first
+        missing = missing[1:]
+    else:
+        stored = read(0)
+        assert stored is not None  # it is not missing
+        first = stored
+    yield from executor.run(run.plan, (run.task(number, first.ends) for number in missing))
+
+
+def _interrupted(run: Run, store: Store | None, done: int) -> str:
+    told = f"stopped after {done:,} of {run.samples:,} samples; "
+    if store is None:
+        return told + "nothing is kept, because no `folder` was given."
+    return told + f"they are in '{store.folder}': the same call continues from there."
+
+
+def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
+    """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
+    law, velocity = sources.law, sources.velocity
+    if not (isinstance(law, Compliant) and isinstance(velocity, jax.Array)):
+        return None
+    law, scene, velocity = in_common_dtype(law, scene, velocity)
+    delta = np.asarray(gap_scale(scene, law, velocity).delta, float)
+    return delta if (delta > 0).all() else None  # 0: nothing approaches

@@ -1,0 +1,192 @@
+"""The folder of a run: one file a chunk, written whole or not at all, and a manifest.
+
+`manifest.json` names what the run is (a hash of each thing that determines its result); every
+`chunk-0000012.npz` carries that hash and a checksum of its own content.
+"""
+
+import errno
+import hashlib
+import io
+import json
+import os
+import tokenize
+import warnings
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jimpact.montecarlo.chunks import Chunk, chunk_from
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+# what reading a damaged file raises: zip's and numpy's complaints, numpy's about its text headers
+UNUSABLE = (
+    ValueError,
+    KeyError,
+    OSError,
+    EOFError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+    SyntaxError,
+    tokenize.TokenError,
+)
+
+
+class Store:
+    """Chunks of one run in one folder.
+
+    Raises:
+        ValueError: the folder holds another run, or its manifest is damaged.
+        OSError: it cannot be written.
+    """
+
+    def __init__(self, folder: str | Path, identity: dict[str, str]):
+        self.folder = Path(folder)
+        self.run = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
+        self.folder.mkdir(parents=True, exist_ok=True)
+        manifest = self.folder / MANIFEST
+        if not any(self.folder.glob("chunk-*.npz")):  # nothing of any run is lost
+            told = {"format": FORMAT, "run": self.run, "identity": identity}
+            _write(manifest, json.dumps(told, indent=2).encode())
+        elif manifest.exists():
+            _check_same(manifest, identity)
+        else:
+            raise ValueError(
+                f"Folder '{self.folder}' has chunks but no {MANIFEST}, so whose they are is not "
+                "known: give another folder, or delete them."
+            )
+
+    def path(self, number: int) -> Path:
+        """The file of a chunk."""
+        return self.folder / f"chunk-{number:07d}.npz"
+
+    def write(self, chunk: Chunk) -> None:
+        """Keep a chunk."""
+        arrays = chunk.arrays()
+        checksum = np.frombuffer(_checksum(arrays, self.run), np.uint8)
+        buffer = io.BytesIO()
+        own: dict[str, Any] = {"run": np.array(self.run), "checksum": checksum}
+        np.savez(buffer, **own, **arrays)  # type: ignore[arg-type]
+        _write(self.path(chunk.number), buffer.getvalue())
+
+    def read(self, number: int, count: int, all_samples: bool) -> Chunk | None:
+        """A chunk with `count` samples; None where there is none, or only an unusable one."""
+        path = self.path(number)
+        if not path.exists():
+            return None
+        try:
+            arrays = _checked(path, self.run)
+            if int(arrays["number"]) != number:
+                raise ValueError(f"it is chunk {int(arrays['number'])} of this run")
+        except UNUSABLE as error:
+            told = str(error) or type(error).__name__
+            warnings.warn(
+                f"'{path}' is not used, its samples are computed again: {told}.", stacklevel=2
+            )
+            return None
+        chunk = chunk_from(arrays)
+        complete = chunk.count == count
+        if all_samples:
+            complete = complete and len(chunk.samples.get("status", ())) == count
+        return chunk if complete else None
+
+
+def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
+    """The raw samples that `monte_carlo(..., folder=..., keep_samples=True)` kept, by chunk.
+
+    Yields:
+        `gaps` (C, m), `velocity_before` (C, n) (no columns where they are constant), `velocity`
+        (C, n) after the impact, `status` (C,); in the order of the samples.
+
+    Raises:
+        FileNotFoundError: no run there. ValueError: a damaged file, or chunks without samples.
+
+    >>> import tempfile, jimpact as ji
+    >>> import jimpact as ji
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     options = {"samples": 30, "chunk": 20, "folder": folder, "keep_samples": True}
+    ...     speeds = ji.Uniform([1.0, 0.0], [2.0, 0.0])
+    ...     _ = ji.monte_carlo(ji.Newton(0.5), ji.chain([1.0, 1.0]), speeds, **options)
+    ...     [part["velocity"].shape for part in ji.read_samples(folder)]
+    [(20, 2), (10, 2)]
+    """
+    folder = Path(folder)
+    run = _manifest(folder / MANIFEST)["run"]
+    for path in sorted(folder.glob("chunk-*.npz")):
+        try:
+            chunk = chunk_from(_checked(path, run))
+        except UNUSABLE as error:
+            raise ValueError(f"'{path}' cannot be used: {error}.") from None
+        if len(chunk.samples.get("status", ())) != chunk.count:
+            raise ValueError(f"'{path}' has no raw samples: run with keep_samples=True.")
+        yield chunk.samples
+
+
+def _checked(path: Path, run: str) -> dict[str, np.ndarray]:
+    """The arrays of a chunk file of this run."""
+    with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    owner, checksum = str(arrays.pop("run")), arrays.pop("checksum").tobytes()
+    if owner != run:
+        raise ValueError(f"it belongs to another run ({owner[:12]}, not {run[:12]})")
+    if checksum != _checksum(arrays, run):
+        raise ValueError("its content does not match its checksum")
+    return arrays
+
+
+def _checksum(arrays: dict[str, np.ndarray], run: str) -> bytes:
+    digest = hashlib.sha256(run.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype} {arrays[name].shape} ".encode())
+        digest.update(array.tobytes())
+    return digest.digest()
+
+
+def _manifest(path: Path) -> dict[str, Any]:
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if told["format"] != FORMAT or not isinstance(told["identity"], dict):
+            raise ValueError(f"format {told['format']}")
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"'{path}' is damaged or of another version ({error}): give another folder, or delete "
+            "this one."
+        ) from None
+    return told
+
+
+def _check_same(path: Path, identity: dict[str, str]) -> None:
+    other = _manifest(path)["identity"]
+    names = sorted(identity.keys() | other.keys())
+    differ = [name for name in names if identity.get(name) != other.get(name)]
+    if differ:
+        raise ValueError(
+            f"Folder '{path.parent}' holds another run, which differs in {', '.join(differ)}: "
+            "give another folder (or repeat that run's arguments to continue it)."
+        )
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Replace a file in one step: after a crash it is the old one or the new one."""
+    temporary = path.with_name(path.name + ".tmp")
+    try:
+        with open(temporary, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        what = "the disk is full" if full else str(error)
+        raise OSError(
+            error.errno,
+            f"'{path}' could not be written, {what}; what was there before is intact, and the same "
+            "call continues from it",
+        ) from error

@@ -1,0 +1,1 @@
+"""Pictures: one function for each kind of result."""

@@ -1,0 +1,130 @@
+"""Pictures of a motion: time histories with events, energy ledger, phase portrait."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from jimpact.motion.record import Motion
+from jimpact.plot.fits import COLOURS
+
+_GREY = "#777777"
+_MARKED = ("accumulation", "detachment", "friction")  # events with a mark of their own
+_MANY = 60  # impacts up to which each gets its line
+_LEGEND = 6  # coordinates that get an entry in the legend
+
+
+def one_motion(motion: Motion) -> None:
+    """Raise a ValueError for a batch."""
+    if np.ndim(motion.status):
+        raise ValueError("Argument `motion` must be one motion, but is a batch: pick one of it.")
+
+
+def plot_motion(motion: Motion, title: str = "", names: Sequence[str] = ()) -> Figure:
+    """Coordinates and velocities against time, events, and where the energy goes.
+
+    Args:
+        motion: one motion (of a batch: `jax.tree.map(lambda x: x[i], motion)`).
+        title: of the picture.
+        names: of the coordinates; default q1, q2, ...
+
+    >>> import jimpact as ji
+    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
+    >>> len(ji.plot_motion(motion).axes)
+    3
+    """
+    one_motion(motion)
+    figure = Figure(figsize=(7.5, 7.5), layout="constrained")
+    top, middle, bottom = figure.subplots(3, 1, sharex=True)
+    time, q, v = (np.asarray(x) for x in (motion.time, motion.q, motion.velocity))
+    for i in range(q.shape[1]):
+        colour = COLOURS[i % len(COLOURS)]
+        label = names[i] if i < len(names) else f"q{i + 1}"
+        top.plot(time, q[:, i], color=colour, label=label if i < _LEGEND else None)
+        middle.plot(time, v[:, i], color=colour)
+    top.set_ylabel("coordinates [m, rad]")
+    middle.set_ylabel("velocities [m/s, rad/s]")
+    for axes in (top, middle):
+        _event_lines(axes, motion)
+    _ledger(bottom, motion)
+    bottom.set_xlabel("time [s]")
+    top.set_title(title, loc="left")
+    for axes in (top, middle, bottom):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", lw=0.4, alpha=0.5)
+    top.legend(frameon=False, fontsize="small", ncols=3, loc="best")
+    bottom.legend(frameon=False, fontsize="small", ncols=2, loc="best")
+    return figure
+
+
+def _event_lines(axes: Axes, motion: Motion) -> None:
+    impacts = motion.event_times("impact")
+    if len(impacts) <= _MANY:
+        for t in impacts:
+            axes.axvline(t, color=_GREY, lw=0.4, zorder=0)
+    for kind, style in zip(_MARKED, ("--", ":", "-."), strict=True):
+        for t in motion.event_times(kind)[:_MANY]:
+            axes.axvline(t, color="black", lw=0.8, ls=style, zorder=0)
+
+
+def _ledger(axes: Axes, motion: Motion) -> None:
+    """Energy, and what has gone where since the start."""
+    time, energy = np.asarray(motion.time), np.asarray(motion.energy)
+    axes.plot(time, energy, color="black", label="T + V")
+    axes.plot(time, motion.kinetic_energy, color=_GREY, lw=0.8, label="T")
+    work = np.asarray(motion.contact_work)
+    # the shares of single contacts in a multiple impact may have either sign: their sum is shown
+    axes.plot(time, -work[:, 0].sum(axis=1), color=COLOURS[0], label="taken by impacts")
+    if np.nanmax(np.abs(work[:, 1]), initial=0.0) > 0:
+        axes.plot(time, -work[:, 1].sum(axis=1), color=COLOURS[1], label="taken by friction")
+    for name, value in (("base", motion.base_work), ("forces", motion.force_work)):
+        if np.nanmax(np.abs(np.asarray(value)), initial=0.0) > 0:
+            axes.plot(time, value, "--", color=COLOURS[2], label=f"work of the {name}")
+    axes.set_ylabel("energy [J]")
+
+
+def plot_phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") -> Figure:
+    """Velocity against one coordinate; impacts are the dashed jumps.
+
+    Args:
+        motion: one motion.
+        coordinate: which, counted from 0.
+        title: of the picture.
+
+    >>> import jimpact as ji
+    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
+    >>> len(ji.plot_phase_portrait(motion).axes)
+    1
+    """
+    one_motion(motion)
+    n = motion.q.shape[-1]
+    if not 0 <= coordinate < n:
+        raise ValueError(f"Argument `coordinate` must lie in [0, {n - 1}], but is {coordinate}.")
+    figure = Figure(figsize=(6.0, 5.0), layout="constrained")
+    axes = figure.subplots()
+    rows = np.asarray(motion.events.kind) > 0
+    jumps = [
+        np.asarray(x)[rows, coordinate]
+        for x in (motion.events.q, motion.events.velocity_before, motion.events.velocity_after)
+    ]
+    # the curve passes through the states before and after every event
+    time = np.concatenate([motion.time, *(2 * [np.asarray(motion.events.time)[rows]])])
+    position = np.concatenate([motion.q[:, coordinate], jumps[0], jumps[0]])
+    speed = np.concatenate([motion.velocity[:, coordinate], jumps[1], jumps[2]])
+    event = np.concatenate(
+        [np.zeros(len(motion.time)), np.ones(rows.sum()), np.full(rows.sum(), 2)]
+    )
+    order = np.lexsort((event, time))
+    position, speed, event = position[order], speed[order], event[order]
+    cut = np.flatnonzero(event == 2)
+    axes.plot(np.insert(position, cut, np.nan), np.insert(speed, cut, np.nan), color=COLOURS[0])
+    axes.plot(
+        np.stack([jumps[0]] * 2), np.stack(jumps[1:]), "--", color=COLOURS[1], lw=0.8, zorder=0
+    )
+    axes.set_xlabel(f"q{coordinate + 1} [m, rad]")
+    axes.set_ylabel(f"velocity of q{coordinate + 1} [m/s, rad/s]")
+    axes.set_title(title, loc="left")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(lw=0.4, alpha=0.5)
+    return figure

@@ -1,0 +1,120 @@
+"""Pictures: contact forces of equal restitution on one chain, and force histories."""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
+
+from jimpact.comparison import Comparison
+from jimpact.contact_space import delassus_matrix, gap_velocity
+from jimpact.histories import History
+from jimpact.laws.forces import Bistiffness, Force
+from jimpact.plot.fits import COLOURS
+from jimpact.solvers.tridiagonal import diagonal
+
+_SPREAD = 0.6  # width that the bodies of one force take, of the distance between forces
+_SAMPLES = 120  # points of a force-indentation loop
+
+
+def plot_rheologies(found: Comparison, title: str = "") -> Figure:
+    """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
+
+    Args:
+        found: of `compare_rheologies`, or of `compare` with `Compliant` laws.
+
+    >>> import jimpact as ji
+    >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
+    >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], laws)
+    >>> len(ji.plot_rheologies(found).axes)
+    2
+    """
+    mass = 1 / float(diagonal(delassus_matrix(found.scene))[0])
+    speed = float(np.max(-np.asarray(gap_velocity(found.scene, found.velocity))))
+    figure = Figure(figsize=(10, 4.4))
+    figure.set_layout_engine("constrained")
+    loops, outcome = figure.subplots(1, 2)
+    for (name, entry), colour in zip(found.entries.items(), COLOURS):
+        first = jax.tree.map(lambda leaf: leaf.ravel()[0], entry.law.force)
+        x, f = _loop(first, mass, speed)
+        loops.plot(x, f, color=colour, label=name, lw=1.4)
+    loops.set_xlabel("indentation [m]")
+    loops.set_ylabel("force [N]")
+    loops.set_title(title or "contact 1 alone", loc="left")
+    loops.legend(frameon=False, fontsize="small")
+    names = list(found.entries)
+    values = np.array([np.asarray(e.outcome.velocity) for e in found.entries.values()])
+    bodies = values.shape[1]
+    dodge = (np.arange(bodies) - (bodies - 1) / 2) * _SPREAD / bodies
+    for i in range(bodies):
+        at = np.arange(len(names)) + dodge[i]
+        outcome.plot(at, values[:, i], "o", color=COLOURS[i % len(COLOURS)], label=f"body {i + 1}")
+    outcome.set_xticks(np.arange(len(names)), [name.replace(", ", ",\n") for name in names])
+    outcome.tick_params(axis="x", labelsize="small", rotation=20)
+    outcome.axhline(0, color="black", lw=0.6)
+    outcome.set_ylabel("velocity after the impact [m/s]")
+    outcome.set_title("all contacts together", loc="left")
+    outcome.legend(frameon=False, fontsize="small", ncols=max(1, bodies // 6))
+    for axes in (loops, outcome):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(lw=0.4, alpha=0.5)
+    return figure
+
+
+def plot_forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
+    """Force at one contact over impact time, one line a history.
+
+    >>> import jimpact as ji
+    >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])
+    >>> len(ji.plot_forces({"one ball": h}).axes[0].lines)
+    1
+    """
+    figure = Figure(figsize=(6.4, 4.2))
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    for j, (name, h) in enumerate(histories.items()):
+        colour = COLOURS[j % len(COLOURS)]
+        axes.plot(
+            1e6 * np.asarray(h.time), np.asarray(h.force[:, contact]), color=colour, label=name
+        )
+    axes.set_xlabel("impact time [us]")
+    axes.set_ylabel("force [N]")
+    axes.set_ylim(bottom=0)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(lw=0.4, alpha=0.5)
+    axes.legend(frameon=False, fontsize="small")
+    return figure
+
+
+def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indentation and force of one pair's collision."""
+    if isinstance(force, Bistiffness):
+        k, eta = float(force.stiffness), float(np.asarray(force.exponent))
+        deepest = ((eta + 1) * mass * speed**2 / (2 * k)) ** (1 / (eta + 1))
+        part = np.linspace(0, 1, _SAMPLES)
+        residual = (1 - float(force.restitution) ** 2) * deepest
+        loading, unloading = part * deepest, residual + part[::-1] * (deepest - residual)
+        f = k * deepest**eta * part**eta
+        return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
+
+    def push(x: float, rate: float) -> float:
+        return float(force.force(jnp.asarray(max(x, 0.0)), jnp.asarray(rate)))
+
+    def slack(_: float, y: np.ndarray) -> float:
+        return push(y[0], y[1]) if y[1] < 0 else 1.0
+
+    slack.terminal = True  # type: ignore[attr-defined]
+    horizon = 1e3 * float(force.indentation_scale(jnp.asarray(0.5 * mass * speed**2))) / speed
+    done = solve_ivp(
+        lambda _, y: [y[1], -max(push(y[0], y[1]), 0.0) / mass],
+        (0, horizon),
+        [0.0, speed],
+        events=slack,
+        rtol=1e-6,
+        atol=1e-12 * horizon * speed,
+        dense_output=True,
+    )
+    y = done.sol(np.linspace(0, done.t[-1], 2 * _SAMPLES))
+    return y[0], np.array([max(push(*row), 0.0) for row in y.T])

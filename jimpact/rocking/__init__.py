@@ -1,1 +1,0 @@
-"""Rocking of a block."""

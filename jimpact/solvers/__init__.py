@@ -1,0 +1,1 @@
+"""Solvers of contact problems: complementarity, friction, linear systems."""

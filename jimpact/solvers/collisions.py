@@ -1,0 +1,277 @@
+"""Sequential pair collisions in contact space, until no contact approaches.
+
+Everything is in normalized quantities: `qn = gamma / sqrt(W_jj)`, `pbar = sqrt(W_jj) p` and G with
+unit diagonal. A collision at contact j adds `pbar_j += s_j` and `qn += G_j s_j`, with
+`s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.numerics.sensitivity import both_modes
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.status import CODE
+
+# In eps, relative to the largest normalized approach velocity at the start: an approach below is
+# rounding (and no collision), criteria closer than that are equal. Errors of the velocities grow
+# with the root of the number of collisions, so this covers some ten thousand.
+REST = 128.0
+# Times to closing are equal within so many eps of the time passed and to come.
+TIE = 16.0
+COUPLED = 16.0  # |G_ij| above so many eps: the collisions of i and j do not commute
+# Three or more contacts: a last collision slower than this (relative, as REST) that leaves an
+# approach is one of an endless sequence; what remains of it is below REST.
+DECAYED = {"float64": 1e-9, "float32": 3e-4}
+BOUNDARY = 8.0  # eps: a state on the edge of the endless cone (body between two walls) is in it
+SINGULAR = 16.0  # eps: two contacts with 1 - cos^2 below this are redundant
+
+
+class Inputs(NamedTuple):
+    """A problem; `coupling` holds the entries of G beside its unit diagonal."""
+
+    coupling: jax.Array
+    restitution: jax.Array  # () or (m,): a scalar costs one tangent, not m
+    qn: jax.Array
+    root: jax.Array  # sqrt(W_jj), only compared
+    gaps: jax.Array | None  # None: no free flight
+
+
+class Options(NamedTuple):
+    """What is static: the cyclic order (None: fastest or earliest) and the limit."""
+
+    cycle: tuple[int, ...] | None
+    max_collisions: int
+    chain: bool
+
+
+class Carry(NamedTuple):
+    """Where the sequence stands; `place` is the next entry of a cyclic order."""
+
+    qn: jax.Array
+    p: jax.Array
+    number: jax.Array
+    place: jax.Array
+    speed: jax.Array  # normalized approach velocity of the last collision
+    tied: jax.Array
+    gaps: jax.Array | None
+    time: jax.Array
+
+
+class Choice(NamedTuple):
+    """The next collision: contact, next place in the cycle, time until then, tied or not."""
+
+    contact: jax.Array
+    place: jax.Array
+    wait: jax.Array
+    tied: jax.Array
+
+
+class End(NamedTuple):
+    """Integers of a finished run: status code and number of collisions (-1: endless)."""
+
+    code: jax.Array
+    number: jax.Array
+
+
+def solve(
+    delassus: Symmetric,
+    gamma: jax.Array,
+    restitution: jax.Array,
+    gaps: jax.Array | None,
+    cycle: tuple[int, ...] | None,
+    max_collisions: int,
+) -> tuple[jax.Array, End]:
+    """Impulses p (m,) [N s] and how it ended, differentiable in both modes."""
+    inputs = to_inputs(delassus, gamma, restitution, gaps)
+    options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
+    pbar, end = both_modes(lambda given, _: run(given, options))(inputs)
+    return pbar / jnp.sqrt(diagonal(delassus)), end
+
+
+def to_inputs(
+    delassus: Symmetric, gamma: jax.Array, restitution: jax.Array, gaps: jax.Array | None
+) -> Inputs:
+    """The normalized problem. Gaps and `sqrt(W_jj)` only order the collisions: no derivatives."""
+    root = jnp.sqrt(diagonal(delassus))
+    g = scaled(delassus, 1 / root)
+    m = gamma.shape[0]
+    beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
+    fixed = jax.lax.stop_gradient
+    return Inputs(
+        beside,
+        restitution,
+        gamma / root,
+        fixed(root),
+        None if gaps is None else fixed(gaps),
+    )
+
+
+def run(inputs: Inputs, options: Options) -> tuple[jax.Array, End]:
+    """Normalized impulses and the end of the sequence."""
+    g = coupling_matrix(inputs, options)
+    start = begin(inputs)
+    pair = inputs.qn.shape[0] == 2
+    endless, limit = jnp.array(False), start.p
+    if pair:
+        first = choose(inputs, options, g, start).contact
+        endless, limit = endless_pair(inputs, first)
+        endless = endless & approaches(inputs, start)
+
+    def unfinished(at: Carry) -> jax.Array:
+        return ~endless & approaches(inputs, at) & (at.number < options.max_collisions)
+
+    end = jax.lax.while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
+    stopped = ~endless & approaches(inputs, end)
+    if not pair:
+        slow = end.speed < DECAYED.get(str(end.qn.dtype), 3e-4) * scale_of(inputs)
+        endless = slow & jnp.any(end.qn < 0) & ~stopped
+    code = jnp.where(end.tied, CODE["order_dependent"], CODE["ok"])
+    code = jnp.where(endless, CODE["plastic_limit"], code)
+    code = jnp.where(stopped, CODE["max_steps"], code)
+    p = jnp.where(endless, limit, end.p) if pair else end.p
+    return p, End(code, jnp.where(endless, -1, end.number))
+
+
+def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
+    """G with its unit diagonal, tridiagonal for a chain."""
+    m, dtype = inputs.qn.shape[0], inputs.qn.dtype
+    if options.chain:
+        return Tridiagonal(jnp.ones(m, dtype), inputs.coupling)
+    i, j = jnp.triu_indices(m, 1)
+    upper = jnp.zeros((m, m), dtype).at[i, j].set(inputs.coupling)
+    return jnp.eye(m, dtype=dtype) + upper + upper.T
+
+
+def scale_of(inputs: Inputs) -> jax.Array:
+    """Largest normalized approach velocity at the start."""
+    return jax.lax.stop_gradient(jnp.max(jnp.maximum(-inputs.qn, 0.0)))
+
+
+def rest_of(inputs: Inputs) -> jax.Array:
+    """Normalized approach velocities up to this are rounding."""
+    return REST * float(jnp.finfo(inputs.qn.dtype).eps) * scale_of(inputs)
+
+
+def approaches(inputs: Inputs, at: Carry) -> jax.Array:
+    """Is there a collision to come?"""
+    return jnp.any(at.qn < -rest_of(inputs))
+
+
+def begin(inputs: Inputs) -> Carry:
+    """Before the first collision."""
+    dtype = inputs.qn.dtype
+    zero = jnp.array(0, jnp.int32)
+    return Carry(
+        qn=inputs.qn,
+        p=jnp.zeros_like(inputs.qn),
+        number=zero,
+        place=zero,
+        speed=jnp.array(jnp.inf, dtype),
+        tied=jnp.array(False),
+        gaps=inputs.gaps,
+        time=jnp.array(0, dtype),
+    )
+
+
+def choose(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Choice:
+    """The next contact to collide; some contact approaches."""
+    rest = rest_of(inputs)
+    approaching = at.qn < -rest
+    if options.cycle is not None:
+        cycle = jnp.array(options.cycle, jnp.int32)
+        turn = approaching[cycle]
+        ahead = turn & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
+        k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(turn)).astype(jnp.int32)
+        return Choice(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
+    speed = jnp.where(approaching, -at.qn * inputs.root, 0.0)  # m/s
+    rivals, wait = approaching, jnp.zeros_like(speed)
+    if at.gaps is not None:
+        rivals, wait = first_to_close(inputs, at, approaching, speed)
+    noise = rest * inputs.root
+    fastest = jnp.max(jnp.where(rivals, speed - noise, -jnp.inf))
+    level = rivals & (speed + noise >= fastest)
+    j = jnp.argmax(level).astype(jnp.int32)  # the lowest index among equals
+    chosen = jnp.arange(speed.shape[0], dtype=jnp.int32) == j
+    floor = COUPLED * float(jnp.finfo(speed.dtype).eps)
+    beside = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
+    equals = rivals if at.gaps is not None else level
+    return Choice(j, at.place, wait[j], jnp.any(equals & beside & ~chosen))
+
+
+def first_to_close(
+    inputs: Inputs, at: Carry, approaching: jax.Array, speed: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Contacts that close first, within rounding, and the time (m,) until each closes."""
+    assert at.gaps is not None
+    assert inputs.gaps is not None
+    safe = jnp.where(approaching, speed, 1.0)
+    wait = jnp.where(approaching, at.gaps / safe, jnp.inf)
+    first = jnp.min(wait)
+    eps = float(jnp.finfo(speed.dtype).eps)
+    rounding = TIE * eps * (at.time + first + inputs.gaps / safe)
+    return approaching & (wait <= first + rounding), wait
+
+
+def times(g: Symmetric, vector: jax.Array) -> jax.Array:
+    """`G vector` without the reduced precision that accelerators use in products."""
+    if isinstance(g, Tridiagonal):
+        return g @ vector
+    return jnp.sum(g * vector[None, :], axis=1)
+
+
+def collide(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Carry:
+    """One collision, after the free flight that leads to it."""
+    choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
+    chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
+    jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+    after = at.qn + times(g, jump)
+    gaps = at.gaps
+    if gaps is not None:
+        flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
+        gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
+    return Carry(
+        qn=jnp.where(chosen, -inputs.restitution * at.qn, after),
+        p=at.p + jump,
+        number=at.number + jnp.array(1, jnp.int32),
+        place=choice.place,
+        speed=jax.lax.stop_gradient(-at.qn[choice.contact]),
+        tied=at.tied | choice.tied,
+        gaps=gaps,
+        time=at.time + choice.wait,
+    )
+
+
+def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Do two contacts collide without end, `first` to begin, and the impulses of that limit.
+
+    Approach speeds of successive collisions at j, k, j, ... obey, c = -G_12,
+
+        s_3 = c (1 + e_k) s_2 - e_j s_1,
+
+    two steps of which have trace `c^2 (1 + e_1) (1 + e_2) - e_1 - e_2` and determinant e_1 e_2.
+    They stay positive iff both eigenvalues are (z >= 1, c > 0) and s_3 / s_1 is not below the
+    smaller one, `chi(lambda) = lambda^2 - trace lambda + det = 0`. The limit is gamma = 0.
+    """
+    e, qn = jnp.broadcast_to(inputs.restitution, (2,)), inputs.qn
+    c = -inputs.coupling[0]
+    eps = float(jnp.finfo(qn.dtype).eps)
+    e_j, e_k, s_1 = e[first], e[1 - first], -qn[first]
+    s_2 = c * (1 + e_j) * s_1 - qn[1 - first]
+    both = e_j * e_k
+    trace = c**2 * (1 + e_j) * (1 + e_k) - e_j - e_k
+    ratio = c * (1 + e_k) * s_2 / s_1 - e_j
+    chi = ratio**2 - trace * ratio + both
+    above = (ratio >= trace / 2) | (chi <= BOUNDARY * eps * (ratio**2 + trace * ratio + both))
+    possible = (c > 0) & (trace >= 2 * jnp.sqrt(jax.lax.stop_gradient(both)))
+    endless = possible & (s_2 > 0) & (ratio >= 0) & above
+    # redundant contacts (c = 1) have no inverse: there s_3 = e_1 e_2 s_1, a geometric series
+    free = 1 - c**2
+    redundant = free <= SINGULAR * eps
+    other = -(qn + c * jnp.flip(qn)) / jnp.where(redundant, 1.0, free)
+    decay = jnp.where(both < 1, 1 - both, 1.0)
+    series_j, series_k = (1 + e_j) * s_1 / decay, (1 + e_k) * s_2 / decay
+    chosen = jnp.arange(2, dtype=jnp.int32) == first
+    p = jnp.where(redundant, jnp.where(chosen, series_j, series_k), other)
+    return endless & ~(redundant & (both >= 1)), p

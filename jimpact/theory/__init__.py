@@ -1,0 +1,1 @@
+"""The chapter's theory: admissible sets, propositions, bounds, rocking."""

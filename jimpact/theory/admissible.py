@@ -1,0 +1,269 @@
+"""All outcomes of an impact that mechanics allows, whatever the law."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from jimpact._checks import as_float_array, check_values
+from jimpact.contact_space import as_velocity, dense_mass, gap_velocity, kinetic_energy
+from jimpact.fits.capped_polyhedron import (
+    CappedPolyhedron,
+    capped_polyhedron,
+    cone_facets,
+)
+from jimpact.scene import Scene
+from jimpact.status import sign_tolerance
+
+# Contacts count as redundant when the matrix of their cosines has an eigenvalue below this
+# multiple of eps * m.
+_SINGULAR = 100.0
+# A contact approaches when |qn-| exceeds this multiple of eps times the speed sqrt(2 T).
+_APPROACH = 64.0
+_ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
+
+
+@dataclass(frozen=True)
+class AdmissibleSet:
+    """The outcomes v+ of `admissible_set`; `print(found)` describes them.
+
+    Every outcome is `center + axes u` with u (d,) in a convex set `coordinates`, and has the
+    energy `T(center) + |u|^2 / 2`: u are kinetic coordinates [sqrt(J)]. `dimension` d is 0 where
+    only one outcome is possible. `plastic` v+ (n,) has the `least_energy` [J]; `energy` is T-.
+    """
+
+    scene: Scene
+    velocity: np.ndarray
+    center: np.ndarray
+    axes: np.ndarray
+    coordinates: CappedPolyhedron = field(repr=False)
+    energy: float
+    tolerance: float
+
+    @property
+    def dimension(self) -> int:
+        """Dimension d of the set."""
+        return self.axes.shape[1]
+
+    @cached_property
+    def plastic(self) -> np.ndarray:
+        """v+ (n,) [m/s] of least energy: every contact that carries an impulse stays closed."""
+        return self._velocity(self.coordinates.project(np.zeros(self.dimension)))
+
+    @property
+    def least_energy(self) -> float:
+        """Least possible T+ [J]."""
+        return float(kinetic_energy(self.scene, self.plastic))
+
+    @cached_property
+    def bounds(self) -> np.ndarray:
+        """Least and greatest value of every coordinate of v+, (n, 2) [m/s].
+
+        Each is a linear function over the convex set, solved to rounding (about 1e-9 of the
+        impact's size).
+        """
+        found = [
+            [self._velocity(self.coordinates.lowest(s * c)) for s in (1, -1)] for c in self.axes
+        ]
+        return np.array([[low[i], high[i]] for i, (low, high) in enumerate(found)])
+
+    def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
+        """Whether v+ (n,), or each of (k, n), is admissible up to `tolerance` times the impact.
+
+        None: the tolerance of `audit`. Size of the impact: `sqrt(2 (T- - T(center)))`, the
+        largest |u|.
+        """
+        v = np.asarray(as_float_array("velocity", velocity), float)
+        if v.ndim not in (1, 2) or v.shape[-1] != self.scene.size:
+            raise ValueError(
+                f"Argument `velocity` must have shape ({self.scene.size},) or "
+                f"(k, {self.scene.size}), but has shape {v.shape}."
+            )
+        check_values("velocity", v)
+        check_values("tolerance", tolerance, low=0.0)
+        allowed = self.tolerance if tolerance is None else tolerance
+        offset = v - self.center
+        mass = dense_mass(self.scene)
+        u = offset @ mass @ self.axes
+        beside = offset - u @ self.axes.T  # against the momentum balance
+        off = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", beside, mass, beside), 0.0))
+        inside = np.maximum(self.coordinates.excess(u), off) <= allowed * self._size
+        return bool(inside) if v.ndim == 1 else inside
+
+    def sample(self, seed: int, count: int) -> np.ndarray:
+        """`count` outcomes (count, n), uniform in kinetic coordinates; fixed by the seed.
+
+        Hit-and-run from an interior point, one walk a sample. For independent contacts, uniform
+        in impulse space too.
+        """
+        _check_count("count", count, 1)
+        if self.dimension == 0:
+            return np.repeat(self.center[None], count, axis=0)
+        return self._velocity(self.coordinates.sample(np.random.default_rng(seed), count))
+
+    def conserving_arc(self, points: int = 100) -> np.ndarray:
+        """The outcomes T+ = T- of two contacts: an arc (points, n) from A to B.
+
+        Evenly spaced in the angle. At A the normalized gap velocity of the first closed contact
+        is smallest. Shape (0, n) if redundant contacts leave no such outcome.
+
+        Raises:
+            ValueError: the set is not two-dimensional.
+        """
+        self._check_plane()
+        _check_count("points", points, 1)
+        ends = self.coordinates.arc()
+        if ends is None:
+            return np.zeros((0, self.scene.size))
+        angle = np.linspace(*ends, points)
+        u = self.coordinates.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        arc = self._velocity(u)
+        first = np.asarray(self.scene.normals)[:, int(np.argmax(self.scene.closed))]
+        return arc[::-1] if arc[0] @ first > arc[-1] @ first else arc
+
+    def boundary(self, points: int = 100) -> np.ndarray:
+        """Boundary (k, n) of a two-dimensional set, in order around it, with exact corners.
+
+        Straight sides are open or impulse-free contacts, `points` lie on the arc T+ = T-.
+
+        Raises:
+            ValueError: the set is not two-dimensional.
+        """
+        self._check_plane()
+        _check_count("points", points, 2)
+        return self._velocity(self.coordinates.boundary(points))
+
+    def __str__(self) -> str:
+        return _in_words(self)
+
+    @property
+    def _size(self) -> float:
+        return self.coordinates.radius or float(np.sqrt(2 * self.energy)) or 1.0
+
+    def _velocity(self, u: np.ndarray) -> np.ndarray:
+        return self.center + u @ self.axes.T
+
+    def _check_plane(self) -> None:
+        if self.dimension != 2:
+            raise ValueError(
+                "An arc and a boundary need a set of dimension 2 (two independent contacts), but "
+                f"this one has dimension {self.dimension}."
+            )
+
+
+def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
+    """All outcomes v+ of an impact that are kinematically, kinetically, energetically consistent.
+
+    Equation: `v+ = v- + M^-1 N p` with `p >= 0`, `gamma+ >= 0` at closed contacts (p = 0 at open
+    ones) and `T+ <= T-`. In kinetic coordinates the set is the part of a ball between flat
+    walls; for two contacts, the region under an arc A-B of the circle of equal energy.
+
+    Args:
+        scene: n coordinates, m contacts, redundant ones included.
+        velocity: v- (n,) [m/s].
+
+    Returns:
+        `AdmissibleSet`: `contains`, `bounds`, `plastic`, `least_energy`, `sample`, and for two
+        contacts `conserving_arc`, `boundary`. Without an approaching contact it is v- alone.
+
+    Raises:
+        ValueError: shape, NaN, a velocity against the bilateral constraints; so many redundant
+            contacts that the cone of impulses cannot be enumerated.
+
+    Host function, not differentiable.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.2, (6.5)-(6.8) and Fig. 6.3.
+
+    >>> import jimpact as ji
+    >>> found = admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+    >>> (found.conserving_arc(2).round(4) + 0.0).tolist()
+    [[0.0, 0.0, 1.0], [-0.3333, 0.6667, 0.6667]]
+    >>> found.contains([0.1, 0.3, 0.6]), found.contains([0.5, 0.25, 0.25])
+    (True, False)
+    """
+    v = as_velocity(scene, velocity)
+    check_values("velocity", v)
+    tolerance = sign_tolerance(scene.mass.dtype)
+    start, closed = np.asarray(v, float), np.asarray(scene.closed)
+    root = np.linalg.cholesky(dense_mass(scene))  # y = root^T v has T = |y|^2 / 2
+    y = root.T @ start
+    free = _unconstrained(scene, root, y, tolerance)
+    unit = np.linalg.solve(root, np.asarray(scene.normals, float)[:, closed])
+    unit = unit / np.linalg.norm(unit, axis=0)
+    approach = unit.T @ y < -_APPROACH * np.finfo(scene.mass.dtype).eps * np.linalg.norm(y)
+    energy = 0.5 * float(y @ y)
+    if not approach.any():
+        alone = CappedPolyhedron(np.zeros((0, 0)), np.zeros(0), 0.0)
+        return AdmissibleSet(
+            scene, start, start, np.zeros((len(start), 0)), alone, energy, tolerance
+        )
+    unit = free @ unit
+    floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * unit.shape[1]
+    unit = unit[:, np.sum(unit**2, axis=0) > floor]  # not what the constraints hold anyway
+    basis, singular, _ = np.linalg.svd(unit, full_matrices=False)
+    basis = basis[:, singular**2 > floor]
+    normal = basis.T @ unit  # contacts in the coordinates z = basis^T y
+    before = basis.T @ y
+    facets = cone_facets(normal)
+    rows = np.vstack([normal.T, facets])
+    offset = np.append(np.zeros(normal.shape[1]), facets @ before)
+    redundant = basis.shape[1] < unit.shape[1]
+    part, center, axes = capped_polyhedron(rows, offset, float(np.linalg.norm(before)), redundant)
+    rest = y - basis @ before + basis @ center
+    return AdmissibleSet(
+        scene,
+        start,
+        np.linalg.solve(root.T, rest),
+        np.linalg.solve(root.T, basis @ axes),
+        part,
+        energy,
+        tolerance,
+    )
+
+
+def _check_count(name: str, value: Any, least: int) -> None:
+    if not isinstance(value, int) or value < least:
+        raise ValueError(
+            f"Argument `{name}` must be an integer >= {least}, but has value {value!r}."
+        )
+
+
+def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
+    """Projector onto what the bilateral constraints leave free, in the coordinates y."""
+    if scene.constraints is None:
+        return np.eye(len(y))
+    held = np.linalg.qr(np.linalg.solve(root, np.asarray(scene.constraints, float)))[0]
+    if np.linalg.norm(held.T @ y) > tolerance * np.linalg.norm(y):
+        raise ValueError(
+            "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but is "
+            f"{np.linalg.norm(held.T @ y):.3g} off in the kinetic norm."
+        )
+    return np.eye(len(y)) - held @ held.T
+
+
+def _in_words(found: AdmissibleSet) -> str:
+    closed = np.asarray(found.scene.closed)
+    approaching = np.asarray(gap_velocity(found.scene, found.velocity))[closed] < 0
+    head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
+    smallest = _ZERO * max(1e-300, float(np.abs(found.velocity).max()))
+
+    def show(x: float, width: int = 0) -> str:
+        return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
+
+    if found.dimension == 0:
+        return f"{head} one admissible outcome, v+ = ({', '.join(map(show, found.center))})"
+    lines = [
+        f"{head} admissible outcomes of dimension {found.dimension}",
+        f"energy       from {found.least_energy:.6g} J (plastic) to {found.energy:.6g} J (T-)",
+        "coordinate          v-         least       plastic      greatest   [m/s]",
+    ]
+    columns = np.column_stack(
+        [found.velocity, found.bounds[:, 0], found.plastic, found.bounds[:, 1]]
+    )
+    for i, row in enumerate(columns):
+        lines.append(f"{i + 1:10d}{show(row[0], 12)}" + "".join(show(x, 14) for x in row[1:]))
+    if found.dimension == 2:
+        for name, v in zip("AB", found.conserving_arc(2)):
+            lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
+    return "\n".join(lines)
