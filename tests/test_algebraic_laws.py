@@ -176,16 +176,20 @@ def test_unequal_restitution_can_gain_energy_and_is_flagged():
 def test_inclusion():
     """(6.65): the closed-form projection, and Newton's law for one contact."""
     gbar, metric = [[1.0, 0.3], [0.3, 1.0]], [[2.0, 0.5], [0.5, 1.0]]
-    out = ji.restitution_inclusion(gbar, metric, jnp.diag(jnp.array([0.6, 0.4])), [-1.0, 0.2])
+    out = ji.theory.restitution_inclusion(
+        gbar, metric, jnp.diag(jnp.array([0.6, 0.4])), [-1.0, 0.2]
+    )
     np.testing.assert_allclose(
         out.velocity, [0.345606694560669456, 0.603682008368200837], atol=1e-15
     )
     # a particle on a line, normal then tangential: the tangential percussion saturates at 0.3
     eye = jnp.eye(2)
-    out = ji.restitution_inclusion(eye, eye, 0.0, [-1.0, 2.0], low=[0.0, -0.3], high=[np.inf, 0.3])
+    out = ji.theory.restitution_inclusion(
+        eye, eye, 0.0, [-1.0, 2.0], low=[0.0, -0.3], high=[np.inf, 0.3]
+    )
     np.testing.assert_allclose(out.velocity, [0.0, 0.3], atol=1e-15)
     np.testing.assert_allclose(out.percussion, [1.0, -1.7], atol=1e-15)
-    empty = ji.restitution_inclusion([[0.0]], [[1.0]], 0.0, [1.0], low=1.0)
+    empty = ji.theory.restitution_inclusion([[0.0]], [[1.0]], 0.0, [1.0], low=1.0)
     assert int(empty.status) == CODE["infeasible"]
 
 
@@ -193,7 +197,7 @@ def test_coupling_is_block_triangular():
     block = ji.Scene(
         [2.0, 2.0, 0.3], [[0, 0], [1.0, 1.0], [-0.5, 0.5]], [[1.0, 1.0], [0, 0], [0.7, 0.7]]
     )
-    gbar = np.asarray(ji.contact_coupling(block))
+    gbar = np.asarray(ji.theory.contact_coupling(block))
     np.testing.assert_allclose(gbar[:2, :2], ji.normalized_delassus(block), atol=1e-14)
     np.testing.assert_allclose(gbar[2, :2], 0, atol=1e-14)
 
@@ -256,9 +260,12 @@ BAD = [
     (lambda: ji.Poisson([0.5, 1.2]), r"`restitution`.*1\.2 at index 1"),
     (lambda: ji.Poisson(-1.0, allow_above_one=True), r"`restitution` must lie in \[0, inf\)"),
     (lambda: ji.impact(ji.Poisson([0.5] * 3), EQUAL, ONE), r"`restitution` must have shape \(2,\)"),
-    (lambda: ji.restitution_inclusion([[1.0]], [[1.0]], 0.5, [1.0, 2.0]), r"`velocity`"),
-    (lambda: ji.restitution_inclusion([1.0], [[1.0]], 0.5, [1.0]), r"`coupling` must be a matrix"),
-    (lambda: ji.restitution_inclusion([[np.nan]], [[1.0]], 0.5, [1.0]), r"`coupling`"),
+    (lambda: ji.theory.restitution_inclusion([[1.0]], [[1.0]], 0.5, [1.0, 2.0]), r"`velocity`"),
+    (
+        lambda: ji.theory.restitution_inclusion([1.0], [[1.0]], 0.5, [1.0]),
+        r"`coupling` must be a matrix",
+    ),
+    (lambda: ji.theory.restitution_inclusion([[np.nan]], [[1.0]], 0.5, [1.0]), r"`coupling`"),
 ]
 
 

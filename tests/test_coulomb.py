@@ -98,13 +98,13 @@ def test_given_slip_agrees_with_the_law():
     e, mu = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2
     fast, slow = np.array([2.0, -0.6, -0.3]), np.array([0.1, -0.6, -0.3])
     out, stuck = (ji.impact(matrix(e, mu), FLAT, v) for v in (fast, slow))
-    p, side = ji.friction_impulses(FLAT, e, mu, 1.0, fast)
+    p, side = ji.theory.friction_impulses(FLAT, e, mu, 1.0, fast)
     assert float((FLAT.tangents.T @ out.velocity)[0]) > 0  # still sliding: xi = 1 was right
     close(out.impulse, p, rtol=1e-12)
     close(out.tangential_impulse, side, rtol=1e-12)
     assert int(out.status) == 0
     # with less speed the given slip would turn back: there the law sticks
-    p, side = ji.friction_impulses(FLAT, e, mu, 1.0, slow)
+    p, side = ji.theory.friction_impulses(FLAT, e, mu, 1.0, slow)
     assert float((FLAT.tangents.T @ (slow + ji.velocity_change(FLAT, p, side)))[0]) < 0
     close(FLAT.tangents.T @ stuck.velocity, 0, atol=1e-14)
     assert int(stuck.status) == CODE["impulse_not_unique"]
@@ -144,7 +144,7 @@ def test_uneven_load_is_shared_as_friction_allows():
     close(out.tangential_impulse[1], 0, atol=1e-14)
     close(scene.tangents[:, 0] @ out.velocity, 0, atol=1e-14)
     # rolling over to B without slip: Housner
-    close(out.velocity[2], rate * ji.housner_restitution(3.0), rtol=1e-13)
+    close(out.velocity[2], rate * ji.theory.housner_restitution(3.0), rtol=1e-13)
 
 
 def test_open_corner_takes_no_part():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jimpact as ji
 from jimpact.histories import history
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
@@ -15,7 +16,6 @@ from jimpact.laws.forces import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, 
 from jimpact.laws.lzb import LZB
 from jimpact.laws.newton import Newton
 from jimpact.montecarlo.gap_scales import crossover, gap_scale
-from jimpact.plot.rheology import plot_forces
 from jimpact.scenes import chain, column
 
 
@@ -110,7 +110,7 @@ def test_bead_column_wall_force(number):
     )
     microseconds = {1: 36.006, 2: 65.812, 5: 149.586, 8: 237.141}  # longer with every bead
     assert 1e6 * float(h.duration) == pytest.approx(microseconds[number], rel=1e-5)
-    figure = plot_forces({f"{number} beads": h})
+    figure = ji.plot.forces({f"{number} beads": h})
     assert figure.axes[0].get_ylabel() == "force [N]"
 
 

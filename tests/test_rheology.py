@@ -8,6 +8,7 @@ from compliant_reference import viscous
 from reference import chain_matrices
 from scipy.optimize import brentq
 
+import jimpact as ji
 from jimpact.impacts import impact
 from jimpact.laws.calibration import calibrate, compare_rheologies, measured_restitution
 from jimpact.laws.compliant import Compliant
@@ -21,7 +22,6 @@ from jimpact.laws.forces import (
     UserForce,
 )
 from jimpact.laws.materials import hertz_stiffness, sphere_mass
-from jimpact.plot.rheology import plot_rheologies
 from jimpact.scenes import chain
 from jimpact.status import CODE
 
@@ -176,7 +176,7 @@ def test_same_pair_restitution_other_chain():
     assert spread[0] > 0.08
     for e in found.entries.values():
         assert int(e.outcome.status) == 0
-    figure = plot_rheologies(found)
+    figure = ji.plot.rheologies(found)
     assert len(figure.axes) == 2
     assert len(figure.axes[0].lines) == 5
 

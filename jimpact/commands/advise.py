@@ -73,6 +73,6 @@ def _parameters(study: Study) -> dict[str, Any]:
 
 
 def _draw(found: Advice, title: str, path: Path) -> None:
-    from jimpact.plot.validity import plot_advice  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_advice(found, title), path)
+    save_picture(plot.advice(found, title), path)

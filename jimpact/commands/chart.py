@@ -83,9 +83,9 @@ def _able(law: LZB, study: Study, full: bool) -> tuple[str, ...]:
 
 
 def _draw(found: WorkPrecision, title: str, path: Path) -> None:
-    from jimpact.plot.chart import plot_work_precision  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_work_precision(found, title), path)
+    save_picture(plot.work_precision(found, title), path)
 
 
 def _print(study: Study, found: WorkPrecision, path: Path) -> None:

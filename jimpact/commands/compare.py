@@ -79,9 +79,9 @@ def _fits(study: Study) -> dict[str, Fit]:
 
 
 def _draw(found: Comparison, measured: np.ndarray | None, title: str, path: Path) -> None:
-    from jimpact.plot.comparison import plot_comparison  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_comparison(found, measured, title), path)
+    save_picture(plot.comparison(found, measured, title), path)
 
 
 def _print(

@@ -50,10 +50,10 @@ def run(
 
 
 def _draw(study: Study, fits: dict[str, Fit], path: Path) -> None:
-    from jimpact.plot.fits import plot_fit  # matplotlib, late: bad input is told sooner
+    from jimpact import plot  # matplotlib, late: bad input is told sooner
 
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
-    save_picture(plot_fit(fits[RAW], others, study.title), path)
+    save_picture(plot.fit(fits[RAW], others, study.title), path)
 
 
 def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:

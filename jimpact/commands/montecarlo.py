@@ -78,6 +78,6 @@ def _executor(name: str, scheduler: str | None) -> Executor:
 
 
 def _draw(found: MonteCarlo, title: str, path: Path) -> None:
-    from jimpact.plot.montecarlo import plot_monte_carlo  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_monte_carlo(found, title), path)
+    save_picture(plot.monte_carlo(found, title), path)

@@ -69,13 +69,12 @@ def _told(what: str) -> Iterator[None]:
 def _draw(
     study: MotionStudy, motion: Motion, pictures: dict[str, Path | None], coordinate: int
 ) -> None:
-    from jimpact.plot.animation import animate_motion  # matplotlib, late
-    from jimpact.plot.motions import plot_motion, plot_phase_portrait
+    from jimpact import plot  # matplotlib, late
 
     path, portrait, gif = (pictures[k] for k in ("picture", "portrait", "animation"))
     assert path is not None
-    save_picture(plot_motion(motion, study.title), path)
+    save_picture(plot.motion(motion, study.title), path)
     if portrait is not None:
-        save_picture(plot_phase_portrait(motion, coordinate - 1, study.title), portrait)
+        save_picture(plot.phase_portrait(motion, coordinate - 1, study.title), portrait)
     if gif is not None:
-        animate_motion(study.system, motion, gif, title=study.title)
+        plot.animation(study.system, motion, gif, title=study.title)

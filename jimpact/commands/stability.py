@@ -52,17 +52,14 @@ def run(methods: tuple[str, ...] | None, full: bool, out: Path, json: bool) -> i
 
 def draw(found: StabilityMap, path: Path) -> list[Path]:
     """Write the picture over single axes to `path`; where the map has pairs, one more a method."""
-    from jimpact.plot.stability import (  # matplotlib, late
-        plot_stability_map,
-        plot_stability_pairs,
-    )
+    from jimpact import plot  # matplotlib, late
 
     title = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
-    save_picture(plot_stability_map(found, title), path)
+    save_picture(plot.stability_map(found, title), path)
     written = [path]
     if any(len(each.axes) == 2 for each in found.slices[found.methods[0]]):
         for name in found.methods:
             beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
-            save_picture(plot_stability_pairs(found, name), beside)
+            save_picture(plot.stability_pairs(found, name), beside)
             written.append(beside)
     return written

@@ -11,8 +11,14 @@ import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
 from jimpact.fits.least_squares import Box, State, advance, begin
-from jimpact.fits.parameters import LOGARITHMIC, Parameters, bounds_of, entries, free_parameters
-from jimpact.fits.parameters import with_entries as law_with
+from jimpact.fits.parameters import (
+    LOGARITHMIC,
+    Parameters,
+    bounds_of,
+    entries,
+    free_parameters,
+    with_entries as law_with,
+)
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.laws.base import Law
 from jimpact.motion.record import MOTION_STATUS, Motion

@@ -19,7 +19,7 @@ _SAMPLES = 2000
 _SHORTEST = 0.5  # a side shorter than this part of the radius is not drawn: its name would not fit
 
 
-def plot_admissible_set(
+def admissible_set(
     found: AdmissibleSet, outcomes: Mapping[str, Any] | None = None, title: str = ""
 ) -> Figure:
     """The set of admissible outcomes, and labelled outcomes v+ (n,) of laws.
@@ -39,8 +39,8 @@ def plot_admissible_set(
         ValueError: an outcome of another size.
 
     >>> import jimpact as ji
-    >>> found = ji.admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
-    >>> len(ji.plot_admissible_set(found, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
+    >>> found = ji.theory.admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+    >>> len(ji.plot.admissible_set(found, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
     1
     """
     marked = {}

@@ -21,7 +21,7 @@ from jimpact.plot.motions import one_motion
 _GREY = "#777777"
 
 
-def animate_motion(
+def animation(
     system: System,
     motion: Motion,
     path: str | Path,
@@ -45,7 +45,7 @@ def animate_motion(
     >>> import jimpact as ji
     >>> ball = ji.ball_system()
     >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> ji.animate_motion(ball, motion, "ball.gif").name
+    >>> ji.plot.animation(ball, motion, "ball.gif").name
     'ball.gif'
     """
     one_motion(motion)

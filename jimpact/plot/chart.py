@@ -17,7 +17,7 @@ _LEAST = 1e-16  # errors below are drawn here: rounding
 _OWN = ("dop853", "dop5", "propagator")  # jimpact's own methods: thick lines
 
 
-def plot_work_precision(found: WorkPrecision, title: str = "") -> Figure:
+def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
 
     Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker is

@@ -9,16 +9,14 @@ from jimpact.plot.fits import COLOURS
 _SPREAD = 0.6  # width that the bodies of one law take, of the distance between laws
 
 
-def plot_comparison(
-    found: Comparison, measured: np.ndarray | None = None, title: str = ""
-) -> Figure:
+def comparison(found: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
     """Velocities after the impact by law, above the energy kept and how evenly it is spread.
 
     Measured velocities are horizontal lines; a law whose outcome fails the audit is crossed.
 
     >>> import jimpact as ji
     >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
-    >>> len(ji.plot_comparison(found).axes)
+    >>> len(ji.plot.comparison(found).axes)
     2
     """
     names, entries = list(found.entries), list(found.entries.values())

@@ -17,7 +17,7 @@ _SPREAD = 0.6  # width that the bodies of one shot take, of the distance between
 _LABELLED = 16  # shots up to which every one gets its label
 
 
-def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
+def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
     """Velocities after every shot, measured and fitted, above their residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
@@ -25,7 +25,7 @@ def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "")
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.3, 0.7])
-    >>> figure = ji.plot_fit(ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data))
+    >>> figure = ji.plot.fit(ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data))
     >>> len(figure.axes)
     2
     """

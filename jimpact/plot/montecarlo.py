@@ -14,7 +14,7 @@ _BODIES = 6  # with a histogram of their own; of more only the most scattered ar
 _DOT = 9.0  # area of a sample in the map [points^2]
 
 
-def plot_monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
+def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
     The map shows the two gaps that vary most and the most scattered velocity; with one random
@@ -24,7 +24,7 @@ def plot_monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([1.0, 1.0, 1.0])
     >>> gaps = ji.Uniform(0.0, 1e-5)
     >>> found = ji.monte_carlo(law, balls, [1.0, 0.0, -1.0], gaps=gaps, samples=100)
-    >>> len(ji.plot_monte_carlo(found).axes)  # three bodies, map, its colour bar
+    >>> len(ji.plot.monte_carlo(found).axes)  # three bodies, map, its colour bar
     5
     """
     scattered = np.argsort(-found.std, kind="stable")

@@ -21,7 +21,7 @@ def one_motion(motion: Motion) -> None:
         raise ValueError("Argument `motion` must be one motion, but is a batch: pick one of it.")
 
 
-def plot_motion(motion: Motion, title: str = "", names: Sequence[str] = ()) -> Figure:
+def motion(motion: Motion, title: str = "", names: Sequence[str] = ()) -> Figure:
     """Coordinates and velocities against time, events, and where the energy goes.
 
     Args:
@@ -31,7 +31,7 @@ def plot_motion(motion: Motion, title: str = "", names: Sequence[str] = ()) -> F
 
     >>> import jimpact as ji
     >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> len(ji.plot_motion(motion).axes)
+    >>> len(ji.plot.motion(motion).axes)
     3
     """
     one_motion(motion)
@@ -84,7 +84,7 @@ def _ledger(axes: Axes, motion: Motion) -> None:
     axes.set_ylabel("energy [J]")
 
 
-def plot_phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") -> Figure:
+def phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") -> Figure:
     """Velocity against one coordinate; impacts are the dashed jumps.
 
     Args:
@@ -94,7 +94,7 @@ def plot_phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") ->
 
     >>> import jimpact as ji
     >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> len(ji.plot_phase_portrait(motion).axes)
+    >>> len(ji.plot.phase_portrait(motion).axes)
     1
     """
     one_motion(motion)

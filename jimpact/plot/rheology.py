@@ -19,7 +19,7 @@ _SPREAD = 0.6  # width that the bodies of one force take, of the distance betwee
 _SAMPLES = 120  # points of a force-indentation loop
 
 
-def plot_rheologies(found: Comparison, title: str = "") -> Figure:
+def rheologies(found: Comparison, title: str = "") -> Figure:
     """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
 
     Args:
@@ -28,7 +28,7 @@ def plot_rheologies(found: Comparison, title: str = "") -> Figure:
     >>> import jimpact as ji
     >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
     >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], laws)
-    >>> len(ji.plot_rheologies(found).axes)
+    >>> len(ji.plot.rheologies(found).axes)
     2
     """
     mass = 1 / float(diagonal(delassus_matrix(found.scene))[0])
@@ -63,12 +63,12 @@ def plot_rheologies(found: Comparison, title: str = "") -> Figure:
     return figure
 
 
-def plot_forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
+def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """Force at one contact over impact time, one line a history.
 
     >>> import jimpact as ji
     >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])
-    >>> len(ji.plot_forces({"one ball": h}).axes[0].lines)
+    >>> len(ji.plot.forces({"one ball": h}).axes[0].lines)
     1
     """
     figure = Figure(figsize=(6.4, 4.2))

@@ -11,7 +11,7 @@ from jimpact.theory.rocking_record import OUTCOMES, STAYS, RockingDispersion, cr
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
 
-def plot_rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
+def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
     """|y_A'+ / y_B'-| against the kinetic angle: a panel for each mu, a line for each e.
 
     The dotted line is `critical_kinetic_angle`.
@@ -19,9 +19,9 @@ def plot_rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure
     >>> import jimpact as ji
     >>> import numpy as np
     >>> zero = np.zeros((2, 1, 1))
-    >>> d = ji.RockingDispersion(*map(np.array, ([1.0, 2], [0.1], [0.5])), np.zeros((2, 1, 1, 2)),
-    ...                       zero, zero, zero, zero)
-    >>> len(ji.plot_rocking_dispersion(d).axes)
+    >>> axes = map(np.array, ([1.0, 2], [0.1], [0.5]))
+    >>> d = ji.theory.RockingDispersion(*axes, np.zeros((2, 1, 1, 2)), zero, zero, zero, zero)
+    >>> len(ji.plot.rocking_dispersion(d).axes)
     1
     """
     figure, panels = _panels(found, title, 3.0)
@@ -41,9 +41,7 @@ def plot_rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure
     return figure
 
 
-def plot_rocking_outcomes(
-    found: RockingDispersion, title: str = "", stays: float = STAYS
-) -> Figure:
+def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = STAYS) -> Figure:
     """Rest, rocking, half-rocking, free over the kinetic angle and e: a panel for each mu.
 
     The dotted line is `critical_kinetic_angle`; `stays` as in `RockingDispersion.outcomes`.
@@ -52,8 +50,8 @@ def plot_rocking_outcomes(
     >>> import numpy as np
     >>> zero = np.zeros((2, 1, 2))
     >>> axes = map(np.array, ([1.0, 2], [0.1], [0.5, 1]))
-    >>> d = ji.RockingDispersion(*axes, np.zeros((2, 1, 2, 2)), zero, zero, zero, zero)
-    >>> len(ji.plot_rocking_outcomes(d).axes)
+    >>> d = ji.theory.RockingDispersion(*axes, np.zeros((2, 1, 2, 2)), zero, zero, zero, zero)
+    >>> len(ji.plot.rocking_outcomes(d).axes)
     1
     """
     figure, panels = _panels(found, title, 3.2)

@@ -32,14 +32,14 @@ _LABELS = {
 _TICKS = 5  # labelled values along an axis, at most
 
 
-def plot_stability_map(found: StabilityMap, title: str = "") -> Figure:
+def stability_map(found: StabilityMap, title: str = "") -> Figure:
     """One panel an axis: a row for each method, a column for each value; other axes at the base.
 
     Args:
         found: what `stability_map` returned.
         title: above the panels.
 
-    Example: `ji.plot_stability_map(ji.stability_map(["default", "rk4"])).savefig("map.png")`.
+    Example: `ji.plot.stability_map(ji.stability_map(["default", "rk4"])).savefig("map.png")`.
     """
     names = list(found.axes)
     columns = min(3, len(names))
@@ -62,7 +62,7 @@ def plot_stability_map(found: StabilityMap, title: str = "") -> Figure:
     return figure
 
 
-def plot_stability_pairs(found: StabilityMap, method: str, title: str = "") -> Figure:
+def stability_pairs(found: StabilityMap, method: str, title: str = "") -> Figure:
     """One panel for every pair of axes, for one method; a ring marks the base point.
 
     Raises:

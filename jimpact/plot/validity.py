@@ -14,7 +14,7 @@ _SPREAD = 0.6  # width that the bodies of one law take, of the distance between 
 _FLOOR = 1e-9  # errors below are drawn here
 
 
-def plot_validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
+def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
     """Dispersion against the stiffness ratio, and the errors of the laws that do not know it.
 
     Above one curve an exponent, between the levels of binary collisions and Moreau's law; below
@@ -22,7 +22,7 @@ def plot_validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = 
 
     >>> import jimpact as ji
     >>> found = ji.validity_map(ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0])
-    >>> len(ji.plot_validity_map(found).axes)
+    >>> len(ji.plot.validity_map(found).axes)
     2
     """
     figure = Figure(figsize=(7.5, 7.0), layout="constrained")
@@ -52,12 +52,12 @@ def plot_validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = 
     return figure
 
 
-def plot_advice(found: Advice, title: str = "") -> Figure:
+def advice(found: Advice, title: str = "") -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
 
     >>> import jimpact as ji
     >>> found = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
-    >>> len(ji.plot_advice(found).axes)
+    >>> len(ji.plot.advice(found).axes)
     2
     """
     names, rows = list(found.candidates), list(found.candidates.values())

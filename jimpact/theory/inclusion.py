@@ -27,7 +27,8 @@ def contact_coupling(scene: Scene) -> jax.Array:
     Source: Brogliato (2016), (6.53), (6.64).
 
     >>> import jimpact as ji
-    >>> ji.contact_coupling(ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])).shape
+    >>> rough = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    >>> ji.theory.contact_coupling(rough).shape
     (2, 2)
     """
     n_q, t_q = quasi_basis(scene)
@@ -64,7 +65,7 @@ def restitution_inclusion(
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.63)-(6.65).
 
     >>> import jimpact as ji
-    >>> out = ji.restitution_inclusion([[1.0]], [[1.0]], 0.5, [-2.0])  # Newton's law
+    >>> out = ji.theory.restitution_inclusion([[1.0]], [[1.0]], 0.5, [-2.0])  # Newton's law
     >>> float(out.velocity[0])
     1.0
     """

@@ -71,7 +71,7 @@ def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
-    >>> ji.dissipation_matrix(jnp.eye(2), jnp.diag(jnp.array([0.5, 1.0]))).tolist()
+    >>> ji.theory.dissipation_matrix(jnp.eye(2), jnp.diag(jnp.array([0.5, 1.0]))).tolist()
     [[0.75, 0.0], [0.0, 0.0]]
     """
     return jnp.linalg.inv(delassus) - matrix.T @ jnp.linalg.solve(delassus, matrix)

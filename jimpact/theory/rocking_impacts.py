@@ -76,7 +76,7 @@ def rocking_dispersion(
     `RockingDispersion.outcomes`.
 
     >>> import jimpact as ji
-    >>> ji.rocking_dispersion(-1.0)
+    >>> ji.theory.rocking_dispersion(-1.0)
     Traceback (most recent call last):
     ...
     ValueError: Argument `aspect` must lie in (0, inf), but has value -1 at index 0.
@@ -105,7 +105,7 @@ def search_critical_angle(
     (at e = 0 there is no V to search). Arguments as in `rocking_dispersion`.
 
     >>> import jimpact as ji
-    >>> ji.search_critical_angle(0.1, -0.5)
+    >>> ji.theory.search_critical_angle(0.1, -0.5)
     Traceback (most recent call last):
     ...
     ValueError: Argument `restitution` must lie in (0, 1], but has value -0.5 at index 0.

@@ -35,7 +35,7 @@ def housner_restitution(aspect: Any) -> jax.Array:
     Source: Housner, Bull. Seism. Soc. Am. 53 (1963) 403-417.
 
     >>> import jimpact as ji
-    >>> [round(float(ji.housner_restitution(a)), 6) for a in (1.0, 2.0, 3.0)]
+    >>> [round(float(ji.theory.housner_restitution(a)), 6) for a in (1.0, 2.0, 3.0)]
     [0.25, 0.7, 0.85]
     """
     a = as_float_array("aspect", aspect)
@@ -60,7 +60,7 @@ def rocking_matrix(restitution: Any) -> jax.Array:
     `v+ = -E v-`.
 
     >>> import jimpact as ji
-    >>> (10 * ji.rocking_matrix(0.7)).round().tolist()
+    >>> (10 * ji.theory.rocking_matrix(0.7)).round().tolist()
     [[0.0, 7.0, 0.0], [7.0, 0.0, 0.0], [0.0, 0.0, -7.0]]
     """
     e = as_float_array("restitution", restitution)
@@ -78,7 +78,7 @@ def rocking_ratios() -> list[RockingRatio]:
     Source: ElGawady et al., as quoted in public abstracts; see data/README.md.
 
     >>> import jimpact as ji
-    >>> for row in ji.rocking_ratios():
+    >>> for row in ji.theory.rocking_ratios():
     ...     print(row.material, row.aspect, round(row.restitution, 4))
     concrete 5.0 0.8952
     rubber 5.0 0.6313

@@ -86,7 +86,7 @@ def rocking_kinetic_angle(aspect: Any) -> jax.Array:
     Source: Brogliato (2016), section 6.3.2.2.
 
     >>> import jimpact as ji
-    >>> round(float(ji.rocking_kinetic_angle(2.0**0.5)), 6)
+    >>> round(float(ji.theory.rocking_kinetic_angle(2.0**0.5)), 6)
     1.570796
     """
     a = as_float_array("aspect", aspect)
@@ -107,7 +107,7 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
         friction: mu >= 0, scalar or array.
 
     >>> import jimpact as ji
-    >>> [round(float(ji.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
+    >>> [round(float(ji.theory.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
     [1.5708, 1.3862, 1.231]
     """
     mu = as_float_array("friction", friction)

@@ -106,7 +106,7 @@ def validity_map(
         restitution: e in [0, 1], scalar or (m,).
 
     Returns:
-        `ValidityMap`; `plot_validity_map` draws it, `print` tells where which law holds.
+        `ValidityMap`; `ji.plot.validity_map` draws it, `print` tells where which law holds.
 
     Source: the kind of Brogliato, Nonsmooth Mechanics (2016), figure 6.9.
 

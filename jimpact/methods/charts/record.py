@@ -50,7 +50,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class WorkPrecision:
-    """Error against time and work; `print` gives a table, `plot_chart` a picture.
+    """Error against time and work; `print` gives a table, `ji.plot.work_precision` a picture.
 
     `points[name]` from coarse to fine; `compile_time[name]` [s] by program ('single', 'batched',
     'gradient'), traced and compiled; `left_out[name]`: why a method is missing.

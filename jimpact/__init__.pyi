@@ -1,0 +1,112 @@
+"""Public names and where they live: read by type checkers, and on import by `lazy_loader`."""
+
+from . import plot as plot, theory as theory
+from .audits import Audit as Audit, audit as audit, summary as summary
+from .bodies.base import Mechanism as Mechanism
+from .bodies.bodies import (
+    Block as Block,
+    Dimer as Dimer,
+    dimer as dimer,
+    rocking_block as rocking_block,
+)
+from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
+from .bodies.planar import (
+    Corner as Corner,
+    DiskBalls as DiskBalls,
+    corner as corner,
+    disk_balls as disk_balls,
+)
+from .bodies.spatial import SpatialDimer as SpatialDimer, dimer_3d as dimer_3d
+from .comparison import (
+    Comparison as Comparison,
+    compare as compare,
+    dispersion_index as dispersion_index,
+    energy_ratio as energy_ratio,
+)
+from .contact_space import (
+    delassus_matrix as delassus_matrix,
+    gap_velocity as gap_velocity,
+    kinetic_angles as kinetic_angles,
+    kinetic_energy as kinetic_energy,
+    momentum as momentum,
+    normalized_delassus as normalized_delassus,
+    normalized_gap_velocity as normalized_gap_velocity,
+    velocity_change as velocity_change,
+)
+from .experiments import Experiments as Experiments, read_experiments as read_experiments
+from .fits.fitting import Fit as Fit, fit as fit
+from .histories import History as History, history as history
+from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
+from .laws import REGISTRY as REGISTRY
+from .laws.base import Law as Law
+from .laws.binary import Binary as Binary
+from .laws.calibration import (
+    calibrate as calibrate,
+    compare_rheologies as compare_rheologies,
+    measured_restitution as measured_restitution,
+)
+from .laws.compliant import Compliant as Compliant
+from .laws.forces import (
+    Bistiffness as Bistiffness,
+    Force as Force,
+    Hertz as Hertz,
+    HuntCrossley as HuntCrossley,
+    KelvinVoigt as KelvinVoigt,
+    KuwabaraKono as KuwabaraKono,
+    LinearSpring as LinearSpring,
+    PowerLaw as PowerLaw,
+    UserForce as UserForce,
+)
+from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
+from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
+from .laws.moreau import Moreau as Moreau
+from .laws.newton import Newton as Newton
+from .laws.poisson import Poisson as Poisson
+from .laws.restitution_matrix import RestitutionMatrix as RestitutionMatrix
+from .methods.advice.advising import advise as advise
+from .methods.advice.report import Advice as Advice
+from .methods.advice.validity import ValidityMap as ValidityMap, validity_map as validity_map
+from .methods.charts.chart import work_precision as work_precision
+from .methods.charts.record import WorkPrecision as WorkPrecision
+from .methods.stability.mapping import stability_map as stability_map
+from .methods.stability.results import StabilityMap as StabilityMap
+from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
+from .montecarlo.gap_scales import (
+    Crossover as Crossover,
+    GapScale as GapScale,
+    crossover as crossover,
+    gap_scale as gap_scale,
+)
+from .montecarlo.gap_sensitivities import (
+    GapSensitivity as GapSensitivity,
+    gap_sensitivity as gap_sensitivity,
+)
+from .montecarlo.results import MonteCarlo as MonteCarlo
+from .montecarlo.running import monte_carlo as monte_carlo
+from .montecarlo.store import read_samples as read_samples
+from .motion.bases import HarmonicBase as HarmonicBase
+from .motion.fitting_motion import MotionFit as MotionFit, fit_motion as fit_motion
+from .motion.ready_systems import (
+    ball_system as ball_system,
+    block_system as block_system,
+    column_system as column_system,
+    cradle_system as cradle_system,
+    dimer_system as dimer_system,
+)
+from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
+from .motion.simulation import simulate as simulate
+from .motion.system import System as System, gravity as gravity
+from .motion.turning import (
+    TurningImpact as TurningImpact,
+    block_gaps as block_gaps,
+    turning_impact as turning_impact,
+)
+from .scene import Scene as Scene
+from .scenes import chain as chain, column as column, scene_from_gaps as scene_from_gaps
+from .status import STATUS as STATUS
+from .theory.han_gilmore_tree import (
+    HanGilmoreOutcome as HanGilmoreOutcome,
+    han_gilmore as han_gilmore,
+)
+
+__version__: str
