@@ -3,7 +3,7 @@
 >>> import jimpact as ji
 >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
 >>> len(ji.plot.comparison(found).axes)
-1
+2
 """
 
 import lazy_loader

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from jimpact.montecarlo.chunks import FAILURE
 from jimpact.montecarlo.results import MonteCarlo
-from jimpact.plot.fits import COLOURS
+from jimpact.plot.style import COLOURS
 
 _BARS = 100  # of a histogram in the picture
 _BODIES = 6  # with a histogram of their own; of more only the most scattered are shown
