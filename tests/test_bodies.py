@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.theory.rocking_ratios import housner_restitution, rocking_matrix
+from jimpact.theory.rocking import housner_restitution, rocking_matrix
 
 # kinetic angle of two contacts: 40-digit values
 BLOCK_ANGLES = {

@@ -75,7 +75,7 @@ class AdmissibleMatrices(eqx.Module):
         """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
 
         The minimizer with a given support is an eigenvector of the smallest eigenvalue there
-        (see `jimpact.theory.copositive`); the others are valid approaches all the same.
+        (see `jimpact.theory.restitution_matrices`); the others are valid approaches all the same.
         """
         m = self.closed.shape[1]
         q = self._dissipation(y)

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from jimpact.contact_space import dense_mass, kinetic_norm
 from jimpact.plot.style import COLOURS, GREY
 from jimpact.theory.admissible import AdmissibleSet
-from jimpact.theory.rocking_record import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
+from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
 
 _FILL = "#DCE9F3"
 _MARKERS = "osD^vP*X"
