@@ -63,13 +63,12 @@ from .laws.moreau import Moreau as Moreau
 from .laws.newton import Newton as Newton
 from .laws.poisson import Poisson as Poisson
 from .laws.restitution_matrix import RestitutionMatrix as RestitutionMatrix
-from .methods.advice.advising import advise as advise
-from .methods.advice.report import Advice as Advice
-from .methods.advice.validity import ValidityMap as ValidityMap, validity_map as validity_map
-from .methods.charts.chart import work_precision as work_precision
-from .methods.charts.record import WorkPrecision as WorkPrecision
-from .methods.stability.mapping import stability_map as stability_map
-from .methods.stability.results import StabilityMap as StabilityMap
+from .methods.advice import advise as advise
+from .methods.advice_report import Advice as Advice
+from .methods.chart import work_precision as work_precision
+from .methods.chart_record import WorkPrecision as WorkPrecision
+from .methods.stability import StabilityMap as StabilityMap, stability_map as stability_map
+from .methods.validity import ValidityMap as ValidityMap, validity_map as validity_map
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .montecarlo.gap_scales import (
     Crossover as Crossover,

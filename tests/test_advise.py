@@ -9,11 +9,10 @@ import pytest
 
 import jimpact as ji
 from jimpact.commands.advise import run as run_command
-from jimpact.methods.advice.advising import advise
-from jimpact.methods.advice.evidence import outcomes
-from jimpact.methods.advice.structure import situation
-from jimpact.methods.advice.validity import validity_map
-from jimpact.methods.advice.words import share
+from jimpact.methods.advice import advise
+from jimpact.methods.advice_evidence import outcomes, situation
+from jimpact.methods.advice_report import share
+from jimpact.methods.validity import validity_map
 from jimpact.theory.linear_chain import newby_ratio
 
 BALLS, V = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]

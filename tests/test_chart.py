@@ -15,9 +15,9 @@ import pytest
 import jimpact as ji
 import jimpact.methods.contenders.base
 from jimpact.commands.chart import run
-from jimpact.methods.charts.chart import work_precision
-from jimpact.methods.charts.record import QUANTITIES
-from jimpact.methods.charts.timing import in_turns
+from jimpact.methods.chart import work_precision
+from jimpact.methods.chart_programs import in_turns
+from jimpact.methods.chart_record import QUANTITIES
 from jimpact.methods.contenders import METHODS, outcome, time_scale
 from jimpact.status import STATUS
 

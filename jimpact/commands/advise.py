@@ -9,8 +9,8 @@ import jax
 
 from jimpact.commands.compare import velocities
 from jimpact.commands.output import picture_path, save_picture
-from jimpact.methods.advice.advising import advise
-from jimpact.methods.advice.report import Advice
+from jimpact.methods.advice import advise
+from jimpact.methods.advice_report import Advice
 from jimpact.study import Study, read_study
 
 PICTURE = "jimpact-advise.png"

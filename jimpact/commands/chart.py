@@ -14,8 +14,8 @@ from jimpact.commands.compare import velocities
 from jimpact.commands.output import console_for, picture_path, save_picture
 from jimpact.laws import REGISTRY
 from jimpact.laws.lzb import LZB
-from jimpact.methods.charts.chart import work_precision
-from jimpact.methods.charts.record import Point, Timing, WorkPrecision
+from jimpact.methods.chart import work_precision
+from jimpact.methods.chart_record import Point, Timing, WorkPrecision
 from jimpact.methods.contenders import METHODS
 from jimpact.study import Study, read_study
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import jax
 
 from jimpact.commands.output import INTERRUPTED, picture_path, save_picture
-from jimpact.methods.stability.mapping import stability_map
-from jimpact.methods.stability.results import StabilityMap
+from jimpact.methods.stability import StabilityMap, stability_map
 
 PICTURE = "jimpact-stability.png"
 QUICK_RESOLUTION, QUICK_STEPS = 7, 5_000

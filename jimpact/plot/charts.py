@@ -9,12 +9,11 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jimpact.methods.advice.report import Advice
-from jimpact.methods.advice.validity import ValidityMap
-from jimpact.methods.advice.words import as_code, share
-from jimpact.methods.charts.record import Point, Timing, WorkPrecision
-from jimpact.methods.stability.results import Slice, StabilityMap
-from jimpact.methods.stability.runs import CLASSES
+from jimpact.methods.advice_report import Advice, as_code, share
+from jimpact.methods.chart_record import Point, Timing, WorkPrecision
+from jimpact.methods.stability import Slice, StabilityMap
+from jimpact.methods.stability_points import CLASSES
+from jimpact.methods.validity import ValidityMap
 from jimpact.plot.style import COLOURS, GREY, SPREAD
 from jimpact.status import CODE, STATUS
 

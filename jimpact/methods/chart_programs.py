@@ -1,18 +1,24 @@
-"""Compiled programs of a method or a law on one impact, and on a batch around it."""
+"""Programs that a chart compares, compiled; their answers' errors, and their times."""
 
+import contextlib
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from jimpact.contact_space import kinetic_energy
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
+from jimpact.methods.chart_record import QUANTITIES, Reference, Timing
 from jimpact.methods.contenders import UNCOUNTED, Method, outcome
 from jimpact.scene import Scene
 
@@ -213,3 +219,105 @@ def on_host(answer: Answer) -> Answer:
     host = Answer(*(np.asarray(a) for a in answer))
     counted = host.evaluations != UNCOUNTED
     return host._replace(evaluations=np.where(counted, host.evaluations, np.nan))
+
+
+FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the other one it is compared with
+Moment = tuple[Answer, np.ndarray | None]  # answers of a sample, and their gradients
+
+
+def moment_of(programs: Programs, setting: float | None) -> Moment:
+    """What a method answers at a setting."""
+    answer = on_host(programs.account(setting))
+    return answer, None if programs.gradient is None else np.asarray(programs.gradient(setting))
+
+
+def errors_of(case: Case, moment: Moment, truth: Moment) -> dict[str, float]:
+    """Relative errors, the largest over as many impacts as `moment` has."""
+    (found, slopes), (exact, exact_slopes) = moment, truth
+    rows = len(found.velocity)
+    fastest = float(jnp.max(jnp.abs(case.velocity))) or float(np.abs(exact.velocity).max())
+    before = float(kinetic_energy(case.scene, case.velocity))
+    before = before or float(np.abs(exact.energy).max())
+
+    def largest(a: Any, b: Any) -> float:
+        return float(np.abs(np.asarray(a) - np.asarray(b)[:rows]).max())
+
+    impulse = np.abs(np.asarray(exact.impulse)).max()
+    duration = np.abs(np.asarray(exact.duration)).max()
+    error = {
+        "velocity": largest(found.velocity, exact.velocity) / fastest,
+        "impulse": largest(found.impulse, exact.impulse) / float(impulse),
+        "energy": largest(found.energy, exact.energy) / before,
+        "duration": largest(found.duration, exact.duration) / float(duration),
+        "gradient": float("nan"),
+    }
+    if slopes is not None and exact_slopes is not None:
+        error["gradient"] = largest(slopes, exact_slopes) / fastest
+    return error
+
+
+def reference_of(
+    case: Case, exact: Method, second: Method, truth: Moment, other: Moment
+) -> Reference:
+    """The reference, and its distance from another solution."""
+    answer = truth[0]
+    uncertainty = errors_of(case, other, truth)
+    assert list(uncertainty) == list(QUANTITIES)
+    return Reference(
+        how=f"{exact.name} at rtol {FINEST:g} against {second.name} at {SECOND:g}",
+        uncertainty=uncertainty,
+        velocity=np.asarray(answer.velocity[0]),
+        impulse=np.asarray(answer.impulse[0]),
+        duration=float(np.asarray(answer.duration)[0]),
+    )
+
+
+SHORT = 2e-3  # seconds; what is faster is run several times for one measurement
+MOST_RUNS = 20
+LEAST_REPEATS = 3
+BUDGET = 2.0  # seconds for one program, after which it is not repeated more than that
+
+
+def in_turns(
+    tasks: list[tuple[Callable[[], Any], int]], repeats: int, advance: Callable[[], None]
+) -> list[Timing]:
+    """Time per impact of each task `(run, impacts)`: quartiles over the repeats."""
+    runs = [_runs(_seconds(run, 1)) for run, _ in tasks]
+    taken: list[list[float]] = [[] for _ in tasks]
+    for _ in range(repeats):
+        for (run, _), count, kept in zip(tasks, runs, taken):
+            if len(kept) < LEAST_REPEATS or count * sum(kept) < BUDGET:
+                kept.append(_seconds(run, count))
+            advance()
+    per_impact = [np.array(kept) / impacts for kept, (_, impacts) in zip(taken, tasks)]
+    return [Timing(*(float(q) for q in np.quantile(t, (0.5, 0.25, 0.75)))) for t in per_impact]
+
+
+def _runs(seconds: float) -> int:
+    return int(np.clip(SHORT / max(seconds, 1e-9), 1, MOST_RUNS))
+
+
+def _seconds(run: Callable[[], Any], count: int) -> float:
+    begin = time.perf_counter()
+    for _ in range(count):
+        jax.block_until_ready(run())
+    return (time.perf_counter() - begin) / count
+
+
+@contextlib.contextmanager
+def stage_bar(
+    progress: bool | None,
+) -> Iterator[tuple[Callable[[str, int], None], Callable[[], None]]]:
+    """Yield `stage(what, steps)`, which begins something new, and `advance()` by a step of it."""
+    if not (sys.stderr.isatty() if progress is None else progress):
+        yield lambda what, steps: None, lambda: None
+        return
+    console = Console(stderr=True, force_terminal=True if progress else None)
+    text = TextColumn("{task.description}")
+    with Progress(text, BarColumn(), TimeElapsedColumn(), console=console, transient=True) as bar:
+        task = bar.add_task("", total=None)
+
+        def stage(what: str, steps: int) -> None:
+            bar.reset(task, total=steps, description=what)
+
+        yield stage, lambda: bar.advance(task)

@@ -1,4 +1,4 @@
-"""Validity map: where along the stiffness ratio Moreau's law, or binary collisions, are right."""
+"""Validity map: for which stiffness ratios Moreau's law, or binary collisions, are right."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -6,39 +6,31 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_whole, check_values
+from jimpact._checks import as_whole, check_per_contact, check_shape, check_values
 from jimpact.contact_space import as_velocity
 from jimpact.impacts import impact
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB, default_rtol
-from jimpact.methods.advice.evidence import (
+from jimpact.methods.advice_evidence import (
+    NUDGE,
+    Block,
     Candidate,
+    Effect,
     Outcomes,
+    Rows,
+    Situation,
     block_errors,
     candidate,
     candidates,
     costs,
     one_outcome,
     outcomes,
-)
-from jimpact.methods.advice.findings import Effect
-from jimpact.methods.advice.inputs import (
-    check_tolerance,
-    missing_stiffness,
-    parameters_of,
-    span_of,
-)
-from jimpact.methods.advice.report import Advice
-from jimpact.methods.advice.structure import (
-    NUDGE,
-    Block,
-    Rows,
-    Situation,
     rows,
     situation,
     unknowns,
 )
+from jimpact.methods.advice_report import Advice
 from jimpact.montecarlo.gap_scales import gap_scale
 from jimpact.scene import Scene
 from jimpact.status import STATUS
@@ -240,3 +232,66 @@ def _effects(
         needed = tolerance / slope if slope > 0 else math.inf
         found.append(Effect(unknown.name, alone, slope, needed))
     return tuple(found)
+
+
+UNKNOWN_RANGE = (0.1, 10.0)  # plausible ratio of two stiffnesses where nothing is said
+
+
+def parameters_of(
+    scene: Scene, law: LZB | None, restitution: Any, stiffness: Any, exponent: Any
+) -> tuple[dict[str, Any], bool]:
+    """Restitution, stiffness and exponent, and whether the stiffness is known."""
+    given = {"restitution": restitution, "stiffness": stiffness, "exponent": exponent}
+    if law is not None:
+        if not isinstance(law, LZB):
+            raise TypeError(f"Argument `law` must be an LZB, but is {law!r}.")
+        double = [name for name, value in given.items() if value is not None]
+        if double:
+            raise ValueError(
+                f"Argument `{double[0]}` must be None where `law` is given, "
+                f"but has value {given[double[0]]!r}."
+            )
+        if np.asarray(law.initial_energy).any():
+            raise ValueError(
+                "Argument `law` must have no initial_energy (no simpler law knows of "
+                f"precompression), but has {law.initial_energy}."
+            )
+        given = {name: getattr(law, name) for name in given}
+    known = given["stiffness"] is not None
+    defaults = {"restitution": 1.0, "stiffness": 1.0, "exponent": 1.5}
+    values = {key: defaults[key] if value is None else value for key, value in given.items()}
+    for key, value in values.items():
+        check_per_contact(key, value, scene.contacts)
+    return values, known
+
+
+def span_of(given: tuple[float, float] | None, known: bool) -> tuple[float, float]:
+    """The range of a stiffness ratio, as factors."""
+    if given is None:
+        return (1.0, 1.0) if known else UNKNOWN_RANGE
+    ends = np.asarray(given)
+    check_shape("stiffness_range", ends, (2,), "low and high factor")
+    check_values("stiffness_range", ends, low=0.0, open_low=True)
+    low, high = float(ends[0]), float(ends[1])
+    if low > high:
+        raise ValueError(
+            f"Argument `stiffness_range` must have low <= high, but has value ({low:g}, {high:g})."
+        )
+    return low, high
+
+
+def check_tolerance(tolerance: Any, finest: float) -> None:
+    """A number between what the reference can resolve and 1."""
+    check_shape("tolerance", tolerance, (), "one number")
+    check_values("tolerance", tolerance, low=finest, high=1.0)
+
+
+def missing_stiffness(at: Situation) -> str:
+    """The message where ratios of stiffnesses are not enough."""
+    if at.gapped.any():
+        named = ", ".join(str(j + 1) for j in np.flatnonzero(at.gapped))
+        return (
+            "Argument `stiffness` must be given [N/m^eta] where open contacts can meet others at "
+            f"work (contact {named}): gaps count in units of the indentation."
+        )
+    return "Argument `stiffness` must be given where exponents differ: ratios then say nothing."

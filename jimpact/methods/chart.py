@@ -3,25 +3,31 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import in_common_dtype
+from jimpact._checks import check_shape, check_values, in_common_dtype
 from jimpact.comparison import registered_laws
+from jimpact.contact_space import as_velocity, gap_velocity
 from jimpact.laws.base import Law
 from jimpact.laws.lzb import LZB
-from jimpact.methods.charts.case import (
-    SAMPLE,
-    SPREAD,
-    case_of,
-    chosen_methods,
-    ladders_of,
-    reference_method,
+from jimpact.methods.chart_programs import (
+    FINEST,
+    SECOND,
+    Case,
+    Moment,
+    Programs,
+    errors_of,
+    in_turns,
+    moment_of,
+    of_law,
+    of_method,
+    reference_of,
+    stage_bar,
 )
-from jimpact.methods.charts.errors import FINEST, SECOND, Moment, errors_of, moment_of, reference_of
-from jimpact.methods.charts.programs import Programs, of_law, of_method
-from jimpact.methods.charts.record import Point, Timing, WorkPrecision
-from jimpact.methods.charts.timing import in_turns, stage_bar
-from jimpact.methods.contenders import METHODS
+from jimpact.methods.chart_record import Point, Timing, WorkPrecision
+from jimpact.methods.contenders import METHODS, Method, checked
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
@@ -174,3 +180,85 @@ def _times(
         single, batched, *gradient = (taken[i] for i in place)
         of_rows.append((single, batched, gradient[0] if gradient else None))
     return of_rows
+
+
+SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
+SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right
+
+
+def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> Case:
+    """The impact in double precision, one parameter per contact, with a batch around it."""
+    v = as_velocity(scene, velocity)
+    check_values("velocity", v)
+    if not isinstance(law, LZB):
+        raise TypeError(f"Argument `law` must be an LZB law, but is {type(law).__name__}.")
+    for name, value in (("batch", batch), ("repeats", repeats)):
+        if not isinstance(value, int) or value < 1:
+            raise ValueError(f"Argument `{name}` must be a whole number >= 1, but is {value!r}.")
+    law, scene, v = in_common_dtype(law, scene, v)
+    if v.dtype != jnp.float64:
+        raise ValueError(
+            f"Argument `velocity` must be in double precision, but has dtype {v.dtype}: "
+            "enable jax_enable_x64."
+        )
+    law.check_options(v.dtype, scene)
+    stored = jnp.any(scene.closed & (law.stored_energy(scene.contacts) > 0))
+    if not bool(jnp.any(scene.closed & (gap_velocity(scene, v) < 0)) | stored):
+        raise ValueError("Argument `velocity` must let a closed contact approach.")
+    m = scene.contacts
+    for name in ("restitution", "stiffness"):
+        value = getattr(law, name)
+        if value.shape not in ((), (m,)):
+            check_shape(name, value, (m,), "one entry per contact, or a scalar")
+    law = eqx.tree_at(
+        lambda old: (old.restitution, old.stiffness),
+        law,
+        (jnp.broadcast_to(law.restitution, (m,)), jnp.broadcast_to(law.stiffness, (m,))),
+    )
+    exponents = np.random.default_rng(0).uniform(-0.5, 0.5, (batch, m))
+    exponents[0] = 0.0  # the impact itself
+    stiffness = law.stiffness[None, :] * jnp.asarray(SPREAD**exponents)
+    return Case(law, scene, v, stiffness, min(SAMPLE, batch))
+
+
+def chosen_methods(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict[str, str]]:
+    """Methods asked for; without names all that can, and why the others cannot."""
+    if names is None:
+        why = {n: m.supports(case.law, case.scene) for n, m in METHODS.items()}
+        left_out = {name: reason for name, reason in why.items() if reason is not None}
+        return [m for n, m in METHODS.items() if n not in left_out], left_out
+    chosen = [_method("methods", name) for name in names]
+    for method in chosen:
+        checked(case.law, case.scene, method)
+    return chosen, {}
+
+
+def _method(argument: str, name: str) -> Method:
+    if name not in METHODS:
+        raise ValueError(
+            f"Argument `{argument}` must be among {', '.join(METHODS)}, but has {name!r}."
+        )
+    return METHODS[name]
+
+
+def ladders_of(
+    chosen: list[Method], settings: Mapping[str, Sequence[float]]
+) -> dict[str, tuple[float, ...]]:
+    """Settings by method."""
+    for name, values in settings.items():
+        if name not in [method.name for method in chosen]:
+            raise ValueError(f"Argument `settings` must be of chosen methods, but has {name!r}.")
+        check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
+    return {m.name: tuple(settings.get(m.name, m.ladder)) for m in chosen}
+
+
+def reference_method(name: str | None, case: Case) -> Method:
+    """The method that errors are measured from."""
+    if name is None:
+        linear = METHODS["propagator"].supports(case.law, case.scene) is None
+        name = "propagator" if linear else "dop853"
+    method = _method("reference", name)
+    checked(case.law, case.scene, method)
+    if method.setting != "rtol":
+        raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
+    return method
