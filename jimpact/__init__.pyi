@@ -70,14 +70,12 @@ from .methods.chart_record import WorkPrecision as WorkPrecision
 from .methods.stability import StabilityMap as StabilityMap, stability_map as stability_map
 from .methods.validity import ValidityMap as ValidityMap, validity_map as validity_map
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
-from .montecarlo.gap_scales import (
+from .montecarlo.gaps import (
     Crossover as Crossover,
     GapScale as GapScale,
+    GapSensitivity as GapSensitivity,
     crossover as crossover,
     gap_scale as gap_scale,
-)
-from .montecarlo.gap_sensitivities import (
-    GapSensitivity as GapSensitivity,
     gap_sensitivity as gap_sensitivity,
 )
 from .montecarlo.results import MonteCarlo as MonteCarlo

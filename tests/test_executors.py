@@ -15,8 +15,8 @@ from jimpact.montecarlo.distributions import RandomLaw, Uniform
 from jimpact.montecarlo.executors import Executor, as_executor
 from jimpact.montecarlo.executors.devices import Devices
 from jimpact.montecarlo.executors.serial import Serial
-from jimpact.montecarlo.fingerprints import fingerprint
 from jimpact.montecarlo.running import monte_carlo
+from jimpact.montecarlo.store import fingerprint
 from jimpact.scenes import chain
 
 BALLS = chain([0.25, 1.0, 0.25])

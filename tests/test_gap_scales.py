@@ -15,7 +15,7 @@ from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, UserForce
 from jimpact.laws.lzb import LZB
 from jimpact.laws.newton import Newton
-from jimpact.montecarlo.gap_scales import crossover, gap_scale
+from jimpact.montecarlo.gaps import crossover, gap_scale
 from jimpact.scenes import chain, column
 
 

@@ -31,7 +31,7 @@ from jimpact.methods.advice_evidence import (
     unknowns,
 )
 from jimpact.methods.advice_report import Advice
-from jimpact.montecarlo.gap_scales import gap_scale
+from jimpact.montecarlo.gaps import gap_scale
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 

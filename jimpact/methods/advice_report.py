@@ -14,7 +14,7 @@ from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB
 from jimpact.laws.newton import Newton
 from jimpact.methods.advice_evidence import Findings
-from jimpact.montecarlo.gap_scales import NEARLY_TOUCHING, WIDE
+from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
 
 _WIDTH = 92  # of the printed lines
 _BODIES = 5  # in the printed table

@@ -14,15 +14,13 @@ from jimpact._checks import in_common_dtype
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.montecarlo.bars import sample_bar
-from jimpact.montecarlo.chunks import Chunk
 from jimpact.montecarlo.drawing import Sources
 from jimpact.montecarlo.executors import Executor, as_executor
-from jimpact.montecarlo.gap_scales import gap_scale
-from jimpact.montecarlo.planning import BINS, CHUNK, description, identity, planned_run
-from jimpact.montecarlo.plans import Run
-from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.gaps import gap_scale
+from jimpact.montecarlo.planning import BINS, CHUNK, Run, description, identity, planned_run
+from jimpact.montecarlo.results import MonteCarlo, Totals
+from jimpact.montecarlo.statistics import Chunk
 from jimpact.montecarlo.store import Store
-from jimpact.montecarlo.totals import Totals
 from jimpact.scene import Scene
 
 

@@ -5,8 +5,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact.montecarlo.chunks import FAILURE
 from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import COLOURS
 
 _BARS = 100  # of a histogram in the picture

@@ -6,8 +6,8 @@ An executor is any object with this `run`; which one is used never changes a res
 from collections.abc import Iterator
 from typing import Any, Protocol, runtime_checkable
 
-from jimpact.montecarlo.chunks import Chunk, Task
-from jimpact.montecarlo.plans import Plan
+from jimpact.montecarlo.planning import Plan
+from jimpact.montecarlo.statistics import Chunk, Task
 
 NAMES = ("serial", "devices", "dask")
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import jax
 
-from jimpact.montecarlo.chunks import Chunk, Task
-from jimpact.montecarlo.plans import Plan
+from jimpact.montecarlo.planning import Plan
+from jimpact.montecarlo.statistics import Chunk, Task
 
 AHEAD = 3  # chunks enqueued for each thread of the cluster
 

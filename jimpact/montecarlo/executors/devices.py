@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import jax
 
-from jimpact.montecarlo.chunks import Chunk, Task
-from jimpact.montecarlo.plans import Plan
+from jimpact.montecarlo.planning import Plan
+from jimpact.montecarlo.statistics import Chunk, Task
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,8 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from jimpact.montecarlo.chunks import Chunk, Task
-from jimpact.montecarlo.plans import Plan
+from jimpact.montecarlo.planning import Plan
+from jimpact.montecarlo.statistics import Chunk, Task
 
 
 @dataclass(frozen=True)
