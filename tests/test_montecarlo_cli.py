@@ -16,7 +16,7 @@ from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.newton import Newton
 from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
-from jimpact.montecarlo.executors.serial import Serial
+from jimpact.montecarlo.executors import Serial
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.scenes import chain
 from jimpact.study import read_study

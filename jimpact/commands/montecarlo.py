@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from jimpact.commands.output import INTERRUPTED, picture_path, save_picture
-from jimpact.montecarlo.executors import Executor, as_executor
+from jimpact.montecarlo.executors import DaskExecutor, Executor, as_executor
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.study import Study, read_study
@@ -72,8 +72,6 @@ def _executor(name: str, scheduler: str | None) -> Executor:
         return as_executor(name)
     if name != "dask":
         raise ValueError(f"--scheduler needs --executor dask, but it is {name}.")
-    from jimpact.montecarlo.executors.dask_cluster import DaskExecutor
-
     return DaskExecutor(scheduler)
 
 

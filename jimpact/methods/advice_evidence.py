@@ -23,7 +23,7 @@ from jimpact.laws.lzb import LZB
 from jimpact.laws.moreau import Moreau
 from jimpact.laws.newton import Newton
 from jimpact.laws.poisson import Poisson
-from jimpact.montecarlo.bars import sample_bar
+from jimpact.progress import sample_bar
 from jimpact.scene import Scene
 from jimpact.scenes import with_gaps
 from jimpact.status import CODE, STATUS

@@ -24,10 +24,10 @@ from jimpact.methods.chart_programs import (
     of_law,
     of_method,
     reference_of,
-    stage_bar,
 )
 from jimpact.methods.chart_record import Point, Timing, WorkPrecision
 from jimpact.methods.contenders import METHODS, Method, checked
+from jimpact.progress import stage_bar
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 

@@ -1,17 +1,13 @@
 """Programs that a chart compares, compiled; their answers' errors, and their times."""
 
-import contextlib
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from jimpact.contact_space import kinetic_energy
 from jimpact.fits.parameters import with_entries
@@ -302,22 +298,3 @@ def _seconds(run: Callable[[], Any], count: int) -> float:
     for _ in range(count):
         jax.block_until_ready(run())
     return (time.perf_counter() - begin) / count
-
-
-@contextlib.contextmanager
-def stage_bar(
-    progress: bool | None,
-) -> Iterator[tuple[Callable[[str, int], None], Callable[[], None]]]:
-    """Yield `stage(what, steps)`, which begins something new, and `advance()` by a step of it."""
-    if not (sys.stderr.isatty() if progress is None else progress):
-        yield lambda what, steps: None, lambda: None
-        return
-    console = Console(stderr=True, force_terminal=True if progress else None)
-    text = TextColumn("{task.description}")
-    with Progress(text, BarColumn(), TimeElapsedColumn(), console=console, transient=True) as bar:
-        task = bar.add_task("", total=None)
-
-        def stage(what: str, steps: int) -> None:
-            bar.reset(task, total=steps, description=what)
-
-        yield stage, lambda: bar.advance(task)

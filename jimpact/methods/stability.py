@@ -42,7 +42,7 @@ from jimpact.methods.stability_references import (
     groups,
     references,
 )
-from jimpact.montecarlo.bars import sample_bar
+from jimpact.progress import sample_bar
 from jimpact.status import CODE
 
 NAMES = ("default", "rk4", "verlet", "impulse_euler")

@@ -13,7 +13,6 @@ import numpy as np
 from jimpact._checks import in_common_dtype
 from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
-from jimpact.montecarlo.bars import sample_bar
 from jimpact.montecarlo.drawing import Sources
 from jimpact.montecarlo.executors import Executor, as_executor
 from jimpact.montecarlo.gaps import gap_scale
@@ -21,6 +20,7 @@ from jimpact.montecarlo.planning import BINS, CHUNK, Run, description, identity,
 from jimpact.montecarlo.results import MonteCarlo, Totals
 from jimpact.montecarlo.statistics import Chunk
 from jimpact.montecarlo.store import Store
+from jimpact.progress import sample_bar
 from jimpact.scene import Scene
 
 
