@@ -15,6 +15,23 @@ from jimpact._checks import as_float_array, check_values
 from jimpact.contact_space import dense_mass
 from jimpact.scene import Scene
 
+UNITS = {  # in m/s
+    "m/s": 1.0,
+    "cm/s": 0.01,
+    "mm/s": 0.001,
+    "km/h": 1 / 3.6,
+    "in/s": 0.0254,
+    "ft/s": 0.3048,
+}
+_KINDS = ("pre", "post", "sigma")
+_HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[([^]]*)\])?")
+_ALLOWED = "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ..."
+# Defects below this share of the momentum or energy before are no finding: a tenth of a percent
+# is what a good measured velocity is worth. With `sigma`, a defect is held against its own error.
+DEFECT_TOLERANCE = 1e-3
+DEFECT_SIGMAS = 3.0
+_LISTED = 6  # shots listed one by one; of more, the range is given
+
 
 class Experiments(eqx.Module):
     """Shots: velocities measured before and after impacts of the same bodies.
@@ -239,19 +256,6 @@ def read_experiments(path: str | Path) -> Experiments:
     return Experiments(table.pre, table.post, table.sigma, shots=table.shots)
 
 
-UNITS = {  # in m/s
-    "m/s": 1.0,
-    "cm/s": 0.01,
-    "mm/s": 0.001,
-    "km/h": 1 / 3.6,
-    "in/s": 0.0254,
-    "ft/s": 0.3048,
-}
-_KINDS = ("pre", "post", "sigma")
-_HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[([^]]*)\])?")
-_ALLOWED = "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ..."
-
-
 class Column(NamedTuple):
     """One column: what it holds, of which body (from 1), and its unit in m/s."""
 
@@ -380,13 +384,6 @@ def _check_sigma(
                 f"{where}, column `{column.header}`: the error of a measured value must be > 0, "
                 f"but {given}."
             )
-
-
-# Defects below this share of the momentum or energy before are no finding: a tenth of a percent
-# is what a good measured velocity is worth. With `sigma`, a defect is held against its own error.
-DEFECT_TOLERANCE = 1e-3
-DEFECT_SIGMAS = 3.0
-_LISTED = 6  # shots listed one by one; of more, the range is given
 
 
 def data_defects(

@@ -30,6 +30,14 @@ _LEAST_DAMPING = {"float64": 1e-8, "float32": 1e-4}
 _SCALINGS = 60  # of the ray: each closes in on the boundary quadratically
 _TIE = 1e-10  # eigenvalues of Q closer than this, relative to G^-1, are not told apart
 
+# Every support of m contacts gives a condition on the energy, 2^m - 1 in all.
+LARGEST = 6
+# Conditions may be broken by rounding, in units of the entries of G^-1.
+_ROUNDING = {"float64": 1e-9, "float32": 1e-4}
+_REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no inverse
+_HALVINGS = 40  # from a start on the boundary towards the inside
+_FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
+
 
 class Approaches(NamedTuple):
     """x (S, F, m), and the eigenvectors (columns) and eigenvalues of Q on the faces they lie on."""
@@ -218,16 +226,6 @@ def _square(inverse: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.einsum("sfi,sij,sfj->sf", x, inverse, x)
 
 
-# Every support of m contacts gives a condition on the energy, 2^m - 1 in all.
-LARGEST = 6
-
-# Conditions may be broken by rounding, in units of the entries of G^-1.
-_ROUNDING = {"float64": 1e-9, "float32": 1e-4}
-_REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no inverse
-_HALVINGS = 40  # from a start on the boundary towards the inside
-_FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
-
-
 def matrix_region(
     law: Law, scenes: list[Scene], origin: np.ndarray, mix: np.ndarray, bounds: np.ndarray
 ) -> AdmissibleMatrices | None:
@@ -257,11 +255,17 @@ def matrix_region(
     inverse, closed = found[:, :m], found[:, m]
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
-    arrays = [None if a is None else jnp.asarray(a, dtype) for a in (inverse, closed, ends)]
     start = jnp.asarray(_start(law.matrix, origin, mix), dtype)
     every = jnp.ones((1 + len(inverse)) * m * m + (0 if ends is None else ends.size), bool)
-    affine = (jnp.asarray(origin, dtype), jnp.asarray(mix, dtype))
-    region = AdmissibleMatrices(*affine, *arrays, start, every)
+    region = AdmissibleMatrices(
+        origin=jnp.asarray(origin, dtype),
+        map=jnp.asarray(mix, dtype),
+        inverse=jnp.asarray(inverse, dtype),
+        closed=jnp.asarray(closed, dtype),
+        bounds=None if ends is None else jnp.asarray(ends, dtype),
+        center=start,
+        moving=every,
+    )
     slack, rows = _host_conditions(region, start)
     _check_start(region, slack)
     moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)

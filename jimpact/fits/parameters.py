@@ -2,7 +2,8 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +13,7 @@ from jimpact.laws.base import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB
 
+AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 DEFAULT_FREE = ("restitution", "stiffness")
 
 # Where a field's values may lie, by name; other fields are unbounded.
@@ -63,13 +65,13 @@ def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
 
 
-def with_entries(law: Law, fields: tuple[str, ...], values: jax.Array) -> Law:
+def with_entries(law: AnyLaw, fields: tuple[str, ...], values: jax.Array) -> AnyLaw:
     """The law with these entries (Q,)."""
     start = 0
     for field in fields:
         old = value_of(law, field)
         new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
-        law = eqx.tree_at(lambda tree, f=field: value_of(tree, f), law, new)
+        law = eqx.tree_at(partial(value_of, field=field), law, new)
         start += old.size
     return law
 

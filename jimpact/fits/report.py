@@ -18,6 +18,12 @@ from jimpact.status import STATUS
 _VELOCITIES_SHOWN = 24
 _MINIMA_SHOWN = 5
 
+# Minima whose sums of squares differ by less than this many noise variances fit equally well:
+# the difference is what moving by one standard error costs.
+EQUALLY_GOOD = 1.0
+# Scatter beyond the stated sigma is worth a word above this ratio (chi^2 per degree of freedom 4).
+TOO_MUCH_SCATTER = 2.0
+
 
 def report(fit: Any) -> str:
     """Parameters with errors, quality, what stays unseen, minima, warnings, shots."""
@@ -152,14 +158,6 @@ def _plain(value: Any) -> Any:
     if array.ndim:
         return [_plain(entry) for entry in array]
     return float(array) if np.isfinite(array) else None
-
-
-# Minima whose sums of squares differ by less than this many noise variances fit equally well:
-# the difference is what moving by one standard error costs.
-EQUALLY_GOOD = 1.0
-
-# Scatter beyond the stated sigma is worth a word above this ratio (chi^2 per degree of freedom 4).
-TOO_MUCH_SCATTER = 2.0
 
 
 def fit_warnings(

@@ -39,6 +39,8 @@ FINEST_TOLERANCE = 100  # times the reference's own tolerance
 RTOL_PART = 10  # the advised rtol is this part of the tolerance, or a little less
 COARSEST_RTOL = 1e-3
 
+UNKNOWN_RANGE = (0.1, 10.0)  # plausible ratio of two stiffnesses where nothing is said
+
 
 def advise(
     scene: Scene,
@@ -232,9 +234,6 @@ def _effects(
         needed = tolerance / slope if slope > 0 else math.inf
         found.append(Effect(unknown.name, alone, slope, needed))
     return tuple(found)
-
-
-UNKNOWN_RANGE = (0.1, 10.0)  # plausible ratio of two stiffnesses where nothing is said
 
 
 def parameters_of(

@@ -34,6 +34,11 @@ CORNERS = 64  # rows with every ratio at an end of its range; of more, random on
 ALONE = (0.0, 1 / 3, 2 / 3, 1.0)  # parts of a ratio's range (in its logarithm) tried alone
 NUDGE = 0.02  # change of ln k for the sensitivity; its square is far below what is told
 
+CHUNK = 64  # rows computed together
+CHEAP = 8  # contacts up to which a chunk is always full
+LANES = 2048  # impacts of a batch, over m^2, of the laws that take no time
+ROUNDS, ROUNDS_SECONDS = 7, 1.0  # of the timing, and after how long there is no further one
+
 
 class Block(NamedTuple):
     """Contacts that feel each other, 0-based; the kinetic angles [deg] between coupled ones."""
@@ -177,12 +182,6 @@ def rows(stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed
     first = 1 + np.arange(len(alone)).reshape(count, -1)
     second = 1 + len(alone) + np.arange(len(nudged)).reshape(count, 2)
     return Rows(tried, unknown, first, second, slice(len(change) - samples, None))
-
-
-CHUNK = 64  # rows computed together
-CHEAP = 8  # contacts up to which a chunk is always full
-LANES = 2048  # impacts of a batch, over m^2, of the laws that take no time
-ROUNDS, ROUNDS_SECONDS = 7, 1.0  # of the timing, and after how long there is no further one
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,12 @@ from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
 _WIDTH = 92  # of the printed lines
 _BODIES = 5  # in the printed table
 
+_TOLD = 4  # stiffness ratios named one by one
+_PERCENT_FROM = 1e-4
+_ROUNDING = 1e-12
+_NONE = 1e-6  # a change of v+ below, relative to max |v-|, is told as none
+NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
+
 
 class Advice(Findings):
     """What `advise` found; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
@@ -114,13 +120,6 @@ def _wrapped(key: str, text: str) -> list[str]:
     whole = f"{text}.".replace(" %", "\u00a0%")
     lines = textwrap.wrap(whole, _WIDTH, initial_indent=f"{key:9s}", subsequent_indent=" " * 9)
     return [line.replace("\u00a0%", " %") for line in lines]
-
-
-_TOLD = 4  # stiffness ratios named one by one
-_PERCENT_FROM = 1e-4
-_ROUNDING = 1e-12
-_NONE = 1e-6  # a change of v+ below, relative to max |v-|, is told as none
-NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
 
 
 def title(name: str) -> str:

@@ -34,6 +34,9 @@ from jimpact.status import STATUS
 Row = tuple[str, float | None]  # a method and its setting, or a law
 ALGEBRAIC = ("newton", "moreau", "poisson", "binary")
 
+SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
+SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right
+
 
 def work_precision(
     scene: Scene,
@@ -180,10 +183,6 @@ def _times(
         single, batched, *gradient = (taken[i] for i in place)
         of_rows.append((single, batched, gradient[0] if gradient else None))
     return of_rows
-
-
-SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
-SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right
 
 
 def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> Case:

@@ -20,6 +20,12 @@ from jimpact.scene import Scene
 
 HOST_BATCH = 4  # impacts that a method without vmap does for its time in a batch: a plain loop
 
+FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the other one it is compared with
+SHORT = 2e-3  # seconds; what is faster is run several times for one measurement
+MOST_RUNS = 20
+LEAST_REPEATS = 3
+BUDGET = 2.0  # seconds for one program, after which it is not repeated more than that
+
 
 class Answer(NamedTuple):
     """v+ (..., n), p (..., m), energy change, duration, evaluations, status; JAX or numpy."""
@@ -217,7 +223,6 @@ def on_host(answer: Answer) -> Answer:
     return host._replace(evaluations=np.where(counted, host.evaluations, np.nan))
 
 
-FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the other one it is compared with
 Moment = tuple[Answer, np.ndarray | None]  # answers of a sample, and their gradients
 
 
@@ -266,12 +271,6 @@ def reference_of(
         impulse=np.asarray(answer.impulse[0]),
         duration=float(np.asarray(answer.duration)[0]),
     )
-
-
-SHORT = 2e-3  # seconds; what is faster is run several times for one measurement
-MOST_RUNS = 20
-LEAST_REPEATS = 3
-BUDGET = 2.0  # seconds for one program, after which it is not repeated more than that
 
 
 def in_turns(

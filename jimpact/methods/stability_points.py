@@ -50,6 +50,23 @@ _RANGES = {
     "balls": (2, 1000),
 }
 
+CLASSES = (
+    "right",
+    "flagged",
+    "wrong",
+    "gains energy",
+    "stalls",
+    "does not end",
+    "not finite",
+    "unchecked",
+)
+(RIGHT, FLAGGED, WRONG, GAINS_ENERGY, STALLS, ENDLESS, NOT_FINITE, UNCHECKED) = range(8)
+HONEST = 10.0  # error over tolerance up to which a result counts as right
+FIXED_STEP_RIGHT = 1e-3  # the same of methods with a step: error in v+ over the largest |v-|
+FINER = 0.1  # setting at which a wrong result is tried again: it stalls if the error does
+FALLS = 0.5  # not fall below this part
+LANES = 32
+
 
 def setting_of(kind: str, level: Any) -> Any:
     """The number a method takes at `level` in [0, 1].
@@ -153,24 +170,6 @@ def sample_points(
         between = np.interp(place, np.arange(len(values)), scaled)
         found[:, AXES.index(name)] = np.exp(between) if powers else between
     return found
-
-
-CLASSES = (
-    "right",
-    "flagged",
-    "wrong",
-    "gains energy",
-    "stalls",
-    "does not end",
-    "not finite",
-    "unchecked",
-)
-(RIGHT, FLAGGED, WRONG, GAINS_ENERGY, STALLS, ENDLESS, NOT_FINITE, UNCHECKED) = range(8)
-HONEST = 10.0  # error over tolerance up to which a result counts as right
-FIXED_STEP_RIGHT = 1e-3  # the same of methods with a step: error in v+ over the largest |v-|
-FINER = 0.1  # setting at which a wrong result is tried again: it stalls if the error does
-FALLS = 0.5  # not fall below this part
-LANES = 32
 
 
 def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:

@@ -12,6 +12,17 @@ from jimpact.methods.stability_points import AXES, CLASSES, DEFAULT, RIGHT, Foun
 from jimpact.scenes import chain
 from jimpact.status import CODE
 
+(_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
+STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # step sqrt(lambda_max)
+RECLOSING = 0.1  # e below which three balls re-close (nearly) without end
+_LONG, _CLUSTERED = 10, 0.9  # chains this long stay clustered up to about this e
+_FAR = 100.0
+REFERENCE_RTOL = 1e-12
+CHECK_RTOL = 1e-11  # of the run by scipy
+CONFIRMED = 1e-7  # difference from it up to which the reference counts as confirmed
+CHECKED = 12  # points
+QUICK_UP_TO, QUICK_BALLS = 1e3, 10  # frequencies over the slowest contact's, size of a chain
+
 
 class Cause(NamedTuple):
     """A limit, its formula, and what to do about it."""
@@ -63,11 +74,6 @@ CAUSES = (
         "steps that end on events (default)",
     ),
 )
-(_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
-STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # step sqrt(lambda_max)
-RECLOSING = 0.1  # e below which three balls re-close (nearly) without end
-_LONG, _CLUSTERED = 10, 0.9  # chains this long stay clustered up to about this e
-_FAR = 100.0
 
 
 def frequencies(point: np.ndarray) -> tuple[float, float]:
@@ -123,13 +129,6 @@ def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
     if method.setting == "impulse step":
         return _FIRST_ORDER
     return _STRADDLES if name in ("wrong", "stalls", "gains energy") else _APART
-
-
-REFERENCE_RTOL = 1e-12
-CHECK_RTOL = 1e-11  # of the run by scipy
-CONFIRMED = 1e-7  # difference from it up to which the reference counts as confirmed
-CHECKED = 12  # points
-QUICK_UP_TO, QUICK_BALLS = 1e3, 10  # frequencies over the slowest contact's, size of a chain
 
 
 class Confirmation(NamedTuple):

@@ -17,6 +17,8 @@ import jax
 from jimpact.montecarlo.planning import Plan
 from jimpact.montecarlo.statistics import Chunk, Task
 
+AHEAD = 3  # chunks enqueued for each thread of the cluster
+
 
 @runtime_checkable
 class Executor(Protocol):
@@ -91,9 +93,6 @@ class Devices:
             finally:  # the caller stopped: finish what runs, drop what waits
                 for future in under_way:
                     future.cancel()
-
-
-AHEAD = 3  # chunks enqueued for each thread of the cluster
 
 
 @dataclass(frozen=True)

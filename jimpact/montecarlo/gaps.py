@@ -23,6 +23,10 @@ from jimpact.status import STATUS
 
 NEARLY_TOUCHING, WIDE = 0.1, 2.0  # gaps below and above so many delta_c are told in these words
 
+# Linearized and sampled standard deviations that differ by more than this are reported.
+AGREES = 0.2
+CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
+
 
 class GapScale(eqx.Module):
     """`delta` (m,) [m], indentation scale of each contact, and the scene's `gaps` (m,) [m]."""
@@ -163,11 +167,6 @@ def _crossover(
 
     velocity, status = jax.vmap(at)(gaps)
     return Crossover(offset, velocity, status)
-
-
-# Linearized and sampled standard deviations that differ by more than this are reported.
-AGREES = 0.2
-CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
 
 
 @dataclass(frozen=True, eq=False)

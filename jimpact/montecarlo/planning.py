@@ -26,6 +26,11 @@ from jimpact.montecarlo.store import fingerprint
 from jimpact.scene import Scene
 from jimpact.scenes import with_gaps
 
+CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
+LARGEST_CHUNK = 2**31  # lanes are numbered in uint32
+SAMPLES = 100_000
+BINS = 1000
+
 
 @dataclass(frozen=True)
 class Started:
@@ -136,12 +141,6 @@ class Run:
         law, velocity, gaps = self.plan.sample(self.task(number), lane)
         scene = self.plan.scene
         return law, scene if gaps is None else with_gaps(scene, gaps), velocity
-
-
-CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
-LARGEST_CHUNK = 2**31  # lanes are numbered in uint32
-SAMPLES = 100_000
-BINS = 1000
 
 
 def planned_run(

@@ -9,6 +9,16 @@ import numpy as np
 from jimpact.montecarlo.drawing import BAD_INPUTS
 from jimpact.status import STATUS, Status
 
+MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
+FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
+LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
+SHOWN = 4096  # first samples of a run that are kept in memory for pictures
+# name, message and whether it is a failure, of every code
+OUTCOMES = [*STATUS, *(Status(*told, True) for told in BAD_INPUTS.values())]
+FAILURE = np.array([row.failure for row in OUTCOMES])
+_SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
+_PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")
+
 
 @dataclass(frozen=True)
 class Moments:
@@ -64,10 +74,6 @@ def merged(a: Moments, b: Moments) -> Moments:
     d = b.mean - a.mean
     products = a.products + b.products + np.outer(d, d) * (a.count * b.count / count)
     return Moments(count, a.mean + d * (b.count / count), products)
-
-
-MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
-FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
 
 
 def bin_range(values: np.ndarray) -> np.ndarray:
@@ -129,15 +135,6 @@ def binned_quantile(
     return np.clip(found, low, high)
 
 
-LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
-SHOWN = 4096  # first samples of a run that are kept in memory for pictures
-
-# name, message and whether it is a failure, of every code
-OUTCOMES = [*STATUS, *(Status(*told, True) for told in BAD_INPUTS.values())]
-FAILURE = np.array([row.failure for row in OUTCOMES])
-_SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
-
-
 @dataclass(frozen=True)
 class Task:
     """What a chunk needs beside the plan: its number, how many samples count, bins, given rows."""
@@ -183,9 +180,6 @@ class Chunk:
         parts = {f"moments.{k}": np.asarray(v) for k, v in vars(self.moments).items()}
         bad = {f"bad.{k}": v for k, v in self.bad.items()}
         return plain | parts | bad | {f"samples.{k}": v for k, v in self.samples.items()}
-
-
-_PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")
 
 
 def chunk_from(arrays: dict[str, np.ndarray]) -> Chunk:

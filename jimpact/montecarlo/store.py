@@ -26,6 +26,21 @@ import numpy as np
 
 from jimpact.montecarlo.statistics import Chunk, chunk_from
 
+FORMAT = 1
+MANIFEST = "manifest.json"
+# what reading a damaged file raises: zip's and numpy's complaints, numpy's about its text headers
+UNUSABLE = (
+    ValueError,
+    KeyError,
+    OSError,
+    EOFError,
+    NotImplementedError,
+    zipfile.BadZipFile,
+    zlib.error,
+    SyntaxError,
+    tokenize.TokenError,
+)
+
 
 def fingerprint(value: Any) -> str:
     """Hexadecimal SHA-256 of everything that `value` holds.
@@ -100,22 +115,6 @@ def _pickled(value: Any) -> bytes:
 
 def _name(value: Any) -> str:
     return f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', type(value))}"
-
-
-FORMAT = 1
-MANIFEST = "manifest.json"
-# what reading a damaged file raises: zip's and numpy's complaints, numpy's about its text headers
-UNUSABLE = (
-    ValueError,
-    KeyError,
-    OSError,
-    EOFError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-    SyntaxError,
-    tokenize.TokenError,
-)
 
 
 class Store:

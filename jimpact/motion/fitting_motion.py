@@ -178,12 +178,12 @@ def _problem(
     first = parameters.first
     with np.errstate(divide="ignore", invalid="ignore"):
         low, high = (np.where(log[first], np.log(x), x / scale[first]) for x in limits)
-    problem = _Problem(
+    problem = _Problem(  # type: ignore[call-arg]
         system,
         law,
         arguments,
         observe,
-        *(jnp.asarray(x) for x in (*given, offset, scale, groups, log)),
+        *(jnp.asarray(x) for x in (*given, offset, scale, groups, log)),  # type: ignore[arg-type]
         parameters.fields,
     )
     return problem, jnp.asarray(scaled[first]), Box(jnp.asarray(low), jnp.asarray(high))

@@ -170,7 +170,7 @@ def _step(
     system: System, at: Along, settings: Settings, t: jax.Array, h: jax.Array, y: State
 ) -> tuple[State, jax.Array]:
     """One step of the solver, and its error over what is allowed."""
-    term = diffrax.ODETerm(at.rates)
+    term = diffrax.ODETerm(at.rates)  # type: ignore[arg-type]
     solver = settings.solver
     memory = solver.init(term, t, t + h, y, None)
     new, error, _, _, _ = solver.step(term, t, t + h, y, None, memory, False)

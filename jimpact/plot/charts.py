@@ -21,6 +21,30 @@ _MARKERS = "osD^vP"
 _LEAST = 1e-16  # errors below are drawn here: rounding
 _OWN = ("dop853", "dop5", "propagator")  # jimpact's own methods: thick lines
 
+# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
+# colours where a result is returned, greys where there is none
+CLASS_COLOURS = (
+    "#009E73",
+    "#56B4E9",
+    "#D55E00",
+    "#CC79A7",
+    "#E69F00",
+    "#999999",
+    "#000000",
+    "#EEEEEE",
+)
+_LABELS = {
+    "setting": "setting, coarse to fine",
+    "stiffness_ratio": "stiffness ratio",
+    "exponent": "exponent",
+    "restitution": "restitution e",
+    "mass_ratio": "mass ratio",
+    "balls": "balls N",
+}
+_TICKS = 5  # labelled values along an axis, at most
+_STYLES = {"moreau": "--", "binary": ":"}
+_FLOOR = 1e-9  # errors below are drawn here
+
 
 def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
@@ -156,29 +180,6 @@ def _note(found: WorkPrecision) -> str:
     )
 
 
-# right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
-# colours where a result is returned, greys where there is none
-CLASS_COLOURS = (
-    "#009E73",
-    "#56B4E9",
-    "#D55E00",
-    "#CC79A7",
-    "#E69F00",
-    "#999999",
-    "#000000",
-    "#EEEEEE",
-)
-_LABELS = {
-    "setting": "setting, coarse to fine",
-    "stiffness_ratio": "stiffness ratio",
-    "exponent": "exponent",
-    "restitution": "restitution e",
-    "mass_ratio": "mass ratio",
-    "balls": "balls N",
-}
-_TICKS = 5  # labelled values along an axis, at most
-
-
 def stability_map(found: StabilityMap, title: str = "") -> Figure:
     """One panel an axis: a row for each method, a column for each value; other axes at the base.
 
@@ -296,10 +297,6 @@ def _finish_map(figure: Figure, found: StabilityMap, title: str) -> None:
         handles=handles, loc="outside lower center", frameon=False, fontsize="small", ncols=8
     )
     figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
-
-
-_STYLES = {"moreau": "--", "binary": ":"}
-_FLOOR = 1e-9  # errors below are drawn here
 
 
 def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:

@@ -11,9 +11,12 @@ from scipy.integrate import solve_ivp
 from jimpact.comparison import Comparison
 from jimpact.contact_space import delassus_matrix, gap_velocity
 from jimpact.histories import History
+from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Force
 from jimpact.plot.style import COLOURS, SPREAD
 from jimpact.solvers.tridiagonal import diagonal
+
+_SAMPLES = 120  # points of a force-indentation loop
 
 
 def comparison(found: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
@@ -60,9 +63,6 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     return figure
 
 
-_SAMPLES = 120  # points of a force-indentation loop
-
-
 def rheologies(found: Comparison, title: str = "") -> Figure:
     """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
 
@@ -75,13 +75,18 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     >>> len(ji.plot.rheologies(found).axes)
     2
     """
+    forces = {
+        name: e.law.force for name, e in found.entries.items() if isinstance(e.law, Compliant)
+    }
+    if len(forces) < len(found.entries):
+        raise TypeError("Argument `found` must hold `Compliant` laws only.")
     mass = 1 / float(diagonal(delassus_matrix(found.scene))[0])
     speed = float(np.max(-np.asarray(gap_velocity(found.scene, found.velocity))))
     figure = Figure(figsize=(10, 4.4))
     figure.set_layout_engine("constrained")
     loops, outcome = figure.subplots(1, 2)
-    for (name, entry), colour in zip(found.entries.items(), COLOURS):
-        first = jax.tree.map(lambda leaf: leaf.ravel()[0], entry.law.force)
+    for (name, force), colour in zip(forces.items(), COLOURS):
+        first = jax.tree.map(lambda leaf: leaf.ravel()[0], force)
         x, f = _loop(first, mass, speed)
         loops.plot(x, f, color=colour, label=name, lw=1.4)
     loops.set_xlabel("indentation [m]")

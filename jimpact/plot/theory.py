@@ -21,6 +21,8 @@ _MOST_CONTACTS = 4  # beyond two contacts: projections onto pairs of the first s
 _SAMPLES = 2000
 _SHORTEST = 0.5  # a side shorter than this part of the radius is not drawn: its name would not fit
 
+_OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
+
 
 def admissible_set(
     found: AdmissibleSet, outcomes: Mapping[str, Any] | None = None, title: str = ""
@@ -218,9 +220,6 @@ def _colour(i: int) -> str:
     from jimpact.plot.fits import COLOURS  # here: the module also loads the fit
 
     return COLOURS[i % len(COLOURS)]
-
-
-_OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
 
 def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:

@@ -30,6 +30,11 @@ _SINGULAR = 100.0
 # rounding; the first one is taken, so that a basis does not depend on the last digit.
 _EQUAL_SHARE = 1e-3
 
+_REDUNDANT = (
+    "Argument `scene` must have independent contact normals and constraints to define "
+    "quasi-velocities, but has {}."
+)
+
 
 class ContactPower(eqx.Module):
     """Power of contact forces [W]: the terms of (6.40) and their sum."""
@@ -204,12 +209,6 @@ def _directions(scene: Scene) -> Scene:
     if fixed.shape[1] > scene.size:
         raise ValueError(_REDUNDANT.format(f"{fixed.shape[1]} of them for {scene.size} velocities"))
     return Scene(scene.mass, fixed)
-
-
-_REDUNDANT = (
-    "Argument `scene` must have independent contact normals and constraints to define "
-    "quasi-velocities, but has {}."
-)
 
 
 def check_independent(scene: Scene) -> None:

@@ -22,6 +22,9 @@ LARGEST = 12  # 2^12 supports of one eigenproblem each are still a fraction of a
 # m eps cond(G), so seven digits remain for the condition number in either precision.
 COPOSITIVITY_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}
 
+# G counts as singular when its smallest eigenvalue is below this multiple of eps * m * largest.
+_SINGULAR = 100.0
+
 
 class Copositivity(NamedTuple):
     """The answer, the margin `min x^T Q x` over `x >= 0`, `|x| = 1`, and its minimizer."""
@@ -127,10 +130,6 @@ def _supports(m: int) -> np.ndarray:
 
 
 _compiled_margin = jax.jit(margin)
-
-
-# G counts as singular when its smallest eigenvalue is below this multiple of eps * m * largest.
-_SINGULAR = 100.0
 
 
 class Sign(NamedTuple):

@@ -14,6 +14,13 @@ from jimpact.impacts import impact
 from jimpact.laws.lzb import LZB
 from jimpact.status import STATUS
 
+# After the impact a corner counts as staying on the ground where its gap velocity is at most this
+# part of the approach of B: real corners are not sharp, and slow ones touch down again at once.
+STAYS = 0.05
+OUTCOMES = ("rest", "rocking", "half-rocking", "free", "unresolved")
+_FAILS = np.array([row.failure for row in STATUS])
+_ZOOMS, _POINTS = 6, 41  # grids of the search, each twenty times finer than the one before
+
 
 class RockingRatio(NamedTuple):
     """A measured restitution of angular velocity, as a multiple of Housner's rigid value."""
@@ -93,12 +100,6 @@ def rocking_ratios() -> list[RockingRatio]:
     rows = (files("jimpact") / "data" / "rocking_ratio.csv").read_text(encoding="utf-8")
     lines = [line.split(",") for line in rows.splitlines()[1:]]
     return [RockingRatio(float(a), material, float(ratio)) for a, material, ratio in lines]
-
-
-# After the impact a corner counts as staying on the ground where its gap velocity is at most this
-# part of the approach of B: real corners are not sharp, and slow ones touch down again at once.
-STAYS = 0.05
-OUTCOMES = ("rest", "rocking", "half-rocking", "free", "unresolved")
 
 
 class RockingDispersion(eqx.Module):
@@ -201,10 +202,6 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     return rocking_kinetic_angle((jnp.sqrt(9 * slips**2 + 8) - 3 * slips) / 2)
 
 
-_FAILS = np.array([row.failure for row in STATUS])
-_ZOOMS, _POINTS = 6, 41  # grids of the search, each twenty times finer than the one before
-
-
 @eqx.filter_jit
 def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.Array, ...]:
     """gamma+ (n, 2), theta'+, slip+, T+ / T-, status, of all (a, mu, e), at unit width and hit."""
@@ -276,8 +273,8 @@ def rocking_dispersion(
     check_values("aspect", a, low=0.0, open_low=True)
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0)
-    grid = [x.reshape(-1) for x in jnp.meshgrid(a, mu, e, indexing="ij")]
-    found = _impacts(*grid, _law(stiffness, exponent, rtol))
+    each_a, each_mu, each_e = (x.reshape(-1) for x in jnp.meshgrid(a, mu, e, indexing="ij"))
+    found = _impacts(each_a, each_mu, each_e, _law(stiffness, exponent, rtol))
     shape = (len(a), len(mu), len(e))
     parts = [x.reshape(shape + x.shape[1:]) for x in found]
     return RockingDispersion(a, mu, e, *parts)
@@ -305,8 +302,9 @@ def search_critical_angle(
     low, high = jnp.full_like(mus, 0.5), jnp.full_like(mus, 2.0)
     for _ in range(_ZOOMS):
         a = jnp.linspace(low, high, _POINTS, axis=1)
-        sides = [jnp.repeat(x, _POINTS) for x in (mus, es)]
-        size = jnp.abs(_impacts(a.reshape(-1), *sides, law)[0][:, 1]).reshape(a.shape)
+        each_mu, each_e = (jnp.repeat(x, _POINTS) for x in (mus, es))
+        gamma = _impacts(a.reshape(-1), each_mu, each_e, law)[0]
+        size = jnp.abs(gamma[:, 1]).reshape(a.shape)
         best = jnp.take_along_axis(a, jnp.nanargmin(size, axis=1)[:, None], 1)[:, 0]
         step = (high - low) / (_POINTS - 1)
         low, high = best - step, best + step

@@ -34,6 +34,10 @@ from jimpact.status import CODE
 
 EVENT_TOLERANCE = 1e-10  # of the root finder, in units of the impact's time scale
 
+FINEST = 100 * float(np.finfo(float).eps)  # scipy takes no smaller rtol
+GIVE_UP = 5000  # evaluations a contact: LSODA may creep without end at an opening
+FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts about pi
+
 
 def _diffrax_solver(
     solver: diffrax.AbstractSolver,
@@ -106,11 +110,6 @@ DIFFRAX = (
     _diffrax_method("dopri8", diffrax.Dopri8(), 13, (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)),
     _diffrax_method("kvaerno5", diffrax.Kvaerno5(), None, (1e-3, 1e-5, 1e-7)),
 )
-
-
-FINEST = 100 * float(np.finfo(float).eps)  # scipy takes no smaller rtol
-GIVE_UP = 5000  # evaluations a contact: LSODA may creep without end at an opening
-FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts about pi
 
 
 class _GaveUpError(Exception):
