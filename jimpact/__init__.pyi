@@ -23,22 +23,24 @@ from .comparison import (
     dispersion_index as dispersion_index,
     energy_ratio as energy_ratio,
 )
-from .contact_space import (
+from .contact import (
+    Contact as Contact,
     delassus_matrix as delassus_matrix,
-    gap_velocity as gap_velocity,
     kinetic_angles as kinetic_angles,
-    kinetic_energy as kinetic_energy,
-    momentum as momentum,
     normalized_delassus as normalized_delassus,
     normalized_gap_velocity as normalized_gap_velocity,
-    velocity_change as velocity_change,
 )
 from .experiments import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import Fit as Fit, fit as fit
 from .histories import History as History, history as history
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
-from .laws import REGISTRY as REGISTRY
-from .laws.base import Law as Law
+from .law import (
+    REGISTRY as REGISTRY,
+    Impulses as Impulses,
+    Law as Law,
+    parameter as parameter,
+    register as register,
+)
 from .laws.binary import Binary as Binary
 from .laws.calibration import (
     calibrate as calibrate,
@@ -57,12 +59,14 @@ from .laws.forces import (
     PowerLaw as PowerLaw,
     UserForce as UserForce,
 )
+from .laws.kinematic import (
+    Moreau as Moreau,
+    Newton as Newton,
+    RestitutionMatrix as RestitutionMatrix,
+)
 from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
-from .laws.moreau import Moreau as Moreau
-from .laws.newton import Newton as Newton
 from .laws.poisson import Poisson as Poisson
-from .laws.restitution_matrix import RestitutionMatrix as RestitutionMatrix
 from .methods.advice import advise as advise
 from .methods.advice_report import Advice as Advice
 from .methods.chart import work_precision as work_precision
@@ -98,8 +102,16 @@ from .motion.turning import (
     block_gaps as block_gaps,
     turning_impact as turning_impact,
 )
-from .scene import Scene as Scene
-from .scenes import chain as chain, column as column, scene_from_gaps as scene_from_gaps
+from .scene import (
+    Scene as Scene,
+    chain as chain,
+    column as column,
+    gap_velocity as gap_velocity,
+    kinetic_energy as kinetic_energy,
+    momentum as momentum,
+    scene_from_gaps as scene_from_gaps,
+    velocity_change as velocity_change,
+)
 from .status import STATUS as STATUS
 from .theory.han_gilmore_tree import (
     HanGilmoreOutcome as HanGilmoreOutcome,

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.contact_space import dense_mass
-from jimpact.scene import Scene
+from jimpact.scene import Scene, dense_mass
 
 UNITS = {  # in m/s
     "m/s": 1.0,

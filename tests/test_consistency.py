@@ -6,17 +6,9 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.contact_space import (
-    kinetic_energy,
-    kinetic_norm,
-    normalized_delassus,
-    velocity_change,
-)
-from jimpact.theory.friction import (
-    friction_bounds,
-    friction_energy_change,
-    friction_impulses,
-)
+from jimpact.contact import kinetic_norm, normalized_delassus
+from jimpact.scene import kinetic_energy, velocity_change
+from jimpact.theory.friction import friction_bounds, friction_energy_change, friction_impulses
 from jimpact.theory.quasi_velocities import from_quasi_velocities, quasi_basis, to_quasi_velocities
 from jimpact.theory.restitution_matrices import (
     audit_matrix,

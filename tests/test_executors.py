@@ -15,7 +15,7 @@ from jimpact.montecarlo.distributions import RandomLaw, Uniform
 from jimpact.montecarlo.executors import Devices, Executor, Serial, as_executor
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.montecarlo.store import fingerprint
-from jimpact.scenes import chain
+from jimpact.scene import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
 

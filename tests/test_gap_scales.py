@@ -13,10 +13,10 @@ from jimpact.histories import history
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, UserForce
+from jimpact.laws.kinematic import Newton
 from jimpact.laws.lzb import LZB
-from jimpact.laws.newton import Newton
 from jimpact.montecarlo.gaps import crossover, gap_scale
-from jimpact.scenes import chain, column
+from jimpact.scene import chain, column
 
 
 def test_formula():

@@ -20,14 +20,14 @@ from jimpact.impacts import impact
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Hertz
-from jimpact.laws.newton import Newton
+from jimpact.laws.kinematic import Newton
 from jimpact.montecarlo import store
 from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
 from jimpact.montecarlo.gaps import gap_scale, gap_sensitivity
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.montecarlo.statistics import bin_counts, bin_range, binned_quantile, merged, moments
 from jimpact.montecarlo.store import fingerprint, read_samples
-from jimpact.scenes import chain
+from jimpact.scene import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
 LAW = Binary(1.0, order="earliest")

@@ -11,21 +11,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.blocks import components
-from jimpact.contact_space import gap_velocity, kinetic_angles, velocity_change
+from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
+from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB
-from jimpact.laws.moreau import Moreau
-from jimpact.laws.newton import Newton
 from jimpact.laws.poisson import Poisson
 from jimpact.progress import sample_bar
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.scene import Scene, gap_velocity, velocity_change, with_gaps
 from jimpact.status import CODE, STATUS
 
 # cos(kinetic angle) below so many roundings is 0: the rounding of normals and of M^-1

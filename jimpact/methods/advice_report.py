@@ -7,12 +7,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from jimpact.law import Law
 from jimpact.laws import REGISTRY
-from jimpact.laws.base import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
+from jimpact.laws.kinematic import Newton
 from jimpact.laws.lzb import LZB
-from jimpact.laws.newton import Newton
 from jimpact.methods.advice_evidence import Findings
 from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
 

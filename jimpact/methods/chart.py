@@ -9,8 +9,7 @@ import numpy as np
 
 from jimpact._checks import check_shape, check_values, in_common_dtype
 from jimpact.comparison import registered_laws
-from jimpact.contact_space import as_velocity, gap_velocity
-from jimpact.laws.base import Law
+from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.chart_programs import (
     FINEST,
@@ -28,7 +27,7 @@ from jimpact.methods.chart_programs import (
 from jimpact.methods.chart_record import Point, Timing, WorkPrecision
 from jimpact.methods.contenders import METHODS, Method, checked
 from jimpact.progress import stage_bar
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 
 Row = tuple[str, float | None]  # a method and its setting, or a law
@@ -200,9 +199,8 @@ def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> 
             f"Argument `velocity` must be in double precision, but has dtype {v.dtype}: "
             "enable jax_enable_x64."
         )
-    law.check_options(v.dtype, scene)
-    stored = jnp.any(scene.closed & (law.stored_energy(scene.contacts) > 0))
-    if not bool(jnp.any(scene.closed & (gap_velocity(scene, v) < 0)) | stored):
+    check_law(law, scene, v.dtype)
+    if not bool(law.contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
     m = scene.contacts
     for name in ("restitution", "stiffness"):

@@ -9,14 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.contact_space import kinetic_energy
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.chart_record import QUANTITIES, Reference, Timing
 from jimpact.methods.contenders import UNCOUNTED, Method, outcome
-from jimpact.scene import Scene
+from jimpact.scene import Scene, kinetic_energy
 
 HOST_BATCH = 4  # impacts that a method without vmap does for its time in a batch: a plain loop
 

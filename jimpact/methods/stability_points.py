@@ -24,8 +24,7 @@ from jimpact.audits import audit
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
 from jimpact.numerics import dimensionless
-from jimpact.scene import Scene
-from jimpact.scenes import chain
+from jimpact.scene import Scene, chain
 from jimpact.status import CODE
 
 AXES = ("setting", "stiffness_ratio", "exponent", "restitution", "mass_ratio", "balls")

@@ -9,7 +9,7 @@ from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import METHODS
 from jimpact.methods.contenders.base import Method, outcome
 from jimpact.methods.stability_points import AXES, CLASSES, DEFAULT, RIGHT, Found, chain_of, runner
-from jimpact.scenes import chain
+from jimpact.scene import chain
 from jimpact.status import CODE
 
 (_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)

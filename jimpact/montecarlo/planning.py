@@ -18,13 +18,12 @@ import numpy as np
 
 import jimpact
 from jimpact._checks import check_kind, in_common_dtype
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.montecarlo.distributions import Rows, as_source
 from jimpact.montecarlo.drawing import Drawn, Sources, draw, impacts, is_random
 from jimpact.montecarlo.statistics import Chunk, Task, reduced
 from jimpact.montecarlo.store import fingerprint
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.scene import Scene, with_gaps
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
 LARGEST_CHUNK = 2**31  # lanes are numbered in uint32

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jimpact._checks import check_values
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.montecarlo.planning import Run
 from jimpact.montecarlo.statistics import (
     LISTED,

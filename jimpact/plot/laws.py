@@ -9,11 +9,12 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from jimpact.comparison import Comparison
-from jimpact.contact_space import delassus_matrix, gap_velocity
+from jimpact.contact import delassus_matrix
 from jimpact.histories import History
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Force
 from jimpact.plot.style import COLOURS, SPREAD
+from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
 _SAMPLES = 120  # points of a force-indentation loop

@@ -10,8 +10,9 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from jimpact.contact_space import dense_mass, kinetic_norm
+from jimpact.contact import kinetic_norm
 from jimpact.plot.style import COLOURS, GREY
+from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
 from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
 
@@ -217,7 +218,7 @@ def _gap_label(contact: int) -> str:
 
 
 def _colour(i: int) -> str:
-    from jimpact.plot.fits import COLOURS  # here: the module also loads the fit
+    from jimpact.plot.style import COLOURS  # here: the module also loads the fit
 
     return COLOURS[i % len(COLOURS)]
 
