@@ -377,8 +377,6 @@ def test_without_friction_nothing_changes():
     for law in (ji.Newton(0.5), ji.Moreau(0.5), ji.RestitutionMatrix([[0.5]])):
         assert law.friction is None is law.tangential_restitution
         assert len(jax.tree.leaves(law)) == 1
-    assert ji.Newton(0.5).by_blocks()
-    assert not newton(0.5, 0.3).by_blocks()
     out = ji.impact(ji.Newton(0.5), FLAT, np.array([0.5, -1.0, 0.0]))
     assert out.tangential_impulse.tolist() == [0.0, 0.0]
 

@@ -152,7 +152,7 @@ def test_summary_speaks():
 def test_public_names_are_functions_not_modules():
     import importlib
 
-    for module in ("impacts", "consistency", "histories", "fits", "experiments", "advice", "scene"):
+    for module in ("impacts", "histories", "fits", "experiments", "scene"):
         importlib.import_module(f"jimpact.{module}")
     for name in ji.__all__:
         assert type(getattr(ji, name)).__name__ != "module", name

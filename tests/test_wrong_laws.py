@@ -15,25 +15,24 @@ from jimpact.numerics import events, flow, isolated
 class WrongSign(ji.Newton):
     """p of the wrong sign: contacts pull."""
 
-    def impulse(self, delassus, gap_velocity):
-        p, code = super().impulse(delassus, gap_velocity)
-        return -p, jnp.zeros_like(code)
+    def impulses(self, contact):
+        return ji.Impulses(-super().impulses(contact).normal)
 
 
 class GainsEnergy(ji.Newton):
     """(1 + e) becomes (1 + 2 e)."""
 
-    def impulse(self, delassus, gap_velocity):
-        p, code = super().impulse(delassus, gap_velocity)
-        return p * (1 + 2 * self.restitution) / (1 + self.restitution), code
+    def impulses(self, contact):
+        p = super().impulses(contact).normal
+        return ji.Impulses(p * (1 + 2 * self.restitution) / (1 + self.restitution))
 
 
 class NotHomogeneous(ji.Newton):
     """Restitution that depends on the speed."""
 
-    def impulse(self, delassus, gap_velocity):
-        p, code = super().impulse(delassus, gap_velocity)
-        return p / (1 + jnp.max(jnp.abs(gap_velocity))), code
+    def impulses(self, contact):
+        p = super().impulses(contact).normal
+        return ji.Impulses(p / (1 + jnp.max(jnp.abs(contact.gap_velocity))))
 
 
 @pytest.mark.parametrize("wrong", [WrongSign, GainsEnergy, NotHomogeneous])

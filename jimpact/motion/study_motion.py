@@ -107,7 +107,7 @@ def _study(tables: Mapping[str, Any], path: Path) -> MotionStudy:
     for name in ("system", "base", "law", "motion"):
         if not isinstance(tables.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
-    row, values, _ = law_table(tables["law"], None)
+    row, values, _ = law_table(tables["law"], None, path.parent)
     if isinstance(values.get("exponent"), list):
         values["exponent"] = tuple(values["exponent"])
     motion = tables["motion"]
