@@ -31,7 +31,7 @@ _WHERE = {
     "bodies.spatial": "SpatialDimer dimer_3d",
     "bodies.planar": "Corner DiskBalls corner disk_balls",
     "bodies.pendulums": "PendulumCradle pendulum_cradle",
-    "law": "Impulses Law parameter",
+    "law": "Impulses Law option parameter",
     "laws": "REGISTRY register",
     "laws.kinematic": "Moreau Newton RestitutionMatrix",
     "laws.poisson": "Poisson",

@@ -12,7 +12,7 @@
 """
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -208,6 +208,58 @@ def scene_from_gaps(
 def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
     """The scene with these gaps (m,)."""
     return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)
+
+
+def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
+    """The scenes with equal structure and sizes, and how many coordinates were added at the end.
+
+    Scenes with fewer contacts than another one get open contacts, each between coordinates of its
+    own that nothing else moves: where these move at unit speed, the contact separates.
+
+    Raises:
+        ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
+            coordinates or constraints.
+    """
+    layouts = {str((jax.tree.structure(s), jax.tree.map(jnp.shape, s))) for s in scenes}
+    if len(layouts) == 1:
+        return list(scenes), 0
+    each = {0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes}
+    held = {0 if s.constraints is None else s.constraints.shape[1] for s in scenes}
+    sizes = {s.size for s in scenes}
+    for what, found in (("tangents a contact", each), ("constraints", held), ("bodies", sizes)):
+        if len(found) > 1:
+            raise ValueError(
+                f"Argument `scenes` must have equally many {what} in all shots, but have "
+                f"{' and '.join(map(str, sorted(found)))}."
+            )
+    (sides,) = each
+    most = max(s.contacts for s in scenes)
+    extra = (most - min(s.contacts for s in scenes)) * (1 + sides)
+    dense = any(s.mass.ndim == 2 for s in scenes)
+
+    def alike(scene: Scene) -> Scene:
+        n, missing = scene.size, most - scene.contacts
+        mass = jnp.pad(scene.mass, [(0, extra)] * scene.mass.ndim)
+        own = jnp.arange(n + extra) >= n
+        mass = mass + (own if mass.ndim == 1 else jnp.diag(own)).astype(mass.dtype)
+        columns = jnp.eye(n + extra, dtype=scene.normals.dtype)[:, n:]
+
+        def grown(matrix: jax.Array, first: int, count: int) -> jax.Array:
+            below = jnp.pad(matrix, ((0, extra), (0, 0)))
+            return jnp.concatenate([below, columns[:, first : first + count]], axis=1)
+
+        gaps = jnp.zeros(scene.contacts, mass.dtype) if scene.gaps is None else scene.gaps
+        tangents = scene.tangents
+        held = scene.constraints
+        return Scene(
+            jnp.diag(mass) if dense and mass.ndim == 1 else mass,
+            grown(scene.normals, 0, missing),
+            None if tangents is None else grown(tangents, missing, missing * sides),
+            jnp.concatenate([gaps, jnp.ones(missing, gaps.dtype)]),
+            None if held is None else jnp.pad(held, ((0, extra), (0, 0))),
+        )
+
+    return [alike(scene) for scene in scenes], extra
 
 
 def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
