@@ -25,11 +25,12 @@ _WHERE = {
         "delassus_matrix gap_velocity kinetic_angles kinetic_energy momentum "
         "normalized_delassus normalized_gap_velocity velocity_change"
     ),
-    "scenes": "chain column scene_from_gaps",
-    "bodies.base": "Mechanism",
-    "bodies.bodies": "Block Dimer dimer rocking_block",
-    "bodies.spatial": "SpatialDimer dimer_3d",
-    "bodies.planar": "Corner DiskBalls corner disk_balls",
+    "scenes": "chain column",
+    "bodies.base": "Body scene_from_gaps",
+    "bodies.blocks": "Block rocking_block",
+    "bodies.dimers": "Dimer SpatialDimer dimer dimer_3d",
+    "bodies.discs": "DiskBalls disk_balls",
+    "bodies.particles": "Column Corner corner",
     "bodies.pendulums": "PendulumCradle pendulum_cradle",
     "laws": "REGISTRY",
     "laws.base": "Law",
@@ -46,7 +47,7 @@ _WHERE = {
     "laws.calibration": "calibrate compare_rheologies measured_restitution",
     "laws.materials": "hertz_stiffness sphere_mass",
     "theory.linear_chain": "bilateral_motion newby_ratio",
-    "motion.turning": "TurningImpact block_gaps turning_impact",
+    "motion.turning": "TurningImpact turning_impact",
     "plot.rheology": "plot_forces plot_rheologies",
     "montecarlo.running": "monte_carlo",
     "montecarlo.results": "MonteCarlo",
@@ -92,14 +93,15 @@ _WHERE = {
     "experiments": "Experiments read_experiments",
     "fits.fitting": "Fit fit",
     "plot.fits": "plot_fit",
-    "motion.simulation": "simulate",
+    "motion.simulate": "simulate",
     "plot.motions": "plot_motion plot_phase_portrait",
     "plot.animation": "animate_motion",
-    "motion.system": "System gravity",
-    "motion.bases": "HarmonicBase",
+    "motion.system": (
+        "HarmonicBase System ball_system block_system column_system cradle_system dimer_system "
+        "gravity"
+    ),
     "motion.fitting_motion": "MotionFit fit_motion",
     "motion.record": "Motion raise_on_failed_motion",
-    "motion.ready_systems": ("ball_system block_system column_system cradle_system dimer_system"),
 }
 _MODULE = {name: module for module, names in _WHERE.items() for name in names.split()}
 

@@ -1,24 +1,30 @@
 """From one event to the next: diffrax steps, landed on samples and events.
 
 A step is a trial. It is taken again, shorter, where its error is too large; where something
-watched crosses zero in it, the step is aimed at the crossing until it lands there. The last
-remainder is a Newton step whose derivative is that of the event time: `dt = -g / g'`. Step
+watched crosses zero in it (seen on cubics), the step is aimed at the crossing until it lands there.
+The last remainder is a Newton step whose derivative is that of the event time: `dt = -g / g'`. Step
 lengths themselves are no part of the derivative.
 """
 
 import operator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
 
-from jimpact.motion.along import Along, Seen, along
-from jimpact.motion.contact_forces import Modes
-from jimpact.motion.crossings import first_crossing
-from jimpact.motion.dynamics import definite, mass_at
-from jimpact.motion.flight_records import Flight, Scales, Settings, State
+from jimpact.motion.contact_forces import (
+    Contacts,
+    Modes,
+    constraint_impulse,
+    contacts_at,
+    forces,
+    powers,
+)
+from jimpact.motion.dynamics import definite, mass_at, user_force
 from jimpact.motion.modes import REST_ACCELERATION
+from jimpact.motion.record import Events
 from jimpact.motion.system import System
 
 LANDED = 1e-8  # of the step: a landing this near is finished by one Newton step (error: squared)
@@ -26,6 +32,191 @@ LANDINGS = 25  # trials to land on a crossing; it was none if that fails (the ga
 SAFETY, SHRINK, GROW = 0.9, 0.2, 5.0  # step-size control, as usual
 SMALLEST_STEP = 1e-15  # of the time: below it the step does not move time any more
 ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is rounding
+_CELLS = 16  # of a step, in which a cubic is looked at for signs
+_POLISH = 3  # Newton steps on the cubic, from the chord of the cell
+
+
+class State(NamedTuple):
+    """What is integrated: q, v, work of forces, of the base, of each contact [J]."""
+
+    q: jax.Array
+    v: jax.Array
+    work: jax.Array  # ()
+    base_work: jax.Array  # ()
+    contact_work: jax.Array  # (2, m): normal (impacts), tangential
+
+
+class Settings(NamedTuple):
+    """Tolerances of a motion."""
+
+    rtol: float
+    atol: float
+    closed_below: jax.Array
+    max_steps: int
+    friction: bool
+    solver: Any
+    duration: jax.Array
+    accumulation: jax.Array  # gap velocity that counts as slow, over the largest of the motion
+
+
+class Scales(NamedTuple):
+    """Largest values of the motion so far."""
+
+    gap_velocity: jax.Array
+    speed: jax.Array  # gap velocity that all kinetic energy could give a contact
+    acceleration: jax.Array
+
+
+class Course(NamedTuple):
+    """A whole motion: states at the sampled times, events, number of steps, status."""
+
+    samples: State
+    events: Events
+    steps: jax.Array
+    status: jax.Array
+
+
+class Flight(NamedTuple):
+    """A flight under way."""
+
+    t: jax.Array
+    state: State
+    step: jax.Array  # of the error control
+    aim: jax.Array  # length of the next trial where it is aimed at something, else inf
+    aimed: jax.Array  # (k,) one-hot: what the trial is to land on
+    landings: jax.Array
+    event: jax.Array  # (k,) one-hot: what has happened
+    sample: jax.Array  # number of samples reached
+    samples: State
+    steps: jax.Array
+    stuck: jax.Array
+    undefined: jax.Array  # the last trial was not a number
+
+
+def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales) -> jax.Array:
+    """What must stay positive (k,): gaps or normal forces, then friction."""
+    m = modes.active.shape[0]
+    found = forces(given, mu, modes)
+    w = jnp.diagonal(given.delassus)
+    slack = REST_ACCELERATION * scales.acceleration
+    normal = jnp.where(modes.active, found.normal * w[:m] + slack, given.normal.value)
+    if given.tangent is None or mu is None or found.tangential is None:
+        return normal
+    cone = (mu * found.normal - jnp.abs(found.tangential)) * w[m:] + slack
+    slip = modes.sign * given.tangent.rate
+    side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)
+    return jnp.concatenate([normal, side])
+
+
+class Seen(NamedTuple):
+    """Watched values (k,), their rates, and the rates of the state."""
+
+    value: jax.Array
+    rate: jax.Array
+    slope: State
+
+
+class Along(NamedTuple):
+    """Functions of (t, state) for one set of modes."""
+
+    rates: Callable[[jax.Array, State], State]
+    watch: Callable[[jax.Array, State], Seen]
+    project: Callable[[jax.Array, State], State]
+
+
+def along(
+    system: System, mu: jax.Array | None, settings: Settings, modes: Modes, scales: Scales
+) -> Along:
+    """The functions for one set of modes."""
+
+    def contacts(t: jax.Array, y: State) -> Contacts:
+        return contacts_at(system, y.q, y.v, t, settings.friction)
+
+    def rates(t: jax.Array, y: State, args: Any = None) -> State:
+        given = contacts(t, y)
+        found = forces(given, mu, modes)
+        friction, base = powers(system, given, found, t)
+        power = user_force(system, y.q, y.v, t) @ y.v
+        per_contact = jnp.stack([jnp.zeros_like(friction), friction])
+        return State(y.v, found.acceleration, power, base, per_contact)
+
+    def watch(t: jax.Array, y: State) -> Seen:
+        slope = rates(t, y)
+        see = lambda t, y: watched(contacts(t, y), mu, modes, scales)  # noqa: E731
+        value, rate = jax.jvp(see, (t, y), (jnp.ones_like(t), slope))
+        return Seen(value, rate, slope)
+
+    def project(t: jax.Array, y: State) -> State:
+        given = contacts(t, y)
+        value, rate = given.normal.value, given.normal.rate
+        if given.tangent is not None:  # tangentially only velocities drift
+            value = jnp.concatenate([value, jnp.zeros_like(value)])
+            rate = jnp.concatenate([rate, given.tangent.rate])
+        p = constraint_impulse(given, mu, modes, jnp.stack([value, rate], axis=1))
+        move = given.moved @ p
+        return y._replace(q=y.q + move[:, 0], v=y.v + move[:, 1])
+
+    return Along(rates, watch, project)
+
+
+class Crossing(NamedTuple):
+    """The first crossing in a step: whether there is one, of which quantity, when, or too short."""
+
+    found: jax.Array  # ()
+    which: jax.Array  # (k,) one-hot
+    time: jax.Array  # () after the beginning of the step
+    unseen: jax.Array  # () something rose and fell between the looks: a shorter step is needed
+
+
+def cubic(s: jax.Array, h: jax.Array, ends: tuple[jax.Array, ...]) -> jax.Array:
+    """The cubic with values g0, g1 and slopes d0, d1 at s = 0, 1 (time s h)."""
+    g0, d0, g1, d1 = ends
+    a, b = h * d0 - (g1 - g0), -h * d1 + (g1 - g0)
+    return (1 - s) * g0 + s * g1 + s * (1 - s) * ((1 - s) * a + s * b)
+
+
+def first_crossing(
+    h: jax.Array,
+    before: tuple[jax.Array, jax.Array],
+    after: tuple[jax.Array, jax.Array],
+    rounding: jax.Array,
+) -> Crossing:
+    """First crossing below `-rounding` in a step of length h.
+
+    Args:
+        h: length of the step.
+        before: values (k,) and rates (k,) at its beginning.
+        after: the same at its end.
+        rounding: (k,) values between `-rounding` and `rounding` are zero.
+
+    What begins at zero (a contact just left) is no crossing until it has been above zero.
+    """
+    ends = tuple(x[None, :] for x in (*before, *after))
+    s = jnp.linspace(0.0, 1.0, _CELLS + 1, dtype=h.dtype)[:, None]
+    values = cubic(s, h, ends)
+    above = jax.lax.cummax((values > rounding[None, :]).astype(jnp.int32), axis=0) > 0
+    below = values < -rounding[None, :]
+    earlier_above = jnp.concatenate([jnp.zeros_like(above[:1]), above[:-1]])
+    crossed = below & earlier_above
+    never = jnp.any(below, axis=0) & ~jnp.any(crossed, axis=0)
+    at_once = never & (before[1] <= 0)
+    cell = jnp.argmax(crossed, axis=0)
+    index = jnp.arange(values.shape[1])
+    left, right = values[cell - 1, index], values[cell, index]
+    share = jnp.clip(left / jnp.where(left > right, left - right, 1.0), 0.0, 1.0)
+    low, high = ((cell + i).astype(h.dtype) / _CELLS for i in (-1, 0))
+    at = low + share / _CELLS
+    found = jnp.any(crossed, axis=0) | at_once
+    flat = tuple(x[0] for x in ends)
+    for _ in range(_POLISH):
+        value, slope = jax.jvp(lambda x: cubic(x, h, flat), (at,), (jnp.ones_like(at),))
+        falls = slope < 0  # before the top of a short hop Newton has no direction
+        newton = at - value / jnp.where(falls, slope, -1.0)
+        at = jnp.clip(jnp.where(falls, newton, 0.5 * (at + high)), low, high)
+    at = jnp.where(at_once, 0.0, at)
+    when = jnp.where(found, at * h, jnp.inf)
+    which = (index == jnp.argmin(when)) & jnp.any(found)
+    return Crossing(jnp.any(found), which, jnp.min(when), jnp.any(never & ~at_once))
 
 
 def fly(

@@ -18,19 +18,18 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.laws.base import Law
-from jimpact.motion.blows import FAILS, Blow, blow_of, no_blow
 from jimpact.motion.contact_forces import contacts_at
 from jimpact.motion.dynamics import base_velocity, gaps, user_force
-from jimpact.motion.event_driven import energies, no_events
-from jimpact.motion.flight_records import State
-from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, Motion
+from jimpact.motion.flight import Course, State
+from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
+from jimpact.motion.transitions import FAILS, blow_of, no_blow
 from jimpact.solvers.lcp import solve_lcp
 
 _ROUNDING = 1e-12  # approaches below this share of the largest velocity change nothing
 
 
-class _Course(NamedTuple):
+class _Now(NamedTuple):
     state: State
     events: Events
     status: jax.Array
@@ -45,7 +44,7 @@ def time_stepping(
     substeps: int,
     closed_below: jax.Array,
     max_events: int,
-) -> Motion:
+) -> Course:
     """The motion with `substeps` steps between neighbours of `times` (S,)."""
     m = gaps(system, q0, times[0]).shape[0]
     zero = jnp.zeros((), q0.dtype)
@@ -60,21 +59,21 @@ def time_stepping(
     status = jnp.where(penetrates, MOTION_CODE["penetration"], status).astype(jnp.int32)
     h = (times[1] - times[0]) / substeps
 
-    def one(course: _Course, t: jax.Array) -> tuple[_Course, None]:
+    def one(course: _Now, t: jax.Array) -> tuple[_Now, None]:
         moved = _one_step(system, law, h, closed_below, course, t)
         going = course.status == MOTION_CODE["ok"]
         return jax.tree.map(lambda a, b: jnp.where(going, a, b), moved, course), None
 
-    def to_sample(course: _Course, t: jax.Array) -> tuple[_Course, State]:
+    def to_sample(course: _Now, t: jax.Array) -> tuple[_Now, State]:
         steps = t + h * jnp.arange(substeps, dtype=t.dtype)
         course, _ = jax.lax.scan(one, course, steps)
         fine = course.status == MOTION_CODE["ok"]
         return course, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), course.state)
 
-    end, rows = jax.lax.scan(to_sample, _Course(begin, events, status), times[:-1])
+    end, rows = jax.lax.scan(to_sample, _Now(begin, events, status), times[:-1])
     samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, rows)
     steps = jnp.int32(substeps * (times.shape[0] - 1))
-    return energies(system, times, samples, end.events, steps, end.status)
+    return Course(samples, end.events, steps, end.status)
 
 
 def _one_step(
@@ -82,9 +81,9 @@ def _one_step(
     law: Law,
     h: jax.Array,
     closed_below: jax.Array,
-    course: _Course,
+    course: _Now,
     t: jax.Array,
-) -> _Course:
+) -> _Now:
     state = course.state
     middle = t + 0.5 * h
     q = state.q + 0.5 * h * state.v
@@ -115,7 +114,19 @@ def _one_step(
     fails = jnp.asarray(FAILS)[blow.code]
     status = jnp.where(fails, MOTION_CODE["law_failed"], course.status)
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
-    return _Course(work, _written(course.events, strikes, middle, q, state.v, blow), status)
+    row = {
+        "time": middle,
+        "kind": jnp.int32(KIND_CODE["impact"]),
+        "contacts": blow.impulse != 0,
+        "q": q,
+        "velocity_before": state.v,
+        "velocity_after": blow.v,
+        "impulse": blow.impulse,
+        "tangential_impulse": blow.tangential,
+        "energy": blow.energy,
+        "status": blow.code,
+    }
+    return _Now(work, with_row(course.events, strikes, row), status)
 
 
 def _pressed(
@@ -141,26 +152,3 @@ def _pressed(
         given.normal.gradient @ p,
         jnp.stack([energy, jnp.zeros_like(energy)]),
     )
-
-
-def _written(
-    events: Events, strikes: jax.Array, t: jax.Array, q: jax.Array, v: jax.Array, blow: Blow
-) -> Events:
-    """One row more if there was an impact and room for it."""
-    size = events.time.shape[0]
-    row = jnp.where(strikes, events.count, size)
-    values = {
-        "time": t,
-        "kind": jnp.int32(KIND_CODE["impact"]),
-        "contacts": blow.impulse != 0,
-        "q": q,
-        "velocity_before": v,
-        "velocity_after": blow.v,
-        "impulse": blow.impulse,
-        "tangential_impulse": blow.tangential,
-        "energy": blow.energy,
-        "status": blow.code,
-    }
-    new = {k: getattr(events, k).at[row].set(x, mode="drop") for k, x in values.items()}
-    count = events.count + (strikes & (events.count < size)).astype(jnp.int32)
-    return Events(count=count, accumulation_end=events.accumulation_end, **new)
