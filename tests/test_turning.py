@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jimpact.bodies.base import scene_from_gaps
+from jimpact.bodies.blocks import Block
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
-from jimpact.bodies.base import scene_from_gaps
-from jimpact.bodies.blocks import Block
 from jimpact.motion.turning import turning_impact
 from jimpact.scenes import chain
 
