@@ -7,14 +7,15 @@ import jax.numpy as jnp
 
 from jimpact.laws.base import Law
 from jimpact.motion.contact_forces import Modes, no_modes
-from jimpact.motion.dynamics import gaps, mass_at
-from jimpact.motion.flight import Course, Flight, Scales, Settings, State, along, fly
+from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
+from jimpact.motion.flow import Course, Flight, Scales, Settings, first_flight, fly
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.motion.transitions import Outcome, resolve
 
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6
+AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
 
 
 class _Run(NamedTuple):
@@ -39,7 +40,7 @@ def event_driven(
     """The motion from `times[0]` to `times[-1]`, sampled at `times` (S,)."""
     n = q0.shape[0]
     m = gaps(system, q0, times[0]).shape[0]
-    begin = _begin(settings, q0, v0, times, m)
+    begin = first_flight(settings, q0, v0, times, m)
     events = no_events(max_events, n, m, q0.dtype)
     zero = jnp.zeros((), q0.dtype)
     penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
@@ -65,21 +66,6 @@ def event_driven(
     return Course(end.flight.samples, end.events, end.flight.steps, end.status)
 
 
-def _begin(settings: Settings, q0: jax.Array, v0: jax.Array, times: jax.Array, m: int) -> Flight:
-    samples = times.shape[0]
-    zero = jnp.zeros((), q0.dtype)
-    state = State(q0, v0, zero, zero, jnp.zeros((2, m), q0.dtype))
-    unknown = jax.tree.map(lambda x: jnp.full((samples, *x.shape), jnp.nan, x.dtype), state)
-    first = jax.tree.map(lambda all_, x: all_.at[0].set(x), unknown, state)
-    k = 2 * m if settings.friction else m
-    no = jnp.zeros(k, bool)
-    step = jax.lax.stop_gradient(times[1] - times[0])
-    infinite = jnp.full_like(zero, jnp.inf)
-    one, none = jnp.int32(1), jnp.int32(0)
-    false = jnp.asarray(False)
-    return Flight(times[0], state, step, infinite, no, none, no, one, first, none, false, false)
-
-
 def _next_event(
     system: System,
     law: Law,
@@ -91,15 +77,11 @@ def _next_event(
 ) -> _Run:
     """Resolve the event that ended the last flight (or the beginning), then fly to the next."""
     flight = run.flight
-    at = along(system, mu, settings, run.modes, run.scales)
-    # the last remainder before an event leaves the constraints, by its square
-    flight = flight._replace(state=at.project(flight.t, flight.state))
     found = resolve(
         system,
         law,
         mu,
         settings,
-        flight.t,
         flight.state,
         run.modes,
         flight.event,
@@ -111,18 +93,24 @@ def _next_event(
     status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
     # after a failure the flight is over at once
     over = status != MOTION_CODE["ok"]
-    ready = flight._replace(
-        state=found.state, event=jnp.zeros_like(flight.event), stuck=over, landings=jnp.int32(0)
-    )
+    ready = flight._replace(state=found.state, event=jnp.zeros_like(flight.event), stuck=over)
     flown = fly(system, mu, settings, found.modes, found.scales, times, ready)
     stuck = flown.stuck & ~over
-    status = jnp.where(stuck, _why_stuck(system, flown), status).astype(jnp.int32)
+    status = jnp.where(
+        stuck, _why_stuck(system, flown, jax.lax.stop_gradient(times)), status
+    ).astype(jnp.int32)
     return _Run(flown, found.modes, found.scales, found.struck, events, status)
 
 
-def _why_stuck(system: System, flight: Flight) -> jax.Array:
-    state = flight.state
-    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & ~flight.undefined
+def _why_stuck(system: System, flight: Flight, times: jax.Array) -> jax.Array:
+    state = jax.lax.stop_gradient(flight.state)
+    # where steps vanish before something that is not a number, it is a few roundings ahead
+    ahead = AHEAD * (times[-1] - times[0])
+    q, t = state.q + ahead * state.v, state.t + ahead
+    force = user_force(system, q, state.v, t)
+    rates = free_acceleration(system, q, state.v, force, mass_at(system, q))
+    parts = (state.q, state.v, rates, gaps(system, q, t))
+    finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
     if not callable(system.mass):
         return code
@@ -137,7 +125,7 @@ def _why_stuck(system: System, flight: Flight) -> jax.Array:
 
 def _written(events: Events, flight: Flight, found: Outcome) -> Events:
     values = {
-        "time": flight.t,
+        "time": flight.state.t,
         "kind": found.kind,
         "contacts": found.contacts,
         "q": flight.state.q,

@@ -3,7 +3,6 @@
 from functools import partial
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,7 +20,7 @@ from jimpact.laws.base import Law
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
 from jimpact.motion.event_driven import event_driven
-from jimpact.motion.flight import Course, Settings
+from jimpact.motion.flow import Course, Settings
 from jimpact.motion.record import Motion
 from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
@@ -53,7 +52,6 @@ def simulate(
     closed_below: float = CLOSED_BELOW,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
-    solver: diffrax.AbstractERK | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
@@ -68,7 +66,7 @@ def simulate(
         t_end: [s] > t_start.
         t_start: [s].
         samples: number of equally spaced instants in the record, both ends included.
-        method: 'events' (flights by diffrax up to located events), or 'time_stepping'
+        method: 'events' (flights that land on each event), or 'time_stepping'
             (Moreau-Jean, for many contacts; needs `step` [s]).
         step: of the time stepping [s].
         friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
@@ -80,7 +78,6 @@ def simulate(
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed.
         max_steps: of the integrator, in all.
-        solver: any explicit Runge-Kutta method of diffrax; default `Dopri8`.
 
     Returns:
         `Motion`. Pure: jit, vmap, and forward derivatives (jvp, jacfwd) in everything that is an
@@ -126,7 +123,6 @@ def simulate(
         jnp.asarray(closed_below, dtype),
         max_steps,
         mu is not None,
-        diffrax.Dopri8(scan_kind="lax") if solver is None else solver,
         end - start,
         jnp.asarray(slow, dtype),
     )
@@ -177,7 +173,7 @@ def _stepped(
 
 def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
     """The record of a course, with its energies and gaps."""
-    q, v, work, base_work, contact_work = course.samples
+    q, v, _, work, base_work, contact_work = course.samples
     return Motion(
         time=times,
         q=q,

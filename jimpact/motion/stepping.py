@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jimpact.laws.base import Law
 from jimpact.motion.contact_forces import contacts_at
 from jimpact.motion.dynamics import base_velocity, gaps, user_force
-from jimpact.motion.flight import Course, State
+from jimpact.motion.flow import Course, State
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.motion.transitions import FAILS, blow_of, no_blow
@@ -52,7 +52,7 @@ def time_stepping(
     """The motion with `substeps` steps between neighbours of `times` (S,)."""
     m = gaps(system, q0, times[0]).shape[0]
     zero = jnp.zeros((), q0.dtype)
-    begin = State(q0, v0, zero, zero, jnp.zeros((2, m), q0.dtype))
+    begin = State(q0, v0, times[0], zero, zero, jnp.zeros((2, m), q0.dtype))
     events = no_events(max_events, q0.shape[0], m, q0.dtype)
     status = jnp.where(
         jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)),
@@ -112,6 +112,7 @@ def _one_step(
     work = State(
         q + 0.5 * h * v,
         v,
+        t + h,
         state.work + h * force @ (0.5 * (blow.v + v)),
         state.base_work + base,
         state.contact_work + blow.energy + energy,

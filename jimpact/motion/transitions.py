@@ -16,7 +16,7 @@ from jimpact.motion.dynamics import (
     mass_at,
     seen_from_base,
 )
-from jimpact.motion.flight import ROUNDING_GAP, Scales, Settings, State
+from jimpact.motion.flow import ROUNDING_GAP, Scales, Settings, State
 from jimpact.motion.modes import REST_ACCELERATION, Choice, choose_with_friction, pressed_together
 from jimpact.motion.record import KIND_CODE, MOTION_CODE
 from jimpact.motion.system import System
@@ -95,7 +95,6 @@ def resolve(
     law: Law,
     mu: jax.Array | None,
     settings: Settings,
-    t: jax.Array,
     state: State,
     before: Modes,
     fired: jax.Array,
@@ -108,7 +107,7 @@ def resolve(
     `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
     impacts is then passed at once (its gap velocity is set to 0, energy is lost).
     """
-    m = before.active.shape[0]
+    m, t = before.active.shape[0], state.t
     given = contacts_at(system, state.q, state.v, t, settings.friction)
     closed = given.normal.value <= settings.closed_below
     scales = jax.lax.stop_gradient(_grown(system, scales, given, t, state))
@@ -147,12 +146,10 @@ def resolve(
     status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
     status = jnp.where(fails, MOTION_CODE["law_failed"], status)
     took = jnp.where(strikes, blow.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
-    work = State(
-        state.q,
-        blow.v,
-        state.work,
-        state.base_work + blow.base_work,
-        state.contact_work + blow.energy,
+    work = state._replace(
+        v=blow.v,
+        base_work=state.base_work + blow.base_work,
+        contact_work=state.contact_work + blow.energy,
     )
     return Outcome(
         work,
