@@ -11,7 +11,7 @@ from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
 from jimpact.motion.turning import turning_impact
-from jimpact.scenes import chain
+from jimpact.scene import chain
 
 GAPS = Block(1.0, 1.0).gap_function
 MASS = jnp.array([1.0, 1.0, 1 / 6])

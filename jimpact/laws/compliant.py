@@ -4,14 +4,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import check_per_contact, check_values
-from jimpact.laws.base import Law, no_tangential_impulse
+from jimpact.contact import Contact
+from jimpact.law import Impulses, Law, option
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import FINEST_RTOL_IN_EPS, default_rtol
+from jimpact.laws.lzb import check_rtol, default_rtol
 from jimpact.numerics.dimensionless import solve, to_dimensionless
 from jimpact.numerics.flow import Viscous
 from jimpact.scene import Scene
@@ -50,42 +49,24 @@ class Compliant(Law):
     uses_gaps: ClassVar[bool] = True
 
     force: Force
-    rtol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
+    max_steps: int = option(100_000, low=1)
 
-    def __init__(self, force: Force, *, rtol: float | None = None, max_steps: int = 100_000):
-        if not isinstance(force, Force):
+    def __check_init__(self) -> None:
+        if not isinstance(self.force, Force):
             raise TypeError(
                 "Argument `force` must be a contact force such as Hertz(k), "
-                f"but has value {force!r}."
-            )
-        if rtol is not None:
-            check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
-        self.force, self.rtol, self.max_steps = force, rtol, max_steps
-
-    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
-        """Parameters per contact, and a tolerance that the precision can hold."""
-        for name, value in vars(self.force).items():
-            if isinstance(value, (jax.Array, tuple)) and name != "parameters":  # the user's own
-                check_per_contact(name, value, scene.contacts)
-        finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
-        if self.rtol is not None and self.rtol < finest:
-            raise ValueError(
-                f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
-                f"but has value {self.rtol:g}: enable jax_enable_x64 for finer tolerances."
+                f"but has value {self.force!r}."
             )
 
-    def all_impulses(
-        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
+        """A tolerance that the precision can hold."""
+        check_rtol(self.rtol, dtype)
+
+    def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
-        gaps = jnp.zeros_like(gap_velocity) if scene.gaps is None else scene.gaps
-        p, code = self._solve(delassus, gap_velocity, gaps)
-        return p, no_tangential_impulse(scene, p.dtype), code
-
-    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Impulses of contacts that touch."""
-        return self._solve(delassus, gap_velocity, jnp.zeros_like(gap_velocity))
+        p, code = self._solve(contact.delassus, contact.gap_velocity, contact.gaps)
+        return Impulses(p, None, code)
 
     def _solve(
         self, delassus: Symmetric, gamma: jax.Array, gaps: jax.Array

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.contact_forces import Modes, no_modes
 from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
 from jimpact.motion.flow import Course, Flight, Scales, Settings, first_flight, fly

@@ -1,6 +1,6 @@
 """Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -95,60 +95,69 @@ class MechanicalFlow(eqx.Module):
     rounding: jax.Array  # (k,)
     sample: jax.Array  # time of the next sample ()
     tolerance: jax.Array  # (rows, 1)
-    like: State = eqx.field(static=False)
-    root: int = eqx.field(static=True, default=1)
-    contacts: int = eqx.field(static=True, default=1)
-    near: float = eqx.field(static=True, default=0.01)
+    like: State  # of its shapes
+
+    root = 1
+    contacts = 1
+    near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
     @property
     def snap(self) -> jax.Array:
+        """Margins are in units of their rounding."""
         return jnp.ones((1, 1), self.tolerance.dtype)
 
-    def state(self, y: jax.Array) -> State:
-        return unpacked(self.like, y)
+    def constants(self, modes: jax.Array) -> Modes:
+        """The modes, of each contact."""
+        active, stick, sign = modes[:, 0].reshape(3, -1)
+        return Modes(active > 0, stick > 0, sign.astype(self.tolerance.dtype))
 
     def _contacts(self, at: State) -> Contacts:
         return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
 
-    def constants(self, modes: jax.Array) -> Modes:
-        return decoded(modes, self.tolerance.dtype)
-
     def field(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
-        at = self.state(y)
+        """Rates of the state; NaN where M is not positive definite."""
+        at = unpacked(self.like, y)
         given = self._contacts(at)
         found = forces(given, self.mu, const)
         friction, base = powers(self.system, given, found, at.t)
         power = user_force(self.system, at.q, at.v, at.t) @ at.v
         per_contact = jnp.stack([jnp.zeros_like(friction), friction])
         rates = State(at.v, found.acceleration, jnp.ones_like(at.t), power, base, per_contact)
-        dy = packed(rates)
         if callable(self.system.mass):
-            dy = jnp.where(definite(mass_at(self.system, at.q)), dy, jnp.nan)
-        return dy
+            regular = definite(mass_at(self.system, at.q))
+            return jnp.where(regular, packed(rates), jnp.nan)
+        return packed(rates)
 
     def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
-        at = self.state(y)
+        """What must stay positive, and the time to the next sample."""
+        at = unpacked(self.like, y)
         seen = watched(self._contacts(at), self.mu, const, self.scales)
         return (jnp.append(seen, self.sample - at.t) / self.rounding)[:, None]
 
     def rooted(self, modes: jax.Array) -> jax.Array:
+        """None: forces are smooth where modes change."""
         return jnp.zeros((self.rounding.shape[0], 1), bool)
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Nothing: what happens at events is decided in `transitions.py`."""
         return modes, y
 
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
+        """Never: see `rooted`."""
         return jnp.zeros((1, 1), bool)
 
     def coasts(self, modes: jax.Array) -> jax.Array | None:
+        """Never: there are loads."""
         return None
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
+        """Never: a flight ends at its first event."""
         return jnp.zeros((1, 1), bool)
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Nothing."""
         return modes, y
 
 
@@ -158,6 +167,7 @@ def packed(state: State) -> jax.Array:
 
 
 def unpacked(like: State, y: jax.Array) -> State:
+    """The state of rows (.., 1)."""
     return ravel_pytree(like)[1](y[:, 0])
 
 
@@ -165,11 +175,6 @@ def encoded(modes: Modes) -> jax.Array:
     """Modes as rows (3 m, 1) of whole numbers."""
     rows = [modes.active, modes.stick, modes.sign]
     return jnp.concatenate([x.astype(jnp.int32) for x in rows])[:, None]
-
-
-def decoded(rows: jax.Array, dtype: Any) -> Modes:
-    active, stick, sign = rows[:, 0].reshape(3, -1)
-    return Modes(active > 0, stick > 0, sign.astype(dtype))
 
 
 def project(system: System, mu: jax.Array | None, friction: bool, modes: Modes, y: State) -> State:
@@ -269,7 +274,7 @@ def fly(
         carry = before._replace(y=packed(flight.state), plan=before.plan.at[2:].set(0.0))
         after, accept = stepper.advance(flow, carry, 2)
         accept = accept[0, 0]
-        new = project(system, mu, settings.friction, modes, flow.state(after.y))
+        new = project(system, mu, settings.friction, modes, unpacked(flow.like, after.y))
         state = jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, flight.state)
         landed = before.step.target[:, 0] & accept
         sampled = landed[-1]

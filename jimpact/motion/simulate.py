@@ -16,7 +16,7 @@ from jimpact._checks import (
     check_values,
     is_traced,
 )
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
 from jimpact.motion.event_driven import event_driven

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.contact_forces import contacts_at
 from jimpact.motion.dynamics import base_velocity, gaps, user_force
 from jimpact.motion.flow import Course, State

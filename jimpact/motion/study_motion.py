@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.system import (

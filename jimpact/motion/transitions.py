@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
 from jimpact.motion.dynamics import (
     base_velocity,

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.bodies.base import scene_from_gaps
-from jimpact.contact_space import delassus_matrix, gap_velocity
+from jimpact.contact import delassus_matrix
 from jimpact.laws.forces import Bistiffness, Force
+from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
 RTOL = 1e-9
