@@ -98,11 +98,12 @@ def _one_step(
     possible = jnp.max(jnp.abs(given.normal.gradient).T @ jnp.abs(state.v))
     speed = jax.lax.stop_gradient(jnp.maximum(course.speed, possible))
     share = max(_ROUNDING, _ROUNDINGS * float(jnp.finfo(q.dtype).eps))
-    strikes = jnp.any(closed & (given.normal.rate < -share * speed))
+    noise = share * speed
+    strikes = jnp.any(closed & (given.normal.rate < -noise))
     at_middle = state._replace(q=q)
     blow = jax.lax.cond(
         strikes,
-        lambda: blow_of(system, law, middle, at_middle, closed),
+        lambda: blow_of(system, law, middle, at_middle, closed, noise),
         lambda: no_blow(at_middle, m),
     )
     force = user_force(system, q, blow.v, middle)

@@ -56,14 +56,19 @@ def scene_now(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: 
     return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
 
 
-def blow_of(system: System, law: Law, t: jax.Array, state: State, closed: jax.Array) -> Blow:
-    """`impact` in the frame of the base, and what it does to energies."""
+def blow_of(
+    system: System, law: Law, t: jax.Array, state: State, closed: jax.Array, noise: jax.Array
+) -> Blow:
+    """`impact` in the frame of the base, and what it does to energies.
+
+    Gap velocities up to `noise` are rounding, on the scale of the motion.
+    """
     m = closed.shape[0]
     scene = scene_now(system, state.q, state.v, t, closed)
     carried = base_velocity(system, t)
     carried = jnp.zeros_like(state.v) if carried is None else carried
     relative = state.v - carried
-    out = impact(law, scene, relative)
+    out = impact(law, scene, relative, noise)
     mean = 0.5 * (out.velocity + relative)
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
@@ -116,7 +121,7 @@ def resolve(
     strikes = jnp.any(closed & (given.normal.rate < -rest))
     blow = jax.lax.cond(
         strikes,
-        lambda: blow_of(system, law, t, state, closed),
+        lambda: blow_of(system, law, t, state, closed, rest),
         lambda: no_blow(state, m),
     )
     given = contacts_at(system, state.q, blow.v, t, settings.friction)
