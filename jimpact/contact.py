@@ -177,10 +177,10 @@ def contact_of(
     cross, tangential, slip = _tangential_block(scene, velocity)
     norm = jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene)
     stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, (m,))
+    stored = jnp.where(scene.closed, stored, 0.0)
     if gaps is not None and not uses_gaps:
         closed = scene.closed
-        w = decoupled(w, closed)
-        gamma, stored = jnp.where(closed, gamma, 0.0), jnp.where(closed, stored, 0.0)
+        w, gamma = decoupled(w, closed), jnp.where(closed, gamma, 0.0)
         if cross is not None and tangential is not None and slip is not None:
             cross, tangential, slip = _closed_block(closed, w, cross, tangential, slip)
     return Contact(

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.events import stepper
+from jimpact.contact import Contact
+from jimpact.events import impulse_form, stepper
 from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import (
     Chain,
@@ -37,6 +38,7 @@ GRADIENT_TIGHTENING = 0.01
 QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
 # Contacts so many times slower than the fastest see as many of its periods, whose errors add up.
 WIDE_SPREAD = 5.0
+METHODS = ("time", "impulse")
 ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
 SWEEPS = 60  # of the search for the contacts that carry the remainder of a plastic limit
 
@@ -52,6 +54,7 @@ class Problem(NamedTuple):
     energy: jax.Array  # x^(eta + 1) of contacts loaded beforehand
     gap: jax.Array | None  # in units of the indentation
     tolerance: jax.Array  # (1,)
+    step: jax.Array  # (1,) of the impulse form: the tolerance itself, whatever the stiffnesses
     viscous: Viscous | None = None
     sides: "Sides | None" = None
 
@@ -103,10 +106,12 @@ def dimensionless(
     fastest = jnp.max(jnp.maximum(-gamma, jnp.sqrt(2 * stored) * root))
     weight = jnp.maximum(1.0, q * root / fastest)
     omega = time / t_ref
-    closeness = jnp.minimum(1.0, WIDE_SPREAD * jnp.min(omega))
+    closeness = jax.lax.stop_gradient(jnp.minimum(1.0, WIDE_SPREAD * jnp.min(omega)))
     g = scaled(delassus, 1 / root)
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
+    # errors of many contacts add up
+    step = jax.lax.stop_gradient(rtol * min(1.0, 2 / m) / weight)
     problem = Problem(
         beside=beside,
         omega=omega,
@@ -115,23 +120,23 @@ def dimensionless(
         gamma=qn / q,
         energy=2 * stored / q**2,
         gap=None if gaps is None else gaps / x_ref,
-        # errors of many contacts add up
-        tolerance=jax.lax.stop_gradient(rtol * min(1.0, 2 / m) * closeness / jnp.max(weight))[None],
+        tolerance=(step * closeness)[None],
+        step=step[None],
     )
     return problem, Units(q, time, root, x_ref)
 
 
-def sides_of(
-    cross: jax.Array, along: jax.Array, friction: jax.Array, slip: jax.Array, units: Units
-) -> Sides:
-    """The tangential block W_nt (m, t), W_tt (t, t), mu, u- (t,) in the units of the normal one."""
-    m, t = cross.shape
-    root = jnp.repeat(units.root, t // m)
+def sides_of(contact: Contact, friction: jax.Array, units: Units) -> Sides:
+    """The tangential block of the contacts in the units of the normal one."""
+    assert contact.cross is not None
+    assert contact.tangential is not None
+    assert contact.slip is not None
+    root = jnp.repeat(units.root, contact.tangents)
     return Sides(
-        cross / (units.root[:, None] * root),
-        along / (root[:, None] * root),
+        contact.cross / (units.root[:, None] * root),
+        contact.tangential / (root[:, None] * root),
         friction * jnp.ones_like(units.root),
-        slip / (root * units.velocity),
+        contact.slip / (root * units.velocity),
     )
 
 
@@ -162,12 +167,11 @@ def flow_of(
         root=root_order(eta),
         closed_form=viscous is None,
     )
-    if problem.gap is not None:
-        x = -problem.gap  # at 0 too: its derivative there is the one-sided one
-    else:
-        loaded = problem.energy > 0
-        energy = jnp.where(loaded, problem.energy, 1.0)
-        x = jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), 0.0)
+    loaded = problem.energy > 0
+    energy = jnp.where(loaded, problem.energy, 1.0)
+    # not loaded: minus the gap, at 0 too, where its derivative is the one-sided one
+    apart = 0.0 if problem.gap is None else -problem.gap
+    x = jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
     if problem.sides is None:
         flow = ContactFlow(**parts)
         return flow, *flow.start(problem.gamma, x)
@@ -218,19 +222,31 @@ class Outcome:
 
 
 def solve(
-    problem: Problem, exponent: Exponent, chain: bool, max_steps: int
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Dimensionless impulses (m,) and (t,), status () and passes () of one impact.
+    problem: Problem,
+    units: Units,
+    exponent: Exponent,
+    delassus: Symmetric,
+    max_steps: int,
+    method: str = "time",
+) -> tuple[jax.Array, jax.Array | None, jax.Array]:
+    """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
-    Differentiable in both modes, in all orders.
+    Differentiable in both modes; method 'time' in all orders.
     """
-    leaves, tree = jax.tree.flatten(problem)
     static = None if isinstance(exponent, jax.Array) else exponent
+    chain = isinstance(delassus, Tridiagonal)
+    if method == "impulse":
+        p, code = impulse_form.solve(problem, static, chain, max_steps)
+        return p * units.momentum, None, code
+    leaves, tree = jax.tree.flatten(problem)
     rows = 0 if problem.sides is None else problem.sides.slip.shape[0]
-    p, side, code, passes = outcome(
+    p, side, code, _ = outcome(
         Outcome(tree, static, chain, max_steps, rows), tuple(x[..., None] for x in leaves)
     )
-    return p[:, 0], side[:, 0], code[0, 0], passes[0, 0]
+    if rows == 0:
+        return p[:, 0] * units.momentum, None, code[0, 0]
+    each = rows // len(units.root)
+    return p[:, 0] * units.momentum, side[:, 0] * jnp.repeat(units.momentum, each), code[0, 0]
 
 
 def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

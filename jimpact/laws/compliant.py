@@ -7,14 +7,15 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from jimpact._checks import check_values
 from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, option
+from jimpact.events.contact_flow import Viscous
+from jimpact.events.impact_dynamics import dimensionless, sides_of, solve
+from jimpact.law import Impulses, Law, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.laws.lzb import check_rtol, default_rtol
-from jimpact.numerics.dimensionless import solve, to_dimensionless
-from jimpact.numerics.flow import Viscous
 from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal
+from jimpact.solvers.tridiagonal import diagonal
 
 
 class Compliant(Law):
@@ -28,6 +29,9 @@ class Compliant(Law):
         force: of `rheology.py`: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
             `Bistiffness(k, eta, e)`, `KelvinVoigt(k, c)`, `HuntCrossley(k, d, eta)`,
             `KuwabaraKono(k, A)`, `UserForce(function, parameters)`.
+        friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
+        initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed contacts; not with
+            a viscous force.
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
         max_steps: passes of the integrator before it gives up.
 
@@ -49,6 +53,8 @@ class Compliant(Law):
     uses_gaps: ClassVar[bool] = True
 
     force: Force
+    friction: jax.Array | None = parameter(low=0.0, default=None, kw_only=True)
+    initial_energy: jax.Array = parameter(low=0.0, default=0.0, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
 
@@ -59,36 +65,40 @@ class Compliant(Law):
                 f"but has value {self.force!r}."
             )
 
+        if not isinstance(self.force, Bistiffness):  # their energy is no function of x alone
+            check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
+
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """A tolerance that the precision can hold."""
         check_rtol(self.rtol, dtype)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
-        p, code = self._solve(contact.delassus, contact.gap_velocity, contact.gaps)
-        return Impulses(p, None, code)
-
-    def _solve(
-        self, delassus: Symmetric, gamma: jax.Array, gaps: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        m, force = gamma.shape[0], self.force
-        ones, none = jnp.ones_like(gamma), jnp.zeros_like(gamma)
-        rtol = self.rtol or default_rtol("time", gamma.dtype)
-        chain, viscous = isinstance(delassus, Tridiagonal), None
+        gamma, force, viscous = contact.gap_velocity, self.force, None
         if isinstance(force, Bistiffness):
-            k, e = (jnp.broadcast_to(z, (m,)) for z in (force.stiffness, force.restitution))
-            exponent = force.exponent
+            k, e, exponent = force.stiffness, force.restitution, force.exponent
         else:  # in units of a spring that stores the impact's energy at the force's indentation
-            q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(delassus)))
-            k = (q / force.indentation_scale(0.5 * q**2 * ones)) ** 2
-            k, e, exponent = jax.lax.stop_gradient(k), ones, 1.0
-        inputs, units = to_dimensionless(delassus, gamma, e, k, exponent, none, rtol, gaps)
-        momentum = units.velocity / units.root
+            q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus)))
+            k = (q / force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))) ** 2
+            k, e, exponent = jax.lax.stop_gradient(k), jnp.ones_like(gamma), 1.0
+        problem, units = dimensionless(
+            contact.delassus,
+            gamma,
+            e,
+            k,
+            exponent,
+            contact.stored,
+            self.rtol or default_rtol("time", gamma.dtype),
+            contact.gaps,
+        )
         if not isinstance(force, Bistiffness):
             speed = units.velocity * units.root
-            viscous = Viscous(force, units.indentation, speed, momentum / units.time)
-        p, code = solve(inputs, exponent, chain, self.max_steps, viscous=viscous)
-        return p * momentum, code
+            viscous = Viscous(force, units.indentation, speed, units.momentum / units.time)
+        problem = problem._replace(viscous=viscous)
+        if self.friction is not None:
+            problem = problem._replace(sides=sides_of(contact, self.friction, units))
+        p, p_t, code = solve(problem, units, exponent, contact.delassus, self.max_steps)
+        return Impulses(p, p_t, code)
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

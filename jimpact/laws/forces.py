@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array
+from jimpact.events.contact_flow import Exponent
 from jimpact.law import Declared, parameter
-from jimpact.numerics.powers import Exponent
 
 _SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
 _BISECTIONS = 50  # of them, to about 1e-13 decades

@@ -7,12 +7,10 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
+from jimpact.events.contact_flow import Exponent
+from jimpact.events.impact_dynamics import METHODS, dimensionless, sides_of, solve
 from jimpact.law import Impulses, Law, StaticNumber, option, parameter
-from jimpact.numerics import friction
-from jimpact.numerics.dimensionless import METHODS, Inputs, Units, solve, to_dimensionless
-from jimpact.numerics.powers import Exponent
 from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself
@@ -135,33 +133,18 @@ class LZB(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
-        if self.friction is not None:
-            return self._with_friction(contact, self.friction)
-        w = contact.delassus
-        inputs, units = self._dimensionless(contact, w)
-        chain = isinstance(w, Tridiagonal)
-        p, code = solve(inputs, self.exponent, chain, self.max_steps, self.method)
-        return Impulses(p * units.velocity / units.root, None, code)
-
-    def _with_friction(self, contact: Contact, mu: jax.Array) -> Impulses:
-        assert contact.cross is not None
-        assert contact.tangential is not None
-        assert contact.slip is not None
-        inputs, units = self._dimensionless(contact, as_matrix(contact.delassus))
-        side = friction.to_dimensionless(contact.cross, contact.tangential, mu, contact.slip, units)
-        (p, p_t), code = friction.solve(inputs, side, self.exponent, self.max_steps)
-        root = jnp.repeat(units.root, contact.tangents)
-        momentum = units.velocity / units.root
-        return Impulses(p * momentum, p_t * units.velocity / root, code)
-
-    def _dimensionless(self, contact: Contact, delassus: Symmetric) -> tuple[Inputs, Units]:
-        gamma = contact.gap_velocity
-        return to_dimensionless(
-            delassus,
-            gamma,
+        problem, units = dimensionless(
+            contact.delassus,
+            contact.gap_velocity,
             self.restitution,
             self.stiffness,
             self.exponent,
             contact.stored,
-            self.rtol or default_rtol(self.method, gamma.dtype),
+            self.rtol or default_rtol(self.method, contact.gap_velocity.dtype),
         )
+        if self.friction is not None:
+            problem = problem._replace(sides=sides_of(contact, self.friction, units))
+        p, p_t, code = solve(
+            problem, units, self.exponent, contact.delassus, self.max_steps, self.method
+        )
+        return Impulses(p, p_t, code)
