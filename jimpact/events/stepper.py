@@ -158,7 +158,7 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     slopes, rates = jax.lax.scan(stage, none, rows)
-    return length * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
+    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
 
 
 class Carry(NamedTuple):
@@ -206,7 +206,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
     scale = local + COARSE_ROUNDING * eps * jnp.abs(y)
-    fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale, axis=1))
+    fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
     ok = error2 <= 1
     factor = jnp.clip(
@@ -269,7 +269,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     in_root = in_root & ~aim
     due = jnp.where(event, first, first - 1) * span
     clock = jnp.concatenate([xi, h, in_root.astype(dtype), aim.astype(dtype)])
-    passes = passes + active
+    passes = passes + active.astype(dtype)
     over = flow.over(modes, y, passes)
     plan = jnp.concatenate(
         [
