@@ -41,10 +41,13 @@ WITH_EXAMPLES = [name for name in MODULES if ">>>" in Path(
 def as_a_user_runs_them(tmp_path, monkeypatch):
     """x64, JAX's own promotion rules, a folder of one's own."""
     monkeypatch.chdir(tmp_path)
+    laws = dict(ji.REGISTRY)  # examples register laws of their own
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
     yield
     plt.close("all")
+    ji.REGISTRY.clear()
+    ji.REGISTRY.update(laws)
     jax.config.update("jax_numpy_rank_promotion", "raise")
     jax.config.update("jax_numpy_dtype_promotion", "strict")
 
