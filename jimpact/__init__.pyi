@@ -2,21 +2,17 @@
 
 from . import plot as plot, theory as theory
 from .audits import Audit as Audit, audit as audit, summary as summary
-from .bodies.base import Mechanism as Mechanism
-from .bodies.bodies import (
-    Block as Block,
+from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
+from .bodies.blocks import Block as Block, rocking_block as rocking_block
+from .bodies.dimers import (
     Dimer as Dimer,
+    SpatialDimer as SpatialDimer,
     dimer as dimer,
-    rocking_block as rocking_block,
+    dimer_3d as dimer_3d,
 )
+from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
+from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
-from .bodies.planar import (
-    Corner as Corner,
-    DiskBalls as DiskBalls,
-    corner as corner,
-    disk_balls as disk_balls,
-)
-from .bodies.spatial import SpatialDimer as SpatialDimer, dimer_3d as dimer_3d
 from .comparison import (
     Comparison as Comparison,
     compare as compare,
@@ -38,6 +34,7 @@ from .law import (
     REGISTRY as REGISTRY,
     Impulses as Impulses,
     Law as Law,
+    option as option,
     parameter as parameter,
     register as register,
 )
@@ -85,23 +82,20 @@ from .montecarlo.gaps import (
 from .montecarlo.results import MonteCarlo as MonteCarlo
 from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
-from .motion.bases import HarmonicBase as HarmonicBase
 from .motion.fitting_motion import MotionFit as MotionFit, fit_motion as fit_motion
-from .motion.ready_systems import (
+from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
+from .motion.simulate import simulate as simulate
+from .motion.system import (
+    HarmonicBase as HarmonicBase,
+    System as System,
     ball_system as ball_system,
     block_system as block_system,
     column_system as column_system,
     cradle_system as cradle_system,
     dimer_system as dimer_system,
+    gravity as gravity,
 )
-from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
-from .motion.simulation import simulate as simulate
-from .motion.system import System as System, gravity as gravity
-from .motion.turning import (
-    TurningImpact as TurningImpact,
-    block_gaps as block_gaps,
-    turning_impact as turning_impact,
-)
+from .motion.turning import TurningImpact as TurningImpact, turning_impact as turning_impact
 from .scene import (
     Scene as Scene,
     chain as chain,
@@ -109,7 +103,6 @@ from .scene import (
     gap_velocity as gap_velocity,
     kinetic_energy as kinetic_energy,
     momentum as momentum,
-    scene_from_gaps as scene_from_gaps,
     velocity_change as velocity_change,
 )
 from .status import STATUS as STATUS

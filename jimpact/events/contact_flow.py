@@ -190,6 +190,8 @@ class ContactFlow:
     root: int = 2
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
 
+    near = 0.0  # landings start from anywhere in a step
+
     @property
     def exponent(self) -> Exponent:
         static = self.exponent_static
@@ -363,7 +365,8 @@ class ContactFlow:
         if not self.closed_form:
             return ~any_of(works)
         # |G| and min(G, 0), both with a unit diagonal
-        felt = self.coupling.magnitude().times(works.astype(y.dtype)) - works > 0
+        load = works.astype(y.dtype)
+        felt = self.coupling.magnitude().times(load) - load > 0
         change = rebound - gamma
         left = gamma + self.coupling.pull().times(change) - change
         return ~any_of(jnp.where(works, felt, left < -tolerance))

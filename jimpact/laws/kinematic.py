@@ -167,7 +167,7 @@ class RestitutionMatrix(Kinematic):
     Equation: with E (m, m): `qn+ = -E qn-`, `qn_j = gamma_j / |grad f_j|`, hence
     `pbar = -G^-1 (I + E) qn-`, `p_j = pbar_j / |grad f_j|`; tangential velocities are conserved.
     With E (m + k, m + k), k = n - m - b: `(qn+, qt+) = -E (qn-, qt-)` in the basis of
-    `ji.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
+    `ji.theory.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
     scene's tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t where
     several do), `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn = 0, E_tt = -I.)
     Bilateral constraints distort G and n_q as in (6.35). With friction, and E (m, m),
@@ -221,10 +221,11 @@ class RestitutionMatrix(Kinematic):
         tangential_restitution: Any = 0.0,
     ):
         self.matrix, self.admissible = matrix, admissible
-        if np.ndim(matrix) != 2:
+        shape = np.shape(matrix)
+        if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
             raise ValueError(
                 "Argument `matrix` must be square, (m, m) for m contacts or (m + k, m + k) with "
-                f"k tangential quasi-velocities, but has shape {np.shape(matrix)}."
+                f"k tangential quasi-velocities, but has shape {shape}."
             )
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution
