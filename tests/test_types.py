@@ -88,5 +88,6 @@ def test_editors_complete_all_names(space, package):
 
 def test_editors_show_signatures():
     script = jedi.Script("import jimpact as ji\nji.impact(", project=jedi.Project(ROOT))
-    shown = [signature.to_string() for signature in script.get_signatures()]
-    assert shown == ["impact(law: Law, scene: Scene, velocity: Any) -> Impact"]
+    (shown,) = (signature.to_string() for signature in script.get_signatures())
+    assert shown.startswith("impact(law: Law, scene: Scene, velocity: Any")
+    assert shown.endswith("-> Impact")
