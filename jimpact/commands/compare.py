@@ -90,8 +90,8 @@ def _print(
         console.print(f"[bold]No impact:[/bold] {escape(quiet)}.", soft_wrap=True)
     for name, reason in found.left_out.items():
         console.print(f"{escape(name)} is left out: it {escape(reason)}.", soft_wrap=True)
-    told = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
-    console.print(f"Parameters: {escape(told)}.", soft_wrap=True)
+    values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
+    console.print(f"Parameters: {escape(values)}.", soft_wrap=True)
     console.print(
         "Dispersion: 0 all energy in one body, 1 equal shares. Time: one compiled call, its "
         "argument checks included.",

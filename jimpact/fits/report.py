@@ -32,9 +32,9 @@ def report(fit: Any) -> str:
         [_headline(fit)],
         _parameters(fit),
         _quality(fit),
-        _told("What the data cannot see", fit.identifiability),
+        _section("What the data cannot see", fit.identifiability),
         _minima(fit),
-        _told("Warnings", fit.warnings),
+        _section("Warnings", fit.warnings),
         _shots(fit),
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
@@ -76,7 +76,7 @@ def _quality(fit: Any) -> list[str]:
     return [*lines, f"solver         {state}, at most {fit.steps} steps a start"]
 
 
-def _told(title: str, lines: tuple[str, ...]) -> list[str]:
+def _section(title: str, lines: tuple[str, ...]) -> list[str]:
     return [title, *(f"  - {line}" for line in lines)] if lines else []
 
 

@@ -111,8 +111,8 @@ class Advice(Findings):
         over = f"; median and worst over {self.rows} stiffnesses" if self.rows > 1 else ""
         timed = all(c.cost is not None for c in self.candidates.values())
         cost = "; cost of an impact in a batch, cheapest = 1" if timed else ""
-        told = f"Error of v+ against {title(self.reference)}, relative to max |v-|{over}{cost}."
-        return textwrap.fill(told, _WIDTH)
+        words = f"Error of v+ against {title(self.reference)}, relative to max |v-|{over}{cost}."
+        return textwrap.fill(words, _WIDTH)
 
 
 def _wrapped(key: str, text: str) -> list[str]:
@@ -168,7 +168,7 @@ def _rtol(rtol: float | None) -> str:
 
 def structure(found: Findings) -> str:
     """Which contacts are coupled: one sentence a block of several, one for all others."""
-    told = []
+    words = []
     for block in found.blocks:
         if len(block.contacts) == 1 or not block.approaches:
             continue
@@ -176,7 +176,7 @@ def structure(found: Findings) -> str:
         low, high = block.angles
         angle = f"angle {low:.4g}" if high - low < 0.05 else f"angles {low:.4g} to {high:.4g}"
         law = f"{title(block.law)} is enough" if block.law else "no law is within tolerance"
-        told.append(f"contacts {block.name} are coupled (kinetic {angle} degrees): {law}")
+        words.append(f"contacts {block.name} are coupled (kinetic {angle} degrees): {law}")
     groups: dict[str, list[int]] = {}
     for block in found.blocks:
         if not block.approaches:
@@ -188,19 +188,19 @@ def structure(found: Findings) -> str:
         groups.setdefault(what, []).extend(j + 1 for j in block.contacts)
     for what, contacts in groups.items():
         named = ", ".join(str(j) for j in contacts)
-        told.append(f"contact{'s' * (len(contacts) > 1)} {named} {what}")
-    return "; ".join(told)
+        words.append(f"contact{'s' * (len(contacts) > 1)} {named} {what}")
+    return "; ".join(words)
 
 
 def effects(found: Findings) -> str:
     """What each unknown stiffness does by itself, the strongest first."""
     strongest = sorted(found.effects, key=lambda effect: -effect.alone)[:_TOLD]
-    told = [
+    words = [
         f"{e.name} {share(e.alone)}"
         + (f" (know it within {100 * e.needed:.2g} %)" if e.needed < 1 else "")
         for e in strongest
     ]
-    return f"alone they move v+ by: {', '.join(told)}"
+    return f"alone they move v+ by: {', '.join(words)}"
 
 
 def agreeing(found: Findings) -> str:
@@ -301,16 +301,16 @@ def _undecided(found: Findings) -> str:
     """Nothing is within tolerance, because the stiffnesses are not known."""
     moved, bound = share(found.candidates[found.name].worst), share(found.tolerance)
     many = len(found.effects) > 1
-    told = (
+    words = (
         f"{ratios(found)} decide{'' if many else 's'}: no law is within {bound}, because "
         f"{'they move' if many else 'it moves'} v+ by up to {moved}"
     )
     most = max(found.effects, key=lambda effect: effect.alone)
     if many:
-        return f"{told}; measure {most.name} first (alone {share(most.alone)})"
+        return f"{words}; measure {most.name} first (alone {share(most.alone)})"
     if most.needed < 1:
-        return f"{told}; it would have to be known within {100 * most.needed:.2g} %"
-    return told
+        return f"{words}; it would have to be known within {100 * most.needed:.2g} %"
+    return words
 
 
 def _closest_simpler(found: Findings) -> str:

@@ -19,9 +19,9 @@ from jimpact.methods.chart_programs import (
     Programs,
     errors_of,
     in_turns,
+    law_programs,
+    method_programs,
     moment_of,
-    of_law,
-    of_method,
     reference_of,
 )
 from jimpact.methods.chart_record import Point, Timing, WorkPrecision
@@ -99,10 +99,10 @@ def work_precision(
         programs: dict[str, Programs] = {}
         for name, method in needed.items():
             wanted = gradients and not method.no_gradient
-            programs[name] = of_method(method, case, wanted, timed=name in ladders)
+            programs[name] = method_programs(method, case, wanted, timed=name in ladders)
             advance()
         for name, other in laws.items():
-            programs[name] = of_law(in_common_dtype(other, case.velocity)[0], case)
+            programs[name] = law_programs(in_common_dtype(other, case.velocity)[0], case)
             advance()
         truth, other_truth = (
             moment_of(programs[m.name], rtol) for m, rtol in ((exact, FINEST), (second, SECOND))

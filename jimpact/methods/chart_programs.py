@@ -63,11 +63,11 @@ class Programs:
     compile_time: dict[str, float]
 
 
-def _told(out: Impact, duration: jax.Array, evaluations: jax.Array) -> Answer:
+def _answer(out: Impact, duration: jax.Array, evaluations: jax.Array) -> Answer:
     return Answer(out.velocity, out.impulse, out.energy_change, duration, evaluations, out.status)
 
 
-def of_method(method: Method, case: Case, gradients: bool, timed: bool = True) -> Programs:
+def method_programs(method: Method, case: Case, gradients: bool, timed: bool = True) -> Programs:
     """Programs of a method; not `timed`: only those that errors need."""
     return _compiled(method, case, gradients, timed) if method.jax else _on_host(method, case)
 
@@ -115,11 +115,11 @@ def _functions(method: Method) -> tuple[Callable[..., Any], ...]:
     def whole(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Answer:
         law = with_entries(law, ("stiffness",), k)
         found = method.solve(law, scene, v, setting)
-        return _told(outcome(law, scene, v, found), found.duration, found.evaluations)
+        return _answer(outcome(law, scene, v, found), found.duration, found.evaluations)
 
     def fast(*given: Any) -> Answer:
-        told = whole(*given)
-        return told._replace(duration=jnp.nan) if method.duration_apart else told
+        answer = whole(*given)
+        return answer._replace(duration=jnp.nan) if method.duration_apart else answer
 
     def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
         def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
@@ -178,7 +178,7 @@ def _on_host(method: Method, case: Case) -> Programs:
         for law in laws[: case.sample]:
             found = one(law, setting)
             out = outcome(law, case.scene, case.velocity, found)
-            answers.append(_told(out, found.duration, found.evaluations))
+            answers.append(_answer(out, found.duration, found.evaluations))
         return jax.tree.map(lambda *a: jnp.stack(a), *answers)
 
     return Programs(
@@ -191,7 +191,7 @@ def _on_host(method: Method, case: Case) -> Programs:
     )
 
 
-def of_law(law: Law, case: Case) -> Programs:
+def law_programs(law: Law, case: Case) -> Programs:
     """Programs of another law; it has no setting, and is accounted for at the impact itself."""
     batch = len(case.stiffness)
     velocities = jnp.tile(case.velocity[None, :], (batch, 1))
@@ -203,7 +203,7 @@ def of_law(law: Law, case: Case) -> Programs:
 
     def account(_: Any) -> Answer:
         out = jax.tree.map(lambda a: a[None], one(law, case.scene, case.velocity))
-        return _told(out, unknown, jnp.asarray([UNCOUNTED]))
+        return _answer(out, unknown, jnp.asarray([UNCOUNTED]))
 
     return Programs(
         single=lambda _: one(law, case.scene, case.velocity),

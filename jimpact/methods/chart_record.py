@@ -71,7 +71,7 @@ class WorkPrecision:
         """Everything, as a JSON file can hold it (NaN: null)."""
         reference = {
             "how": self.reference.how,
-            "uncertainty": _told(self.reference.uncertainty),
+            "uncertainty": _json_ready(self.reference.uncertainty),
             "velocity": self.reference.velocity.tolist(),
             "impulse": self.reference.impulse.tolist(),
             "duration_s": _number(self.reference.duration),
@@ -95,8 +95,8 @@ class WorkPrecision:
         lines = [head + "  status"]
         for row in self.points.values():
             lines += [_line(point) for point in row]
-        told = ", ".join(f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items())
-        lines += [f"reference: {self.reference.how}; uncertain by {told}"]
+        uncertain = ", ".join(f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items())
+        lines += [f"reference: {self.reference.how}; uncertain by {uncertain}"]
         lines += [
             f"errors relative, largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; medians of {self.repeats}, batch of {self.batch}"
@@ -125,7 +125,7 @@ def _number(value: float) -> float | None:
     return None if math.isnan(value) else float(value)
 
 
-def _told(values: dict[str, float]) -> dict[str, float | None]:
+def _json_ready(values: dict[str, float]) -> dict[str, float | None]:
     return {key: _number(value) for key, value in values.items()}
 
 
@@ -135,7 +135,7 @@ def _point(point: Point) -> dict[str, Any]:
 
     return {
         "setting": point.setting,
-        "error": _told(point.error),
+        "error": _json_ready(point.error),
         "evaluations": _number(point.evaluations),
         "single_us": time_us(point.single),
         "batched_us": time_us(point.batched),

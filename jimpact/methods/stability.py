@@ -103,7 +103,7 @@ class StabilityMap:
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it."""
 
-        def told(found: Slice) -> dict[str, Any]:
+        def as_data(found: Slice) -> dict[str, Any]:
             error = np.where(np.isfinite(found.error), found.error, -1.0)  # JSON has no NaN
             return {
                 "axes": list(found.axes),
@@ -124,8 +124,8 @@ class StabilityMap:
                 name: {
                     "counts": self.counts(name),
                     "causes": self.causes(name),
-                    "slices": [told(each) for each in self.slices[name]],
-                    "sampled": told(self.sampled[name]),
+                    "slices": [as_data(each) for each in self.slices[name]],
+                    "sampled": as_data(self.sampled[name]),
                 }
                 for name in self.methods
             },
@@ -209,10 +209,10 @@ def stability_map(
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
     chosen, lines = _methods(methods), checked_axes(axes, int(resolution))
     start = checked_base(base)
-    along: list[tuple[str, ...]] = [(name,) for name in lines]
+    axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
     if slices == "pairs":
-        along += list(combinations(lines, 2))
-    parts = [slice_points(start, lines, names) for names in along]
+        axis_sets += list(combinations(lines, 2))
+    parts = [slice_points(start, lines, names) for names in axis_sets]
     sampled = sample_points(start, lines, int(samples), seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
     total = len(points) * (len(chosen) + 1)
@@ -226,7 +226,7 @@ def stability_map(
         columns = [np.split(column, cut) for column in found[name]]
         cuts = [
             Slice(names, *(column[i].reshape(part.shape[:-1]) for column in columns))
-            for i, (names, part) in enumerate(zip(along, parts))
+            for i, (names, part) in enumerate(zip(axis_sets, parts))
         ]
         return tuple(cuts), Slice(("samples",), *(column[-1] for column in columns))
 

@@ -140,12 +140,12 @@ def checked_base(base: Mapping[str, float] | None) -> dict[str, float]:
 
 
 def slice_points(
-    base: Mapping[str, float], axes: Mapping[str, np.ndarray], along: tuple[str, ...]
+    base: Mapping[str, float], axes: Mapping[str, np.ndarray], varied: tuple[str, ...]
 ) -> np.ndarray:
     """Points (K_1 .. K_d, 6) in which the axes `along` run over their values."""
-    grids = np.meshgrid(*(axes[name] for name in along), indexing="ij")
+    grids = np.meshgrid(*(axes[name] for name in varied), indexing="ij")
     rows = [
-        grids[along.index(name)] if name in along else np.full(grids[0].shape, base[name])
+        grids[varied.index(name)] if name in varied else np.full(grids[0].shape, base[name])
         for name in AXES
     ]
     return np.stack(rows, axis=-1)

@@ -114,14 +114,14 @@ class MonteCarlo:
     def to_dict(self) -> dict[str, Any]:
         """Everything but samples and run, as a JSON file can hold it."""
         arrays = "mean covariance minimum maximum gap_mean gap_covariance cross_covariance"
-        told: dict[str, Any] = {"samples": self.samples, "count": self.count}
-        told |= {name: getattr(self, name).tolist() for name in arrays.split()}
-        told["standard_error"] = self.standard_error.tolist()
-        told["quantiles"] = {f"{q:g}": self.quantile(q).tolist() for q in REPORTED}
-        told["quantile_resolution"] = self.quantile_resolution.tolist()
-        told["histogram"] = {"edges": self.edges.tolist(), "counts": self.counts.tolist()}
-        told["statuses"] = self.statuses
-        told["bad"] = [
+        data: dict[str, Any] = {"samples": self.samples, "count": self.count}
+        data |= {name: getattr(self, name).tolist() for name in arrays.split()}
+        data["standard_error"] = self.standard_error.tolist()
+        data["quantiles"] = {f"{q:g}": self.quantile(q).tolist() for q in REPORTED}
+        data["quantile_resolution"] = self.quantile_resolution.tolist()
+        data["histogram"] = {"edges": self.edges.tolist(), "counts": self.counts.tolist()}
+        data["statuses"] = self.statuses
+        data["bad"] = [
             {
                 "index": bad.index,
                 "status": bad.status,
@@ -130,8 +130,8 @@ class MonteCarlo:
             }
             for bad in self.bad
         ]
-        told["gap_scale"] = None if self.gap_scale is None else self.gap_scale.tolist()
-        return told | {"rate": self.rate, "resumed": self.resumed}
+        data["gap_scale"] = None if self.gap_scale is None else self.gap_scale.tolist()
+        return data | {"rate": self.rate, "resumed": self.resumed}
 
     def __str__(self) -> str:
         lines = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
@@ -154,8 +154,8 @@ class MonteCarlo:
     def _rate(self) -> str:
         if self.resumed == self.samples:
             return "all read from the folder"
-        told = f"{self.rate:,.0f} samples/s"
-        return told + (f", {self.resumed:,} read from the folder" if self.resumed else "")
+        text = f"{self.rate:,.0f} samples/s"
+        return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
 
     def _gap_lines(self) -> list[str]:
         lines = []

@@ -96,10 +96,10 @@ def monte_carlo(
     )
     failed = found.samples - found.count
     if failed:
-        told = ", ".join(f"{count} {name}" for name, count in found.statuses.items())
+        text = ", ".join(f"{count} {name}" for name, count in found.statuses.items())
         warnings.warn(
             f"{failed} of {found.samples} samples failed and are left out of the statistics "
-            f"({told}); see `bad` and `replay`.",
+            f"({text}); see `bad` and `replay`.",
             stacklevel=2,
         )
     return found
@@ -169,10 +169,10 @@ def _computed(
 
 
 def _interrupted(run: Run, store: Store | None, done: int) -> str:
-    told = f"stopped after {done:,} of {run.samples:,} samples; "
+    text = f"stopped after {done:,} of {run.samples:,} samples; "
     if store is None:
-        return told + "nothing is kept, because no `folder` was given."
-    return told + f"they are in '{store.folder}': the same call continues from there."
+        return text + "nothing is kept, because no `folder` was given."
+    return text + f"they are in '{store.folder}': the same call continues from there."
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:

@@ -14,7 +14,7 @@ FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
 LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
 SHOWN = 4096  # first samples of a run that are kept in memory for pictures
 # name, message and whether it is a failure, of every code
-OUTCOMES = [*STATUS, *(Status(*told, True) for told in BAD_INPUTS.values())]
+OUTCOMES = [*STATUS, *(Status(*row, True) for row in BAD_INPUTS.values())]
 FAILURE = np.array([row.failure for row in OUTCOMES])
 _SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
 _PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")
@@ -228,9 +228,9 @@ def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples:
 def _first_ends(velocity: np.ndarray, status: np.ndarray) -> np.ndarray:
     """Histogram ranges from the first chunk; an error where not one of its samples is usable."""
     if velocity.shape[1] == 0:
-        told = ", ".join(f"{count} {name}" for name, count in named(np.bincount(status)).items())
+        counts = ", ".join(f"{count} {name}" for name, count in named(np.bincount(status)).items())
         raise RuntimeError(
-            f"Not one of the first {len(status)} samples gave a usable outcome: {told}."
+            f"Not one of the first {len(status)} samples gave a usable outcome: {counts}."
         )
     return bin_range(velocity)
 

@@ -131,8 +131,8 @@ class Store:
         self.folder.mkdir(parents=True, exist_ok=True)
         manifest = self.folder / MANIFEST
         if not any(self.folder.glob("chunk-*.npz")):  # nothing of any run is lost
-            told = {"format": FORMAT, "run": self.run, "identity": identity}
-            _write(manifest, json.dumps(told, indent=2).encode())
+            content = {"format": FORMAT, "run": self.run, "identity": identity}
+            _write(manifest, json.dumps(content, indent=2).encode())
         elif manifest.exists():
             _check_same(manifest, identity)
         else:
@@ -164,9 +164,9 @@ class Store:
             if int(arrays["number"]) != number:
                 raise ValueError(f"it is chunk {int(arrays['number'])} of this run")
         except UNUSABLE as error:
-            told = str(error) or type(error).__name__
+            text = str(error) or type(error).__name__
             warnings.warn(
-                f"'{path}' is not used, its samples are computed again: {told}.", stacklevel=2
+                f"'{path}' is not used, its samples are computed again: {text}.", stacklevel=2
             )
             return None
         chunk = chunk_from(arrays)
@@ -230,15 +230,15 @@ def _checksum(arrays: dict[str, np.ndarray], run: str) -> bytes:
 
 def _manifest(path: Path) -> dict[str, Any]:
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["format"] != FORMAT or not isinstance(told["identity"], dict):
-            raise ValueError(f"format {told['format']}")
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT or not isinstance(content["identity"], dict):
+            raise ValueError(f"format {content['format']}")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"'{path}' is damaged or of another version ({error}): give another folder, or delete "
             "this one."
         ) from None
-    return told
+    return text
 
 
 def _check_same(path: Path, identity: dict[str, str]) -> None:

@@ -160,20 +160,20 @@ class _Frame:
 
 
 def _line(
-    axes: Axes, frame: _Frame, start: np.ndarray, along: np.ndarray, text: str, style: str
+    axes: Axes, frame: _Frame, start: np.ndarray, direction: np.ndarray, text: str, style: str
 ) -> None:
     """A side of the set as a ray up to the circle, named beside its outer part."""
-    b = start @ along
+    b = start @ direction
     length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
-    end = start + length * along
+    end = start + length * direction
     if length < _SHORTEST * frame.radius:
         return
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
-    angle = np.degrees(np.arctan2(along[1], along[0]))
+    angle = np.degrees(np.arctan2(direction[1], direction[0]))
     angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
     share, side = (0.62, "top") if style == "-" else (0.3, "bottom")
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
-    _write(axes, start + share * length * along, text, color=GREY, **turned)
+    _write(axes, start + share * length * direction, text, color=GREY, **turned)
 
 
 def _projections(

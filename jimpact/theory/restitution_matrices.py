@@ -60,18 +60,18 @@ def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     m = _size(matrix)
     q = 0.5 * (matrix + matrix.T)
-    still = jax.lax.stop_gradient(q)
-    largest = jnp.abs(still).max()
-    still = still / jnp.where(largest > 0, largest, 1.0)
+    fixed = jax.lax.stop_gradient(q)
+    largest = jnp.abs(fixed).max()
+    fixed = fixed / jnp.where(largest > 0, largest, 1.0)
     supports = _supports(m).astype(q.dtype)
     inside = supports[:, :, None] * supports[:, None, :]
     outside = (m + 1.0) * (1 - supports)  # above every eigenvalue of Q_SS, which are at most m
-    blocks = inside * still[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
+    blocks = inside * fixed[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
     lowest = jnp.linalg.eigh(blocks)[1][:, :, 0] * supports
     lowest = lowest * jnp.where(jnp.sum(lowest, axis=1) < 0, -1.0, 1.0)[:, None]
     x = jnp.maximum(lowest, 0.0)
     x = x / jnp.linalg.norm(x, axis=1, keepdims=True)
-    best = x[jnp.argmin(jnp.einsum("si,ij,sj->s", x, still, x))]
+    best = x[jnp.argmin(jnp.einsum("si,ij,sj->s", x, fixed, x))]
     return best @ q @ best, best
 
 

@@ -158,9 +158,9 @@ class RockingDispersion(eqx.Module):
         ]
         for j, mu in enumerate(np.asarray(self.friction)):
             counts = np.bincount(found[:, j].ravel(), minlength=len(OUTCOMES))
-            told = ", ".join(f"{n} {name}" for name, n in zip(OUTCOMES, counts) if n)
+            shares = ", ".join(f"{n} {name}" for name, n in zip(OUTCOMES, counts) if n)
             critical = float(np.degrees(critical_kinetic_angle(mu)))
-            lines.append(f"mu = {mu:g}: critical angle {critical:.2f} degrees; {told}")
+            lines.append(f"mu = {mu:g}: critical angle {critical:.2f} degrees; {shares}")
         return "\n".join(lines)
 
 
