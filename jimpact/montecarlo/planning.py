@@ -241,19 +241,17 @@ def description(run: Run) -> str:
     """The run in one line."""
     sources, scene = run.plan.sources, run.plan.scene
     law = sources.law
-    name = type(law).__name__ if isinstance(law, Law) else _in_words(law)
+    name = type(law).__name__ if isinstance(law, Law) else _source(law)
     text = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
     for what in ("gaps", "velocity"):
         source = getattr(sources, what)
         if is_random(source):
             rows = run.rows.get(what)
-            text += f"; {what}: " + (
-                _in_words(source) if rows is None else f"{len(rows)} given rows"
-            )
+            text += f"; {what}: " + (_source(source) if rows is None else f"{len(rows)} given rows")
     return text
 
 
-def _in_words(source: Any) -> str:
+def _source(source: Any) -> str:
     if isinstance(source, eqx.Module):
         return repr(source)
     return f"function {getattr(source, '__qualname__', type(source).__name__)}"

@@ -238,7 +238,7 @@ def _manifest(path: Path) -> dict[str, Any]:
             f"'{path}' is damaged or of another version ({error}): give another folder, or delete "
             "this one."
         ) from None
-    return text
+    return content
 
 
 def _check_same(path: Path, identity: dict[str, str]) -> None:
