@@ -1,7 +1,7 @@
 """Public names and where they live: read by type checkers, and on import by `lazy_loader`."""
 
 from . import plot as plot, theory as theory
-from .audits import Audit as Audit, audit as audit, summary as summary
+from .audits import audit as audit, summary as summary
 from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
 from .bodies.blocks import Block as Block, rocking_block as rocking_block
 from .bodies.dimers import (
@@ -14,7 +14,6 @@ from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
 from .comparison import (
-    Comparison as Comparison,
     compare as compare,
     dispersion_index as dispersion_index,
     energy_ratio as energy_ratio,
@@ -28,7 +27,7 @@ from .contact import (
 )
 from .experiments import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import Fit as Fit, fit as fit
-from .histories import History as History, history as history
+from .histories import history as history
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .law import (
     REGISTRY as REGISTRY,
@@ -65,16 +64,11 @@ from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
 from .laws.poisson import Poisson as Poisson
 from .methods.advice import advise as advise
-from .methods.advice_report import Advice as Advice
 from .methods.chart import work_precision as work_precision
-from .methods.chart_record import WorkPrecision as WorkPrecision
-from .methods.stability import StabilityMap as StabilityMap, stability_map as stability_map
-from .methods.validity import ValidityMap as ValidityMap, validity_map as validity_map
+from .methods.stability import stability_map as stability_map
+from .methods.validity import validity_map as validity_map
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .montecarlo.gaps import (
-    Crossover as Crossover,
-    GapScale as GapScale,
-    GapSensitivity as GapSensitivity,
     crossover as crossover,
     gap_scale as gap_scale,
     gap_sensitivity as gap_sensitivity,
@@ -82,7 +76,7 @@ from .montecarlo.gaps import (
 from .montecarlo.results import MonteCarlo as MonteCarlo
 from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
-from .motion.fitting_motion import MotionFit as MotionFit, fit_motion as fit_motion
+from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
 from .motion.simulate import simulate as simulate
 from .motion.system import (
@@ -95,7 +89,7 @@ from .motion.system import (
     dimer_system as dimer_system,
     gravity as gravity,
 )
-from .motion.turning import TurningImpact as TurningImpact, turning_impact as turning_impact
+from .motion.turning import turning_impact as turning_impact
 from .scene import (
     Scene as Scene,
     chain as chain,
@@ -106,9 +100,6 @@ from .scene import (
     velocity_change as velocity_change,
 )
 from .status import STATUS as STATUS
-from .theory.han_gilmore_tree import (
-    HanGilmoreOutcome as HanGilmoreOutcome,
-    han_gilmore as han_gilmore,
-)
+from .theory.han_gilmore_tree import han_gilmore as han_gilmore
 
 __version__: str
