@@ -12,7 +12,7 @@
 """
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +23,6 @@ import numpy as np
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 
 _SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of M that rounding may cause in float32
-CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0
 
 _CONSTRAINTS = operator.attrgetter("constraints")
 _WALLS = {
@@ -165,44 +164,6 @@ def column(masses: Any, gaps: Any = None) -> Scene:
     2
     """
     return chain(masses, wall="right", gaps=gaps)
-
-
-def scene_from_gaps(
-    gap_function: Callable[[jax.Array], jax.Array],
-    mass: Any,
-    q: Any,
-    closed_below: float = CLOSED_BELOW,
-) -> Scene:
-    """Scene of a system at configuration `q`; the normals are the gradients of its gaps.
-
-    Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
-
-    Args:
-        gap_function: q (n,) -> gaps f(q) (m,) [m], written with jax.numpy.
-        mass: M (n,) or (n, n), or a function q -> M(q).
-        q: (n,) configuration.
-        closed_below: gaps with |f| up to this count as closed [m].
-
-    Raises:
-        ValueError: penetration (f < -closed_below), or what `Scene` refuses.
-
-    >>> import jax.numpy as jnp, jimpact as ji
-    >>> bouncing = ji.scene_from_gaps(lambda q: q[1:] - 0.5, [1.0, 1.0], [0.0, 0.5])
-    >>> bouncing.normals.tolist()
-    [[0.0], [1.0]]
-    """
-    q = as_float_array("q", q)
-    check_values("q", q)
-    f = jnp.atleast_1d(gap_function(q))
-    if not is_traced(f) and bool(jnp.any(f < -closed_below)):
-        worst = int(jnp.argmin(f))
-        raise ValueError(
-            f"Argument `q` must have no penetration (f >= -{closed_below:g} m), "
-            f"but gap {worst} has value {float(f[worst]):g} m."
-        )
-    normals = jax.jacobian(lambda x: jnp.atleast_1d(gap_function(x)))(q).T
-    gaps = jnp.where(f > closed_below, f, 0.0)
-    return Scene(mass(q) if callable(mass) else mass, normals, gaps=gaps)
 
 
 def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:

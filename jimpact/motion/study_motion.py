@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from jimpact.law import Law
-from jimpact.motion.bases import HarmonicBase
-from jimpact.motion.ready_systems import (
+from jimpact.motion.record import Motion
+from jimpact.motion.simulate import simulate
+from jimpact.motion.system import (
+    HarmonicBase,
+    System,
     ball_system,
     block_system,
     column_system,
     cradle_system,
     dimer_system,
 )
-from jimpact.motion.record import Motion
-from jimpact.motion.simulation import simulate
-from jimpact.motion.system import System
 from jimpact.study import check_keys, law_table, locate
 
 # kind -> builder, {key of the study: its argument}
