@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
+from jimpact.contact import coupled_groups
 from jimpact.status import CODE
 
 FOUR = ji.chain(np.ones(4))
@@ -124,3 +125,34 @@ def test_scenes_that_cannot_be_fitted_together():
     one = ji.Scene([1.0, 1.0], [[1.0], [0.0]], tangents=tangents)
     with pytest.raises(ValueError, match="equally many tangents a contact"):
         ji.Experiments(np.ones((2, 2)), np.ones((2, 2)), scenes=[one, ji.chain([1.0, 1.0])])
+
+
+PAIRS = np.array([[-1.0, 0.0, 0], [1, 0, 0], [0, -1, -1], [0, 1, 0], [0, 0, 1]])
+
+
+def test_contacts_that_do_not_feel_each_other_are_solved_apart():
+    """A pair and three balls in one scene; concrete it is solved in groups, traced as a whole."""
+    balls = ji.Scene([1.0, 2.0, 1.0, 0.5, 0.7], PAIRS)
+    assert [g.tolist() for g in coupled_groups(balls)] == [[[0, 3], [1, 2]]]
+    assert coupled_groups(ji.Scene(np.ones(3), [[-1.0, 0], [1, -1], [0, 1]])) is None
+    v, e = np.array([1.0, 0.2, 0.5, 0.1, -0.3]), np.array([0.9, 0.5, 0.3])
+    whole = jax.jit(lambda scene: ji.impact(ji.Newton(e), scene, v))(balls)
+    apart = ji.impact(ji.Newton(e), balls, v)
+    np.testing.assert_allclose(apart.velocity, whole.velocity, atol=1e-14)
+    np.testing.assert_allclose(apart.impulse, whole.impulse, atol=1e-14)
+
+
+def test_groups_with_friction_and_open_contacts():
+    normals, tangents = np.zeros((6, 3)), np.zeros((6, 3))
+    for j in range(3):
+        normals[2 * j + 1, j] = tangents[2 * j, j] = 1.0
+    tangents[1, 0] = 0.3
+    three = ji.Scene(np.linspace(1.0, 2.0, 6), normals, tangents=tangents, gaps=[0.0, 0.0, 0.1])
+    assert [g.tolist() for g in coupled_groups(three)] == [[[0], [1]]]
+    v = np.array([0.5, -1.0, 0.1, -1.0, 1.0, -1.0])
+    law = ji.Moreau([0.5, 0.2, 0.1], [0.3, 0.2, 0.1])
+    whole = jax.jit(lambda scene: ji.impact(law, scene, v))(three)
+    apart = ji.impact(law, three, v)
+    for name in ("velocity", "impulse", "tangential_impulse", "energy_change"):
+        np.testing.assert_allclose(getattr(apart, name), getattr(whole, name), atol=1e-14)
+    assert apart.velocity[4:].tolist() == [1.0, -1.0]
