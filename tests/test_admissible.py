@@ -10,7 +10,6 @@ from scipy.optimize import minimize, nnls
 
 import jimpact as ji
 from jimpact.fits.capped_polyhedron import CappedPolyhedron, cone_facets, least_squares
-from jimpact.plot.admissible import plot_admissible_set
 from jimpact.theory.admissible import admissible_set
 
 BALLS, V = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
@@ -338,7 +337,7 @@ def test_in_words():
             ),
             r"fewer redundant contacts: 24 contacts of rank 12",
         ),
-        (lambda: plot_admissible_set(THREE, {"x": [1.0]}), r"`outcomes`.*'x' has shape \(1,\)"),
+        (lambda: ji.plot.admissible_set(THREE, {"x": [1.0]}), r"`outcomes`.*'x' has shape \(1,\)"),
     ],
 )
 def test_bad_input(call, message):
@@ -400,7 +399,7 @@ def labels(figure):
 
 def test_picture_of_two_contacts(tmp_path):
     outcomes = {"A": [0.0, 0.0, 1.0], "gain": [0.0, 0.0, 1.1]}
-    figure = plot_admissible_set(THREE, outcomes)
+    figure = ji.plot.admissible_set(THREE, outcomes)
     (axes,) = figure.axes
     assert labels(figure)[-2:] == ["A", "gain (not admissible)"]
     drawn = {line.get_label(): line.get_xydata() for line in axes.get_lines()}
@@ -421,10 +420,10 @@ def test_picture_of_two_contacts(tmp_path):
 def test_picture_of_other_numbers_of_contacts():
     for masses, panels in (([1.0, 1.0], 1), (np.ones(4), 3), (np.ones(7), 6)):
         v = np.eye(len(masses))[0]
-        figure = plot_admissible_set(admissible_set(ji.chain(masses), v), {"stays": v}, "title")
+        figure = ji.plot.admissible_set(admissible_set(ji.chain(masses), v), {"stays": v}, "title")
         visible = [axes for axes in figure.axes if axes.get_visible()]
         assert len(visible) == panels + 1  # and the colour bar
         assert labels(figure) == ["stays (not admissible)"]
         assert figure.get_suptitle() == "title"
     resting = admissible_set(ji.chain([1.0, 1.0], gaps=[1.0]), [0.0, 0.0])
-    assert plot_admissible_set(resting).axes
+    assert ji.plot.admissible_set(resting).axes

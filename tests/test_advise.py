@@ -9,12 +9,10 @@ import pytest
 
 import jimpact as ji
 from jimpact.commands.advise import run as run_command
-from jimpact.methods.advice.advising import advise
-from jimpact.methods.advice.evidence import outcomes
-from jimpact.methods.advice.structure import situation
-from jimpact.methods.advice.validity import validity_map
-from jimpact.methods.advice.words import share
-from jimpact.plot.validity import plot_advice, plot_validity_map
+from jimpact.methods.advice import advise
+from jimpact.methods.advice_evidence import outcomes, situation
+from jimpact.methods.advice_report import share
+from jimpact.methods.validity import validity_map
 from jimpact.theory.linear_chain import newby_ratio
 
 BALLS, V = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
@@ -328,7 +326,7 @@ def test_report_and_picture(unknown):
     assert max(len(line) for line in text.splitlines()) <= 100
     assert len(text.splitlines()) < 25
     assert "*lzb" in text
-    axes = plot_advice(unknown, "balls").axes
+    axes = ji.plot.advice(unknown, "balls").axes
     assert len(axes) == 2
     assert "NOT within 1 %" in text
     assert "not within 1 %" in axes[0].get_title(loc="left")
@@ -389,7 +387,7 @@ def test_where_a_law_may_be_used(valid):
             assert error[i, at + step] > 0.05
     assert np.isnan(valid.limit("moreau", 1e-6)[1:]).all()
     assert "ratio <= 0.001" in str(valid).splitlines()[1]
-    figure = plot_validity_map(valid)
+    figure = ji.plot.validity_map(valid)
     assert len(figure.axes) == 2
     json.dumps(valid.to_dict())
     with pytest.raises(ValueError, match="`law` must be one of moreau, binary"):

@@ -15,11 +15,10 @@ import pytest
 import jimpact as ji
 import jimpact.methods.contenders.base
 from jimpact.commands.chart import run
-from jimpact.methods.charts.chart import work_precision
-from jimpact.methods.charts.record import QUANTITIES
-from jimpact.methods.charts.timing import in_turns
+from jimpact.methods.chart import work_precision
+from jimpact.methods.chart_programs import in_turns
+from jimpact.methods.chart_record import QUANTITIES
 from jimpact.methods.contenders import METHODS, outcome, time_scale
-from jimpact.plot.chart import plot_work_precision
 from jimpact.status import STATUS
 
 pytestmark = pytest.mark.slow  # compiles every method
@@ -268,7 +267,7 @@ def test_table_json_and_picture(found):
     told = json.loads(json.dumps(found.to_dict()))
     assert told["points"]["verlet"][0]["error"].keys() == set(QUANTITIES)
     assert told["points"]["binary"][0]["evaluations"] is None
-    figure = plot_work_precision(found, "three balls")
+    figure = ji.plot.work_precision(found, "three balls")
     assert len(figure.axes) == 4
     labels = [text.get_text() for text in figure.axes[3].get_legend().get_texts()]
     assert labels == [row[0].label for row in found.points.values()]
@@ -280,7 +279,7 @@ def test_picture_without_gradients(found):
         name: tuple(dataclasses.replace(point, gradient=None) for point in row)
         for name, row in found.points.items()
     }
-    figure = plot_work_precision(dataclasses.replace(found, points=points))
+    figure = ji.plot.work_precision(dataclasses.replace(found, points=points))
     left, right, legend = figure.axes
     assert all(axes.lines for axes in (left, right))
     assert "gradient" not in left.get_xlabel() + right.get_xlabel()

@@ -8,17 +8,14 @@ import pytest
 import jimpact as ji
 from jimpact.contact import kinetic_norm, normalized_delassus
 from jimpact.scene import kinetic_energy, velocity_change
-from jimpact.theory.copositive import copositivity, margin
-from jimpact.theory.friction_consistency import (
-    friction_bounds,
-    friction_energy_change,
-    friction_impulses,
-)
+from jimpact.theory.friction import friction_bounds, friction_energy_change, friction_impulses
 from jimpact.theory.quasi_velocities import from_quasi_velocities, quasi_basis, to_quasi_velocities
-from jimpact.theory.restitution_audit import (
+from jimpact.theory.restitution_matrices import (
     audit_matrix,
     carnot_energy_loss,
+    copositivity,
     dissipation_matrix,
+    margin,
 )
 
 MARGIN = jax.jit(margin)

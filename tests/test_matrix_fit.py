@@ -13,7 +13,7 @@ from jimpact.fits.fitting import fit
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.solvers.tridiagonal import as_matrix
-from jimpact.theory.copositive import margin
+from jimpact.theory.restitution_matrices import margin
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])
 E_TRUE = np.array([[0.3, 0.1], [0.5, 0.4]])

@@ -10,14 +10,14 @@ import time
 import numpy as np
 import pytest
 
+import jimpact as ji
 from jimpact.cli import main
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.kinematic import Newton
 from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
-from jimpact.montecarlo.executors.serial import Serial
+from jimpact.montecarlo.executors import Serial
 from jimpact.montecarlo.running import monte_carlo
-from jimpact.plot.montecarlo import plot_monte_carlo
 from jimpact.scene import chain
 from jimpact.study import read_study
 
@@ -208,11 +208,11 @@ def test_pictures_of_one_gap_and_of_none():
     one = monte_carlo(
         Newton(0.5), pair, Normal([1.0, 0.0], 0.1), Uniform(0.0, 1e-3), samples=50, chunk=64
     )
-    figure = plot_monte_carlo(one, "one gap")
+    figure = ji.plot.monte_carlo(one, "one gap")
     assert figure.axes[-1].get_xlabel() == "gap 1 [µm]"
     assert len(figure.axes) == 3
     none = monte_carlo(Newton(0.5), pair, Normal([1.0, 0.0], 0.1), samples=50, chunk=64)
-    figure = plot_monte_carlo(none)
+    figure = ji.plot.monte_carlo(none)
     assert len(figure.axes) == 2
     shown = figure.axes[0].patches[0].get_data()
     np.testing.assert_allclose(shown.values.sum(), 100.0)

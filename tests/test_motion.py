@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
+from jimpact.bodies.base import LinearPotential
 from jimpact.motion.record import EVENT_KINDS, KIND_CODE, MOTION_CODE
-from jimpact.motion.system import LinearPotential
 
 G = 9.80665
 

@@ -12,7 +12,7 @@ import jimpact as ji
 from jimpact.cli import main
 from jimpact.motion.record import EVENT_KINDS, MOTION_CODE
 from jimpact.motion.study_motion import read_motion_study
-from jimpact.theory.rocking_ratios import housner_restitution, rocking_matrix
+from jimpact.theory.rocking import housner_restitution, rocking_matrix
 
 G = 9.80665
 

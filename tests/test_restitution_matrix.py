@@ -10,7 +10,7 @@ from jimpact.contact import kinetic_norm, normalized_delassus
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import CODE
 from jimpact.theory.quasi_velocities import from_quasi_velocities, to_quasi_velocities
-from jimpact.theory.rocking_ratios import housner_restitution, rocking_matrix, rocking_ratios
+from jimpact.theory.rocking import housner_restitution, rocking_matrix, rocking_ratios
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])
 E2 = jnp.array([[0.7, 0.1], [0.25, 0.6]])

@@ -17,10 +17,9 @@ import pytest
 
 import jimpact as ji
 from jimpact.methods.contenders import METHODS
-from jimpact.methods.stability.causes import frequencies
-from jimpact.methods.stability.mapping import stability_map
-from jimpact.methods.stability.points import chain_of, setting_of
-from jimpact.methods.stability.runs import CLASSES
+from jimpact.methods.stability import stability_map
+from jimpact.methods.stability_points import CLASSES, chain_of, setting_of
+from jimpact.methods.stability_references import frequencies
 from jimpact.status import STATUS
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))

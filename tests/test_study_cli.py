@@ -9,7 +9,6 @@ import pytest
 
 import jimpact as ji
 from jimpact.cli import main
-from jimpact.plot.fits import plot_fit
 from jimpact.study import read_study
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.2,0.8\n2,0,0.4,1.6\n"
@@ -244,7 +243,7 @@ def test_pictures_are_drawn_for_few_and_many_shots(shots, tmp_path):
     if shots > 1:
         post[0, 0] = np.nan
     found = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), ji.Experiments(pre, post), starts=1)
-    figure = plot_fit(found, {"the same": found}, title="simulated")
+    figure = ji.plot.fit(found, {"the same": found}, title="simulated")
     top, bottom = figure.axes
     assert top.get_ylabel().endswith("[m/s]")
     assert bottom.get_ylabel().endswith("[m/s]")
