@@ -14,7 +14,9 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
     over(modes, y, passes)     -> (1, B): nothing is left to integrate
     finish(modes, y)           -> (modes, y) where it is over
+    allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
     tolerance (1, B), snap (1, B), root, contacts
+    longest                    the longest step in the flow's own time that is stable
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
 
@@ -72,6 +74,7 @@ class Flow(Protocol):
 
     tolerance: jax.Array
     root: int
+    longest: float
 
     @property
     def contacts(self) -> int: ...
@@ -84,6 +87,7 @@ class Flow(Protocol):
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]: ...
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float: ...
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array: ...
     def coasts(self, modes: jax.Array) -> jax.Array | None: ...
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array: ...
@@ -202,7 +206,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     full = FULL * flow.contacts
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
-    scale = local + COARSE_ROUNDING * eps * jnp.abs(y)
+    scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale, axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
     ok = error2 <= 1
@@ -250,6 +254,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     restart = root_of(jnp.minimum(RESTART * span, FIRST), r)
     in_root, xi = in_root | fresh, jnp.where(fresh, 0.0, xi)
     h = jnp.where(fresh & (restart > 0), restart, h)
+    h = jnp.where(in_root, h, jnp.minimum(h, flow.longest))
     new_span = jnp.where(in_root, (xi + h) ** r - xi**r, h)
     coasts = flow.coasts(s.modes)
     reached = (first - 1) * span < new_span
