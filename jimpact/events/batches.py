@@ -133,10 +133,10 @@ def _wider(
             x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
         else:
             x = jnp.moveaxis(x, axis, -2)
-        return x.reshape(*x.shape[:-2], -1)
+        return x.reshape(*x.shape[:-2], size * x.shape[-1])
 
     outs = in_columns(function, *map(wide, arrays, axes))
-    apart = [out.reshape(*out.shape[:-1], size, -1) for out in outs]
+    apart = [out.reshape(*out.shape[:-1], size, out.shape[-1] // size) for out in outs]
     return [jnp.moveaxis(out, -2, 0) for out in apart], [0] * len(apart)
 
 

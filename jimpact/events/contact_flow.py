@@ -370,7 +370,8 @@ class ContactFlow:
         if not self.closed_form:
             return ~any_of(works)
         # |G| and min(G, 0), both with a unit diagonal
-        felt = self.coupling.magnitude().times(works.astype(y.dtype)) - works > 0
+        load = works.astype(y.dtype)
+        felt = self.coupling.magnitude().times(load) - load > 0
         change = rebound - gamma
         left = gamma + self.coupling.pull().times(change) - change
         return ~any_of(jnp.where(works, felt, left < -tolerance))

@@ -105,7 +105,7 @@ class FrictionFlow(ContactFlow):
         f = self.force(const, x, g)
         most = self.friction * f
         stick = (modes[2 * m :] == 0) & self.loaded(modes)
-        sliding = jnp.where(stick, 0.0, -modes[2 * m :] * most)
+        sliding = jnp.where(stick, 0.0, -modes[2 * m :].astype(most.dtype) * most)
         missing = times(jnp.swapaxes(self.across, 0, 1), f) + times(self.along, sliding)
         holding = self.holding(jnp.where(stick, -missing, 0.0), stick, most)
         return f, most, jnp.where(stick, holding, sliding), stick
@@ -144,7 +144,7 @@ class FrictionFlow(ContactFlow):
         return jnp.concatenate(
             [
                 super().margins(const, modes, y),
-                jnp.where(slides, modes[2 * m :] * self.slip(y), 1.0),
+                jnp.where(slides, modes[2 * m :].astype(y.dtype) * self.slip(y), 1.0),
                 jnp.where(stick, most - jnp.abs(side), 1.0),
             ]
         )
@@ -185,7 +185,7 @@ class FrictionFlow(ContactFlow):
         top = jnp.max(f, axis=0, keepdims=True)
         f = f / jnp.where(top > 0, top, 1.0)
         most = still.friction * f
-        slides = jnp.where(asked | ~loaded, 0.0, -slip * most)
+        slides = jnp.where(asked | ~loaded, 0.0, -slip.astype(u.dtype) * most)
         b = times(jnp.swapaxes(still.across, 0, 1), f) + times(still.along, slides)
         stick, towards = distribute(still.along, b, most, asked)
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))

@@ -112,7 +112,7 @@ def dimensionless(
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
-    step = jax.lax.stop_gradient(rtol * min(1.0, 2 / m) / weight)
+    step = jax.lax.stop_gradient(rtol * min(1.0, 2 / m) / jnp.max(weight))
     problem = Problem(
         beside=beside,
         omega=omega,
@@ -134,8 +134,8 @@ def sides_of(contact: Contact, friction: jax.Array, units: Units) -> Sides:
     assert contact.slip is not None
     root = jnp.repeat(units.root, contact.tangents)
     return Sides(
-        contact.cross / (units.root[:, None] * root),
-        contact.tangential / (root[:, None] * root),
+        contact.cross / (units.root[:, None] * root[None]),
+        contact.tangential / (root[:, None] * root[None]),
         friction * jnp.ones_like(units.root),
         contact.slip / (root * units.velocity),
     )

@@ -159,7 +159,7 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     slopes, rates = jax.lax.scan(stage, none, rows)
-    return length * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
+    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
 
 
 class Carry(NamedTuple):
@@ -207,7 +207,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
-    fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale, axis=1))
+    fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
     ok = error2 <= 1
     factor = jnp.clip(
@@ -265,7 +265,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     in_root = in_root & ~aim
     due = jnp.where(event, first, first - 1) * span
     clock = jnp.concatenate([xi, h, in_root.astype(dtype), aim.astype(dtype)])
-    passes = passes + active
+    passes = passes + active.astype(dtype)
     over = flow.over(modes, y, passes)
     plan = jnp.concatenate(
         [
@@ -318,7 +318,8 @@ def record(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> tuple[Carry
         # a pass that no impact of the batch accepts leaves its row to the next one
         index = jnp.minimum(count, size - 1)
         plan = Plan(
-            _put(plan.marks, marks * accept, index), _put(plan.clock, s.clock * accept, index)
+            _put(plan.marks, jnp.where(accept, marks, 0), index),
+            _put(plan.clock, jnp.where(accept, s.clock, 0.0), index),
         )
         count = count + jnp.any(accept).astype(count.dtype)
         return after, plan, count, lost | (accept & (count > size))
@@ -329,7 +330,7 @@ def record(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> tuple[Carry
         (start, plan, jnp.zeros((), jnp.uint32), jnp.zeros(y[:1].shape, bool)),
     )
     # an impact of more steps than there are rows has no derivative: NaN, not a wrong number
-    return end, Plan(plan.marks, jnp.where(lost, jnp.nan, plan.clock))
+    return end, Plan(plan.marks, jnp.where(lost[None], jnp.nan, plan.clock))
 
 
 def repeat(
