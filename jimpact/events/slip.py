@@ -136,9 +136,9 @@ def pseudoinverse(k: jax.Array, held: jax.Array) -> jax.Array:
     """Of the positive semidefinite rows and columns `held` of (t, t, B): least forces."""
     both = held[:, None] & held[None]
     k = jnp.where(both, k, 0.0)
-    size = jnp.max(jnp.abs(k), axis=(0, 1))
+    size = jnp.max(jnp.abs(k), axis=(0, 1), keepdims=True)
     part = SINGULAR * math.sqrt(float(jnp.finfo(k.dtype).eps)) * jnp.where(size > 0, size, 1.0)
-    damped = inverse(k + unit(k) * jnp.where(held, part, 1.0)[:, None])
+    damped = inverse(k + unit(k) * jnp.where(held[:, None], part, 1.0))
     z = product(damped, product(k, damped))
     for _ in range(REFINEMENTS):  # of Newton and Schulz
         z = 2 * z - product(z, product(k, z))
@@ -234,7 +234,6 @@ class SlipFlow(FrictionFlow):
 
     def motion(self, const: Reduced, modes: jax.Array, y: jax.Array) -> Motion:
         """Forces, and how fast slip changes."""
-        m = self.contacts
         frozen = const.frozen
         x, g, _ = self.rows(y)
         stick, slips, creeps = self.sliding(modes)
@@ -243,20 +242,10 @@ class SlipFlow(FrictionFlow):
         c = jnp.where(slides, self.friction * f, 0.0)
         angle, r = jnp.where(slides, q[:, 1], 0.0), self.speed(modes, q)
         over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
-
-        def accelerations(f: jax.Array, side: jax.Array) -> jax.Array:
-            return pairs(times(const.pull, f) + times(const.along, flat(side)))
-
-        along, right = polar(angle)
-        a = accelerations(f, -c[:, None] * along)
-        grows, turns = dot(along, a), dot(right, a)
-        blocks = const.along.reshape(m, 2, m, 2, *y.shape[1:])
-        own = sum(blocks[jnp.arange(m), i, jnp.arange(m), i] for i in range(2)) / 2
-        stiffness = c * own
-        drift, correction = self._creep(const, f, c, angle, r * creeps, over_r * turns, creeps, y)
+        drift, correction = self._creep(const, modes, y, f, c, angle, over_r)
         along, right = polar(angle + correction)
-        side = -c[:, None] * along
-        a = accelerations(f, side)
+        side = flat(-c[:, None] * along)
+        a = pairs(times(const.pull, f) + times(const.along, side))
         grows, turns = dot(along, a), dot(right, a)
         rate = jnp.stack(
             [
@@ -265,65 +254,71 @@ class SlipFlow(FrictionFlow):
             ],
             1,
         )
-        rate = jnp.where(self.loaded(modes)[:, None], rate, frozen.unit * a)
+        rate = jnp.where(self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a)
+        own = self._blocks(const)
+        stiffness = c * jnp.stack([own[j, 0, j, 0] + own[j, 1, j, 1] for j in range(len(c))]) / 2
         haste = 1 + total(over_r * (length(a) + 2 * stiffness))
-        side = flat(side)
         holding = -(times(const.held, f) + times(const.carried, side))
         return Motion(f, side, jnp.where(twice(stick), holding, 0.0), rate, stiffness, haste)
+
+    def _blocks(self, const: Reduced) -> jax.Array:
+        """K_tt (m, 2, m, 2, B)."""
+        m = self.contacts
+        return const.along.reshape(m, 2, m, 2, *const.along.shape[2:])
 
     def _creep(
         self,
         const: Reduced,
+        modes: jax.Array,
+        y: jax.Array,
         f: jax.Array,
         c: jax.Array,
         angle: jax.Array,
-        r: jax.Array,
-        spin: jax.Array,
-        creeps: jax.Array,
-        y: jax.Array,
+        over_r: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        """How fast the directions of creep drift, and where they are beside `angle`.
+        """How fast the directions (m, B) of creep drift, and where they are beside `angle`.
 
-        With G = n . a (of all contacts that creep), G' at fixed angles and J = -dG/d angle, the
-        quasi-static solution G = 0 drifts by J^-1 G'. Beside it directions lag by
+        With G = n . a of all contacts that creep, G' at fixed angles and J = -dG/d angle, the
+        quasi-static solution G = 0 drifts by J^-1 G'. The directions lag behind it by
         (J + diag(r'))^-1 r drift, as r angle' = G and r grows at the rate r'.
         """
-        m = self.contacts
         frozen = const.frozen
         x, g, _ = self.rows(y)
+        *_, creeps = self.sliding(modes)
+        r = jnp.where(creeps, self.slip(y)[:, 0], 0.0)
         along, right = polar(angle)
+
+        def acceleration(f: jax.Array, side: jax.Array) -> jax.Array:
+            return pairs(times(const.pull, f) + times(const.along, flat(side)))
+
         side = -c[:, None] * along
-        pulled = times(const.coupling, f) + times(const.across, flat(side))
-        _, df = jax.jvp(
-            lambda x, g: self.force(frozen, x, g), (x, g), (frozen.closing * g, frozen.ratio * pulled)
-        )
+        a = acceleration(f, side)
+        grows, turns = dot(along, a), dot(right, a)
+        pull = times(const.coupling, f) + times(const.across, flat(side))
+        rates = (frozen.closing * g, frozen.ratio * pull)
+        _, df = jax.jvp(lambda x, g: self.force(frozen, x, g), (x, g), rates)
         dc = jnp.where(c > 0, self.friction * df, 0.0)
-
-        def across(f: jax.Array, side: jax.Array) -> tuple[jax.Array, jax.Array]:
-            a = pairs(times(const.pull, f) + times(const.along, flat(side)))
-            return dot(along, a), dot(right, a)
-
-        grows, turns = across(f, side)
-        _, changes = across(df, -dc[:, None] * along - (c * spin)[:, None] * right)
-        blocks = const.along.reshape(m, 2, m, 2, *y.shape[1:])
-        turned = sum(
-            right[:, i][:, None] * blocks[:, i, :, j] * right[:, j][None]
+        turned = (c * over_r * turns)[:, None] * right  # of those that slip
+        changes = dot(right, acceleration(df, -dc[:, None] * along - turned))
+        # all in units of the largest entry: forces begin at 0
+        blocks = self._blocks(const)
+        j = sum(
+            right[:, i][:, None] * blocks[:, i, :, k] * right[:, k][None]
             for i in range(2)
-            for j in range(2)
+            for k in range(2)
         )
-        j = jnp.where(creeps[:, None] & creeps[None], turned * c[None], 0.0)
-        eye = unit(j)
-        size = jnp.max(jnp.abs(j), axis=(0, 1)) + jnp.max(jnp.abs(grows), axis=0)
+        j = jnp.where(creeps[:, None] & creeps[None], j * c[None], 0.0)
+        size = jnp.max(jnp.max(jnp.abs(j), axis=1) + jnp.abs(grows), axis=0, keepdims=True)
         size = jnp.where(size > 0, size, 1.0)
-        growth = jnp.where(creeps, grows / size + LEAST_STIFFNESS, 1.0)
-        j = j / size + eye * growth[:, None]
+        growth = jnp.where(creeps, grows / size, 0.0)
+        j, eye = j / size[None], unit(j)
         turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
-        drift, newton = solve(j, changes, turns)
-        slower = frozen.unit * (j + eye * jnp.where(creeps, growth, 0.0)[:, None])
-        slower = jnp.where(creeps[:, None], slower, eye) + eye * LEAST_STIFFNESS
-        (lag,) = solve(slower, r * drift / size)
-        correction = jnp.where(creeps, jnp.clip(newton - lag, -1.0, 1.0), 0.0)
-        return jnp.where(creeps, drift, 0.0), correction
+        away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
+        drift, newton = solve(j + eye * (growth + away)[:, None], changes, turns)
+        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (j + eye * (2 * growth + away)[:, None])
+        (lag,) = solve(lagging + eye * LEAST_STIFFNESS, r * drift / size)
+        correction = jnp.clip(newton - lag, -1.0, 1.0)
+        return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
     def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
         _, g, _ = self.rows(y)
