@@ -192,6 +192,7 @@ class ContactFlow:
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
 
     longest = math.inf  # no rate is large beside the others
+    near = 0.0  # landings start from anywhere in a step
 
     @property
     def exponent(self) -> Exponent:

@@ -360,9 +360,13 @@ class SlipFlow(FrictionFlow):
         stick, slips, creeps = self.sliding(modes)
         loaded, q, slip = self.loaded(modes), self.slip(y), modes[2 * m :]
         cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
-        holding = pairs(self.motion(self.constants(modes), modes, y).holding)
         breaks, grows = stick & ended, creeps & ended
-        away = angle_of(jnp.where(breaks[:, None], -holding, 0.0))
+        # a contact breaks loose against the force that held it, and Newton's method sees to the rest
+        const = self.constants(modes)
+        f = self.force(const.frozen, *self.rows(y)[:2])
+        side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * polar(q[:, 1])[0]
+        pulled = pairs(times(const.held, f) + times(const.carried, flat(side)))
+        away = angle_of(jnp.where(breaks[:, None], pulled, 0.0))
         logarithm = jnp.log(jnp.where(grows, q[:, 0], 1.0))
         q = jnp.where(breaks[:, None], jnp.stack([jnp.zeros_like(away), away], 1), q)
         q = jnp.where(grows[:, None], jnp.stack([logarithm, q[:, 1]], 1), q)
