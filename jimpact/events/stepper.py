@@ -153,16 +153,17 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
         xi = start + c * length
         now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
         dy = flow.field(const, s.modes, now)
-        dc = jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))[1]
+        margins = lambda z: flow.margins(const, s.modes, z)
+        value, dc = jax.jvp(margins, (now,), (dy,))
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate
-        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), dc if ends else None
+        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), (value, dc) if ends else None
 
     none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     slopes, rates = jax.lax.scan(stage, none, rows)
-    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
+    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates
 
 
 class Carry(NamedTuple):
@@ -201,10 +202,9 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
-    sums, c0, rates, const = _stages(flow, s, y, ends=True)
-    d0, d1 = rates[0], rates[-1]
+    sums, c0, (values, rates) = _stages(flow, s, y, ends=True)
+    c1, d0, d1 = values[-1], rates[0], rates[-1]
     end = y + sums[0, :n]
-    c1 = flow.margins(const, s.modes, end)
     eps = float(jnp.finfo(dtype).eps)
     full = FULL * flow.contacts
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
