@@ -28,6 +28,7 @@ from jimpact.events.contact_flow import (
     unit,
 )
 from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.slip import SlipFlow
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -176,7 +177,8 @@ def flow_of(
         flow = ContactFlow(**parts)
         return flow, *flow.start(problem.gamma, x)
     across, along, friction, slip = problem.sides
-    frictional = FrictionFlow(**parts, across=across, along=along, friction=friction)
+    kind = FrictionFlow if len(slip) == m else SlipFlow
+    frictional = kind(**parts, across=across, along=along, friction=friction)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
 
 
