@@ -116,7 +116,11 @@ def test_against_the_plain_reference(order):
 def test_sequence():
     """Contacts in their order, with times and velocities; two collisions are (6.13), corrected."""
     rng = np.random.default_rng(1)
-    masses, gaps, e = 10.0 ** rng.uniform(-0.5, 0.5, 5), rng.uniform(0, 1, 4), rng.uniform(0.3, 1, 4)
+    masses, gaps, e = (
+        10.0 ** rng.uniform(-0.5, 0.5, 5),
+        rng.uniform(0, 1, 4),
+        rng.uniform(0.3, 1, 4),
+    )
     v = -np.sort(rng.normal(size=5))
     scene = ji.chain(masses, gaps=gaps)
     steps = ji.Binary(e, "earliest").sequence(scene, v)

@@ -122,7 +122,9 @@ def test_least_norm_of_many():
     @jax.vmap
     def impulse(normals, v):
         scene = ji.Scene(jnp.eye(3), normals)
-        outs = [ji.impact(law, scene, v) for law in (ji.Newton(0.5), ji.Moreau(0.5), ji.Poisson(0.5))]
+        outs = [
+            ji.impact(law, scene, v) for law in (ji.Newton(0.5), ji.Moreau(0.5), ji.Poisson(0.5))
+        ]
         return jnp.stack([out.impulse for out in outs]), jnp.stack([out.status for out in outs])
 
     v = np.array([[-1.0, 0, 0], [-1.0, -0.05, 0.0]])
@@ -154,7 +156,9 @@ def test_derivatives_at_a_kink_are_one_sided():
     """Contact 2 takes part while v3 < 1/2: p2 = max(0, (1 - 2 v3) / 3)."""
 
     def p2(v3):
-        return ji.impact(ji.Moreau(0.0), ji.chain(jnp.ones(3)), jnp.stack([1.0, 0.0, v3])).impulse[1]
+        return ji.impact(ji.Moreau(0.0), ji.chain(jnp.ones(3)), jnp.stack([1.0, 0.0, v3])).impulse[
+            1
+        ]
 
     low, at, high = jax.jit(jax.vmap(jax.grad(p2)))(jnp.array([0.5 - 1e-9, 0.5, 0.5 + 1e-9]))
     assert float(low) == pytest.approx(-2 / 3)

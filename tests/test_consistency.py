@@ -4,22 +4,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import kinetic_norm
 
 import jimpact as ji
-from jimpact.contact import kinetic_norm, normalized_delassus
-from jimpact.scene import kinetic_energy, velocity_change
-from jimpact.theory.copositive import copositivity, margin
-from jimpact.theory.friction_consistency import (
+from jimpact import (
+    audit_matrix,
+    carnot_energy_loss,
+    copositivity,
+    dissipation_matrix,
     friction_bounds,
     friction_energy_change,
     friction_impulses,
+    from_quasi_velocities,
+    kinetic_energy,
+    normalized_delassus,
+    quasi_basis,
+    to_quasi_velocities,
+    velocity_change,
 )
-from jimpact.theory.quasi_velocities import from_quasi_velocities, quasi_basis, to_quasi_velocities
-from jimpact.theory.restitution_audit import (
-    audit_matrix,
-    carnot_energy_loss,
-    dissipation_matrix,
-)
+from jimpact.theory.copositive import margin
 
 MARGIN = jax.jit(margin)
 HORN = np.array(

@@ -10,14 +10,11 @@ import time
 import pytest
 
 import jimpact.montecarlo.executors
-from jimpact.laws.binary import Binary
-from jimpact.montecarlo.distributions import RandomLaw, Uniform
+from jimpact import Binary, RandomLaw, Uniform, chain, monte_carlo
 from jimpact.montecarlo.executors import Executor, as_executor
 from jimpact.montecarlo.executors.devices import Devices
 from jimpact.montecarlo.executors.serial import Serial
 from jimpact.montecarlo.fingerprints import fingerprint
-from jimpact.montecarlo.running import monte_carlo
-from jimpact.scene import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
 

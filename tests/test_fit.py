@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from programs import CODE, as_matrix
 from scipy import stats
 
 import jimpact as ji
-from jimpact.law import Law
-from jimpact.solvers.tridiagonal import as_matrix
-from jimpact.status import CODE
+from jimpact import Law
 
 DATA = files("jimpact") / "data"
 PAIR = ji.chain([1.0, 2.0])

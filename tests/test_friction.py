@@ -269,9 +269,7 @@ def test_outcomes_satisfy_the_kinematic_law(name, rows):
         for i in range(64):  # `infeasible` exactly where no pattern is consistent
             mass, normals, tangents, v = (x[i] for x in scenes)
             both = np.concatenate([normals, tangents], axis=1)
-            given = np.concatenate(
-                [(1 + e[i]) * (normals.T @ v), (1 + e_t) * (tangents.T @ v)]
-            )
+            given = np.concatenate([(1 + e[i]) * (normals.T @ v), (1 + e_t) * (tangents.T @ v)])
             several = solutions(both.T @ np.linalg.solve(mass, both), given, mu[i])
             assert (several == 0) == (names(out.status[i]) == ["infeasible"])
             if several > 1:
@@ -413,9 +411,9 @@ def test_lzb_without_friction():
     """mu = 0 is the frictionless law; no tangents are needed without `friction`."""
     (mass, normals, tangents, v), e, _, k = random_scenes(16, seed=8)
     none, _ = run("lzb", mass, normals, tangents, v, e, np.zeros((16, 2)), k=k)
-    bare = jax.jit(
-        jax.vmap(lambda m, n, v, e, k: ji.impact(ji.LZB(e, k, 1.5), ji.Scene(m, n), v))
-    )(mass, normals, v, e, k)
+    bare = jax.jit(jax.vmap(lambda m, n, v, e, k: ji.impact(ji.LZB(e, k, 1.5), ji.Scene(m, n), v)))(
+        mass, normals, v, e, k
+    )
     good = ~failed(bare.status) & ~failed(none.status)
     assert good.sum() >= 15
     close(none.velocity[good], np.asarray(bare.velocity)[good], atol=1e-7)
@@ -456,9 +454,9 @@ def test_derivatives(name, kind):
     rng = np.random.default_rng(1)
     way = [0.3 * rng.normal(size=np.shape(y)) for y in x]
     step = 1e-3
-    moved = [
-        [np.concatenate([y + s * step * d for s in (2, 1, -1, -2)]) for y, d in zip(x, way)]
-    ][0]
+    moved = [[np.concatenate([y + s * step * d for s in (2, 1, -1, -2)]) for y, d in zip(x, way)]][
+        0
+    ]
     four = [np.concatenate([y] * 4) for y in scenes[:3]]
     out, _ = run(name, *four, moved[0], moved[1], moved[2], k=moved[3])
     f, fine = out.velocity.reshape(4, 8, n), ~failed(out.status).reshape(4, 8).any(axis=0)

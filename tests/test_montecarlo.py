@@ -15,21 +15,25 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from jimpact import (
+    Binary,
+    Compliant,
+    Hertz,
+    Newton,
+    Normal,
+    RandomLaw,
+    Uniform,
+    chain,
+    gap_scale,
+    gap_sensitivity,
+    impact,
+    monte_carlo,
+    read_samples,
+)
 from jimpact.comparison import registered_laws
-from jimpact.impacts import impact
-from jimpact.laws.binary import Binary
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Hertz
-from jimpact.laws.kinematic import Newton
 from jimpact.montecarlo import histograms, store
-from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
 from jimpact.montecarlo.fingerprints import fingerprint
-from jimpact.montecarlo.gap_scales import gap_scale
-from jimpact.montecarlo.gap_sensitivities import gap_sensitivity
 from jimpact.montecarlo.moments import merged, moments
-from jimpact.montecarlo.running import monte_carlo
-from jimpact.montecarlo.store import read_samples
-from jimpact.scene import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
 LAW = Binary(1.0, order="earliest")

@@ -75,14 +75,10 @@ def test_compare_and_the_registry(registered):
 def test_it_is_fitted_within_its_domain():
     pre = np.array([[1.0, 0.0, -0.5], [2.0, 0.5, 0.0], [1.0, 0.2, -1.0]])
     post = np.array([ji.impact(Blended(0.8, 0.25), BALLS, v).velocity for v in pre])
-    found = ji.fit(
-        Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2
-    )
+    found = ji.fit(Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2)
     np.testing.assert_allclose(found.value, [0.25], atol=1e-9)
     post = np.array([ji.impact(ji.Newton(0.1), BALLS, v).velocity for v in pre])
-    edge = ji.fit(
-        Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2
-    )
+    edge = ji.fit(Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2)
     np.testing.assert_allclose(edge.value, [0.5])
     assert edge.at_bound.all()
 

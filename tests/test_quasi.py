@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import kinetic_norm
 
 import jimpact as ji
-from jimpact.contact import kinetic_norm
-from jimpact.theory.quasi_velocities import (
+from jimpact import (
     contact_power,
     from_quasi_velocities,
     kinetic_energy_split,

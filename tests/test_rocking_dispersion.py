@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import CODE
 
 import jimpact as ji
-from jimpact.status import CODE
-from jimpact.theory.rocking_ratios import housner_restitution
-from jimpact.theory.rocking_record import OUTCOMES, RockingDispersion
+from jimpact import RockingDispersion, housner_restitution
+from jimpact.theory.rocking_record import OUTCOMES
 
 MU = np.array([0.0, 0.3, 1.0])
 CRITICAL = [2**0.5, (8.81**0.5 - 0.9) / 2, 0.5**0.5]  # of these mu; the roots of the two forms

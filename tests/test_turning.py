@@ -5,11 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jimpact.impacts import impact
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
-from jimpact.motion.turning import block_gaps, turning_impact
-from jimpact.scene import chain, scene_from_gaps
+from jimpact import (
+    Bistiffness,
+    Compliant,
+    Hertz,
+    HuntCrossley,
+    LinearSpring,
+    block_gaps,
+    chain,
+    impact,
+    scene_from_gaps,
+    turning_impact,
+)
 
 GAPS = block_gaps(1.0, 1.0)
 MASS = jnp.array([1.0, 1.0, 1 / 6])

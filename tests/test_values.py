@@ -23,9 +23,7 @@ def held_states(most=4):
         )
         if len(k) < most:
             states.append(
-                chain(
-                    m, v, data["wall"], e=e, k=k, eta=eta, after=after, impulse=p, name=name
-                )
+                chain(m, v, data["wall"], e=e, k=k, eta=eta, after=after, impulse=p, name=name)
             )
     return states
 
@@ -121,7 +119,9 @@ def test_lzb_edges():
 def test_lzb_between_the_limits():
     """k2/k1 -> 0: binary collisions; a symmetric impact stays so; redundant contacts share."""
     states = [
-        chain([1, 2, 3], [1, 0, 0], e=[0.9, 0.8], k=[1, 1e-7], after=[-4 / 15, -19 / 375, 57 / 125]),
+        chain(
+            [1, 2, 3], [1, 0, 0], e=[0.9, 0.8], k=[1, 1e-7], after=[-4 / 15, -19 / 375, 57 / 125]
+        ),
         chain([1, 4, 1], [1, 0, -1], e=0.7, k=2.0),
         State(np.eye(2), np.array([[1.0, 1.0], [0, 0]]), [-1, 0], e=[0.5, 0.8], k=[1, 3]),
     ]
@@ -151,9 +151,7 @@ def test_slow_plastic_limits(masses, k, exponent, u0):
 
 def test_compliant_values():
     """Touching, without losses and never opening twice it is LZB; with gaps it waits."""
-    same = [
-        s for s in held_states() if not s.name.startswith("wall2_lin") and np.min(s.e) == 1
-    ]
+    same = [s for s in held_states() if not s.name.startswith("wall2_lin") and np.min(s.e) == 1]
     assert len(same) > 20
     own = [
         chain(
