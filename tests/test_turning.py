@@ -7,18 +7,18 @@ import pytest
 
 from jimpact import (
     Bistiffness,
+    Block,
     Compliant,
     Hertz,
     HuntCrossley,
     LinearSpring,
-    block_gaps,
     chain,
     impact,
     scene_from_gaps,
     turning_impact,
 )
 
-GAPS = block_gaps(1.0, 1.0)
+GAPS = Block(1.0, 1.0).gap_function
 MASS = jnp.array([1.0, 1.0, 1 / 6])
 FLAT, LANDING = jnp.array([0.0, 0.5, 0.0]), jnp.array([0.0, -0.5, -1.0])  # gap rates (-1, 0)
 
@@ -108,5 +108,3 @@ def test_nothing_approaches_and_bad_input():
         turning_impact(GAPS, MASS, FLAT - 0.1, LANDING, Hertz(1e6))
     with pytest.raises(TypeError, match="`force`"):
         turning_impact(GAPS, MASS, FLAT, LANDING, 1.0)
-    with pytest.raises(ValueError, match="`width`"):
-        block_gaps(0.0, 1.0)
