@@ -15,19 +15,25 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from jimpact import (
+    Binary,
+    Compliant,
+    Hertz,
+    Newton,
+    Normal,
+    RandomLaw,
+    Uniform,
+    chain,
+    gap_scale,
+    gap_sensitivity,
+    impact,
+    monte_carlo,
+    read_samples,
+)
 from jimpact.comparison import registered_laws
-from jimpact.impacts import impact
-from jimpact.laws.binary import Binary
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Hertz
-from jimpact.laws.kinematic import Newton
-from jimpact.montecarlo import store
-from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
-from jimpact.montecarlo.gaps import gap_scale, gap_sensitivity
-from jimpact.montecarlo.running import monte_carlo
-from jimpact.montecarlo.statistics import bin_counts, bin_range, binned_quantile, merged, moments
-from jimpact.montecarlo.store import fingerprint, read_samples
-from jimpact.scene import chain
+from jimpact.montecarlo import histograms, store
+from jimpact.montecarlo.fingerprints import fingerprint
+from jimpact.montecarlo.moments import merged, moments
 
 BALLS = chain([0.25, 1.0, 0.25])
 LAW = Binary(1.0, order="earliest")
@@ -153,17 +159,19 @@ def test_float32_samples_are_summed_in_float64():
 
 
 def test_histograms_hold_what_lies_outside_the_first_range():
-    ends = bin_range(np.array([[0.0, 1.0], [3.0, 3.0]]))
+    ends = histograms.bin_range(np.array([[0.0, 1.0], [3.0, 3.0]]))
     np.testing.assert_allclose(ends[0], [-0.1, 1.1])
     assert ends[1, 0] < 3.0 < ends[1, 1]
-    counts = bin_counts(np.array([[-5.0, 0.5, 9.0, 7.0], [3.0, 3.0, 3.0, 3.0]]), ends, 10)
+    counts = histograms.bin_counts(
+        np.array([[-5.0, 0.5, 9.0, 7.0], [3.0, 3.0, 3.0, 3.0]]), ends, 10
+    )
     assert counts[0, 0] == 1
     assert counts[0, -1] == 2
     assert counts[1].max() == 4
     low, high = np.array([-5.0, 3.0]), np.array([9.0, 3.0])
-    assert binned_quantile(0.0, ends, counts, low, high).tolist() == [-5.0, 3.0]
-    assert binned_quantile(1.0, ends, counts, low, high).tolist() == [9.0, 3.0]
-    assert -5.0 <= binned_quantile(0.2, ends, counts, low, high)[0] <= -0.1
+    assert histograms.quantile(0.0, ends, counts, low, high).tolist() == [-5.0, 3.0]
+    assert histograms.quantile(1.0, ends, counts, low, high).tolist() == [9.0, 3.0]
+    assert -5.0 <= histograms.quantile(0.2, ends, counts, low, high)[0] <= -0.1
 
 
 def test_truncated_normal_gaps():

@@ -5,13 +5,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jimpact.bodies.base import scene_from_gaps
-from jimpact.bodies.blocks import Block
-from jimpact.impacts import impact
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
-from jimpact.motion.turning import turning_impact
-from jimpact.scene import chain
+from jimpact import (
+    Bistiffness,
+    Block,
+    Compliant,
+    Hertz,
+    HuntCrossley,
+    LinearSpring,
+    chain,
+    impact,
+    scene_from_gaps,
+    turning_impact,
+)
 
 GAPS = Block(1.0, 1.0).gap_function
 MASS = jnp.array([1.0, 1.0, 1 / 6])
