@@ -40,6 +40,7 @@ b gives margins and their rates at the end of a step), and what is one number an
 two arrays.
 """
 
+from functools import partial
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -148,13 +149,12 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
 
-    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, jax.Array | None]:
+    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, tuple[jax.Array, jax.Array] | None]:
         i, a, c = at
         xi = start + c * length
         now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
         dy = flow.field(const, s.modes, now)
-        margins = lambda z: flow.margins(const, s.modes, z)
-        value, dc = jax.jvp(margins, (now,), (dy,))
+        value, dc = jax.jvp(partial(flow.margins, const, s.modes), (now,), (dy,))
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate

@@ -1,5 +1,6 @@
 """Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -99,7 +100,12 @@ class MechanicalFlow(eqx.Module):
 
     root = 1
     contacts = 1
+    longest = math.inf
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> float:
+        """Tolerances that the error of each row may be."""
+        return 1.0
 
     @property
     def snap(self) -> jax.Array:

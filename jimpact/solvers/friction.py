@@ -1,5 +1,7 @@
 """Coulomb friction: who sticks, who slides and where to."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -28,18 +30,20 @@ def distribute(
     least = SETTLED * jnp.max(limit, axis=0, keepdims=True)
 
     def slip(side: jax.Array) -> jax.Array:
-        return sum(matrix[:, i] * side[i : i + 1] for i in range(m * rows)) + rate
+        return sum((matrix[:, i] * side[i : i + 1] for i in range(m * rows)), rate)
 
-    def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+    def sweep(carry: tuple[jax.Array, jax.Array, Any]) -> tuple[jax.Array, jax.Array, Any]:
         before, _, count = carry
         side = before
         for j in range(m):
             at = slice(rows * j, rows * (j + 1))
-            total = sum(matrix[i, i] for i in range(at.start, at.stop))[None]  # no step is too long
+            own = [matrix[i, i] for i in range(at.start, at.stop)]
+            total = sum(own, jnp.zeros_like(own[0]))[None]  # no step is too long
             tried = side[at] - slip(side)[at] / total
             length = _size(tried, rows)
             over = length > limit[j : j + 1]
-            tried = jnp.where(over, tried * (limit[j : j + 1] / jnp.where(over, length, 1.0)), tried)
+            scale = limit[j : j + 1] / jnp.where(over, length, 1.0)
+            tried = jnp.where(over, tried * scale, tried)
             side = side.at[at].set(jnp.where(asked[j : j + 1], tried, 0.0))
         moves = jnp.any(jnp.abs(side - before) > least)
         return side, moves, count + 1
