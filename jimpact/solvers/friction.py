@@ -39,7 +39,9 @@ def distribute(
             tried = side[at] - slip(side)[at] / total
             length = _size(tried, rows)
             over = length > limit[j : j + 1]
-            tried = jnp.where(over, tried * (limit[j : j + 1] / jnp.where(over, length, 1.0)), tried)
+            tried = jnp.where(
+                over, tried * (limit[j : j + 1] / jnp.where(over, length, 1.0)), tried
+            )
             side = side.at[at].set(jnp.where(asked[j : j + 1], tried, 0.0))
         moves = jnp.any(jnp.abs(side - before) > least)
         return side, moves, count + 1
