@@ -10,8 +10,7 @@ from jimpact._checks import as_float_array, check_values, is_traced
 from jimpact.contact_space import solve_mass
 from jimpact.laws.base import Law
 from jimpact.scene import Scene
-from jimpact.solvers.coulomb import Impulses, Problem, solve_complementary, solve_prescribed
-from jimpact.solvers.coulomb_disc import DiscProblem, solve_disc
+from jimpact.solvers.friction import FrictionImpulses, solve
 
 
 def friction_fields(
@@ -48,7 +47,7 @@ def frictional_impulses(
     friction: jax.Array,
     tangential_restitution: jax.Array,
     complementary: bool,
-) -> Impulses:
+) -> FrictionImpulses:
     """p (m,) and p_t (m,) or (2 m,) with `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
 
     `normal` (m,) [m/s] is what gamma+ - gamma- must make up for: `gamma+ - gamma- + normal` is 0,
@@ -59,23 +58,15 @@ def frictional_impulses(
     each = scene.tangents.shape[1] // m
     both = jnp.concatenate([scene.normals, scene.tangents], axis=1)
     matrix = both.T @ solve_mass(scene, both)
-    norm = jnp.sqrt(jnp.diagonal(matrix)[:m])
-    scale = jnp.concatenate([1 / norm, jnp.repeat(1 / norm, each)])
     there = jnp.concatenate([closed, jnp.repeat(closed, each)])
-    matrix = matrix * scale[:, None] * scale[None, :]
-    unit = jnp.eye(len(scale), dtype=norm.dtype)
-    matrix = jnp.where(there[:, None] & there[None, :], matrix, unit)
-    e_t = jnp.repeat(tangential_restitution * jnp.ones_like(norm), each)
-    slip = (1 + e_t) * (scene.tangents.T @ velocity) * scale[m:]
-    parts = (
-        matrix,
-        jnp.where(closed, normal / norm, 0.0),
-        jnp.where(there[m:], slip, 0.0),
-        jnp.where(closed, friction * jnp.ones_like(norm), 0.0),
+    unit = jnp.eye(len(there), dtype=matrix.dtype)
+    e_t = jnp.repeat(tangential_restitution * jnp.ones(m, matrix.dtype), each)
+    found = solve(
+        jnp.where(there[:, None] & there[None, :], matrix, unit),
+        jnp.where(closed, normal, 0.0),
+        jnp.where(there[m:], (1 + e_t) * (scene.tangents.T @ velocity), 0.0),
+        jnp.where(closed, friction * jnp.ones(m, matrix.dtype), 0.0),
+        complementary=complementary,
     )
-    if each == 2:
-        found = solve_disc(DiscProblem(*parts, complementary))
-    else:
-        found = (solve_complementary if complementary else solve_prescribed)(Problem(*parts))
-    p = jnp.where(closed, found.normal / norm, 0.0)  # exactly
-    return Impulses(p, jnp.where(there[m:], found.tangential * scale[m:], 0.0), found.code)
+    p = jnp.where(closed, found.normal, 0.0)  # exactly
+    return FrictionImpulses(p, jnp.where(there[m:], found.tangential, 0.0), found.status)
