@@ -20,21 +20,20 @@ __version__ = "0.1.0"
 # module -> public names, imported on first use so that `jimpact --help` stays fast. No module
 # here is named like a public name: importing it would put the module in the function's place.
 _WHERE = {
-    "scene": "Scene",
-    "contact_space": (
-        "delassus_matrix gap_velocity kinetic_angles kinetic_energy momentum "
-        "normalized_delassus normalized_gap_velocity velocity_change"
+    "scene": (
+        "Scene chain column gap_velocity kinetic_energy momentum scene_from_gaps velocity_change"
     ),
-    "scenes": "chain column scene_from_gaps",
+    "contact": (
+        "Contact delassus_matrix kinetic_angles normalized_delassus normalized_gap_velocity"
+    ),
     "bodies.base": "Mechanism",
     "bodies.bodies": "Block Dimer dimer rocking_block",
     "bodies.spatial": "SpatialDimer dimer_3d",
     "bodies.planar": "Corner DiskBalls corner disk_balls",
     "bodies.pendulums": "PendulumCradle pendulum_cradle",
-    "laws": "REGISTRY",
-    "laws.base": "Law",
-    "laws.newton": "Newton",
-    "laws.moreau": "Moreau",
+    "law": "Impulses Law parameter",
+    "laws": "REGISTRY register",
+    "laws.kinematic": "Moreau Newton RestitutionMatrix",
     "laws.poisson": "Poisson",
     "laws.binary": "Binary",
     "laws.compliant": "Compliant",
@@ -73,7 +72,6 @@ _WHERE = {
         "ContactPower contact_power from_quasi_velocities kinetic_energy_split quasi_basis "
         "to_quasi_velocities"
     ),
-    "laws.restitution_matrix": "RestitutionMatrix",
     "theory.rocking_ratios": "RockingRatio housner_restitution rocking_matrix rocking_ratios",
     "theory.rocking_impacts": "rocking_dispersion search_critical_angle",
     "theory.rocking_record": "RockingDispersion critical_kinetic_angle rocking_kinetic_angle",

@@ -7,15 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.contact_space import (
-    as_velocity,
-    delassus_matrix,
-    gap_velocity,
-    kinetic_energy,
-    momentum,
-)
-from jimpact.impacts import Impact, gap_velocity_rounding
-from jimpact.scene import Scene
+from jimpact.contact import contact_of
+from jimpact.impacts import Impact
+from jimpact.scene import Scene, as_velocity, gap_velocity, kinetic_energy, momentum
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS, sign_tolerance
 
@@ -57,9 +51,9 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     True
     """
     v = as_velocity(scene, velocity)
-    delassus = delassus_matrix(scene)
-    root = jnp.sqrt(diagonal(delassus))
-    gamma = jnp.where(scene.closed, gap_velocity(scene, v), 0.0)
+    contact = contact_of(scene, v, uses_gaps=True)
+    root = jnp.sqrt(diagonal(contact.delassus))
+    gamma = jnp.where(scene.closed, contact.gap_velocity, 0.0)
     gamma_plus = gap_velocity(scene, out.velocity)
     approach = jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2)
     size = jnp.sqrt(approach + 2 * out.initial_energy)
@@ -73,7 +67,7 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
         basis = jnp.linalg.qr(scene.constraints)[0]
         residual = residual - basis @ (basis.T @ residual)
     # as `impact` judges: what is within rounding is none of the law's doing
-    rounding = gap_velocity_rounding(scene, delassus, gamma, out.impulse)
+    rounding = contact.rounding(out.impulse, out.tangential_impulse)
     within = jnp.clip(gamma_plus, -rounding, 0.0)
     least = jnp.where(scene.closed, (gamma_plus - within) / root, jnp.inf)
     worst_gap_velocity = jnp.min(least) / size

@@ -11,11 +11,10 @@ import numpy as np
 
 from jimpact._checks import check_values
 from jimpact.audits import Audit, audit
-from jimpact.contact_space import as_velocity, kinetic_energy, momentum
 from jimpact.impacts import Impact, impact
+from jimpact.law import Law
 from jimpact.laws import REGISTRY, Row
-from jimpact.laws.base import Law
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity, kinetic_energy, momentum
 from jimpact.status import STATUS
 
 _REPEATS = 20  # of the timing; its median is told

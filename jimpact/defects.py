@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from jimpact.contact_space import dense_mass
 from jimpact.experiments import Experiments
-from jimpact.scene import Scene
+from jimpact.scene import Scene, dense_mass
 
 # Defects below this share of the momentum or energy before are no finding: a tenth of a percent
 # is what a good measured velocity is worth. With `sigma`, a defect is held against its own error.

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.contact_space import dense_mass
 from jimpact.csv_shots import read_table
-from jimpact.scene import Scene
+from jimpact.scene import Scene, dense_mass
 
 
 class Experiments(eqx.Module):

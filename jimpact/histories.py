@@ -7,14 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import check_values, in_common_dtype, is_traced
-from jimpact.contact_space import (
-    as_velocity,
-    delassus_matrix,
-    gap_velocity,
-    velocity_change,
-    without_open_contacts,
-)
-from jimpact.laws.base import Law
+from jimpact.law import Law, check_law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
 from jimpact.laws.lzb import LZB, default_rtol
@@ -31,7 +24,7 @@ from jimpact.numerics.dimensionless import (
 from jimpact.numerics.flow import START, TIME, Flow, State, scales, step
 from jimpact.numerics.powers import factor, plus_one, power
 from jimpact.numerics.steps import Carry, Control
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity, velocity_change
 from jimpact.solvers.tridiagonal import Tridiagonal
 
 TRACED_RECORDS = 512  # passes kept when the number needed cannot be looked up (inside jit, grad)
@@ -99,7 +92,7 @@ def history(
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
     law, scene, v = in_common_dtype(law, scene, v)
-    law.check_options(v.dtype, scene)
+    check_law(law, scene, v.dtype)
     if records is None and is_traced((law, scene, v)):
         records = TRACED_RECORDS
     elif records is None:
@@ -119,21 +112,17 @@ def _contact(law: Sampled) -> Bistiffness:
 
 
 def _setup(law: Sampled, scene: Scene, v: jax.Array) -> tuple[Flow, Control, Carry, Units]:
-    w, gamma = delassus_matrix(scene), gap_velocity(scene, v)
-    gapped, contact = isinstance(law, Compliant), _contact(law)
-    if not gapped:
-        w, gamma = without_open_contacts(scene, w, gamma)
-    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
-    happens = jnp.any(gamma < 0) | jnp.any(stored > 0)
+    given, contact = law.contact(scene, v), _contact(law)
+    w, gamma, happens = given.delassus, given.gap_velocity, given.happens
     inputs, units = to_dimensionless(
         w,
         jnp.where(happens, gamma, -jnp.ones_like(gamma)),
         contact.restitution,
         contact.stiffness,
         contact.exponent,
-        stored,
+        given.stored,
         law.rtol or default_rtol("time", v.dtype),
-        scene.gaps if gapped else None,
+        given.gaps if law.uses_gaps else None,
     )
     flow = flow_of(inputs, contact.exponent, isinstance(w, Tridiagonal))
     control = control_of(inputs, law.max_steps, "time")._replace(closed_form=False)

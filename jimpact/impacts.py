@@ -1,35 +1,22 @@
 """`impact`: the one place that turns a law's impulses into velocities, energy and status."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
-    check_kind,
-    check_shape,
-    check_values,
-    in_common_dtype,
-    is_traced,
-)
-from jimpact.blocks import Groups, coupled_groups, solve_groups
-from jimpact.contact_space import (
-    as_velocity,
-    delassus_matrix,
-    gap_velocity,
-    momentum,
-    solve_mass,
-    velocity_change,
-    without_open_contacts,
-)
-from jimpact.laws.base import Law, no_tangential_impulse
-from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal
+from jimpact._checks import check_kind, check_values, in_common_dtype, is_traced
+from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
+from jimpact.law import Impulses, Law, check_law, is_separable, of_contacts
+from jimpact.scene import Scene, as_velocity, momentum, velocity_change
+from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import CODE, STATUS, sign_tolerance
 
-ROUNDINGS = 4  # of the largest terms that cancel: each is rounded a few times
+# Impulses up to this many times what would undo the noise of gamma- are rounding: up to twice the
+# noise is asked for, and contacts that feel each other pass it on a few times.
+ROUNDING_PUSHES = 8
 
 
 class Impact(eqx.Module):
@@ -54,7 +41,8 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
 
     Contacts that no coordinate joins (two pairs of balls in one scene) are solved apart where the
-    scene is known, not traced, and the law allows it (`Law.by_blocks`); the outcome is the same.
+    scene is known, not traced, and the law allows it (`Law.separable`); the outcome is the same.
+    Approach within the rounding of v- is none.
 
     Args:
         law: its parameters are scalars or have one entry per contact.
@@ -79,13 +67,9 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
     _check_constrained(scene, v)
-    groups = coupled_groups(scene) if law.by_blocks() else None
     law, scene, v = in_common_dtype(law, scene, v)
-    for name, value in vars(law).items():
-        if isinstance(value, jax.Array) and value.ndim == 1 and len(value) != scene.contacts:
-            check_shape(name, value, (scene.contacts,), "one entry per contact, or a scalar")
-    law.check_options(v.dtype, scene)
-    return _impact(law, scene, v, groups)
+    check_law(law, scene, v.dtype)
+    return _impact(law, scene, v, coupled_groups(scene) if is_separable(law) else None)
 
 
 def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
@@ -105,73 +89,106 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
 
 @eqx.filter_jit
 def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None) -> Impact:
-    gamma_all = gap_velocity(scene, v)
-    taking_part = jnp.ones_like(scene.closed) if law.uses_gaps else scene.closed
-    gamma = jnp.where(taking_part, gamma_all, 0.0)
-    stored = jnp.where(taking_part, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
-    law = law.with_stored(stored)
-    happens = jnp.any(gamma < 0) | jnp.any(stored > 0) | ~jnp.all(jnp.isfinite(gamma))
     if groups is None:
-        w_all = delassus_matrix(scene)
-        w = w_all if law.uses_gaps else without_open_contacts(scene, w_all, gamma)[0]
-        # where nothing happens the law sees a harmless approach, so its gradients stay finite
-        approach = jnp.where(happens, gamma, -jnp.ones_like(gamma))
-        p, tangential, code = law.all_impulses(scene, w, approach, v)
-        w_diagonal = diagonal(w)
+        contact = law.contact(scene, v)
+        happens = contact.happens
+        outcome = _resolved(law, contact, happens)
+        stored = contact.stored
     else:
-        p, code, w_diagonal = solve_groups(law, scene, groups, gamma, stored, happens)
-        tangential = no_tangential_impulse(scene, p.dtype)
-    p, tangential = jnp.where(happens, p, 0.0), jnp.where(happens, tangential, 0.0)
+        outcome, happens, stored = _in_groups(law, scene, v, groups)
+    p, tangential = outcome.normal, outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
-    by_delassus = groups is None and tangential.size == 0
-    gamma_plus = gamma_all + (w_all @ p if by_delassus else gap_velocity(scene, jump))
     # `(gamma+ + gamma-)^T p / 2`, summed over bodies: beside a light one terms of W p cancel
     change = 0.5 * momentum(scene, jump) @ (v + v_plus)
-    code = jnp.where(happens, code, CODE["ok"])
-    rounding = gap_velocity_rounding(scene, w_all if groups is None else None, gamma_all, p)
-    code = jnp.maximum(
-        code, _signs(w_diagonal, gamma, gamma_plus, p, change, stored, taking_part, rounding)
-    )
+    total = jnp.sum(stored)
+    tolerance = sign_tolerance(v.dtype) * outcome.size**2 + outcome.noise
+    code = jnp.where(change > total + tolerance, CODE["energy_gain"], CODE["ok"])
+    code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     code = jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32)
-    return Impact(v_plus, p, tangential, change, jnp.sum(stored), code)
+    return Impact(v_plus, p, tangential, change, total, code)
 
 
-def gap_velocity_rounding(
-    scene: Scene, w: Symmetric | None, gamma: jax.Array, p: jax.Array
-) -> jax.Array:
-    """Rounding (m,) of gamma+: terms of W p may be large and cancel, as beside a light ball."""
-    if w is None:
-        moved = solve_mass(scene, scene.normals)
-        size = jnp.abs(scene.normals).T @ (jnp.abs(moved) @ jnp.abs(p))
-    elif isinstance(w, Tridiagonal):
-        size = Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(p)
-    else:
-        size = jnp.abs(w) @ jnp.abs(p)
-    return ROUNDINGS * float(jnp.finfo(p.dtype).eps) * (jnp.abs(gamma) + size)
+class _Resolved(NamedTuple):
+    """Impulses of contacts, the status of the law and of their signs, and two scales."""
+
+    normal: jax.Array
+    tangential: jax.Array
+    status: jax.Array
+    size: jax.Array  # () of the impact, square root of an energy
+    noise: jax.Array  # () energy that the rounding of v- leaves unknown
 
 
-def _signs(
-    w_diagonal: jax.Array,
-    gamma: jax.Array,
-    gamma_plus: jax.Array,
-    p: jax.Array,
-    change: jax.Array,
-    stored: jax.Array,
-    closed: jax.Array,
-    rounding: jax.Array,
-) -> jax.Array:
-    """The gravest of negative_impulse, inadmissible_velocity, energy_gain; 0 if none."""
-    tolerance = sign_tolerance(p.dtype)
-    root = jnp.sqrt(w_diagonal)
-    # size of the impact in sqrt(energy): what approaches and what is stored
-    size = jnp.sqrt(jnp.sum((jnp.minimum(gamma, 0.0) / root) ** 2) + 2 * jnp.sum(stored))
-    pull = jnp.any(p * root < -tolerance * size)
-    approach = jnp.any(closed & ((gamma_plus + rounding) / root < -tolerance * size))
-    gain = change > jnp.sum(stored) + tolerance * size**2
-    code = jnp.where(gain, CODE["energy_gain"], CODE["ok"])
-    code = jnp.where(approach, CODE["inadmissible_velocity"], code)
+def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
+    """The law's answer; nothing where nothing happens, nor at open contacts."""
+    gamma = contact.gap_velocity
+    # where nothing happens the law sees a harmless approach, so its gradients stay finite
+    harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
+    shown = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
+    answer = Impulses(*law.impulses(shown))
+    part = happens & (contact.closed | law.uses_gaps)
+    p = jnp.where(part, answer.normal, 0.0)
+    sides = 0 if contact.slip is None else contact.slip.shape[0]
+    tangential = jnp.zeros(sides, p.dtype)
+    if answer.tangential is not None:
+        rows = jnp.repeat(part, contact.tangents)
+        tangential = jnp.where(rows, answer.tangential, 0.0)
+    code = jnp.maximum(answer.status, _signs(contact, p, tangential))
+    code = jnp.where(happens, code, CODE["ok"])
+    noise = jnp.sum(contact.noise * jnp.abs(p))
+    return _Resolved(p, tangential, code, contact.size, noise)
+
+
+def _in_groups(
+    law: Law, scene: Scene, v: jax.Array, groups: Groups
+) -> tuple[_Resolved, jax.Array, jax.Array]:
+    """All groups solved side by side; whether anything happens, and the stored energy (m,).
+
+    Signs are judged on the scale of their group. A group in which nothing happens gets p = 0,
+    unless the law also pulls at separating contacts.
+    """
+    m = scene.contacts
+    stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
+    all_contacts = contacts_of_groups(scene, v, stored, groups)
+    own = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in all_contacts]
+    happens = jnp.any(jnp.concatenate(own))
+    p = jnp.zeros(m, v.dtype)
+    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
+    tangential = jnp.zeros((m, each), v.dtype)
+    code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+    for filled, contacts, acts in zip(groups, all_contacts, own):
+        index = jnp.asarray(filled % m)
+        acts = happens & (acts | law.pulls)
+
+        def of_group(index: jax.Array, contact: Contact, acts: jax.Array) -> _Resolved:
+            return _resolved(of_contacts(law, index), contact, acts)
+
+        if len(index) == 1:  # without the cost of a batch
+            one = of_group(*jax.tree.map(lambda x: x[0], (index, contacts, acts)))
+            part = jax.tree.map(lambda x: jnp.asarray(x)[None], one)
+        else:
+            part = jax.vmap(of_group)(index, contacts, acts)
+        at = filled.reshape(-1)
+        p = p.at[at].set(part.normal.reshape(-1), mode="drop")
+        rows = part.tangential.reshape(len(at), each)
+        tangential = tangential.at[at].set(rows, mode="drop")
+        code = jnp.maximum(code, jnp.max(part.status))
+        square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
+    found = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise)
+    return found, happens, stored
+
+
+def _signs(contact: Contact, p: jax.Array, tangential: jax.Array) -> jax.Array:
+    """negative_impulse or inadmissible_velocity; 0 if neither."""
+    tolerance = sign_tolerance(p.dtype) * contact.size
+    root = jnp.sqrt(diagonal(contact.delassus))
+    # an impulse that only undoes what the rounding of v- may hold has no sign
+    floor = tolerance + jnp.sqrt(jnp.sum((ROUNDING_PUSHES * contact.noise / root) ** 2))
+    pull = jnp.any(p * root < -floor)
+    after = contact.gap_velocity_after(p, tangential) + contact.rounding(p, tangential)
+    approach = jnp.any(contact.closed & (after / root < -tolerance))
+    code = jnp.where(approach, CODE["inadmissible_velocity"], CODE["ok"])
     return jnp.where(pull, CODE["negative_impulse"], code)
 
 

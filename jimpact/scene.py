@@ -11,6 +11,8 @@
 #   T = v^T M v / 2  kinetic energy                              [J]
 """
 
+import operator
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,6 +23,16 @@ import numpy as np
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 
 _SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of M that rounding may cause in float32
+CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0
+
+_CONSTRAINTS = operator.attrgetter("constraints")
+_WALLS = {
+    False: (False, False),
+    True: (False, True),
+    "right": (False, True),
+    "left": (True, False),
+    "both": (True, True),
+}
 
 
 class Scene(eqx.Module):
@@ -102,6 +114,209 @@ class Scene(eqx.Module):
         if self.gaps is None:
             return jnp.ones(self.contacts, bool)
         return self.gaps <= 0
+
+
+def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
+    """A row of bodies along +x; contact j joins bodies j and j+1.
+
+    Equation: `gamma_j = v_{j+1} - v_j`; at a wall on the right `gamma_m = -v_n`, on the left
+    `gamma_1 = v_1`. The Delassus matrix is tridiagonal and never formed densely.
+
+    Args:
+        masses: (n,) > 0 [kg].
+        wall: False; True or 'right': last contact; 'left': first contact; 'both'.
+        gaps: (m,) >= 0 [m], None: all closed.
+
+    Raises:
+        ValueError: masses or gaps out of range or of wrong shape, unknown wall, no contact.
+
+    >>> import jimpact as ji
+    >>> ji.chain([1.0, 1.0, 1.0], wall=True).contacts
+    3
+    """
+    if wall not in _WALLS:
+        raise ValueError(
+            f"Argument `wall` must be one of False, True, 'left', 'right', 'both', "
+            f"but has value {wall!r}."
+        )
+    mass = as_float_array("masses", masses)
+    if mass.ndim != 1:
+        raise ValueError(f"Argument `masses` must have shape (n,), but has shape {mass.shape}.")
+    check_values("masses", mass, low=0.0, open_low=True)
+    left, right = _WALLS[wall]
+    contacts = mass.shape[0] - 1 + left + right
+    if contacts < 1:
+        raise ValueError(
+            f"Argument `masses` must give at least one contact, "
+            f"but {mass.shape[0]} body and wall={wall!r} give none."
+        )
+    if gaps is not None:
+        gaps = as_float_array("gaps", gaps)
+        check_shape("gaps", gaps, (contacts,), "one gap per contact")
+        check_values("gaps", gaps, low=0.0)
+    return chain_scene(mass, (left, right), gaps)
+
+
+def column(masses: Any, gaps: Any = None) -> Scene:
+    """A column of bodies above a floor: `chain(masses, wall='right')`, +x down, body 1 on top.
+
+    >>> import jimpact as ji
+    >>> ji.column([1.0, 1.0]).contacts
+    2
+    """
+    return chain(masses, wall="right", gaps=gaps)
+
+
+def scene_from_gaps(
+    gap_function: Callable[[jax.Array], jax.Array],
+    mass: Any,
+    q: Any,
+    closed_below: float = CLOSED_BELOW,
+) -> Scene:
+    """Scene of a system at configuration `q`; the normals are the gradients of its gaps.
+
+    Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
+
+    Args:
+        gap_function: q (n,) -> gaps f(q) (m,) [m], written with jax.numpy.
+        mass: M (n,) or (n, n), or a function q -> M(q).
+        q: (n,) configuration.
+        closed_below: gaps with |f| up to this count as closed [m].
+
+    Raises:
+        ValueError: penetration (f < -closed_below), or what `Scene` refuses.
+
+    >>> import jax.numpy as jnp, jimpact as ji
+    >>> bouncing = ji.scene_from_gaps(lambda q: q[1:] - 0.5, [1.0, 1.0], [0.0, 0.5])
+    >>> bouncing.normals.tolist()
+    [[0.0], [1.0]]
+    """
+    q = as_float_array("q", q)
+    check_values("q", q)
+    f = jnp.atleast_1d(gap_function(q))
+    if not is_traced(f) and bool(jnp.any(f < -closed_below)):
+        worst = int(jnp.argmin(f))
+        raise ValueError(
+            f"Argument `q` must have no penetration (f >= -{closed_below:g} m), "
+            f"but gap {worst} has value {float(f[worst]):g} m."
+        )
+    normals = jax.jacobian(lambda x: jnp.atleast_1d(gap_function(x)))(q).T
+    gaps = jnp.where(f > closed_below, f, 0.0)
+    return Scene(mass(q) if callable(mass) else mass, normals, gaps=gaps)
+
+
+def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
+    """The scene with these gaps (m,)."""
+    return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)
+
+
+def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
+    """`velocity` as an array; raise a ValueError unless it has one entry per coordinate."""
+    v = as_float_array("velocity", velocity)
+    check_shape("velocity", v, (scene.size,), "one per coordinate of the scene")
+    return v
+
+
+def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
+    """Gap velocities `gamma = N^T v` (m,) [m/s] of velocities (n,); negative on approach.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
+    Source: Brogliato (2016), (6.24) before normalization.
+
+    >>> import jimpact as ji
+    >>> ji.gap_velocity(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.5]).tolist()
+    [-1.0, 0.5]
+    """
+    v = as_velocity(scene, velocity)
+    if scene.walls is None:
+        return scene.normals.T @ v
+    left, right = scene.walls
+    return jnp.diff(jnp.pad(v, (int(left), int(right))))
+
+
+def momentum(scene: Scene, velocity: Any) -> jax.Array:
+    """Generalized momenta `M v` (n,); for a chain without walls their sum is conserved.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
+    >>> import jimpact as ji
+    >>> ji.momentum(ji.chain([1.0, 2.0]), [1.0, 0.5]).tolist()
+    [1.0, 1.0]
+    """
+    v = as_velocity(scene, velocity)
+    return scene.mass * v if scene.mass.ndim == 1 else scene.mass @ v
+
+
+def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
+    """Kinetic energy `T = v^T M v / 2` [J] of velocities (n,).
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
+    >>> import jimpact as ji
+    >>> float(ji.kinetic_energy(ji.chain([1.0, 2.0]), [1.0, 0.5]))
+    0.75
+    """
+    v = as_velocity(scene, velocity)
+    return 0.5 * v @ momentum(scene, v)
+
+
+def dense_mass(scene: Scene) -> np.ndarray:
+    """M (n, n) on the host, in double precision."""
+    mass = np.asarray(scene.mass, float)
+    return np.diag(mass) if mass.ndim == 1 else mass
+
+
+def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
+    """`M^-1 right`, with the reactions of bilateral constraints where the scene has some."""
+    if scene.mass.ndim == 1:
+        shape = (-1,) + (1,) * (right.ndim - 1)
+        free = right / scene.mass.reshape(shape)
+    else:
+        free = jax.scipy.linalg.solve(scene.mass, right, assume_a="pos")
+    if scene.constraints is None:
+        return free
+    h = scene.constraints
+    m_inv_h = solve_mass(without_constraints(scene), h)
+    return free - m_inv_h @ jnp.linalg.solve(h.T @ m_inv_h, h.T @ free)
+
+
+def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.Array:
+    """What contact impulses change: `v+ - v- = M^-1 (N p + H p_t)` (n,) [m/s].
+
+    Args:
+        scene: n coordinates, m contacts.
+        impulse: p (m,) [N s].
+        tangential: p_t, one per tangent of the scene [N s]; None: 0.
+
+    Raises:
+        ValueError: not one impulse per contact, or per tangent.
+
+    >>> import jimpact as ji
+    >>> ji.velocity_change(ji.chain([1.0, 2.0]), [1.0]).tolist()
+    [-1.0, 0.5]
+    """
+    impulse = as_float_array("impulse", impulse)
+    check_shape("impulse", impulse, (scene.contacts,), "one per contact")
+    if tangential is not None and scene.tangents is not None:
+        tangential = as_float_array("tangential", tangential)
+        check_shape("tangential", tangential, scene.tangents.shape[1:], "one per tangent")
+    if scene.walls is None:
+        push = scene.normals @ impulse
+        if scene.tangents is not None and tangential is not None:
+            push = push + scene.tangents @ tangential
+        return solve_mass(scene, push)
+    left, right = scene.walls
+    padded = jnp.pad(impulse, (int(not left), int(not right)))
+    return -jnp.diff(padded) / scene.mass
+
+
+def without_constraints(scene: Scene) -> Scene:
+    """The scene as if it had no bilateral constraints."""
+    return scene if scene.constraints is None else eqx.tree_at(_CONSTRAINTS, scene, None)
 
 
 def chain_scene(masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | None) -> Scene:

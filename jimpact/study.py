@@ -11,11 +11,10 @@ import numpy as np
 
 from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
+from jimpact.law import Law
 from jimpact.laws import REGISTRY, Row
-from jimpact.laws.base import Law
 from jimpact.montecarlo.study_table import arguments
-from jimpact.scene import Scene
-from jimpact.scenes import chain
+from jimpact.scene import Scene, chain
 
 _TABLES = ("title", "scene", "law", "fit", "data", "monte_carlo")
 _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")

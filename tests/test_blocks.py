@@ -10,8 +10,8 @@ import pytest
 
 import jimpact as ji
 from jimpact import impacts
-from jimpact.blocks import coupled_groups
-from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.contact import coupled_groups
+from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import CODE
 
 

@@ -14,8 +14,7 @@ from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Hertz, LinearSpring, PowerLaw
 from jimpact.laws.lzb import LZB
-from jimpact.scene import Scene
-from jimpact.scenes import chain
+from jimpact.scene import Scene, chain
 from jimpact.status import CODE
 from jimpact.theory.linear_chain import bilateral_motion, newby_ratio
 

@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.contact_space import (
-    kinetic_energy,
-    kinetic_norm,
-    normalized_delassus,
-    velocity_change,
-)
+from jimpact.contact import kinetic_norm, normalized_delassus
+from jimpact.scene import kinetic_energy, velocity_change
 from jimpact.theory.copositive import copositivity, margin
 from jimpact.theory.friction_consistency import (
     friction_bounds,

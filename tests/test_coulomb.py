@@ -124,7 +124,8 @@ def test_block_lying_flat(name):
     close(out.impulse[0], free.impulse, atol=1e-14)
     slip = np.asarray(FLAT.tangents.T @ v)
     close(FLAT.tangents.T @ out.velocity[1], -0.2 * slip, atol=1e-14)  # mu -> infinity: sticks
-    close(out.tangential_impulse[1, 0], out.tangential_impulse[1, 1], rtol=1e-12)
+    shares = out.tangential_impulse[1] / out.impulse[1]  # in proportion to the load
+    close(shares[0], shares[1], rtol=1e-12)
     close(out.tangential_impulse[2], -0.2 * out.impulse[2], atol=1e-14)  # slides
     codes = [CODE["ok"], CODE["impulse_not_unique"], CODE["ok"]]
     assert out.status.tolist() == codes

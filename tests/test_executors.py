@@ -17,7 +17,7 @@ from jimpact.montecarlo.executors.devices import Devices
 from jimpact.montecarlo.executors.serial import Serial
 from jimpact.montecarlo.fingerprints import fingerprint
 from jimpact.montecarlo.running import monte_carlo
-from jimpact.scenes import chain
+from jimpact.scene import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
 

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 import jimpact as ji
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.status import CODE
 

@@ -12,11 +12,11 @@ from jimpact.histories import history
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Hertz, HuntCrossley, KelvinVoigt, LinearSpring, UserForce
+from jimpact.laws.kinematic import Newton
 from jimpact.laws.lzb import LZB
-from jimpact.laws.newton import Newton
 from jimpact.montecarlo.gap_scales import crossover, gap_scale
 from jimpact.plot.rheology import plot_forces
-from jimpact.scenes import chain, column
+from jimpact.scene import chain, column
 
 
 def test_formula():

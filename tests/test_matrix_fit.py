@@ -8,10 +8,10 @@ import pytest
 from scipy.optimize import minimize
 
 import jimpact as ji
-from jimpact.contact_space import normalized_delassus
+from jimpact.contact import normalized_delassus
 from jimpact.fits.fitting import fit
 from jimpact.fits.matrix_fit import matrix_region
-from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.theory.copositive import margin
 

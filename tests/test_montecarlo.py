@@ -20,7 +20,7 @@ from jimpact.impacts import impact
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Hertz
-from jimpact.laws.newton import Newton
+from jimpact.laws.kinematic import Newton
 from jimpact.montecarlo import histograms, store
 from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
 from jimpact.montecarlo.fingerprints import fingerprint
@@ -29,7 +29,7 @@ from jimpact.montecarlo.gap_sensitivities import gap_sensitivity
 from jimpact.montecarlo.moments import merged, moments
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.montecarlo.store import read_samples
-from jimpact.scenes import chain
+from jimpact.scene import chain
 
 BALLS = chain([0.25, 1.0, 0.25])
 LAW = Binary(1.0, order="earliest")

@@ -13,12 +13,12 @@ import pytest
 from jimpact.cli import main
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
-from jimpact.laws.newton import Newton
+from jimpact.laws.kinematic import Newton
 from jimpact.montecarlo.distributions import Normal, RandomLaw, Uniform
 from jimpact.montecarlo.executors.serial import Serial
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.plot.montecarlo import plot_monte_carlo
-from jimpact.scenes import chain
+from jimpact.scene import chain
 from jimpact.study import read_study
 
 STUDY = """

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.contact_space import kinetic_norm
+from jimpact.contact import kinetic_norm
 from jimpact.theory.quasi_velocities import (
     contact_power,
     from_quasi_velocities,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.contact_space import kinetic_norm, normalized_delassus
-from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.contact import kinetic_norm, normalized_delassus
+from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import CODE
 from jimpact.theory.quasi_velocities import from_quasi_velocities, to_quasi_velocities
 from jimpact.theory.rocking_ratios import housner_restitution, rocking_matrix, rocking_ratios

@@ -22,7 +22,7 @@ from jimpact.laws.forces import (
 )
 from jimpact.laws.materials import hertz_stiffness, sphere_mass
 from jimpact.plot.rheology import plot_rheologies
-from jimpact.scenes import chain
+from jimpact.scene import chain
 from jimpact.status import CODE
 
 # name: (force of (k, damping), the same by numpy, its smooth sign)

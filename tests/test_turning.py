@@ -9,7 +9,7 @@ from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
 from jimpact.motion.turning import block_gaps, turning_impact
-from jimpact.scenes import chain, scene_from_gaps
+from jimpact.scene import chain, scene_from_gaps
 
 GAPS = block_gaps(1.0, 1.0)
 MASS = jnp.array([1.0, 1.0, 1 / 6])

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.scene import Scene
-from jimpact.scenes import CLOSED_BELOW
+from jimpact.scene import CLOSED_BELOW, Scene
 
 _ROUNDINGS = 16  # of the largest coordinate: a gap that small is zero, in float32 too
 

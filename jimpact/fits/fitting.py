@@ -23,7 +23,7 @@ from jimpact.fits.problem import Problem, build_problem
 from jimpact.fits.report import report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.fits.warned import fit_warnings
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.scene import Scene
 
 

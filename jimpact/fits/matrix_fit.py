@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linprog
 
-from jimpact.contact_space import delassus_matrix, kinetic_norm, without_open_contacts
+from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
 from jimpact.fits.matrix_region import AdmissibleMatrices
-from jimpact.laws.base import Law
-from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.law import Law
+from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import as_matrix, scaled
 
@@ -77,8 +77,7 @@ def encloses(law: Law, scene: Scene) -> bool:
 
 def _inverse(scene: Scene) -> np.ndarray:
     """G^-1 with a further row that marks closed contacts."""
-    zero = jnp.zeros(scene.contacts, scene.mass.dtype)
-    w, _ = without_open_contacts(scene, delassus_matrix(scene), zero)
+    w = decoupled(delassus_matrix(scene), scene.closed)
     g = np.asarray(as_matrix(scaled(w, 1 / kinetic_norm(scene))))
     smallest = np.linalg.eigvalsh(g)[0]
     if smallest < _REDUNDANT * len(g) * np.finfo(g.dtype).eps:

@@ -1,6 +1,7 @@
 """Which entries of a law are free, their names, bounds and natural scales."""
 
 import dataclasses
+import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -8,25 +9,14 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jimpact.laws.base import Law
-from jimpact.laws.compliant import Compliant
+from jimpact.law import Law, free_parameters_of, parameters_of
 from jimpact.laws.lzb import LZB
 
 DEFAULT_FREE = ("restitution", "stiffness")
 
-# Where a field's values may lie, by name; other fields are unbounded.
-DOMAIN = {
-    "restitution": (0.0, 1.0),
-    "stiffness": (0.0, np.inf),
-    "exponent": (1.0, np.inf),
-    "initial_energy": (0.0, np.inf),
-    "friction": (0.0, np.inf),
-}
-LOGARITHMIC = ("stiffness",)  # fitted in their logarithm: only ratios of them have a meaning
-
-# A stiffness without bounds may move this far from its start: beyond, the softer contact has
-# no further influence that a measurement could see.
-STIFFNESS_RANGE = 1e4
+# What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
+# beyond, the softer contact has no further influence that a measurement could see.
+LOG_RANGE = 1e4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +31,7 @@ class Parameters:
     names: tuple[str, ...]
     groups: tuple[tuple[int, ...], ...]
     entry_fields: tuple[str, ...]  # of each entry
+    log: np.ndarray  # (Q,) entries that are fitted in their logarithm
 
     @property
     def first(self) -> list[int]:
@@ -53,9 +44,9 @@ class Parameters:
 
 
 def value_of(law: Law, field: str) -> Any:
-    """A field of a law, or of the force of a compliant one; None if it has none."""
-    own = getattr(law, field, None)
-    return getattr(law.force, field, None) if own is None and isinstance(law, Compliant) else own
+    """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
+    found = parameters_of(law).get(field)
+    return None if found is None else found.value
 
 
 def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
@@ -69,14 +60,14 @@ def with_entries(law: Law, fields: tuple[str, ...], values: jax.Array) -> Law:
     for field in fields:
         old = value_of(law, field)
         new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
-        law = eqx.tree_at(lambda tree, f=field: value_of(tree, f), law, new)
+        law = eqx.tree_at(operator.attrgetter(parameters_of(law)[field].path), law, new)
         start += old.size
     return law
 
 
 def free_parameters(law: Law, contacts: int, free: Any) -> tuple[Parameters, list[str]]:
     """The parameters that `free` names, and notes on what was held instead."""
-    known = _array_fields(law)
+    known = list(free_parameters_of(law))
     labels, notes = {}, []
     for field, choice in _as_mapping(free, known).items():
         if field not in known:
@@ -105,7 +96,8 @@ def free_parameters(law: Law, contacts: int, free: Any) -> tuple[Parameters, lis
     if not names:
         raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
     owners = tuple(field for field, label in labels.items() for _ in range(label.size))
-    return Parameters(tuple(labels), tuple(names), tuple(groups), owners), notes
+    log = np.array([parameters_of(law)[field].domain.log for field in owners])
+    return Parameters(tuple(labels), tuple(names), tuple(groups), owners, log), notes
 
 
 def _name(field: str, members: np.ndarray, size: int) -> str:
@@ -113,18 +105,6 @@ def _name(field: str, members: np.ndarray, size: int) -> str:
     if len(members) == size and (size > 1 or members.shape[1] == 0):
         return field
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
-
-
-def _array_fields(law: Law) -> list[str]:
-    """Public names of the law's float arrays (`exponent_array` is reached as `exponent`)."""
-    parts = (law, law.force) if isinstance(law, Compliant) else (law,)
-    fields = [
-        f.name
-        for part in parts
-        for f in dataclasses.fields(part)
-        if eqx.is_inexact_array(getattr(part, f.name))
-    ]
-    return [name.removesuffix("_array") for name in fields]
 
 
 def _as_mapping(free: Any, known: list[str]) -> dict[str, Any]:
@@ -196,10 +176,10 @@ def bounds_of(
         inside = np.array([owner == field for owner in parameters.entry_fields])
         if field in given:
             ends[:, inside] = _bound_pair(field, given[field], law)
-        elif field in LOGARITHMIC:
-            ends[:, inside] = values[inside] / STIFFNESS_RANGE, values[inside] * STIFFNESS_RANGE
+        elif parameters_of(law)[field].domain.log:
+            ends[:, inside] = values[inside] / LOG_RANGE, values[inside] * LOG_RANGE
         else:
-            ends[:, inside] = np.array(_domain(field, law))[:, None]
+            ends[:, inside] = np.array(parameters_of(law)[field].domain.bounds)[:, None]
     low = np.array([ends[0, list(group)].max() for group in parameters.groups])
     high = np.array([ends[1, list(group)].min() for group in parameters.groups])
     for name, start, a, b in zip(parameters.names, values[parameters.first], low, high):
@@ -209,10 +189,6 @@ def bounds_of(
                 f"but is [{a:g}, {b:g}]."
             )
     return low, high
-
-
-def _domain(field: str, law: Law) -> tuple[float, float]:
-    return law.domain().get(field, DOMAIN.get(field, (-np.inf, np.inf)))
 
 
 def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray]:
@@ -225,7 +201,8 @@ def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray
             f"Argument `bounds` must map `{field}` to (low, high), each a number or of shape "
             f"{shape}, but has {pair!r}."
         ) from None
-    smallest, largest = _domain(field, law)
+    domain = parameters_of(law)[field].domain
+    smallest, largest = domain.bounds
     if not (low < high).all():
         raise ValueError(f"Argument `bounds` must have low < high for `{field}`, but has {pair!r}.")
     if (low < smallest).any() or (high > largest).any():
@@ -233,6 +210,6 @@ def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray
             f"Argument `bounds` must lie in [{smallest:g}, {largest:g}] for `{field}`, "
             f"but has {pair!r}."
         )
-    if field in LOGARITHMIC and (low <= 0).any():
+    if domain.log and (low <= 0).any():
         raise ValueError(f"Argument `bounds` must be > 0 for `{field}`, but has {pair!r}.")
     return low, high

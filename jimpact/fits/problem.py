@@ -7,14 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.contact_space import dense_mass
 from jimpact.experiments import Experiments
 from jimpact.fits.least_squares import Box, Method, Region, State, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
-from jimpact.fits.parameters import LOGARITHMIC, Parameters, entries, with_entries
+from jimpact.fits.parameters import Parameters, entries, with_entries
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
-from jimpact.scene import Scene
+from jimpact.law import Law
+from jimpact.scene import Scene, dense_mass
 from jimpact.status import CODE
 
 # Outcomes whose velocities mean nothing. A trial that meets one gets a residual far above any
@@ -97,7 +96,7 @@ def _scales(
     parameters: Parameters, values: np.ndarray, energy: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Of each entry: the size of a change of order 1 (or 1, where fitted in its logarithm), log."""
-    log = np.array([field in LOGARITHMIC for field in parameters.entry_fields])
+    log = parameters.log
     of_energy = np.array([field == "initial_energy" for field in parameters.entry_fields])
     scale = np.where(of_energy, energy, np.maximum(np.abs(values), 1.0))
     return np.where(log, 1.0, scale), log

@@ -1,5 +1,6 @@
 """What a user must know before trusting a fit, in words."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from jimpact.defects import data_defects
@@ -9,8 +10,8 @@ from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.parameters import Parameters
 from jimpact.fits.problem import Problem
 from jimpact.fits.uncertainty import Uncertainty
-from jimpact.laws.base import Law
-from jimpact.laws.restitution_matrix import RestitutionMatrix
+from jimpact.law import Law
+from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
@@ -32,7 +33,7 @@ def fit_warnings(
     spread: Uncertainty,
 ) -> list[str]:
     """All warnings, those about the data first."""
-    stored = float(np.sum(law.stored_energy(experiments.scene_of(scene, 0).contacts)))
+    stored = float(np.sum(jnp.broadcast_to(law.stored, experiments.scene_of(scene, 0).contacts)))
     lines = data_defects(experiments, scene, stored)
     if not found.converged:
         lines.append(

@@ -1,39 +1,13 @@
-"""The registry of laws: one row a law. The CLI, the contract tests and the charts read it."""
+"""Our laws, entered in the registry: one row a law."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
-
-from jimpact.laws.base import Law
+from jimpact.law import EVERY_PROPERTY, REGISTRY, Row, register
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant, make_compliant
+from jimpact.laws.kinematic import Moreau, Newton, RestitutionMatrix
 from jimpact.laws.lzb import LZB
-from jimpact.laws.moreau import Moreau
-from jimpact.laws.newton import Newton
 from jimpact.laws.poisson import Poisson
-from jimpact.laws.restitution_matrix import RestitutionMatrix
 
-
-class Row(NamedTuple):
-    """A law, what it promises on every scene, and where it comes from.
-
-    `promises` names the properties the contract suite holds it to; where the law breaks another
-    one of them, its status must say so.
-    """
-
-    law: type[Law]
-    parameters: tuple[str, ...]
-    summary: str
-    right_when: str
-    fails_when: str
-    promises: frozenset[str]
-    source: str
-    bibtex: str
-    make: Callable[..., Law] | None = None  # from `parameters`, where the class takes others
-
-    def build(self, **parameters: Any) -> Law:
-        """The law with these parameters."""
-        return (self.make or self.law)(**parameters)
-
+__all__ = ["REGISTRY", "Row", "register"]
 
 BROGLIATO = """@book{brogliato2016,
   author = {Brogliato, Bernard}, title = {Nonsmooth Mechanics: Models, Dynamics and Control},
@@ -60,80 +34,74 @@ TOWNE = """@article{towne1977,
   title = {One-dimensional collisions and {C}hebyshev polynomials},
   journal = {American Journal of Physics}, volume = {45}, pages = {255--259}, year = {1977}}"""
 
-EVERY_PROPERTY = frozenset(
-    {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
+register(
+    "lzb",
+    LZB,
+    summary="energetic restitution, distributed by the stiffness ratios",
+    right_when="local, rate-independent contacts with known stiffness ratios (touching beads)",
+    fails_when="bulk waves (rods), viscous contacts, gaps that must re-close, adhesion",
+    promises=EVERY_PROPERTY,
+    source="Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.67)-(6.73)",
+    bibtex=LIU,
 )
-
-REGISTRY: dict[str, Row] = {
-    "lzb": Row(
-        law=LZB,
-        parameters=("restitution", "stiffness", "exponent", "initial_energy"),
-        summary="energetic restitution, distributed by the stiffness ratios",
-        right_when="local, rate-independent contacts with known stiffness ratios (touching beads)",
-        fails_when="bulk waves (rods), viscous contacts, gaps that must re-close, adhesion",
-        promises=EVERY_PROPERTY,
-        source="Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.67)-(6.73)",
-        bibtex=LIU,
-    ),
-    "newton": Row(
-        law=Newton,
-        parameters=("restitution",),
-        summary="gamma+ = -e gamma- at every contact",
-        right_when="one contact, or contacts with kinetic angle pi/2",
-        fails_when="contacts at rest (no dispersion), kinetic angles above pi/2 (p < 0)",
-        promises=frozenset({"velocity_scaling", "mass_scaling"}),
-        source="Brogliato, Nonsmooth Mechanics (2016), (6.41) with diagonal E",
-        bibtex=BROGLIATO,
-    ),
-    "moreau": Row(
-        law=Moreau,
-        parameters=("restitution",),
-        summary="0 <= gamma+ + e gamma- and p >= 0, one of them zero",
-        right_when="stiffness rising along the chain, plastic or decoupled contacts",
-        fails_when="chains at rest (no dispersion), contacts that separate before the impact",
-        promises=frozenset({"impulse_sign", "velocity_scaling", "mass_scaling"}),
-        source="Moreau (1988); Brogliato (2016), (6.51)",
-        bibtex=MOREAU,
-    ),
-    "poisson": Row(
-        law=Poisson,
-        parameters=("restitution",),
-        summary="every contact returns e times the impulse of its compression",
-        right_when="contacts that reach their largest compression together",
-        fails_when="dispersion in chains (would need e > 1), unequal e (may gain energy)",
-        promises=EVERY_PROPERTY - {"energy"},
-        source="Pfeiffer and Glocker (1996); Brogliato (2016), (6.76)-(6.79)",
-        bibtex=PFEIFFER,
-    ),
-    "binary": Row(
-        law=Binary,
-        parameters=("restitution",),
-        summary="pair collisions one after another, in a given order",
-        right_when="gaps well above the indentation, stiffness falling along the chain",
-        fails_when="touching equal balls (the striker never reverses), ties: order dependent",
-        promises=EVERY_PROPERTY,
-        source="Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)",
-        bibtex=TOWNE,
-    ),
-    "restitution_matrix": Row(
-        law=RestitutionMatrix,
-        parameters=("matrix",),
-        summary="qn+ = -E qn-: a full matrix of coefficients, tangential blocks included",
-        right_when="E is known or fitted for this very system and kind of approach; rocking",
-        fails_when="other masses or geometry than E was found for; E outside the admissible set",
-        promises=frozenset({"velocity_scaling", "mass_scaling"}),
-        source="Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)",
-        bibtex=BROGLIATO,
-    ),
-    "compliant": Row(
-        law=Compliant,
-        parameters=("stiffness", "exponent", "restitution", "rheology", "damping"),
-        summary="springs and dampers between bodies with real gaps",
-        right_when="gaps near the indentation, viscous contacts, known absolute stiffness",
-        fails_when="stiffness and damping unknown in SI units; geometry that turns during contact",
-        promises=frozenset({"impulse_sign", "gap_velocity_sign", "energy"}),
-        source="Brogliato (2016), (6.14)-(6.16); forces as cited in `rheology.py`",
-        bibtex=BROGLIATO,
-        make=make_compliant,
-    ),
-}
+register(
+    "newton",
+    Newton,
+    summary="gamma+ = -e gamma- at every contact",
+    right_when="one contact, or contacts with kinetic angle pi/2",
+    fails_when="contacts at rest (no dispersion), kinetic angles above pi/2 (p < 0)",
+    promises={"velocity_scaling", "mass_scaling"},
+    source="Brogliato, Nonsmooth Mechanics (2016), (6.41) with diagonal E",
+    bibtex=BROGLIATO,
+)
+register(
+    "moreau",
+    Moreau,
+    summary="0 <= gamma+ + e gamma- and p >= 0, one of them zero",
+    right_when="stiffness rising along the chain, plastic or decoupled contacts",
+    fails_when="chains at rest (no dispersion), contacts that separate before the impact",
+    promises={"impulse_sign", "velocity_scaling", "mass_scaling"},
+    source="Moreau (1988); Brogliato (2016), (6.51)",
+    bibtex=MOREAU,
+)
+register(
+    "poisson",
+    Poisson,
+    summary="every contact returns e times the impulse of its compression",
+    right_when="contacts that reach their largest compression together",
+    fails_when="dispersion in chains (would need e > 1), unequal e (may gain energy)",
+    promises=EVERY_PROPERTY - {"energy"},
+    source="Pfeiffer and Glocker (1996); Brogliato (2016), (6.76)-(6.79)",
+    bibtex=PFEIFFER,
+)
+register(
+    "binary",
+    Binary,
+    summary="pair collisions one after another, in a given order",
+    right_when="gaps well above the indentation, stiffness falling along the chain",
+    fails_when="touching equal balls (the striker never reverses), ties: order dependent",
+    promises=EVERY_PROPERTY,
+    source="Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)",
+    bibtex=TOWNE,
+)
+register(
+    "restitution_matrix",
+    RestitutionMatrix,
+    summary="qn+ = -E qn-: a full matrix of coefficients, tangential blocks included",
+    right_when="E is known or fitted for this very system and kind of approach; rocking",
+    fails_when="other masses or geometry than E was found for; E outside the admissible set",
+    promises={"velocity_scaling", "mass_scaling"},
+    source="Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)",
+    bibtex=BROGLIATO,
+)
+register(
+    "compliant",
+    Compliant,
+    summary="springs and dampers between bodies with real gaps",
+    right_when="gaps near the indentation, viscous contacts, known absolute stiffness",
+    fails_when="stiffness and damping unknown in SI units; geometry that turns during contact",
+    promises={"impulse_sign", "gap_velocity_sign", "energy"},
+    source="Brogliato (2016), (6.14)-(6.16); forces as cited in `rheology.py`",
+    bibtex=BROGLIATO,
+    make=make_compliant,
+)

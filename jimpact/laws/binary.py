@@ -1,7 +1,6 @@
 """Binary collisions: the contacts collide one after another, in a given order."""
 
 import operator
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -9,20 +8,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import (
-    as_float_array,
-    as_whole,
-    check_per_contact,
-    check_values,
-    in_common_dtype,
-)
-from jimpact.contact_space import as_velocity, delassus_matrix, gap_velocity, velocity_change
-from jimpact.laws.base import Law, no_tangential_impulse
-from jimpact.scene import Scene
+from jimpact._checks import as_whole, check_values, in_common_dtype
+from jimpact.contact import Contact, delassus_matrix
+from jimpact.law import Impulses, Law, check_law, option, parameter
+from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 from jimpact.solvers import collisions
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
 
 ORDERS = ("fastest", "earliest", "left_to_right")
+
+
+def _checked_order(order: Any) -> str | tuple[int, ...]:
+    """`order` as a name or a tuple of ints; what needs no scene to be wrong is refused here."""
+    if isinstance(order, str) and order in ORDERS:
+        return order
+    if not isinstance(order, (tuple, list)) or not order:
+        raise ValueError(
+            f"Argument `order` must be one of {ORDERS} or a tuple of contact indices, "
+            f"but has value {order!r}."
+        )
+    bad = [j for j in order if isinstance(j, bool) or not hasattr(j, "__index__") or j < 0]
+    if bad:
+        raise ValueError(
+            f"Argument `order` must hold contact indices >= 0, but has value {order!r}."
+        )
+    return tuple(operator.index(j) for j in order)
 
 
 class Binary(Law):
@@ -63,25 +73,12 @@ class Binary(Law):
 
     uses_gaps: ClassVar[bool] = True
 
-    restitution: jax.Array
-    order: str | tuple[int, ...] = eqx.field(static=True)
-    max_collisions: int = eqx.field(static=True)
+    restitution: jax.Array = parameter(low=0.0, high=1.0)
+    order: str | tuple[int, ...] = option("fastest", converter=_checked_order, kw_only=False)
+    max_collisions: int = option(10_000, converter=lambda n: as_whole("max_collisions", n, 1))
 
-    def __init__(
-        self,
-        restitution: Any,
-        order: str | Sequence[int] = "fastest",
-        *,
-        max_collisions: int = 10_000,
-    ):
-        self.restitution = as_float_array("restitution", restitution)
-        check_values("restitution", self.restitution, low=0.0, high=1.0)
-        self.order = _checked_order(order)
-        self.max_collisions = as_whole("max_collisions", max_collisions, 1)
-
-    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """An order that names no such contact, or leaves one out, is an error."""
-        check_per_contact("restitution", self.restitution, scene.contacts)
         if isinstance(self.order, str):
             return
         m = scene.contacts
@@ -102,17 +99,10 @@ class Binary(Law):
                 f"follow each other), but has value {self.order!r}: it separates at once."
             )
 
-    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Sum of the impulses of all collisions; contacts without gaps."""
-        p, end = self._solve(delassus, gap_velocity, None)
-        return p, end.code
-
-    def all_impulses(
-        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Impulses of all collisions; the gaps of the scene matter in the order 'earliest'."""
-        p, end = self._solve(delassus, gap_velocity, scene.gaps)
-        return p, no_tangential_impulse(scene, p.dtype), end.code
+    def impulses(self, contact: Contact) -> Impulses:
+        """Sum of the impulses of all collisions; gaps matter in the order 'earliest'."""
+        p, end = self._solve(contact.delassus, contact.gap_velocity, contact.gaps)
+        return Impulses(p, None, end.code)
 
     def _cycle(self, m: int) -> tuple[int, ...] | None:
         if isinstance(self.order, tuple):
@@ -186,7 +176,7 @@ class Binary(Law):
         v = as_velocity(scene, velocity)
         check_values("velocity", v)
         law, scene, v = in_common_dtype(self, scene, v)
-        law.check_options(v.dtype, scene)
+        check_law(law, scene, v.dtype)
         assert isinstance(law, Binary)
         return law, scene, v
 
@@ -198,20 +188,3 @@ def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
 
 
 _collide = eqx.filter_jit(collisions.collide)
-
-
-def _checked_order(order: Any) -> str | tuple[int, ...]:
-    """`order` as a name or a tuple of ints; what needs no scene to be wrong is refused here."""
-    if isinstance(order, str) and order in ORDERS:
-        return order
-    if not isinstance(order, (tuple, list)) or not order:
-        raise ValueError(
-            f"Argument `order` must be one of {ORDERS} or a tuple of contact indices, "
-            f"but has value {order!r}."
-        )
-    bad = [j for j in order if isinstance(j, bool) or not hasattr(j, "__index__") or j < 0]
-    if bad:
-        raise ValueError(
-            f"Argument `order` must hold contact indices >= 0, but has value {order!r}."
-        )
-    return tuple(operator.index(j) for j in order)

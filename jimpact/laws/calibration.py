@@ -13,12 +13,11 @@ import optimistix as optx
 
 from jimpact._checks import as_float_array, check_per_contact, check_values
 from jimpact.comparison import Comparison, compare
-from jimpact.contact_space import delassus_matrix, gap_velocity
+from jimpact.contact import delassus_matrix
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.scene import Scene
-from jimpact.scenes import chain
+from jimpact.scene import Scene, chain, gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
 RTOL = {"float64": 1e-11}  # of the pair's impact; else the law's default

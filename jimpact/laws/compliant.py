@@ -4,18 +4,18 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import check_per_contact, check_values
-from jimpact.laws.base import Law, no_tangential_impulse
+from jimpact._checks import check_values
+from jimpact.contact import Contact
+from jimpact.events.contact_flow import Viscous
+from jimpact.events.impact_dynamics import dimensionless, sides_of, solve
+from jimpact.law import Impulses, Law, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import FINEST_RTOL_IN_EPS, default_rtol
-from jimpact.numerics.dimensionless import solve, to_dimensionless
-from jimpact.numerics.flow import Viscous
+from jimpact.laws.lzb import check_rtol, default_rtol
 from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal
+from jimpact.solvers.tridiagonal import diagonal
 
 
 class Compliant(Law):
@@ -29,6 +29,9 @@ class Compliant(Law):
         force: of `rheology.py`: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
             `Bistiffness(k, eta, e)`, `KelvinVoigt(k, c)`, `HuntCrossley(k, d, eta)`,
             `KuwabaraKono(k, A)`, `UserForce(function, parameters)`.
+        friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
+        initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed contacts; not with
+            a viscous force.
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
         max_steps: passes of the integrator before it gives up.
 
@@ -50,64 +53,52 @@ class Compliant(Law):
     uses_gaps: ClassVar[bool] = True
 
     force: Force
-    rtol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    friction: jax.Array | None = parameter(low=0.0, default=None, kw_only=True)
+    initial_energy: jax.Array = parameter(low=0.0, default=0.0, kw_only=True)
+    rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
+    max_steps: int = option(100_000, low=1)
 
-    def __init__(self, force: Force, *, rtol: float | None = None, max_steps: int = 100_000):
-        if not isinstance(force, Force):
+    def __check_init__(self) -> None:
+        if not isinstance(self.force, Force):
             raise TypeError(
                 "Argument `force` must be a contact force such as Hertz(k), "
-                f"but has value {force!r}."
-            )
-        if rtol is not None:
-            check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
-        self.force, self.rtol, self.max_steps = force, rtol, max_steps
-
-    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
-        """Parameters per contact, and a tolerance that the precision can hold."""
-        for name, value in vars(self.force).items():
-            if isinstance(value, (jax.Array, tuple)) and name != "parameters":  # the user's own
-                check_per_contact(name, value, scene.contacts)
-        finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
-        if self.rtol is not None and self.rtol < finest:
-            raise ValueError(
-                f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
-                f"but has value {self.rtol:g}: enable jax_enable_x64 for finer tolerances."
+                f"but has value {self.force!r}."
             )
 
-    def all_impulses(
-        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        if not isinstance(self.force, Bistiffness):  # their energy is no function of x alone
+            check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
+
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
+        """A tolerance that the precision can hold."""
+        check_rtol(self.rtol, dtype)
+
+    def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
-        gaps = jnp.zeros_like(gap_velocity) if scene.gaps is None else scene.gaps
-        p, code = self._solve(delassus, gap_velocity, gaps)
-        return p, no_tangential_impulse(scene, p.dtype), code
-
-    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Impulses of contacts that touch."""
-        return self._solve(delassus, gap_velocity, jnp.zeros_like(gap_velocity))
-
-    def _solve(
-        self, delassus: Symmetric, gamma: jax.Array, gaps: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        m, force = gamma.shape[0], self.force
-        ones, none = jnp.ones_like(gamma), jnp.zeros_like(gamma)
-        rtol = self.rtol or default_rtol("time", gamma.dtype)
-        chain, viscous = isinstance(delassus, Tridiagonal), None
+        gamma, force, viscous = contact.gap_velocity, self.force, None
         if isinstance(force, Bistiffness):
-            k, e = (jnp.broadcast_to(z, (m,)) for z in (force.stiffness, force.restitution))
-            exponent = force.exponent
+            k, e, exponent = force.stiffness, force.restitution, force.exponent
         else:  # in units of a spring that stores the impact's energy at the force's indentation
-            q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(delassus)))
-            k = (q / force.indentation_scale(0.5 * q**2 * ones)) ** 2
-            k, e, exponent = jax.lax.stop_gradient(k), ones, 1.0
-        inputs, units = to_dimensionless(delassus, gamma, e, k, exponent, none, rtol, gaps)
-        momentum = units.velocity / units.root
+            q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus)))
+            k = (q / force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))) ** 2
+            k, e, exponent = jax.lax.stop_gradient(k), jnp.ones_like(gamma), 1.0
+        problem, units = dimensionless(
+            contact.delassus,
+            gamma,
+            e,
+            k,
+            exponent,
+            contact.stored,
+            self.rtol or default_rtol("time", gamma.dtype),
+            contact.gaps,
+        )
         if not isinstance(force, Bistiffness):
             speed = units.velocity * units.root
-            viscous = Viscous(force, units.indentation, speed, momentum / units.time)
-        p, code = solve(inputs, exponent, chain, self.max_steps, viscous=viscous)
-        return p * momentum, code
+            viscous = Viscous(force, units.indentation, speed, units.momentum / units.time)
+        problem = problem._replace(viscous=viscous)
+        if self.friction is not None:
+            problem = problem._replace(sides=sides_of(contact, self.friction, units))
+        p, p_t, code = solve(problem, units, exponent, contact.delassus, self.max_steps)
+        return Impulses(p, p_t, code)
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

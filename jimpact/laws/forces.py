@@ -12,13 +12,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_values
+from jimpact._checks import as_float_array
+from jimpact.events.contact_flow import Exponent
+from jimpact.law import Declared, parameter
 
 _SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
 _BISECTIONS = 50  # of them, to about 1e-13 decades
 
 
-class Force(eqx.Module):
+class Force(Declared):
     """A contact force; `force` and, where it may slacken, `onset` (of the same sign, smooth)."""
 
     slackens: ClassVar[bool] = False
@@ -64,31 +66,9 @@ class Bistiffness(Force):
     Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.1, (6.67).
     """
 
-    stiffness: jax.Array
-    restitution: jax.Array
-    exponent_array: jax.Array | None
-    exponent_static: float | tuple[float, ...] | None = eqx.field(static=True)
-
-    def __init__(self, stiffness: Any, exponent: Any = 1.5, restitution: Any = 1.0):
-        self.stiffness = as_float_array("stiffness", stiffness)
-        self.restitution = as_float_array("restitution", restitution)
-        static = isinstance(exponent, (int, float, tuple))
-        self.exponent_static = (
-            None
-            if not static
-            else tuple(map(float, exponent))
-            if isinstance(exponent, tuple)
-            else float(exponent)
-        )
-        self.exponent_array = None if static else as_float_array("exponent", exponent)
-        check_values("stiffness", self.stiffness, low=0.0, open_low=True)
-        check_values("exponent", self.exponent, low=1.0)
-        check_values("restitution", self.restitution, low=0.0, high=1.0)
-
-    @property
-    def exponent(self) -> Any:
-        """The exponents as given: static float or tuple, or an array."""
-        return self.exponent_static if self.exponent_array is None else self.exponent_array
+    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
+    exponent: Exponent = parameter(low=1.0, static_numbers=True, default=1.5)
+    restitution: jax.Array = parameter(low=0.0, high=1.0, default=1.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """Loading branch."""
@@ -130,11 +110,8 @@ class KelvinVoigt(Force):
 
     slackens: ClassVar[bool] = True
 
-    stiffness: jax.Array
-    damping: jax.Array
-
-    def __init__(self, stiffness: Any, damping: Any):
-        self.stiffness, self.damping = _checked(stiffness, damping)
+    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
+    damping: jax.Array = parameter(low=0.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x + c x'`."""
@@ -152,19 +129,15 @@ class HuntCrossley(Force):
     Source: Hunt and Crossley (1975).
     """
 
-    stiffness: jax.Array
-    damping: jax.Array
-    exponent: float = eqx.field(static=True)
-
-    def __init__(self, stiffness: Any, damping: Any, exponent: float = 1.5):
-        self.stiffness, self.damping = _checked(stiffness, damping)
-        check_values("exponent", exponent, low=1.0)
-        self.exponent = float(exponent)
+    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
+    damping: jax.Array = parameter(low=0.0)
+    exponent: Exponent = parameter(low=1.0, static_numbers=True, default=1.5)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x^eta (1 + d x')`."""
         positive = x > 0
-        power = jnp.where(positive, jnp.where(positive, x, 1.0) ** self.exponent, 0.0)
+        eta = jnp.asarray(self.exponent, x.dtype)
+        power = jnp.where(positive, jnp.where(positive, x, 1.0) ** eta, 0.0)
         return self.stiffness * power * (1 + self.damping * rate)
 
 
@@ -180,11 +153,8 @@ class KuwabaraKono(Force):
 
     slackens: ClassVar[bool] = True
 
-    stiffness: jax.Array
-    damping: jax.Array
-
-    def __init__(self, stiffness: Any, damping: Any):
-        self.stiffness, self.damping = _checked(stiffness, damping)
+    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
+    damping: jax.Array = parameter(low=0.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k sqrt(x) (x + 1.5 A x')`."""
@@ -225,10 +195,3 @@ class UserForce(Force):
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`function(x, rate, parameters)`."""
         return self.function(x, rate, self.parameters)
-
-
-def _checked(stiffness: Any, damping: Any) -> tuple[jax.Array, jax.Array]:
-    k, c = as_float_array("stiffness", stiffness), as_float_array("damping", damping)
-    check_values("stiffness", k, low=0.0, open_low=True)
-    check_values("damping", c, low=0.0)
-    return k, c

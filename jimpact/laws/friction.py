@@ -1,4 +1,4 @@
-"""Coulomb friction of the kinematic laws: their fields, checks, and the impulses of a scene."""
+"""Coulomb friction of the algebraic laws: their two fields, and the solver behind one function."""
 
 from typing import Any
 
@@ -6,67 +6,41 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_values, is_traced
-from jimpact.contact_space import solve_mass
-from jimpact.laws.base import Law
-from jimpact.scene import Scene
-from jimpact.solvers.friction import FrictionImpulses, solve
+from jimpact._checks import is_traced
+from jimpact.contact import Contact
+from jimpact.law import Impulses
+from jimpact.solvers.friction import solve
 
 
-def friction_fields(
-    friction: Any, tangential_restitution: Any
-) -> tuple[jax.Array | None, jax.Array | None]:
-    """`(mu, e_t)` as arrays, or `(None, None)` without friction."""
-    if friction is None:
-        if is_traced(tangential_restitution) or np.any(np.asarray(tangential_restitution) != 0):
-            raise ValueError(
-                "Argument `tangential_restitution` must be 0 without `friction`: then nothing acts "
-                f"along the contacts, but has value {tangential_restitution!r}."
-            )
-        return None, None
-    mu = as_float_array("friction", friction)
-    e_t = as_float_array("tangential_restitution", tangential_restitution)
-    check_values("friction", mu, low=0.0)
-    check_values("tangential_restitution", e_t, low=-1.0, high=1.0)
-    return mu, e_t
-
-
-def check_friction(law: Law, scene: Scene) -> None:
-    """Raise where a law with friction meets a scene without tangents."""
-    if scene.tangents is None:
+def friction_fields(friction: Any, tangential_restitution: Any) -> tuple[Any, Any]:
+    """`(mu, e_t)`, or `(None, None)` without friction."""
+    if friction is not None:
+        return friction, tangential_restitution
+    if is_traced(tangential_restitution) or np.any(np.asarray(tangential_restitution) != 0):
         raise ValueError(
-            f"Argument `scene` must have tangents where {type(law).__name__} has `friction`: "
-            "give Scene(..., tangents=...), or friction=None."
+            "Argument `tangential_restitution` must be 0 without `friction`: then nothing acts "
+            f"along the contacts, but has value {tangential_restitution!r}."
         )
+    return None, None
 
 
 def frictional_impulses(
-    scene: Scene,
-    velocity: jax.Array,
+    contact: Contact,
     normal: jax.Array,
     friction: jax.Array,
     tangential_restitution: jax.Array,
+    *,
     complementary: bool,
-) -> FrictionImpulses:
-    """p (m,) and p_t (m,) or (2 m,) with `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
+) -> Impulses:
+    """p (m,) and p_t (t,) with `p_t in -mu p Sgn(u+ + e_t u-)`.
 
     `normal` (m,) [m/s] is what gamma+ - gamma- must make up for: `gamma+ - gamma- + normal` is 0,
     or (`complementary`) >= 0 and 0 where p > 0.
     """
-    assert scene.tangents is not None  # see `check_friction`
-    m, closed = scene.contacts, scene.closed
-    each = scene.tangents.shape[1] // m
-    both = jnp.concatenate([scene.normals, scene.tangents], axis=1)
-    matrix = both.T @ solve_mass(scene, both)
-    there = jnp.concatenate([closed, jnp.repeat(closed, each)])
-    unit = jnp.eye(len(there), dtype=matrix.dtype)
-    e_t = jnp.repeat(tangential_restitution * jnp.ones(m, matrix.dtype), each)
+    assert contact.slip is not None  # see `check_law`
+    ones = jnp.ones_like(contact.gap_velocity)
+    slip = (1 + jnp.repeat(tangential_restitution * ones, contact.tangents)) * contact.slip
     found = solve(
-        jnp.where(there[:, None] & there[None, :], matrix, unit),
-        jnp.where(closed, normal, 0.0),
-        jnp.where(there[m:], (1 + e_t) * (scene.tangents.T @ velocity), 0.0),
-        jnp.where(closed, friction * jnp.ones(m, matrix.dtype), 0.0),
-        complementary=complementary,
+        contact.whole_delassus, normal, slip, friction * ones, complementary=complementary
     )
-    p = jnp.where(closed, found.normal, 0.0)  # exactly
-    return FrictionImpulses(p, jnp.where(there[m:], found.tangential, 0.0), found.status)
+    return Impulses(*found)

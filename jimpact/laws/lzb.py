@@ -1,20 +1,16 @@
 """The LZB law: energetic restitution, distributed over the contacts by their stiffness ratios."""
 
-from typing import Any
+from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.contact_space import tangential_delassus
-from jimpact.laws.base import Law
-from jimpact.laws.friction import check_friction
-from jimpact.numerics import friction
-from jimpact.numerics.dimensionless import METHODS, Inputs, Units, solve, to_dimensionless
-from jimpact.numerics.powers import Exponent
+from jimpact._checks import as_float_array, check_values
+from jimpact.contact import Contact
+from jimpact.events.contact_flow import Exponent
+from jimpact.events.impact_dynamics import METHODS, dimensionless, sides_of, solve
+from jimpact.law import Impulses, Law, StaticNumber, option, parameter
 from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself
@@ -24,6 +20,16 @@ FINEST_RTOL_IN_EPS = 16  # below this many roundings the error estimate is noise
 def default_rtol(method: str, dtype: jnp.dtype) -> float:
     """Tolerance used where the law names none."""
     return DEFAULT_RTOL_IMPULSE if method == "impulse" else DEFAULT_RTOL.get(str(dtype), 1e-5)
+
+
+def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
+    """Raise where the precision cannot hold this tolerance."""
+    finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
+    if rtol is not None and rtol < finest:
+        raise ValueError(
+            f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
+            f"but has value {rtol:g}: enable jax_enable_x64 for finer tolerances."
+        )
 
 
 def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
@@ -99,120 +105,46 @@ class LZB(Law):
     [-0.27931, -0.04383, 0.45566]
     """
 
-    restitution: jax.Array
-    stiffness: jax.Array
-    initial_energy: jax.Array
-    friction: jax.Array | None
-    exponent_array: jax.Array | None
-    exponent_static: float | tuple[float, ...] | None = eqx.field(static=True)
-    rtol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
-    method: str = eqx.field(static=True)
+    separable: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        restitution: Any,
-        stiffness: Any = 1.0,
-        exponent: Any = 1.5,
-        initial_energy: Any = 0.0,
-        *,
-        friction: Any = None,
-        rtol: float | None = None,
-        max_steps: int = 100_000,
-        method: str = "time",
-    ):
-        self.restitution = as_float_array("restitution", restitution)
-        self.stiffness = as_float_array("stiffness", stiffness)
-        self.initial_energy = as_float_array("initial_energy", initial_energy)
-        self.friction = None if friction is None else as_float_array("friction", friction)
-        if isinstance(exponent, (int, float)):
-            self.exponent_static, self.exponent_array = float(exponent), None
-        elif isinstance(exponent, tuple) and not is_traced(exponent):
-            self.exponent_static, self.exponent_array = tuple(float(x) for x in exponent), None
-        else:
-            self.exponent_static = None
-            self.exponent_array = as_float_array("exponent", exponent)
-        self.rtol, self.max_steps, self.method = rtol, max_steps, method
-        check_values("restitution", self.restitution, low=0.0, high=1.0)
-        check_values("stiffness", self.stiffness, low=0.0, open_low=True)
-        check_values("initial_energy", self.initial_energy, low=0.0)
-        if self.friction is not None:
-            check_values("friction", self.friction, low=0.0)
-        check_values("exponent", self.exponent, low=1.0)
-        if rtol is not None:
-            check_values("rtol", rtol, low=0.0, high=1.0, open_low=True)
-        if method not in METHODS:
-            raise ValueError(
-                f"Argument `method` must be one of {METHODS}, but has value {method!r}."
-            )
-        if method == "propagator" and self.exponent_static != 1.0:
+    restitution: jax.Array = parameter(low=0.0, high=1.0)
+    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True, default=1.0)
+    exponent: Exponent = parameter(low=1.0, static_numbers=True, default=1.5)
+    initial_energy: jax.Array = parameter(low=0.0, default=0.0)
+    friction: jax.Array | None = parameter(low=0.0, default=None, kw_only=True)
+    rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
+    max_steps: int = option(100_000, low=1)
+    method: str = option("time", METHODS)
+
+    def __check_init__(self) -> None:
+        if self.method == "propagator" and self.exponent != StaticNumber(1.0):
             raise ValueError(
                 "Argument `exponent` must be the float 1.0 for method='propagator', "
                 f"but has value {self.exponent}."
             )
-        if method != "time" and friction is not None:
+        if self.method != "time" and self.friction is not None:
             raise ValueError(
-                f"Argument `method` must be 'time' with friction, but has value {method!r}."
+                f"Argument `method` must be 'time' with friction, but has value {self.method!r}."
             )
 
-    @property
-    def exponent(self) -> Exponent:
-        """The exponents as given: static float or tuple, or an array."""
-        static = self.exponent_static
-        return static if static is not None else self.exponent_array  # type: ignore[return-value]
-
-    def stored_energy(self, contacts: int) -> jax.Array:
-        """`U_0` (m,) [J]."""
-        return jnp.broadcast_to(self.initial_energy, (contacts,))
-
-    def with_stored(self, energy: jax.Array) -> "LZB":
-        """Open contacts store nothing."""
-        return eqx.tree_at(lambda law: law.initial_energy, self, energy)
-
-    def check_options(self, dtype: jnp.dtype, scene: Scene) -> None:
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """A tolerance finer than the precision can hold is an error."""
-        if isinstance(self.exponent_static, tuple):
-            check_shape("exponent", self.exponent_static, (scene.contacts,), "one per contact")
-        finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
-        if self.rtol is not None and self.rtol < finest:
-            raise ValueError(
-                f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
-                f"but has value {self.rtol:g}: enable jax_enable_x64 for finer tolerances."
-            )
-        if self.friction is not None:
-            check_friction(self, scene)
+        check_rtol(self.rtol, dtype)
 
-    def by_blocks(self) -> bool:
-        """Contacts feel each other through W only; a tuple of exponents belongs to all of them."""
-        return self.friction is None and not isinstance(self.exponent_static, tuple)
-
-    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
-        inputs, units = self._dimensionless(delassus, gap_velocity)
-        chain = isinstance(delassus, Tridiagonal)
-        p, code = solve(inputs, self.exponent, chain, self.max_steps, self.method)
-        return p * units.velocity / units.root, code
-
-    def all_impulses(
-        self, scene: Scene, delassus: Symmetric, gap_velocity: jax.Array, velocity: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Impulses with friction, where the law has some."""
-        if self.friction is None:
-            return super().all_impulses(scene, delassus, gap_velocity, velocity)
-        inputs, units = self._dimensionless(as_matrix(delassus), gap_velocity)
-        w_nt, w_tt, slip = tangential_delassus(scene, velocity)
-        side = friction.to_dimensionless(w_nt, w_tt, self.friction, slip, units)
-        (p, p_t), code = friction.solve(inputs, side, self.exponent, self.max_steps)
-        root = jnp.repeat(units.root, p_t.shape[0] // p.shape[0])
-        return p * units.velocity / units.root, p_t * units.velocity / root, code
-
-    def _dimensionless(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[Inputs, Units]:
-        return to_dimensionless(
-            delassus,
-            gap_velocity,
+        problem, units = dimensionless(
+            contact.delassus,
+            contact.gap_velocity,
             self.restitution,
             self.stiffness,
             self.exponent,
-            self.stored_energy(gap_velocity.shape[0]),
-            self.rtol or default_rtol(self.method, gap_velocity.dtype),
+            contact.stored,
+            self.rtol or default_rtol(self.method, contact.gap_velocity.dtype),
         )
+        if self.friction is not None:
+            problem = problem._replace(sides=sides_of(contact, self.friction, units))
+        p, p_t, code = solve(
+            problem, units, self.exponent, contact.delassus, self.max_steps, self.method
+        )
+        return Impulses(p, p_t, code)

@@ -1,16 +1,14 @@
 """Poisson's law in the two-stage form of Pfeiffer and Glocker."""
 
-from typing import Any
+from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jimpact._checks import as_float_array, check_values
-from jimpact.laws.base import Law
+from jimpact.contact import Contact
+from jimpact.law import Impulses, Law, option, parameter
 from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.tridiagonal import Symmetric, as_matrix, is_regular
+from jimpact.solvers.tridiagonal import as_matrix, is_regular
 
 
 class Poisson(Law):
@@ -38,28 +36,16 @@ class Poisson(Law):
     [0.0667, 0.2667, 0.6667]
     """
 
-    restitution: jax.Array
-    allow_above_one: bool = eqx.field(static=True)
+    separable: ClassVar[bool] = True
 
-    def __init__(self, restitution: Any, *, allow_above_one: bool = False):
-        self.restitution = as_float_array("restitution", restitution)
-        self.allow_above_one = allow_above_one
-        high = np.inf if allow_above_one else 1.0
-        check_values("restitution", self.restitution, low=0.0, high=high)
+    restitution: jax.Array = parameter(low=0.0, high=1.0, high_unless="allow_above_one")
+    allow_above_one: bool = option(False, converter=bool)
 
-    def domain(self) -> dict[str, tuple[float, float]]:
-        """Values a fit may give the coefficients."""
-        return {"restitution": (0.0, np.inf)} if self.allow_above_one else {}
-
-    def by_blocks(self) -> bool:
-        """Contacts feel each other through W only."""
-        return True
-
-    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def impulses(self, contact: Contact) -> Impulses:
         """Two linear complementarity problems."""
-        w, regular = as_matrix(delassus), is_regular(delassus)
-        compression = solve_lcp(w, gap_velocity, regular=regular)
+        w, regular = as_matrix(contact.delassus), is_regular(contact.delassus)
+        compression = solve_lcp(w, contact.gap_velocity, regular=regular)
         returned = self.restitution * compression.z
         supplement = solve_lcp(w, compression.w + w @ returned, regular=regular)
         code = jnp.maximum(compression.code, supplement.code)
-        return compression.z + returned + supplement.z, code
+        return Impulses(compression.z + returned + supplement.z, None, code)

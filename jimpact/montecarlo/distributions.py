@@ -11,8 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.fits.parameters import DOMAIN
-from jimpact.laws.base import Law
+from jimpact.law import Domain, Law, free_parameters_of
 
 OVERLAP = (
     "a negative gap is an overlap, that is a precompressed contact: give LZB the energy stored in "
@@ -107,17 +106,6 @@ class Normal(Distribution):
             )
 
 
-def parameter_paths(module: eqx.Module) -> dict[str, str]:
-    """Where the arrays of a law are, by field, those of its parts (Compliant's force) included."""
-    found: dict[str, str] = {}
-    for name, value in vars(module).items():
-        if isinstance(value, eqx.Module):
-            found |= {own: f"{name}.{path}" for own, path in parameter_paths(value).items()}
-        elif eqx.is_inexact_array(value):
-            found[name] = name
-    return found
-
-
 class Rows(eqx.Module):
     """Given samples (S, size): sample i is row i."""
 
@@ -150,19 +138,19 @@ class RandomLaw(eqx.Module):
     parameters: dict[str, Distribution]
 
     def __init__(self, law: Law, **parameters: Distribution):
-        paths = parameter_paths(law)
+        known = free_parameters_of(law)
         for name, distribution in parameters.items():
-            if name not in paths:
+            if name not in known:
                 raise ValueError(
                     f"Parameters of {type(law).__name__} that can be random are "
-                    f"{', '.join(paths)}, but not `{name}`."
+                    f"{', '.join(known)}, but not `{name}`."
                 )
             if not isinstance(distribution, Distribution):
                 raise TypeError(
                     f"Argument `{name}` must be Uniform or Normal, but is {distribution!r}."
                 )
-            distribution.check(name, operator.attrgetter(paths[name])(law).size, False)
-            _check_domain(name, distribution)
+            distribution.check(name, known[name].value.size, False)
+            _check_domain(name, distribution, known[name].domain)
         self.law, self.parameters = law, parameters
 
     def __repr__(self) -> str:
@@ -171,12 +159,11 @@ class RandomLaw(eqx.Module):
 
     def __call__(self, key: jax.Array) -> Law:
         """The law of this key."""
-        law, paths = self.law, parameter_paths(self.law)
+        law, known = self.law, free_parameters_of(self.law)
         for i, (name, distribution) in enumerate(sorted(self.parameters.items())):
-            get = operator.attrgetter(paths[name])
-            old = get(law)
+            old, path, _ = known[name]
             new = distribution.sample(jax.random.fold_in(key, i), old.size, old.dtype, False)
-            law = eqx.tree_at(get, law, new.reshape(old.shape))
+            law = eqx.tree_at(operator.attrgetter(path), law, new.reshape(old.shape))
         return law
 
 
@@ -216,8 +203,8 @@ def _check_sizes(value: Any, name: str, size: int, fields: tuple[str, ...]) -> N
             )
 
 
-def _check_domain(name: str, distribution: Distribution) -> None:
-    low, high = DOMAIN.get(name, (-np.inf, np.inf))
+def _check_domain(name: str, distribution: Distribution, domain: Domain) -> None:
+    low, high = domain.bounds
     if isinstance(distribution, Uniform):
         least, most = np.min(np.asarray(distribution.low)), np.max(np.asarray(distribution.high))
     else:

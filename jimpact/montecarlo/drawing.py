@@ -4,19 +4,16 @@ Sample i is lane i % C of chunk i // C; its key is `fold_in(fold_in(key, chunk),
 impacts are two compiled programs, so that draws made again give the same bits.
 """
 
-import operator
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact.fits.parameters import DOMAIN
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
-from jimpact.montecarlo.distributions import Distribution, Source, parameter_paths
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.law import Law, free_parameters_of
+from jimpact.montecarlo.distributions import Distribution, Source
+from jimpact.scene import Scene, with_gaps
 from jimpact.status import STATUS
 
 # Further outcomes of a sample: it never reached the law.
@@ -104,8 +101,6 @@ def _outcome(
 
 def _in_domain(law: Law) -> jax.Array:
     fine = jnp.asarray(True)
-    for name, path in parameter_paths(law).items():
-        value = operator.attrgetter(path)(law)
-        low, high = DOMAIN.get(name, (-jnp.inf, jnp.inf))
-        fine = fine & jnp.all(jnp.isfinite(value) & (value >= low) & (value <= high))
+    for value, _, domain in free_parameters_of(law).values():
+        fine = fine & domain.holds(value)
     return fine

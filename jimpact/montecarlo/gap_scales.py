@@ -8,14 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values, is_traced
-from jimpact.contact_space import as_velocity, delassus_matrix, gap_velocity
+from jimpact.contact import delassus_matrix
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law, check_law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
 from jimpact.laws.lzb import LZB
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 
 NEARLY_TOUCHING, WIDE = 0.1, 2.0  # gaps below and above so many delta_c are told in these words
@@ -95,7 +94,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
             f"Argument `law` must be a Compliant or an LZB, whose contacts indent, but is {law!r}."
         )
     force = law.force if isinstance(law, Compliant) else Bistiffness(law.stiffness, law.exponent)
-    law.check_options(v.dtype, scene)
+    check_law(law, scene, v.dtype)
     speed = jnp.maximum(jnp.max(-gap_velocity(scene, v)), 0.0)
     work = 2 / diagonal(delassus_matrix(scene)) * speed**2
     if isinstance(force, Bistiffness):

@@ -8,10 +8,9 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.montecarlo.results import MonteCarlo
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.scene import Scene, with_gaps
 from jimpact.status import STATUS
 
 # Linearized and sampled standard deviations that differ by more than this are reported.

@@ -10,7 +10,7 @@ import numpy as np
 
 import jimpact
 from jimpact._checks import check_kind, in_common_dtype
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.montecarlo.distributions import Rows, as_source
 from jimpact.montecarlo.drawing import Sources, is_random
 from jimpact.montecarlo.fingerprints import fingerprint

@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.montecarlo.chunks import Chunk, Task, reduced
 from jimpact.montecarlo.drawing import Drawn, Sources, draw, impacts
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.scene import Scene, with_gaps
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 
 from jimpact._checks import check_values
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.montecarlo import histograms
 from jimpact.montecarlo.chunks import OUTCOMES
 from jimpact.montecarlo.plans import Run

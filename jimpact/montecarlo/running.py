@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from jimpact._checks import in_common_dtype
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.montecarlo.bars import sample_bar
 from jimpact.montecarlo.chunks import Chunk

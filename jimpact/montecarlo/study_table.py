@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
 from jimpact.scene import Scene
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.dynamics import base_velocity, gaps, kinematics, mass_at, seen_from_base
 from jimpact.motion.flight_records import State
 from jimpact.motion.system import System

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.along import along
 from jimpact.motion.contact_forces import Modes, no_modes
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential

@@ -11,10 +11,10 @@ import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
 from jimpact.fits.least_squares import Box, State, advance, begin
-from jimpact.fits.parameters import LOGARITHMIC, Parameters, bounds_of, entries, free_parameters
+from jimpact.fits.parameters import Parameters, bounds_of, entries, free_parameters
 from jimpact.fits.parameters import with_entries as law_with
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.record import MOTION_STATUS, Motion
 from jimpact.motion.simulation import simulate
 from jimpact.motion.system import System
@@ -162,7 +162,7 @@ def _problem(
 ) -> tuple[_Problem, jax.Array, Box]:
     """The problem, its start and its box in scaled parameters."""
     values = entries(law, parameters.fields)
-    log = np.array([field in LOGARITHMIC for field in parameters.entry_fields])
+    log = parameters.log
     scale = np.where(log, 1.0, np.maximum(np.abs(values), 1.0))
     scaled = np.where(log, np.log(np.where(log, values, 1.0)), values / scale)
     groups = np.zeros((len(values), len(parameters.names)))

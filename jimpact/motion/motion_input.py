@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.dynamics import gaps, mass_at
 from jimpact.motion.system import System
 from jimpact.scene import check_mass

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, as_whole, check_kind, check_values
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.event_driven import event_driven
 from jimpact.motion.flight_records import Settings

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.bases import HarmonicBase
 from jimpact.motion.ready_systems import (
     ball_system,

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.motion.blows import FAILS, Blow, blow_of, no_blow
 from jimpact.motion.contact_forces import contacts_at
 from jimpact.motion.dynamics import base_velocity, gaps, user_force

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.contact_space import delassus_matrix, gap_velocity
+from jimpact.contact import delassus_matrix
 from jimpact.laws.forces import Bistiffness, Force
-from jimpact.scenes import scene_from_gaps
+from jimpact.scene import gap_velocity, scene_from_gaps
 from jimpact.solvers.tridiagonal import diagonal
 
 RTOL = 1e-9

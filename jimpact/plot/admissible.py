@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact.contact_space import dense_mass, kinetic_norm
+from jimpact.contact import kinetic_norm
+from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
 
 _GREY = "#777777"

@@ -9,10 +9,11 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from jimpact.comparison import Comparison
-from jimpact.contact_space import delassus_matrix, gap_velocity
+from jimpact.contact import delassus_matrix
 from jimpact.histories import History
 from jimpact.laws.forces import Bistiffness, Force
 from jimpact.plot.fits import COLOURS
+from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
 _SPREAD = 0.6  # width that the bodies of one force take, of the distance between forces

@@ -33,6 +33,8 @@ _COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8  # tolerances of the sweeps; each is 
 # What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
 # contacts that reach their cone while others hold them: sweeps bring those to rest slowly.
 _ROOM, _SLOW_ROOM = 10.0, 100.0
+SHARING_SWEEPS = 60  # of the projected Gauss-Seidel iteration of `distribute`
+INSIDE = 1e-9  # part of the limit below which a force is inside the disc
 
 
 class FrictionImpulses(NamedTuple):
@@ -117,12 +119,12 @@ def solve(
     squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
     squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
     norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
-    scale = 1 / jnp.repeat(norm, np.array([1, rows]), axis=1)
+    scale = 1 / jnp.repeat(norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows)
     given = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
     largest = jax.lax.stop_gradient(jnp.abs(given).max())
     size = jnp.where(largest > 0, largest, 1.0)
     problem = _Problem(
-        of_contacts * scale[:, :, None, None] * scale,
+        of_contacts * scale[:, :, None, None] * scale[None, None],
         given / size,
         friction * norm[:, 1] / norm[:, 0],
         complementary,
@@ -144,8 +146,12 @@ def solve(
 
 def _rates(problem: _Problem, x: jax.Array) -> jax.Array:
     """(r, s) (m, b, N) of impulses (m, b, N)."""
-    moved = jnp.sum(problem.matrix[..., None] * x, axis=(2, 3))
-    return problem.given[..., None] + moved
+    return problem.given[..., None] + _times(problem.matrix[..., None], x)
+
+
+def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
+    """(m, b, N) of matrices (m, b, m, b, N) and (m, b, N)."""
+    return jnp.sum(matrix * x[None, None], axis=(2, 3))
 
 
 def _length(vectors: jax.Array) -> jax.Array:
@@ -195,18 +201,16 @@ def _equations(problem: _Problem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
     """
     m, rows = modes.direction.shape[:2]
     dtype = problem.matrix.dtype
-    q = modes.sticks[:, None, None] * jnp.eye(rows, dtype=dtype)[..., None]
+    q = modes.sticks[:, None, None].astype(dtype) * jnp.eye(rows, dtype=dtype)[None, ..., None]
     if rows == 2:
         e = jnp.stack([-modes.direction[:, 1], modes.direction[:, 0]], axis=1)
         q = q + modes.turning[:, None, None] * e[:, :, None] * e[:, None]
     q = jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0))).at[:, 0, 0].set(modes.taking.astype(dtype))
     unit = jnp.eye(m * (1 + rows), dtype=dtype).reshape(problem.matrix.shape)
-    pressed = jnp.zeros((1 + rows, 1 + rows), dtype).at[1:, 0].set(1.0)
+    own = jnp.eye(m, dtype=dtype)[:, None, :, None, None]
+    first = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
     along = jnp.pad(modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0)))
-    pressed = (
-        along[:, :, None, None]
-        * (jnp.eye(m, dtype=dtype)[:, None, :, None] * pressed[:, None])[..., None]
-    )
+    pressed = along[:, :, None, None] * own * first
     moved = jnp.sum(q[:, :, :, None, None] * (problem.matrix - unit)[:, None, ..., None], axis=2)
     right = -jnp.sum(q * problem.given[:, None, :, None], axis=2)
     return moved + pressed + unit[..., None], right
@@ -236,19 +240,20 @@ def _solved(problem: _Problem, modes: _Modes) -> jax.Array:
     m, unit = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
 
     def pivot(i: jax.Array, inverse: jax.Array) -> jax.Array:
-        here = jnp.arange(m) == i
+        here = (jnp.arange(m) == i)[:, None, None, None]
         column, row = inverse[:, :, i], inverse[i]
         block = _inverse(column[i], perturbed)
-        column = jnp.where(here[:, None, None, None], -unit, column)
-        row = jnp.where(here[:, None, None], unit[:, None], row)
+        column = jnp.where(here, -unit[None], column)
+        row = jnp.where(here[:, 0][None], unit[:, None], row)
         row = jnp.sum(block[:, :, None, None] * row[None], axis=1)
-        rest = jnp.where(here[:, None, None, None, None] | here[:, None, None], 0.0, inverse)
-        return rest - jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        gone = here[..., None] | here[None, None, :, 0]
+        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        return jnp.where(gone, 0.0, inverse) - spread
 
     inverse = jax.lax.fori_loop(0, m, pivot, matrix)
-    x = jnp.sum(inverse * right, axis=(2, 3))
+    x = _times(inverse, right)
     for _ in range(2):
-        x = x + jnp.sum(inverse * (right - jnp.sum(matrix * x, axis=(2, 3))), axis=(2, 3))
+        x = x + _times(inverse, right - _times(matrix, x))
     return x
 
 
@@ -272,18 +277,19 @@ def _inverse(block: jax.Array, perturbed: float) -> jax.Array:
         return jnp.sum(a[0] * cofactors(a)[:, 0], axis=0)
 
     small = jnp.abs(determinant(block)) < perturbed
-    block = block + jnp.where(small, perturbed, 0.0) * jnp.eye(b, dtype=block.dtype)[..., None]
+    unit = jnp.eye(b, dtype=block.dtype)[..., None]
+    block = block + jnp.where(small, perturbed, 0.0)[None, None] * unit
     whole = determinant(block)
-    return cofactors(block) / jnp.where(whole == 0, 1.0, whole)
+    return cofactors(block) / jnp.where(whole == 0, 1.0, whole)[None, None]
 
 
 # ------------------------------------------------------------------- the decision
 
 
 def _table(contacts: int, rows: int) -> np.ndarray:
-    """All modes (m, N), those that stick most first: 0 sticks, 1 is free, 2... slide."""
+    """All modes (m, N), sticking before sliding before free: 0 sticks, 1 is free, 2... slide."""
     kinds = itertools.product(range(2 + (2 if rows == 1 else _DIRECTIONS)), repeat=contacts)
-    return np.array(sorted(kinds, key=np.count_nonzero)).T
+    return np.array(sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))).T
 
 
 def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
@@ -302,7 +308,7 @@ def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     modes = _Modes(
         jnp.asarray((kinds != 1) | (not problem.complementary)),
         jnp.asarray(kinds == 0),
-        jnp.sum(turn * begin.swapaxes(0, 1), axis=1).swapaxes(0, 1),
+        jnp.sum(turn * begin.swapaxes(0, 1)[None], axis=1).swapaxes(0, 1),
         jnp.zeros(kinds.shape, dtype),
     )
     modes, x = _newton(problem, modes)
@@ -338,7 +344,7 @@ def _newton(problem: _Problem, modes: _Modes) -> tuple[_Modes, jax.Array]:
 def _at_rest(problem: _Problem, x: jax.Array, room: jax.Array) -> _Modes:
     """The modes (N = 1) that x (m, b) has: all sticks that does not slip by `room`."""
     rate = _rates(problem, x[..., None])
-    room = room * _size(x[..., None])
+    room = (room * _size(x[..., None]))[None]
     taking = rate[:, 0] <= room if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
     pushes = taking & (x[:, :1] >= -room)
     speed = _length(rate[:, 1:])
@@ -366,10 +372,10 @@ def _inverted(problem: _Problem, modes: _Modes, x: jax.Array) -> _Inverted:
     n = x.size
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
     weight = 1 / jnp.sqrt(_weights(problem, x))
-    left, values, right = jnp.linalg.svd((matrix[..., 0] * weight).reshape(n, n))
+    left, values, right = jnp.linalg.svd((matrix[..., 0] * weight[None, None]).reshape(n, n))
     null = values <= _SINGULAR * n * float(jnp.finfo(x.dtype).eps) * values[0]
-    inverse = (right.T / jnp.where(null, 1.0, values)) @ left.T
-    return _Inverted(inverse, (left * null) @ right, weight, jnp.asarray(True))
+    inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
+    return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
 
 
 def _weights(problem: _Problem, x: jax.Array) -> jax.Array:
@@ -408,7 +414,7 @@ def _on_modes(problem: _Problem, modes: _Modes, inverted: _Inverted, x: jax.Arra
         y, null = state
         x = (weight * y).reshape(shape)
         matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
-        scaled = matrix.reshape(n, n) * weight
+        scaled = matrix.reshape(n, n) * weight[None]
         shared = weight * _weights(problem, x).reshape(n) * weight
         null = null - inverted.inverse @ (scaled @ null + pairs @ null - pairs)
         least = jnp.where(inverted.held, y - start, null.T @ (shared * y))
@@ -495,7 +501,7 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
     stiffest = jnp.where(stiffest > 0, stiffest, 1.0)
 
     def contact(i: jax.Array, x: jax.Array) -> jax.Array:
-        rate = problem.given[i] + jnp.sum(problem.matrix[i] * x, axis=(1, 2))
+        rate = problem.given[i] + jnp.sum(problem.matrix[i] * x[None], axis=(1, 2))
         p = x[i, 0] - rate[0] / own[i, 0, 0]
         p = jnp.maximum(p, 0.0) if problem.complementary else p
         rate = rate[1:] + own[i, 1:, 0] * (p - x[i, 0])
@@ -517,3 +523,32 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
 
     change = jnp.where(skip, 0.0, jnp.inf).astype(x.dtype)
     return jax.lax.while_loop(going, sweep, (x, change, jnp.asarray(0)))[0]
+
+
+# ------------------------------------------------------------------- known normal forces
+
+
+def distribute(
+    matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Of the contacts `asked` (m, B): whether they stick, else the direction (t, B) of slip.
+
+    `matrix` (t, t, B), `rate` (t, B) of slip without their forces, `limit` mu F (m, B).
+    """
+    m, rate = len(limit), jnp.where(asked, rate, 0.0)
+
+    def slip(side: jax.Array) -> jax.Array:
+        return sum(matrix[:, i] * side[i : i + 1] for i in range(m)) + rate
+
+    def sweep(_: int, side: jax.Array) -> jax.Array:
+        for j in range(m):
+            tried = side[j : j + 1] - slip(side)[j : j + 1] / matrix[j : j + 1, j]
+            tried = jnp.clip(tried, -limit[j : j + 1], limit[j : j + 1])
+            side = side.at[j : j + 1].set(jnp.where(asked[j : j + 1], tried, 0.0))
+        return side
+
+    side = jax.lax.fori_loop(0, SHARING_SWEEPS, sweep, jnp.zeros_like(rate))
+    left = jnp.where(asked, slip(side), 0.0)
+    scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
+    stick = (jnp.abs(side) < (1 - INSIDE) * limit) | (jnp.abs(left) <= INSIDE * scale)
+    return asked & stick, jnp.where(jnp.abs(side) > 0, -side, left)

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from jimpact._checks import check_values, is_traced
-from jimpact.contact_space import as_velocity, dense_mass
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity, dense_mass
 
 # Relative to the largest normalized approach velocity at the start: gap velocities and impulses
 # below are zero, velocities that differ by less are the same.

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.contact_space import normalized_delassus
+from jimpact.contact import normalized_delassus
 from jimpact.scene import Scene
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.tridiagonal import as_matrix

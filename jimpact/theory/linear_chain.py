@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
-from jimpact.contact_space import as_velocity, gap_velocity, velocity_change
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 
 
 def bilateral_motion(

@@ -9,17 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, is_traced
-from jimpact.contact_space import (
-    as_velocity,
-    dense_mass,
-    gap_velocity,
-    kinetic_norm,
-    momentum,
-    normalized_delassus,
-    normalized_gap_velocity,
-    velocity_change,
-)
-from jimpact.scene import Scene
+from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.scene import Scene, as_velocity, dense_mass, gap_velocity, momentum, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix
 
 # Normals count as dependent when the matrix of their cosines has an eigenvalue below this

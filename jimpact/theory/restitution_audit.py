@@ -7,14 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.contact_space import (
-    kinetic_energy,
-    kinetic_norm,
-    normalized_delassus,
-    normalized_gap_velocity,
-    velocity_change,
-)
-from jimpact.scene import Scene
+from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.scene import Scene, kinetic_energy, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.theory.copositive import COPOSITIVITY_TOLERANCE, Copositivity, copositivity
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from jimpact._checks import as_whole, check_values
-from jimpact.contact_space import as_velocity
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.methods.advice.evidence import (
@@ -40,7 +39,7 @@ from jimpact.methods.advice.structure import (
     unknowns,
 )
 from jimpact.montecarlo.gap_scales import gap_scale
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 
 FINEST_TOLERANCE = 100  # times the reference's own tolerance

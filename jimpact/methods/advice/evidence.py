@@ -10,21 +10,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.contact_space import velocity_change
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
+from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB
-from jimpact.laws.moreau import Moreau
-from jimpact.laws.newton import Newton
 from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice.structure import Block, Rows, Situation
 from jimpact.montecarlo.bars import sample_bar
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.scene import Scene, velocity_change, with_gaps
 from jimpact.status import CODE, STATUS
 
 CHUNK = 64  # rows computed together

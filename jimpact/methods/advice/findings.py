@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.methods.advice.evidence import Candidate
 from jimpact.methods.advice.structure import Block, Unknown
 from jimpact.scene import Scene

@@ -6,10 +6,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.blocks import components
-from jimpact.contact_space import gap_velocity, kinetic_angles
-from jimpact.scene import Scene
-from jimpact.scenes import with_gaps
+from jimpact.contact import components, kinetic_angles
+from jimpact.scene import Scene, gap_velocity, with_gaps
 
 # cos(kinetic angle) below so many roundings is 0: the rounding of normals and of M^-1
 DECOUPLED_IN_EPS = 64

@@ -10,13 +10,12 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_per_contact, check_values
 from jimpact.comparison import dispersion_index
-from jimpact.contact_space import as_velocity
 from jimpact.impacts import impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.binary import Binary
+from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
-from jimpact.laws.moreau import Moreau
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 
 RATIOS = (1e-3, 1e3, 121)  # of a map where none are given: from, to, how many

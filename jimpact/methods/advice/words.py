@@ -5,12 +5,12 @@ import math
 import jax
 import numpy as np
 
+from jimpact.law import Law
 from jimpact.laws import REGISTRY
-from jimpact.laws.base import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
+from jimpact.laws.kinematic import Newton
 from jimpact.laws.lzb import LZB
-from jimpact.laws.newton import Newton
 from jimpact.methods.advice.findings import Findings
 from jimpact.montecarlo.gap_scales import NEARLY_TOUCHING, WIDE
 

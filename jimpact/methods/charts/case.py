@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_shape, check_values, in_common_dtype
-from jimpact.contact_space import as_velocity, gap_velocity
+from jimpact.law import check_law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.charts.programs import Case
 from jimpact.methods.contenders import METHODS, Method, checked
-from jimpact.scene import Scene
+from jimpact.scene import Scene, as_velocity
 
 SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
 SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right
@@ -33,9 +33,8 @@ def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> 
             f"Argument `velocity` must be in double precision, but has dtype {v.dtype}: "
             "enable jax_enable_x64."
         )
-    law.check_options(v.dtype, scene)
-    stored = jnp.any(scene.closed & (law.stored_energy(scene.contacts) > 0))
-    if not bool(jnp.any(scene.closed & (gap_velocity(scene, v) < 0)) | stored):
+    check_law(law, scene, v.dtype)
+    if not bool(law.contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
     m = scene.contacts
     for name in ("restitution", "stiffness"):

@@ -7,7 +7,7 @@ import numpy as np
 
 from jimpact._checks import in_common_dtype
 from jimpact.comparison import registered_laws
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.charts.case import (
     SAMPLE,

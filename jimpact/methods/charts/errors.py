@@ -5,10 +5,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.contact_space import kinetic_energy
 from jimpact.methods.charts.programs import Answer, Case, Programs, on_host
 from jimpact.methods.charts.record import QUANTITIES, Reference
 from jimpact.methods.contenders import Method
+from jimpact.scene import kinetic_energy
 
 FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the other one it is compared with
 Moment = tuple[Answer, np.ndarray | None]  # answers of a sample, and their gradients

@@ -11,7 +11,7 @@ import numpy as np
 
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
-from jimpact.laws.base import Law
+from jimpact.law import Law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import UNCOUNTED, Method, outcome
 from jimpact.scene import Scene

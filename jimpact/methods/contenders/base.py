@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, in_common_dtype, is_traced
-from jimpact.contact_space import delassus_matrix, gap_velocity, without_open_contacts
+from jimpact.contact import Contact
 from jimpact.impacts import Impact, impact
-from jimpact.laws.base import Law
+from jimpact.law import Impulses, Law
 from jimpact.laws.lzb import LZB
 from jimpact.numerics.dimensionless import (
     Inputs,
@@ -29,7 +29,7 @@ from jimpact.numerics.dimensionless import (
 from jimpact.numerics.flow import Flow
 from jimpact.numerics.powers import Exponent, factor, power
 from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
+from jimpact.solvers.tridiagonal import Tridiagonal
 from jimpact.status import CODE
 
 UNCOUNTED = -1  # evaluations that the method cannot tell by itself
@@ -95,16 +95,15 @@ def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
         raise TypeError("Argument `law` must have no friction: these methods have none.")
     v = as_float_array("velocity", velocity)
     law, scene, v = in_common_dtype(law, scene, v)
-    w, gamma = without_open_contacts(scene, delassus_matrix(scene), gap_velocity(scene, v))
-    stored = jnp.where(scene.closed, law.stored_energy(scene.contacts).astype(v.dtype), 0.0)
-    happens = jnp.any(gamma < 0) | jnp.any(stored > 0)
+    contact = law.contact(scene, v)
+    w, gamma, happens = contact.delassus, contact.gap_velocity, contact.happens
     inputs, units = to_dimensionless(
         w,
         jnp.where(happens, gamma, -jnp.ones_like(gamma)),
         law.restitution,
         law.stiffness,
         law.exponent,
-        stored,
+        contact.stored,
         jnp.asarray(rtol, v.dtype),  # type: ignore[arg-type]
     )
     return Problem(inputs, units, law.exponent, isinstance(w, Tridiagonal), law.max_steps, happens)
@@ -142,15 +141,12 @@ def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
 class _Given(Law):
     """A "law" whose impulses are known."""
 
-    impulses: jax.Array
+    known: jax.Array
     code: jax.Array
     initial_energy: jax.Array
 
-    def impulse(self, delassus: Symmetric, gap_velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return self.impulses, self.code
-
-    def stored_energy(self, contacts: int) -> jax.Array:
-        return jnp.broadcast_to(self.initial_energy, (contacts,))
+    def impulses(self, contact: Contact) -> Impulses:
+        return Impulses(self.known, None, self.code)
 
 
 def outcome(law: LZB, scene: Scene, velocity: Any, result: MethodResult) -> Impact:

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from jimpact.events.tableaux import DOP853, DOPRI5
-from jimpact.laws.base import Law
+from jimpact.law import Law, StaticNumber
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, problem
 from jimpact.numerics import stepper, windows
@@ -61,7 +61,7 @@ def _solver(
 
 def _linear_only(law: Law, scene: Scene) -> str | None:
     reason = lzb_only(law, scene)
-    if reason is None and law.exponent_static != 1.0:
+    if reason is None and law.exponent != StaticNumber(1.0):
         return "it is exact for the exponent 1.0 (a number, not an array) only"
     return reason
 

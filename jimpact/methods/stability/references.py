@@ -11,7 +11,7 @@ from jimpact.methods.contenders.base import Method, outcome
 from jimpact.methods.stability.causes import RECLOSING, frequencies
 from jimpact.methods.stability.points import AXES, chain_of
 from jimpact.methods.stability.runs import DEFAULT, Found, runner
-from jimpact.scenes import chain
+from jimpact.scene import chain
 from jimpact.status import CODE
 
 REFERENCE_RTOL = 1e-12

@@ -16,8 +16,7 @@ from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
 from jimpact.methods.stability.points import AXES, chain_of, setting_of
 from jimpact.numerics import dimensionless
-from jimpact.scene import Scene
-from jimpact.scenes import chain
+from jimpact.scene import Scene, chain
 from jimpact.status import CODE
 
 CLASSES = (

@@ -1,0 +1,410 @@
+"""Contact space: what a law is given of an impact, and the groups of contacts that feel each other.
+
+A scene of n coordinates and m contacts is reduced to W, gamma- and, where it has tangents, the
+tangential rows: everything that an impact law may depend on.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, is_traced
+from jimpact.scene import Scene, gap_velocity, solve_mass, without_constraints
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
+
+# A gap velocity is taken for 0 below this many times eps |N|^T |v-|: v- comes out of sums and
+# products that are rounded a few times each. Ten times more would hide true, slow approaches
+# beside fast common motion; without it, the last bits of equal velocities are an impact.
+ROUNDINGS = 4
+
+# Groups of unequal size are filled up to the largest of them: compiling one program more takes
+# longer than many impacts. A second one for the smaller groups must save this factor of entries
+# of W.
+WORTH_A_PROGRAM = 4
+
+# Contact indices (count, size), one array for each program; where a group is smaller, m plus one of
+# its contacts fills its row up (one of its own: stored energy there is on the group's scale). They
+# are data, not structure: scenes whose groups differ in their members only share the compiled
+# impact.
+Groups = tuple[np.ndarray, ...]
+
+
+class Contact(eqx.Module):
+    """All that a law sees of an impact, and what follows from it.
+
+    Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`.
+
+    Open contacts are decoupled (their rows of W are 0 beside the diagonal, gamma- = 0, nothing is
+    stored in them), unless the law uses gaps; gap velocities within `noise` are 0. A law is asked
+    only where some contact approaches or stores energy.
+
+    Args:
+        delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain).
+        gap_velocity: gamma- (m,) [m/s], < 0 on approach.
+        closed: (m,) contacts without a gap; None: all.
+        gaps: (m,) [m]; None: 0.
+        stored: energy (m,) [J] in the contacts before the impact (precompression); None: 0.
+        norm: |grad f_j| (m,) in the metric of M^-1; None: sqrt(W_jj), which it is without
+            bilateral constraints.
+        noise: (m,) [m/s] what the rounding of v- leaves unknown of gamma-; None: 0.
+        cross: W_nt (m, t), None without tangents; t = m planar, 2 m in space, contact-major.
+        tangential: W_tt (t, t), or None.
+        slip: tangential velocities u- (t,) [m/s], or None.
+
+    Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
+
+    >>> import jimpact as ji
+    >>> ji.Newton(0.5).impulses(ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])).normal.tolist()
+    [1.0, 0.5]
+    """
+
+    delassus: Symmetric
+    gap_velocity: jax.Array
+    closed: jax.Array
+    gaps: jax.Array
+    stored: jax.Array
+    norm: jax.Array
+    noise: jax.Array
+    cross: jax.Array | None
+    tangential: jax.Array | None
+    slip: jax.Array | None
+
+    def __init__(
+        self,
+        delassus: Any,
+        gap_velocity: Any,
+        *,
+        closed: Any = None,
+        gaps: Any = None,
+        stored: Any = None,
+        norm: Any = None,
+        noise: Any = None,
+        cross: Any = None,
+        tangential: Any = None,
+        slip: Any = None,
+    ):
+        chain = isinstance(delassus, Tridiagonal)
+        self.delassus = delassus if chain else as_float_array("delassus", delassus)
+        self.gap_velocity = as_float_array("gap_velocity", gap_velocity)
+        zero = jnp.zeros_like(self.gap_velocity)
+        self.closed = zero == 0 if closed is None else jnp.asarray(closed, bool)
+        self.gaps = zero if gaps is None else gaps
+        self.stored = zero if stored is None else stored
+        self.norm = jnp.sqrt(diagonal(self.delassus)) if norm is None else norm
+        self.noise = zero if noise is None else noise
+        self.cross, self.tangential, self.slip = cross, tangential, slip
+
+    @property
+    def contacts(self) -> int:
+        """Number m of contacts."""
+        return self.gap_velocity.shape[0]
+
+    @property
+    def tangents(self) -> int:
+        """Tangents of each contact: 0, 1 (planar) or 2."""
+        return 0 if self.slip is None else self.slip.shape[0] // self.contacts
+
+    @property
+    def normalized_delassus(self) -> Symmetric:
+        """G: W between unit normals."""
+        return scaled(self.delassus, 1 / self.norm)
+
+    @property
+    def normalized_gap_velocity(self) -> jax.Array:
+        """qn- = gamma- / |grad f| (m,) [sqrt(J)]."""
+        return self.gap_velocity / self.norm
+
+    @property
+    def whole_delassus(self) -> jax.Array:
+        """[[W, W_nt], [W_tn, W_tt]] (m + t, m + t); W where there are no tangents."""
+        w = as_matrix(self.delassus)
+        if self.cross is None or self.tangential is None:
+            return w
+        return jnp.block([[w, self.cross], [self.cross.T, self.tangential]])
+
+    @property
+    def size(self) -> jax.Array:
+        """Square root of twice the energy of what approaches and what is stored () [sqrt(J)]."""
+        root = jnp.sqrt(diagonal(self.delassus))
+        approach = jnp.sum((jnp.minimum(self.gap_velocity, 0.0) / root) ** 2)
+        return jnp.sqrt(approach + 2 * jnp.sum(self.stored))
+
+    @property
+    def happens(self) -> jax.Array:
+        """Whether a contact approaches or stores energy (or is not finite)."""
+        gamma = self.gap_velocity
+        return jnp.any(gamma < 0) | jnp.any(self.stored > 0) | ~jnp.all(jnp.isfinite(gamma))
+
+    def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
+        """gamma+ (m,) [m/s] of impulses p (m,) and p_t (t,)."""
+        after = self.gap_velocity + self.delassus @ normal
+        return (
+            after if self.cross is None or tangential is None else after + self.cross @ tangential
+        )
+
+    def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
+        """Rounding (m,) of gamma+: terms of W p may be large and cancel, as beside a light ball."""
+        w = self.delassus
+        if isinstance(w, Tridiagonal):
+            size = Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(normal)
+        else:
+            size = jnp.abs(w) @ jnp.abs(normal)
+        if self.cross is not None and tangential is not None:
+            size = size + jnp.abs(self.cross) @ jnp.abs(tangential)
+        eps = float(jnp.finfo(size.dtype).eps)
+        return self.noise + ROUNDINGS * eps * (jnp.abs(self.gap_velocity) + size)
+
+
+def contact_of(
+    scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
+) -> Contact:
+    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part."""
+    gamma, noise = settled(scene, velocity)
+    w, gaps, m = delassus_matrix(scene), scene.gaps, scene.contacts
+    cross, tangential, slip = _tangential_block(scene, velocity)
+    norm = jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene)
+    stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, (m,))
+    stored = jnp.where(scene.closed, stored, 0.0)
+    if gaps is not None and not uses_gaps:
+        closed = scene.closed
+        w, gamma = decoupled(w, closed), jnp.where(closed, gamma, 0.0)
+        if cross is not None and tangential is not None and slip is not None:
+            cross, tangential, slip = _closed_block(closed, w, cross, tangential, slip)
+    return Contact(
+        w,
+        gamma,
+        closed=scene.closed,
+        gaps=gaps,
+        stored=stored.astype(gamma.dtype),
+        norm=norm,
+        noise=noise,
+        cross=cross,
+        tangential=tangential,
+        slip=slip,
+    )
+
+
+def settled(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """gamma- (m,), 0 where it is within the rounding of v-, and that rounding (m,).
+
+    The derivative of gamma- stays that of N^T v- where its value is set to 0.
+    """
+    gamma, speed = gap_velocity(scene, velocity), jax.lax.stop_gradient(jnp.abs(velocity))
+    if scene.walls is None:
+        size = jnp.abs(scene.normals).T @ speed
+    else:
+        left, right = scene.walls
+        padded = jnp.pad(speed, (int(left), int(right)))
+        size = padded[:-1] + padded[1:]
+    noise = jax.lax.stop_gradient(ROUNDINGS * float(jnp.finfo(speed.dtype).eps) * size)
+    return gamma - jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0)), noise
+
+
+def _tangential_block(scene: Scene, velocity: jax.Array) -> tuple[jax.Array | None, ...]:
+    """W_nt, W_tt and u-; None without tangents."""
+    if scene.tangents is None:
+        return None, None, None
+    moved = solve_mass(scene, scene.tangents)
+    return scene.normals.T @ moved, scene.tangents.T @ moved, scene.tangents.T @ velocity
+
+
+def _closed_block(
+    closed: jax.Array, w: Symmetric, cross: jax.Array, tangential: jax.Array, slip: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The tangential block with 0 for open contacts; their diagonal is that of W."""
+    each = slip.shape[0] // closed.shape[0]
+    rows = jnp.repeat(closed, each)
+    keep = rows[:, None] & rows[None, :]
+    own = jnp.diag(jnp.where(rows, 0.0, jnp.repeat(diagonal(w), each)))
+    cross = jnp.where(closed[:, None] & rows[None, :], cross, 0.0)
+    return cross, jnp.where(keep, tangential, own), jnp.where(rows, slip, 0.0)
+
+
+def delassus_matrix(scene: Scene) -> Symmetric:
+    """`W = N^T M^-1 N` [1/kg]: (m, m), or `Tridiagonal` for a chain.
+
+    Source: Brogliato (2016), (6.35) where bilateral constraints are present.
+
+    >>> import jimpact as ji
+    >>> ji.delassus_matrix(ji.chain([1.0, 2.0, 2.0])).diagonal.tolist()
+    [1.5, 1.0]
+    """
+    if scene.walls is None:
+        return scene.normals.T @ solve_mass(scene, scene.normals)
+    left, right = scene.walls
+    inverse = 1 / scene.mass
+    padded = jnp.pad(inverse, (int(left), int(right)))
+    shared = inverse[int(not left) : scene.size - int(not right)]
+    return Tridiagonal(padded[:-1] + padded[1:], -shared, scene.contacts <= scene.size)
+
+
+def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
+    """W whose rows and columns of open contacts hold their diagonal only."""
+    if isinstance(delassus, Tridiagonal):
+        off = jnp.where(closed[:-1] & closed[1:], delassus.off_diagonal, 0.0)
+        return Tridiagonal(delassus.diagonal, off, delassus.regular)
+    keep = (closed[:, None] & closed[None, :]) | jnp.eye(closed.shape[0], dtype=bool)
+    return jnp.where(keep, delassus, 0.0)
+
+
+def kinetic_norm(scene: Scene) -> jax.Array:
+    """`|grad f_j|` in the metric of M^-1 (m,), the square roots of the free W_jj."""
+    if scene.walls is not None:
+        return jnp.sqrt(diagonal(delassus_matrix(scene)))
+    moved = solve_mass(without_constraints(scene), scene.normals)
+    return jnp.sqrt(jnp.sum(scene.normals * moved, axis=0))
+
+
+def normalized_delassus(scene: Scene) -> Symmetric:
+    """`G = W` between unit normals: unit diagonal, `G_ij = -cos(theta_ij)`.
+
+    Bilateral constraints distort it, its diagonal included: Brogliato (2016), (6.35).
+
+    >>> import jimpact as ji
+    >>> ji.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(3).tolist()
+    [-0.5]
+    """
+    return scaled(delassus_matrix(scene), 1 / kinetic_norm(scene))
+
+
+def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
+    """`gamma_j / |grad f_j|` (m,) [sqrt(J)], the normal quasi-velocities.
+
+    Source: Brogliato (2016), (6.24).
+
+    >>> import jimpact as ji
+    >>> ji.normalized_gap_velocity(ji.chain([0.5, 0.5]), [1.0, 0.0]).tolist()
+    [-0.5]
+    """
+    return gap_velocity(scene, velocity) / kinetic_norm(scene)
+
+
+def kinetic_angles(scene: Scene) -> jax.Array:
+    """Angles `theta_ij = pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
+
+    Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
+    Source: Brogliato (2016), (6.66).
+
+    >>> import jimpact as ji
+    >>> float(ji.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))
+    1.1071
+    """
+    w = delassus_matrix(scene)
+    cosine = as_matrix(scaled(w, 1 / jnp.sqrt(diagonal(w))))
+    return jnp.pi - jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
+
+
+def coupled_groups(scene: Scene) -> Groups | None:
+    """Groups of contacts between which the Delassus matrix is zero whatever its values.
+
+    Which contacts belong together is seen from the zeros of M, N, tangents and constraints, never
+    from rounded values of W: they move a common coordinate, or coordinates joined by an
+    entry of a dense M or by bilateral constraints. Open contacts are in no group (traced gaps: all
+    contacts count as closed). None: there is but one group of all contacts, or the zeros are not
+    known on the host, or the scene is a chain, whose tridiagonal W costs O(m) as it is.
+
+    >>> import jimpact as ji
+    >>> from jimpact.contact import coupled_groups
+    >>> beside = ji.Scene([1.0] * 4, [[-1, 0], [1, 0], [0, -1], [0, 1]])  # o o  o o
+    >>> [group.tolist() for group in coupled_groups(beside)]
+    [[[0], [1]]]
+    """
+    m, tangents = scene.contacts, scene.tangents
+    if scene.walls is not None or m == 1:
+        return None
+    if is_traced((scene.normals, tangents, scene.constraints)):
+        return None
+    if scene.mass.ndim == 2 and is_traced(scene.mass):
+        return None
+    known = scene.gaps is not None and not is_traced(scene.gaps)
+    members = np.flatnonzero(np.asarray(scene.gaps) <= 0) if known else np.arange(m)
+    if len(members) == 0:
+        return None
+    moves = np.asarray(scene.normals) != 0
+    if tangents is not None:
+        moves |= (np.asarray(tangents) != 0).reshape(len(moves), m, -1).any(axis=2)
+    touched = [moves[:, members]]
+    if scene.mass.ndim == 2:
+        touched.append(np.asarray(scene.mass) != 0)
+    if scene.constraints is not None:
+        touched.append(np.asarray(scene.constraints) != 0)
+    label = components(np.concatenate(touched, axis=1))[: len(members)]
+    groups = [members[label == first] for first in np.unique(label)]
+    return None if len(groups[0]) == m else _by_size(groups, m)
+
+
+def components(touches: np.ndarray) -> np.ndarray:
+    """For each column of a boolean matrix the first of the columns it hangs together with."""
+    none = touches.shape[1]
+    label = np.arange(none)
+    while True:
+        of_row = np.where(touches, label[None, :], none).min(axis=1)
+        least = np.where(touches, of_row[:, None], none).min(axis=0)
+        least = least[least]  # of the column it points to: long chains take few rounds
+        if (least == label).all():
+            return label
+        label = least
+
+
+def _by_size(groups: list[np.ndarray], m: int) -> Groups:
+    """The groups in one array, or the smaller ones and the larger ones in two."""
+    groups = sorted(groups, key=len)  # stable
+    size = np.array([len(group) for group in groups])
+    few = np.arange(len(groups))  # entries of W if the first so many groups have their own array
+    entries = few * size[few - 1] ** 2 + (len(groups) - few) * size[-1] ** 2
+    cut = int(np.argmin(entries)) if entries[0] > WORTH_A_PROGRAM * entries.min() else 0
+
+    def filled(part: list[np.ndarray]) -> np.ndarray:
+        most = len(part[-1])
+        return np.stack([np.pad(g, (0, most - len(g)), constant_values=m + g[0]) for g in part])
+
+    return tuple(filled(part) for part in (groups[:cut], groups[cut:]) if part)
+
+
+def contacts_of_groups(
+    scene: Scene, velocity: jax.Array, stored: jax.Array, groups: Groups
+) -> list[Contact]:
+    """For each array of groups (c, g) their contacts, with a leading axis (c,).
+
+    W of all contacts is never formed; what fills a group up is like an open contact.
+    """
+    gamma, noise = settled(scene, velocity)
+    m, norm = scene.contacts, kinetic_norm(scene)
+    gaps = jnp.zeros_like(gamma) if scene.gaps is None else scene.gaps
+    each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
+    columns = scene.normals
+    if scene.tangents is not None:
+        columns = jnp.concatenate([columns, scene.tangents], axis=1)
+        slip = scene.tangents.T @ velocity
+    moved = solve_mass(scene, columns)
+
+    def of_array(filled: np.ndarray) -> Contact:
+        index = filled % m
+        g = index.shape[1]
+        sides = (m + each * index[:, :, None] + np.arange(each)).reshape(len(index), -1)
+        every = np.concatenate([index, sides], axis=1)
+        there = jnp.asarray(filled < m) & scene.closed[index]
+        matrix = jnp.einsum("nca,ncb->cab", columns[:, every], moved[:, every])
+        w = jax.vmap(decoupled)(matrix[:, :g, :g], there)
+        block: tuple[jax.Array | None, ...] = (None, None, None)
+        if each:
+            own = matrix[:, :g, g:], matrix[:, g:, g:], slip[sides - m]
+            block = jax.vmap(_closed_block)(there, w, *own)
+        cross, tangential, side = block
+        return Contact(
+            w,
+            jnp.where(there, gamma[index], 0.0),
+            closed=there,
+            gaps=gaps[index],
+            stored=jnp.where(there, stored[index], 0.0),
+            norm=norm[index],
+            noise=noise[index],
+            cross=cross,
+            tangential=tangential,
+            slip=side,
+        )
+
+    return [of_array(filled) for filled in groups]

@@ -1,0 +1,381 @@
+"""Forces in contacts as a flow: LZB, gaps and viscous forces, with and without planar friction.
+
+With sqrt-energy units (see `dimensionless.py`) and frozen geometry the law reads
+
+    x_j' = -omega_j c_j gamma_j,   p_j' = F_j = (eta_j + 1)/2 omega_j x_j^eta_j,
+    gamma' = G F + K_nt lambda,    u' = K_tn F + K_tt lambda
+
+with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2. In
+expansion g_j = gamma_j / e_j takes the place of gamma_j, and time runs in units of the smallest e
+at work: nothing is then divided by e, so that e = 0 is an ordinary, differentiable case (the whole
+expansion takes no time; derivatives in e there are one-sided).
+
+STATE (rows)   x, g, p (m each), time; with friction slip u and its impulse (t each).
+MODES (rows)   phase (m), how often each contact has closed (m); with friction the slip: 0 sticks,
+               +-1 the direction (m).
+
+A contact is OPEN, in COMPRESSION or in EXPANSION. Without gaps the geometry is frozen: an open
+contact closes as soon as gamma < 0. With gaps (`gapped`) it keeps track of x = -gap and closes when
+that returns to 0. A `viscous` force replaces the power law; it never pulls, so that a contact
+may be SLACK: x > 0, and no force.
+"""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.events.stepper import any_of
+
+OPEN, COMPRESSION, EXPANSION, SLACK = 0, 1, 2, 3
+
+SNAP = 1e-2  # of the tolerance: margins closer to 0 than that are 0
+NEGLIGIBLE = 0.1  # of the tolerance: an approach or a load below it does nothing more
+PATIENCE = 2000  # passes per contact after which an impact may end at WIDENED tolerances
+WIDENED = 100.0
+UNROLLED = 8  # products with a matrix of this size are written out, without a reduction
+LARGE = 6.0  # exponents below it that are whole or half are products
+
+Exponent = float | tuple[float, ...] | jax.Array
+
+
+def power(x: jax.Array, exponent: Exponent) -> jax.Array:
+    """`max(x, 0)^exponent` of rows x, with finite derivatives at 0; fast for static halves."""
+    if isinstance(exponent, tuple) and len(set(exponent)) == 1:
+        exponent = exponent[0]
+    if isinstance(exponent, float) and exponent == 1.0:
+        return jnp.where(x >= 0, x, 0.0)  # at 0 the derivative of a contact that closes
+    positive = x > 0
+    safe = jnp.where(positive, x, 1.0)
+    if isinstance(exponent, float) and exponent < LARGE and (2 * exponent).is_integer():
+        x = jnp.where(positive, x, 0.0)
+        whole = [x] * int(exponent)
+        factors = whole if exponent.is_integer() else [*whole, jnp.sqrt(safe)]
+        return functools.reduce(jnp.multiply, factors)
+    eta = per_row(exponent, x)
+    return jnp.where(positive, jnp.exp(eta * jnp.log(safe)), 0.0)
+
+
+def per_row(values: Exponent, like: jax.Array) -> jax.Array:
+    """Values of contacts, (m,) or one, shaped to broadcast against rows (m, B)."""
+    values = jnp.asarray(values, like.dtype)
+    return values if values.ndim == like.ndim else values.reshape(-1, *[1] * (like.ndim - 1))
+
+
+def plus_one(exponent: Exponent) -> Exponent:
+    """`exponent + 1`, static where `exponent` is."""
+    return tuple(e + 1 for e in exponent) if isinstance(exponent, tuple) else exponent + 1
+
+
+def root_order(exponent: Exponent) -> int:
+    """`r` of the rooted variables: powers `xi^(r eta)` are then smooth enough.
+
+    At 4 other than whole and half exponents take half the steps, but the errors of many closings
+    reach 100 tolerances.
+    """
+    known = isinstance(exponent, (float, tuple))
+    etas = np.atleast_1d(np.asarray(exponent)) if known else np.array([0.1])
+    return 2 if np.all(2 * etas == np.round(2 * etas)) else 8
+
+
+class Viscous(NamedTuple):
+    """A force `model` (see `laws/forces.py`) and the units (m, B) that make it dimensionless."""
+
+    model: Any
+    indentation: jax.Array  # [m]
+    speed: jax.Array  # [m/s]
+    force: jax.Array  # [N]
+
+    def push(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
+        """Dimensionless force, not tensile."""
+        x = jnp.where(x >= 0, x, 0.0) * self.indentation
+        return jnp.maximum(self._value("force", x, gamma) / self.force, 0.0)
+
+    def onset(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
+        """Smooth function with the sign of the force, of order 1."""
+        return self._value("onset", x * self.indentation, gamma) / self.force
+
+    def _value(self, name: str, x: jax.Array, gamma: jax.Array) -> jax.Array:
+        """A force knows contacts (m,), not batches."""
+
+        def of_one(model: Any, x: jax.Array, rate: jax.Array) -> jax.Array:
+            return getattr(model, name)(x, rate)
+
+        return jax.vmap(of_one, in_axes=-1, out_axes=-1)(self.model, x, -gamma * self.speed)
+
+
+class Chain(NamedTuple):
+    """The coupling of a chain: G without its unit diagonal, (m - 1, B)."""
+
+    beside: jax.Array
+
+    def times(self, f: jax.Array) -> jax.Array:
+        none = jnp.zeros_like(f[:1])
+        return (
+            f
+            + jnp.concatenate([none, self.beside * f[:-1]])
+            + jnp.concatenate([self.beside * f[1:], none])
+        )
+
+    def magnitude(self) -> "Chain":
+        return Chain(jnp.abs(self.beside))
+
+    def pull(self) -> "Chain":
+        return Chain(jnp.minimum(self.beside, 0.0))
+
+
+class Dense(NamedTuple):
+    """A coupling matrix (m, m, B)."""
+
+    matrix: jax.Array
+
+    def times(self, f: jax.Array) -> jax.Array:
+        return times(self.matrix, f)
+
+    def _beside(self) -> jax.Array:
+        return self.matrix * (1 - unit(self.matrix))
+
+    def magnitude(self) -> "Dense":
+        return Dense(jnp.abs(self._beside()) + unit(self.matrix))
+
+    def pull(self) -> "Dense":
+        return Dense(jnp.minimum(self._beside(), 0.0) + unit(self.matrix))
+
+
+def unit(matrix: jax.Array) -> jax.Array:
+    """The unit matrix (m, m, 1) beside a matrix (m, m, B)."""
+    return jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
+        *matrix.shape[:2], *[1] * (matrix.ndim - 2)
+    )
+
+
+def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """`matrix @ vector` for (a, b, B) and (b, B)."""
+    if matrix.shape[1] > UNROLLED:
+        return jnp.sum(matrix * vector[None], axis=1)
+    columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[1])]
+    return functools.reduce(jnp.add, columns)
+
+
+class Frozen(NamedTuple):
+    """What of the field does not change while the modes last."""
+
+    unit: jax.Array  # (1, B) time unit s*: the smallest e at work
+    ratio: jax.Array  # (m, B) s* / s_j
+    closing: jax.Array  # (m, B) x' / g
+    stiffness: jax.Array  # (m, B) force / x^eta
+    scale: jax.Array  # (m, B) s_j = gamma / g
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("coupling", "omega", "restitution", "exponent_array", "tolerance", "viscous"),
+    meta_fields=("exponent_static", "gapped", "root", "closed_form"),
+)
+@dataclasses.dataclass
+class ContactFlow:
+    """Contacts without friction, an instance of the protocol of `stepper.py`."""
+
+    coupling: Chain | Dense
+    omega: jax.Array  # (m, B)
+    restitution: jax.Array  # (m, B)
+    exponent_array: jax.Array | None  # (m, B)
+    tolerance: jax.Array  # (1, B)
+    viscous: Viscous | None = None
+    exponent_static: float | tuple[float, ...] | None = None
+    gapped: bool = False
+    root: int = 2
+    closed_form: bool = True  # an impact may end by the energy of contacts that work alone
+
+    @property
+    def exponent(self) -> Exponent:
+        static = self.exponent_static
+        return static if static is not None else self.exponent_array  # type: ignore[return-value]
+
+    @property
+    def contacts(self) -> int:
+        return self.omega.shape[0]
+
+    @property
+    def snap(self) -> jax.Array:
+        return SNAP * self.tolerance
+
+    @property
+    def slackens(self) -> bool:
+        """Whether a contact may lose its force before its indentation."""
+        return self.viscous is not None and self.viscous.model.slackens
+
+    # ---- the state
+
+    def rows(self, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """x, g and p."""
+        m = self.contacts
+        return y[:m], y[m : 2 * m], y[2 * m : 3 * m]
+
+    def start(self, gamma: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Modes and state before the impact; a touching contact at rest starts in compression."""
+        phase = jnp.where((gamma <= 0) | (x > 0), COMPRESSION, OPEN)
+        phase = jnp.where(x < 0, OPEN, phase)
+        expands = (x > 0) & (gamma > 0)
+        if not self.slackens:
+            phase = jnp.where(expands, EXPANSION, phase)
+        # loaded, separating and e = 0: it opens at once and returns nothing
+        spent = (phase == EXPANSION) & (self.restitution == 0)
+        phase, x = jnp.where(spent, OPEN, phase), jnp.where(spent, 0.0, x)
+        g = gamma / jnp.where(phase == EXPANSION, self.restitution, 1.0)
+        modes = jnp.concatenate([phase, jnp.zeros_like(phase)]).astype(jnp.int32)
+        return modes, jnp.concatenate([x, g, jnp.zeros_like(g), jnp.zeros_like(g[:1])])
+
+    # ---- the protocol
+
+    def constants(self, modes: jax.Array) -> Frozen:
+        phase = modes[: self.contacts]
+        s = jnp.where(phase == EXPANSION, self.restitution, 1.0)
+        # the least one makes e = 0 regular; of several one of them, whole: min() would share its
+        # derivative among them
+        least = (
+            functools.reduce(
+                lambda a, b: jnp.where(b < a, b, a), [s[j : j + 1] for j in range(self.contacts)]
+            )
+            if self.contacts <= UNROLLED
+            else jnp.take_along_axis(s, jnp.argmin(s, axis=0, keepdims=True), axis=0)
+        )
+        ratio = jnp.where(s > 0, least / jnp.where(s > 0, s, 1.0), 1.0)
+        moves = jnp.ones_like(phase, bool) if self.gapped else phase != OPEN
+        loaded = (phase == COMPRESSION) | (phase == EXPANSION)
+        closing = jnp.where(moves, -ratio * self.omega, 0.0)
+        stiffness = (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
+        return Frozen(least, ratio, closing, jnp.where(loaded, stiffness, 0.0), s)
+
+    def force(self, const: Frozen, x: jax.Array, g: jax.Array) -> jax.Array:
+        """Normal force: p' = unit * force with respect to time in units of `s*`."""
+        if self.viscous is None:
+            return const.stiffness * power(x, self.exponent)
+        return jnp.where(const.stiffness > 0, self.viscous.push(x, g), 0.0)
+
+    def field(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
+        x, g, _ = self.rows(y)
+        f = self.force(const, x, g)
+        dg = const.ratio * self.coupling.times(f)
+        return jnp.concatenate([const.closing * g, dg, const.unit * f, const.unit])
+
+    def margins(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """By indentation (an opening, a gap that closes, the onset of a force), by velocity."""
+        x, g, _ = self.rows(y)
+        phase = modes[: self.contacts]
+        by_x = jnp.where(phase == EXPANSION, x, 1.0)
+        by_g = jnp.where(phase == COMPRESSION, -g, g)
+        if not self.gapped:
+            return jnp.concatenate(
+                [by_x, by_g + jnp.where(phase == OPEN, NEGLIGIBLE * self.tolerance, 0.0)]
+            )
+        by_x = jnp.where(phase == OPEN, -x, by_x)
+        by_g = jnp.where(phase == OPEN, 1.0, by_g)
+        if self.slackens:
+            onset = self.viscous.onset(x, g)  # type: ignore[union-attr]
+            by_x = jnp.where(phase == COMPRESSION, onset, jnp.where(phase == SLACK, -onset, by_x))
+            by_g = jnp.where(phase == COMPRESSION, 1.0, jnp.where(phase == SLACK, x, by_g))
+        return jnp.concatenate([by_x, by_g])
+
+    def rooted(self, modes: jax.Array) -> jax.Array:
+        opens = modes[: self.contacts] == EXPANSION
+        return jnp.concatenate([opens, jnp.zeros_like(opens)])
+
+    def switch(
+        self, modes: jax.Array, y: jax.Array, which: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        m = self.contacts
+        phase, count = modes[:m], modes[m : 2 * m]
+        x, g, _ = self.rows(y)
+        by_x, by_g = which[:m], which[m : 2 * m]
+        if self.slackens:
+            after = self._slackening(phase, by_x, by_g)
+            opened = by_g & (phase == SLACK)
+            closed = by_x & (phase == OPEN)
+            x = jnp.where(opened | closed, 0.0, x)
+        else:
+            opened = by_x & (phase == EXPANSION)
+            closed = (by_x | by_g) & (phase == OPEN)
+            # what is left in it would do nothing more: it need not be unloaded
+            idle = power(x, plus_one(self.exponent)) <= (NEGLIGIBLE * self.tolerance) ** 2
+            turned = by_g & (phase == COMPRESSION)
+            after = jnp.where(turned, jnp.where(idle, OPEN, EXPANSION), phase)
+            after = jnp.where(by_g & (phase == EXPANSION), COMPRESSION, after)
+            after = jnp.where(opened, OPEN, jnp.where(closed, COMPRESSION, after))
+            g = jnp.where(opened, self.restitution * g, g)
+            g = jnp.where(by_g & (phase != OPEN), 0.0, g)
+            x = jnp.where(opened | (turned & idle) | (closed & self.gapped), 0.0, x)
+        count = count + closed.astype(count.dtype)
+        modes = jnp.concatenate([after, count, modes[2 * m :]]).astype(modes.dtype)
+        return modes, jnp.concatenate([x, g, y[2 * m :]])
+
+    def _slackening(self, phase: jax.Array, by_x: jax.Array, by_g: jax.Array) -> jax.Array:
+        after = jnp.where(by_x & (phase == COMPRESSION), SLACK, phase)
+        after = jnp.where(by_x & ((phase == SLACK) | (phase == OPEN)), COMPRESSION, after)
+        return jnp.where(by_g & (phase == SLACK), OPEN, after)
+
+    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
+        """Without gaps a contact closes with x ~ t^2: t^(2 eta) is smooth if 2 eta is whole."""
+        m = self.contacts
+        if self.root == 2 and not self.gapped:
+            return jnp.zeros((1, *before.shape[1:]), bool)
+        return any_of(after[m : 2 * m] > before[m : 2 * m])
+
+    def coasts(self, modes: jax.Array) -> jax.Array | None:
+        if not self.gapped:
+            return None
+        phase = modes[: self.contacts]
+        return ~any_of((phase == COMPRESSION) | (phase == EXPANSION))
+
+    # ---- the end
+
+    def patience(self, passes: jax.Array) -> jax.Array:
+        """Widens what counts as nothing left once an impact drags on."""
+        return jnp.where(passes > PATIENCE * self.contacts, WIDENED, 1.0) * self.tolerance
+
+    def energy(self, x: jax.Array, g: jax.Array) -> jax.Array:
+        """Twice the energy of each contact by itself."""
+        return power(x, plus_one(self.exponent)) + g * g
+
+    def at_work(
+        self, modes: jax.Array, y: jax.Array, tolerance: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Contacts loaded or approaching by more than the tolerance, gamma, gamma once alone."""
+        x, g, _ = self.rows(y)
+        phase = modes[: self.contacts]
+        gamma = jnp.where(phase == EXPANSION, self.restitution, 1.0) * g
+        energy = self.energy(x, g)
+        works = ((x > 0) | (gamma < 0)) & (energy > tolerance**2)
+        if self.viscous is not None:
+            loaded = (phase == COMPRESSION) | (phase == EXPANSION)
+            works = loaded & (x > 0) | (gamma < 0)
+            works = works & ((x > tolerance) | (jnp.abs(g) > tolerance))
+        rebound = self.restitution * jnp.sqrt(jnp.where(works, energy, 1.0))
+        return works, gamma, jnp.where(works, rebound, gamma)
+
+    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
+        """Whether contacts at work feel and press no others: the rest follows from the energy."""
+        tolerance = self.patience(passes)
+        works, gamma, rebound = self.at_work(modes, y, tolerance)
+        if not self.closed_form:
+            return ~any_of(works)
+        # |G| and min(G, 0), both with a unit diagonal
+        load = works.astype(y.dtype)
+        felt = self.coupling.magnitude().times(load) - load > 0
+        change = rebound - gamma
+        left = gamma + self.coupling.pull().times(change) - change
+        return ~any_of(jnp.where(works, felt, left < -tolerance))
+
+    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        m = self.contacts
+        x, _, p = self.rows(y)
+        _, gamma, rebound = self.at_work(modes, y, self.tolerance)
+        if not self.closed_form:
+            rebound = gamma
+        phase = jnp.full_like(modes[:m], OPEN)
+        return jnp.concatenate([phase, modes[m:]]), jnp.concatenate(
+            [jnp.zeros_like(x), rebound, p + rebound - gamma, y[3 * m :]]
+        )

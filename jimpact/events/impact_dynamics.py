@@ -1,0 +1,333 @@
+"""The dynamics of an impact in units of its own: results do not depend on the user's unit system.
+
+With Q the largest normalized approach velocity (or stored energy) of the impact, contact j has
+
+    x_ref,j = ((eta_j + 1) Q^2 / (2 k_j))^(1 / (eta_j + 1)),   t_ref,j = x_ref,j / (Q sqrt(W_jj))
+
+and omega_j = T / t_ref,j with T the smallest t_ref: the flow of `contact_flow.py`.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.contact import Contact
+from jimpact.events import impulse_form, stepper
+from jimpact.events.batches import in_columns
+from jimpact.events.contact_flow import (
+    Chain,
+    ContactFlow,
+    Dense,
+    Exponent,
+    Viscous,
+    per_row,
+    root_order,
+    unit,
+)
+from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.stepper import any_of, total
+from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.status import CODE
+
+# Derivatives are one or two digits worse than values at the same tolerance; at order 8 two digits
+# more cost a third more steps.
+GRADIENT_TIGHTENING = 0.01
+QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
+# Contacts so many times slower than the fastest see as many of its periods, whose errors add up.
+WIDE_SPREAD = 5.0
+METHODS = ("time", "impulse")
+ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
+SWEEPS = 60  # of the search for the contacts that carry the remainder of a plastic limit
+
+
+class Problem(NamedTuple):
+    """What the dimensionless outcome depends on, arrays (m,); `beside` of a chain (m - 1,)."""
+
+    beside: jax.Array  # off-diagonal entries of G: of a chain, or the upper triangle
+    omega: jax.Array
+    restitution: jax.Array
+    exponent: jax.Array | None
+    gamma: jax.Array
+    energy: jax.Array  # x^(eta + 1) of contacts loaded beforehand
+    gap: jax.Array | None  # in units of the indentation
+    tolerance: jax.Array  # (1,)
+    step: jax.Array  # (1,) of the impulse form: the tolerance itself, whatever the stiffnesses
+    viscous: Viscous | None = None
+    sides: "Sides | None" = None
+
+
+class Sides(NamedTuple):
+    """The tangential block with friction: normalized as the normal one."""
+
+    across: jax.Array  # K_nt (m, t)
+    along: jax.Array  # K_tt (t, t)
+    friction: jax.Array  # mu (m,)
+    slip: jax.Array  # u- (t,)
+
+
+class Units(NamedTuple):
+    """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m]."""
+
+    velocity: jax.Array
+    time: jax.Array
+    root: jax.Array
+    indentation: jax.Array
+
+    @property
+    def momentum(self) -> jax.Array:
+        """Unit of the impulses (m,) [N s]."""
+        return self.velocity / self.root
+
+
+def dimensionless(
+    delassus: Symmetric,
+    gamma: jax.Array,
+    restitution: jax.Array,
+    stiffness: jax.Array,
+    exponent: Exponent,
+    stored: jax.Array,
+    rtol: float,
+    gaps: jax.Array | None = None,
+) -> tuple[Problem, Units]:
+    """The dimensionless problem and the units to return from it."""
+    m, dtype = gamma.shape[0], gamma.dtype
+    eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
+    root = jnp.sqrt(diagonal(delassus))
+    qn = gamma / root
+    approach = jnp.where(gamma < 0, qn, 0.0)
+    q = jax.lax.stop_gradient(jnp.sqrt(jnp.max(approach**2 + 2 * stored)))
+    x_ref = ((eta + 1) * q**2 / (2 * stiffness)) ** (1 / (eta + 1))
+    t_ref = x_ref / (q * root)
+    time = jax.lax.stop_gradient(jnp.min(t_ref))
+    # tolerance is asked of velocities: where W_jj is large, impulses must be finer
+    fastest = jnp.max(jnp.maximum(-gamma, jnp.sqrt(2 * stored) * root))
+    weight = jnp.maximum(1.0, q * root / fastest)
+    omega = time / t_ref
+    closeness = jax.lax.stop_gradient(jnp.minimum(1.0, WIDE_SPREAD * jnp.min(omega)))
+    g = scaled(delassus, 1 / root)
+    beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
+    ones = jnp.ones_like(gamma)
+    # errors of many contacts add up
+    step = jax.lax.stop_gradient(rtol * min(1.0, 2 / m) / jnp.max(weight))
+    problem = Problem(
+        beside=beside,
+        omega=omega,
+        restitution=restitution * ones,
+        exponent=exponent * ones if isinstance(exponent, jax.Array) else None,
+        gamma=qn / q,
+        energy=2 * stored / q**2,
+        gap=None if gaps is None else gaps / x_ref,
+        tolerance=(step * closeness)[None],
+        step=step[None],
+    )
+    return problem, Units(q, time, root, x_ref)
+
+
+def sides_of(contact: Contact, friction: jax.Array, units: Units) -> Sides:
+    """The tangential block of the contacts in the units of the normal one."""
+    assert contact.cross is not None
+    assert contact.tangential is not None
+    assert contact.slip is not None
+    root = jnp.repeat(units.root, contact.tangents)
+    return Sides(
+        contact.cross / (units.root[:, None] * root[None]),
+        contact.tangential / (root[:, None] * root[None]),
+        friction * jnp.ones_like(units.root),
+        contact.slip / (root * units.velocity),
+    )
+
+
+def flow_of(
+    problem: Problem, exponent: Exponent | None, chain: bool, tighten: float = 1.0
+) -> tuple[ContactFlow, jax.Array, jax.Array]:
+    """The flow of a problem in columns (.., B), and its first modes and state."""
+    m, dtype = problem.omega.shape[0], problem.omega.dtype
+    batch = problem.omega.shape[1:]
+    coupling: Chain | Dense = Chain(problem.beside)
+    if not chain or m <= DENSE_CHAIN:
+        i, j = jnp.triu_indices(m, 1)
+        if chain:
+            i, j = jnp.arange(m - 1), jnp.arange(1, m)
+        upper = jnp.zeros((m, m, *batch), dtype).at[i, j].set(problem.beside)
+        coupling = Dense(unit(upper) + upper + jnp.swapaxes(upper, 0, 1))
+    eta: Any = exponent if problem.exponent is None else problem.exponent
+    viscous = problem.viscous
+    parts: dict[str, Any] = dict(
+        coupling=coupling,
+        omega=problem.omega,
+        restitution=problem.restitution,
+        exponent_array=problem.exponent,
+        tolerance=tighten * problem.tolerance,
+        viscous=viscous,
+        exponent_static=None if problem.exponent is not None else exponent,
+        gapped=problem.gap is not None,
+        root=root_order(eta),
+        closed_form=viscous is None,
+    )
+    loaded = problem.energy > 0
+    energy = jnp.where(loaded, problem.energy, 1.0)
+    # not loaded: minus the gap, at 0 too, where its derivative is the one-sided one
+    apart = 0.0 if problem.gap is None else -problem.gap
+    x = jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
+    if problem.sides is None:
+        flow = ContactFlow(**parts)
+        return flow, *flow.start(problem.gamma, x)
+    across, along, friction, slip = problem.sides
+    frictional = FrictionFlow(**parts, across=across, along=along, friction=friction)
+    return frictional, *frictional.start_with(problem.gamma, x, slip)
+
+
+DENSE_CHAIN = 4  # contacts: up to so many a dense product is faster than shifts by one contact
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """From the leaves of a `Problem` in columns to impulses (m, B), status and passes (1, B)."""
+
+    tree: Any
+    exponent: float | tuple[float, ...] | None
+    chain: bool
+    most: int
+    sides: int = 0  # tangential rows
+    repeats: bool = False  # walk the steps once more, for derivatives
+
+    def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
+        problem = jax.tree.unflatten(self.tree, leaves)
+        still = jax.lax.stop_gradient(problem)
+        tighten = GRADIENT_TIGHTENING if self.repeats else 1.0
+        flow, modes, y = flow_of(still, self.exponent, self.chain, tighten)
+        if self.repeats:
+            end, plan = stepper.record(flow, modes, y, self.most)
+        else:
+            end = stepper.run(flow, modes, y, self.most)
+        over, last = end.plan[2:3] > 0, end.step.modes
+        m = flow.contacts
+        if self.repeats:
+            moving, _, y = flow_of(problem, self.exponent, self.chain, tighten)
+            state = stepper.repeat(moving, modes, y, plan, last, over)
+        else:
+            moving, state = flow, jnp.where(over, flow.finish(last, end.y)[1], end.y)
+        p = state[2 * m : 3 * m]
+        rest = at_rest(flow, still.gamma, p, over, last, end)
+        p = settled(moving, problem.gamma, p, rest, exactly=self.repeats)
+        side = state[3 * m + self.sides : -1][: self.sides]
+        if self.repeats:
+            return p, side
+        code = jnp.where(any_of(rest), CODE["plastic_limit"], CODE["ok"])
+        code = jnp.where(over, code, CODE["max_steps"]).astype(jnp.int32)
+        return p, side, code, end.plan[3:4].astype(jnp.int32)
+
+
+def solve(
+    problem: Problem,
+    units: Units,
+    exponent: Exponent,
+    delassus: Symmetric,
+    max_steps: int,
+    method: str = "time",
+) -> tuple[jax.Array, jax.Array | None, jax.Array]:
+    """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
+
+    Differentiable in both modes; method 'time' in all orders.
+    """
+    static = None if isinstance(exponent, jax.Array) else exponent
+    chain = isinstance(delassus, Tridiagonal)
+    if method == "impulse":
+        p, code = impulse_form.solve(problem, static, chain, max_steps)
+        return p * units.momentum, None, code
+    leaves, tree = jax.tree.flatten(problem)
+    rows = 0 if problem.sides is None else problem.sides.slip.shape[0]
+    p, side, code, _ = outcome(
+        Outcome(tree, static, chain, max_steps, rows), tuple(x[..., None] for x in leaves)
+    )
+    if rows == 0:
+        return p[:, 0] * units.momentum, None, code[0, 0]
+    each = rows // len(units.root)
+    return p[:, 0] * units.momentum, side[:, 0] * jnp.repeat(units.momentum, each), code[0, 0]
+
+
+def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    """`function(*leaves)` in columns; derivatives walk the accepted steps once more."""
+
+    @jax.custom_jvp
+    def value(*leaves: jax.Array) -> tuple[jax.Array, ...]:
+        return in_columns(function, *leaves)
+
+    @value.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        again = dataclasses.replace(function, repeats=True)
+        rates = jax.jvp(lambda *x: in_columns(again, *x), primals, tangents)[1]
+        p, side, *whole = value(*primals)
+        still = [np.zeros(x.shape, jax.dtypes.float0) for x in whole]
+        return (p, side, *whole), (*rates, *still)
+
+    return value(*leaves)
+
+
+def at_rest(
+    flow: ContactFlow,
+    gamma: jax.Array,
+    p: jax.Array,
+    over: jax.Array,
+    modes: jax.Array,
+    end: stepper.Carry,
+) -> jax.Array:
+    """Contacts (m, B) as good as at rest where some re-closed again and again."""
+    m = flow.contacts
+    after = gamma + flow.coupling.times(jax.lax.stop_gradient(p))
+    quiet = jnp.abs(after) <= QUIET * flow.patience(end.plan[3:4])
+    endless = quiet & (modes[m : 2 * m] >= ENDLESS)
+    return over & (endless | (any_of(endless) & quiet & (after < 0)))
+
+
+def settled(
+    flow: ContactFlow, gamma: jax.Array, p: jax.Array, rest: jax.Array, exactly: bool
+) -> jax.Array:
+    """Impulses once endless re-closing has come to its limit, gamma+ = 0 at contacts at rest.
+
+    They carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, a remainder of
+    the size of the tolerance; `exactly`, as derivatives need it, or to a part of it.
+    """
+
+    def come_to_rest(p: jax.Array) -> jax.Array:
+        times = flow.coupling.times
+        after = gamma + times(p)
+        still = jax.lax.stop_gradient(jnp.where(rest, after, 0.0))
+        bound = jax.lax.stop_gradient(flow.coupling.magnitude())
+        # projected steps, shorter than 1 / |G| so that they converge
+        reach = jnp.max(bound.times(jnp.ones_like(still)), axis=0, keepdims=True)
+        frozen = jax.lax.stop_gradient(flow.coupling)
+
+        def sweep(_: int, dp: jax.Array) -> jax.Array:
+            down = still + jnp.where(rest, frozen.times(dp), 0.0)
+            return jnp.where(rest, jnp.maximum(dp - down / reach, 0.0), 0.0)
+
+        dp = jax.lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(still))
+        if not exactly:
+            return p + dp
+        carries = rest & (dp > 0)
+        return p + conjugate_gradients(
+            lambda z: jnp.where(carries, times(z), 0.0), jnp.where(carries, -after, 0.0)
+        )
+
+    return jax.lax.cond(jnp.any(rest), come_to_rest, lambda p: p, p)
+
+
+def conjugate_gradients(apply: Any, right: jax.Array) -> jax.Array:
+    """The solution of least effort of `apply(z) = right` (m, B), symmetric and consistent."""
+
+    def step(carry: Any, _: None) -> tuple[Any, None]:
+        z, residual, direction, size = carry
+        image = apply(direction)
+        curvature = total(direction * image)
+        length = jnp.where(curvature > 0, size / jnp.where(curvature > 0, curvature, 1.0), 0.0)
+        z, residual = z + length * direction, residual - length * image
+        new = total(residual * residual)
+        kept = jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0)
+        return (z, residual, residual + kept * direction, new), None
+
+    start = (jnp.zeros_like(right), right, right, total(right * right))
+    return jax.lax.scan(step, start, None, length=2 * right.shape[0])[0][0]

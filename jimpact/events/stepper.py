@@ -1,0 +1,356 @@
+"""One event-aligned stepper for every flow with modes: no step straddles a change of mode.
+
+LAYOUT   Rows first, batch last: state y (n, B), margins (k, B), modes (m, B) whole numbers; what is
+one number an impact is (1, B). One impact is a batch of one.
+
+PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
+
+    constants(modes)           what of the field does not change while the modes last
+    field(const, modes, y)     -> dy (n, B), in the flow's own time
+    margins(const, modes, y)   -> c (k, B): each is >= 0 while its mode lasts
+    rooted(modes)              -> (k, B): margins whose root c^(1/root) is the variable of a landing
+    switch(modes, y, which)    -> (modes, y) after the events `which` (k, B), one-hot
+    begins(before, after)      -> (1, B): forces set in like t^(1/root), so steps begin in that root
+    coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
+    over(modes, y, passes)     -> (1, B): nothing is left to integrate
+    finish(modes, y)           -> (modes, y) where it is over
+    tolerance (1, B), snap (1, B), root, contacts
+
+ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
+
+    N = root xi^(root - 1) where xi is a root, else 1;   R = dc_k/dt on landings, else 1.
+
+A landing on margin k runs from xi = c_k (or its root) to exactly 0 (Henon): no root is searched
+for, and its length is differentiated. An event where a step begins is a landing of length 0; an
+explicit Runge-Kutta step of length 0 has the right derivatives up to its order, so there are no
+jump rules, also where events coincide.
+
+WHAT COMES NEXT   Every margin gets one number, in units of the step just tried, and the least of
+them decides (`advance`).
+
+DERIVATIVES   The run records its accepted steps; `repeat` walks through them once more as a scan
+in which nothing is decided. JAX differentiates that: both modes, any order.
+
+COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
+reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
+b gives margins and their rates at the end of a step), and what is one number an impact is rows of
+two arrays.
+"""
+
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.events.tableaux import DOP853
+
+GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
+FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
+RESTART = 0.1  # first rooted step after a contact has closed, as a part of the step before it
+CUT = 0.7  # part of the way to an event that a step is shortened to where it cannot land
+DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
+TIE = 1e-13  # of a step: events of one moment are taken in the order of their rows
+# Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
+# with the number of passes, or the errors of N steps would add up to N tolerances.
+FULL = 30
+FINEST = 16  # roundings: an error estimate below them is noise
+COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
+
+# Accepted steps kept for derivatives: blocks of steps, where nothing is kept a block is skipped.
+# An impact of more steps has no derivative (NaN): its status says max_steps.
+BLOCKS, BLOCK = 64, 16
+
+STAGES = len(DOP853.c)
+_TABLE = np.array([[*row, *[0.0] * (STAGES - len(row))] for row in (*DOP853.a, DOP853.b)])
+_NODES = np.array([*DOP853.c, 1.0])
+_WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
+
+
+class Flow(Protocol):
+    """What the stepper asks of a flow (see above)."""
+
+    tolerance: jax.Array
+    root: int
+
+    @property
+    def contacts(self) -> int: ...
+    @property
+    def snap(self) -> jax.Array: ...
+    def constants(self, modes: jax.Array) -> Any: ...
+    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array: ...
+    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array: ...
+    def rooted(self, modes: jax.Array) -> jax.Array: ...
+    def switch(
+        self, modes: jax.Array, y: jax.Array, which: jax.Array
+    ) -> tuple[jax.Array, jax.Array]: ...
+    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array: ...
+    def coasts(self, modes: jax.Array) -> jax.Array | None: ...
+    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array: ...
+    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]: ...
+
+
+F = TypeVar("F", bound=Flow)
+
+
+def total(x: jax.Array) -> jax.Array:
+    """Sum over the rows."""
+    return jnp.sum(x, axis=0, keepdims=True)
+
+
+def any_of(x: jax.Array) -> jax.Array:
+    """Whether any row."""
+    return jnp.any(x, axis=0, keepdims=True)
+
+
+def root_of(x: jax.Array, order: int) -> jax.Array:
+    """`x^(1/order)` of x > 0, for orders that are powers of 2."""
+    return x if order == 1 else root_of(jnp.sqrt(x), order // 2)
+
+
+def _put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
+    return jax.lax.dynamic_update_slice_in_dim(
+        buffer, value[None], index, 0, allow_negative_indices=False
+    )
+
+
+class Step(NamedTuple):
+    """What a step needs beside the state: enough to repeat it."""
+
+    modes: jax.Array  # (m, B)
+    target: jax.Array  # (k, B) one-hot: the margin it lands on; none: a step in time
+    clock: jax.Array  # (4, B): xi at the beginning, length, whether xi is a root, whether it lands
+
+
+def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
+    """Sums (3, n + 1, B) of the slopes of y and of time (weights b and both error estimates);
+    margins at the beginning; their rates (stages, k, B); the constants of the field."""
+    dtype, r = y.dtype, flow.root
+    const = flow.constants(s.modes)
+    c0 = flow.margins(const, s.modes, y)
+    begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
+    # from a margin that is 0 already a landing has length 0, and no root
+    root = flow.rooted(s.modes) & (c0 > flow.snap)
+    xi0 = jnp.where(root, root_of(jnp.where(root, c0, 1.0), r), c0)
+    xi0 = total(jnp.where(s.target, xi0, 0.0))
+    rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
+    start = jnp.where(lands > 0, xi0, begun)
+    length = jnp.where(lands > 0, -xi0, h)
+    nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)  # a margin at rest at 0 takes no time
+    count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
+    table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
+    weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
+
+    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, jax.Array | None]:
+        i, a, c = at
+        xi = start + c * length
+        now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
+        dy = flow.field(const, s.modes, now)
+        dc = jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))[1]
+        rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
+        rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
+        dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate
+        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), dc if ends else None
+
+    none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
+    rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
+    slopes, rates = jax.lax.scan(stage, none, rows)
+    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
+
+
+class Carry(NamedTuple):
+    """What one pass hands to the next."""
+
+    y: jax.Array
+    step: Step  # the one to try
+    plan: jax.Array  # (4, B): time it is expected to take, landing aimed at twice, over, passes
+
+
+def begin(flow: Flow, modes: jax.Array, y: jax.Array) -> Carry:
+    """The first step: short, in the root of time, for forces set in like a power of it."""
+    one = jnp.ones_like(y[:1])
+    clock = jnp.concatenate([0 * one, FIRST ** (1 / flow.root) * one, one, 0 * one])
+    targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
+    step = Step(modes, jnp.zeros(targets, bool), clock)
+    over = flow.over(modes, y, 0 * one).astype(y.dtype)
+    return Carry(y, step, jnp.concatenate([FIRST * one, 0 * one, over, 0 * one]))
+
+
+def goes_on(carry: Carry, most: int) -> jax.Array:
+    """Impacts (1, B) that are neither over nor given up."""
+    return (carry.plan[2:3] == 0) & (carry.plan[3:4] < most)
+
+
+def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
+    """One pass: try a step; accept it, or aim at what lies in its middle, or shorten it.
+
+    Every margin gets one number, in units of the step tried, and the least one decides:
+        -2 .. -1   it dips, or cannot be landed on from here: shorten the step to CUT * (at + 2)
+         0 ..  1   it vanishes inside the step: repeat the step as a landing on it
+         1 .. inf  it is expected to vanish so far ahead: land on it if the next step reaches it
+    """
+    y, s = carry.y, carry.step
+    n, r, dtype = y.shape[0], flow.root, y.dtype
+    expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
+    begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
+    in_root, lands = in_root > 0, lands > 0
+    sums, c0, rates, const = _stages(flow, s, y, ends=True)
+    d0, d1 = rates[0], rates[-1]
+    end = y + sums[0, :n]
+    c1 = flow.margins(const, s.modes, end)
+    eps = float(jnp.finfo(dtype).eps)
+    full = FULL * flow.contacts
+    local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
+    # Hairer's error, squared, in tolerances
+    scale = local + COARSE_ROUNDING * eps * jnp.abs(y)
+    fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
+    error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
+    ok = error2 <= 1
+    factor = jnp.clip(
+        SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20)))), SHRINK, GROWTH
+    )
+    factor = jnp.where(error2 < jnp.inf, factor, SHRINK)
+    span = jnp.where(ok & (sums[0, n:] > 0), sums[0, n:], expected)
+    # what each margin does in this step, and after it
+    d0, d1 = d0 * span, d1 * span
+    snap = flow.snap
+    free = ~s.target
+    crossed, turns = free & (c1 < -snap), free & (d0 < 0) & (d1 > 0) & (c0 > snap)
+    top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
+    bottom = jnp.where(crossed, c0 - c1, jnp.where(turns, d1 - d0, -d1))
+    u = top / jnp.where(bottom > 0, bottom, jnp.inf)
+    v = 1 - u
+    low = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
+    dipped = turns & (low < DOUBT * (d1 - d0) - snap)
+    at_once = (c0 <= snap) & (d0 <= 0)
+    direct = at_once | ((d0 < 0) & (c0 > snap))
+    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & ~lands
+    at = jnp.where(
+        crossed,
+        jnp.where(direct & (again == 0), jnp.where(at_once, 0.0, u), u - 2),
+        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + u, jnp.inf)),
+    )
+    at = at + TIE * jnp.arange(c0.shape[0], dtype=dtype)[:, None]
+    first = jnp.min(at, axis=0, keepdims=True)
+    event = first <= 1
+    active = goes_on(carry, most)
+    accept = ok & ~event & active
+    landed = accept & lands
+    which = s.target & landed
+    modes, end = flow.switch(s.modes, end, which)
+    y = jnp.where(accept, end, y)
+    # the next step
+    in_root = in_root & ~lands
+    xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
+    cut = jnp.where(ok & (first < 0), CUT * (first + 2), 0.5)
+    shorter = jnp.where(in_root, root_of(cut, r) * h, cut * jnp.where(lands, span, h))
+    kept = jnp.where(first < 0, shorter, h)
+    h = jnp.where(ok & event, kept, jnp.where(lands, jnp.where(ok, h, shorter), factor * h))
+    fresh = accept & flow.begins(s.modes, modes)
+    restart = root_of(jnp.minimum(RESTART * span, FIRST), r)
+    in_root, xi = in_root | fresh, jnp.where(fresh, 0.0, xi)
+    h = jnp.where(fresh & (restart > 0), restart, h)
+    new_span = jnp.where(in_root, (xi + h) ** r - xi**r, h)
+    coasts = flow.coasts(s.modes)
+    reached = (first - 1) * span < new_span
+    reached = reached if coasts is None else reached | (coasts & (first < jnp.inf))
+    aim = ok & jnp.where(event, first >= 0, ~lands & reached)
+    target = aim & (at == first)
+    h = jnp.where(aim & in_root, new_span, h)
+    in_root = in_root & ~aim
+    due = jnp.where(event, first, first - 1) * span
+    clock = jnp.concatenate([xi, h, in_root.astype(dtype), aim.astype(dtype)])
+    passes = passes + active.astype(dtype)
+    over = flow.over(modes, y, passes)
+    plan = jnp.concatenate(
+        [
+            jnp.where(aim, due, new_span),
+            (aim & lands & event).astype(dtype),
+            jnp.where(over, 1.0, done),
+            passes,
+        ]
+    )
+    return Carry(y, Step(modes, target, clock), plan), accept
+
+
+def run(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> Carry:
+    """From the beginning to the end, or to the limit of passes; `finish` is not yet applied."""
+    return jax.lax.while_loop(
+        lambda c: jnp.any(goes_on(c, most)),
+        lambda c: advance(flow, c, most)[0],
+        begin(flow, modes, y),
+    )
+
+
+# ---- derivatives: the accepted steps once more -------------------------------------------------
+
+
+class Plan(NamedTuple):
+    """Accepted steps in order, at most BLOCKS * BLOCK; nothing kept: zeros."""
+
+    marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 where a step is kept
+    clock: jax.Array  # (steps, 4, B)
+
+
+def record(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> tuple[Carry, Plan]:
+    """As `run`, and the plan of its steps."""
+    size = BLOCKS * BLOCK
+    start = begin(flow, modes, y)
+    rows = modes.shape[0] + start.step.target.shape[0] + 1
+    plan = Plan(
+        jnp.zeros((size, rows, *y.shape[1:]), jnp.int8), jnp.zeros((size, 4, *y.shape[1:]), y.dtype)
+    )
+
+    Loop = tuple[Carry, Plan, jax.Array, jax.Array]
+
+    def body(state: Loop) -> Loop:
+        carry, plan, count, lost = state
+        after, accept = advance(flow, carry, most)
+        s = carry.step
+        marks = jnp.concatenate(
+            [s.modes.astype(jnp.int8), s.target.astype(jnp.int8), jnp.ones_like(accept, jnp.int8)]
+        )
+        # a pass that no impact of the batch accepts leaves its row to the next one
+        index = jnp.minimum(count, size - 1)
+        plan = Plan(
+            _put(plan.marks, jnp.where(accept, marks, 0), index),
+            _put(plan.clock, jnp.where(accept, s.clock, 0.0), index),
+        )
+        count = count + jnp.any(accept).astype(count.dtype)
+        return after, plan, count, lost | (accept & (count > size))
+
+    end, plan, _, lost = jax.lax.while_loop(
+        lambda state: jnp.any(goes_on(state[0], most)),
+        body,
+        (start, plan, jnp.zeros((), jnp.uint32), jnp.zeros(y[:1].shape, bool)),
+    )
+    # an impact of more steps than there are rows has no derivative: NaN, not a wrong number
+    return end, Plan(plan.marks, jnp.where(lost[None], jnp.nan, plan.clock))
+
+
+def repeat(
+    flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, last: jax.Array, over: jax.Array
+) -> jax.Array:
+    """The state that `run` and `finish` end with, as a smooth function of `flow` and `y`."""
+    n, m = y.shape[0], modes.shape[0]
+
+    def step(y: jax.Array, row: Plan) -> tuple[jax.Array, None]:
+        accept = row.marks[-1:] > 0
+        s = Step(row.marks[:m].astype(modes.dtype), row.marks[m:-1] > 0, row.clock)
+
+        def walk(y: jax.Array) -> jax.Array:
+            sums, *_ = _stages(flow, s, y, ends=False)
+            end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
+            return jnp.where(accept, end, y)
+
+        return jax.lax.cond(jnp.any(accept), walk, lambda y: y, y), None
+
+    def block(y: jax.Array, rows: Plan) -> tuple[jax.Array, None]:
+        def walk(y: jax.Array) -> jax.Array:
+            return jax.lax.scan(jax.checkpoint(step), y, rows)[0]
+
+        return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, lambda y: y, y), None
+
+    rows = jax.tree.map(lambda x: x.reshape(BLOCKS, BLOCK, *x.shape[1:]), plan)
+    y, _ = jax.lax.scan(jax.checkpoint(block), y, rows)
+    return jnp.where(over, flow.finish(last, y)[1], y)

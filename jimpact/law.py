@@ -1,0 +1,455 @@
+"""What a law is: one method from `Contact` to impulses, declared parameters, an open registry."""
+
+import abc
+import copy
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_square, check_values, is_traced
+from jimpact.contact import Contact, contact_of
+from jimpact.scene import Scene
+from jimpact.status import CODE
+
+_KEY = "jimpact"  # of what a field declares, in its metadata
+
+
+@jax.tree_util.register_static
+class StaticNumber(float):
+    """A float that is part of the structure of a pytree: compiled in, not differentiated."""
+
+
+@jax.tree_util.register_static
+class StaticNumbers(tuple[float, ...]):
+    """Floats, one per contact, that are part of the structure of a pytree."""
+
+
+class Domain:
+    """What `parameter` declares of a field; called by equinox to convert and check a value."""
+
+    def __init__(
+        self,
+        low: float = -np.inf,
+        high: float = np.inf,
+        *,
+        open_low: bool = False,
+        log: bool = False,
+        static_numbers: bool = False,
+        matrix: bool = False,
+        per_contact: bool = True,
+        high_unless: str | None = None,
+    ):
+        self.name = "parameter"  # until the class that holds it is made
+        self.low, self.high, self.open_low, self.log = low, high, open_low, log
+        self.static_numbers, self.matrix, self.per_contact = static_numbers, matrix, per_contact
+        self.high_unless = high_unless
+
+    def __call__(self, value: Any) -> Any:
+        """The value as a float array (or static numbers); None stays None."""
+        if value is None:
+            return None
+        if self.static_numbers and isinstance(value, (int, float)):
+            return StaticNumber(value)
+        if self.static_numbers and isinstance(value, tuple) and not is_traced(value):
+            return StaticNumbers(float(x) for x in value)
+        return as_float_array(self.name, value)
+
+    def of(self, module: eqx.Module) -> "Domain":
+        """The domain in this module, whose option may have lifted the upper end."""
+        if self.high_unless is None or not getattr(module, self.high_unless):
+            return self
+        lifted = copy.copy(self)
+        lifted.high = np.inf
+        return lifted
+
+    def check(self, value: Any) -> None:
+        """Raise a ValueError for a value outside."""
+        if self.matrix and np.ndim(value) >= 2:
+            check_square(self.name, value)
+            check_values(self.name, value)
+        else:
+            check_values(self.name, value, low=self.low, high=self.high, open_low=self.open_low)
+
+    def holds(self, value: Any) -> Any:
+        """Whether all entries are finite and inside, on the device."""
+        low, high = (-np.inf, np.inf) if self.matrix and np.ndim(value) >= 2 else self.bounds
+        above = value > low if self.open_low else value >= low
+        return jnp.all(jnp.isfinite(value) & above & (value <= high))
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """(low, high)."""
+        return self.low, self.high
+
+
+class Option:
+    """What `option` declares of a static field; called by equinox to check a value."""
+
+    def __init__(
+        self,
+        choices: tuple[str, ...] | None = None,
+        low: float | None = None,
+        high: float = np.inf,
+        *,
+        open_low: bool = False,
+        converter: Callable[[Any], Any] | None = None,
+    ):
+        self.name = "option"
+        self.choices, self.low, self.high, self.open_low = choices, low, high, open_low
+        self.converter = converter
+
+    def __call__(self, value: Any) -> Any:
+        """The value, checked; None stays None."""
+        if self.converter is not None:
+            return self.converter(value)
+        if self.choices is not None and value not in self.choices:
+            raise ValueError(
+                f"Argument `{self.name}` must be one of {self.choices}, but has value {value!r}."
+            )
+        if self.low is not None and value is not None:
+            check_values(self.name, value, low=self.low, high=self.high, open_low=self.open_low)
+        return value
+
+
+def parameter(
+    low: float = -np.inf,
+    high: float = np.inf,
+    *,
+    open_low: bool = False,
+    log: bool = False,
+    static_numbers: bool = False,
+    matrix: bool = False,
+    per_contact: bool = True,
+    high_unless: str | None = None,
+    default: Any = dataclasses.MISSING,
+    kw_only: bool = False,
+) -> Any:
+    """A field of a `Law` that is a parameter: a float array with a domain, declared once.
+
+    The check of the constructor, the bounds and transforms of `fit`, the random laws of
+    `monte_carlo`, studies and the command line all read this declaration.
+
+    Args:
+        low, high: the closed interval of its values; `open_low`: without `low` itself.
+        log: only its logarithm has a natural scale (a stiffness): fitted there.
+        static_numbers: a Python number or tuple is compiled in, an array is a parameter.
+        matrix: may be a square matrix, which is not bounded.
+        per_contact: a scalar or one value per contact (m,), checked against the scene.
+        high_unless: name of an option that, where true, lifts `high`.
+        default: value of a law that is not given one; may be None (no such effect).
+        kw_only: it is given by keyword only.
+
+    >>> import jimpact as ji
+    >>> class Lossy(ji.Newton):
+    ...     loss: float = ji.parameter(low=0, high=1, default=0.1)
+    ...
+    ...     def __init__(self, loss):
+    ...         self.loss = loss
+    ...         super().__init__(1 - self.loss)
+    >>> Lossy(1.5)
+    Traceback (most recent call last):
+        ...
+    ValueError: Argument `loss` must lie in [0, 1], but has value 1.5.
+    """
+    declared = Domain(
+        low,
+        high,
+        open_low=open_low,
+        log=log,
+        static_numbers=static_numbers,
+        matrix=matrix,
+        per_contact=per_contact,
+        high_unless=high_unless,
+    )
+    return _field(declared, default, kw_only, False)
+
+
+def option(
+    default: Any,
+    choices: tuple[str, ...] | None = None,
+    *,
+    low: float | None = None,
+    high: float = np.inf,
+    open_low: bool = False,
+    converter: Callable[[Any], Any] | None = None,
+    kw_only: bool = True,
+) -> Any:
+    """A static field of a `Law` that says how it is solved: one of `choices`, or in an interval.
+
+    `converter` takes the place of these checks.
+    """
+    declared = Option(choices, low, high, open_low=open_low, converter=converter)
+    return _field(declared, default, kw_only, True)
+
+
+def _field(declared: Domain | Option, default: Any, kw_only: bool, static: bool) -> Any:
+    given = {} if default is dataclasses.MISSING else {"default": default}
+    return eqx.field(
+        converter=declared, static=static, kw_only=kw_only, metadata={_KEY: declared}, **given
+    )
+
+
+class Declared(eqx.Module):
+    """A module whose fields are parameters and options: laws, contact forces."""
+
+    def __init_subclass__(cls, **given: Any) -> None:
+        super().__init_subclass__(**given)
+        for name, value in vars(cls).items():
+            if isinstance(value, dataclasses.Field) and _KEY in value.metadata:
+                value.metadata[_KEY].name = name
+
+    def __check_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            declared = field.metadata.get(_KEY)
+            if isinstance(declared, Domain):
+                declared.of(self).check(getattr(self, field.name))
+
+
+class Parameter(NamedTuple):
+    """A parameter of a law: its value, where it is in the law, and what it declares."""
+
+    value: Any
+    path: str
+    domain: Domain
+
+
+def parameters_of(module: eqx.Module) -> dict[str, Parameter]:
+    """Parameters by name, those of a law's parts (the force of `Compliant`) included.
+
+    Float arrays that a class does not declare are parameters without bounds.
+    """
+    found: dict[str, Parameter] = {}
+    for field in dataclasses.fields(module):
+        value, declared = getattr(module, field.name), field.metadata.get(_KEY)
+        if isinstance(value, Declared):
+            inner = parameters_of(value)
+            found |= {k: x._replace(path=f"{field.name}.{x.path}") for k, x in inner.items()}
+        elif isinstance(declared, Domain):
+            found[field.name] = Parameter(value, field.name, declared.of(module))
+        elif eqx.is_inexact_array(value):
+            found[field.name] = Parameter(value, field.name, Domain(per_contact=False))
+    return found
+
+
+def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
+    """Those that are arrays, not None or static numbers: they can be fitted and drawn."""
+    return {k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)}
+
+
+class Impulses(NamedTuple):
+    """What a law answers: p (m,) [N s], p_t (t,) [N s] or None for none, its status code ()."""
+
+    normal: jax.Array
+    tangential: jax.Array | None = None
+    status: Any = CODE["ok"]
+
+
+class Law(Declared):
+    """An impact law: parameters and the one method `impulses`.
+
+    A law is a pytree: grad of a law is a law, vmap over a law is a batch. Fields are declared with
+    `ji.parameter`; two of them mean the same in every law: `friction`, Coulomb's mu (the scene
+    must have tangents unless it is None), and `initial_energy`, stored in the contacts before the
+    impact [J]. `impact` asks a law only where something happens, has left out open contacts and
+    taken rounding for 0, and adds to the status what it sees itself (not finite, negative impulse,
+    inadmissible velocity, energy gain).
+
+    Class attributes:
+        uses_gaps: open contacts take part, at their gaps.
+        pulls: separating contacts, too, if anything happens anywhere.
+        separable: contacts that W does not couple may be solved apart: the law itself couples
+            none, and its parameters are scalars or (m,).
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> class Plastic(ji.Law):  # all contacts of a pair of bodies stop
+    ...     def impulses(self, contact):
+    ...         p = jnp.linalg.solve(contact.whole_delassus, -contact.gap_velocity)
+    ...         return ji.Impulses(p)
+    >>> ji.impact(Plastic(), ji.chain([1.0, 1.0]), [1.0, 0.0]).velocity.tolist()
+    [0.5, 0.5]
+    """
+
+    uses_gaps: ClassVar[bool] = False
+    pulls: ClassVar[bool] = False
+    separable: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def impulses(self, contact: Contact) -> Impulses:
+        """Impulses of the contacts, and the law's own status code."""
+
+    def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
+        """What the law is shown of the scene; to override where it must see more."""
+        return contact_of(scene, velocity, self.stored, self.uses_gaps)
+
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
+        """To override: raise where the law does not fit the scene, or the precision."""
+
+    @property
+    def stored(self) -> jax.Array:
+        """Energy stored in the contacts before the impact, () or (m,) [J]."""
+        stored = getattr(self, "initial_energy", None)
+        return jnp.zeros(()) if stored is None else stored
+
+
+def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
+    """Raise where parameters do not fit the scene, or the law says so."""
+    for name, (value, _, domain) in parameters_of(law).items():
+        ndim = np.ndim(value)
+        if value is None or not domain.per_contact or ndim == 0 or (domain.matrix and ndim == 2):
+            continue
+        check_shape(name, value, (scene.contacts,), "one entry per contact, or a scalar")
+    if getattr(law, "friction", None) is not None and scene.tangents is None:
+        raise ValueError(
+            f"Argument `scene` must have tangents where {type(law).__name__} has `friction`: "
+            "give Scene(..., tangents=...), or friction=None."
+        )
+    law.check(scene, dtype)
+
+
+def is_separable(law: Law) -> bool:
+    """Whether contacts that W does not couple may be solved apart."""
+    known = all(
+        x.domain.per_contact and np.ndim(x.value) < 2 and not isinstance(x.value, tuple)
+        for x in parameters_of(law).values()
+    )
+    return law.separable and known and not law.uses_gaps
+
+
+def of_contacts(law: Law, index: jax.Array) -> Law:
+    """The law of some contacts only: their entries of what it has one of per contact."""
+    return jax.tree.map(lambda x: x[index] if eqx.is_array(x) and x.ndim == 1 else x, law)
+
+
+# ------------------------------------------------------------------------------- the registry
+
+L = TypeVar("L", bound=type[Law])
+EVERY_PROPERTY = frozenset(
+    {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
+)
+
+
+class Row(NamedTuple):
+    """A registered law, what it promises on every scene, and where it comes from.
+
+    `promises` names the properties the contract suite holds it to; where the law breaks another
+    one of them, its status must say so.
+    """
+
+    law: type[Law]
+    summary: str
+    right_when: str
+    fails_when: str
+    promises: frozenset[str]
+    source: str
+    bibtex: str
+    make: Callable[..., Law] | None = None  # from plain numbers, where the class takes others
+
+    @property
+    def arguments(self) -> dict[str, inspect.Parameter]:
+        """What `build` takes, by name."""
+        return dict(inspect.signature(self.make or self.law).parameters)
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of what says how the law is solved."""
+        fields = dataclasses.fields(self.law)
+        return tuple(f.name for f in fields if isinstance(f.metadata.get(_KEY), Option))
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(name for name in self.arguments if name not in self.options)
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Parameters without a default."""
+        empty = inspect.Parameter.empty
+        return tuple(name for name, x in self.arguments.items() if x.default is empty)
+
+    def build(self, **parameters: Any) -> Law:
+        """The law with these parameters."""
+        return (self.make or self.law)(**parameters)
+
+
+REGISTRY: dict[str, Row] = {}
+
+
+def register(
+    name: str,
+    law: Any = None,
+    *,
+    summary: str = "",
+    right_when: str = "",
+    fails_when: str = "",
+    promises: Iterable[str] = (),
+    source: str = "",
+    bibtex: str = "",
+    make: Callable[..., Law] | None = None,
+) -> Any:
+    """Enter a law in `ji.REGISTRY`: then `compare`, studies and the command line know it by name.
+
+    Args:
+        name: in small letters; what a study calls it.
+        law: the class; None: `register` is used as a decorator of it.
+        summary, right_when, fails_when: a line each, for `jimpact laws`.
+        promises: properties it keeps on every scene, of 'impulse_sign', 'gap_velocity_sign',
+            'energy', 'velocity_scaling', 'mass_scaling'.
+        source, bibtex: where it comes from.
+        make: builds it from plain numbers, where the class takes other things.
+
+    Returns:
+        The class, or the decorator.
+
+    Raises:
+        TypeError: no Law. ValueError: a name that another law has, an unknown promise.
+
+    >>> import jimpact as ji
+    >>> @ji.register("gentle", summary="half of Newton's impulse")
+    ... class Gentle(ji.Newton):
+    ...     def impulses(self, contact):
+    ...         p, side, status = super().impulses(contact)
+    ...         return ji.Impulses(0.5 * p, side, status)
+    >>> ji.REGISTRY["gentle"].parameters
+    ('restitution', 'friction', 'tangential_restitution')
+    >>> del ji.REGISTRY["gentle"]
+    """
+    if law is None:
+        given = dict(summary=summary, right_when=right_when, fails_when=fails_when)
+        given |= dict(source=source, bibtex=bibtex)
+        return lambda own: register(name, own, promises=promises, make=make, **given)
+    if not (isinstance(law, type) and issubclass(law, Law)):
+        raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
+    if name != name.lower() or not name:
+        raise ValueError(f"Argument `name` must be in small letters, but has value {name!r}.")
+    unknown = set(promises) - EVERY_PROPERTY
+    if unknown:
+        raise ValueError(
+            f"Argument `promises` must be among {', '.join(sorted(EVERY_PROPERTY))}, but has "
+            f"{sorted(unknown)[0]!r}."
+        )
+    other = REGISTRY.get(name)
+    if other is not None and _place(other.law) != _place(law):  # a module read again is the same
+        raise ValueError(
+            f"Argument `name` must be new, but {name!r} is {other.law.__qualname__} of "
+            f"{other.law.__module__}."
+        )
+    REGISTRY[name] = Row(
+        law, summary, right_when, fails_when, frozenset(promises), source, bibtex, make
+    )
+    return law
+
+
+def _place(law: type[Law]) -> tuple[str, str]:
+    return law.__module__, law.__qualname__
+
+
+def registered_name(law: Law) -> str | None:
+    """The name of this law's class in the registry; None if it has none."""
+    return next((name for name, row in REGISTRY.items() if row.law is type(law)), None)

@@ -1,0 +1,303 @@
+"""The kinematic laws: what gap velocities become is said; Newton, Moreau, RestitutionMatrix."""
+
+import abc
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import check_shape, is_traced
+from jimpact.contact import Contact
+from jimpact.law import Impulses, Law, option, parameter
+from jimpact.laws.friction import friction_fields, frictional_impulses
+from jimpact.scene import Scene, momentum
+from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.linear import solve_symmetric
+from jimpact.solvers.tridiagonal import as_matrix, diagonal, is_regular
+from jimpact.status import CODE
+from jimpact.theory.quasi_velocities import check_independent, quasi_basis
+
+
+class Kinematic(Law):
+    """A law that says what becomes of the normal velocities: `gamma+ = -E gamma-`, E of any form.
+
+    Equation: with `b = |grad f| (I + E) qn-`, prescribed: `W p + b = 0`; complementary:
+    `0 <= W p + b  _|_  p >= 0`. With friction `W_nt p_t` is added, and
+    `p_t in -mu p Sgn(u+ + e_t u-)`.
+    """
+
+    complementary: ClassVar[bool]
+
+    friction: eqx.AbstractVar[jax.Array | None]
+    tangential_restitution: eqx.AbstractVar[jax.Array | None]
+
+    @property
+    @abc.abstractmethod
+    def coefficients(self) -> jax.Array:
+        """E: (), its diagonal (m,), or (m, m)."""
+
+    def required(self, contact: Contact) -> jax.Array:
+        """b (m,) [m/s]: what gamma+ - gamma- must make up for."""
+        e, gamma = self.coefficients, contact.gap_velocity
+        if e.ndim < 2:
+            return (1 + e) * gamma
+        return gamma + contact.norm * (e @ contact.normalized_gap_velocity)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """One linear system, one complementarity problem, or the friction problem."""
+        required = self.required(contact)
+        mu, e_t = self.friction, self.tangential_restitution
+        if mu is not None and e_t is not None:
+            return frictional_impulses(contact, required, mu, e_t, complementary=self.complementary)
+        w = contact.delassus
+        if self.complementary:
+            found = solve_lcp(as_matrix(w), required, regular=is_regular(w))
+            return Impulses(found.z, None, found.code)
+        return prescribed_impulses(contact, required)
+
+
+def prescribed_impulses(contact: Contact, required: jax.Array) -> Impulses:
+    """p (m,) with `W p + b = 0`."""
+    w = contact.delassus
+    norm = jnp.sqrt(diagonal(w))
+    g = as_matrix(w) / (norm[:, None] * norm[None, :])
+    pbar, singular, missed = solve_symmetric(g, -required / norm, regular=is_regular(w))
+    code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
+    return Impulses(pbar / norm, None, jnp.where(missed, CODE["infeasible"], code))
+
+
+class _WithCoefficient(Kinematic):
+    """E is one number, or one per contact."""
+
+    restitution: jax.Array = parameter(low=0.0, high=1.0)
+    friction: jax.Array | None = parameter(low=0.0)
+    tangential_restitution: jax.Array | None = parameter(low=-1.0, high=1.0)
+
+    def __init__(self, restitution: Any, friction: Any = None, tangential_restitution: Any = 0.0):
+        self.restitution = restitution
+        self.friction, self.tangential_restitution = friction_fields(
+            friction, tangential_restitution
+        )
+
+    @property
+    def coefficients(self) -> jax.Array:
+        """e."""
+        return self.restitution
+
+
+class Newton(_WithCoefficient):
+    """Newton's restitution at every contact, without complementarity.
+
+    Equation: `gamma+ = -e gamma-`, hence `p = -W^-1 (I + diag(e)) gamma-`; with friction also
+    `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
+
+    Args:
+        restitution: kinematic coefficient e in [0, 1], scalar or one per contact (m,).
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
+        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `v_t+ = -e_t v_t-`.
+
+    Status: `negative_impulse` or `inadmissible_velocity` where the kinematic law contradicts
+    unilateral contact (kinetic angles above pi/2, separating contacts, unequal e);
+    `impulse_not_unique` for redundant contacts, `infeasible` where they contradict each other;
+    with friction as in `RestitutionMatrix`.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.41) with a diagonal E; (6.54)-(6.57).
+
+    >>> import jimpact as ji
+    >>> ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0]), [1.0, 0.0]).velocity.tolist()
+    [0.25, 0.75]
+    """
+
+    complementary: ClassVar[bool] = False
+    pulls: ClassVar[bool] = True
+    separable: ClassVar[bool] = True
+
+
+class Moreau(_WithCoefficient):
+    """Moreau's impact law: a contact either reverses its gap velocity or takes no impulse.
+
+    Equation: `0 <= G pbar + (I + E) qn-  _|_  pbar >= 0`, in normalized gap velocities
+    `qn = gamma / |grad f|` and impulses `pbar = |grad f| p`; with a scalar or diagonal E
+    `0 <= gamma+ + e gamma-  _|_  p >= 0`. With friction also `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
+
+    Args:
+        restitution: e in [0, 1], scalar or one per contact (m,), or a matrix E (m, m).
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
+        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `v_t+ = -e_t v_t-`.
+
+    Status: `inadmissible_velocity` where a contact that separated before the impact is driven
+    together (the law then asks for gamma+ >= -e gamma- < 0 only); `energy_gain`, with unequal e;
+    `infeasible` (a body squeezed between walls with unequal e); `impulse_not_unique` for redundant
+    contacts (of all p that of least |pbar| is given, where friction allows it). With friction there
+    is a solution unless contacts jam (impulses that move nothing).
+
+    Derivatives are one-sided where a contact is about to take part (p_j = 0 = gamma+ + e gamma-).
+
+    Source: Moreau (1988); Brogliato, Nonsmooth Mechanics (2016), (6.51), (6.54).
+
+    >>> import jimpact as ji
+    >>> out = ji.impact(ji.Moreau(0.5), ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0])
+    >>> [round(float(v), 6) for v in out.velocity]
+    [-0.25, 0.25, 0.25]
+    """
+
+    complementary: ClassVar[bool] = True
+    separable: ClassVar[bool] = True
+
+    restitution: jax.Array = parameter(low=0.0, high=1.0, matrix=True)
+
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
+        """A matrix must have one row and one column per contact."""
+        if self.restitution.ndim == 2:
+            shape = (scene.contacts, scene.contacts)
+            check_shape("restitution", self.restitution, shape, "one row per contact")
+
+
+class RestitutionMatrix(Kinematic):
+    """A full matrix of kinematic coefficients between the quasi-velocities of all contacts.
+
+    Equation: with E (m, m): `qn+ = -E qn-`, `qn_j = gamma_j / |grad f_j|`, hence
+    `pbar = -G^-1 (I + E) qn-`, `p_j = pbar_j / |grad f_j|`; tangential velocities are conserved.
+    With E (m + k, m + k), k = n - m - b: `(qn+, qt+) = -E (qn-, qt-)` in the basis of
+    `ji.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
+    scene's tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t where
+    several do), `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn = 0, E_tt = -I.)
+    Bilateral constraints distort G and n_q as in (6.35). With friction, and E (m, m),
+    `qn+ = -E qn-` and `p_t in -mu p Sgn(v_t+ + e_t v_t-)`.
+
+    Args:
+        matrix: E, (m, m) or (m + k, m + k), without dimension. Diagonal, it is `Newton`.
+        admissible: whether `fit` keeps an (m, m) matrix consistent for all approach velocities
+            `qn- <= 0`: `E >= 0` and `G^-1 (I + E) >= 0` elementwise, `G^-1 - E^T G^-1 E`
+            copositive. An impact takes E as it is, whatever this says.
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
+        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `v_t+ = -e_t v_t-`.
+
+    Open contacts take no part: their rows and columns of E count as zero; an
+    (m + k, m + k) matrix needs closed contacts (ValueError; `infeasible` if traced).
+
+    Status: `negative_impulse`, `inadmissible_velocity`, `energy_gain` where E contradicts
+    unilateral contact or energy at this velocity; `infeasible` where contacts are redundant and
+    contradict each other, or no tangential impulses give the change of qt; `impulse_not_unique`
+    for redundant contacts. With friction `infeasible`, too, where normal and tangential directions
+    couple so that neither sticking nor sliding is consistent, `several_outcomes` where more than
+    one is (found for up to 3 contacts; of them that which sticks most is given), and
+    `impulse_not_unique` where p_t is not determined (a block lying flat).
+
+    Raises:
+        ValueError: E not square, not finite, or not of a size that fits the scene; tangential
+            blocks, or friction, for a scene without tangents; both together.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)-(6.57).
+
+    >>> import jimpact as ji
+    >>> law = ji.RestitutionMatrix([[0.1, 0.0], [0.8, 0.5]])  # the striker's impact moves ball 3
+    >>> out = ji.impact(law, ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+    >>> [round(float(v), 6) for v in out.velocity]
+    [0.0, 0.1, 0.9]
+    """
+
+    complementary: ClassVar[bool] = False
+    pulls: ClassVar[bool] = True
+
+    matrix: jax.Array = parameter(matrix=True)
+    friction: jax.Array | None = parameter(low=0.0)
+    tangential_restitution: jax.Array | None = parameter(low=-1.0, high=1.0)
+    admissible: bool = option(True, converter=bool)
+
+    def __init__(
+        self,
+        matrix: Any,
+        admissible: bool = True,
+        friction: Any = None,
+        tangential_restitution: Any = 0.0,
+    ):
+        self.matrix, self.admissible = matrix, admissible
+        if np.ndim(matrix) != 2:
+            raise ValueError(
+                "Argument `matrix` must be square, (m, m) for m contacts or (m + k, m + k) with "
+                f"k tangential quasi-velocities, but has shape {np.shape(matrix)}."
+            )
+        self.friction, self.tangential_restitution = friction_fields(
+            friction, tangential_restitution
+        )
+
+    @property
+    def coefficients(self) -> jax.Array:
+        """E."""
+        return self.matrix
+
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
+        """Raise where E does not fit the scene."""
+        m, size = scene.contacts, self.matrix.shape[0]
+        if size == m:
+            return
+        if self.friction is not None:
+            raise ValueError(
+                f"Argument `matrix` must have shape ({m}, {m}) with `friction`, which decides "
+                f"about the tangential velocities itself, but has shape {self.matrix.shape}."
+            )
+        held = 0 if scene.constraints is None else scene.constraints.shape[1]
+        full = scene.size - held
+        if size != full or full < m:
+            other = f" or ({full}, {full})" if full > m else ""
+            raise ValueError(
+                f"Argument `matrix` must have shape ({m}, {m}){other} for {m} contacts and "
+                f"{full} free velocities, but has shape {self.matrix.shape}."
+            )
+        if scene.tangents is None:
+            raise ValueError(
+                "Argument `scene` must have tangents for a `matrix` with tangential blocks: "
+                "normal impulses cannot change tangential quasi-velocities."
+            )
+        gaps = scene.gaps
+        if gaps is not None and not is_traced(gaps) and np.any(np.asarray(gaps) > 0):
+            raise ValueError(
+                "Argument `scene` must have closed contacts only for a `matrix` with tangential "
+                "blocks: which quasi-velocities are tangential depends on the contacts."
+            )
+        check_independent(scene)
+
+    def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
+        """With tangential blocks the tangential quasi-velocities, too."""
+        contact = super().contact(scene, velocity)
+        if self.matrix.shape[0] == scene.contacts:
+            return contact
+        assert scene.tangents is not None  # see `check`
+        _, basis = quasi_basis(scene)
+        return QuasiContact(contact, basis.T @ momentum(scene, velocity), basis.T @ scene.tangents)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Impulses of either form of E."""
+        if not isinstance(contact, QuasiContact):
+            return super().impulses(contact)
+        assert contact.cross is not None
+        m = contact.contacts
+        quasi = jnp.concatenate([contact.normalized_gap_velocity, contact.quasi])
+        change = quasi + self.matrix @ quasi  # qn- - qn+, qt- - qt+
+        side, missed = _least(contact.directions, -change[m:], jnp.abs(quasi).max())
+        required = contact.norm * change[:m] + contact.cross @ side
+        p, _, code = prescribed_impulses(contact, required)
+        lost = missed | ~jnp.all(contact.closed)
+        return Impulses(p, side, jnp.where(lost, CODE["infeasible"], code))
+
+
+class QuasiContact(Contact):
+    """A contact with its tangential quasi-velocities qt- (k,) and `t_q^T H` (k, t)."""
+
+    quasi: jax.Array
+    directions: jax.Array
+
+    def __init__(self, contact: Contact, quasi: jax.Array, directions: jax.Array):
+        for name, value in vars(contact).items():
+            setattr(self, name, value)
+        self.quasi, self.directions = quasi, directions
+
+
+def _least(matrix: jax.Array, right: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Least x with `A x = right`, and whether none has, compared to velocities of this size."""
+    x = jnp.linalg.pinv(matrix) @ right
+    off = jnp.abs(matrix @ x - right).max()
+    return x, off > jnp.sqrt(jnp.finfo(x.dtype).eps) * size
