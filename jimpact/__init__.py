@@ -20,18 +20,17 @@ __version__ = "0.1.0"
 # module -> public names, imported on first use so that `jimpact --help` stays fast. No module
 # here is named like a public name: importing it would put the module in the function's place.
 _WHERE = {
-    "scene": (
-        "Scene chain column gap_velocity kinetic_energy momentum scene_from_gaps velocity_change"
-    ),
+    "scene": ("Scene chain column gap_velocity kinetic_energy momentum velocity_change"),
     "contact": (
         "Contact delassus_matrix kinetic_angles normalized_delassus normalized_gap_velocity"
     ),
-    "bodies.base": "Mechanism",
-    "bodies.bodies": "Block Dimer dimer rocking_block",
-    "bodies.spatial": "SpatialDimer dimer_3d",
-    "bodies.planar": "Corner DiskBalls corner disk_balls",
+    "bodies.base": "Body scene_from_gaps",
+    "bodies.blocks": "Block rocking_block",
+    "bodies.dimers": "Dimer SpatialDimer dimer dimer_3d",
+    "bodies.discs": "DiskBalls disk_balls",
+    "bodies.particles": "Column Corner corner",
     "bodies.pendulums": "PendulumCradle pendulum_cradle",
-    "law": "Impulses Law parameter",
+    "law": "Impulses Law option parameter",
     "laws": "REGISTRY register",
     "laws.kinematic": "Moreau Newton RestitutionMatrix",
     "laws.poisson": "Poisson",
@@ -45,7 +44,7 @@ _WHERE = {
     "laws.calibration": "calibrate compare_rheologies measured_restitution",
     "laws.materials": "hertz_stiffness sphere_mass",
     "theory.linear_chain": "bilateral_motion newby_ratio",
-    "motion.turning": "TurningImpact block_gaps turning_impact",
+    "motion.turning": "TurningImpact turning_impact",
     "plot.rheology": "plot_forces plot_rheologies",
     "montecarlo.running": "monte_carlo",
     "montecarlo.results": "MonteCarlo",
@@ -90,14 +89,15 @@ _WHERE = {
     "experiments": "Experiments read_experiments",
     "fits.fitting": "Fit fit",
     "plot.fits": "plot_fit",
-    "motion.simulation": "simulate",
+    "motion.simulate": "simulate",
     "plot.motions": "plot_motion plot_phase_portrait",
     "plot.animation": "animate_motion",
-    "motion.system": "System gravity",
-    "motion.bases": "HarmonicBase",
+    "motion.system": (
+        "HarmonicBase System ball_system block_system column_system cradle_system dimer_system "
+        "gravity"
+    ),
     "motion.fitting_motion": "MotionFit fit_motion",
     "motion.record": "Motion raise_on_failed_motion",
-    "motion.ready_systems": ("ball_system block_system column_system cradle_system dimer_system"),
 }
 _MODULE = {name: module for module, names in _WHERE.items() for name in names.split()}
 

@@ -87,6 +87,17 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     )
 
 
+def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
+    """A sentence where no contact approaches, so that no impact happens; else None."""
+    contact = contact_of(scene, as_velocity(scene, velocity), uses_gaps=True)
+    approaches = np.asarray(contact.gap_velocity < 0)
+    if (approaches & np.asarray(scene.closed)).any():
+        return None
+    if approaches.any():
+        return "no closed contact approaches (gamma- < 0), only open ones do: few laws look at them"
+    return "nothing approaches (gamma- < 0 at no contact): is the sign of the velocities as meant?"
+
+
 def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     """A printable account of one impact (or, for a batch, of its status codes).
 
@@ -108,8 +119,11 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
         f"{name} {'ok' if bool(getattr(checks, name)) else 'VIOLATED'}"
         for name in ("kinematic", "kinetic", "energetic", "momentum")
     ]
+    nothing = nothing_approaches(scene, velocity)
+    quiet = nothing is not None and not np.asarray(out.impulse).any()
     lines = [
         f"status         {row.name}: {row.message}",
+        *([f"impact         none: {nothing}"] if quiet else []),
         f"energy         {before:.6g} J before, change {float(out.energy_change):.6g} J "
         f"({100 * kept:.4g} % kept)",
         f"audit          {', '.join(words)}",

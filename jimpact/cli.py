@@ -222,6 +222,8 @@ class SimulateCommand:
 class LawsCommand:
     """List the laws: what they say, when they are right and when they fail."""
 
+    module: str | None = None
+    """File (.py) or module that registers further laws, see `ji.register`."""
     bibtex: bool = False
     """Print the references as BibTeX."""
     json: bool = False
@@ -233,7 +235,14 @@ class LawsCommand:
         from rich.table import Table
 
         from jimpact.laws import REGISTRY
+        from jimpact.study import import_laws
 
+        if self.module is not None:
+            try:
+                import_laws(self.module, Path())
+            except (ValueError, ImportError) as error:
+                print(f"jimpact laws: {error}", file=sys.stderr)
+                return 2
         if self.bibtex:
             print("\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values())))
         elif self.json:

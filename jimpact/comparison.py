@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_values
-from jimpact.audits import Audit, audit
+from jimpact.audits import Audit, audit, nothing_approaches
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
-from jimpact.laws import REGISTRY, Row
+from jimpact.laws import REGISTRY
 from jimpact.scene import Scene, as_velocity, kinetic_energy, momentum
 from jimpact.status import STATUS
 
@@ -70,11 +70,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found: `entries[name]`; `print` gives a table."""
+    """What `compare` found: `entries[name]`; `left_out[name]` says why; `print` gives a table."""
 
     scene: Scene
     velocity: np.ndarray
     entries: dict[str, Entry]
+    left_out: dict[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it."""
@@ -99,6 +100,9 @@ class Comparison:
             v = "".join(f"{x:11.5f}" for x in np.asarray(entry.outcome.velocity))
             numbers = f"{entry.energy_ratio:8.4f}{entry.dispersion_index:7.3f}"
             lines.append(f"{name:22s}{v}{numbers}{1e6 * entry.time:8.0f}  {verdict(entry)}")
+        lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
+        quiet = nothing_approaches(self.scene, self.velocity)
+        lines += [] if quiet is None else [quiet]
         return "\n".join(lines)
 
 
@@ -110,21 +114,22 @@ def verdict(entry: Entry) -> str:
     return ", ".join(broken + told) or "ok"
 
 
-def registered_laws(values: Mapping[str, Any]) -> dict[str, Law]:
-    """One law of each kind of the registry, from parameters by name; without what a law needs: not.
+def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str, str]]:
+    """One law of each kind of the registry, from parameters by name; and why others are left out.
 
     >>> from jimpact.comparison import registered_laws
-    >>> sorted(registered_laws({"restitution": 0.9}))
-    ['binary', 'lzb', 'moreau', 'newton', 'poisson']
+    >>> laws, left_out = registered_laws({"restitution": 0.9})
+    >>> sorted(laws), left_out["restitution_matrix"]
+    (['binary', 'lzb', 'moreau', 'newton', 'poisson'], 'needs `matrix`')
     """
-
-    def made(row: Row) -> Law | None:
-        if row.parameters[0] not in values:
-            return None
-        return row.build(**{key: values[key] for key in row.parameters if key in values})
-
-    laws = {name: made(row) for name, row in REGISTRY.items()}
-    return {name: law for name, law in laws.items() if law is not None}
+    laws, left_out = {}, {}
+    for name, row in REGISTRY.items():
+        missing = [f"`{key}`" for key in row.required if key not in values]
+        if missing:
+            left_out[name] = f"needs {', '.join(missing)}"
+        else:
+            laws[name] = row.build(**{key: values[key] for key in row.arguments if key in values})
+    return laws, left_out
 
 
 def compare(
@@ -137,7 +142,8 @@ def compare(
         velocity: v- (n,) [m/s].
         laws: by name; default: every law of the registry, with these
         values: parameters by name, `restitution=0.9, stiffness=..., exponent=..., matrix=...`
-            (laws that need others are left out); restitution is 1 where nothing is said.
+            (laws that need others are left out, see `left_out`); restitution is 1 where nothing
+            is said.
 
     >>> import jimpact as ji
     >>> table = ji.compare(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0], restitution=1.0)
@@ -146,15 +152,16 @@ def compare(
     """
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
+    left_out: dict[str, str] = {}
     if laws is None:
-        laws = registered_laws({"restitution": 1.0} | values)
+        laws, left_out = registered_laws({"restitution": 1.0} | values)
     elif values:
         raise ValueError(
             f"Argument `laws` must be None where parameters are given, but {', '.join(values)} "
             "came with it."
         )
     entries = {name: _entry(law, scene, v) for name, law in laws.items()}
-    return Comparison(scene, np.asarray(v), entries)
+    return Comparison(scene, np.asarray(v), entries, left_out)
 
 
 def _entry(law: Law, scene: Scene, v: jax.Array) -> Entry:

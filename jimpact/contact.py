@@ -138,6 +138,16 @@ class Contact(eqx.Module):
         gamma = self.gap_velocity
         return jnp.any(gamma < 0) | jnp.any(self.stored > 0) | ~jnp.all(jnp.isfinite(gamma))
 
+    def within(self, noise: jax.Array) -> "Contact":
+        """The same with gap velocities up to `noise` () [m/s] set to 0, like those in rounding."""
+        gamma = self.gap_velocity
+        small = jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0))
+        return eqx.tree_at(
+            lambda contact: (contact.gap_velocity, contact.noise),
+            self,
+            (gamma - small, jnp.maximum(self.noise, noise)),
+        )
+
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """gamma+ (m,) [m/s] of impulses p (m,) and p_t (t,)."""
         after = self.gap_velocity + self.delassus @ normal

@@ -11,7 +11,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.csv_shots import read_table
-from jimpact.scene import Scene, dense_mass
+from jimpact.scene import Scene, dense_mass, stackable
 
 
 class Experiments(eqx.Module):
@@ -22,7 +22,8 @@ class Experiments(eqx.Module):
         post: v+ of the same shape [m/s]; NaN marks a value that was not measured.
         sigma: standard error of each `post` value, (K, n) or a scalar, > 0 [m/s]; None: unknown,
             then `fit` estimates one common noise from the residual.
-        scenes: one `Scene` a shot, all of the same kind and sizes; None: `fit` gets the scene.
+        scenes: one `Scene` a shot, with the same coordinates, but any number of contacts; a law's
+            entry j belongs to contact j of each. None: `fit` gets the scene.
         shots: K labels for tables and pictures; None: 1, 2, ...
 
     Raises:
@@ -93,6 +94,11 @@ class Experiments(eqx.Module):
             )
         return own
 
+    def largest_scene(self, scene: Scene | None) -> Scene:
+        """The first of the scenes with the most contacts."""
+        scenes = [self.scene_of(scene, k) for k in range(len(self.shots))]
+        return max(scenes, key=lambda own: own.contacts)
+
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
         """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
 
@@ -106,7 +112,7 @@ class Experiments(eqx.Module):
         0.1
         """
         rows = [m @ (post - pre) for m, pre, post in self.balances(scene)]
-        return np.array(rows).reshape(len(self.shots), -1)
+        return _filled(rows)
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """Conserved momentum after over before, (K, c); inf or NaN where there was none before."""
@@ -115,7 +121,7 @@ class Experiments(eqx.Module):
             before, rounding = m @ pre, 1e-12 * np.abs(m) @ np.abs(pre)
             with np.errstate(divide="ignore", invalid="ignore"):
                 rows.append((m @ post) / np.where(np.abs(before) > rounding, before, 0.0))
-        return np.array(rows).reshape(len(self.shots), -1)
+        return _filled(rows)
 
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """`T+ / T-` of every shot (K,); NaN for shots with missing values."""
@@ -155,6 +161,14 @@ class Experiments(eqx.Module):
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
         scenes = [self.scene_of(scene, k) for k in range(len(pre))]
         return [(conserved_momenta(s), a, b) for s, a, b in zip(scenes, pre, post)]
+
+
+def _filled(rows: list[np.ndarray]) -> np.ndarray:
+    """Rows of one length; shots whose contacts can change more momenta have NaN at the end."""
+    filled = np.full((len(rows), max(map(len, rows))), np.nan)
+    for row, values in zip(filled, rows):
+        row[: len(values)] = values
+    return filled
 
 
 def conserved_momenta(scene: Scene) -> np.ndarray:
@@ -200,18 +214,13 @@ def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, 
         raise ValueError(
             f"Argument `scenes` must have one scene per shot, {shape[0]}, but has {len(scenes)}."
         )
-    layout = [(jax.tree.structure(s), [x.shape for x in jax.tree.leaves(s)]) for s in scenes]
     for k, scene in enumerate(scenes):
         if scene.size != shape[1]:
             raise ValueError(
                 f"Argument `scenes` must have {shape[1]} bodies as the velocities have, "
                 f"but the scene of shot {k + 1} has {scene.size}."
             )
-        if layout[k] != layout[0]:
-            raise ValueError(
-                "Argument `scenes` must hold scenes of one kind (same bodies, contacts, walls; "
-                f"gaps in all or in none), but that of shot {k + 1} differs from the first."
-            )
+    stackable(scenes)  # raises where they cannot be fitted together
     return scenes
 
 

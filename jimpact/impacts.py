@@ -35,19 +35,21 @@ class Impact(eqx.Module):
     status: jax.Array
 
 
-def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
+def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
     """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
 
     Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
 
     Contacts that no coordinate joins (two pairs of balls in one scene) are solved apart where the
     scene is known, not traced, and the law allows it (`Law.separable`); the outcome is the same.
-    Approach within the rounding of v- is none.
+    Approach within the rounding of v- (or within `noise`) is none.
 
     Args:
         law: its parameters are scalars or have one entry per contact.
         scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
         velocity: v- (n,) [m/s].
+        noise: gap velocities () up to which are rounding, too [m/s]: in a motion v- holds the
+            rounding of its largest speeds. None: of v- only.
 
     Returns:
         `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
@@ -69,7 +71,9 @@ def impact(law: Law, scene: Scene, velocity: Any) -> Impact:
     _check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
-    return _impact(law, scene, v, coupled_groups(scene) if is_separable(law) else None)
+    check_values("noise", noise, low=0.0)
+    noise = None if noise is None else jnp.asarray(noise, v.dtype)
+    return _impact(law, scene, v, coupled_groups(scene) if is_separable(law) else None, noise)
 
 
 def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
@@ -88,14 +92,17 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
 
 
 @eqx.filter_jit
-def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None) -> Impact:
+def _impact(
+    law: Law, scene: Scene, v: jax.Array, groups: Groups | None, noise: jax.Array | None
+) -> Impact:
     if groups is None:
         contact = law.contact(scene, v)
+        contact = contact if noise is None else contact.within(noise)
         happens = contact.happens
         outcome = _resolved(law, contact, happens)
         stored = contact.stored
     else:
-        outcome, happens, stored = _in_groups(law, scene, v, groups)
+        outcome, happens, stored = _in_groups(law, scene, v, groups, noise)
     p, tangential = outcome.normal, outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
@@ -141,7 +148,7 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
 
 
 def _in_groups(
-    law: Law, scene: Scene, v: jax.Array, groups: Groups
+    law: Law, scene: Scene, v: jax.Array, groups: Groups, noise: jax.Array | None
 ) -> tuple[_Resolved, jax.Array, jax.Array]:
     """All groups solved side by side; whether anything happens, and the stored energy (m,).
 
@@ -151,12 +158,14 @@ def _in_groups(
     m = scene.contacts
     stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
     all_contacts = contacts_of_groups(scene, v, stored, groups)
+    if noise is not None:
+        all_contacts = [contact.within(noise) for contact in all_contacts]
     own = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in all_contacts]
     happens = jnp.any(jnp.concatenate(own))
     p = jnp.zeros(m, v.dtype)
     each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
     tangential = jnp.zeros((m, each), v.dtype)
-    code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+    code, square, unknown = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
     for filled, contacts, acts in zip(groups, all_contacts, own):
         index = jnp.asarray(filled % m)
         acts = happens & (acts | law.pulls)
@@ -174,8 +183,8 @@ def _in_groups(
         rows = part.tangential.reshape(len(at), each)
         tangential = tangential.at[at].set(rows, mode="drop")
         code = jnp.maximum(code, jnp.max(part.status))
-        square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
-    found = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise)
+        square, unknown = square + jnp.sum(part.size**2), unknown + jnp.sum(part.noise)
+    found = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), unknown)
     return found, happens, stored
 
 

@@ -12,7 +12,7 @@
 """
 
 import operator
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +23,6 @@ import numpy as np
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 
 _SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of M that rounding may cause in float32
-CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0
 
 _CONSTRAINTS = operator.attrgetter("constraints")
 _WALLS = {
@@ -167,47 +166,61 @@ def column(masses: Any, gaps: Any = None) -> Scene:
     return chain(masses, wall="right", gaps=gaps)
 
 
-def scene_from_gaps(
-    gap_function: Callable[[jax.Array], jax.Array],
-    mass: Any,
-    q: Any,
-    closed_below: float = CLOSED_BELOW,
-) -> Scene:
-    """Scene of a system at configuration `q`; the normals are the gradients of its gaps.
-
-    Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
-
-    Args:
-        gap_function: q (n,) -> gaps f(q) (m,) [m], written with jax.numpy.
-        mass: M (n,) or (n, n), or a function q -> M(q).
-        q: (n,) configuration.
-        closed_below: gaps with |f| up to this count as closed [m].
-
-    Raises:
-        ValueError: penetration (f < -closed_below), or what `Scene` refuses.
-
-    >>> import jax.numpy as jnp, jimpact as ji
-    >>> bouncing = ji.scene_from_gaps(lambda q: q[1:] - 0.5, [1.0, 1.0], [0.0, 0.5])
-    >>> bouncing.normals.tolist()
-    [[0.0], [1.0]]
-    """
-    q = as_float_array("q", q)
-    check_values("q", q)
-    f = jnp.atleast_1d(gap_function(q))
-    if not is_traced(f) and bool(jnp.any(f < -closed_below)):
-        worst = int(jnp.argmin(f))
-        raise ValueError(
-            f"Argument `q` must have no penetration (f >= -{closed_below:g} m), "
-            f"but gap {worst} has value {float(f[worst]):g} m."
-        )
-    normals = jax.jacobian(lambda x: jnp.atleast_1d(gap_function(x)))(q).T
-    gaps = jnp.where(f > closed_below, f, 0.0)
-    return Scene(mass(q) if callable(mass) else mass, normals, gaps=gaps)
-
-
 def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
     """The scene with these gaps (m,)."""
     return eqx.tree_at(lambda tree: tree.gaps, scene, gaps, is_leaf=lambda x: x is None)
+
+
+def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
+    """The scenes with equal structure and sizes, and how many coordinates were added at the end.
+
+    Scenes with fewer contacts than another one get open contacts, each between coordinates of its
+    own that nothing else moves: where these move at unit speed, the contact separates.
+
+    Raises:
+        ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
+            coordinates or constraints.
+    """
+    layouts = {str((jax.tree.structure(s), jax.tree.map(jnp.shape, s))) for s in scenes}
+    if len(layouts) == 1:
+        return list(scenes), 0
+    each = {0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes}
+    held = {0 if s.constraints is None else s.constraints.shape[1] for s in scenes}
+    sizes = {s.size for s in scenes}
+    for what, found in (("tangents a contact", each), ("constraints", held), ("bodies", sizes)):
+        if len(found) > 1:
+            raise ValueError(
+                f"Argument `scenes` must have equally many {what} in all shots, but have "
+                f"{' and '.join(map(str, sorted(found)))}."
+            )
+    (sides,) = each
+    most = max(s.contacts for s in scenes)
+    extra = (most - min(s.contacts for s in scenes)) * (1 + sides)
+    dense = any(s.mass.ndim == 2 for s in scenes)
+
+    def alike(scene: Scene) -> Scene:
+        n, missing = scene.size, most - scene.contacts
+        mass = jnp.pad(scene.mass, [(0, extra)] * scene.mass.ndim)
+        own = jnp.arange(n + extra) >= n
+        mass = mass + (own if mass.ndim == 1 else jnp.diag(own)).astype(mass.dtype)
+        columns = jnp.eye(n + extra, dtype=scene.normals.dtype)[:, n:]
+
+        def grown(matrix: jax.Array, first: int, count: int) -> jax.Array:
+            below = jnp.pad(matrix, ((0, extra), (0, 0)))
+            return jnp.concatenate([below, columns[:, first : first + count]], axis=1)
+
+        gaps = jnp.zeros(scene.contacts, mass.dtype) if scene.gaps is None else scene.gaps
+        tangents = scene.tangents
+        held = scene.constraints
+        return Scene(
+            jnp.diag(mass) if dense and mass.ndim == 1 else mass,
+            grown(scene.normals, 0, missing),
+            None if tangents is None else grown(tangents, missing, missing * sides),
+            jnp.concatenate([gaps, jnp.ones(missing, gaps.dtype)]),
+            None if held is None else jnp.pad(held, ((0, extra), (0, 0))),
+        )
+
+    return [alike(scene) for scene in scenes], extra
 
 
 def as_velocity(scene: Scene, velocity: Any) -> jax.Array:

@@ -1,5 +1,7 @@
 """A study: one TOML file with scene, law, what is free, and the data file."""
 
+import importlib.util
+import sys
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -20,7 +22,6 @@ _TABLES = ("title", "scene", "law", "fit", "data", "monte_carlo")
 _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 _FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
 _DATA_KEYS = ("file", "momentum_corrected")
-_LAW_OPTIONS = {"binary": ("order",)}  # of a law, beside its parameters
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,9 @@ class Study:
 def read_study(path: str | Path, law: str | None = None) -> Study:
     """Read a study file; `law` puts another law in the place of the study's.
 
-    Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`); `[law]` name and start
-    values, a number for all contacts or a list with one each, and `[law.bounds]`; `[fit]` free (a
+    Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`); `[law]` name, options and
+    start values, a number for all contacts or a list with one each, module (a file or module that
+    registers the law, see `ji.register`), and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
     to the study), momentum_corrected; without data a study can be compared, not fitted;
     `[monte_carlo]` velocity_m_per_s, gaps_m, law, samples, seed (see `jimpact.montecarlo`). A name
@@ -104,7 +106,7 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
     scene = _scene(tables["scene"])
     options = dict(tables.get("fit", {}))
     check_keys("[fit]", options, _FIT_KEYS)
-    row, values, bounds = law_table(tables["law"], other_law)
+    row, values, bounds = law_table(tables["law"], other_law, path.parent)
     free = options.pop("free", ["restitution"])
     free = free if isinstance(free, dict) else dict.fromkeys(_as_names(free), True)
     if other_law is not None:
@@ -137,11 +139,13 @@ def _scene(table: Mapping[str, Any]) -> Scene:
 
 
 def law_table(
-    table: Mapping[str, Any], other: str | None
+    table: Mapping[str, Any], other: str | None, folder: Path
 ) -> tuple[Row, dict[str, Any], dict[str, Any]]:
     """Registry row, start values and bounds; of another law only what both have is kept."""
     table = dict(table)
     check_keys("[law]", table, tuple(table), required=("name",))
+    if "module" in table:
+        import_laws(str(table.pop("module")), folder)
     own = str(table.pop("name")).lower()
     name = (other or own).lower()
     for key in (own, name):
@@ -149,12 +153,35 @@ def law_table(
             raise ValueError(f"the law must be one of {', '.join(REGISTRY)}, but is {key!r}.")
     row = REGISTRY[name]
     bounds = table.pop("bounds", {})
-    options = _LAW_OPTIONS.get(own, ())
-    check_keys("[law]", table, (*REGISTRY[own].parameters, "name", "bounds", *options))
+    check_keys("[law]", table, (*REGISTRY[own].arguments, "name", "bounds"))
     check_keys("[law.bounds]", bounds, REGISTRY[own].parameters)
-    taken = (*row.parameters, *_LAW_OPTIONS.get(name, ()))
-    kept = {k: v for k, v in table.items() if k in taken}
+    kept = {k: v for k, v in table.items() if k in row.arguments}
     return row, kept, {k: v for k, v in bounds.items() if k in row.parameters}
+
+
+def import_laws(module: str, folder: Path) -> None:
+    """Import a module that registers laws: a file (.py, relative to the folder), or by its name."""
+    if not module.endswith(".py"):
+        importlib.import_module(module)
+        return
+    path = (folder / module).resolve()
+    if not path.is_file():
+        raise ValueError(f"`module` must be a file or an importable module, but '{path}' is none.")
+    known = sys.modules.get(path.stem)
+    if known is not None:
+        if Path(getattr(known, "__file__", None) or "").resolve() == path:
+            return
+        raise ValueError(f"`module` must have a new name, but another '{path.stem}' is imported.")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = loaded  # before it runs: classes are looked up there by name
+    try:
+        spec.loader.exec_module(loaded)
+    except BaseException:
+        del sys.modules[path.stem]
+        raise
 
 
 def _as_names(free: Any) -> list[str]:

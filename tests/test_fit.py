@@ -271,12 +271,12 @@ class Coupled(Law):
     matrix: jax.Array
     broken_below: float = -np.inf
 
-    def impulse(self, delassus, gap_velocity):
-        w = as_matrix(delassus)
-        change = -(self.matrix + jnp.eye(len(w))) @ gap_velocity
+    def impulses(self, contact):
+        w = as_matrix(contact.delassus)
+        change = -(self.matrix + jnp.eye(len(w))) @ contact.gap_velocity
         bad = self.matrix[0, 0] < self.broken_below
         p = jnp.where(bad, jnp.nan, jnp.linalg.solve(w, change))
-        return p, jnp.where(bad, CODE["max_steps"], CODE["ok"])
+        return ji.Impulses(p, None, jnp.where(bad, CODE["max_steps"], CODE["ok"]))
 
 
 class Even(Law):
@@ -284,9 +284,9 @@ class Even(Law):
 
     root: jax.Array
 
-    def impulse(self, delassus, gap_velocity):
-        change = -(1 + self.root**2) * gap_velocity
-        return jnp.linalg.solve(as_matrix(delassus), change), jnp.asarray(CODE["ok"])
+    def impulses(self, contact):
+        change = -(1 + self.root**2) * contact.gap_velocity
+        return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
 
 
 def test_a_law_with_a_matrix_field():

@@ -516,7 +516,7 @@ def test_where_the_linearization_has_nothing_to_say(whole):
         _ = gap_sensitivity(LAW, BALLS, BEFORE, [0.0, 1e-6]).explained
 
 
-LAWS = registered_laws({"restitution": 0.9, "stiffness": 1.0, "matrix": 0.9 * np.eye(2)})
+LAWS = registered_laws({"restitution": 0.9, "stiffness": 1.0, "matrix": 0.9 * np.eye(2)})[0]
 
 
 @pytest.mark.slow

@@ -53,7 +53,8 @@ def test_check_values():
     np.testing.assert_allclose(pbar, [2.57058240589371162, 1.87959940026865904], atol=1e-14)
     np.testing.assert_allclose(out.energy_change, -0.224854663778188231, atol=1e-14)
     assert int(out.status) == 0
-    p, code = RestitutionMatrix(E2).impulse(ji.delassus_matrix(CHAIN), ji.gap_velocity(CHAIN, v))
+    contact = ji.Contact(ji.delassus_matrix(CHAIN), ji.gap_velocity(CHAIN, v))
+    p, _, code = RestitutionMatrix(E2).impulses(contact)
     np.testing.assert_allclose(p, out.impulse, atol=1e-14)
     assert int(code) == 0
 

@@ -369,9 +369,9 @@ def test_float32_floor():
     """
     scene = ji.chain(jnp.ones(3, jnp.float32))
     floor = 16 * float(np.finfo(np.float32).eps)
-    ji.LZB(0.9, rtol=1.001 * floor).check_options(jnp.dtype("float32"), scene)
+    ji.LZB(0.9, rtol=1.001 * floor).check(scene, jnp.dtype("float32"))
     with pytest.raises(ValueError, match="rtol"):
-        ji.LZB(0.9, rtol=0.999 * floor).check_options(jnp.dtype("float32"), scene)
+        ji.LZB(0.9, rtol=0.999 * floor).check(scene, jnp.dtype("float32"))
 
 
 # --- the map itself ---

@@ -5,13 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jimpact.bodies.base import scene_from_gaps
+from jimpact.bodies.blocks import Block
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
-from jimpact.motion.turning import block_gaps, turning_impact
-from jimpact.scene import chain, scene_from_gaps
+from jimpact.motion.turning import turning_impact
+from jimpact.scene import chain
 
-GAPS = block_gaps(1.0, 1.0)
+GAPS = Block(1.0, 1.0).gap_function
 MASS = jnp.array([1.0, 1.0, 1 / 6])
 FLAT, LANDING = jnp.array([0.0, 0.5, 0.0]), jnp.array([0.0, -0.5, -1.0])  # gap rates (-1, 0)
 
@@ -101,5 +103,3 @@ def test_nothing_approaches_and_bad_input():
         turning_impact(GAPS, MASS, FLAT - 0.1, LANDING, Hertz(1e6))
     with pytest.raises(TypeError, match="`force`"):
         turning_impact(GAPS, MASS, FLAT, LANDING, 1.0)
-    with pytest.raises(ValueError, match="`width`"):
-        block_gaps(0.0, 1.0)

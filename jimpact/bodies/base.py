@@ -1,26 +1,36 @@
-"""A mechanical system as functions of its configuration: gaps, tangents, mass matrix."""
+"""The description of a body: gaps, tangents and mass matrix as functions of its configuration."""
 
-import abc
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.scene import CLOSED_BELOW, Scene
+from jimpact.scene import Scene, check_mass
 
+STANDARD_GRAVITY = 9.80665  # m/s^2
+CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0
 _ROUNDINGS = 16  # of the largest coordinate: a gap that small is zero, in float32 too
 
+_AROUND = np.linspace(0, 2 * np.pi, 49)
+CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=1)  # outline of a ball of radius 1
 
-class Mechanism(eqx.Module):
-    """What a motion needs of a system with contacts; at one instant it is a `Scene`.
+Potential = Callable[[jax.Array], jax.Array]  # q (n,) -> V () [J]
+
+
+class Body(eqx.Module):
+    """One or several bodies with contacts, as functions of their configuration q (n,).
 
     Equation: gaps `f(q)`, normals `N = grad f`, tangents `H_t`, mass matrix `M(q)`.
 
-    A system of your own gives `coordinates`, `gap_function(q) -> (m,)`, `mass_matrix(q)` and, for
-    friction, `tangent_function(q) -> (m,)` (or `tangents(q)` itself). It is a pytree: its numbers
-    may be traced, batched and differentiated.
+    At one instant a body is a `Scene` (`scene(q)`), under loads it is a `System` that moves. A body
+    of your own gives `gap_function(q) -> (m,)`, `mass`, and for friction `tangent_function(q) ->
+    (m,)` (or `tangents(q)` itself); where it shall stand under gravity or on a moving base,
+    `gravity(acceleration)` and `base_directions`. It is a pytree: its numbers may be traced,
+    batched and differentiated.
 
     >>> import jimpact as ji
     >>> block = ji.Block(width=1.0, height=2.0)
@@ -28,65 +38,156 @@ class Mechanism(eqx.Module):
     [0.0, 0.0]
     """
 
-    @property
-    @abc.abstractmethod
-    def coordinates(self) -> int:
-        """Number n of coordinates q."""
-
-    @abc.abstractmethod
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f(q) (m,) [m]; negative in penetration."""
+        raise NotImplementedError(f"{type(self).__name__} must define `gap_function`.")
 
-    @abc.abstractmethod
-    def mass_matrix(self, q: jax.Array) -> jax.Array:
-        """M(q) (n, n), or (n,) its diagonal."""
+    @property
+    def mass(self) -> Any:
+        """M: an array (n,) or (n, n) if it is constant, else a function q -> M(q)."""
+        raise NotImplementedError(f"{type(self).__name__} must define `mass`.")
 
-    def tangent_function(self, q: jax.Array) -> jax.Array:
+    def tangent_function(self, q: jax.Array) -> jax.Array | None:
         """Displacements (m,) [m] along the contact planes; their rates are the sliding speeds."""
-        raise NotImplementedError(f"{type(self).__name__} has no planar tangents.")
+        return None
 
-    def tangents(self, q: jax.Array) -> jax.Array:
-        """H_t (n, m), planar, or (n, 2 m), contact-major: `v_t = H_t^T v`."""
+    def tangents(self, q: jax.Array) -> jax.Array | None:
+        """H_t (n, m), planar, or (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
+        if self.tangent_function(q) is None:
+            return None
         return jax.jacobian(self.tangent_function)(q).T
 
-    def scene(self, q: Any) -> Scene:
+    def mass_matrix(self, q: jax.Array) -> jax.Array:
+        """M(q) (n, n), or (n,) its diagonal."""
+        mass = self.mass
+        return jnp.asarray(mass(q) if callable(mass) else mass)
+
+    def gravity(self, acceleration: Any) -> Potential:
+        """Potential `q -> V ()` [J] of its weight at this acceleration g [m/s^2]."""
+        raise TypeError(f"{type(self).__name__} has no vertical: give its `potential` yourself.")
+
+    @property
+    def base_directions(self) -> jax.Array | None:
+        """B (n, d): how q changes when everything moves with the base; None: it has no base."""
+        return None
+
+    def outlines(self, q: np.ndarray, point: float) -> Sequence[np.ndarray]:
+        """Curves (k, 2) of points (x, y) [m] that show it; mass points get the radius `point`."""
+        raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
+
+    def scene(self, q: Any, closed_below: float = CLOSED_BELOW) -> Scene:
         """The scene at configuration q (n,).
 
-        Gaps up to 1e-12 m (or a few roundings of q) count as closed.
+        Gaps up to `closed_below` [m] (or a few roundings of q) count as closed.
 
         Raises:
-            ValueError: q of another size or not finite; penetration.
+            ValueError: q of another size or not finite; penetration; a mass that is not positive.
         """
         q = as_float_array("q", q)
-        check_shape("q", q, (self.coordinates,), "one per coordinate of the system")
+        mass = self.mass
+        if callable(mass):
+            mass = jax.eval_shape(mass, q)
+        check_shape("q", q, mass.shape[:1], "one per coordinate of the body")
         check_values("q", q)
-        mass, normals, tangents, f = _at(self, q)
+        mass, normals, tangents, f = self._parts(q)
         eps = float(jnp.finfo(f.dtype).eps)
-        none = jnp.maximum(CLOSED_BELOW, _ROUNDINGS * eps * jnp.maximum(1.0, jnp.abs(q).max()))
+        none = jnp.maximum(closed_below, _ROUNDINGS * eps * jnp.maximum(1.0, jnp.abs(q).max()))
         if not is_traced((f, none)) and bool(jnp.any(f < -none)):
             worst = int(jnp.argmin(f))
             raise ValueError(
-                f"Argument `q` must have no penetration, but gap {worst} has value "
-                f"{float(f[worst]):g} m."
+                f"Argument `q` must have no penetration (f >= -{float(none):g} m), "
+                f"but gap {worst} has value {float(f[worst]):g} m."
             )
         gaps = jnp.where(f > none.astype(f.dtype), f, 0.0)
         parts = (mass, normals, tangents, gaps)
         return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), parts))
 
-
-@eqx.filter_jit
-def _at(
-    system: Mechanism, q: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
-    tangents = None if _frictionless(system) else system.tangents(q)
-    normals = jax.jacobian(system.gap_function)(q).T
-    return system.mass_matrix(q), normals, tangents, system.gap_function(q)
+    def _parts(self, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
+        return _compiled_parts(self, q)
 
 
-def _frictionless(system: Mechanism) -> bool:
-    kind = type(system)
-    own = kind.tangents is not Mechanism.tangents
-    return not own and kind.tangent_function is Mechanism.tangent_function
+def _parts(body: Body, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
+    normals = jax.jacobian(body.gap_function)(q).T
+    return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q)
+
+
+_compiled_parts = eqx.filter_jit(_parts)
+
+
+class GivenBody(Body):
+    """A body given by functions, see `System` and `scene_from_gaps`."""
+
+    gaps: Callable[[jax.Array], jax.Array]
+    mass_given: Any
+    sliding: Callable[[jax.Array], jax.Array | None] | None
+
+    def __init__(self, gap_function: Any, mass: Any, tangent_function: Any = None):
+        for name, function in (
+            ("gap_function", gap_function),
+            ("tangent_function", tangent_function),
+        ):
+            if not (callable(function) or (function is None and name != "gap_function")):
+                raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
+        self.gaps, self.sliding = gap_function, tangent_function
+        if callable(mass):
+            self.mass_given = mass
+        else:
+            self.mass_given = as_float_array("mass", mass)
+            check_mass(self.mass_given)
+
+    @property
+    def mass(self) -> Any:
+        """M or q -> M(q), as given."""
+        return self.mass_given
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Gaps f(q) (m,) [m]."""
+        return jnp.atleast_1d(self.gaps(q))
+
+    def tangent_function(self, q: jax.Array) -> jax.Array | None:
+        """Displacements (m,) [m] along the contact planes."""
+        found = None if self.sliding is None else self.sliding(q)
+        return None if found is None else jnp.atleast_1d(found)
+
+    def _parts(self, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
+        return _parts(self, q)  # each new lambda would be compiled anew
+
+
+def scene_from_gaps(
+    gap_function: Callable[[jax.Array], jax.Array],
+    mass: Any,
+    q: Any,
+    closed_below: float = CLOSED_BELOW,
+) -> Scene:
+    """Scene of bodies at configuration `q`; the normals are the gradients of their gaps.
+
+    Equation: `N = grad f(q)`, `M = M(q)`, gaps `f(q)`.
+
+    Args:
+        gap_function: q (n,) -> gaps f(q) (m,) [m], written with jax.numpy.
+        mass: M (n,) or (n, n), or a function q -> M(q).
+        q: (n,) configuration.
+        closed_below: gaps with |f| up to this count as closed [m].
+
+    Raises:
+        ValueError: penetration (f < -closed_below), or what `Scene` refuses.
+
+    >>> import jax.numpy as jnp, jimpact as ji
+    >>> bouncing = ji.scene_from_gaps(lambda q: q[1:] - 0.5, [1.0, 1.0], [0.0, 0.5])
+    >>> bouncing.normals.tolist()
+    [[0.0], [1.0]]
+    """
+    return GivenBody(gap_function, mass).scene(q, closed_below)
+
+
+class LinearPotential(eqx.Module):
+    """`V = w^T q`: constant forces -w."""
+
+    weights: jax.Array
+
+    def __call__(self, q: jax.Array) -> jax.Array:
+        """V () [J]."""
+        return self.weights @ q
 
 
 def positive(name: str, value: Any, low_allowed: bool = False) -> jax.Array:
@@ -105,13 +206,41 @@ def number(name: str, value: Any) -> jax.Array:
     return found
 
 
-def positives(name: str, value: Any, count: int | None = None) -> jax.Array:
-    """Numbers (count,) > 0; a scalar stands for all of them."""
+def positives(
+    name: str, value: Any, count: int | None = None, low_allowed: bool = False
+) -> jax.Array:
+    """Numbers (count,) > 0, or >= 0 where `low_allowed`; a scalar stands for all of them."""
     found = as_float_array(name, value)
     if count is not None and found.ndim == 0:
         found = jnp.full(count, found)
     if found.ndim != 1 or (count is not None and found.shape[0] != count):
         size = "n" if count is None else count
         raise ValueError(f"Argument `{name}` must have shape ({size},), but has {found.shape}.")
-    check_values(name, found, low=0.0, open_low=True)
+    check_values(name, found, low=0.0, open_low=not low_allowed)
     return found
+
+
+class OnGround(Body):
+    """A planar body above the ground y = 0; q = (x, y, theta) of its middle."""
+
+    @property
+    def base_directions(self) -> jax.Array:
+        """The ground moves in x and y (3, 2)."""
+        return jnp.eye(3, 2, dtype=self.mass.dtype)
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = m g y`."""
+        up = jnp.array([0.0, 1.0, 0.0], self.mass.dtype)
+        return LinearPotential(self.mass * up * acceleration)
+
+    def touching(self, angle: Any = 0.0) -> jax.Array:
+        """q (3,) with x = 0 at which the lower contact (at angle 0: both) touches the ground."""
+        turn = number("angle", angle)
+        zero = jnp.zeros_like(turn)
+        return jnp.stack([zero, -jnp.min(self.gap_function(jnp.stack([zero, zero, turn]))), turn])
+
+
+def turned(points: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Points (k, 2) of a planar body, in its own frame, at q = (x, y, theta)."""
+    c, s = np.cos(q[2]), np.sin(q[2])
+    return q[:2] + points @ np.array([[c, s], [-s, c]])

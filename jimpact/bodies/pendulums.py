@@ -2,15 +2,17 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.bodies.base import Mechanism, positive, positives
+from jimpact.bodies.base import CIRCLE, Body, positive, positives
 from jimpact.scene import Scene
 
 
-class PendulumCradle(Mechanism):
+class PendulumCradle(Body):
     """Balls on parallel strings, side by side; q = the angles of the strings, to the right > 0.
 
     Equation: ball i at `(s_i + l sin(q_i), -l cos(q_i))`, `f_j = |c_{j+1} - c_j| - R_j - R_{j+1}`,
@@ -48,13 +50,13 @@ class PendulumCradle(Mechanism):
         check_values("gaps", self.gaps, low=0.0)
 
     @property
-    def coordinates(self) -> int:
-        """One angle for each ball."""
-        return self.masses.shape[0]
-
-    def mass_matrix(self, q: jax.Array) -> jax.Array:
-        """Its diagonal (n,): m_i l^2."""
+    def mass(self) -> jax.Array:
+        """M, its diagonal (n,): m_i l^2."""
         return self.masses * self.length**2
+
+    def gravity(self, acceleration: Any) -> "PendulumPotential":
+        """`V = g l sum m_i (1 - cos q_i)`."""
+        return PendulumPotential(self.masses * self.length * acceleration)
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Distances between neighbouring balls."""
@@ -64,6 +66,27 @@ class PendulumCradle(Mechanism):
         # |c| - d as (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
         across = (right - touching) * (right + touching) + up**2
         return across / (jnp.sqrt(right**2 + up**2) + touching)
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Strings and balls."""
+        length, radius = float(self.length), np.asarray(self.radius)
+        between = radius[:-1] + radius[1:] + np.asarray(self.gaps)
+        curves = []
+        for x, r, angle in zip(np.cumsum([0.0, *between]), radius, q):
+            pivot = np.array([x, 0.0])
+            centre = pivot + length * np.array([np.sin(angle), -np.cos(angle)])
+            curves += [np.stack([pivot, centre]), centre + r * CIRCLE]
+        return curves
+
+
+class PendulumPotential(eqx.Module):
+    """`V = sum w_i (1 - cos q_i)`."""
+
+    weight_length: jax.Array
+
+    def __call__(self, q: jax.Array) -> jax.Array:
+        """V () [J]."""
+        return self.weight_length @ (1 - jnp.cos(q))
 
 
 def pendulum_cradle(
@@ -90,4 +113,4 @@ def pendulum_cradle(
     """
     cradle = PendulumCradle(masses, length, radius, gaps)
     q = as_float_array("angles", angles)
-    return cradle.scene(jnp.full(cradle.coordinates, q) if q.ndim == 0 else q)
+    return cradle.scene(jnp.full(cradle.masses.shape[0], q) if q.ndim == 0 else q)

@@ -12,6 +12,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from jimpact.audits import nothing_approaches
 from jimpact.commands.output import console_for, picture_path, save_picture
 from jimpact.comparison import (
     Comparison,
@@ -36,7 +37,8 @@ def run(
         path = picture_path(out, PICTURE)
         given = read_study(study)
         before, measured = velocities(given, velocity, shot)
-        found = compare(given.scene, before, registered_laws(given.parameters))
+        laws, left_out = registered_laws(given.parameters)
+        found = replace(compare(given.scene, before, laws), left_out=left_out)
         fits = _fits(given) if fit else {}
         _draw(found, measured, given.title, path)
     except (ValueError, TypeError, OSError) as error:
@@ -45,6 +47,7 @@ def run(
     if json:
         told: dict[str, Any] = {"title": given.title, "velocity": before.tolist()}
         told |= {"laws": found.to_dict(), "fits": {n: f.to_dict() for n, f in fits.items()}}
+        told |= {"left_out": found.left_out}
         print(dumps(told | {"picture": str(path)}, indent=2))
     else:
         _print(given, found, measured, fits, path)
@@ -71,7 +74,7 @@ def _fits(study: Study) -> dict[str, Fit]:
     each = {**start, "restitution": np.full(study.scene.contacts, 0.9)}
     fits = {}
     for label, values in (("one e", start), ("e per contact", each)):
-        for name, law in registered_laws(values).items():
+        for name, law in registered_laws(values)[0].items():
             if hasattr(law, "restitution") and (label == "one e" or study.scene.contacts > 1):
                 own = replace(study, law=law, free={"restitution": True}, bounds={})
                 fits[f"{name}, {label}"] = own.run()
@@ -96,6 +99,11 @@ def _print(
     before = ", ".join(f"{v:g}" for v in found.velocity)
     console.print(f"[bold]{escape(study.title)}[/bold]: v- = ({before}) m/s", soft_wrap=True)
     console.print(*tables)
+    quiet = nothing_approaches(found.scene, found.velocity)
+    if quiet is not None:
+        console.print(f"[bold]No impact:[/bold] {escape(quiet)}.", soft_wrap=True)
+    for name, reason in found.left_out.items():
+        console.print(f"{escape(name)} is left out: it {escape(reason)}.", soft_wrap=True)
     told = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     console.print(f"Parameters: {escape(told)}.", soft_wrap=True)
     console.print(

@@ -190,6 +190,8 @@ class ContactFlow:
     root: int = 2
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
 
+    near = 0.0  # landings start from anywhere in a step
+
     @property
     def exponent(self) -> Exponent:
         static = self.exponent_static

@@ -14,7 +14,8 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
     over(modes, y, passes)     -> (1, B): nothing is left to integrate
     finish(modes, y)           -> (modes, y) where it is over
-    tolerance (1, B), snap (1, B), root, contacts
+    tolerance (1, B) or (n, B), snap (1, B), root, contacts
+    near                       share of a step from which landings start, 0: from anywhere
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
 
@@ -54,6 +55,7 @@ TIE = 1e-13  # of a step: events of one moment are taken in the order of their r
 # Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
 # with the number of passes, or the errors of N steps would add up to N tolerances.
 FULL = 30
+POLISH = 2  # Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3
 FINEST = 16  # roundings: an error estimate below them is noise
 COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
 
@@ -72,6 +74,7 @@ class Flow(Protocol):
 
     tolerance: jax.Array
     root: int
+    near: float
 
     @property
     def contacts(self) -> int: ...
@@ -219,11 +222,15 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
     bottom = jnp.where(crossed, c0 - c1, jnp.where(turns, d1 - d0, -d1))
     u = top / jnp.where(bottom > 0, bottom, jnp.inf)
+    if flow.near:
+        # steps in time go before: exact in a parabola, where dt/dxi has a singularity at the top
+        u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
+        u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
     v = 1 - u
     low = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
     dipped = turns & (low < DOUBT * (d1 - d0) - snap)
     at_once = (c0 <= snap) & (d0 <= 0)
-    direct = at_once | ((d0 < 0) & (c0 > snap))
+    direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > snap))
     ahead = free & ~turns & (d1 < 0) & (c1 > snap) & ~lands
     at = jnp.where(
         crossed,
@@ -242,7 +249,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     # the next step
     in_root = in_root & ~lands
     xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
-    cut = jnp.where(ok & (first < 0), CUT * (first + 2), 0.5)
+    cut = jnp.where(ok & (first < 0), (1 - flow.near if flow.near else CUT) * (first + 2), 0.5)
     shorter = jnp.where(in_root, root_of(cut, r) * h, cut * jnp.where(lands, span, h))
     kept = jnp.where(first < 0, shorter, h)
     h = jnp.where(ok & event, kept, jnp.where(lands, jnp.where(ok, h, shorter), factor * h))
@@ -254,6 +261,8 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     coasts = flow.coasts(s.modes)
     reached = (first - 1) * span < new_span
     reached = reached if coasts is None else reached | (coasts & (first < jnp.inf))
+    if flow.near:
+        reached = reached & (first - 1 < 5 * flow.near)
     aim = ok & jnp.where(event, first >= 0, ~lands & reached)
     target = aim & (at == first)
     h = jnp.where(aim & in_root, new_span, h)
@@ -271,6 +280,21 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
         ]
     )
     return Carry(y, Step(modes, target, clock), plan), accept
+
+
+def _root_of_cubic(
+    u: jax.Array, c0: jax.Array, d0: jax.Array, c1: jax.Array, d1: jax.Array
+) -> jax.Array:
+    """The root in [0, 1] near u of the cubic with values c and slopes d at 0 and 1."""
+    rise = c1 - c0
+    a, b = d0 - rise, rise - d1
+    for _ in range(POLISH):
+        v = 1 - u
+        bend = v * a + u * b
+        value = v * c0 + u * c1 + u * v * bend
+        slope = rise + (v - u) * bend + u * v * (b - a)
+        u = jnp.clip(u - value / jnp.where(slope < 0, slope, -jnp.inf), 0.0, 1.0)
+    return u
 
 
 def run(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> Carry:

@@ -150,7 +150,7 @@ def fit(
     for name, count in (("starts", starts), ("max_steps", steps)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"Argument `{name}` must be an integer >= 1, but has value {count!r}.")
-    contacts = experiments.scene_of(scene, 0).contacts
+    contacts = experiments.largest_scene(scene).contacts
     parameters, notes = free_parameters(law, contacts, free)
     limits = bounds_of(parameters, law, bounds)
     problem = build_problem(law, scene, experiments, parameters, limits)

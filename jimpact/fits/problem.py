@@ -13,7 +13,7 @@ from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import Parameters, entries, with_entries
 from jimpact.impacts import impact
 from jimpact.law import Law
-from jimpact.scene import Scene, dense_mass
+from jimpact.scene import Scene, dense_mass, stackable
 from jimpact.status import CODE
 
 # Outcomes whose velocities mean nothing. A trial that meets one gets a residual far above any
@@ -39,7 +39,7 @@ class Problem(eqx.Module):
     high: jax.Array
     region: Region  # where y may lie: the box, or a part of it
     scenes: Scene  # one, or stacked one a shot
-    pre: jax.Array
+    pre: jax.Array  # (K, n), further columns where scenes were made alike
     post: jax.Array  # 0 where not measured
     weight: jax.Array  # 0 where not measured; makes |r|^2 a mean square relative to `unit`
     size: jax.Array  # () size r is (v+ - measured) / sigma, with sigma = 1 m/s where unknown
@@ -60,6 +60,7 @@ def build_problem(
     per_shot = experiments.scenes is not None
     leaves = jax.tree.leaves((law, own, experiments.pre))
     dtype = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
+    own, extra = stackable(own)
     law, *own = jax.tree.map(
         lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (law, *own)
     )
@@ -68,7 +69,9 @@ def build_problem(
     sigma = np.ones_like(post) if experiments.sigma is None else np.asarray(experiments.sigma)
     weight = np.where(experiments.measured, 1 / sigma, 0.0)
     size = unit * np.linalg.norm(weight)
-    energy = max(0.5 * v @ dense_mass(s) @ v for s, v in zip(own, pre)) or 1.0
+    n = pre.shape[1]
+    energy = max(0.5 * v @ dense_mass(s)[:n, :n] @ v for s, v in zip(own, pre)) or 1.0
+    pre = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
     values = entries(law, parameters.fields)
     scale, log = _scales(parameters, values, energy)
     offset, mix = to_scaled(values, scale, log), np.zeros((len(values), len(values)))
@@ -123,11 +126,12 @@ def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any
         law = with_entries(problem.law, problem.fields, values)
         axes = (None, 0 if problem.scene_per_shot else None, 0)
         out = jax.vmap(impact, in_axes=axes)(law, problem.scenes, problem.pre)
+        velocity = out.velocity[:, : problem.post.shape[1]]
         codes = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
         bad = jnp.any(out.status[:, None] == codes[None, :], axis=1)
-        error = jnp.where(bad[:, None], PENALTY * problem.unit, out.velocity - problem.post)
+        error = jnp.where(bad[:, None], PENALTY * problem.unit, velocity - problem.post)
         residual = (error * problem.weight).reshape(-1)
-        return residual, (residual, out.velocity, out.status)
+        return residual, (residual, velocity, out.status)
 
     jacobian, (residual, velocity, status) = jax.jacfwd(outcome, has_aux=True)(y)
     return residual, jacobian, (velocity, status)
@@ -136,11 +140,11 @@ def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any
 @eqx.filter_jit
 def begin_all(problem: Problem, starts: jax.Array, method: Method, max_steps: int) -> State:
     """States of a batch of starts y (S, Q)."""
-    shots, bodies = problem.pre.shape
+    shots, bodies = problem.post.shape
 
     def one(y: jax.Array) -> State:
         y = problem.region.retract(y)
-        velocity, status = jnp.zeros_like(problem.pre), jnp.zeros(shots, jnp.int32)
+        velocity, status = jnp.zeros_like(problem.post), jnp.zeros(shots, jnp.int32)
         residual = jnp.zeros(shots * bodies, y.dtype)
         jacobian = jnp.zeros((shots * bodies, y.shape[0]), y.dtype)
         return begin(y, (residual, jacobian, (velocity, status)), method, max_steps)

@@ -33,7 +33,7 @@ def fit_warnings(
     spread: Uncertainty,
 ) -> list[str]:
     """All warnings, those about the data first."""
-    stored = float(np.sum(jnp.broadcast_to(law.stored, experiments.scene_of(scene, 0).contacts)))
+    stored = float(np.sum(jnp.broadcast_to(law.stored, experiments.largest_scene(scene).contacts)))
     lines = data_defects(experiments, scene, stored)
     if not found.converged:
         lines.append(
@@ -46,7 +46,7 @@ def fit_warnings(
         lines.append(
             f"{names[i]} ends at its bound {found.value[i]:g}: its error holds for one side."
         )
-    lines += _matrix(law, problem, experiments.scene_of(scene, 0), found)
+    lines += _matrix(law, problem, experiments.largest_scene(scene), found)
     if spread.rank < len(names):
         lines.append(
             f"The data determine {spread.rank} of {len(names)} parameters (rank "

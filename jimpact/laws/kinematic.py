@@ -215,10 +215,11 @@ class RestitutionMatrix(Kinematic):
         tangential_restitution: Any = 0.0,
     ):
         self.matrix, self.admissible = matrix, admissible
-        if np.ndim(matrix) != 2:
+        shape = np.shape(matrix)
+        if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
             raise ValueError(
                 "Argument `matrix` must be square, (m, m) for m contacts or (m + k, m + k) with "
-                f"k tangential quasi-velocities, but has shape {np.shape(matrix)}."
+                f"k tangential quasi-velocities, but has shape {shape}."
             )
         self.friction, self.tangential_restitution = friction_fields(
             friction, tangential_restitution

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, option, parameter
 from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.linear import null_projector
 from jimpact.solvers.tridiagonal import as_matrix, is_regular
+from jimpact.status import CODE
 
 
 class Poisson(Law):
@@ -21,8 +23,9 @@ class Poisson(Law):
         restitution: kinetic coefficient e in [0, 1], scalar or one per contact (m,).
         allow_above_one: let e exceed 1, which dispersion in a chain would need.
 
-    Status: `impulse_not_unique` for redundant contacts (v+ then rests on the p_c of least norm
-    where their e differ), `energy_gain` where unequal or large e create energy.
+    Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where, besides, their e
+    differ: v+ then depends on how they share p_c (the least one is taken); `energy_gain` where
+    unequal or large e create energy.
 
     Derivatives are one-sided where a contact is about to take part in either stage.
 
@@ -48,4 +51,18 @@ class Poisson(Law):
         returned = self.restitution * compression.z
         supplement = solve_lcp(w, compression.w + w @ returned, regular=regular)
         code = jnp.maximum(compression.code, supplement.code)
+        if self.restitution.ndim == 1 and not regular:
+            shared = _depends_on_sharing(w, self.restitution, compression.z > 0)
+            code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
         return Impulses(compression.z + returned + supplement.z, None, code)
+
+
+def _depends_on_sharing(w: jax.Array, e: jax.Array, loaded: jax.Array) -> jax.Array:
+    """Whether `W diag(e) p_c` differs among the p_c of loaded contacts with the same `W p_c`."""
+    norm = jnp.sqrt(jnp.diagonal(w))
+    g = jax.lax.stop_gradient(w / (norm[:, None] * norm[None, :]))
+    both = loaded[:, None] & loaded[None, :]
+    unit = jnp.eye(len(e), dtype=w.dtype)
+    projector, _ = null_projector(jnp.where(both, g, unit))
+    returned = g @ (jax.lax.stop_gradient(e)[:, None] * projector)
+    return jnp.abs(returned).max() > jnp.sqrt(jnp.finfo(w.dtype).eps)

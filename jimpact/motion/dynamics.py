@@ -37,13 +37,14 @@ def seen_from_base(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
 
 def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     """f (m,) [m]."""
-    return jnp.atleast_1d(system.gap_function(seen_from_base(system, q, t)))
+    return jnp.atleast_1d(system.body.gap_function(seen_from_base(system, q, t)))
 
 
 def tangential(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     """Tangential displacements h (m,) [m]."""
-    assert system.tangent_function is not None
-    return jnp.atleast_1d(system.tangent_function(seen_from_base(system, q, t)))
+    found = system.body.tangent_function(seen_from_base(system, q, t))
+    assert found is not None
+    return found
 
 
 def kinematics(
@@ -65,7 +66,7 @@ def kinematics(
 
 def mass_at(system: System, q: jax.Array) -> jax.Array:
     """M (n,) or (n, n)."""
-    return jnp.asarray(system.mass(q) if callable(system.mass) else system.mass)
+    return system.body.mass_matrix(q)
 
 
 def solve_mass(mass: jax.Array, right: jax.Array) -> jax.Array:

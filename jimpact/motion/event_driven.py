@@ -1,25 +1,24 @@
 """Event by event: resolve what happens, write it down, fly on."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jimpact.law import Law
-from jimpact.motion.along import along
 from jimpact.motion.contact_forces import Modes, no_modes
-from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
-from jimpact.motion.flight import fly
-from jimpact.motion.flight_records import Flight, Scales, Settings, State
-from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, Motion
-from jimpact.motion.strikes import Outcome, resolve
+from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
+from jimpact.motion.flow import Course, Flight, Scales, Settings, first_flight, fly
+from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
+from jimpact.motion.transitions import Outcome, resolve
 
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6
+AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
 
 
-class _Course(NamedTuple):
+class _Run(NamedTuple):
     flight: Flight
     modes: Modes
     scales: Scales
@@ -37,18 +36,18 @@ def event_driven(
     v0: jax.Array,
     times: jax.Array,
     max_events: int,
-) -> Motion:
+) -> Course:
     """The motion from `times[0]` to `times[-1]`, sampled at `times` (S,)."""
     n = q0.shape[0]
     m = gaps(system, q0, times[0]).shape[0]
-    begin = _begin(settings, q0, v0, times, m)
+    begin = first_flight(settings, q0, v0, times, m)
     events = no_events(max_events, n, m, q0.dtype)
     zero = jnp.zeros((), q0.dtype)
     penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
-    start = _Course(
+    start = _Run(
         begin,
         no_modes(m, q0.dtype),
         Scales(zero, zero, zero),
@@ -57,29 +56,14 @@ def event_driven(
         status,
     )
 
-    def going(course: _Course) -> jax.Array:
-        return (course.status == MOTION_CODE["ok"]) & (course.flight.sample < times.shape[0])
+    def going(run: _Run) -> jax.Array:
+        return (run.status == MOTION_CODE["ok"]) & (run.flight.sample < times.shape[0])
 
-    def one(course: _Course) -> _Course:
-        return _next_event(system, law, mu, settings, times, max_events, course)
+    def one(run: _Run) -> _Run:
+        return _next_event(system, law, mu, settings, times, max_events, run)
 
     end = jax.lax.while_loop(going, one, start)
-    return energies(system, times, end.flight.samples, end.events, end.flight.steps, end.status)
-
-
-def _begin(settings: Settings, q0: jax.Array, v0: jax.Array, times: jax.Array, m: int) -> Flight:
-    samples = times.shape[0]
-    zero = jnp.zeros((), q0.dtype)
-    state = State(q0, v0, zero, zero, jnp.zeros((2, m), q0.dtype))
-    unknown = jax.tree.map(lambda x: jnp.full((samples, *x.shape), jnp.nan, x.dtype), state)
-    first = jax.tree.map(lambda all_, x: all_.at[0].set(x), unknown, state)
-    k = 2 * m if settings.friction else m
-    no = jnp.zeros(k, bool)
-    step = jax.lax.stop_gradient(times[1] - times[0])
-    infinite = jnp.full_like(zero, jnp.inf)
-    one, none = jnp.int32(1), jnp.int32(0)
-    false = jnp.asarray(False)
-    return Flight(times[0], state, step, infinite, no, none, no, one, first, none, false, false)
+    return Course(end.flight.samples, end.events, end.flight.steps, end.status)
 
 
 def _next_event(
@@ -89,42 +73,44 @@ def _next_event(
     settings: Settings,
     times: jax.Array,
     max_events: int,
-    course: _Course,
-) -> _Course:
+    run: _Run,
+) -> _Run:
     """Resolve the event that ended the last flight (or the beginning), then fly to the next."""
-    flight = course.flight
-    at = along(system, mu, settings, course.modes, course.scales)
-    # the last remainder before an event leaves the constraints, by its square
-    flight = flight._replace(state=at.project(flight.t, flight.state))
+    flight = run.flight
     found = resolve(
         system,
         law,
         mu,
         settings,
-        flight.t,
         flight.state,
-        course.modes,
+        run.modes,
         flight.event,
-        course.scales,
-        course.struck,
+        run.scales,
+        run.struck,
     )
-    full = (course.events.count >= max_events) & (found.kind != KIND_CODE["none"])
-    events = _written(course.events, flight, found)
+    full = (run.events.count >= max_events) & (found.kind != KIND_CODE["none"])
+    events = _written(run.events, flight, found)
     status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
     # after a failure the flight is over at once
     over = status != MOTION_CODE["ok"]
-    ready = flight._replace(
-        state=found.state, event=jnp.zeros_like(flight.event), stuck=over, landings=jnp.int32(0)
-    )
+    ready = flight._replace(state=found.state, event=jnp.zeros_like(flight.event), stuck=over)
     flown = fly(system, mu, settings, found.modes, found.scales, times, ready)
     stuck = flown.stuck & ~over
-    status = jnp.where(stuck, _why_stuck(system, flown), status).astype(jnp.int32)
-    return _Course(flown, found.modes, found.scales, found.struck, events, status)
+    status = jnp.where(
+        stuck, _why_stuck(system, flown, jax.lax.stop_gradient(times)), status
+    ).astype(jnp.int32)
+    return _Run(flown, found.modes, found.scales, found.struck, events, status)
 
 
-def _why_stuck(system: System, flight: Flight) -> jax.Array:
-    state = flight.state
-    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v)) & ~flight.undefined
+def _why_stuck(system: System, flight: Flight, times: jax.Array) -> jax.Array:
+    state = jax.lax.stop_gradient(flight.state)
+    # where steps vanish before something that is not a number, it is a few roundings ahead
+    ahead = AHEAD * (times[-1] - times[0])
+    q, t = state.q + ahead * state.v, state.t + ahead
+    force = user_force(system, q, state.v, t)
+    rates = free_acceleration(system, q, state.v, force, mass_at(system, q))
+    parts = (state.q, state.v, rates, gaps(system, q, t))
+    finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
     if not callable(system.mass):
         return code
@@ -137,34 +123,9 @@ def _why_stuck(system: System, flight: Flight) -> jax.Array:
     return jnp.where(~(least > _SINGULAR), MOTION_CODE["singular_mass"], code)
 
 
-def no_events(size: int, n: int, m: int, dtype: Any) -> Events:
-    """An empty table of events."""
-
-    def blank(*shape: int) -> jax.Array:
-        return jnp.full((size, *shape), jnp.nan, dtype)
-
-    return Events(
-        count=jnp.int32(0),
-        time=blank(),
-        kind=jnp.zeros(size, jnp.int32),
-        contacts=jnp.zeros((size, m), bool),
-        q=blank(n),
-        velocity_before=blank(n),
-        velocity_after=blank(n),
-        impulse=blank(m),
-        tangential_impulse=blank(m),
-        energy=blank(2, m),
-        status=jnp.zeros(size, jnp.int32),
-        accumulation_end=blank(),
-    )
-
-
 def _written(events: Events, flight: Flight, found: Outcome) -> Events:
-    """One row more; beyond the last row nothing is written."""
-    happened = found.kind != KIND_CODE["none"]
-    row = jnp.where(happened, events.count, events.time.shape[0])
     values = {
-        "time": flight.t,
+        "time": flight.state.t,
         "kind": found.kind,
         "contacts": found.contacts,
         "q": flight.state.q,
@@ -176,31 +137,4 @@ def _written(events: Events, flight: Flight, found: Outcome) -> Events:
         "status": found.blow.code,
         "accumulation_end": found.accumulation_end,
     }
-    new = {k: getattr(events, k).at[row].set(v, mode="drop") for k, v in values.items()}
-    fits = happened & (events.count < events.time.shape[0])
-    return Events(count=events.count + fits.astype(jnp.int32), **new)
-
-
-def energies(
-    system: System,
-    times: jax.Array,
-    samples: State,
-    events: Events,
-    steps: jax.Array,
-    status: jax.Array,
-) -> Motion:
-    """The record of sampled states, with their energies and gaps."""
-    return Motion(
-        time=times,
-        q=samples.q,
-        velocity=samples.v,
-        kinetic_energy=jax.vmap(lambda q, v: kinetic(system, q, v))(samples.q, samples.v),
-        potential_energy=jax.vmap(lambda q: potential(system, q))(samples.q),
-        force_work=samples.work,
-        base_work=samples.base_work,
-        contact_work=samples.contact_work,
-        gaps=jax.vmap(lambda q, t: gaps(system, q, t))(samples.q, times),
-        events=events,
-        steps=steps,
-        status=status,
-    )
+    return with_row(events, found.kind != KIND_CODE["none"], values)

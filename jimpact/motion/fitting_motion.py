@@ -16,7 +16,7 @@ from jimpact.fits.parameters import with_entries as law_with
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.law import Law
 from jimpact.motion.record import MOTION_STATUS, Motion
-from jimpact.motion.simulation import simulate
+from jimpact.motion.simulate import simulate
 from jimpact.motion.system import System
 
 Observe = Callable[[Motion], jax.Array]
@@ -133,7 +133,7 @@ def fit_motion(
         raise ValueError("Argument `measured` must have at least one value that is not NaN.")
     errors = np.broadcast_to(1.0 if sigma is None else np.asarray(sigma, float), record.shape)
     check_values("sigma", errors, low=0.0, open_low=True)
-    contacts = jax.eval_shape(system.gap_function, as_float_array("q0", q0)).shape
+    contacts = jax.eval_shape(system.body.gap_function, as_float_array("q0", q0)).shape
     parameters, _ = free_parameters(law, contacts[0] if contacts else 1, free)
     limits = bounds_of(parameters, law, bounds)
     arguments = {"q0": q0, "v0": v0, "t_end": t_end} | options

@@ -1,5 +1,6 @@
 """The record of a motion: samples, events, energy ledger, status."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -46,6 +47,40 @@ class Events(eqx.Module):
     energy: jax.Array  # (E, 2, m)
     status: jax.Array  # (E,) of the law, see `jimpact.STATUS`
     accumulation_end: jax.Array  # (E,)
+
+
+def no_events(size: int, n: int, m: int, dtype: Any) -> Events:
+    """An empty table of events."""
+
+    def blank(*shape: int) -> jax.Array:
+        return jnp.full((size, *shape), jnp.nan, dtype)
+
+    return Events(
+        count=jnp.int32(0),
+        time=blank(),
+        kind=jnp.zeros(size, jnp.int32),
+        contacts=jnp.zeros((size, m), bool),
+        q=blank(n),
+        velocity_before=blank(n),
+        velocity_after=blank(n),
+        impulse=blank(m),
+        tangential_impulse=blank(m),
+        energy=blank(2, m),
+        status=jnp.zeros(size, jnp.int32),
+        accumulation_end=blank(),
+    )
+
+
+def with_row(events: Events, happened: jax.Array, values: dict[str, jax.Array]) -> Events:
+    """One row more if it `happened` and there is room; beyond the last row nothing is written."""
+    size = events.time.shape[0]
+    row = jnp.where(happened, events.count, size)
+    new = {
+        name: getattr(events, name).at[row].set(value, mode="drop")
+        for name, value in values.items()
+    }
+    fits = (happened & (events.count < size)).astype(jnp.int32)
+    return dataclasses.replace(events, count=events.count + fits, **new)
 
 
 class Motion(eqx.Module):

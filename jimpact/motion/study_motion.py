@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from jimpact.law import Law
-from jimpact.motion.bases import HarmonicBase
-from jimpact.motion.ready_systems import (
+from jimpact.motion.record import Motion
+from jimpact.motion.simulate import simulate
+from jimpact.motion.system import (
+    HarmonicBase,
+    System,
     ball_system,
     block_system,
     column_system,
     cradle_system,
     dimer_system,
 )
-from jimpact.motion.record import Motion
-from jimpact.motion.simulation import simulate
-from jimpact.motion.system import System
 from jimpact.study import check_keys, law_table, locate
 
 # kind -> builder, {key of the study: its argument}
@@ -107,7 +107,7 @@ def _study(tables: Mapping[str, Any], path: Path) -> MotionStudy:
     for name in ("system", "base", "law", "motion"):
         if not isinstance(tables.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
-    row, values, _ = law_table(tables["law"], None)
+    row, values, _ = law_table(tables["law"], None, path.parent)
     if isinstance(values.get("exponent"), list):
         values["exponent"] = tuple(values["exponent"])
     motion = tables["motion"]

@@ -1,4 +1,4 @@
-"""A mechanical system in motion: gaps, mass, forces, base."""
+"""Systems of mechanical motion: bodies under loads; the ready ones."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,19 +8,24 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.scene import check_mass
+from jimpact.bodies.base import STANDARD_GRAVITY, Body, GivenBody, LinearPotential, Potential
+from jimpact.bodies.blocks import Block
+from jimpact.bodies.dimers import Dimer
+from jimpact.bodies.particles import Column
+from jimpact.bodies.pendulums import PendulumCradle
 
-STANDARD_GRAVITY = 9.80665  # m/s^2
+Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
 
 
 class System(eqx.Module):
-    """Everything that moves a system but its impacts; a pytree, as far as its functions are.
+    """A body and everything that moves it but its impacts; a pytree, as far as its functions are.
 
     Equation: `M(q) q'' = F(q, q', t) - grad V(q) - (Coriolis terms) + N lambda_n + H lambda_t`
     with `N = grad f(q_r)`, `H = grad h(q_r)`, `q_r = q - B y_b(t)` the position seen from the base.
 
     Args:
-        gap_function: q_r (n,) -> gaps f (m,) [m], written with jax.numpy.
+        gap_function: a `Body`, which has its own mass and tangents; or q_r (n,) -> gaps f (m,)
+            [m], written with jax.numpy.
         mass: M: (n,), (n, n), or a function q -> M(q); its Coriolis terms follow by
             differentiation of `T = v^T M(q) v / 2`.
         force: (q, v, t) -> generalized forces (n,); None: none.
@@ -28,7 +33,8 @@ class System(eqx.Module):
         tangent_function: q_r -> tangential displacements h (m,) [m] of the contacts (planar);
             their gradients are the tangents. None: no friction possible.
         base: t -> displacement y_b (d,) [m] of a moving base, written with jax.numpy.
-        base_directions: B (n, d): how q changes when everything moves with the base.
+        base_directions: B (n, d): how q changes when everything moves with the base; None: those
+            of the body.
 
     Functions that are `equinox.Module`s may hold arrays: `simulate` is differentiable in them. A
     new lambda is a new function to JAX, and compiled anew.
@@ -40,43 +46,42 @@ class System(eqx.Module):
     >>> ball = ji.System(lambda q: q[1:] - 0.5, [2.0, 2.0], potential=ji.gravity([0.0, 2.0]))
     >>> float(ball.potential(jnp.array([0.0, 1.0])))
     19.6133
+    >>> block = ji.Block(width=0.2, height=0.6)
+    >>> ji.System(block, potential=ji.gravity(block)).mass.shape
+    (3,)
     """
 
-    gap_function: Callable[[jax.Array], jax.Array]
-    mass: Any
+    body: Body
     force: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None
-    potential: Callable[[jax.Array], jax.Array] | None
-    tangent_function: Callable[[jax.Array], jax.Array] | None
-    base: Callable[[jax.Array], jax.Array] | None
+    potential: Potential | None
+    base: Base | None
     base_directions: jax.Array | None
 
     def __init__(
         self,
-        gap_function: Callable[[jax.Array], jax.Array],
-        mass: Any,
+        gap_function: Body | Callable[[jax.Array], jax.Array],
+        mass: Any = None,
         force: Callable[[jax.Array, jax.Array, jax.Array], jax.Array] | None = None,
-        potential: Callable[[jax.Array], jax.Array] | None = None,
-        tangent_function: Callable[[jax.Array], jax.Array] | None = None,
-        base: Callable[[jax.Array], jax.Array] | None = None,
+        potential: Potential | None = None,
+        tangent_function: Callable[[jax.Array], jax.Array | None] | None = None,
+        base: Base | None = None,
         base_directions: Any = None,
     ):
-        given = {
-            "gap_function": gap_function,
-            "force": force,
-            "potential": potential,
-            "tangent_function": tangent_function,
-            "base": base,
-        }
-        for name, function in given.items():
-            if not (callable(function) or (function is None and name != "gap_function")):
+        for name, function in {"force": force, "potential": potential, "base": base}.items():
+            if not (callable(function) or function is None):
                 raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
-        self.gap_function, self.force, self.potential = gap_function, force, potential
-        self.tangent_function, self.base = tangent_function, base
-        if callable(mass):
-            self.mass = mass
+        if not isinstance(gap_function, Body):
+            self.body = GivenBody(gap_function, mass, tangent_function)
+        elif mass is None and tangent_function is None:
+            self.body = gap_function
         else:
-            self.mass = as_float_array("mass", mass)
-            check_mass(self.mass)
+            raise ValueError(
+                "Arguments `mass` and `tangent_function` must not be given with a body, which has "
+                "its own."
+            )
+        self.force, self.potential, self.base = force, potential, base
+        if base is not None and base_directions is None:
+            base_directions = self.body.base_directions
         if (base is None) != (base_directions is None):
             raise ValueError(
                 "Argument `base_directions` must be given with `base`, and only with it."
@@ -91,32 +96,200 @@ class System(eqx.Module):
                     f"{self.base_directions.shape}."
                 )
 
+    @property
+    def gap_function(self) -> Callable[[jax.Array], jax.Array]:
+        """q_r -> gaps f (m,) [m] of the body."""
+        return self.body.gap_function
 
-class LinearPotential(eqx.Module):
-    """`V = w^T q`: constant forces -w."""
+    @property
+    def tangent_function(self) -> Callable[[jax.Array], jax.Array | None]:
+        """q_r -> displacements h (m,) [m] along the contact planes, or None."""
+        return self.body.tangent_function
 
-    weights: jax.Array
+    @property
+    def mass(self) -> Any:
+        """M of the body, or q -> M(q)."""
+        return self.body.mass
 
-    def __call__(self, q: jax.Array) -> jax.Array:
-        """V () [J]."""
-        return self.weights @ q
 
-
-def gravity(mass_along_up: Any, acceleration: Any = STANDARD_GRAVITY) -> LinearPotential:
-    """Potential of gravity for coordinates in which heights are linear.
+def gravity(mass_along_up: Any, acceleration: Any = STANDARD_GRAVITY) -> Potential:
+    """Potential of gravity of a body, or for coordinates in which heights are linear.
 
     Equation: `V = g sum_i m_i q_i`.
 
     Args:
-        mass_along_up: (n,): the mass that each coordinate lifts [kg], 0 for horizontal ones and
-            angles, negative where the coordinate points down.
+        mass_along_up: a `Body`; or (n,): the mass that each coordinate lifts [kg], 0 for
+            horizontal ones and angles, negative where the coordinate points down.
         acceleration: g [m/s^2].
 
     >>> import jimpact as ji
     >>> ji.gravity([0.0, 2.0], acceleration=10.0).weights.tolist()
     [0.0, 20.0]
+    >>> ji.gravity(ji.Block(width=0.2, height=0.6, mass=2.0), acceleration=10.0).weights.tolist()
+    [0.0, 20.0, 0.0]
     """
+    check_values("acceleration", acceleration)
+    if isinstance(mass_along_up, Body):
+        return mass_along_up.gravity(as_float_array("acceleration", acceleration))
     weights = as_float_array("mass_along_up", mass_along_up)
     check_values("mass_along_up", weights)
-    check_values("acceleration", acceleration)
     return LinearPotential(weights * jnp.asarray(acceleration, weights.dtype))
+
+
+DIRECTIONS = ("line", "vertical", "horizontal")
+
+
+class HarmonicBase(eqx.Module):
+    """A base that vibrates: `y_b = A sin(2 pi f t + phase)`.
+
+    Args:
+        amplitude: A [m].
+        frequency: f [Hz].
+        phase: [rad].
+        direction: 'line' for systems that move along one (`ball_system`, `column_system`);
+            'vertical' or 'horizontal' for bodies in the plane.
+
+    >>> import jimpact as ji
+    >>> ji.HarmonicBase(0.1, 1.0, direction="horizontal")(0.25).tolist()
+    [0.1, 0.0]
+    """
+
+    amplitude: jax.Array
+    frequency: jax.Array
+    phase: jax.Array
+    direction: str = eqx.field(static=True)
+
+    def __init__(self, amplitude: Any, frequency: Any, phase: Any = 0.0, direction: str = "line"):
+        self.amplitude = as_float_array("amplitude", amplitude)
+        self.frequency = as_float_array("frequency", frequency)
+        self.phase = as_float_array("phase", phase)
+        for name in ("amplitude", "frequency", "phase"):
+            check_values(name, getattr(self, name))
+        if direction not in DIRECTIONS:
+            raise ValueError(
+                f"Argument `direction` must be one of {DIRECTIONS}, but has value {direction!r}."
+            )
+        self.direction = direction
+
+    def __call__(self, t: jax.Array) -> jax.Array:
+        """Displacement (1,) or (2,) [m]."""
+        y = self.amplitude * jnp.sin(2 * jnp.pi * self.frequency * t + self.phase)
+        if self.direction == "line":
+            return y[None]
+        pair = (0 * y, y) if self.direction == "vertical" else (y, 0 * y)
+        return jnp.stack(pair)
+
+
+def _under_gravity(body: Body, acceleration: Any, base: Base | None = None) -> System:
+    return System(body, potential=gravity(body, acceleration), base=base)
+
+
+def column_system(
+    masses: Any,
+    radii: Any = 0.0,
+    acceleration: Any = STANDARD_GRAVITY,
+    base: Base | None = None,
+) -> System:
+    """Balls above one another on a floor, or a plate that moves vertically: `Column` in gravity.
+
+    Args:
+        masses: (n,) [kg].
+        radii: scalar or (n,) [m].
+        acceleration: of gravity [m/s^2].
+        base: t -> height of the plate () [m].
+
+    >>> import jimpact as ji
+    >>> ji.column_system([1.0, 2.0], 0.1).mass.tolist()
+    [1.0, 2.0]
+    """
+    return _under_gravity(Column(masses, radii), acceleration, base)
+
+
+def ball_system(
+    mass: Any = 1.0,
+    acceleration: Any = STANDARD_GRAVITY,
+    base: Base | None = None,
+) -> System:
+    """A ball (a point at height q) above a floor or a vibrating plate: a `Column` of one.
+
+    >>> import jimpact as ji
+    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
+    >>> round(float(motion.events.time[0]), 6)
+    0.451601
+    """
+    mass = jnp.atleast_1d(as_float_array("mass", mass))
+    check_values("mass", mass, low=0.0, open_low=True)
+    return column_system(mass, 0.0, acceleration, base)
+
+
+def cradle_system(
+    masses: Any,
+    length: Any = 0.1,
+    diameter: Any = 0.02,
+    gap: Any = 0.0,
+    acceleration: Any = STANDARD_GRAVITY,
+) -> System:
+    """Newton's cradle, a row of pendulums: `PendulumCradle` in gravity, q the angles.
+
+    Args:
+        masses: (n,) [kg], points for the kinetic energy.
+        length: l [m], from pivot to centre.
+        diameter: d [m].
+        gap: distance between hanging balls [m].
+        acceleration: of gravity [m/s^2].
+
+    >>> import jimpact as ji, jax.numpy as jnp
+    >>> float(ji.cradle_system([1.0, 1.0]).gap_function(jnp.zeros(2))[0])
+    0.0
+    """
+    diameter = as_float_array("diameter", diameter)
+    check_values("diameter", diameter, low=0.0, open_low=True)
+    return _under_gravity(PendulumCradle(masses, length, diameter / 2, gap), acceleration)
+
+
+def block_system(
+    width: Any,
+    height: Any,
+    mass: Any = 1.0,
+    acceleration: Any = STANDARD_GRAVITY,
+    base: Base | None = None,
+) -> System:
+    """A homogeneous planar block on a plane: `Block` in gravity; q = (x, y, theta).
+
+    Args:
+        width: w [m].
+        height: h [m].
+        mass: [kg].
+        acceleration: of gravity [m/s^2].
+        base: t -> (x_b, y_b) [m], how the plane moves.
+
+    >>> import jimpact as ji, jax.numpy as jnp
+    >>> ji.block_system(1.0, 2.0).gap_function(jnp.array([0.0, 1.0, 0.0])).tolist()
+    [0.0, 0.0]
+    """
+    return _under_gravity(Block(width, height, mass), acceleration, base)
+
+
+def dimer_system(
+    radius: Any,
+    length: Any,
+    sphere_mass: Any = 1.0,
+    rod_mass: Any = 1.0,
+    acceleration: Any = STANDARD_GRAVITY,
+    base: Base | None = None,
+) -> System:
+    """A planar dimer above a plate: `Dimer` in gravity; q = (x, y, theta).
+
+    Args:
+        radius: R of the spheres [m].
+        length: L of the rod between their surfaces [m].
+        sphere_mass: of one sphere [kg].
+        rod_mass: of the rod [kg], 0 for a massless one.
+        acceleration: of gravity [m/s^2].
+        base: t -> (x_b, y_b) [m], how the plate moves.
+
+    >>> import jimpact as ji, jax.numpy as jnp
+    >>> ji.dimer_system(0.1, 1.0).gap_function(jnp.array([0.0, 0.1, 0.0])).tolist()
+    [0.0, 0.0]
+    """
+    return _under_gravity(Dimer(radius, length, sphere_mass, rod_mass), acceleration, base)

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.bodies.base import scene_from_gaps
 from jimpact.contact import delassus_matrix
 from jimpact.laws.forces import Bistiffness, Force
-from jimpact.scene import gap_velocity, scene_from_gaps
+from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
 RTOL = 1e-9
@@ -59,8 +60,9 @@ def turning_impact(
         No other forces act (no gravity). Reverse mode only (diffrax's default adjoint).
 
     >>> import jimpact as ji
-    >>> gaps, mass = ji.block_gaps(1.0, 1.0), [1.0, 1.0, 1 / 6]
-    >>> out = ji.turning_impact(gaps, mass, [0.0, 0.5, 0.0], [0.0, -0.5, -1.0], ji.Hertz(1e8))
+    >>> block = ji.Block(1.0, 1.0)
+    >>> q, v = [0.0, 0.5, 0.0], [0.0, -0.5, -1.0]
+    >>> out = ji.turning_impact(block.gap_function, block.mass, q, v, ji.Hertz(1e8))
     >>> bool(out.ended), [round(float(v), 2) for v in out.velocity[1:]]
     (True, [0.61, 0.49])
     """
@@ -80,30 +82,6 @@ def turning_impact(
     depth = force.indentation_scale(0.5 * reduced * speed**2 * jnp.ones(scene.contacts, v.dtype))
     unit = jax.lax.stop_gradient(jnp.max(depth) / speed)
     return _integrate(gap_function, mass, position, v, force, unit, moving, rtol, max_steps)
-
-
-def block_gaps(width: float, height: float) -> Callable[[jax.Array], jax.Array]:
-    """Gaps of the right and left lower corners of a planar block over the ground.
-
-    Equation: `f_{1,2} = y - (l/2) cos(theta) +/- (L/2) sin(theta)`, q = (x, y, theta), width L,
-    height l, theta counter-clockwise.
-
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.74).
-
-    >>> import jax.numpy as jnp
-    >>> import jimpact as ji
-    >>> ji.block_gaps(width=2.0, height=1.0)(jnp.array([0.0, 0.75, 0.0])).tolist()
-    [0.25, 0.25]
-    """
-    check_values("width", width, low=0.0, open_low=True)
-    check_values("height", height, low=0.0, open_low=True)
-
-    def gaps(q: jax.Array) -> jax.Array:
-        middle = q[1] - 0.5 * height * jnp.cos(q[2])
-        lift = 0.5 * width * jnp.sin(q[2])
-        return jnp.stack([middle + lift, middle - lift])
-
-    return gaps
 
 
 def _matrix(mass: Any, q: jax.Array) -> jax.Array:

@@ -1,5 +1,6 @@
 """A motion as an animated GIF."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,16 @@ from matplotlib.figure import Figure
 
 from jimpact.bodies.pendulums import PendulumCradle
 from jimpact.motion.dynamics import seen_from_base
-from jimpact.motion.outlines import Outlines, mechanism, outlines_of
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.plot.fits import COLOURS
 from jimpact.plot.motions import one_motion
 
+# q (n,) -> curves (k, 2) of points (x, y) in metres
+Outlines = Callable[[np.ndarray], Sequence[np.ndarray]]
+
 _GREY = "#777777"
+_POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 
 
 def animate_motion(
@@ -35,12 +39,12 @@ def animate_motion(
         system: that moved.
         motion: one motion.
         path: the file, ending in .gif.
-        outlines: q (n,) -> curves (k, 2) [m]; None: those of the ready systems.
+        outlines: q (n,) -> curves (k, 2) [m]; None: those of the body.
         frames_per_second: of the GIF.
         title: of the picture; the time stands below it.
 
     Raises:
-        ValueError: another ending, a batch; TypeError: no outlines for this system.
+        ValueError: another ending, a batch; TypeError: a body without outlines.
 
     >>> import jimpact as ji
     >>> ball = ji.ball_system()
@@ -55,8 +59,8 @@ def animate_motion(
     q = np.asarray(motion.q)
     reached = np.isfinite(q).all(axis=1)
     q, time = q[reached], np.asarray(motion.time)[reached]
-    outlines = outlines_of(system, q) if outlines is None else outlines
-    curves = [outlines(x) for x in q]
+    point = _POINT * (np.nanmax(q) - np.nanmin(q) or 1.0)
+    curves = [system.body.outlines(x, point) if outlines is None else outlines(x) for x in q]
     ground = _grounds(system, q, time)
     figure = Figure(figsize=(4.8, 4.8), layout="constrained", dpi=80)
     axes = figure.subplots()
@@ -84,7 +88,7 @@ def animate_motion(
 
 def _grounds(system: System, q: np.ndarray, time: np.ndarray) -> np.ndarray | None:
     """Where the base is (S, 2); None for a system that hangs."""
-    if isinstance(mechanism(system), PendulumCradle):
+    if isinstance(system.body, PendulumCradle):
         return None
     moved = q - np.asarray(
         jax.vmap(lambda x, t: seen_from_base(system, x, t))(jnp.asarray(q), jnp.asarray(time))

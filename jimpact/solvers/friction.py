@@ -298,8 +298,8 @@ def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     dtype = problem.matrix.dtype
     kinds = _table(m, rows)
     angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    turn = jnp.asarray(np.where(kinds > 1, turn, 0.0)[:rows, :rows], dtype)
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
         begin = problem.given[:, 1:, None] + 0.0

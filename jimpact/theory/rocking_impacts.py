@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.bodies.bodies import rocking_block
+from jimpact.bodies.blocks import rocking_block
 from jimpact.impacts import impact
 from jimpact.laws.lzb import LZB
 from jimpact.status import STATUS

@@ -81,7 +81,7 @@ def work_precision(
     ladders = ladders_of(chosen, settings or {})
     exact, second = reference_method(reference, case), METHODS["dop853"]
     if laws is None:
-        known = registered_laws({"restitution": law.restitution})
+        known = registered_laws({"restitution": law.restitution})[0]
         laws = {name: known[name] for name in ALGEBRAIC}
     rows: list[Row] = [(name, value) for name, ladder in ladders.items() for value in ladder]
     rows += [(name, None) for name in laws]

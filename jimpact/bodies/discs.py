@@ -1,4 +1,4 @@
-"""Planar systems of particles and disks: a particle in a corner, a disk with balls around it."""
+"""Discs: a disc with balls around its rim, in a plane."""
 
 from typing import Any
 
@@ -6,61 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import Mechanism, number, positive, positives
+from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.bodies.base import CIRCLE, Body, positive, positives, turned
 from jimpact.scene import Scene
 
 
-class Corner(Mechanism):
-    """A particle between two walls that meet at the origin; q = (x, y).
-
-    Equation: `f_1 = y`, `f_2 = x sin(angle) - y cos(angle)`: wall 1 along +x, wall 2 along
-    (cos(angle), sin(angle)); tangents point away from the corner.
-
-    Args:
-        angle: between the walls, in (0, pi) [rad].
-        mass: > 0 [kg].
-
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.66): the kinetic angle is the angle.
-
-    >>> import jimpact as ji
-    >>> ji.Corner(angle=1.0).gap_function(ji.Corner(angle=1.0).touching()).tolist()
-    [0.0, 0.0]
-    """
-
-    angle: jax.Array
-    mass: jax.Array
-
-    def __init__(self, angle: Any, mass: Any = 1.0):
-        self.angle, self.mass = number("angle", angle), positive("mass", mass)
-        if not is_traced(self.angle) and not 0 < float(self.angle) < np.pi:
-            raise ValueError(
-                f"Argument `angle` must lie in (0, pi), but has value {float(self.angle):g}."
-            )
-
-    @property
-    def coordinates(self) -> int:
-        """x, y."""
-        return 2
-
-    def mass_matrix(self, q: jax.Array) -> jax.Array:
-        """diag(m, m)."""
-        return jnp.stack([self.mass, self.mass])
-
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Distances from the walls."""
-        return jnp.stack([q[1], q[0] * jnp.sin(self.angle) - q[1] * jnp.cos(self.angle)])
-
-    def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Ways along the walls, away from the corner."""
-        return jnp.stack([q[0], q[0] * jnp.cos(self.angle) + q[1] * jnp.sin(self.angle)])
-
-    def touching(self) -> jax.Array:
-        """q (2,) in the corner."""
-        return jnp.zeros(2, self.angle.dtype)
-
-
-class DiskBalls(Mechanism):
+class DiskBalls(Body):
     """A disk with balls around its rim, in a plane; q = (x, y, turn) of the disk, then each ball.
 
     Equation: `f_i = |c_i - c_0| - R - r_i`; at rest `W_ij = cos(phi_i - phi_j) / m_0 + delta_ij /
@@ -74,8 +25,8 @@ class DiskBalls(Mechanism):
         ball_masses: m_i > 0 (m,) [kg].
 
     >>> import jimpact as ji
-    >>> ji.DiskBalls(0.05, 0.01, 1.0, [0.1, 0.1]).coordinates
-    9
+    >>> ji.DiskBalls(0.05, 0.01, 1.0, [0.1, 0.1]).mass.shape
+    (9,)
     """
 
     disk_radius: jax.Array
@@ -90,12 +41,8 @@ class DiskBalls(Mechanism):
         self.ball_radius = positives("ball_radius", ball_radius, self.ball_masses.shape[0])
 
     @property
-    def coordinates(self) -> int:
-        """Three for the disk and three for each ball."""
-        return 3 * (1 + self.ball_masses.shape[0])
-
-    def mass_matrix(self, q: jax.Array) -> jax.Array:
-        """Its diagonal (n,)."""
+    def mass(self) -> jax.Array:
+        """M, its diagonal (n,)."""
         disk = jnp.stack([self.disk_mass, self.disk_mass, self.disk_mass * self.disk_radius**2 / 2])
         turning = 0.4 * self.ball_masses * self.ball_radius**2
         balls = jnp.stack([self.ball_masses, self.ball_masses, turning], axis=1)
@@ -127,29 +74,15 @@ class DiskBalls(Mechanism):
         balls = jnp.stack([far * jnp.cos(phi), far * jnp.sin(phi), jnp.zeros_like(phi)], axis=1)
         return jnp.concatenate([jnp.zeros(3, balls.dtype), balls.reshape(-1)])
 
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Circles, each with the radius that shows how far it has turned."""
+        radii = [self.disk_radius, *self.ball_radius]
+        spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
+        return [turned(float(r) * spoke, at) for r, at in zip(radii, q.reshape(-1, 3))]
+
     def _apart(self, q: jax.Array) -> jax.Array:
         """Centres of the balls from that of the disk (m, 2)."""
         return q.reshape(-1, 3)[1:, :2] - q[None, :2]
-
-
-def corner(angle: Any, mass: Any = 1.0) -> Scene:
-    """Scene of a particle in a corner of two walls; q = (x, y). The kinetic angle is `angle`.
-
-    Args:
-        angle: between the walls, in (0, pi) [rad].
-        mass: > 0 [kg].
-
-    Raises:
-        ValueError: angle or mass out of range.
-
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.66).
-
-    >>> import jimpact as ji
-    >>> round(float(ji.kinetic_angles(ji.corner(angle=1.2))[0, 1]), 12)
-    1.2
-    """
-    system = Corner(angle, mass)
-    return system.scene(system.touching())
 
 
 def disk_balls(

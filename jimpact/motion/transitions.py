@@ -5,24 +5,80 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.impacts import impact
 from jimpact.law import Law
-from jimpact.motion.blows import FAILS, Blow, blow_of, no_blow
 from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
-from jimpact.motion.dynamics import base_velocity, kinetic
-from jimpact.motion.flight import ROUNDING_GAP
-from jimpact.motion.flight_records import Scales, Settings, State
-from jimpact.motion.modes import (
-    REST_ACCELERATION,
-    Choice,
-    choose_with_friction,
-    pressed_together,
+from jimpact.motion.dynamics import (
+    base_velocity,
+    gaps,
+    kinematics,
+    kinetic,
+    mass_at,
+    seen_from_base,
 )
+from jimpact.motion.flow import ROUNDING_GAP, Scales, Settings, State
+from jimpact.motion.modes import REST_ACCELERATION, Choice, choose_with_friction, pressed_together
 from jimpact.motion.record import KIND_CODE, MOTION_CODE
 from jimpact.motion.system import System
+from jimpact.scene import Scene
+from jimpact.status import CODE, STATUS
 
+# A contact that still approaches is no failure: it has another impact at the same instant.
+FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STATUS)
 # Gap velocities below this share of what the kinetic energy could give are 0: rounding.
 REST_SPEED = 1e-9
 ROUNDINGS = 64  # of the time: velocities that arise within them are 0
+
+
+class Blow(NamedTuple):
+    """What the contacts do to the velocities at one event; all impulses [N s]."""
+
+    v: jax.Array
+    impulse: jax.Array  # (m,)
+    tangential: jax.Array  # (m,)
+    energy: jax.Array  # (2, m): change by each contact, normal and tangential
+    base_work: jax.Array
+    code: jax.Array  # of the law
+
+
+def no_blow(state: State, m: int) -> Blow:
+    """Nothing happens."""
+    zero = jnp.zeros_like(state.work)
+    none = jnp.zeros(m, state.v.dtype)
+    return Blow(state.v, none, none, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
+
+
+def scene_now(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
+    """The scene that a law sees: normals and tangents at q, gaps 0 where `closed`."""
+    normal = kinematics(system, q, v, t)
+    tangents = system.body.tangents(seen_from_base(system, q, t))
+    open_gaps = jnp.where(closed, 0.0, jnp.maximum(gaps(system, q, t), 0.0))
+    return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
+
+
+def blow_of(
+    system: System, law: Law, t: jax.Array, state: State, closed: jax.Array, noise: jax.Array
+) -> Blow:
+    """`impact` in the frame of the base, and what it does to energies.
+
+    Gap velocities up to `noise` are rounding, on the scale of the motion.
+    """
+    m = closed.shape[0]
+    scene = scene_now(system, state.q, state.v, t, closed)
+    carried = base_velocity(system, t)
+    carried = jnp.zeros_like(state.v) if carried is None else carried
+    relative = state.v - carried
+    out = impact(law, scene, relative, noise)
+    mean = 0.5 * (out.velocity + relative)
+    push = scene.normals @ out.impulse
+    normal = (scene.normals.T @ mean) * out.impulse
+    tangential, side = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
+    if scene.tangents is not None:
+        tangential = out.tangential_impulse
+        side = (scene.tangents.T @ mean) * tangential
+        push = push + scene.tangents @ tangential
+    energy = jnp.stack([normal, side])
+    return Blow(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
 
 
 class Outcome(NamedTuple):
@@ -44,7 +100,6 @@ def resolve(
     law: Law,
     mu: jax.Array | None,
     settings: Settings,
-    t: jax.Array,
     state: State,
     before: Modes,
     fired: jax.Array,
@@ -57,7 +112,7 @@ def resolve(
     `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
     impacts is then passed at once (its gap velocity is set to 0, energy is lost).
     """
-    m = before.active.shape[0]
+    m, t = before.active.shape[0], state.t
     given = contacts_at(system, state.q, state.v, t, settings.friction)
     closed = given.normal.value <= settings.closed_below
     scales = jax.lax.stop_gradient(_grown(system, scales, given, t, state))
@@ -66,7 +121,7 @@ def resolve(
     strikes = jnp.any(closed & (given.normal.rate < -rest))
     blow = jax.lax.cond(
         strikes,
-        lambda: blow_of(system, law, t, state, closed),
+        lambda: blow_of(system, law, t, state, closed, rest),
         lambda: no_blow(state, m),
     )
     given = contacts_at(system, state.q, blow.v, t, settings.friction)
@@ -96,12 +151,10 @@ def resolve(
     status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
     status = jnp.where(fails, MOTION_CODE["law_failed"], status)
     took = jnp.where(strikes, blow.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
-    work = State(
-        state.q,
-        blow.v,
-        state.work,
-        state.base_work + blow.base_work,
-        state.contact_work + blow.energy,
+    work = state._replace(
+        v=blow.v,
+        base_work=state.base_work + blow.base_work,
+        contact_work=state.contact_work + blow.energy,
     )
     return Outcome(
         work,

@@ -1,17 +1,87 @@
-"""Bodies in space: the dimer of two spheres and a rod on a horizontal plane."""
+"""Dimers: two spheres and a rod, in a vertical plane and in space."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jimpact._checks import check_values
-from jimpact.bodies.base import Mechanism, number, positive
-from jimpact.bodies.bodies import Dimer
+from jimpact.bodies.base import CIRCLE, Body, LinearPotential, OnGround, number, positive, turned
 from jimpact.scene import Scene
 
 
-class SpatialDimer(Mechanism):
+class Dimer(OnGround):
+    """Two equal spheres on the ends of a rod, in a vertical plane; q = (x, y, theta).
+
+    Equation: `f_{1,2} = y +/- (L/2 + R) sin(theta) - R`, contact 1 the right sphere. The lowest
+    point of a sphere slides at `v_t = x' -/+ (L/2 + R) sin(theta) theta' + R theta'`.
+
+    Args:
+        radius: R >= 0 of the spheres [m].
+        length: L > 0 of the rod between their surfaces [m].
+        sphere_mass: of one sphere, > 0 [kg].
+        rod_mass: of the thin rod, >= 0 [kg].
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
+
+    >>> import jimpact as ji
+    >>> dimer = ji.Dimer(radius=1.0, length=2.0)
+    >>> dimer.scene(dimer.touching(0.1)).closed.tolist()
+    [False, True]
+    """
+
+    radius: jax.Array
+    length: jax.Array
+    sphere_mass: jax.Array
+    rod_mass: jax.Array
+
+    def __init__(self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0):
+        self.radius = positive("radius", radius, low_allowed=True)
+        self.length = positive("length", length)
+        self.sphere_mass = positive("sphere_mass", sphere_mass)
+        self.rod_mass = positive("rod_mass", rod_mass, low_allowed=True)
+
+    @property
+    def arm(self) -> jax.Array:
+        """Distance of a sphere's centre from the middle, L/2 + R."""
+        return 0.5 * self.length + self.radius
+
+    @property
+    def total_mass(self) -> jax.Array:
+        """Of both spheres and the rod."""
+        return 2 * self.sphere_mass + self.rod_mass
+
+    @property
+    def inertia(self) -> jax.Array:
+        """About an axis through the middle, across the rod."""
+        sphere = self.sphere_mass * (0.4 * self.radius**2 + self.arm**2)
+        return 2 * sphere + self.rod_mass * self.length**2 / 12
+
+    @property
+    def mass(self) -> jax.Array:
+        """M = diag(m, m, I)."""
+        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Heights of the right and the left sphere over the ground."""
+        lift = self.arm * jnp.sin(q[2])
+        return jnp.stack([q[1] + lift, q[1] - lift]) - self.radius
+
+    def tangent_function(self, q: jax.Array) -> jax.Array:
+        """Ways that the lowest points of the spheres slide."""
+        rolled, side = q[0] + self.radius * q[2], self.arm * jnp.cos(q[2])
+        return jnp.stack([rolled + side, rolled - side])
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """The rod between the centres, and the spheres."""
+        radius, arm = float(self.radius), float(self.arm)
+        ends = turned(np.array([[arm, 0.0], [-arm, 0.0]]), q)
+        return [ends, *(end + radius * CIRCLE for end in ends)]
+
+
+class SpatialDimer(Body):
     """Two equal spheres on the ends of a rod over a plane; q = (x, y, z, yaw, pitch, spin).
 
     Equation: with the rod's axis `a = (cos p cos w, cos p sin w, sin p)`, pitch p, yaw w,
@@ -42,12 +112,21 @@ class SpatialDimer(Mechanism):
         self.planar = Dimer(radius, length, sphere_mass, rod_mass)
 
     @property
-    def coordinates(self) -> int:
-        """x, y, z, yaw, pitch, spin."""
-        return 6
+    def mass(self) -> Callable[[jax.Array], jax.Array]:
+        """q -> M(q) (6, 6)."""
+        return self._mass
 
-    def mass_matrix(self, q: jax.Array) -> jax.Array:
-        """M(q) (6, 6)."""
+    @property
+    def base_directions(self) -> jax.Array:
+        """The plane moves in x, y and z (6, 3)."""
+        return jnp.eye(6, 3, dtype=self.planar.mass.dtype)
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = m g z`."""
+        up = jnp.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0], self.planar.mass.dtype)
+        return LinearPotential(self.planar.total_mass * up * acceleration)
+
+    def _mass(self, q: jax.Array) -> jax.Array:
         body = self.planar
         about_axis = 0.8 * body.sphere_mass * body.radius**2
         sine, cosine = jnp.sin(q[4]), jnp.cos(q[4])
@@ -89,6 +168,35 @@ class SpatialDimer(Mechanism):
         zero = jnp.zeros_like(pitch)
         low = self.planar.touching(pitch)[1]
         return jnp.stack([zero, zero, low, turn.astype(zero.dtype), pitch, zero])
+
+
+def dimer(
+    radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0, angle: Any = 0.0
+) -> Scene:
+    """Scene of a planar dimer on the ground; q = (x, y, theta).
+
+    Equation: see `Dimer`. With all masses equal and a = radius / length,
+    `alpha = (1 + 2 a)^2 / (16 a^2 / 5 + 1/3 + 2 (1 + 2 a)^2)`,
+    `cos(theta_12) = -(1/3 - alpha) / (1/3 + alpha)`; theta_12 is least at a = 5/24.
+
+    Args:
+        radius: R >= 0 of the spheres [m].
+        length: L > 0 of the rod between their surfaces [m].
+        sphere_mass: of one sphere, > 0 [kg].
+        rod_mass: of the thin rod, >= 0 [kg].
+        angle: theta [rad]: > 0 lifts the right sphere, contact 1.
+
+    Raises:
+        ValueError: sizes or masses out of range, an angle that is not finite.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.11.
+
+    >>> import jimpact as ji
+    >>> round(float(ji.kinetic_angles(ji.dimer(radius=5 / 24, length=1.0))[0, 1]), 6)
+    1.424204
+    """
+    body = Dimer(radius, length, sphere_mass, rod_mass)
+    return body.scene(body.touching(angle))
 
 
 def dimer_3d(

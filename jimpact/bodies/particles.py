@@ -1,0 +1,138 @@
+"""Particles: in a corner of two walls, and balls above one another."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import is_traced
+from jimpact.bodies.base import CIRCLE, Body, LinearPotential, number, positive, positives
+from jimpact.scene import Scene
+
+
+class Corner(Body):
+    """A particle between two walls that meet at the origin; q = (x, y).
+
+    Equation: `f_1 = y`, `f_2 = x sin(angle) - y cos(angle)`: wall 1 along +x, wall 2 along
+    (cos(angle), sin(angle)); tangents point away from the corner.
+
+    Args:
+        angle: between the walls, in (0, pi) [rad].
+        mass: > 0 [kg].
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.66): the kinetic angle is the angle.
+
+    >>> import jimpact as ji
+    >>> ji.Corner(angle=1.0).gap_function(ji.Corner(angle=1.0).touching()).tolist()
+    [0.0, 0.0]
+    """
+
+    angle: jax.Array
+    particle_mass: jax.Array
+
+    def __init__(self, angle: Any, mass: Any = 1.0):
+        self.angle, self.particle_mass = number("angle", angle), positive("mass", mass)
+        if not is_traced(self.angle) and not 0 < float(self.angle) < np.pi:
+            raise ValueError(
+                f"Argument `angle` must lie in (0, pi), but has value {float(self.angle):g}."
+            )
+
+    @property
+    def mass(self) -> jax.Array:
+        """M = diag(m, m)."""
+        return jnp.stack([self.particle_mass, self.particle_mass])
+
+    @property
+    def base_directions(self) -> jax.Array:
+        """The walls move in x and y (2, 2)."""
+        return jnp.eye(2, dtype=self.mass.dtype)
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = m g y`."""
+        return LinearPotential(self.mass * jnp.array([0.0, 1.0], self.mass.dtype) * acceleration)
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Distances from the walls."""
+        return jnp.stack([q[1], q[0] * jnp.sin(self.angle) - q[1] * jnp.cos(self.angle)])
+
+    def tangent_function(self, q: jax.Array) -> jax.Array:
+        """Ways along the walls, away from the corner."""
+        return jnp.stack([q[0], q[0] * jnp.cos(self.angle) + q[1] * jnp.sin(self.angle)])
+
+    def touching(self) -> jax.Array:
+        """q (2,) in the corner."""
+        return jnp.zeros(2, self.angle.dtype)
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """The particle."""
+        return [q + point * CIRCLE]
+
+
+class Column(Body):
+    """Balls above one another on a floor; q = their heights, ball 1 is the lowest.
+
+    Equation: `f_1 = q_1 - R_1`, `f_j = (q_j - R_j) - (q_{j-1} + R_{j-1})`; contact 1 is the floor.
+
+    Args:
+        masses: (n,) > 0 [kg].
+        radii: >= 0, scalar or (n,) [m]; 0: mass points.
+
+    >>> import jimpact as ji, jax.numpy as jnp
+    >>> ji.Column([1.0, 2.0], 0.5).gap_function(jnp.array([0.5, 2.0])).tolist()
+    [0.0, 0.5]
+    """
+
+    masses: jax.Array
+    radii: jax.Array
+
+    def __init__(self, masses: Any, radii: Any = 0.0):
+        self.masses = positives("masses", masses)
+        count = self.masses.shape[0]
+        radii = positives("radii", radii, count, low_allowed=True)
+        self.radii = radii.astype(self.masses.dtype)
+
+    @property
+    def mass(self) -> jax.Array:
+        """M, its diagonal (n,)."""
+        return self.masses
+
+    @property
+    def base_directions(self) -> jax.Array:
+        """The floor moves vertically (n, 1)."""
+        return jnp.ones((self.masses.shape[0], 1), self.masses.dtype)
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = g sum m_i q_i`."""
+        return LinearPotential(self.masses * acceleration)
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Distances from the floor and between neighbours."""
+        top_below = jnp.concatenate([jnp.zeros(1, q.dtype), (q + self.radii)[:-1]])
+        return q - self.radii - top_below
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Circles; mass points are drawn above their height."""
+        radii = np.asarray(self.radii)
+        shown, lift = np.where(radii > 0, radii, point), np.where(radii > 0, 0.0, point)
+        return [r * CIRCLE + (0, y + d) for r, y, d in zip(shown, q, lift, strict=True)]
+
+
+def corner(angle: Any, mass: Any = 1.0) -> Scene:
+    """Scene of a particle in a corner of two walls; q = (x, y). The kinetic angle is `angle`.
+
+    Args:
+        angle: between the walls, in (0, pi) [rad].
+        mass: > 0 [kg].
+
+    Raises:
+        ValueError: angle or mass out of range.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.66).
+
+    >>> import jimpact as ji
+    >>> round(float(ji.kinetic_angles(ji.corner(angle=1.2))[0, 1]), 12)
+    1.2
+    """
+    system = Corner(angle, mass)
+    return system.scene(system.touching())

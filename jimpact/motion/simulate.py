@@ -1,0 +1,292 @@
+"""`simulate`: whole motions."""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import (
+    as_float_array,
+    as_whole,
+    check_kind,
+    check_shape,
+    check_values,
+    is_traced,
+)
+from jimpact.law import Law
+from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
+from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
+from jimpact.motion.event_driven import event_driven
+from jimpact.motion.flow import Course, Settings
+from jimpact.motion.record import Motion
+from jimpact.motion.stepping import time_stepping
+from jimpact.motion.system import System
+from jimpact.scene import check_mass
+
+CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
+RTOL, ATOL = 1e-10, 1e-12  # of the flights
+SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
+MAX_EVENTS, MAX_STEPS = 500, 100_000
+METHODS = ("events", "time_stepping")
+_BASE_LOOKS = 64  # times at which the base is looked at before the motion starts
+
+
+def simulate(
+    system: System,
+    law: Law,
+    q0: Any,
+    v0: Any,
+    t_end: Any,
+    *,
+    t_start: Any = 0.0,
+    samples: int = 201,
+    method: str = "events",
+    step: float | None = None,
+    friction: Any = None,
+    max_events: int = MAX_EVENTS,
+    rtol: float = RTOL,
+    atol: float = ATOL,
+    closed_below: float = CLOSED_BELOW,
+    slow: float = SLOW,
+    max_steps: int = MAX_STEPS,
+) -> Motion:
+    """The whole motion of a system: flights, impacts by `law`, persistent contact.
+
+    Equation: between impacts that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at contacts that
+    are closed and at rest; at an impact `v+` of `ji.impact` in the frame of the base.
+
+    Args:
+        system: gaps, mass, forces, base.
+        law: any impact law.
+        q0: (n,) at the start, without penetration.
+        v0: (n,).
+        t_end: [s] > t_start.
+        t_start: [s].
+        samples: number of equally spaced instants in the record, both ends included.
+        method: 'events' (flights that land on each event), or 'time_stepping'
+            (Moreau-Jean, for many contacts; needs `step` [s]).
+        step: of the time stepping [s].
+        friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
+            `tangent_function`; None: that of the law, if it has a field `friction`. Not in time
+            stepping.
+        max_events: rows for events; one more ends the motion with the status `max_events`.
+        rtol, atol: tolerances of the flights.
+        closed_below: contacts with smaller gaps [m] take part in an impact.
+        slow: accumulations are passed: a contact that leaves slower than this share of the largest
+            gap velocity of the motion, and would be pressed back, stays closed.
+        max_steps: of the integrator, in all.
+
+    Returns:
+        `Motion`. Pure: jit, vmap, and forward derivatives (jvp, jacfwd) in everything that is an
+        array, event times included. A bad motion of a batch ends alone, with its status.
+
+    Raises:
+        ValueError: shapes, t_end <= t_start, penetration, a base or a mass that is not a number, on
+            the host; inside jit only the status speaks (`raise_on_failed_motion`).
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
+
+    >>> import jimpact as ji
+    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.8), [1.0], [0.0], 5.0, samples=21)
+    >>> [round(float(t), 6) for t in motion.event_times()[:3]]
+    [0.451601, 1.174162, 1.752211]
+    >>> [round(float(t), 6) for t in motion.events.accumulation_end[motion.events.count - 1 :][:1]]
+    [4.064407]
+    """
+    check_kind("system", system, System)
+    check_kind("law", law, Law)
+    q, v = as_float_array("q0", q0), as_float_array("v0", v0)
+    dtype = jnp.result_type(q, v)
+    start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))
+    _check_motion(system, q, v, start, end, closed_below)
+    count = as_whole("samples", samples, 2)
+    as_whole("max_events", max_events, 1)
+    as_whole("max_steps", max_steps, 1)
+    for name, value in (("rtol", rtol), ("atol", atol), ("closed_below", closed_below)):
+        check_values(name, value, low=0.0, open_low=True)
+    check_values("slow", slow, low=0.0, high=1.0)
+    if method not in METHODS:
+        raise ValueError(f"Argument `method` must be one of {METHODS}, but has value {method!r}.")
+    if method == "events" and rtol < FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps):
+        raise ValueError(
+            f"Argument `rtol` must be at least {FINEST_RTOL_IN_EPS} roundings of {dtype}, but has "
+            f"value {rtol:g}: enable jax_enable_x64, or give a coarser one."
+        )
+    mu = _friction_of(system, law, friction, q)
+    q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
+    settings = Settings(
+        rtol,
+        atol,
+        jnp.asarray(closed_below, dtype),
+        max_steps,
+        mu is not None,
+        end - start,
+        jnp.asarray(slow, dtype),
+    )
+    if method == "time_stepping":
+        substeps = _substeps_of(step, t_start, t_end, count)
+        closed = settings.closed_below
+        return _stepped(system, law, q, v, start, end, count, substeps, closed, max_events)
+    return _events(system, law, mu, settings, q, v, start, end, count, max_events)
+
+
+@eqx.filter_jit
+def _events(
+    system: System,
+    law: Law,
+    mu: jax.Array | None,
+    settings: Settings,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    samples: int,
+    max_events: int,
+) -> Motion:
+    times = _equal_times(start, end, samples)
+    return _recorded(
+        system, times, event_driven(system, law, mu, settings, q, v, times, max_events)
+    )
+
+
+@eqx.filter_jit
+def _stepped(
+    system: System,
+    law: Law,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    samples: int,
+    substeps: int,
+    closed_below: jax.Array,
+    max_events: int,
+) -> Motion:
+    times = _equal_times(start, end, samples)
+    return _recorded(
+        system, times, time_stepping(system, law, q, v, times, substeps, closed_below, max_events)
+    )
+
+
+def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
+    """The record of a course, with its energies and gaps."""
+    q, v, _, work, base_work, contact_work = course.samples
+    return Motion(
+        time=times,
+        q=q,
+        velocity=v,
+        kinetic_energy=jax.vmap(lambda q, v: kinetic(system, q, v))(q, v),
+        potential_energy=jax.vmap(lambda q: potential(system, q))(q),
+        force_work=work,
+        base_work=base_work,
+        contact_work=contact_work,
+        gaps=jax.vmap(lambda q, t: gaps(system, q, t))(q, times),
+        events=course.events,
+        steps=course.steps,
+        status=course.status,
+    )
+
+
+def _equal_times(start: jax.Array, end: jax.Array, samples: int) -> jax.Array:
+    """`samples` instants from start to end."""
+    share = jnp.arange(samples, dtype=start.dtype) / (samples - 1)
+    return start + share * (end - start)
+
+
+def _check_motion(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    closed_below: float,
+) -> None:
+    """Raise a ValueError for a bad start, end or system."""
+    if q.ndim != 1:
+        raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
+    check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
+        check_values(name, value)
+    check_shape("t_start", start, (), "a time")
+    check_shape("t_end", end, (), "a time")
+    if not is_traced((start, end)) and not float(end) > float(start):
+        raise ValueError(
+            f"Argument `t_end` must be larger than `t_start` = {float(start):g}, "
+            f"but has value {float(end):g}."
+        )
+    _check_system(system, q, v, start, end, closed_below)
+
+
+def _check_system(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    closed_below: float,
+) -> None:
+    n = q.shape[0]
+    mass = jax.eval_shape(partial(mass_at, system), q)
+    if mass.shape not in ((n,), (n, n)):
+        raise ValueError(
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `q0` has {n} "
+            f"coordinates, but has one of shape {mass.shape}."
+        )
+    if is_traced((system, q, v, start, end)):
+        return
+    if callable(system.mass):
+        check_mass(mass_at(system, q))
+    if system.base is not None:
+        looks = np.linspace(float(start), float(end), _BASE_LOOKS)
+        moved = system.base
+        base = jax.vmap(lambda t: jnp.atleast_1d(moved(t)))(jnp.asarray(looks, q.dtype))
+        bad = ~np.isfinite(np.asarray(base)).all(axis=1)
+        if bad.any():
+            raise ValueError(
+                "Argument `system` must have a finite base motion, but base(t) has value "
+                f"{np.asarray(base)[bad][0]} at t = {looks[bad][0]:g} s."
+            )
+    f = np.asarray(gaps(system, q, start))
+    if not (f >= -closed_below).all():
+        worst = int(np.argmin(f))
+        raise ValueError(
+            f"Argument `q0` must have no penetration (f >= -{closed_below:g} m), "
+            f"but gap {worst} has value {f[worst]:g} m."
+        )
+
+
+def _friction_of(system: System, law: Law, given: Any, q: jax.Array) -> jax.Array | None:
+    """mu (m,), given or of the law; None without friction."""
+    mu = getattr(law, "friction", None) if given is None else given
+    tangents = jax.eval_shape(system.body.tangents, q)
+    if mu is None or (tangents is None and given is None):
+        return None
+    if tangents is None:
+        raise ValueError("Argument `friction` needs a system with a `tangent_function`.")
+    mu = as_float_array("friction", mu)
+    check_values("friction", mu, low=0.0)
+    if not is_traced(mu) and not np.any(mu):
+        return None  # frictionless systems pay nothing
+    m = jax.eval_shape(system.body.gap_function, q).shape[0]
+    if tangents.shape[1] != m or jax.eval_shape(system.body.tangent_function, q) is None:
+        raise ValueError(
+            "Argument `friction` must be 0 for a body with tangents in space: motions know planar "
+            "friction only, by a `tangent_function`."
+        )
+    if mu.shape not in ((), (m,)):
+        raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
+    return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
+
+
+def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
+    """Steps between two samples, none longer than `step`."""
+    if step is None or is_traced(step):
+        raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
+    check_values("step", step, low=0.0, open_low=True)
+    if is_traced((start, end)):
+        raise ValueError("Arguments `t_start`, `t_end` must not be traced in time stepping.")
+    between = (float(end) - float(start)) / (samples - 1)
+    return max(1, int(np.ceil(between / float(step) * (1 - 1e-9))))
