@@ -254,8 +254,9 @@ class SlipFlow(FrictionFlow):
             ],
             1,
         )
-        free = (frozen.unit * jnp.ones_like(x))[:, None] * a
-        rate = jnp.where(self.loaded(modes)[:, None], rate, free)
+        rate = jnp.where(
+            self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
+        )
         own = self._blocks(const)
         stiffness = c * jnp.stack([own[j, 0, j, 0] + own[j, 1, j, 1] for j in range(len(c))]) / 2
         haste = 1 + total(over_r * (length(a) + 2 * stiffness))
@@ -316,8 +317,9 @@ class SlipFlow(FrictionFlow):
         turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
         away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
         drift, newton = solve(j + eye * (growth + away)[:, None], changes, turns)
-        lag_unit = jnp.where(creeps, frozen.unit, 1.0)[:, None]
-        lagging = lag_unit * (j + eye * (2 * growth + away)[:, None])
+        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
+            j + eye * (2 * growth + away)[:, None]
+        )
         (lag,) = solve(lagging + eye * LEAST_STIFFNESS, r * drift / size)
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
@@ -406,8 +408,9 @@ class SlipFlow(FrictionFlow):
         top = jnp.max(f, axis=0, keepdims=True)
         f = f / jnp.where(top > 0, top, 1.0)
         most = still.friction * f
-        held = polar(jax.lax.stop_gradient(q[:, 1]))[0]
-        slides = jnp.where((asked | ~loaded)[:, None], 0.0, held)
+        slides = jnp.where(
+            (asked | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
+        )
         b = times(jnp.swapaxes(still.across, 0, 1), f)
         b = b - times(still.along, flat(most[:, None] * slides))
         inside, towards = distribute(still.along, b, most, asked)
