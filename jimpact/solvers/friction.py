@@ -13,7 +13,7 @@ in proportion to mu p, and normal impulses are the least, wherever that is allow
 """
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -552,12 +552,13 @@ def distribute(
     def slip(side: jax.Array) -> jax.Array:
         return sum(matrix[:, i] * side[i : i + 1] for i in range(m * rows)) + rate
 
-    def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+    def sweep(carry: tuple[jax.Array, jax.Array, Any]) -> tuple[jax.Array, jax.Array, Any]:
         before, _, count = carry
         side = before
         for j in range(m):
             at = slice(rows * j, rows * (j + 1))
-            total = sum(matrix[i, i] for i in range(at.start, at.stop))[None]  # no step is too long
+            own = jnp.stack([matrix[i, i] for i in range(at.start, at.stop)])
+            total = own.sum(axis=0)[None]  # no step is too long
             tried = side[at] - slip(side)[at] / total
             length = _lengths(tried, rows)
             over = length > limit[j : j + 1]
