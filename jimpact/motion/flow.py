@@ -16,13 +16,16 @@ from jimpact.motion.contact_forces import (
     forces,
     powers,
 )
-from jimpact.motion.dynamics import definite, mass_at, user_force
+from jimpact.motion.dynamics import definite, free_acceleration, mass_at, user_force
 from jimpact.motion.modes import REST_ACCELERATION
 from jimpact.motion.record import Events
 from jimpact.motion.system import System
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
 ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is rounding
+# Error allowed in the ledger, of what the errors allowed in q and v are worth: ten times more, and
+# the steps of a body that rests on a moving base are those of the base's motion only.
+LEDGER = 0.01
 
 
 class State(NamedTuple):
@@ -219,6 +222,15 @@ def first_flight(
     return Flight(state, plan, jnp.zeros(k, bool), jnp.int32(1), first, none, jnp.asarray(False))
 
 
+def _loads(system: System, at: State) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """(q, v), generalized forces M q'' and momenta M v, without contacts."""
+    mass = mass_at(system, at.q)
+    free = free_acceleration(system, at.q, at.v, user_force(system, at.q, at.v, at.t), mass)
+    both = jnp.stack([free, at.v], axis=1)
+    pushed = mass[:, None] * both if mass.ndim == 1 else mass @ both
+    return jnp.concatenate([at.q, at.v]), pushed[:, 0], pushed[:, 1]
+
+
 def fly(
     system: System,
     mu: jax.Array | None,
@@ -243,11 +255,15 @@ def fly(
     rows = encoded(modes)
     k = rounding.shape[0]
 
+    size, force, momentum = (jnp.abs(x) for x in _loads(system, begin.state))
+    allowed = settings.atol + settings.rtol * size
+    ledger = LEDGER * (allowed[:n] @ force + allowed[n:] @ momentum) + tiny
+
     def flow_at(flight: Flight) -> MechanicalFlow:
         state = flight.state
-        size = jnp.concatenate([jnp.abs(state.q), jnp.abs(state.v)])
-        free = jnp.full(packed(state).shape[0] - 2 * n, jnp.inf, dtype)
-        tolerance = jnp.concatenate([settings.atol + settings.rtol * size, free])[:, None]
+        size = jnp.abs(jnp.concatenate([state.q, state.v]))
+        rest = jnp.full(packed(state).shape[0] - 2 * n, ledger).at[0].set(jnp.inf)  # of time: none
+        tolerance = jnp.concatenate([settings.atol + settings.rtol * size, rest])[:, None]
         target = targets[jnp.minimum(flight.sample, n_targets - 1)]
         return MechanicalFlow(
             system, mu, scales, rounding, target, jax.lax.stop_gradient(tolerance), state
