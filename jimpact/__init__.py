@@ -44,7 +44,7 @@ _WHERE = {
     "laws.calibration": "calibrate compare_rheologies measured_restitution",
     "laws.materials": "hertz_stiffness sphere_mass",
     "theory.linear_chain": "bilateral_motion newby_ratio",
-    "motion.turning": "TurningImpact turning_impact",
+    "motion.contact_dynamics": "TurningImpact turning_impact",
     "plot.rheology": "plot_forces plot_rheologies",
     "montecarlo.running": "monte_carlo",
     "montecarlo.results": "MonteCarlo",
