@@ -1,11 +1,19 @@
-"""Strict JAX flags for every test; the package itself sets none."""
+"""Strict JAX flags for every test, and the count of the programs that the tests compile.
+
+Compiling is what the suite's time goes into: a session tells the tests that compile most, and a
+session of the whole default suite fails beyond BUDGET programs.
+"""
 
 import os
+import random
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 import jax
 import matplotlib
+import numpy as np
+import programs as programs_of_laws
 import pytest
 
 jax.config.update("jax_enable_x64", True)
@@ -17,14 +25,31 @@ matplotlib.use("Agg")
 # compiler aborts. A process that holds half of them forgets its programs.
 MANY_MAPS = 30_000
 
+# Processes side by side share the programs that took longer than this to compile.
+WORTH_SHARING = "0.2"  # seconds
 
-# Most of the time is compilation: processes side by side share what takes longer than this.
-WORTH_SHARING = "0.3"  # seconds
+# A program counts if its compilation took longer; single operations, run eagerly, take less.
+COUNTS_FROM = 0.1  # seconds
+BUDGET = 250  # programs of the default suite, over all processes
+COMPILED = "/jax/core/compile/backend_compile_duration"
+
+programs, seconds = Counter(), Counter()  # of each test, in this process
+running = ["imports"]
+
+
+def compiled(event, duration, **_):
+    if event == COMPILED and duration > COUNTS_FROM:
+        programs[running[0]] += 1
+        seconds[running[0]] += duration
 
 
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
-    if not hasattr(config, "workerinput") and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    jax.monitoring.register_event_duration_secs_listener(compiled)
+    if hasattr(config, "workerinput"):
+        return
+    config.pluginmanager.register(Workers())
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = tempfile.TemporaryDirectory(prefix="jimpact-tests-")
         config.add_cleanup(folder.cleanup)
         os.environ["JAX_COMPILATION_CACHE_DIR"] = folder.name
@@ -33,8 +58,62 @@ def pytest_configure(config):
         jax.config.update("jax_persistent_cache_min_compile_time_secs", float(WORTH_SHARING))
 
 
+class Workers:
+    """Takes over what the processes of xdist have counted; their plugin calls it."""
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node, error):
+        told = getattr(node, "workeroutput", {})
+        programs.update(told.get("programs", {}))
+        seconds.update(told.get("seconds", {}))
+
+
+def pytest_sessionfinish(session, exitstatus):
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["programs"] = dict(programs)
+        session.config.workeroutput["seconds"] = dict(seconds)
+    elif whole_suite(session.config) and programs.total() > BUDGET:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def whole_suite(config):
+    """Whether this is the default call: no files, no selection but the default one."""
+    return not config.option.keyword and config.option.markexpr == "not slow" and not files(config)
+
+
+def files(config):
+    return [x for x in config.args if Path(x).name != "tests"]
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    write, total = terminalreporter.write_line, programs.total()
+    terminalreporter.section("programs")
+    write(f"{total} programs took {seconds.total():.0f} CPU s to compile (budget {BUDGET})")
+    for name, count in sorted(programs.items(), key=lambda item: -seconds[item[0]])[:10]:
+        write(f"{seconds[name]:6.1f} s {count:3d}  {name}")
+    if whole_suite(config) and total > BUDGET:
+        write(f"FAILED: {total} programs are more than the budget of {BUDGET}")
+
+
+def pytest_collection_modifyitems(items):
+    """Tests that share a program run in one process: those of a law, those of a file."""
+    for item in items:
+        law = getattr(item, "callspec", None) and item.callspec.params.get("name")
+        shared = law if law in programs_of_laws.LAWS else Path(item.path).stem
+        if not item.get_closest_marker("xdist_group"):
+            item.add_marker(pytest.mark.xdist_group(str(shared)))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    running[0] = item.nodeid
+
+
 @pytest.fixture(autouse=True)
-def few_memory_maps():
+def each_test():
+    """Fixed seeds; a process does not hold too many programs."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:

@@ -1,247 +1,339 @@
-"""One suite for every law: what it promises holds, and what can fail is flagged."""
+"""One contract for every registered law: what it promises holds, and what can fail is told.
+
+All states of a law are lanes of one compiled batch (`programs.values`), its derivatives of one
+more. A user's own law is held to the same functions (`test_wrong_laws_are_caught`).
+"""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import programs
 import pytest
-from cases import LAWS
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from programs import LAWS, SEQUENTIAL, State, chain, failed
 
 import jimpact as ji
 
-SCENES = {
-    "chain": lambda: (ji.chain(jnp.array([1.0, 2.0, 0.7])), jnp.array([1.0, 0.1, -0.4])),
-    "wall": lambda: (ji.chain(jnp.array([1.0, 2.0]), wall=True), jnp.array([1.0, 0.3])),
-    "plane": lambda: (
-        ji.Scene(jnp.array([[2.0, 0.3], [0.3, 1.0]]), jnp.array([[1.0, 0.2], [-0.3, 0.9]])),
-        jnp.array([-1.0, -0.6]),
-    ),
-}
-E, K = jnp.array([0.9, 0.6]), jnp.array([1.0, 2.5])
+each_law = pytest.mark.parametrize("name", LAWS)
 
 
-def once_a_law():
-    """Every law once; its further methods and orders, which share its code, are slow tests."""
-    seen = set()
-    for name, (law, *_) in LAWS.items():
-        yield pytest.param(name, id=name, marks=[pytest.mark.slow] if law in seen else [])
-        seen.add(law)
+def random_states(count, seed, least=0.0, most=1.0):
+    """Scenes of three contacts, kinetic angles of all sizes; something approaches."""
+    rng = np.random.default_rng(seed)
+    states = []
+    for _ in range(count):
+        a = rng.normal(size=(4, 4))
+        normals, v = rng.normal(size=(4, 3)), rng.normal(size=4)
+        v = v if (normals.T @ v < 0).any() else -v
+        states.append(
+            State(
+                a @ a.T + 0.2 * np.eye(4),
+                normals,
+                v,
+                e=rng.uniform(least, most, 3),
+                k=10 ** rng.uniform(-1, 1, 3),
+            )
+        )
+    return states
 
 
-@pytest.fixture(params=once_a_law())
-def row(request):
-    name, make, accuracy, slope_accuracy = LAWS[request.param]
-    return ji.REGISTRY[name], make, accuracy, slope_accuracy
+def random_chains(count, seed):
+    rng = np.random.default_rng(seed)
+    states = []
+    for i in range(count):
+        wall = (False, True, "left", "both")[i % 4]
+        n = 4 - (wall in (True, "left")) - 2 * (wall == "both")
+        v = rng.normal(size=n)
+        if wall == "both":  # a body that never comes to rest is no state of the contract
+            wall, n = False, 2
+        m = n - 1 + bool(wall)
+        v = v if np.min(np.diff(v), initial=0) < 0 else -v
+        states.append(
+            chain(
+                10 ** rng.uniform(-0.5, 0.5, n),
+                v,
+                wall,
+                e=rng.uniform(0.3, 1, m),
+                k=10 ** rng.uniform(-1, 1, m),
+            )
+        )
+    return states
 
 
-@pytest.fixture(params=SCENES, ids=list(SCENES))
-def scene(request):
-    return SCENES[request.param]()
+GENERAL = [*random_states(16, seed=1, least=0.2), *random_chains(16, seed=2)]
+LIGHT = [
+    chain([1.0, 1e-3, 1.0], [1.0, 0.0, 0.0], e=0.9),
+    chain([1e-3, 1.0, 1e-3, 1.0], [1.0, 0.0, 0.0, -1.0], e=0.8, k=[1.0, 30.0, 0.1]),
+    chain([1e4, 1.0, 1.0], [1.0, 0.0, -1.0], e=0.5),
+]
 
 
-def failed(out):
-    return ji.STATUS[int(out.status)].failure
-
-
-def check_promises(entry, law, scene, v, accuracy):
-    """Every property: promised, or else the status says that it fails."""
-    out = ji.impact(law, scene, v)
-    found = ji.audit(scene, v, out)
-    size = float(jnp.abs(jnp.asarray(v)).max()) or 1.0
+def check_promises(run, entry, accuracy, states):
+    """Signs, energy, momentum, scaling: kept, or else (where not promised) told by the status."""
+    fast = [dataclasses.replace(s, velocity=1e3 * np.asarray(s.velocity)) for s in states]
+    light = [dataclasses.replace(s, mass=1e-4 * np.asarray(s.mass)) for s in states]
+    (out, found), (out_fast, _), (out_light, _) = run(states), run(fast), run(light)
     assert np.isfinite(out.velocity).all()
-    assert bool(found.momentum)
+    assert found.momentum.all()
     signs = {
-        "impulse_sign": bool(found.kinetic),
-        "gap_velocity_sign": bool(found.kinematic),
-        "energy": bool(found.energetic),
+        "impulse_sign": found.kinetic,
+        "gap_velocity_sign": found.kinematic,
+        "energy": found.energetic,
     }
-    for name, holds in signs.items():
-        assert holds or (name not in entry.promises and failed(out)), (name, out)
+    over = ~np.isin(programs.names(out.status), ["max_steps"])  # told, and few: see below
+    for promise, holds in signs.items():
+        if promise in entry.promises:
+            assert holds[over].all(), (promise, np.flatnonzero(over & ~holds))
+        silent = ~holds & ~failed(out.status)
+        assert not silent.any(), (promise, np.flatnonzero(silent))
+    speed = np.array([np.abs(s.velocity).max() for s in states])[:, None]
     if "velocity_scaling" in entry.promises:
-        fast = ji.impact(law, scene, 1e3 * jnp.asarray(v))
-        np.testing.assert_allclose(fast.velocity / 1e3, out.velocity, atol=2 * accuracy * size)
+        error = np.abs(out_fast.velocity / 1e3 - out.velocity) / speed
+        assert error.max() < 2 * accuracy, error.max(axis=1)
     if "mass_scaling" in entry.promises:
-        heavy = jax.tree.map(lambda x: x, scene)
-        object.__setattr__(heavy, "mass", scene.mass * 1e-4)
-        same = ji.impact(law, heavy, v)
-        np.testing.assert_allclose(same.velocity, out.velocity, atol=2 * accuracy * size)
+        error = np.abs(out_light.velocity - out.velocity) / speed
+        assert error.max() < 2 * accuracy, error.max(axis=1)
+    return out, found
 
 
-def test_promises(row, scene):
-    entry, make, accuracy, _ = row
-    check_promises(entry, make(E, K), *scene, accuracy)
+@each_law
+def test_promises(name):
+    row = LAWS[name]
+    entry = ji.REGISTRY[row.registered]
+    out, _ = check_promises(programs.values(name), entry, row.accuracy, GENERAL + LIGHT)
+    # "right or told" is worth something only if little is told
+    most = {"newton": 0.8, "matrix": 0.8, "moreau": 0.5, "poisson": 0.25}.get(name, 0.05)
+    assert failed(out.status).mean() <= most, failed(out.status).mean()
 
 
-def test_single_contact_is_newton(row):
-    _, make, accuracy, _ = row
-    chain, v = ji.chain(jnp.array([1.0, 3.0])), jnp.array([2.0, 0.5])
-    out = ji.impact(make(jnp.array(0.7), jnp.array(5.0)), chain, v)
-    expected = ji.impact(ji.Newton(0.7), chain, v)
-    np.testing.assert_allclose(out.velocity, expected.velocity, atol=accuracy)
-    np.testing.assert_allclose(out.impulse, expected.impulse, atol=2 * accuracy)
+@each_law
+def test_one_contact_is_newtons(name):
+    """v+ = v- + (1 + e) ..., whatever else the law knows."""
+    states = []
+    for e in (0.0, 1e-9, 0.4, 1.0):
+        p = (1 + e) * 1.5 / (1 + 1 / 3)
+        after = [2 - p, 0.5 + p / 3]
+        for k in (1e-3, 1.0, 1e6):
+            states.append(chain([1, 3], [2, 0.5], e=e, k=k, after=after, impulse=[p]))
+    programs.check_held(name, states, allowed=max(1e-12, LAWS[name].accuracy))
 
 
-def test_nothing_happens(row):
-    _, make, _, _ = row
-    out = ji.impact(make(E, K), ji.chain(jnp.ones(3)), jnp.array([0.0, 0.0, 1.0]))
-    assert int(out.status) == 0
-    assert np.array_equal(out.velocity, [0.0, 0.0, 1.0])
-    assert not np.asarray(out.impulse).any()
+@each_law
+def test_nothing_happens(name):
+    """Separating, at rest relative to each other, at rest: v+ = v- to the last bit, p = 0."""
+    states = [
+        chain([1, 1, 1], [0, 0, 1]),
+        chain([1, 2, 1], [0.3, 0.3, 0.3]),
+        chain([1, 2, 1], [0, 0, 0]),
+    ]
+    out, _ = programs.values(name)(states)
+    for i, state in enumerate(states):
+        assert np.array_equal(out.velocity[i, :3], state.velocity)
+    assert not out.impulse.any()
+    assert not out.energy_change.any()
+    assert programs.names(out.status) == ["ok"] * 3
 
 
-def test_open_contacts_take_no_part(row):
-    entry, make, accuracy, _ = row
-    if entry.law.uses_gaps:
-        pytest.skip("its open contacts may close: tested with the law")
-    v = jnp.array([1.0, 0.0, -0.5])
-    gapped = ji.impact(make(E, K), ji.chain(jnp.ones(3), gaps=jnp.array([0.0, 1e-3])), v)
-    alone = ji.impact(make(E[0], K[0]), ji.chain(jnp.ones(2)), v[:2])
-    np.testing.assert_allclose(gapped.velocity[:2], alone.velocity, atol=accuracy)
-    assert float(gapped.velocity[2]) == -0.5
-    assert float(gapped.impulse[1]) == 0.0
-    assert "open" in ji.summary(gapped, ji.chain(jnp.ones(3), gaps=jnp.array([0.0, 1e-3])), v)
-
-
-def test_permutation(row):
-    _, make, accuracy, _ = row
-    if getattr(make(E, K), "order", "fastest") not in ("fastest", "earliest"):
-        pytest.skip("its order is by number of the contact")
-    scene, v = SCENES["plane"]()
-    swapped = ji.Scene(scene.mass, scene.normals[:, ::-1])
-    a = ji.impact(make(E, K), scene, v)
-    b = ji.impact(make(E[::-1], K[::-1]), swapped, v)
-    np.testing.assert_allclose(a.velocity, b.velocity, atol=2 * accuracy)
-    np.testing.assert_allclose(a.impulse, b.impulse[::-1], atol=2 * accuracy)
-
-
-def test_bilateral_constraints_reduce_the_scene(row):
-    """Four balls, the middle two welded together: three balls, in every law."""
-    _, make, accuracy, _ = row
-    four = jnp.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]])
-    welded = ji.Scene(
-        jnp.array([1.0, 2.0, 0.5, 0.7]), four, constraints=jnp.array([[0.0], [-1], [1], [0]])
+@each_law
+def test_open_contacts_take_no_part(name):
+    """Padded lanes hold open contacts; here one of them would approach."""
+    if name in ("compliant", *SEQUENTIAL):
+        pytest.skip("its open contacts close: tested with the law")
+    gapped = chain([1, 1, 1], [1.0, 0.0, -0.5], e=0.7, gaps=[0.0, 1e-3], k=[2.0, 1.0])
+    alone = chain([1, 1], [1.0, 0.0], e=0.7, k=2.0)
+    out, _ = programs.values(name)([gapped, alone])
+    np.testing.assert_allclose(
+        out.velocity[0, :2], out.velocity[1, :2], atol=2 * LAWS[name].accuracy
     )
-    three = ji.Scene(jnp.array([1.0, 2.5, 0.7]), jnp.array([[-1.0, 0], [1, -1], [0, 1]]))
-    out = ji.impact(make(E, K), welded, jnp.array([1.0, 0.1, 0.1, -0.4]))
-    same = ji.impact(make(E, K), three, jnp.array([1.0, 0.1, -0.4]))
-    np.testing.assert_allclose(out.velocity[jnp.array([0, 1, 3])], same.velocity, atol=2 * accuracy)
-    np.testing.assert_allclose(out.velocity[1], out.velocity[2], atol=1e-14)
-    np.testing.assert_allclose(out.impulse, same.impulse, atol=2 * accuracy)
-    np.testing.assert_allclose(out.energy_change, same.energy_change, atol=2 * accuracy)
+    assert out.velocity[0, 2] == -0.5
+    assert out.impulse[0, 1] == 0.0
 
 
-def test_chain_equals_dense_scene(row):
-    _, make, accuracy, _ = row
-    chain, v = SCENES["wall"]()
-    a = ji.impact(make(E, K), chain, v)
-    b = ji.impact(make(E, K), ji.Scene(chain.mass, chain.normals), v)
-    np.testing.assert_allclose(a.velocity, b.velocity, atol=2 * accuracy)
+@each_law
+def test_order_of_contacts_does_not_matter(name):
+    if LAWS[name].by_order:
+        pytest.skip("its order is by number of the contact")
+    turned = [
+        dataclasses.replace(s, normals=s.normals[:, ::-1], e=s.e[::-1], k=s.k[::-1])
+        for s in GENERAL
+    ]
+    (a, _), (b, _) = programs.values(name)(GENERAL), programs.values(name)(turned)
+    tied = np.isin(programs.names(a.status), ["order_dependent", "plastic_limit"])
+    size = np.array([np.abs(s.velocity).max() for s in GENERAL])[:, None]
+    error = np.abs(a.velocity - b.velocity) / size
+    assert error[~tied].max() < 4 * LAWS[name].accuracy
+    fine = ~tied & ~failed(a.status)
+    assert fine.sum() >= 3
+    np.testing.assert_array_equal(a.status[fine], b.status[fine])
 
 
-def test_jit_equals_eager_and_vmap_equals_loop(row):
-    _, make, accuracy, _ = row
-    chain, v = SCENES["chain"]()
-    law = make(E, K)
-    one = ji.impact(law, chain, v)
-    jitted = jax.jit(ji.impact)(law, chain, v)
-    np.testing.assert_allclose(jitted.velocity, one.velocity, atol=1e-12)
-    batch = jnp.stack([v, 0.5 * v, jnp.zeros_like(v)])
-    many = jax.jit(jax.vmap(lambda w: ji.impact(law, chain, w)))(batch)
-    for i, w in enumerate(batch):
-        single = ji.impact(law, chain, w)
-        np.testing.assert_allclose(many.velocity[i], single.velocity, atol=max(accuracy, 1e-12))
-        assert int(many.status[i]) == int(single.status)
+@each_law
+def test_decoupled_contacts_are_solved_as_if_alone(name):
+    """Two pairs of balls in one scene, and each with another pair that separates."""
+    pairs = np.array([[-1, 0], [1, 0], [0, -1], [0, 1.0]])
+    mass = np.diag([1, 2, 3, 0.5])
+
+    def state(v):
+        full = np.zeros((4, 3))
+        full[:, :2] = pairs
+        full[:, 2] = [0, 1, 0, 0]  # far away
+        return State(mass, full, v, e=[0.9, 0.3, 0.5], k=[1, 5, 1.0], gaps=[0, 0, 1e3])
+
+    both, first = state([1, -0.5, 1, 0]), state([1, -0.5, 0, 1])
+    second = state([0, 1, 1, 0])
+    out, _ = programs.values(name)([both, first, second])
+    if name == "compliant":  # the second coordinate reaches its far contact one day
+        return
+    np.testing.assert_allclose(
+        out.velocity[0, :2], out.velocity[1, :2], atol=4 * LAWS[name].accuracy
+    )
+    np.testing.assert_allclose(
+        out.velocity[0, 2:], out.velocity[2, 2:], atol=4 * LAWS[name].accuracy
+    )
 
 
-def test_dtype_is_kept(row):
-    _, make, _, _ = row
-    scene = SCENES["chain"]()
-    single = jax.tree.map(lambda x: x.astype(jnp.float32), (make(E, K), *scene))
-    out = ji.impact(*single)
-    assert {x.dtype for x in jax.tree.leaves(out)} == {jnp.dtype("float32"), jnp.dtype("int32")}
-    double = ji.impact(make(E, K), *scene)
-    np.testing.assert_allclose(out.velocity, double.velocity, atol=5e-3)
+@each_law
+def test_one_bad_lane_stays_alone(name):
+    nan = chain([1, 1, 1], [np.nan, 0, 0])
+    bad = chain([1, 1, 1], [1, 0, 0], e=np.nan)
+    good = GENERAL[16]
+    out, _ = programs.values(name)([nan, good, bad])
+    alone, _ = programs.values(name)([good])
+    assert programs.names(out.status)[0] == "not_finite"
+    assert failed(out.status).tolist() == [True, failed(alone.status[0]), True]
+    np.testing.assert_array_equal(out.velocity[1], alone.velocity[0])
+    with pytest.raises(RuntimeError, match=r"not_finite: .*at 0"):
+        ji.raise_on_failure(out)
 
 
-def test_forward_equals_reverse(row):
-    _, make, _, _ = row
-    chain, v = SCENES["chain"]()
+SMOOTH = [
+    chain([1.0, 2.0, 1.5, 0.7], [1.0, 0.4, 0.1, -0.6], e=[0.9, 0.7, 0.8], k=[1, 2.5, 0.7], eta=1.4),
+    chain([3.0, 1.0, 2.0], [1.0, 0.2, -0.5], e=[0.95, 0.6], k=[1, 3.0], eta=[1.5, 1.3]),
+    chain([1.0, 2.0], [1.0, 0.3], True, e=[0.9, 0.8], k=[1.0, 1.4], eta=1.6),
+    State(
+        np.array([[2, 0.3], [0.3, 1]]),
+        np.array([[1, 0.2], [-0.3, 0.9]]),
+        [-1, -0.6],
+        e=[0.9, 0.6],
+        k=[1, 2.5],
+    ),
+]
+STEP = 4e-3  # of differences of fourth order, relative
 
-    def f(e, k, m, v):
-        return ji.impact(make(e, k), ji.chain(m), v).velocity
 
-    args = (E, K, chain.mass, v)
-    forward = jax.jit(jax.jacfwd(f, argnums=(0, 1, 2, 3)))(*args)
-    reverse = jax.jit(jax.jacrev(f, argnums=(0, 1, 2, 3)))(*args)
+@each_law
+def test_derivatives(name):
+    """Forward equals reverse, and both are the slope of the values."""
+    states = SMOOTH
+    if name == "poisson":
+        states = [dataclasses.replace(s, e=np.max(s.e)) for s in SMOOTH]
+    forward, reverse = programs.derivatives(name)(states)[:2]
     for a, b in zip(forward, reverse):
-        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-11)
-        assert np.isfinite(np.asarray(a)).all()
+        np.testing.assert_allclose(a, b, rtol=0, atol=LAWS[name].slope * (1 + np.abs(a).max()))
+        assert np.isfinite(a).all()
+    rng = np.random.default_rng(3)
+    moved, along = [], []
+    for state in states:
+        n, m = state.size
+        eta = np.broadcast_to(np.asarray(state.eta, float), m)
+        e, k = (np.broadcast_to(np.asarray(x, float), m) for x in (state.e, state.k))
+        way = [rng.uniform(-1, 1, x) for x in (n, m, m, m)]
+        way[1] = -np.abs(way[1])
+        along.append(way)
+        for step in (2 * STEP, STEP, -STEP, -2 * STEP):
+            moved.append(
+                dataclasses.replace(
+                    state,
+                    velocity=np.asarray(state.velocity) + step * way[0],
+                    e=e + step * way[1],
+                    k=k * (1 + step * way[2]),
+                    eta=eta + step * way[3],
+                )
+            )
+    out, _ = programs.values(name)(moved)
+    f = out.velocity.reshape(len(states), 4, 4)
+    slope = (-f[:, 0] + 8 * f[:, 1] - 8 * f[:, 2] + f[:, 3]) / (12 * STEP)
+    for i, (state, way) in enumerate(zip(states, along)):
+        n, m = state.size
+        way[2] = way[2] * np.broadcast_to(np.asarray(state.k, float), m)
+        found = sum(forward[j][i][:, : len(w)] @ w for j, w in enumerate(way))  # by v, e, k, eta
+        np.testing.assert_allclose(found[:n], slope[i, :n], rtol=0, atol=1e-6)
 
 
-def test_gradient_is_that_of_the_value(row):
-    """At a generic state, against differences of the value; both laws' tables say how close."""
-    _, make, accuracy, slope_accuracy = row
-    chain, v = SCENES["chain"]()
+def test_a_law_is_a_pytree_and_its_gradient_a_law():
+    law = ji.Moreau(jnp.array([0.9, 0.6]))
+    balls, v = ji.chain(jnp.array([1.0, 2.0, 0.7])), jnp.array([1.0, 0.1, -0.4])
+    gradient = jax.grad(lambda law: ji.impact(law, balls, v).velocity[1])(law)
+    assert type(gradient) is type(law)
+    for make in (row.make for row in LAWS.values()):
+        law = make(*jnp.full((4, 3), 0.5).at[2].set(1.5))
+        batch = jax.tree.map(lambda x: jnp.stack([x, x]), law)
+        assert type(batch) is type(law)
+        assert jax.tree.structure(batch) == jax.tree.structure(law)
+
+
+def test_every_registered_law_has_a_row():
+    assert {row.registered for row in LAWS.values()} == set(ji.REGISTRY)
+    for entry in ji.REGISTRY.values():
+        assert entry.promises <= {
+            "impulse_sign",
+            "gap_velocity_sign",
+            "energy",
+            "velocity_scaling",
+            "mass_scaling",
+        }
+        for words in (entry.summary, entry.right_when, entry.fails_when, entry.source):
+            assert words
+        assert entry.bibtex.count("{") == entry.bibtex.count("}") > 3
+
+
+# ------------------------------------------------------------------------------- wrong laws
+
+
+WRONG = {
+    "right": lambda p, gamma, e: p,
+    "sign": lambda p, gamma, e: -p,
+    "energy": lambda p, gamma, e: p * (1 + 2 * e) / (1 + e),
+    "too little": lambda p, gamma, e: 0.5 * p,
+    "not homogeneous": lambda p, gamma, e: p / (1 + jnp.max(jnp.abs(gamma))),
+}
+
+
+@pytest.fixture(scope="module")
+def wrong():
+    """`wrong(kind)(states)`: Moreau's impulses, spoilt in one of the ways above."""
 
     @jax.jit
-    def f(e):
-        return ji.impact(make(jnp.stack([e, e]), K), chain, v).velocity
+    @jax.vmap
+    def program(kind, mass, normals, gaps, v, e, k, eta, stored):
+        scene = ji.Scene(mass, normals, gaps=gaps)
+        out = ji.impact(ji.Moreau(e), scene, v)
+        p = jax.lax.switch(kind, [*WRONG.values()], out.impulse, ji.gap_velocity(scene, v), e)
+        after = v + ji.velocity_change(scene, p)
+        energy = ji.kinetic_energy(scene, after) - ji.kinetic_energy(scene, v)
+        wrong = dataclasses.replace(out, velocity=after, impulse=p, energy_change=energy)
+        return wrong, ji.audit(scene, v, wrong)
 
-    step = max(1e-4, 3 * accuracy ** (1 / 3))
-    slope = (f(0.8 + step) - f(0.8 - step)) / (2 * step)
-    allowed = slope_accuracy + 5 * step**2 + 2 * accuracy / step
-    np.testing.assert_allclose(jax.jacfwd(f)(0.8), slope, atol=allowed)
+    def of(kind):
+        def run(states):
+            columns = [np.stack(column) for column in zip(*map(programs.padded, states))]
+            at = np.full(len(states), [*WRONG].index(kind))
+            return jax.tree.map(np.asarray, program(at, *columns))
 
+        return run
 
-def test_law_is_a_pytree_and_its_gradient_a_law(row):
-    _, make, _, _ = row
-    chain, v = SCENES["chain"]()
-    law = make(E, K)
-    gradient = jax.grad(lambda law: ji.impact(law, chain, v).velocity[1])(law)
-    assert type(gradient) is type(law)
-    shapes = [jax.tree.map(jnp.shape, jax.tree.leaves(tree)) for tree in (gradient, law)]
-    assert shapes[0] == shapes[1]
-    batch = jax.vmap(lambda e: make(e, K))(jnp.stack([E, 0.5 * E]))
-    assert all(len(x) == 2 for x in jax.tree.leaves(batch))
-
-
-PAIRS = st.floats(0, 1, width=32)
-SPEEDS = st.floats(-1e6, 1e6, width=32)
-HARD = st.floats(-6, 6)
+    return of
 
 
-@settings(max_examples=60, deadline=None, derandomize=True)
-@given(
-    e=st.tuples(PAIRS, PAIRS),
-    logk=st.tuples(HARD, HARD),
-    logm=st.tuples(HARD, HARD, HARD),
-    v=st.tuples(SPEEDS, SPEEDS, SPEEDS),
-)
-@pytest.mark.parametrize(
-    "name",
-    [
-        "newton",
-        "moreau",
-        "poisson",
-        "restitution-matrix",
-        "binary-fastest",
-        pytest.param("lzb-hertz", marks=pytest.mark.slow),
-    ],
-)
-def test_extreme_input_is_right_or_flagged(name, e, logk, logm, v):
-    make = LAWS[name][1]
-    law = make(jnp.array(e), 10.0 ** jnp.array(logk))
-    chain, v = ji.chain(10.0 ** jnp.array(logm)), jnp.array(v)
-    out = ji.impact(law, chain, v)
-    if failed(out):
+@pytest.mark.parametrize("kind", WRONG)
+def test_wrong_laws_are_caught(wrong, kind):
+    """Held to what `lzb` promises; chains that only approach, with one e, are right by Moreau."""
+    states = [dataclasses.replace(s, e=0.8) for s in GENERAL[16:]]
+    states = [s for s in states if (s.normals.T @ s.velocity <= 0).all()]
+    assert len(states) > 2
+    if kind == "right":
+        check_promises(wrong(kind), ji.REGISTRY["lzb"], 1e-7, states)
         return
-    assert np.isfinite(out.velocity).all()
-    found = ji.audit(chain, v, out)
-    assert bool(found.kinetic)
-    assert bool(found.energetic)
-    assert bool(found.kinematic)
-    momentum = ji.momentum(chain, v)
-    scale = float(jnp.abs(momentum).sum() + jnp.abs(ji.momentum(chain, out.velocity)).sum())
-    lost = float(jnp.sum(ji.momentum(chain, out.velocity) - momentum))
-    assert abs(lost) <= 1e-9 * scale + 1e-300
+    with pytest.raises(AssertionError):
+        check_promises(wrong(kind), ji.REGISTRY["lzb"], 1e-7, states)

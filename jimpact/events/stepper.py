@@ -232,11 +232,14 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     dipped = turns & (low < DOUBT * (d1 - d0) - snap)
     at_once = (c0 <= snap) & (d0 <= 0)
     direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > snap))
-    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & ~lands
+    # ahead by a parabola: a margin that only creeps towards 0 is not about to reach it
+    left = d1 * d1 - 2 * (d1 - d0) * c1
+    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
+    soon = 2 * c1 / (jnp.sqrt(jnp.where(ahead, left, 1.0)) - jnp.where(ahead, d1, 0.0))
     at = jnp.where(
         crossed,
         jnp.where(direct & (again == 0), jnp.where(at_once, 0.0, u), u - 2),
-        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + u, jnp.inf)),
+        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + soon, jnp.inf)),
     )
     at = at + TIE * jnp.arange(c0.shape[0], dtype=dtype)[:, None]
     first = jnp.min(at, axis=0, keepdims=True)

@@ -1,0 +1,162 @@
+"""README, docs, docstrings and notebooks run as printed; all in one process, which shares programs."""
+
+import doctest
+import importlib
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jupytext
+import matplotlib.pyplot as plt
+import nbclient
+import nbformat
+import pytest
+
+import jimpact as ji
+
+ROOT = Path(__file__).parent.parent
+DOCS = sorted((ROOT / "docs").glob("*.md"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+MODULES = ["jimpact", *(m.name for m in pkgutil.walk_packages(ji.__path__, "jimpact."))]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def examples(name):
+    """Examples of a module that has some, as one doctest."""
+    module = importlib.import_module(name)
+    found = doctest.DocTestFinder(exclude_empty=True).find(module, name)
+    return [test for test in found if test.examples]
+
+
+WITH_EXAMPLES = [name for name in MODULES if ">>>" in Path(
+    importlib.util.find_spec(name).origin
+).read_text(encoding="utf-8")]  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def as_a_user_runs_them(tmp_path, monkeypatch):
+    """x64, JAX's own promotion rules, a folder of one's own."""
+    monkeypatch.chdir(tmp_path)
+    laws = dict(ji.REGISTRY)  # examples register laws of their own
+    jax.config.update("jax_numpy_rank_promotion", "allow")
+    jax.config.update("jax_numpy_dtype_promotion", "standard")
+    yield
+    plt.close("all")
+    ji.REGISTRY.clear()
+    ji.REGISTRY.update(laws)
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.mark.parametrize("module", WITH_EXAMPLES)
+def test_docstrings_run(module):
+    runner = doctest.DocTestRunner(optionflags=OPTIONS)
+    tests = examples(module)
+    assert tests
+    for test in tests:
+        runner.run(test)
+    assert runner.summarize(verbose=False).failed == 0
+
+
+def test_readme_runs():
+    done = doctest.testfile(str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS)
+    assert done.attempted > 10
+    assert done.failed == 0
+    assert len(README.splitlines()) <= 150
+
+
+def code_of(path):
+    """Python code of a page: fenced blocks, those with prompts by doctest."""
+    text = path.read_text(encoding="utf-8")
+    blocks = re.findall(r"```python\n(.*?)```", text, re.S)
+    return [block for block in blocks if ">>>" not in block], ">>>" in text
+
+
+@pytest.mark.parametrize("path", [p for p in DOCS if any(code_of(p))], ids=lambda p: p.stem)
+def test_docs_run(path):
+    blocks, prompts = code_of(path)
+    space = {}
+    for block in blocks:
+        exec(compile(block, str(path), "exec"), space)
+    if prompts:
+        done = doctest.testfile(str(path), module_relative=False, optionflags=OPTIONS)
+        assert done.attempted > 0
+        assert done.failed == 0
+
+
+def test_docs_name_what_exists():
+    """Every `ji.name` of the texts is a public name; every path a file."""
+    for path in [ROOT / "README.md", *DOCS]:
+        text = path.read_text(encoding="utf-8")
+        for name in set(re.findall(r"\bji\.([A-Za-z_]\w*)", text)):
+            assert hasattr(ji, name), (path.name, name)
+        for name in set(re.findall(r"\]\(((?!http)[^)#]+)\)", text)):
+            assert (path.parent / name).exists(), (path.name, name)
+
+
+def test_every_law_is_in_the_readme_as_in_the_registry():
+    for row in ji.REGISTRY.values():
+        assert f"| `{row.law.__name__}` | {row.right_when} | {row.fails_when} |" in README
+
+
+def test_public_names():
+    """Functions and classes with an example or a record's fields; no module in a name's place."""
+    without = []
+    for name in ji.__all__:
+        value = getattr(ji, name)
+        assert type(value).__name__ != "module" or name in ("plot", "theory"), name
+        if callable(value) and not (value.__doc__ or "").strip():
+            without.append(name)
+    assert not without
+    functions = [x for x in map(ji.__dict__.get, ji.__all__) if type(x).__name__ == "function"]
+    bare = [x.__name__ for x in functions if ">>>" not in (x.__doc__ or "")]
+    assert not bare, bare
+    with pytest.raises(AttributeError, match="no attribute 'Lzb'"):
+        _ = ji.Lzb
+
+
+def run_python(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+
+def test_import_sets_nothing_and_is_lazy():
+    code = (
+        "import sys, jimpact; assert 'jax' not in sys.modules; import jax;"
+        "before = jax.config.jax_enable_x64; jimpact.LZB, jimpact.fit, jimpact.history;"
+        "assert jax.config.jax_enable_x64 == before == False; print('ok')"
+    )
+    assert run_python(code).stdout.strip() == "ok"
+
+
+# -------------------------------------------------------------------------------- notebooks
+
+
+def code_and_text(notebook):
+    return [(cell.cell_type, cell.source.strip()) for cell in notebook.cells]
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_and_script_agree(path):
+    notebook = nbformat.read(path, as_version=4)
+    assert code_and_text(notebook) == code_and_text(jupytext.read(path.with_suffix(".py")))
+    outputs = [o for cell in notebook.cells for o in cell.get("outputs", [])]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+    assert not any(output.output_type == "error" for output in outputs)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebook_runs(path, tmp_path):
+    notebook = nbformat.read(path, as_version=4)
+    place = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=place).execute()
+
+
+def test_every_script_has_its_notebook():
+    scripts = sorted((ROOT / "notebooks").glob("*.py"))
+    assert [path.stem for path in NOTEBOOKS] == [path.stem for path in scripts]
+    assert NOTEBOOKS

@@ -1,0 +1,297 @@
+"""Scenes and bodies: contact space, kinetic angles, gaps and tangents against mechanics; statuses."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import programs
+import pytest
+import reference
+
+import jimpact as ji
+
+
+def dense(matrix):
+    return np.asarray(matrix.as_matrix() if hasattr(matrix, "as_matrix") else matrix)
+
+
+def dense_mass(scene):
+    mass = np.asarray(scene.mass)
+    return np.diag(mass) if mass.ndim == 1 else mass
+
+
+@pytest.mark.parametrize("wall", [False, True, "left", "right", "both"])
+def test_chain_is_the_dense_scene(wall):
+    masses, v = [1.0, 2.0, 3.0, 0.5], np.array([1.0, -2.0, 0.5, 0.3])
+    chain = ji.chain(masses, wall=wall)
+    mass, normals = reference.chain_matrices(masses, wall)
+    np.testing.assert_array_equal(chain.normals, normals)
+    assert chain.contacts == normals.shape[1]
+    p = np.linspace(0.1, 1.0, chain.contacts)
+    w = normals.T @ np.linalg.solve(mass, normals)
+    np.testing.assert_allclose(dense(ji.delassus_matrix(chain)), w, atol=1e-14)
+    np.testing.assert_allclose(ji.delassus_matrix(chain) @ p, w @ p, atol=1e-14)
+    np.testing.assert_allclose(ji.gap_velocity(chain, v), normals.T @ v)
+    np.testing.assert_allclose(ji.velocity_change(chain, p), np.linalg.solve(mass, normals @ p))
+    np.testing.assert_allclose(ji.kinetic_energy(chain, v), 0.5 * v @ mass @ v)
+    np.testing.assert_allclose(ji.momentum(chain, v), mass @ v)
+    np.testing.assert_allclose(dense(ji.delassus_matrix(ji.Scene(mass, normals))), w, atol=1e-14)
+    if wall == "right":
+        np.testing.assert_array_equal(ji.column(masses).normals, normals)
+
+
+def test_normalized_quantities_and_kinetic_angles():
+    chain = ji.chain([1.0, 2.0, 3.0])
+    assert dense(ji.normalized_delassus(chain))[0, 1] == pytest.approx(-1 / 5**0.5, abs=1e-15)
+    assert float(ji.kinetic_angles(chain)[0, 1]) == pytest.approx(1.1071487177940905, abs=1e-14)
+    qn = ji.normalized_gap_velocity(ji.chain([2.0] * 4), [0.3, -0.2, 0.5, 0.7])
+    np.testing.assert_allclose(qn, [-0.5, 0.7, 0.2], atol=1e-15)
+
+
+def test_constraints_reduce_and_distort():
+    """(6.35): the Schur complement of G over the constraints; welded balls are one."""
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=(5, 5))
+    mass, normals, h = x @ x.T + np.eye(5), rng.normal(size=(5, 2)), rng.normal(size=(5, 2))
+    every = np.hstack([h, normals])
+    free = every.T @ np.linalg.solve(mass, every)
+    free = free / np.sqrt(np.outer(np.diag(free), np.diag(free)))
+    bb, bu, uu = free[:2, :2], free[:2, 2:], free[2:, 2:]
+    g = ji.normalized_delassus(ji.Scene(mass, normals, constraints=h))
+    np.testing.assert_allclose(g, uu - bu.T @ np.linalg.solve(bb, bu), atol=1e-12)
+    assert (np.diag(g) < 1).all()
+
+
+@pytest.mark.parametrize("name", ["newton", "poisson", "binary", "lzb"])
+def test_welded_bodies_are_one(name):
+    """Four balls, the middle two welded together: three balls, in every kind of law."""
+    welded = jnp.array([[0.0], [-1], [1], [0]])
+    normals = jnp.array([[-1.0, 0], [1, 0], [0, -1], [0, 1]])
+    make = programs.LAWS[name].make
+
+    @jax.jit
+    def out(v, e, k):
+        law = make(e, k, jnp.full(2, 1.5), jnp.zeros(2))
+        scene = ji.Scene(jnp.array([1.0, 2.0, 0.5, 0.7]), normals, constraints=welded)
+        return ji.impact(law, scene, v), ji.audit(scene, v, ji.impact(law, scene, v)).momentum
+
+    e, k = np.array([0.9, 0.6]), np.array([1.0, 2.5])
+    got, momentum = out(np.array([1.0, 0.1, 0.1, -0.4]), e, k)
+    same, _ = programs.values(name)([programs.chain([1, 2.5, 0.7], [1, 0.1, -0.4], e=e, k=k)])
+    np.testing.assert_allclose(np.asarray(got.velocity)[[0, 1, 3]], same.velocity[0, :3], atol=2e-8)
+    np.testing.assert_allclose(got.velocity[1], got.velocity[2], atol=1e-13)
+    np.testing.assert_allclose(got.impulse, same.impulse[0, :2], atol=4e-8)
+    assert bool(momentum)
+
+
+# ---------------------------------------------------------------------------- kinetic angles
+
+BLOCKS = {  # aspect: kinetic angle, 40-digit values
+    1e-9: np.pi / 3,
+    0.5: 1.14640661820171004,
+    1.0: 1.36943840600456583,
+    np.sqrt(2.0): np.pi / 2,
+    2.0: 1.82347658193697527,
+    3.0: 2.13940662705907887,
+}
+DIMERS = {0.0: 1.44546849562683122, 5 / 24: 1.42420445174657522, 1e12: 1.53630673083321779}
+
+
+def test_kinetic_angles_of_bodies():
+    @jax.jit
+    def angles(aspects, ratios):
+        block = jax.vmap(lambda a: ji.kinetic_angles(ji.rocking_block(2.0, 2 * a, 3.0))[0, 1])
+        dimer = jax.vmap(lambda r: ji.kinetic_angles(ji.dimer(2 * r, 2.0))[0, 1])
+        cosine = jax.grad(lambda r: ji.normalized_delassus(ji.dimer(r, 1.0))[0, 1])
+        return block(aspects), dimer(ratios), jax.vmap(cosine)(jnp.array([0.2, 5 / 24, 0.22]))
+
+    block, dimer, slope = angles(np.array([*BLOCKS]), np.array([*DIMERS]))
+    np.testing.assert_allclose(block, [*BLOCKS.values()], atol=1e-10)
+    np.testing.assert_allclose(dimer, [*DIMERS.values()], atol=1e-10)
+    # least angle at R / L = 5/24: the slope vanishes and rises
+    assert abs(float(slope[1])) < 1e-12
+    assert float(slope[0]) < -1e-3 < 1e-3 < float(slope[2])
+    for angle in (0.1, 1.2, 3.0):
+        found = float(ji.kinetic_angles(ji.corner(angle, mass=2.0))[0, 1])
+        assert found == pytest.approx(angle, abs=1e-14)
+    phi, masses, m0 = np.array([0.3, 1.9, -2.0]), np.array([0.5, 0.7, 2.0]), 1.5
+    disk = ji.disk_balls(phi, masses, m0, disk_radius=0.3, ball_radius=[0.1, 0.2, 0.1])
+    g = np.cos(phi[:, None] - phi) / np.sqrt((1 + m0 / masses)[:, None] * (1 + m0 / masses))
+    away = ~np.eye(3, dtype=bool)
+    np.testing.assert_allclose(dense(ji.normalized_delassus(disk))[away], g[away], atol=1e-14)
+
+
+def test_scene_from_gaps_is_the_block():
+    width, height = 1.0, 2.0
+
+    def gaps(q):  # q = (x, y, theta): corners of a block on the ground
+        _, y, t = q
+        return jnp.stack(
+            [y - height / 2 * jnp.cos(t) + s * width / 2 * jnp.sin(t) for s in (1.0, -1.0)]
+        )
+
+    def mass(q):
+        return jnp.diag(jnp.array([1.0, 1.0, (width**2 + height**2) / 12])) + 0 * q[0]
+
+    scene = ji.scene_from_gaps(gaps, mass, [0.0, height / 2, 0.0])
+    np.testing.assert_allclose(scene.normals, ji.rocking_block(width, height).normals, atol=1e-15)
+    assert not np.asarray(scene.gaps).any()
+    lifted = ji.scene_from_gaps(gaps, mass, [0.0, height / 2 + 1e-3, 0.0])
+    np.testing.assert_allclose(lifted.gaps, 1e-3, rtol=1e-9)
+    with pytest.raises(ValueError, match="penetration"):
+        ji.scene_from_gaps(gaps, mass, [0.0, 0.4 * height, 0.0])
+    slope = jax.grad(
+        lambda t: ji.scene_from_gaps(gaps, mass, jnp.stack([0.0, 1.2, t])).normals[2, 0]
+    )(0.1)
+    assert float(slope) == pytest.approx(height / 2 * np.cos(0.1) - width / 2 * np.sin(0.1))
+
+
+# ---------------------------------------------------------------- gaps and tangents of bodies
+
+
+def test_block_away_from_rest():
+    """Equation of moments: each corner's lever arms, at an angle."""
+    width, height, angle = 1.5, 2.0, 0.3
+    scene = ji.rocking_block(width, height, mass=2.0, angle=angle)
+    s, c = np.sin(angle), np.cos(angle)
+    np.testing.assert_allclose(scene.gaps, [width * s, 0.0], atol=1e-15)
+    normals = [[0, 0], [1, 1], [height / 2 * s + width / 2 * c, height / 2 * s - width / 2 * c]]
+    tangents = [[1, 1], [0, 0], [height / 2 * c - width / 2 * s, height / 2 * c + width / 2 * s]]
+    np.testing.assert_allclose(scene.normals, normals, atol=1e-15)
+    np.testing.assert_allclose(scene.tangents, tangents, atol=1e-15)
+    np.testing.assert_allclose(scene.mass, [2.0, 2.0, 2 * (4 + 2.25) / 12])
+    left = ji.rocking_block(width, height, angle=-angle)
+    np.testing.assert_allclose(left.gaps, [0.0, width * s], atol=1e-15)
+    assert float(ji.rocking_block(1.0, 1.0, inertia=0.7).mass[2]) == 0.7
+
+
+def test_dimer_tangents_are_the_slip_of_the_lowest_points():
+    radius, length, angle = 0.3, 1.1, 0.4
+    scene = ji.dimer(radius, length, sphere_mass=2.0, rod_mass=0.5, angle=angle)
+    arm = length / 2 + radius
+    for contact, side in enumerate((arm, -arm)):
+        lever = np.array([side * np.cos(angle), side * np.sin(angle) - radius])
+        slip = np.array([1.0, 0.0, -lever[1]])  # v + omega x lever, along x
+        np.testing.assert_allclose(scene.tangents[:, contact], slip, atol=1e-14)
+        np.testing.assert_allclose(scene.normals[:, contact], [0, 1, lever[0]], atol=1e-14)
+    inertia = 2 * 2.0 * (0.4 * radius**2 + arm**2) + 0.5 * length**2 / 12
+    np.testing.assert_allclose(scene.mass, [4.5, 4.5, inertia])
+
+
+def test_dimer_in_space():
+    """M and H_t against rigid-body mechanics: angular velocity from the rates of the angles."""
+    pitch, yaw, radius, length = 0.4, 1.1, 0.3, 1.1
+    scene = ji.dimer_3d(radius, length, sphere_mass=2.0, rod_mass=0.5, angle=pitch, yaw=yaw)
+    axis = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
+    up = np.array([0.0, 0.0, 1.0])
+    across = np.array([np.sin(yaw), -np.cos(yaw), 0.0])  # about it a positive pitch rate turns
+    turning = np.stack([up, across, axis], axis=1)
+    arm, about = length / 2 + radius, 0.8 * 2.0 * radius**2
+    planar = 2 * 2.0 * (0.4 * radius**2 + arm**2) + 0.5 * length**2 / 12
+    inertia = planar * (np.eye(3) - np.outer(axis, axis)) + about * np.outer(axis, axis)
+    expected = np.zeros((6, 6))
+    expected[:3, :3], expected[3:, 3:] = 4.5 * np.eye(3), turning.T @ inertia @ turning
+    np.testing.assert_allclose(dense_mass(scene), expected, atol=1e-13)
+    for contact, side in enumerate((arm, -arm)):
+        lever = side * axis - radius * up
+        velocity = np.concatenate([np.eye(3), np.cross(turning.T, lever).T], axis=1)
+        np.testing.assert_allclose(scene.normals[:, contact], velocity[2], atol=1e-14)
+        own = scene.tangents[:, 2 * contact : 2 * contact + 2]
+        np.testing.assert_allclose(own, velocity[:2].T, atol=1e-14)
+    np.testing.assert_allclose(scene.gaps, [2 * arm * np.sin(pitch), 0.0], atol=1e-14)
+
+
+def test_bodies_that_are_chains():
+    """Balls around a disk, pendulums at rest."""
+    scene, chain = ji.disk_balls([np.pi, 0.0], [1.0, 3.0], 2.0), ji.chain([1.0, 2.0, 3.0])
+    w = dense(ji.delassus_matrix(chain))
+    np.testing.assert_allclose(dense(ji.delassus_matrix(scene)), w, atol=1e-14)
+    off = ji.disk_balls([np.pi, 0.0], gaps=[0.0, 0.25])
+    np.testing.assert_allclose(off.gaps, [0.0, 0.25], atol=1e-12)
+    assert np.asarray(off.closed).tolist() == [True, False]
+    scene = ji.pendulum_cradle([1.0, 2.0, 3.0], 0.3, radius=0.02)
+    np.testing.assert_allclose(scene.normals, 0.3 * chain.normals, atol=1e-15)
+    np.testing.assert_allclose(dense(ji.delassus_matrix(scene)), w, atol=1e-13)
+
+
+def test_cradle_gaps():
+    length, radius, gaps = 0.4, jnp.array([0.02, 0.03, 0.02]), [0.0, 1e-3]
+    cradle = ji.PendulumCradle([1.0, 1.0, 1.0], length, radius, gaps)
+    np.testing.assert_allclose(cradle.gap_function(jnp.zeros(3)), gaps, atol=1e-17)
+    q = jnp.array([-0.7, 0.1, 0.4])
+    at = np.array([0.0, 0.05, 0.101]) + length * np.sin(q)
+    apart = np.hypot(np.diff(at), np.diff(length * np.cos(q))) - [0.05, 0.05]
+    np.testing.assert_allclose(cradle.gap_function(q), apart, atol=1e-15)
+    with pytest.raises(ValueError, match="penetration"):
+        cradle.scene([0.2, 0.0, 0.0])
+
+
+def test_scenes_are_differentiable_in_their_arguments():
+    """d/d(width, height, angle) of an impact on a tilted block, against differences."""
+
+    def outcome(x):
+        scene = ji.rocking_block(x[0], x[1], 1.3, angle=x[2])
+        return ji.impact(ji.Moreau(0.5), scene, jnp.array([0.3, -1.0, 0.2])).velocity[2]
+
+    x, step = jnp.array([1.0, 1.7, 0.2]), 1e-6 * jnp.eye(3)
+    moved = jnp.concatenate([x[None] + step, x[None] - step])
+    slope, values = jax.jit(lambda x, y: (jax.grad(outcome)(x), jax.vmap(outcome)(y)))(x, moved)
+    np.testing.assert_allclose(slope, (values[:3] - values[3:]) / 2e-6, rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["newton", "moreau", "poisson", "binary", "lzb"])
+def test_float32_is_kept(name):
+    """Scene, law and velocities in single precision; mixed with Python numbers and with float64."""
+    f = np.float32
+    scene = jax.tree.map(lambda x: jnp.asarray(x, f), ji.chain([1.0, 2.0, 0.7]))
+    law = programs.LAWS[name].make(*(jnp.full(2, x, f) for x in (0.9, 1.0, 1.5, 0.0)))
+    out = ji.impact(law, scene, jnp.array([1.0, 0.1, -0.4], f))
+    assert {x.dtype for x in jax.tree.leaves(out)} == {np.dtype(f), np.dtype(np.int32)}
+    full, _ = programs.values(name)([programs.chain([1, 2, 0.7], [1, 0.1, -0.4], e=0.9)])
+    np.testing.assert_allclose(out.velocity, full.velocity[0, :3], atol=1e-4)
+    assert programs.names(out.status) == programs.names(full.status)
+
+
+# -------------------------------------------------------------------------------- in words
+
+
+@pytest.fixture(scope="module")
+def three():
+    scene, v = ji.chain([1.0] * 3), jnp.array([1.0, 0.0, 0.0])
+    return scene, v, ji.impact(ji.Moreau(0.9), scene, v)
+
+
+def test_audit_reads_measured_outcomes(three):
+    import dataclasses
+
+    scene, v, out = three
+    measured = dataclasses.replace(out, velocity=jnp.array([-0.0605, 0.1049, 0.9978]))
+    found = ji.audit(scene, v, measured)
+    assert not bool(found.momentum)
+    assert not bool(found.energetic)
+    assert not bool(found.consistent)
+    assert bool(ji.audit(scene, v, out).consistent)
+
+
+def test_summary_speaks(three):
+    import dataclasses
+
+    scene, v, out = three
+    text = ji.summary(out, scene, v)
+    kept = 100 * float(ji.kinetic_energy(scene, out.velocity)) / 0.5
+    assert f"{kept:.1f} % kept" in text
+    assert text.count("ok") >= 5
+    bad = dataclasses.replace(out, status=jnp.asarray(len(ji.STATUS) - 1, jnp.int32))
+    assert ji.STATUS[-1].name in ji.summary(bad, scene, v)
+    gapped = ji.chain([1.0] * 3, gaps=[0.0, 1e-3])
+    assert "open" in ji.summary(out, gapped, v)
+
+
+def test_statuses_go_from_mild_to_grave():
+    told = [row.name for row in ji.STATUS]
+    assert told[0] == "ok"
+    assert len(set(told)) == len(told)
+    failures = [row.failure for row in ji.STATUS]
+    assert failures == sorted(failures)
+    wanted = "max_steps not_finite infeasible inadmissible_velocity negative_impulse energy_gain"
+    wanted += " impulse_not_unique order_dependent plastic_limit several_outcomes"
+    assert set(wanted.split()) <= set(told)

@@ -1,0 +1,41 @@
+"""Every row of `docs/validation.md`, computed and compared; the page is what the rows give."""
+
+import re
+
+import page
+import pytest
+from rows import CASES
+
+TEXT = page.PAGE.read_text(encoding="utf-8") if page.PAGE.exists() else ""
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.rows.__name__)
+def test_numbers_by_others(case):
+    rows = case.rows()
+    assert rows
+    wrong = [row for row in rows if not row.error <= row.allowed]
+    assert not wrong, wrong
+    # the committed page: the same words, digits and sources; errors to within a power of ten
+    told = re.search(rf"## {re.escape(case.title)}\n.*?(?=\n## |\Z)", TEXT, re.S)
+    assert told, f"docs/validation.md lacks {case.title!r}: run python tests/validation/page.py"
+    written = told.group().strip().splitlines()
+    given = "\n".join(page.lines(case, rows)).strip().splitlines()
+    assert len(written) == len(given)
+    for a, b in zip(written, given):
+        if a == b:
+            continue
+        *first, ours, error, _ = a.split("|")
+        *second, ours_now, error_now, _ = b.split("|")
+        assert first == second
+        digits = len(ours.split(".")[-1].strip())
+        assert abs(float(ours) - float(ours_now)) <= 10 * 10.0**-digits
+        assert exponent(error_now) <= exponent(error) + 1
+
+
+def exponent(text):
+    return int(text.split("e")[1]) if "e" in text else -14
+
+
+def test_page_has_nothing_else():
+    assert re.findall(r"^## (.*)$", TEXT, re.M) == [case.title for case in CASES]
+    assert TEXT.startswith(page.HEAD)
