@@ -226,9 +226,10 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
     bottom = jnp.where(crossed, c0 - c1, jnp.where(turns, d1 - d0, -d1))
     u = top / jnp.where(bottom > 0, bottom, jnp.inf)
+    # what rises from 0 and falls back: as in a parabola
+    u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
     if flow.near:
         # steps in time go before: exact in a parabola, where dt/dxi has a singularity at the top
-        u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
         u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
     v = 1 - u
     low = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
