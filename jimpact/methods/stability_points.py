@@ -22,9 +22,9 @@ import numpy as np
 from jimpact._checks import check_values
 from jimpact.audits import audit
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
-from jimpact.numerics import dimensionless
-from jimpact.scene import Scene, chain
+from jimpact.methods.contenders.base import Method, outcome
+from jimpact.methods.contenders.event_aligned import DOP853_ALIGNED
+from jimpact.scene import chain
 from jimpact.status import CODE
 
 AXES = ("setting", "stiffness_ratio", "exponent", "restitution", "mass_ratio", "balls")
@@ -171,24 +171,9 @@ def sample_points(
     return found
 
 
-def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-    """What `ji.impact(ji.LZB(..., rtol=setting), ...)` does."""
-    given = problem(law, scene, velocity, setting)
-    p, code = dimensionless.solve(
-        given.inputs, given.exponent, given.chain, given.max_steps, law.method
-    )
-    unknown = jnp.full((), jnp.nan, p.dtype)
-    return in_si(given, p, unknown, jnp.asarray(-1), code)
-
-
-DEFAULT = Method(
-    name="default",
-    label="jimpact's default",
-    setting="rtol",
-    ladder=(1e-4, 1e-8, 1e-12),
-    jax=True,
-    supports=lzb_only,
-    solve=_solve_default,
+# what `ji.impact(ji.LZB(..., rtol=setting), ...)` does
+DEFAULT = DOP853_ALIGNED._replace(
+    name="default", label="jimpact's default", ladder=(1e-4, 1e-8, 1e-12)
 )
 
 

@@ -30,7 +30,7 @@ METHODS: dict[str, Method] = {
         impulse.RK4,
         fixed_step.RK4,
         fixed_step.VERLET,
-        *event_aligned.METHODS,
+        event_aligned.DOP853_ALIGNED,
         *libraries.DIFFRAX,
         *libraries.SCIPY,
     )
