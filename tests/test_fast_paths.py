@@ -1,7 +1,7 @@
 """What is only faster gives the same: compared with the canonical program of the law.
 
 Canonical is: a dense scene, an array of exponents, padded contacts, one of a batch. Faster are
-numbers for exponents (1, 1.5, 2), tuples, chains, the exact propagator, single impacts; the impulse
+numbers for exponents (1, 1.5, 2), tuples, chains, single impacts; the impulse
 form is another formulation of first order.
 """
 
@@ -94,16 +94,6 @@ def light_and_stiff(count):
             )
         )
     return rows
-
-
-def test_propagator():
-    """Exact where contacts are linear; it sees events that no end of a step shows."""
-    given = light_and_stiff(48)
-    law = lambda e, k, u: ji.LZB(e, k, 1.0, u, method="propagator", max_steps=4000)  # noqa: E731
-    exact, (out, _) = faster(law)(given), programs.values("lzb")(given)
-    ended = ~failed(exact.status) & ~failed(out.status)
-    assert ended.mean() > 0.6, ended.mean()
-    np.testing.assert_allclose(out.velocity[ended], exact.velocity[ended], rtol=0, atol=1e-7)
 
 
 def test_impulse_form():

@@ -81,7 +81,7 @@ def test_gradients_and_the_other_methods():
     linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
     found = ji.work_precision(BALLS, STRIKE, linear, laws={}, batch=8, repeats=1)
     assert not found.left_out
-    assert found.reference.uncertainty["velocity"] < 1e-11
+    assert found.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
     for name, row in found.points.items():
         assert all(point.evaluations > 0 for point in row), name
     assert 1e-9 < found.points["verlet"][-1].error["gradient"] < 0.1

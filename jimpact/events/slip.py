@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.contact_flow import ContactFlow, Frozen, times, unit
+from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, times, unit
 from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.friction import distribute
@@ -324,9 +324,23 @@ class SlipFlow(FrictionFlow):
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
-    def field(  # type: ignore[override]
-        self, const: Reduced, modes: jax.Array, y: jax.Array
-    ) -> jax.Array:
+    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+        m, (x, g, p) = self.contacts, self.rows(y)
+        const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
+        motion = self.motion(const, modes, y)
+        turned = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        return Measured(
+            force=motion.force,
+            indentation=x,
+            impulse=p,
+            gap_velocity=const.frozen.scale * g,
+            tangential_force=motion.sliding + motion.holding,
+            tangential_impulse=y[5 * m : 7 * m],
+            slip=flat(jnp.where(loaded[:, None], turned, q)),
+            rate=const.frozen.unit / motion.haste,
+        )
+
+    def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
         _, g, _ = self.rows(y)
         frozen, motion = const.frozen, self.motion(const, modes, y)
         pull = times(const.coupling, motion.force) + times(const.across, motion.sliding)
@@ -342,9 +356,7 @@ class SlipFlow(FrictionFlow):
         )
         return dy / motion.haste
 
-    def margins(  # type: ignore[override]
-        self, const: Reduced, modes: jax.Array, y: jax.Array
-    ) -> jax.Array:
+    def margins(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Beside those of the normal flow: until slip stops; until stick, or creep, ends."""
         motion, r = self.motion(const, modes, y), self.slip(y)[:, 0]
         stick, slips, creeps = self.sliding(modes)
@@ -369,7 +381,7 @@ class SlipFlow(FrictionFlow):
         loaded, q, slip = self.loaded(modes), self.slip(y), modes[2 * m :]
         cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
         breaks, grows = stick & ended, creeps & ended
-        # a contact breaks loose against the force that held it, and Newton's method does the rest
+        # a contact breaks loose against the force that held it, Newton's method sees to the rest
         const = self.constants(modes)
         f = self.force(const.frozen, *self.rows(y)[:2])
         side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * polar(q[:, 1])[0]

@@ -67,8 +67,8 @@ def work_precision(
         settings: settings by method where its own ladder is not wanted.
         laws: algebraic laws by name, points with their *model* error against LZB on this impact;
             None: Newton, Moreau, Poisson and Binary with the law's restitution.
-        reference: method that errors are measured from, at rtol 1e-14; None: the event-aligned
-            order 8. Its uncertainty is its distance from
+        reference: method that errors are measured from, at rtol 1e-14; None: the
+            event-aligned order 8. Its uncertainty is its distance from
             a second solution: order 8 at 1e-12.
         batch: impacts in a batch. repeats: of every time. gradients: measure them, too.
         progress: bar on stderr; None: on a terminal.

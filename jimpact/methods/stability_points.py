@@ -21,10 +21,10 @@ import numpy as np
 
 from jimpact._checks import check_values
 from jimpact.audits import audit
+from jimpact.events.impact_dynamics import solve
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders.base import Method, outcome
-from jimpact.methods.contenders.event_aligned import DOP853_ALIGNED
-from jimpact.scene import chain
+from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
+from jimpact.scene import Scene, chain
 from jimpact.status import CODE
 
 AXES = ("setting", "stiffness_ratio", "exponent", "restitution", "mass_ratio", "balls")
@@ -171,9 +171,22 @@ def sample_points(
     return found
 
 
-# what `ji.impact(ji.LZB(..., rtol=setting), ...)` does
-DEFAULT = DOP853_ALIGNED._replace(
-    name="default", label="jimpact's default", ladder=(1e-4, 1e-8, 1e-12)
+def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+    """What `ji.impact(ji.LZB(..., rtol=setting), ...)` does."""
+    given = problem(law, scene, velocity, setting)
+    p, _, code = solve(given.dynamics, given.max_steps, law.method)
+    unknown = jnp.full((), jnp.nan, p.dtype)
+    return in_si(given, p / given.units.momentum, unknown, jnp.asarray(-1), code)
+
+
+DEFAULT = Method(
+    name="default",
+    label="jimpact's default",
+    setting="rtol",
+    ladder=(1e-4, 1e-8, 1e-12),
+    jax=True,
+    supports=lzb_only,
+    solve=_solve_default,
 )
 
 

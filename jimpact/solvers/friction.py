@@ -13,7 +13,7 @@ in proportion to mu p, and normal impulses are the least, wherever that is allow
 """
 
 import itertools
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -534,6 +534,9 @@ def _lengths(side: jax.Array, rows: int) -> jax.Array:
     return jnp.sqrt(jnp.sum(side.reshape(-1, rows, *side.shape[1:]) ** 2, axis=1))
 
 
+_Sweep = tuple[jax.Array, jax.Array, jax.Array]  # forces, whether they move, count
+
+
 def distribute(
     matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -552,13 +555,12 @@ def distribute(
     def slip(side: jax.Array) -> jax.Array:
         return sum(matrix[:, i] * side[i : i + 1] for i in range(m * rows)) + rate
 
-    def sweep(carry: tuple[jax.Array, jax.Array, Any]) -> tuple[jax.Array, jax.Array, Any]:
+    def sweep(carry: _Sweep) -> _Sweep:
         before, _, count = carry
         side = before
         for j in range(m):
             at = slice(rows * j, rows * (j + 1))
-            own = jnp.stack([matrix[i, i] for i in range(at.start, at.stop)])
-            total = own.sum(axis=0)[None]  # no step is too long
+            total = jnp.trace(matrix[at, at])[None]  # no step is too long
             tried = side[at] - slip(side)[at] / total
             length = _lengths(tried, rows)
             over = length > limit[j : j + 1]
@@ -569,9 +571,8 @@ def distribute(
         moves = jnp.any(jnp.abs(side - before) > least)
         return side, moves, count + 1
 
-    side, _, _ = jax.lax.while_loop(
-        lambda c: c[1] & (c[2] < SHARING_SWEEPS), sweep, (jnp.zeros_like(rate), jnp.any(asked), 0)
-    )
+    start = (jnp.zeros_like(rate), jnp.any(asked), jnp.asarray(0))
+    side, *_ = jax.lax.while_loop(lambda c: c[1] & (c[2] < SHARING_SWEEPS), sweep, start)
     left = jnp.where(every, slip(side), 0.0)
     stick = _lengths(side, rows) < (1 - INSIDE) * limit
     if rows == 1:

@@ -30,7 +30,7 @@ METHODS: dict[str, Method] = {
         impulse.RK4,
         fixed_step.RK4,
         fixed_step.VERLET,
-        event_aligned.DOP853_ALIGNED,
+        *event_aligned.METHODS,
         *libraries.DIFFRAX,
         *libraries.SCIPY,
     )

@@ -17,14 +17,13 @@ import numpy as np
 from jimpact._checks import as_float_array, in_common_dtype, is_traced
 from jimpact.contact import Contact
 from jimpact.events import impact_dynamics
-from jimpact.events.contact_flow import Exponent, power
-from jimpact.events.impact_dynamics import Units, dimensionless
+from jimpact.events.contact_flow import power
+from jimpact.events.impact_dynamics import Dynamics, Units
 from jimpact.events.impulse_form import Rule, rule_of
 from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
 from jimpact.laws.lzb import LZB
 from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Tridiagonal
 from jimpact.status import CODE
 
 UNCOUNTED = -1  # evaluations that the method cannot tell by itself
@@ -66,23 +65,31 @@ class Method(NamedTuple):
 class Problem(NamedTuple):
     """The dimensionless problem of an impact; the tolerances in `inputs` are those of rtol."""
 
-    inputs: impact_dynamics.Problem
-    units: Units
-    exponent: Exponent
-    chain: bool
+    dynamics: Dynamics
     max_steps: int
     happens: jax.Array  # False: nothing approaches, nothing is stored; `inputs` then are a dummy
 
     @property
-    def x(self) -> jax.Array:
-        """Indentations (m,) before the impact."""
-        energy, eta = self.inputs.energy, jnp.asarray(self.rule.exponent, self.inputs.energy.dtype)
-        return jnp.where(energy > 0, jnp.where(energy > 0, energy, 1.0) ** (1 / (eta + 1)), 0.0)
+    def inputs(self) -> impact_dynamics.Problem:
+        """Arrays (m,) of the contacts."""
+        return self.dynamics.problem
 
     @property
-    def rule(self) -> Rule:
-        """Coupling, omega, restitution and exponent."""
-        return rule_of(self.inputs, self.exponent, self.chain)
+    def units(self) -> Units:
+        """Scales back to SI."""
+        return self.dynamics.units
+
+    @property
+    def x(self) -> jax.Array:
+        """Indentations (m,) before the impact."""
+        energy, eta = self.inputs.energy, jnp.asarray(self.dynamics.exponent)
+        loaded = energy > 0
+        return jnp.where(loaded, jnp.where(loaded, energy, 1.0) ** (1 / (eta + 1)), 0.0)
+
+    @property
+    def flow(self) -> Rule:
+        """G, omega, e and eta of the contacts."""
+        return rule_of(self.inputs, self.dynamics.static_exponent, self.dynamics.chain)
 
 
 def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
@@ -92,17 +99,10 @@ def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
     v = as_float_array("velocity", velocity)
     law, scene, v = in_common_dtype(law, scene, v)
     contact = law.contact(scene, v)
-    w, gamma, happens = contact.delassus, contact.gap_velocity, contact.happens
-    inputs, units = dimensionless(
-        w,
-        jnp.where(happens, gamma, -jnp.ones_like(gamma)),
-        law.restitution,
-        law.stiffness,
-        law.exponent,
-        contact.stored,
-        jnp.asarray(rtol, v.dtype),  # type: ignore[arg-type]
-    )
-    return Problem(inputs, units, law.exponent, isinstance(w, Tridiagonal), law.max_steps, happens)
+    gamma, happens = contact.gap_velocity, contact.happens
+    harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
+    contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
+    return Problem(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), law.max_steps, happens)
 
 
 def in_si(
@@ -151,14 +151,14 @@ def outcome(law: LZB, scene: Scene, velocity: Any, result: MethodResult) -> Impa
 
 
 def time_form(
-    rule: Rule, gamma: jax.Array, x: jax.Array, p: jax.Array
+    flow: Rule, gamma: jax.Array, x: jax.Array, p: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Rates `(x', p')` at indentations x and impulses p; `gamma`: gap velocities before."""
-    now = gamma + rule.coupling @ p
-    opening = 1 / rule.restitution**2
-    closing = -rule.omega * jnp.where(now > 0, opening, 1.0) * now
-    stiffness = (jnp.asarray(rule.exponent, x.dtype) + 1) / 2 * rule.omega
-    return closing, stiffness * power(x, rule.exponent)
+    now = gamma + flow.coupling @ p
+    opening = 1 / flow.restitution**2
+    closing = -flow.omega * jnp.where(now > 0, opening, 1.0) * now
+    factor = (jnp.asarray(flow.exponent, x.dtype) + 1) / 2
+    return closing, factor * flow.omega * power(x, flow.exponent)
 
 
 def held_open(x: jax.Array, closing: jax.Array) -> jax.Array:

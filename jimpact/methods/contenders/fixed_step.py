@@ -36,14 +36,14 @@ class _Walk(NamedTuple):
 
 def _solve_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     given = problem(law, scene, velocity)
-    rule, before = given.rule, given.inputs.gamma
+    flow, before = given.flow, given.inputs.gamma
     h = jnp.asarray(setting, before.dtype)
 
     def advance(walk: _Walk) -> _Walk:
         def at(part: jax.Array, dx: jax.Array, dp: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return time_form(rule, before, walk.x + part * dx, walk.p + part * dp)
+            return time_form(flow, before, walk.x + part * dx, walk.p + part * dp)
 
-        a = time_form(rule, before, walk.x, walk.p)
+        a = time_form(flow, before, walk.x, walk.p)
         b = at(0.5 * h, *a)
         c = at(0.5 * h, *b)
         d = at(h, *c)
@@ -53,7 +53,7 @@ def _solve_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodRes
         )
         p = walk.p + dp
         x = jnp.maximum(walk.x + dx, 0.0)
-        return _Walk(x, p, before + rule.coupling @ p, walk.force, walk.steps + 1)
+        return _Walk(x, p, before + flow.coupling @ p, walk.force, walk.steps + 1)
 
     end = _walk(given, advance)
     return in_si(given, end.p, h * end.steps.astype(h.dtype), 4 * end.steps, _code(end))
@@ -61,16 +61,16 @@ def _solve_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodRes
 
 def _solve_verlet(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     given = problem(law, scene, velocity)
-    rule, before = given.rule, given.inputs.gamma
+    flow, before = given.flow, given.inputs.gamma
     h = jnp.asarray(setting, before.dtype)
 
     def advance(walk: _Walk) -> _Walk:
         p = walk.p + 0.5 * h * walk.force
-        closing, _ = time_form(rule, before, walk.x, p)  # compression or expansion: at mid-step
+        closing, _ = time_form(flow, before, walk.x, p)  # compression or expansion: at mid-step
         x = jnp.maximum(walk.x + h * closing, 0.0)
-        _, force = time_form(rule, before, x, p)
+        _, force = time_form(flow, before, x, p)
         p = p + 0.5 * h * force
-        return _Walk(x, p, before + rule.coupling @ p, force, walk.steps + 1)
+        return _Walk(x, p, before + flow.coupling @ p, force, walk.steps + 1)
 
     end = _walk(given, advance)
     return in_si(
@@ -80,7 +80,7 @@ def _solve_verlet(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Method
 
 def _walk(given: Problem, advance: Any) -> _Walk:
     x, gamma, zero = given.x, given.inputs.gamma, jnp.zeros_like(given.inputs.gamma)
-    _, force = time_form(given.rule, gamma, x, zero)
+    _, force = time_form(given.flow, gamma, x, zero)
     return jax.lax.while_loop(
         lambda w: _at_work(w) & (w.steps < given.max_steps),
         advance,

@@ -41,7 +41,7 @@ _WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 def _solve_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     given = problem(law, scene, velocity, setting)
     gamma, energy, dp = _start(given)
-    end = impulse_form.walk(given.rule, dp, given.max_steps, gamma, energy)
+    end = impulse_form.walk(given.flow, dp, given.max_steps, gamma, energy)
     return _result(given, end, 1)
 
 
@@ -50,14 +50,17 @@ def _solve_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodRes
     gamma, energy, dp = _start(given)
     end = jax.lax.while_loop(
         lambda w: impulse_form.at_work(w) & (w.steps < given.max_steps),
-        lambda w: _advance(given.rule, dp, w),
+        lambda w: _advance(given.flow, dp, w),
         Walk(gamma, energy, jnp.zeros_like(gamma), jnp.zeros((), jnp.int32)),
     )
     return _result(given, end, len(_NODES))
 
 
 def _start(given: Problem) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return given.inputs.gamma, 0.5 * given.inputs.energy, given.inputs.step[0]
+    x = given.x
+    eta = jnp.asarray(given.flow.exponent, x.dtype)
+    energy = 0.5 * jnp.where(x > 0, jnp.where(x > 0, x, 1.0) ** (eta + 1), 0.0)
+    return given.inputs.gamma, energy, given.inputs.step[0]
 
 
 def _result(given: Problem, end: Walk, stages: int) -> MethodResult:
@@ -65,30 +68,30 @@ def _result(given: Problem, end: Walk, stages: int) -> MethodResult:
     return in_si(given, end.p, jnp.full_like(end.p[0], jnp.nan), stages * end.steps, code)
 
 
-def _advance(rule: Rule, dp: jax.Array, walk: Walk) -> Walk:
+def _advance(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
     """One Runge-Kutta step of `dp` in the primary impulse."""
     gamma, energy = walk.gamma, walk.energy
-    eta = jnp.asarray(rule.exponent, gamma.dtype)
+    eta = jnp.asarray(flow.exponent, gamma.dtype)
     approach, loaded = jnp.maximum(-gamma, 0.0), energy > 0
-    f = force(rule, energy)
-    f_start = jnp.where(jnp.any(loaded), f, force(rule, approach * dp))
+    f = force(flow, energy)
+    f_start = jnp.where(jnp.any(loaded), f, force(flow, approach * dp))
     primary = jnp.arange(gamma.shape[0]) == jnp.argmax(f_start)
     scale = dp / jnp.max(f_start)
-    first = (scale * force(rule, approach)) * jnp.where(approach > 0, 1.0, 0.0)
+    first = (scale * force(flow, approach)) * jnp.where(approach > 0, 1.0, 0.0)
     begun = jnp.where(loaded, scale * f, power(first, eta + 1))
     begun = jnp.where(primary, dp, begun)
-    dp = dp * impulse_form.emptying(rule, walk, primary, begun)
+    dp = dp * impulse_form.emptying(flow, walk, primary, begun)
     fresh = begun / jnp.max(jnp.where(primary, begun, 0.0))
 
     def rates(de: jax.Array, push: jax.Array) -> tuple[jax.Array, jax.Array]:
-        at = force(rule, energy + de)
+        at = force(flow, energy + de)
         leading = jnp.sum(jnp.where(primary, at, 0.0))
         # as the primary contact is unloaded the rule has a pole; a force that outgrows its own
         # is primary from the next step on
         slope = jnp.minimum(at / jnp.where(leading > 0, leading, 1.0), 1.0)
         slope = jnp.where(primary, 1.0, jnp.where(loaded & (leading > 0), slope, fresh))
-        now = gamma + rule.coupling @ push
-        return -jnp.where(now > 0, 1 / rule.restitution**2, 1.0) * now * slope, slope
+        now = gamma + flow.coupling @ push
+        return -jnp.where(now > 0, 1 / flow.restitution**2, 1.0) * now * slope, slope
 
     de, push = jnp.zeros_like(energy), jnp.zeros_like(energy)
     change, increment = de, push
@@ -97,7 +100,7 @@ def _advance(rule: Rule, dp: jax.Array, walk: Walk) -> Walk:
         change, increment = change + weight * dp * de, increment + weight * dp * push
     left = jnp.maximum(energy + change, 0.0)
     return Walk(
-        gamma + rule.coupling @ increment,
+        gamma + flow.coupling @ increment,
         jnp.where(left > EMPTY * jnp.max(energy + approach**2), left, 0.0),
         walk.p + increment,
         walk.steps + 1,

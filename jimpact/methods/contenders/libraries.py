@@ -48,18 +48,18 @@ def _diffrax_solver(
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
         given = problem(law, scene, velocity)
-        inputs, rule = given.inputs, given.rule
+        inputs, flow = given.inputs, given.flow
         rtol = jnp.asarray(setting, inputs.gamma.dtype)
-        static = None if isinstance(rule.exponent, jax.Array) else rule.exponent
-        eta = rule.exponent if static is None else None
+        static = None if isinstance(flow.exponent, jax.Array) else flow.exponent
+        eta = flow.exponent if static is None else None
 
         def rates(t: Any, y: Any, args: Any) -> tuple[jax.Array, jax.Array]:
             if tally is not None:
                 jax.debug.callback(tally)
             gamma, coupling, omega, restitution, eta, _ = args
             exponent = eta if static is None else static
-            rule = Rule(coupling, omega, restitution, exponent)
-            closing, force = time_form(rule, gamma, *y)
+            flow = Rule(coupling, omega, restitution, exponent)
+            closing, force = time_form(flow, gamma, *y)
             return held_open(y[0], closing), force
 
         def at_work(t: Any, y: Any, args: Any, **_: Any) -> jax.Array:
@@ -74,7 +74,7 @@ def _diffrax_solver(
             t1=jnp.full_like(rtol, jnp.inf),
             dt0=None,
             y0=(given.x, jnp.zeros_like(inputs.gamma)),
-            args=(inputs.gamma, rule.coupling, rule.omega, rule.restitution, eta, rtol),
+            args=(inputs.gamma, flow.coupling, flow.omega, flow.restitution, eta, rtol),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
             event=diffrax.Event(
                 at_work,
@@ -123,17 +123,17 @@ def _scipy_solver(name: str) -> Callable[[LZB, Scene, Any, Any], MethodResult]:
         from scipy.integrate import solve_ivp  # late: scipy is slow to import
 
         given = setup(law, scene, velocity)
-        inputs, rule = given.inputs, given.rule
+        inputs, flow = given.inputs, given.flow
         gamma, omega, e = (
             np.asarray(a, float)
             for a in (
                 inputs.gamma,
-                rule.omega,
+                flow.omega,
                 jnp.broadcast_to(inputs.restitution, inputs.gamma.shape),
             )
         )
-        coupling = np.asarray(as_matrix(rule.coupling), float)
-        eta = np.asarray(rule.exponent, float)
+        coupling = np.asarray(as_matrix(flow.coupling), float)
+        eta = np.asarray(flow.exponent, float)
         m = len(gamma)
         rtol = max(float(setting), FINEST)
 
