@@ -97,6 +97,7 @@ class Poisson(Law):
             e = jnp.concatenate([self.restitution, jnp.zeros_like(contact.slip)])
             shared = _depends_on_sharing(a, e, loaded)
             code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
+        assert first.tangential is not None
         p = first.normal + returned + second.normal
         return Impulses(p, first.tangential + second.tangential, code)
 
