@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.csv_shots import UNITS
-from jimpact.defects import data_defects
+from jimpact.experiments import UNITS, data_defects
 
 DATA = files("jimpact") / "data"
 CHAIN = ji.chain([1.0, 1.0, 1.0])

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, option, parameter
-from jimpact.laws.friction import friction_fields, solve
+from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
+from jimpact.laws.friction import friction_fields
+from jimpact.solvers.friction import FrictionImpulses, solve
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.linear import null_projector
 from jimpact.solvers.tridiagonal import as_matrix, is_regular
@@ -46,9 +47,9 @@ class Poisson(Law):
 
     separable: ClassVar[bool] = True
 
-    restitution: jax.Array = parameter(low=0.0, high=1.0, high_unless="allow_above_one")
-    friction: jax.Array | None = parameter(low=0.0)
-    tangential_restitution: jax.Array | None = parameter(low=-1.0, high=1.0)
+    restitution: Values = parameter(low=0.0, high=1.0, high_unless="allow_above_one")
+    friction: OptionalValues = parameter(low=0.0)
+    tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
     allow_above_one: bool = option(False, converter=bool)
 
     def __init__(
@@ -97,14 +98,13 @@ class Poisson(Law):
             e = jnp.concatenate([self.restitution, jnp.zeros_like(contact.slip)])
             shared = _depends_on_sharing(a, e, loaded)
             code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
-        assert first.tangential is not None
         p = first.normal + returned + second.normal
         return Impulses(p, first.tangential + second.tangential, code)
 
 
 def _with_load(
     a: jax.Array, normal: jax.Array, slip: jax.Array, mu: jax.Array, load: jax.Array
-) -> Impulses:
+) -> FrictionImpulses:
     """s (m,) and p_t (t,) with `0 <= r _|_ s >= 0` and `p_t in -mu (s + load) Sgn(u)`.
 
     A second contact with the same tangents takes the load: its normal velocity is its own and
@@ -129,7 +129,7 @@ def _with_load(
     )
     sharing = found.status == CODE["impulse_not_unique"]
     code = jnp.where(sharing, CODE["ok"], found.status)
-    return Impulses(found.normal[:m], found.tangential[:t] + found.tangential[t:], code)
+    return FrictionImpulses(found.normal[:m], found.tangential[:t] + found.tangential[t:], code)
 
 
 def _depends_on_sharing(w: jax.Array, e: jax.Array, loaded: jax.Array) -> jax.Array:
