@@ -108,6 +108,11 @@ class Contact(eqx.Module):
         return 0 if self.slip is None else self.slip.shape[0] // self.contacts
 
     @property
+    def chain(self) -> bool:
+        """Whether W is stored as that of a chain."""
+        return isinstance(self.delassus, Tridiagonal)
+
+    @property
     def normalized_delassus(self) -> Symmetric:
         """G: W between unit normals."""
         return scaled(self.delassus, 1 / self.norm)
@@ -394,8 +399,9 @@ def contacts_of_groups(
     def of_array(filled: np.ndarray) -> Contact:
         index = filled % m
         g = index.shape[1]
-        sides = (m + each * index[:, :, None] + np.arange(each)).reshape(len(index), -1)
-        every = np.concatenate([index, sides], axis=1)
+        sides = m + each * index[:, :, None] + jnp.arange(each)[None, None, :]
+        sides = sides.reshape(len(index), each * g)
+        every = jnp.concatenate([index, sides], axis=1)
         there = jnp.asarray(filled < m) & scene.closed[index]
         matrix = jnp.einsum("nca,ncb->cab", columns[:, every], moved[:, every])
         w = jax.vmap(decoupled)(matrix[:, :g, :g], there)

@@ -14,6 +14,8 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
     over(modes, y, passes)     -> (1, B): nothing is left to integrate
     finish(modes, y)           -> (modes, y) where it is over
+    allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
+    longest                    the longest step in the flow's own time that is stable
     tolerance (1, B) or (n, B), snap (1, B), root, contacts
     near                       share of a step from which landings start, 0: from anywhere
 
@@ -74,6 +76,7 @@ class Flow(Protocol):
 
     tolerance: jax.Array
     root: int
+    longest: float
     near: float
 
     @property
@@ -87,6 +90,7 @@ class Flow(Protocol):
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]: ...
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float: ...
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array: ...
     def coasts(self, modes: jax.Array) -> jax.Array | None: ...
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array: ...
@@ -144,21 +148,21 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
 
-    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, jax.Array | None]:
+    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, Any]:
         i, a, c = at
         xi = start + c * length
         now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
         dy = flow.field(const, s.modes, now)
-        dc = jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))[1]
+        value, dc = jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate
-        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), dc if ends else None
+        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), (value, dc) if ends else None
 
     none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     slopes, rates = jax.lax.scan(stage, none, rows)
-    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
+    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates
 
 
 class Carry(NamedTuple):
@@ -197,15 +201,14 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
-    sums, c0, rates, const = _stages(flow, s, y, ends=True)
-    d0, d1 = rates[0], rates[-1]
+    sums, c0, (values, rates) = _stages(flow, s, y, ends=True)
+    c1, d0, d1 = values[-1], rates[0], rates[-1]
     end = y + sums[0, :n]
-    c1 = flow.margins(const, s.modes, end)
     eps = float(jnp.finfo(dtype).eps)
     full = FULL * flow.contacts
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
-    scale = local + COARSE_ROUNDING * eps * jnp.abs(y)
+    scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
     ok = error2 <= 1
@@ -261,6 +264,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     restart = root_of(jnp.minimum(RESTART * span, FIRST), r)
     in_root, xi = in_root | fresh, jnp.where(fresh, 0.0, xi)
     h = jnp.where(fresh & (restart > 0), restart, h)
+    h = jnp.where(in_root, h, jnp.minimum(h, flow.longest))
     new_span = jnp.where(in_root, (xi + h) ** r - xi**r, h)
     coasts = flow.coasts(s.modes)
     reached = (first - 1) * span < new_span
@@ -360,25 +364,61 @@ def repeat(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, last: jax.Array, over: jax.Array
 ) -> jax.Array:
     """The state that `run` and `finish` end with, as a smooth function of `flow` and `y`."""
-    n, m = y.shape[0], modes.shape[0]
+    y, _ = _walk(flow, modes, y, plan, states=False)
+    return jnp.where(over, flow.finish(last, y)[1], y)
 
-    def step(y: jax.Array, row: Plan) -> tuple[jax.Array, None]:
-        accept = row.marks[-1:] > 0
-        s = Step(row.marks[:m].astype(modes.dtype), row.marks[m:-1] > 0, row.clock)
+
+def path(flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan) -> jax.Array:
+    """States (steps + 1, n, B) at the beginning and after each step of the plan, smooth as well."""
+    after: Any = _walk(flow, modes, y, plan, states=True)[1]
+    return jnp.concatenate([y[None], after.reshape(-1, *y.shape)])
+
+
+def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
+    """The state so long (1, B) after y, in the flow's own time, within the step from there."""
+    begun, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
+    in_root = in_root * (1 - lands)
+    begun, r = begun * in_root, flow.root
+    reached = begun**r + ahead
+    positive = reached > 0
+    root = jnp.where(positive, root_of(jnp.where(positive, reached, 1.0), r), 0.0)
+    h = jnp.where(in_root > 0, root - begun, ahead)
+    clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
+    sums, *_ = _stages(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y, ends=False)
+    return y + sums[0, :-1]
+
+
+def step_of(row: Plan, modes: int) -> tuple[Step, jax.Array]:
+    """A step of the plan, and whether (1, B) there is one."""
+    marks = row.marks
+    return Step(marks[:modes].astype(jnp.int32), marks[modes:-1] > 0, row.clock), marks[-1:] > 0
+
+
+def _walk(
+    flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
+) -> tuple[jax.Array, jax.Array | None]:
+    """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
+    n = y.shape[0]
+
+    def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
+        s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
             sums, *_ = _stages(flow, s, y, ends=False)
             end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
             return jnp.where(accept, end, y)
 
-        return jax.lax.cond(jnp.any(accept), walk, lambda y: y, y), None
+        y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
+        return y, y if states else None
 
-    def block(y: jax.Array, rows: Plan) -> tuple[jax.Array, None]:
-        def walk(y: jax.Array) -> jax.Array:
-            return jax.lax.scan(jax.checkpoint(step), y, rows)[0]
+    def block(y: jax.Array, rows: Plan) -> tuple[jax.Array, jax.Array | None]:
+        def walk(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            return jax.lax.scan(jax.checkpoint(step), y, rows)
 
-        return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, lambda y: y, y), None
+        def stay(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
+
+        return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, stay, y)
 
     rows = jax.tree.map(lambda x: x.reshape(BLOCKS, BLOCK, *x.shape[1:]), plan)
-    y, _ = jax.lax.scan(jax.checkpoint(block), y, rows)
-    return jnp.where(over, flow.finish(last, y)[1], y)
+    return jax.lax.scan(jax.checkpoint(block), y, rows)

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jimpact._checks import check_values
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
-from jimpact.events.impact_dynamics import dimensionless, sides_of, solve
-from jimpact.law import Impulses, Law, option, parameter
+from jimpact.events.impact_dynamics import Dynamics, dimensionless, sides_of, solve
+from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.laws.lzb import check_rtol, default_rtol
 from jimpact.scene import Scene
@@ -53,8 +53,8 @@ class Compliant(Law):
     uses_gaps: ClassVar[bool] = True
 
     force: Force
-    friction: jax.Array | None = parameter(low=0.0, default=None, kw_only=True)
-    initial_energy: jax.Array = parameter(low=0.0, default=0.0, kw_only=True)
+    friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
+    initial_energy: Values = parameter(low=0.0, default=0.0, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
 
@@ -72,8 +72,8 @@ class Compliant(Law):
         """A tolerance that the precision can hold."""
         check_rtol(self.rtol, dtype)
 
-    def impulses(self, contact: Contact) -> Impulses:
-        """Impulses over the whole encounter, gaps included."""
+    def dynamics(self, contact: Contact) -> Dynamics:
+        """The dynamics of the whole encounter in units of their own."""
         gamma, force, viscous = contact.gap_velocity, self.force, None
         if isinstance(force, Bistiffness):
             k, e, exponent = force.stiffness, force.restitution, force.exponent
@@ -97,8 +97,11 @@ class Compliant(Law):
         problem = problem._replace(viscous=viscous)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        p, p_t, code = solve(problem, units, exponent, contact.delassus, self.max_steps)
-        return Impulses(p, p_t, code)
+        return Dynamics(problem, units, exponent, contact.chain)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Impulses over the whole encounter, gaps included."""
+        return Impulses(*solve(self.dynamics(contact), self.max_steps))
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

@@ -7,9 +7,16 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
-from jimpact.events.contact_flow import Exponent
-from jimpact.events.impact_dynamics import METHODS, dimensionless, sides_of, solve
-from jimpact.law import Impulses, Law, StaticNumber, option, parameter
+from jimpact.events.impact_dynamics import METHODS, Dynamics, dimensionless, sides_of, solve
+from jimpact.law import (
+    Impulses,
+    Law,
+    OptionalValues,
+    StaticOrValues,
+    Values,
+    option,
+    parameter,
+)
 from jimpact.scene import Scene
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
@@ -84,8 +91,8 @@ class LZB(Law):
             velocity is exactly 0 and `|lambda| <= mu F` (see `docs/friction.md`).
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
         max_steps: passes of the integrator (or steps, method 'impulse') before it gives up.
-        method: 'time' (default), event-aligned, order 8; 'propagator', exact, exponent 1 only;
-            'impulse', the published scheme in the impulse of a primary contact, order 1.
+        method: 'time' (default), event-aligned, order 8; 'impulse', the published scheme in the
+            impulse of a primary contact, order 1.
 
     Status: `plastic_limit` where contacts re-close without end; `max_steps`, also where large
     friction wedges contacts that then vibrate for long.
@@ -107,21 +114,16 @@ class LZB(Law):
 
     separable: ClassVar[bool] = True
 
-    restitution: jax.Array = parameter(low=0.0, high=1.0)
-    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True, default=1.0)
-    exponent: Exponent = parameter(low=1.0, static_numbers=True, default=1.5)
-    initial_energy: jax.Array = parameter(low=0.0, default=0.0)
-    friction: jax.Array | None = parameter(low=0.0, default=None, kw_only=True)
+    restitution: Values = parameter(low=0.0, high=1.0)
+    stiffness: Values = parameter(low=0.0, open_low=True, log=True, default=1.0)
+    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    initial_energy: Values = parameter(low=0.0, default=0.0)
+    friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
     method: str = option("time", METHODS)
 
     def __check_init__(self) -> None:
-        if self.method == "propagator" and self.exponent != StaticNumber(1.0):
-            raise ValueError(
-                "Argument `exponent` must be the float 1.0 for method='propagator', "
-                f"but has value {self.exponent}."
-            )
         if self.method != "time" and self.friction is not None:
             raise ValueError(
                 f"Argument `method` must be 'time' with friction, but has value {self.method!r}."
@@ -131,8 +133,8 @@ class LZB(Law):
         """A tolerance finer than the precision can hold is an error."""
         check_rtol(self.rtol, dtype)
 
-    def impulses(self, contact: Contact) -> Impulses:
-        """Impulses at the end of the impact dynamics."""
+    def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
+        """The impact dynamics in units of their own; `rtol` in place of the law's."""
         problem, units = dimensionless(
             contact.delassus,
             contact.gap_velocity,
@@ -140,11 +142,14 @@ class LZB(Law):
             self.stiffness,
             self.exponent,
             contact.stored,
-            self.rtol or default_rtol(self.method, contact.gap_velocity.dtype),
+            self.rtol or default_rtol(self.method, contact.gap_velocity.dtype)
+            if rtol is None
+            else rtol,
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        p, p_t, code = solve(
-            problem, units, self.exponent, contact.delassus, self.max_steps, self.method
-        )
-        return Impulses(p, p_t, code)
+        return Dynamics(problem, units, self.exponent, contact.chain)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Impulses at the end of the impact dynamics."""
+        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method))
