@@ -34,7 +34,9 @@ def canned(shots, **change):
         "degrees_of_freedom": 2 * shots - 2,
         "rank": 1,
         "singular_values": np.array([3.0, 0.0]),
-        "identifiability": ("The data cannot see stiffness[1]: no measured velocity depends on it.",),
+        "identifiability": (
+            "The data cannot see stiffness[1]: no measured velocity depends on it.",
+        ),
         "starts": (start(0.6, 3), start(0.4, 5)),
         "status": np.zeros(shots, int),
         "converged": True,
