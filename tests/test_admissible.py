@@ -9,7 +9,8 @@ import pytest
 from scipy.optimize import minimize
 
 import jimpact as ji
-from jimpact import admissible_set, plot_admissible_set
+from jimpact.plot import admissible_set as plot_admissible_set
+from jimpact.theory import admissible_set
 
 BALLS, V = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 THREE = admissible_set(BALLS, V)

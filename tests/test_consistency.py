@@ -7,7 +7,8 @@ import pytest
 from programs import kinetic_norm
 
 import jimpact as ji
-from jimpact import (
+from jimpact import kinetic_energy, normalized_delassus, velocity_change
+from jimpact.theory import (
     audit_matrix,
     carnot_energy_loss,
     copositivity,
@@ -16,13 +17,10 @@ from jimpact import (
     friction_energy_change,
     friction_impulses,
     from_quasi_velocities,
-    kinetic_energy,
-    normalized_delassus,
     quasi_basis,
     to_quasi_velocities,
-    velocity_change,
 )
-from jimpact.theory.copositive import margin
+from jimpact.theory.restitution_matrices import margin
 
 MARGIN = jax.jit(margin)
 HORN = np.array(

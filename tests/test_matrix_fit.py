@@ -10,7 +10,7 @@ from scipy.optimize import minimize
 
 import jimpact as ji
 from jimpact import RestitutionMatrix, fit, normalized_delassus
-from jimpact.theory.copositive import margin
+from jimpact.theory.restitution_matrices import margin
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])
 E_TRUE = np.array([[0.3, 0.1], [0.5, 0.4]])

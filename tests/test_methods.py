@@ -71,7 +71,7 @@ def test_chart_in_words_and_picture(chart):
     assert "verlet" in str(chart)
     told = json.loads(json.dumps(chart.to_dict()))
     assert told["points"]["binary"][0]["evaluations"] is None
-    figure = ji.plot_work_precision(chart, "three balls")
+    figure = ji.plot.work_precision(chart, "three balls")
     assert figure.axes[-1].get_legend() is not None
     assert all(axes.lines for axes in figure.axes[:-1])
 
@@ -90,7 +90,7 @@ def test_gradients_and_the_other_methods():
         name: tuple(dataclasses.replace(point, gradient=None) for point in row)
         for name, row in found.points.items()
     }
-    bare = ji.plot_work_precision(dataclasses.replace(found, points=points))
+    bare = ji.plot.work_precision(dataclasses.replace(found, points=points))
     assert all("gradient" not in axes.get_xlabel() for axes in bare.axes)
 
 
@@ -297,7 +297,7 @@ def test_stability_map():
     assert found.confirmation.tried == found.confirmation.confirmed > 0
     assert "step beyond the linear stability limit" in str(found)
     assert json.loads(json.dumps(found.to_dict()))["methods"]["rk4"]["counts"]["right"] > 3
-    assert ji.plot_stability_map(found, "title").axes
+    assert ji.plot.stability_map(found, "title").axes
 
 
 @pytest.mark.parametrize(
@@ -445,7 +445,7 @@ def test_advice_in_words_and_picture(unknown):
     assert max(len(line) for line in text.splitlines()) <= 100
     assert len(text.splitlines()) < 25
     assert "NOT within 1 %" in text
-    axes = ji.plot_advice(unknown, "balls").axes
+    axes = ji.plot.advice(unknown, "balls").axes
     assert len(axes) == 2
     assert "not within 1 %" in axes[0].get_title(loc="left")
 
@@ -487,7 +487,7 @@ def test_validity_map(valid):
             run = error[i, : at + 1] if step == 1 else error[i, at:]
             assert (run <= 0.05).all()
             assert error[i, at + step] > 0.05
-    assert len(ji.plot_validity_map(valid).axes) == 2
+    assert len(ji.plot.validity_map(valid).axes) == 2
     json.dumps(valid.to_dict())
     with pytest.raises(ValueError, match="`law` must be one of moreau, binary"):
         valid.error("newton")

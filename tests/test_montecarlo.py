@@ -31,9 +31,9 @@ from jimpact import (
     read_samples,
 )
 from jimpact.comparison import registered_laws
-from jimpact.montecarlo import histograms, store
-from jimpact.montecarlo.fingerprints import fingerprint
-from jimpact.montecarlo.moments import merged, moments
+from jimpact.montecarlo import statistics as histograms, store
+from jimpact.montecarlo.statistics import merged, moments
+from jimpact.montecarlo.store import fingerprint
 
 BALLS = chain([0.25, 1.0, 0.25])
 LAW = Binary(1.0, order="earliest")
@@ -451,8 +451,7 @@ def test_a_killed_process_continues_with_the_same_bits(tmp_path, whole):
     code = f"""
 import jax; jax.config.update("jax_enable_x64", True)
 import time, jimpact as ji
-from jimpact.montecarlo.running import monte_carlo
-from jimpact.montecarlo.distributions import Uniform
+from jimpact import monte_carlo, Uniform
 class Slow:
     def run(self, plan, tasks):
         for task in tasks:

@@ -58,10 +58,10 @@ def upright(theta, width=0.2, height=0.6):
 @pytest.mark.slow
 def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
-    e = float(ji.housner_restitution(3.0))
+    e = float(ji.theory.housner_restitution(3.0))
     motion = ji.simulate(
         ji.block_system(0.2, 0.6),
-        ji.RestitutionMatrix(ji.rocking_matrix(e)),
+        ji.RestitutionMatrix(ji.theory.rocking_matrix(e)),
         upright(0.15),
         [0.0] * 3,
         4.0,
@@ -118,7 +118,7 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
 @pytest.mark.slow
 def test_overturning_on_a_harmonic_base():
     """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
-    law = ji.RestitutionMatrix(ji.rocking_matrix(0.85))
+    law = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))
 
     @jax.jit
     @jax.vmap

@@ -7,7 +7,7 @@ import pytest
 from programs import kinetic_norm
 
 import jimpact as ji
-from jimpact import (
+from jimpact.theory import (
     contact_power,
     from_quasi_velocities,
     kinetic_energy_split,

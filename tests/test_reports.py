@@ -57,7 +57,7 @@ def start(value, count):
 @pytest.mark.parametrize("shots", [1, 2, 50])
 def test_picture_of_a_fit(shots, tmp_path):
     found = canned(shots)
-    figure = ji.plot_fit(found, {"the same": found}, title="simulated")
+    figure = ji.plot.fit(found, {"the same": found}, title="simulated")
     top, bottom = figure.axes
     assert top.get_ylabel().endswith("[m/s]")
     assert bottom.get_ylabel().endswith("[m/s]")
@@ -94,9 +94,9 @@ def test_confidence_intervals_are_cut_at_the_bounds():
 def test_picture_of_a_rocking_record():
     a, one = np.array([0.4, 1.0, 2.0, 3.0, 4.0]), np.ones((5, 1, 1))
     gamma = np.array([[0.0, 0.0], [0.0, 0.4], [0.5, 0.04], [0.5, 0.4], [np.nan, np.nan]])
-    record = ji.RockingDispersion(
+    record = ji.theory.RockingDispersion(
         a, np.array([0.3]), np.array([0.5]), gamma[:, None, None], one, one, one, one
     )
-    v = ji.plot_rocking_dispersion(record)
+    v = ji.plot.rocking_dispersion(record)
     np.testing.assert_allclose(v.axes[0].lines[0].get_ydata(), np.abs(gamma[:, 1]))
     assert "critical angle 79.42 degrees" in str(record)

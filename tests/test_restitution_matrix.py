@@ -7,11 +7,10 @@ import pytest
 from programs import CODE, kinetic_norm
 
 import jimpact as ji
-from jimpact import (
-    RestitutionMatrix,
+from jimpact import RestitutionMatrix, normalized_delassus
+from jimpact.theory import (
     from_quasi_velocities,
     housner_restitution,
-    normalized_delassus,
     rocking_matrix,
     rocking_ratios,
     to_quasi_velocities,
