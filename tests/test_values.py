@@ -108,6 +108,22 @@ def test_lzb_values():
     check_held("lzb", states, allowed=1e-7)  # ten times the default tolerance
 
 
+def test_light_and_stiff_chains():
+    """Linear contacts, e >= .3, masses over four decades and stiffness over six: several events
+    inside one period of the fastest. Held: exact propagation phase by phase, rtol 1e-11 beside it.
+    """
+    held = np.load(Path(__file__).parent / "data" / "light_and_stiff.npz")
+    states = [
+        chain(m, v, k=k, e=e, eta=1.0, after=after, name=str(i))
+        for i, (m, k, e, v, after) in enumerate(zip(*(held[x] for x in COLUMNS)))
+    ]
+    assert len(states) == 48
+    check_held("lzb", states, allowed=2e-7)
+
+
+COLUMNS = ("mass", "k", "e", "velocity", "after")
+
+
 def test_lzb_edges():
     out = check_held("lzb", LZB_EDGES, allowed=1e-6)
     assert out.impulse[-1, 1] == 0.0
