@@ -168,6 +168,10 @@ def test_histograms_hold_what_lies_outside_the_first_range():
     assert counts[0, 0] == 1
     assert counts[0, -1] == 2
     assert counts[1].max() == 4
+    low, high = np.array([-5.0, 3.0]), np.array([9.0, 3.0])
+    assert histograms.binned_quantile(0.0, ends, counts, low, high).tolist() == [-5.0, 3.0]
+    assert histograms.binned_quantile(1.0, ends, counts, low, high).tolist() == [9.0, 3.0]
+    assert -5.0 <= histograms.binned_quantile(0.2, ends, counts, low, high)[0] <= -0.1
 
 
 def test_truncated_normal_gaps():
@@ -447,7 +451,7 @@ def test_a_killed_process_continues_with_the_same_bits(tmp_path, whole):
     code = f"""
 import jax; jax.config.update("jax_enable_x64", True)
 import time, jimpact as ji
-from jimpact import monte_carlo, Uniform
+from jimpact import (monte_carlo, Uniform)
 class Slow:
     def run(self, plan, tasks):
         for task in tasks:

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.contact_flow import OPEN, ContactFlow, Frozen, times, unit
+from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, times, unit
 from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.friction import distribute
@@ -254,7 +254,9 @@ class SlipFlow(FrictionFlow):
             ],
             1,
         )
-        rate = jnp.where(self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a)
+        rate = jnp.where(
+            self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
+        )
         own = self._blocks(const)
         stiffness = c * jnp.stack([own[j, 0, j, 0] + own[j, 1, j, 1] for j in range(len(c))]) / 2
         haste = 1 + total(over_r * (length(a) + 2 * stiffness))
@@ -315,10 +317,28 @@ class SlipFlow(FrictionFlow):
         turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
         away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
         drift, newton = solve(j + eye * (growth + away)[:, None], changes, turns)
-        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (j + eye * (2 * growth + away)[:, None])
+        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
+            j + eye * (2 * growth + away)[:, None]
+        )
         (lag,) = solve(lagging + eye * LEAST_STIFFNESS, r * drift / size)
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
+
+    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+        m, (x, g, p) = self.contacts, self.rows(y)
+        const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
+        motion = self.motion(const, modes, y)
+        turned = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        return Measured(
+            force=motion.force,
+            indentation=x,
+            impulse=p,
+            gap_velocity=const.frozen.scale * g,
+            tangential_force=motion.sliding + motion.holding,
+            tangential_impulse=y[5 * m : 7 * m],
+            slip=flat(jnp.where(loaded[:, None], turned, q)),
+            rate=const.frozen.unit / motion.haste,
+        )
 
     def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
         _, g, _ = self.rows(y)
@@ -361,7 +381,7 @@ class SlipFlow(FrictionFlow):
         loaded, q, slip = self.loaded(modes), self.slip(y), modes[2 * m :]
         cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
         breaks, grows = stick & ended, creeps & ended
-        # a contact breaks loose against the force that held it, and Newton's method sees to the rest
+        # a contact breaks loose against the force that held it, Newton's method sees to the rest
         const = self.constants(modes)
         f = self.force(const.frozen, *self.rows(y)[:2])
         side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * polar(q[:, 1])[0]
@@ -400,7 +420,9 @@ class SlipFlow(FrictionFlow):
         top = jnp.max(f, axis=0, keepdims=True)
         f = f / jnp.where(top > 0, top, 1.0)
         most = still.friction * f
-        slides = jnp.where((asked | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0])
+        slides = jnp.where(
+            (asked | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
+        )
         b = times(jnp.swapaxes(still.across, 0, 1), f)
         b = b - times(still.along, flat(most[:, None] * slides))
         inside, towards = distribute(still.along, b, most, asked)

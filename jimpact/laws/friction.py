@@ -9,8 +9,7 @@ import numpy as np
 from jimpact._checks import is_traced
 from jimpact.contact import Contact
 from jimpact.law import Impulses
-from jimpact.solvers.coulomb import Problem, solve_complementary, solve_prescribed
-from jimpact.solvers.coulomb_disc import DiscProblem, solve_disc
+from jimpact.solvers.friction import solve
 
 
 def friction_fields(friction: Any, tangential_restitution: Any) -> tuple[Any, Any]:
@@ -41,25 +40,7 @@ def frictional_impulses(
     assert contact.slip is not None  # see `check_law`
     ones = jnp.ones_like(contact.gap_velocity)
     slip = (1 + jnp.repeat(tangential_restitution * ones, contact.tangents)) * contact.slip
-    return solve(contact.whole_delassus, normal, slip, friction * ones, complementary=complementary)
-
-
-def solve(
-    matrix: jax.Array,
-    normal: jax.Array,
-    slip: jax.Array,
-    friction: jax.Array,
-    *,
-    complementary: bool,
-) -> Impulses:
-    """The solvers of `solvers.coulomb` and `coulomb_disc` as one function."""
-    m = normal.shape[0]
-    each = slip.shape[0] // m
-    norm = jnp.sqrt(jnp.diagonal(matrix)[:m])
-    scale = jnp.concatenate([1 / norm, jnp.repeat(1 / norm, each)])
-    parts = matrix * scale[:, None] * scale[None, :], normal / norm, slip * scale[m:], friction
-    if each == 2:
-        found = solve_disc(DiscProblem(*parts, complementary))
-    else:
-        found = (solve_complementary if complementary else solve_prescribed)(Problem(*parts))
-    return Impulses(found.normal / norm, found.tangential * scale[m:], found.code)
+    found = solve(
+        contact.whole_delassus, normal, slip, friction * ones, complementary=complementary
+    )
+    return Impulses(*found)

@@ -1,15 +1,540 @@
-"""Coulomb friction: who sticks, who slides and where to."""
+"""Coulomb friction: which contacts stick, which slide and where to. Planar is a disc of one row.
+
+With A = D^T M^-1 D of the normals and tangents D = [N, H] and x = (p, p_t) the question is
+
+    normal      r = a + A_n x:  r = 0 (prescribed), or  0 <= r _|_ p >= 0 (complementary)
+    tangential  s = b + A_t x,  p_t in -mu max(p, 0) Sgn(s)
+
+for impulses and velocities, or for forces and accelerations. Each contact is free (p = 0, or it
+pulls; p_t = 0), sticks (s = 0) or slides (p_t = -mu p d, d = s / |s|). These modes are found with
+derivatives switched off; linear solves on them then give values and derivatives. Where A is
+singular on the modes (both corners of a block lying flat), sticking contacts share what they hold
+in proportion to mu p, and normal impulses are the least, wherever that is allowed.
+"""
+
+import itertools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-SWEEPS = 200  # of the projected Gauss-Seidel iteration, at most
-SETTLED = 1e-13  # of the largest limit: a sweep that changes less is the last
+from jimpact.solvers.lcp import solve_lcp
+from jimpact.status import CODE
+
+ENUMERATED = 3  # contacts up to which all modes are looked at
+_DIRECTIONS = 4  # of slip that each sliding contact in space is started with, evenly spread
+_ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usual
+_POWER = 2 / 3  # what a solve may gather in rounding, as in `lcp`: m eps^(2/3)
+_SINGULAR = 100.0  # singular values below this times eps n, of the largest, are zero
+_LEAST_SHARE = 1e-6  # of the largest mu p: a contact without load keeps a weight in the sharing
+_SWEEPS = 2000  # of the projected Gauss-Seidel iteration, at each of its tolerances
+_COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8  # tolerances of the sweeps; each is taken twice
+# What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
+# contacts that reach their cone while others hold them: sweeps bring those to rest slowly.
+_ROOM, _SLOW_ROOM = 10.0, 100.0
+SHARING_SWEEPS = 200  # of the projected Gauss-Seidel iteration of `distribute`, at most
+_SETTLED = 1e-13  # of the largest limit: a sweep of it that changes less is the last
 INSIDE = 1e-9  # part of the limit below which a force is inside the disc
 
 
-def _size(side: jax.Array, rows: int) -> jax.Array:
+class FrictionImpulses(NamedTuple):
+    """p (m,), p_t (m,) or (2 m,), and the status code ()."""
+
+    normal: jax.Array
+    tangential: jax.Array
+    status: jax.Array
+
+
+class _Problem(NamedTuple):
+    """A (m, b, m, b), (a, b) (m, b), mu (m,): contact-major, b = 1 + rows, diagonal of order 1."""
+
+    matrix: jax.Array
+    given: jax.Array
+    friction: jax.Array
+    complementary: bool
+
+    @property
+    def tolerance(self) -> float:
+        """Of what is satisfied, in parts of the size."""
+        return len(self.friction) * float(jnp.finfo(self.matrix.dtype).eps) ** _POWER
+
+
+class _Modes(NamedTuple):
+    """N modes: `taking` (m, N) has r = 0, not p = 0; `sticks` (m, N); `direction` (m, rows, N).
+
+    The direction of slip is 0 for a free contact. `turning` (m, N): see `_equations`.
+    """
+
+    taking: jax.Array
+    sticks: jax.Array
+    direction: jax.Array
+    turning: jax.Array
+
+
+def solve(
+    matrix: jax.Array,
+    normal: jax.Array,
+    slip: jax.Array,
+    friction: jax.Array,
+    *,
+    complementary: bool,
+) -> FrictionImpulses:
+    """Impulses `x = (p, p_t)` of contacts with Coulomb friction.
+
+    Equation: `r = normal + A_n x` is 0, or (`complementary`) `0 <= r _|_ p >= 0`;
+    `s = slip + A_t x`, `p_t in -mu max(p, 0) Sgn(s)`.
+
+    Args:
+        matrix: A (m + t, m + t), normals first, then the t = m (planar) or 2 m tangents,
+            contact-major. A contact that takes no part has rows and columns of a unit matrix.
+        normal: (m,) what gamma+ - gamma- must make up for; the same for accelerations.
+        slip: (t,) `(1 + e_t) u-`.
+        friction: mu (m,).
+        complementary: contacts may part; otherwise they may pull (without friction).
+
+    Returns:
+        p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are looked at, and
+        consistent ones whose velocities differ were found; that which sticks most is returned. In
+        space Newton's method looks for the directions of slip from 4 starts a contact, all
+        combined: solutions that none of them reaches are missed. Above 3 contacts others are not
+        looked for. `impulse_not_unique`: only the impulses differ. `infeasible`: no modes are
+        consistent; `max_steps`: none were found (in space, above 3 contacts).
+
+    Derivatives of any order hold the modes, which is one-sided where they are about to change;
+    those of shared impulses take the singular matrix to keep its rank.
+
+    Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247 (planar existence).
+
+    >>> import jax.numpy as jnp
+    >>> from jimpact.solvers.friction import solve
+    >>> found = solve(jnp.diag(jnp.array([1.0, 2.0])), jnp.array([-1.0]), jnp.array([3.0]),
+    ...               jnp.array([0.5]), complementary=True)
+    >>> [round(float(x), 6) for x in (found.normal[0], found.tangential[0])]
+    [1.0, -0.5]
+    """
+    m = len(normal)
+    rows = len(slip) // m
+    order = np.concatenate([np.arange(m)[:, None], m + np.arange(m * rows).reshape(m, rows)], 1)
+    of_contacts = matrix[order[:, :, None, None], order[None, None]]
+    squares = jnp.diagonal(jax.lax.stop_gradient(matrix))[order]
+    squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
+    norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
+    scale = 1 / jnp.repeat(norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows)
+    given = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
+    largest = jax.lax.stop_gradient(jnp.abs(given).max())
+    size = jnp.where(largest > 0, largest, 1.0)
+    problem = _Problem(
+        of_contacts * scale[:, :, None, None] * scale[None, None],
+        given / size,
+        friction * norm[:, 1] / norm[:, 0],
+        complementary,
+    )
+    fixed = _Problem(*jax.lax.stop_gradient(problem[:3]), complementary)
+    modes, x, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
+    modes, inverted = _most_at_rest(fixed, modes, x)
+    shared = jnp.any(jnp.abs(inverted.pairs) > 0)
+    status = jnp.maximum(status, jnp.where(shared, CODE["impulse_not_unique"], CODE["ok"]))
+    x = _on_modes(problem, modes, inverted, x)
+    wrong = _misfit(fixed, jax.lax.stop_gradient(x)[..., None])[0] > problem.tolerance
+    status = jnp.where(wrong, jnp.maximum(status, CODE["infeasible"]), status)
+    x = x * scale * size
+    return FrictionImpulses(x[:, 0], x[:, 1:].reshape(-1), status)
+
+
+# ------------------------------------------------------------------- the equations of modes
+
+
+def _rates(problem: _Problem, x: jax.Array) -> jax.Array:
+    """(r, s) (m, b, N) of impulses (m, b, N)."""
+    return problem.given[..., None] + _times(problem.matrix[..., None], x)
+
+
+def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
+    """(m, b, N) of matrices (m, b, m, b, N) and (m, b, N)."""
+    return jnp.sum(matrix * x[None, None], axis=(2, 3))
+
+
+def _length(vectors: jax.Array) -> jax.Array:
+    """(m, N) of vectors (m, rows, N); its derivative is 0 at 0."""
+    squares = jnp.sum(vectors**2, axis=1)
+    return jnp.where(squares > 0, jnp.sqrt(jnp.where(squares > 0, squares, 1.0)), 0.0)
+
+
+def _over(vectors: jax.Array, length: jax.Array) -> jax.Array:
+    """Vectors (m, rows, N) over (m, N), 0 over 0."""
+    return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)[:, None] * vectors
+
+
+def _in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
+    """The points of discs (m, N) next to `side` (m, rows, N)."""
+    length = _length(side)
+    return jnp.where((length > radius)[:, None], _over(side, length) * radius[:, None], side)
+
+
+def _bound(problem: _Problem, x: jax.Array) -> jax.Array:
+    """mu p (m, N)."""
+    return problem.friction[:, None] * jnp.maximum(x[:, 0], 0.0)
+
+
+def _size(x: jax.Array) -> jax.Array:
+    """(N,) of (m, b, N); what is given has size 1."""
+    return 1 + jnp.abs(x).max(axis=(0, 1))
+
+
+def _misfit(problem: _Problem, x: jax.Array) -> jax.Array:
+    """How far x (m, b, N) is from what the law makes of it (N,), in parts of its size."""
+    rate = _rates(problem, x)
+    p, r, side = x[:, 0], rate[:, 0], x[:, 1:]
+    normal = jnp.minimum(p, r) if problem.complementary else r
+    wrong = side - _in_disc(side - rate[:, 1:], _bound(problem, x))
+    return jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1))) / _size(x)
+
+
+def _equations(problem: _Problem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
+    """Linear equations (m, b, m, b, N), (m, b, N) of modes: r = 0 or p = 0, and
+
+        Q s + (1 - Q) p_t + mu p d = 0
+
+    with Q = 1 where a contact sticks and Q = 0 where it is free or slides along a fixed direction.
+    With Q = beta e e^T, e orthogonal to d, beta = mu p / (mu p + |s|), this is Newton's method for
+    the direction of slip.
+    """
+    m, rows = modes.direction.shape[:2]
+    dtype = problem.matrix.dtype
+    q = modes.sticks[:, None, None].astype(dtype) * jnp.eye(rows, dtype=dtype)[None, ..., None]
+    if rows == 2:
+        e = jnp.stack([-modes.direction[:, 1], modes.direction[:, 0]], axis=1)
+        q = q + modes.turning[:, None, None] * e[:, :, None] * e[:, None]
+    q = jnp.pad(q, ((0, 0), (1, 0), (1, 0), (0, 0))).at[:, 0, 0].set(modes.taking.astype(dtype))
+    unit = jnp.eye(m * (1 + rows), dtype=dtype).reshape(problem.matrix.shape)
+    own = jnp.eye(m, dtype=dtype)[:, None, :, None, None]
+    first = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
+    along = jnp.pad(modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0)))
+    pressed = along[:, :, None, None] * own * first
+    moved = jnp.sum(q[:, :, :, None, None] * (problem.matrix - unit)[:, None, ..., None], axis=2)
+    right = -jnp.sum(q * problem.given[:, None, :, None], axis=2)
+    return moved + pressed + unit[..., None], right
+
+
+def _turned(problem: _Problem, modes: _Modes, x: jax.Array) -> _Modes:
+    """The modes with the directions of slip that x (m, b, N) has, in space."""
+    if modes.direction.shape[1] == 1:
+        return modes
+    slip = _rates(problem, x)[:, 1:]
+    pull = slip - x[:, 1:]  # along d where a contact slides, and where it only reaches its cone
+    length, bound = _length(pull), _bound(problem, x)
+    slides = (_length(modes.direction) > 0) & (length > 0)
+    direction = jnp.where(slides[:, None], _over(pull, length), modes.direction)
+    whole = bound + _length(slip)
+    turning = jnp.where(slides & (whole > 0), bound / jnp.where(whole > 0, whole, 1.0), 0.0)
+    return modes._replace(direction=direction, turning=turning)
+
+
+def _solved(problem: _Problem, modes: _Modes) -> jax.Array:
+    """x (m, b, N) on modes, contact by contact; wrong where their equations are singular.
+
+    Blocks that cannot be inverted are perturbed, which refinements undo.
+    """
+    matrix, right = _equations(problem, modes)
+    perturbed = float(jnp.finfo(matrix.dtype).eps) ** (1 / 3)
+    m, unit = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
+
+    def pivot(i: jax.Array, inverse: jax.Array) -> jax.Array:
+        here = (jnp.arange(m) == i)[:, None, None, None]
+        column, row = inverse[:, :, i], inverse[i]
+        block = _inverse(column[i], perturbed)
+        column = jnp.where(here, -unit[None], column)
+        row = jnp.where(here[:, 0][None], unit[:, None], row)
+        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)
+        gone = here[..., None] | here[None, None, :, 0]
+        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        return jnp.where(gone, 0.0, inverse) - spread
+
+    inverse = jax.lax.fori_loop(0, m, pivot, matrix)
+    x = _times(inverse, right)
+    for _ in range(2):
+        x = x + _times(inverse, right - _times(matrix, x))
+    return x
+
+
+def _inverse(block: jax.Array, perturbed: float) -> jax.Array:
+    """Inverses of blocks (b, b, N) by cofactors, b = 2 or 3."""
+    b = len(block)
+
+    def cofactors(a: jax.Array) -> jax.Array:
+        if b == 2:
+            return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
+        return jnp.stack(
+            [
+                jnp.cross(a[1], a[2], axis=0),
+                jnp.cross(a[2], a[0], axis=0),
+                jnp.cross(a[0], a[1], axis=0),
+            ],
+            axis=1,
+        )
+
+    def determinant(a: jax.Array) -> jax.Array:
+        return jnp.sum(a[0] * cofactors(a)[:, 0], axis=0)
+
+    small = jnp.abs(determinant(block)) < perturbed
+    unit = jnp.eye(b, dtype=block.dtype)[..., None]
+    block = block + jnp.where(small, perturbed, 0.0)[None, None] * unit
+    whole = determinant(block)
+    return cofactors(block) / jnp.where(whole == 0, 1.0, whole)[None, None]
+
+
+# ------------------------------------------------------------------- the decision
+
+
+def _table(contacts: int, rows: int) -> np.ndarray:
+    """All modes (m, N), sticking before sliding before free: 0 sticks, 1 is free, 2... slide."""
+    kinds = itertools.product(range(2 + (2 if rows == 1 else _DIRECTIONS)), repeat=contacts)
+    return np.array(sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))).T
+
+
+def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
+    """The consistent modes (N = 1) that stick most, their x (m, b), and the status."""
+    m, rows = len(problem.friction), problem.given.shape[1] - 1
+    dtype = problem.matrix.dtype
+    kinds = _table(m, rows)
+    angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
+    turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
+    begin = jnp.ones((m, 1, 1), dtype)
+    if rows == 2:  # the slip without impulses, if there is some
+        begin = problem.given[:, 1:, None] + 0.0
+        begin = jnp.where(_length(begin)[:, None] > 0, begin, 1.0)
+        begin = _over(begin, _length(begin))
+    modes = _Modes(
+        jnp.asarray((kinds != 1) | (not problem.complementary)),
+        jnp.asarray(kinds == 0),
+        jnp.sum(turn * begin.swapaxes(0, 1)[None], axis=1).swapaxes(0, 1),
+        jnp.zeros(kinds.shape, dtype),
+    )
+    modes, x = _newton(problem, modes)
+    misfit, root = _misfit(problem, x), float(jnp.finfo(dtype).eps) ** 0.5
+    # larger impulses are the rounding of a singular matrix
+    good = (misfit <= problem.tolerance) & (_size(x) < 1 / root)
+    best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
+
+    def differ(values: jax.Array) -> jax.Array:
+        apart = jnp.abs(values - values[..., best][..., None]).max(axis=(0, 1))
+        return jnp.any(good & (apart > root * _size(x[..., best])))
+
+    status = jnp.where(differ(x), CODE["impulse_not_unique"], CODE["ok"])
+    status = jnp.where(differ(_rates(problem, x)), CODE["several_outcomes"], status)
+    none = CODE["infeasible" if rows == 1 else "max_steps"]
+    chosen = jax.tree.map(lambda leaf: leaf[..., best][..., None], modes)
+    return chosen, x[..., best], jnp.where(jnp.any(good), status, none)
+
+
+def _newton(problem: _Problem, modes: _Modes) -> tuple[_Modes, jax.Array]:
+    """x (m, b, N) of modes, in space with the directions of slip that they lead to."""
+    if modes.direction.shape[1] == 1:
+        return modes, _solved(problem, modes)
+
+    def step(_: int, state: tuple[_Modes, jax.Array]) -> tuple[_Modes, jax.Array]:
+        x = _solved(problem, state[0])
+        return _turned(problem, state[0], x), x
+
+    none = jnp.zeros((*problem.given.shape, modes.taking.shape[1]), problem.matrix.dtype)
+    return jax.lax.fori_loop(0, _ITERATIONS, step, (modes, none))
+
+
+def _at_rest(problem: _Problem, x: jax.Array, room: jax.Array) -> _Modes:
+    """The modes (N = 1) that x (m, b) has: all sticks that does not slip by `room`."""
+    rate = _rates(problem, x[..., None])
+    room = (room * _size(x[..., None]))[None]
+    taking = rate[:, 0] <= room if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
+    pushes = taking & (x[:, :1] >= -room)
+    speed = _length(rate[:, 1:])
+    sticks = pushes & (speed <= room)
+    slides = pushes & ~sticks
+    direction = jnp.where(slides[:, None], _over(rate[:, 1:], speed), 0.0)
+    modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
+    return _turned(problem, modes, x[..., None])
+
+
+class _Inverted(NamedTuple):
+    """Of the equations E of modes, with the weights D of the sharing and no derivatives.
+
+    B = E D = U S V^T: `inverse` (n, n) of B + U_0 V_0^T, `pairs` U_0 V_0^T of its null vectors,
+    and D (m, b). `held`: what is free stays as it is, as the least is not allowed.
+    """
+
+    inverse: jax.Array
+    pairs: jax.Array
+    weight: jax.Array
+    held: jax.Array
+
+
+def _inverted(problem: _Problem, modes: _Modes, x: jax.Array) -> _Inverted:
+    n = x.size
+    matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
+    weight = 1 / jnp.sqrt(_weights(problem, x))
+    left, values, right = jnp.linalg.svd((matrix[..., 0] * weight[None, None]).reshape(n, n))
+    null = values <= _SINGULAR * n * float(jnp.finfo(x.dtype).eps) * values[0]
+    inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
+    return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
+
+
+def _weights(problem: _Problem, x: jax.Array) -> jax.Array:
+    """(m, b) of the squares of impulses in what is least where they are shared."""
+    bound = _bound(problem, x[..., None])
+    largest = jax.lax.stop_gradient(bound.max())
+    share = jnp.maximum(bound / jnp.where(largest > 0, largest, 1.0), _LEAST_SHARE)
+    return jnp.concatenate([jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1)
+
+
+def _most_at_rest(problem: _Problem, modes: _Modes, x: jax.Array) -> tuple[_Modes, _Inverted]:
+    """Modes with the velocities of x where all sticks that can, if its shared impulses are allowed.
+
+    Otherwise the modes as they are.
+    """
+    rest = _at_rest(problem, x, jnp.asarray(problem.tolerance, x.dtype))
+    both = jax.tree.map(lambda *leaf: jnp.stack(leaf), rest, modes)
+    inverted = jax.vmap(lambda modes: _inverted(problem, modes, x))(both)
+    inverted = inverted._replace(held=jnp.array([False, True]))
+    first = jax.tree.map(lambda leaf: leaf[0], inverted)
+    shared = _on_modes(problem, rest, first, x)
+    allowed = _misfit(problem, shared[..., None])[0] <= problem.tolerance
+    return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), (both, inverted))
+
+
+def _on_modes(problem: _Problem, modes: _Modes, inverted: _Inverted, x: jax.Array) -> jax.Array:
+    """x (m, b) on its modes, with derivatives up to the third, by as many chord steps.
+
+    With y = x / D and N the null space of B it solves `B y = f`, `N^T (D W D) y = 0`, or holds
+    `N^T y`.
+    """
+    shape, n = x.shape, x.size
+    pairs, weight = inverted.pairs, inverted.weight.reshape(n)
+
+    def step(_: int, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        y, null = state
+        x = (weight * y).reshape(shape)
+        matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
+        scaled = matrix.reshape(n, n) * weight[None]
+        shared = weight * _weights(problem, x).reshape(n) * weight
+        null = null - inverted.inverse @ (scaled @ null + pairs @ null - pairs)
+        least = jnp.where(inverted.held, y - start, null.T @ (shared * y))
+        missed = scaled @ y - right.reshape(n) + pairs @ least
+        return y - inverted.inverse @ missed, null
+
+    start = x.reshape(n) / weight
+    y, _ = jax.lax.fori_loop(0, 3, step, (start, pairs.T @ pairs))
+    return (weight * y).reshape(shape)
+
+
+# ------------------------------------------------------------------- many contacts
+
+
+class _Searched(NamedTuple):
+    x: jax.Array
+    modes: _Modes
+    done: jax.Array
+    level: jax.Array
+
+
+def _search(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
+    """Modes, x (m, b) and status from Lemke's method (planar) or Gauss-Seidel sweeps.
+
+    Sweeps at finer and finer tolerances give modes, Newton's method finishes on them, until the
+    law is satisfied.
+    """
+    x, code = jnp.zeros_like(problem.given), jnp.asarray(CODE["ok"])
+    started = problem.given.shape[1] == 2 and problem.complementary
+    if started:
+        x, code = _by_lemke(problem)
+    eps = float(jnp.finfo(x.dtype).eps)
+
+    def refine(state: _Searched) -> _Searched:
+        level = (state.level // 2).astype(x.dtype)
+        tolerance = jnp.maximum(_COARSEST * _FINER**level, 4 * eps)
+        skip = started & (state.level < 0)
+        swept = _sweeps(problem, state.x, tolerance, skip)
+        room = tolerance * jnp.where(state.level % 2 == 0, _ROOM, _SLOW_ROOM)
+        room = jnp.where(skip, problem.tolerance, room)
+        modes, better = _newton(problem, _at_rest(problem, swept, room))
+        good = _misfit(problem, better)[0] <= problem.tolerance
+        return _Searched(jnp.where(good, better[..., 0], swept), modes, good, state.level + 1)
+
+    first = jnp.asarray(-1 if started else 0)
+    blank = _at_rest(problem, x, jnp.zeros((), x.dtype))
+    none = code == CODE["infeasible"]
+    end = jax.lax.while_loop(
+        lambda s: ~s.done & ~none & (s.level < _LEVELS),
+        refine,
+        _Searched(x, blank, jnp.asarray(False), first),
+    )
+    status = jnp.where(none, code, CODE["max_steps"])
+    return end.modes, end.x, jnp.where(end.done, CODE["ok"], status)
+
+
+def _by_lemke(problem: _Problem) -> tuple[jax.Array, jax.Array]:
+    """x from the complementarity problem of (p, p_t+, p_t-, lambda); lambda is |s| where sliding.
+
+    Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247.
+    """
+    m, a = len(problem.friction), problem.matrix
+    nn, nt, tn, tt = a[:, 0, :, 0], a[:, 0, :, 1], a[:, 1, :, 0], a[:, 1, :, 1]
+    unit, none = jnp.eye(m, dtype=a.dtype), jnp.zeros((m, m), a.dtype)
+    whole = jnp.block(
+        [
+            [nn, nt, -nt, none],
+            [tn, tt, -tt, unit],
+            [-tn, -tt, tt, unit],
+            [jnp.diag(problem.friction), -unit, -unit, none],
+        ]
+    )
+    r, s = problem.given.T
+    found = solve_lcp(whole, jnp.concatenate([r, s, -s, jnp.zeros_like(r)]), symmetric=False)
+    z = found.z.reshape(4, m)
+    return jnp.stack([z[0], z[1] - z[2]], axis=1), found.code
+
+
+def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Array) -> jax.Array:
+    """Projected Gauss-Seidel sweeps until x changes by less than `tolerance`, in its size."""
+    m = len(problem.friction)
+    own = problem.matrix[jnp.arange(m), :, jnp.arange(m)]
+    stiffest = jnp.linalg.norm(own[:, 1:, 1:], axis=(1, 2))
+    stiffest = jnp.where(stiffest > 0, stiffest, 1.0)
+
+    def contact(i: jax.Array, x: jax.Array) -> jax.Array:
+        rate = problem.given[i] + jnp.sum(problem.matrix[i] * x[None], axis=(1, 2))
+        p = x[i, 0] - rate[0] / own[i, 0, 0]
+        p = jnp.maximum(p, 0.0) if problem.complementary else p
+        rate = rate[1:] + own[i, 1:, 0] * (p - x[i, 0])
+        bound = problem.friction[i] * jnp.maximum(p, 0.0)
+        side = (x[i, 1:] - rate / stiffest[i])[None, :, None]
+        side = _in_disc(side, bound[None, None])[0, :, 0]
+        return x.at[i].set(jnp.concatenate([p[None], side]))
+
+    State = tuple[jax.Array, jax.Array, jax.Array]
+
+    def going(state: State) -> jax.Array:
+        x, change, count = state
+        return (change > tolerance * _size(x[..., None])[0]) & (count < _SWEEPS)
+
+    def sweep(state: State) -> State:
+        x, _, count = state
+        new = jax.lax.fori_loop(0, m, contact, x)
+        return new, jnp.abs(new - x).max(), count + 1
+
+    change = jnp.where(skip, 0.0, jnp.inf).astype(x.dtype)
+    return jax.lax.while_loop(going, sweep, (x, change, jnp.asarray(0)))[0]
+
+
+# ------------------------------------------------------------------- known normal forces
+
+
+def _lengths(side: jax.Array, rows: int) -> jax.Array:
+    """|lambda_j| (m, B) of tangential rows (t, B)."""
     return jnp.sqrt(jnp.sum(side.reshape(-1, rows, *side.shape[1:]) ** 2, axis=1))
+
+
+_Sweep = tuple[jax.Array, jax.Array, jax.Array]  # forces, whether they move, count
 
 
 def distribute(
@@ -25,32 +550,33 @@ def distribute(
     rows = len(rate) // m
     every = jnp.repeat(asked, rows, axis=0)
     rate = jnp.where(every, rate, 0.0)
-    least = SETTLED * jnp.max(limit, axis=0, keepdims=True)
+    least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
 
     def slip(side: jax.Array) -> jax.Array:
         return sum(matrix[:, i] * side[i : i + 1] for i in range(m * rows)) + rate
 
-    def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+    def sweep(carry: _Sweep) -> _Sweep:
         before, _, count = carry
         side = before
         for j in range(m):
             at = slice(rows * j, rows * (j + 1))
-            total = sum(matrix[i, i] for i in range(at.start, at.stop))[None]  # no step is too long
+            total = jnp.trace(matrix[at, at])[None]  # no step is too long
             tried = side[at] - slip(side)[at] / total
-            length = _size(tried, rows)
+            length = _lengths(tried, rows)
             over = length > limit[j : j + 1]
-            tried = jnp.where(over, tried * (limit[j : j + 1] / jnp.where(over, length, 1.0)), tried)
+            tried = jnp.where(
+                over, tried * (limit[j : j + 1] / jnp.where(over, length, 1.0)), tried
+            )
             side = side.at[at].set(jnp.where(asked[j : j + 1], tried, 0.0))
         moves = jnp.any(jnp.abs(side - before) > least)
         return side, moves, count + 1
 
-    side, _, _ = jax.lax.while_loop(
-        lambda c: c[1] & (c[2] < SWEEPS), sweep, (jnp.zeros_like(rate), jnp.any(asked), 0)
-    )
+    start = (jnp.zeros_like(rate), jnp.any(asked), jnp.asarray(0))
+    side, *_ = jax.lax.while_loop(lambda c: c[1] & (c[2] < SHARING_SWEEPS), sweep, start)
     left = jnp.where(every, slip(side), 0.0)
-    stick = _size(side, rows) < (1 - INSIDE) * limit
+    stick = _lengths(side, rows) < (1 - INSIDE) * limit
     if rows == 1:
         scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
         stick = stick | (jnp.abs(left) <= INSIDE * scale)
-    pushed = jnp.repeat(_size(side, rows) > 0, rows, axis=0)
+    pushed = jnp.repeat(_lengths(side, rows) > 0, rows, axis=0)
     return asked & stick, jnp.where(pushed, -side, left)
