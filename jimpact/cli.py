@@ -246,8 +246,8 @@ class LawsCommand:
         if self.bibtex:
             print("\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values())))
         elif self.json:
-            told = ("parameters", "summary", "right_when", "fails_when", "source")
-            rows = {name: {k: getattr(row, k) for k in told} for name, row in REGISTRY.items()}
+            columns = ("parameters", "summary", "right_when", "fails_when", "source")
+            rows = {name: {k: getattr(row, k) for k in columns} for name, row in REGISTRY.items()}
             print(json_module.dumps(rows, indent=2))
         else:
             table = Table()

@@ -110,8 +110,8 @@ def verdict(entry: Entry) -> str:
     """'ok', or what is violated, and a status that is not ok."""
     names = ("kinematic", "kinetic", "energetic", "momentum")
     broken = [f"{n} violated" for n in names if not bool(getattr(entry.audit, n))]
-    told = [] if entry.status == "ok" else [entry.status]
-    return ", ".join(broken + told) or "ok"
+    words = [] if entry.status == "ok" else [entry.status]
+    return ", ".join(broken + words) or "ok"
 
 
 def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str, str]]:

@@ -394,8 +394,9 @@ def contacts_of_groups(
     def of_array(filled: np.ndarray) -> Contact:
         index = filled % m
         g = index.shape[1]
-        sides = (m + each * index[:, :, None] + np.arange(each)).reshape(len(index), -1)
-        every = np.concatenate([index, sides], axis=1)
+        sides = m + each * index[:, :, None] + jnp.arange(each)[None, None, :]
+        sides = sides.reshape(len(index), each * g)
+        every = jnp.concatenate([index, sides], axis=1)
         there = jnp.asarray(filled < m) & scene.closed[index]
         matrix = jnp.einsum("nca,ncb->cab", columns[:, every], moved[:, every])
         w = jax.vmap(decoupled)(matrix[:, :g, :g], there)

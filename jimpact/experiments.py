@@ -1,8 +1,10 @@
-"""Measured impacts: velocities before and after, their errors, and what is wrong with them."""
+"""Measured shots: velocities before and after, read from CSV; momentum and energy they defy."""
 
+import csv
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,8 +12,24 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.csv_shots import read_table
 from jimpact.scene import Scene, dense_mass, stackable
+
+UNITS = {  # in m/s
+    "m/s": 1.0,
+    "cm/s": 0.01,
+    "mm/s": 0.001,
+    "km/h": 1 / 3.6,
+    "in/s": 0.0254,
+    "ft/s": 0.3048,
+}
+_KINDS = ("pre", "post", "sigma")
+_HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[([^]]*)\])?")
+_ALLOWED = "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ..."
+# Defects below this share of the momentum or energy before are no finding: a tenth of a percent
+# is what a good measured velocity is worth. With `sigma`, a defect is held against its own error.
+DEFECT_TOLERANCE = 1e-3
+DEFECT_SIGMAS = 3.0
+_LISTED = 6  # shots listed one by one; of more, the range is given
 
 
 class Experiments(eqx.Module):
@@ -244,3 +262,200 @@ def read_experiments(path: str | Path) -> Experiments:
     """
     table = read_table(path)
     return Experiments(table.pre, table.post, table.sigma, shots=table.shots)
+
+
+class Column(NamedTuple):
+    """One column: what it holds, of which body (from 1), and its unit in m/s."""
+
+    header: str
+    kind: str
+    body: int
+    factor: float
+
+
+class Table(NamedTuple):
+    """Velocities in m/s, NaN where not measured; sigma is None where the file has none."""
+
+    pre: np.ndarray
+    post: np.ndarray
+    sigma: np.ndarray | None
+    shots: list[str] | None
+
+
+def read_table(path: str | Path) -> Table:
+    """Parse the file; every error names file, line, column, the value and what is allowed."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"Data file '{path}' does not exist or is no file.")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: the file must be UTF-8 text, but is not ({error}).") from None
+    reader = csv.reader(text.splitlines())
+    lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    rows = [(number, row) for number, row in lines if any(row)]
+    if not rows:
+        raise ValueError(f"{path}: the file is empty; its first line must name the columns.")
+    header_line, headers = rows[0]
+    columns = [_column(f"{path}, line {header_line}", i, h) for i, h in enumerate(headers)]
+    bodies = _check_columns(f"{path}, line {header_line}", columns)
+    if len(rows) == 1:
+        raise ValueError(f"{path}: the file has no shots; each line below the header is one.")
+    values = {kind: np.full((len(rows) - 1, bodies), np.nan) for kind in _KINDS}
+    shots = []
+    for k, (line, row) in enumerate(rows[1:]):
+        if len(row) != len(columns):
+            raise ValueError(
+                f"{path}, line {line}: a shot must have {len(columns)} values, one per column, "
+                f"but has {len(row)}."
+            )
+        for column, cell in zip(columns, row):
+            if column.kind == "shot":
+                shots.append(cell or str(k + 1))
+            else:
+                number = _number(f"{path}, line {line}, column `{column.header}`", column, cell)
+                values[column.kind][k, column.body - 1] = number
+        _check_sigma(f"{path}, line {line}", columns, values, k)
+    has_sigma = any(c.kind == "sigma" for c in columns)
+    sigma = values["sigma"] if has_sigma else None
+    return Table(values["pre"], values["post"], sigma, shots or None)
+
+
+def _column(where: str, index: int, header: str) -> Column:
+    if header == "shot":
+        return Column(header, "shot", 0, 1.0)
+    match = _HEADER.fullmatch(header)
+    if match is None:
+        hint = " (columns are separated by commas)" if ";" in header or "\t" in header else ""
+        raise ValueError(
+            f"{where}: column {index + 1} must be one of {_ALLOWED}, but has name {header!r}{hint}."
+        )
+    kind, body, unit = match.groups()
+    if not unit:
+        raise ValueError(
+            f"{where}: column `{header}` must state its unit, as in `{kind}_{body}[m/s]`; "
+            f"allowed are {', '.join(UNITS)}."
+        )
+    if unit.strip() not in UNITS:
+        raise ValueError(
+            f"{where}: the unit of column `{header}` must be one of {', '.join(UNITS)}, "
+            f"but is {unit!r}."
+        )
+    return Column(header, kind, int(body), UNITS[unit.strip()])
+
+
+def _check_columns(where: str, columns: list[Column]) -> int:
+    """Number of bodies; every body must have each kind of column once."""
+    found = [(c.kind, c.body) for c in columns]
+    for column, key in zip(columns, found):
+        if found.count(key) > 1:
+            raise ValueError(f"{where}: column `{column.header}` must occur once, but is repeated.")
+    bodies = max((body for _, body in found), default=0)
+    kinds = [k for k in _KINDS if k != "sigma" or any(kind == k for kind, _ in found)]
+    for body in range(1, max(bodies, 1) + 1):
+        for kind in kinds:
+            if (kind, body) not in found:
+                raise ValueError(
+                    f"{where}: column `{kind}_{body}[unit]` is missing; every body from 1 to "
+                    f"{max(bodies, 1)} needs {', '.join(f'`{k}`' for k in kinds)}."
+                )
+    return bodies
+
+
+def _number(where: str, column: Column, cell: str) -> float:
+    if cell == "" or cell.lower() == "nan":
+        if column.kind == "pre":
+            raise ValueError(
+                f"{where}: a velocity before the impact must be given, but the cell is "
+                f"{cell!r}; only `post` may be left empty (not measured)."
+            )
+        return np.nan
+    try:
+        number = float(cell)
+    except ValueError:
+        raise ValueError(f"{where}: the value must be a number, but is {cell!r}.") from None
+    if not np.isfinite(number):
+        raise ValueError(f"{where}: the value must be finite, but is {cell!r}.")
+    return number * column.factor
+
+
+def _check_sigma(
+    where: str, columns: list[Column], values: dict[str, np.ndarray], shot: int
+) -> None:
+    for column in columns:
+        if column.kind != "sigma":
+            continue
+        post, sigma = values["post"][shot, column.body - 1], values["sigma"][shot, column.body - 1]
+        if not np.isnan(post) and not sigma > 0:
+            given = "is empty" if np.isnan(sigma) else f"is {sigma / column.factor:g}"
+            raise ValueError(
+                f"{where}, column `{column.header}`: the error of a measured value must be > 0, "
+                f"but {given}."
+            )
+
+
+def data_defects(
+    experiments: Experiments, scene: Scene | None = None, stored_energy: float = 0.0
+) -> list[str]:
+    """What the data break beyond their error: at most one line each for momentum and energy.
+
+    Momentum is told as `1 + excess / sum |m v-|`: after over before where all bodies move one way.
+
+    Args:
+        experiments: the shots; those with missing values are not judged.
+        scene: the common scene, None where the shots carry their own.
+        stored_energy: what the law may add to the energy (precompression) [J].
+
+    >>> import jimpact as ji
+    >>> from jimpact.experiments import data_defects
+    >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
+    'The data gain energy (1 = conserved): shot 1: 1.4400.'
+    """
+    momentum, energy = {}, {}
+    energy_ratios = experiments.energy_ratio(scene)
+    for k, (rows, pre, post) in enumerate(experiments.balances(scene)):
+        if np.isnan(post).any():
+            continue
+        sigma = None if experiments.sigma is None else np.asarray(experiments.sigma[k], float)
+        for row in rows:
+            excess, scale = row @ (post - pre), np.abs(row) @ np.abs(pre)
+            error = None if sigma is None else float(np.linalg.norm(row * sigma))
+            if _is_defect(excess, scale, error):
+                momentum[k] = 1 + excess / scale if scale else np.inf
+        mass = dense_mass(experiments.scene_of(scene, k))
+        t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
+        error = None if sigma is None else float(np.linalg.norm((mass @ post) * sigma))
+        gain = t_plus - t_minus - stored_energy
+        if gain > 0 and _is_defect(gain, t_minus, error):
+            energy[k] = energy_ratios[k]
+    lines = []
+    if momentum:
+        lines.append(
+            f"The data break momentum (1 = conserved): {_listed(experiments, momentum)}; "
+            f"no law can reproduce that part{_floor(experiments, scene)}."
+        )
+    if energy:
+        lines.append(f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.")
+    return lines
+
+
+def _is_defect(excess: float, scale: float, error: float | None) -> bool:
+    if error is not None:
+        return bool(abs(excess) > DEFECT_SIGMAS * error)
+    return bool(abs(excess) > DEFECT_TOLERANCE * scale)
+
+
+def _listed(experiments: Experiments, ratios: dict[int, float]) -> str:
+    if len(ratios) <= _LISTED:
+        return ", ".join(f"shot {experiments.shots[k]}: {r:.4f}" for k, r in ratios.items())
+    values = list(ratios.values())
+    share = f"{len(ratios)} of {len(experiments.shots)} shots"
+    return f"{share}, {min(values):.4f} to {max(values):.4f}"
+
+
+def _floor(experiments: Experiments, scene: Scene | None) -> str:
+    """The rms that the momentum defect alone leaves, whatever the law."""
+    if experiments.sigma is not None:
+        return ""
+    change = np.asarray(experiments.post) - np.asarray(experiments.momentum_corrected(scene).post)
+    return f" (rms {np.sqrt(np.nanmean(change**2)):.3g} m/s)"

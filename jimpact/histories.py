@@ -96,9 +96,9 @@ def history(
     if records is None and is_traced((law, scene, v)):
         records = TRACED_RECORDS
     elif records is None:
-        passes = int(_passes(law, scene, v))
+        passes = int(_passes(law, scene, v))  # type: ignore[arg-type]
         records = 1 << max(4, (passes - 1).bit_length())  # few sizes, few compilations
-    return _history(law, scene, v, samples, records)
+    return _history(law, scene, v, samples, records)  # type: ignore[arg-type]
 
 
 Sampled = LZB | Compliant
@@ -107,7 +107,7 @@ Sampled = LZB | Compliant
 def _contact(law: Sampled) -> Bistiffness:
     """Stiffness, exponent and restitution of the contacts."""
     if isinstance(law, Compliant):
-        return law.force
+        return law.force  # type: ignore[return-value]
     return Bistiffness(law.stiffness, law.exponent, law.restitution)
 
 

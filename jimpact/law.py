@@ -4,8 +4,8 @@ import abc
 import copy
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterable
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, overload
 
 import equinox as eqx
 import jax
@@ -28,6 +28,52 @@ class StaticNumber(float):
 @jax.tree_util.register_static
 class StaticNumbers(tuple[float, ...]):
     """Floats, one per contact, that are part of the structure of a pytree."""
+
+
+if TYPE_CHECKING:
+    # What a parameter takes and what it is read as; type checkers see both in such a descriptor.
+    Numbers = jax.typing.ArrayLike | Sequence[Any]
+
+    class Values:
+        """Takes numbers or an array, is read as an array."""
+
+        @overload
+        def __get__(self, module: None, owner: type) -> "Values": ...
+        @overload
+        def __get__(self, module: object, owner: type) -> jax.Array: ...
+        def __get__(self, module: object | None, owner: type) -> Any:
+            """An array."""
+
+        def __set__(self, module: object, value: Numbers) -> None: ...
+
+    class OptionalValues:
+        """Takes numbers, an array or None, is read as an array or None."""
+
+        @overload
+        def __get__(self, module: None, owner: type) -> "OptionalValues": ...
+        @overload
+        def __get__(self, module: object, owner: type) -> jax.Array | None: ...
+        def __get__(self, module: object | None, owner: type) -> Any:
+            """An array or None."""
+
+        def __set__(self, module: object, value: Numbers | None) -> None: ...
+
+    class StaticOrValues:
+        """Takes numbers or an array, is read as static numbers or an array."""
+
+        @overload
+        def __get__(self, module: None, owner: type) -> "StaticOrValues": ...
+        @overload
+        def __get__(self, module: object, owner: type) -> float | tuple[float, ...] | jax.Array: ...
+        def __get__(self, module: object | None, owner: type) -> Any:
+            """Static numbers or an array."""
+
+        def __set__(self, module: object, value: Numbers) -> None: ...
+
+else:
+    Values = jax.Array
+    OptionalValues = jax.Array | None
+    StaticOrValues = float | tuple[float, ...] | jax.Array
 
 
 class Domain:

@@ -15,13 +15,15 @@ from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.law import Law
 from jimpact.laws import REGISTRY, Row
-from jimpact.montecarlo.study_table import arguments
+from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
 from jimpact.scene import Scene, chain
 
 _TABLES = ("title", "scene", "law", "fit", "data", "monte_carlo")
 _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 _FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
 _DATA_KEYS = ("file", "momentum_corrected")
+_SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
+_DISTRIBUTIONS: dict[tuple[str, ...], Any] = {("high", "low"): Uniform, ("mean", "std"): Normal}
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,7 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
     law = row.build(**values)
     experiments = _experiments(tables["data"], path, scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
-    sampled = arguments(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}
+    sampled = _sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}
     return Study(title, scene, law, free, bounds, experiments, values, options, sampled)
 
 
@@ -157,6 +159,40 @@ def law_table(
     check_keys("[law.bounds]", bounds, REGISTRY[own].parameters)
     kept = {k: v for k, v in table.items() if k in row.arguments}
     return row, kept, {k: v for k, v in bounds.items() if k in row.parameters}
+
+
+def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any]:
+    """Arguments of `monte_carlo` from the table [monte_carlo].
+
+    Keys: velocity_m_per_s and gaps_m, a list, or a table with low and high (uniform) or mean and
+    std (normal; gaps truncated at 0); law, a table of such tables by parameter; samples, seed,
+    chunk, bins.
+    """
+    check_keys("[monte_carlo]", table, _SAMPLING_KEYS, required=("velocity_m_per_s",))
+    found: dict[str, Any] = {"scene": scene}
+    found["velocity"] = _source("velocity_m_per_s", table["velocity_m_per_s"])
+    if "gaps_m" in table:
+        found["gaps"] = _source("gaps_m", table["gaps_m"])
+    random = table.get("law", {})
+    if not isinstance(random, dict):
+        raise ValueError(f"[monte_carlo.law] must be a table, but is {random!r}.")
+    drawn = {name: _distribution(f"law.{name}", value) for name, value in random.items()}
+    found["law"] = RandomLaw(law, **drawn) if drawn else law
+    found |= {name: table[name] for name in ("samples", "chunk", "bins") if name in table}
+    return found | ({"key": table["seed"]} if "seed" in table else {})
+
+
+def _source(name: str, value: Any) -> Any:
+    return _distribution(name, value) if isinstance(value, dict) else value
+
+
+def _distribution(name: str, value: Any) -> Distribution:
+    kind = _DISTRIBUTIONS.get(tuple(sorted(value))) if isinstance(value, dict) else None
+    if kind is None:
+        raise ValueError(
+            f"`{name}` in [monte_carlo] must have low and high, or mean and std, but is {value!r}."
+        )
+    return kind(**value)
 
 
 def import_laws(module: str, folder: Path) -> None:

@@ -78,7 +78,7 @@ for name, fit in (("LZB", lzb), ("LZB, corrected", lzb_corrected), ("Newton", ne
 # energy. (Grey crosses.)
 
 # %%
-ji.plot_fit(lzb, {"Newton fitted": newton}, title="Three balls, one shot")
+ji.plot.fit(lzb, {"Newton fitted": newton}, title="Three balls, one shot")
 
 # %% [markdown]
 # ## What one shot cannot tell

@@ -81,7 +81,7 @@ print(found)
 
 # %%
 
-ji.plot_monte_carlo(found, "gaps uniform up to four gap scales")
+ji.plot.monte_carlo(found, "gaps uniform up to four gap scales")
 
 # %% [markdown]
 # ## Where a linearization fails

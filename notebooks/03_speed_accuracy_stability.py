@@ -42,7 +42,7 @@ cradle = ji.advise(balls, v, 0.01)
 print(cradle)
 
 # %%
-ji.plot_advice(cradle, "Three equal balls, stiffness ratio unknown")
+ji.plot.advice(cradle, "Three equal balls, stiffness ratio unknown")
 
 # %% [markdown]
 # With a known ratio it is another matter. Stiffness that falls steeply lets the balls collide one
@@ -78,7 +78,7 @@ for scene, velocity, options in (
 # %%
 valid = ji.validity_map(balls, v)
 print(valid)
-ji.plot_validity_map(valid)
+ji.plot.validity_map(valid)
 
 # %% [markdown]
 # ## Speed against accuracy
@@ -96,7 +96,7 @@ chart = ji.work_precision(
 print(chart)
 
 # %%
-ji.plot_work_precision(chart)
+ji.plot.work_precision(chart)
 
 # %% [markdown]
 # ## Where methods fail
@@ -112,4 +112,4 @@ stable = ji.stability_map(["default", "rk4"], axes, max_steps=3000)
 print(stable)
 
 # %%
-ji.plot_stability_map(stable)
+ji.plot.stability_map(stable)

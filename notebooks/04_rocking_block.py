@@ -39,12 +39,12 @@ import jimpact as ji
 # %%
 mu, e = [0.0, 0.1, 0.3, 0.8], [0.1, 0.3, 0.5, 0.7, 0.9, 1.0]
 shapes = np.linspace(0.35, 4.5, 60)
-found = ji.rocking_dispersion(shapes, mu, e)
+found = ji.theory.rocking_dispersion(shapes, mu, e)
 print(found)
 
 # %%
 # |d| = |y_A'+ / y_B'-|
-ji.plot_rocking_dispersion(found, "Velocity of A after over velocity of B before, by LZB")
+ji.plot.rocking_dispersion(found, "Velocity of A after over velocity of B before, by LZB")
 
 # %% [markdown]
 # It is a V around its tip. Two things bend it: the kink on the right (mu = 0.3, 112 degrees) is where B
@@ -60,10 +60,10 @@ ji.plot_rocking_dispersion(found, "Velocity of A after over velocity of B before
 # down, and A rebounds. Right of it the block is slender: B's hit lifts A at once.
 
 # %%
-c = np.cos(np.asarray(ji.critical_kinetic_angle(mu)))
+c = np.cos(np.asarray(ji.theory.critical_kinetic_angle(mu)))
 tips = np.sqrt((2 - 4 * c) / (1 + c))  # as aspects
 off = np.arange(-7, 8) / 7000
-near = ji.rocking_dispersion((tips[:, None] * (1 + off)).ravel(), mu, e)
+near = ji.theory.rocking_dispersion((tips[:, None] * (1 + off)).ravel(), mu, e)
 size = np.abs(np.asarray(near.dispersion)).reshape(4, 15, 4, 6)
 print("mu   critical angle   a_c      where |d| is least, in (a - a_c) / a_c, by e; |d| there")
 for j, m in enumerate(mu):
@@ -72,7 +72,7 @@ for j, m in enumerate(mu):
     print(f"{m:3.1f} {angle:9.3f} deg {tips[j]:10.5f}   {least}   {size[j, :, j].min():.0e}")
 
 # %% [markdown]
-# All six restitutions have it in the same place. (`ji.search_critical_angle` finds the tip from impacts
+# All six restitutions have it in the same place. (`ji.theory.search_critical_angle` finds the tip from impacts
 # alone, to 1e-8 rad.)
 
 # %% [markdown]
@@ -85,30 +85,34 @@ for j, m in enumerate(mu):
 
 # %%
 levels = np.linspace(0.02, 0.24, 12)
-field = ji.rocking_dispersion(np.linspace(0.6, 2.5, 40), [0.0, 0.3, 0.8], levels)
+field = ji.theory.rocking_dispersion(np.linspace(0.6, 2.5, 40), [0.0, 0.3, 0.8], levels)
 print(field)
-ji.plot_rocking_outcomes(field, "What the block does after the hit")
+ji.plot.rocking_outcomes(field, "What the block does after the hit")
 
 # %% [markdown]
 # ## Housner's value, and a restitution matrix of rocking
 #
 # Housner: if B neither slips nor rebounds, angular momentum about B is conserved, and
 # $\dot\theta^+ = e_\theta \dot\theta^-$ with $e_\theta = (2 a^2 - 1) / (2 (a^2 + 1))$. LZB with e = 0 and a
-# friction that sticks is that block. Without friction it keeps less. `rocking_matrix` puts e_theta into a
+# friction that sticks is that block. Without friction it keeps less. `ji.theory.rocking_matrix` puts e_theta into a
 # generalized restitution matrix, $q_n^+ = -E q_n^-$ and so on: the same velocities.
 
 # %%
-plastic = ji.rocking_dispersion(np.linspace(1.5, 6.0, 480), [0.0, 0.1, 0.8], 0.0)
+plastic = ji.theory.rocking_dispersion(np.linspace(1.5, 6.0, 480), [0.0, 0.1, 0.8], 0.0)
 print("   a   Housner   e_theta by LZB, mu = 0, 0.1, 0.8")
 for i in range(0, 480, 80):
     a = float(plastic.aspect[i])
     ratios = np.asarray(plastic.angular_ratio[i, :, 0])
-    print(f"{a:5.2f} {float(ji.housner_restitution(a)):8.4f}     {ratios.round(4)}")
+    print(f"{a:5.2f} {float(ji.theory.housner_restitution(a)):8.4f}     {ratios.round(4)}")
 
 before = [1.5, -0.5, -1.0]  # a = 3: rotating about A, corner B comes down with 1
 block = ji.rocking_block(width=1.0, height=3.0)
-out = ji.impact(ji.RestitutionMatrix(ji.rocking_matrix(ji.housner_restitution(3.0))), block, before)
-print(ji.rocking_matrix(ji.housner_restitution(3.0)))
+out = ji.impact(
+    ji.RestitutionMatrix(ji.theory.rocking_matrix(ji.theory.housner_restitution(3.0))),
+    block,
+    before,
+)
+print(ji.theory.rocking_matrix(ji.theory.housner_restitution(3.0)))
 print(
     "by the matrix, velocity after:",
     out.velocity,
@@ -121,7 +125,7 @@ print(
 # published numbers, not fits.
 
 # %%
-for row in ji.rocking_ratios():
+for row in ji.theory.rocking_ratios():
     print(f"a = {row.aspect:g}, {row.material}: e_theta = {row.restitution:.3f}, ", end="")
     print(f"{row.measured_over_housner:g} of Housner's value")
 
@@ -147,9 +151,9 @@ for e_n, motion in motions.items():
 events = motions[0.0].events
 ratios = -events.velocity_after[:4, 2] / -events.velocity_before[:4, 2]
 print("e = 0, angular velocity kept by the first four hits:", np.asarray(ratios))
-print("Housner's value:", float(ji.housner_restitution(3.0)))
+print("Housner's value:", float(ji.theory.housner_restitution(3.0)))
 top = {e_n: np.nanmax(-np.asarray(m.q[:, 2])) for e_n, m in motions.items()}
 print("largest angle on the other side, e = 0 and 0.1:", np.degrees(list(top.values())), "degrees")
 
 # %%
-ji.plot_phase_portrait(motions[0.0], 2, "LZB, e = 0, mu = 0.8: free rocking, angle")
+ji.plot.phase_portrait(motions[0.0], 2, "LZB, e = 0, mu = 0.8: free rocking, angle")

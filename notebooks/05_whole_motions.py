@@ -42,7 +42,7 @@ motion = ji.simulate(cradle, law, [-0.3, 0, 0], [0.0, 0, 0], 50 * period, sample
 print(motion)
 
 # %%
-ji.plot_motion(motion, "Newton's cradle, 50 swings", ["ball 1", "ball 2", "ball 3"])
+ji.plot.motion(motion, "Newton's cradle, 50 swings", ["ball 1", "ball 2", "ball 3"])
 
 # %% [markdown]
 # ## A bouncing ball: exact event times, and their derivative
@@ -69,7 +69,7 @@ end = motion.events.accumulation_end[motion.events.count - 1]
 print("accumulation ends at", float(end), "exact", first * 1.8 / 0.2)
 
 # %%
-ji.plot_phase_portrait(motion, title="Bouncing ball, e = 0.8")
+ji.plot.phase_portrait(motion, title="Bouncing ball, e = 0.8")
 
 # %% [markdown]
 # ## A block rocks to rest
@@ -79,14 +79,14 @@ ji.plot_phase_portrait(motion, title="Bouncing ball, e = 0.8")
 
 # %%
 block = ji.block_system(0.2, 0.6)
-e = ji.housner_restitution(3.0)
+e = ji.theory.housner_restitution(3.0)
 theta = 0.15
 corner = [0.0, 0.1 * np.sin(theta) + 0.3 * np.cos(theta), theta]
 rocks = ji.simulate(
-    block, ji.RestitutionMatrix(ji.rocking_matrix(e)), corner, [0.0, 0, 0], 3.0, friction=5.0
+    block, ji.RestitutionMatrix(ji.theory.rocking_matrix(e)), corner, [0.0, 0, 0], 3.0, friction=5.0
 )
 print(rocks)
-ji.plot_phase_portrait(rocks, 2, "Free rocking, angle")
+ji.plot.phase_portrait(rocks, 2, "Free rocking, angle")
 
 # %% [markdown]
 # ## A block on a shaken base: does it overturn?
@@ -103,7 +103,7 @@ def shake(acceleration):
     amplitude = -acceleration * 9.80665 / (4 * jnp.pi) ** 2
     base = ji.HarmonicBase(amplitude, 2.0, jnp.pi / 2, "horizontal")
     start = jnp.stack([amplitude, jnp.asarray(0.3), jnp.asarray(0.0)])
-    law = ji.RestitutionMatrix(ji.rocking_matrix(e))
+    law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
     shaken = ji.block_system(0.2, 0.6, base=base)
     return ji.simulate(shaken, law, start, jnp.zeros(3), 2.0, friction=5.0)
 
@@ -146,7 +146,7 @@ from jimpact.motion.study_motion import read_motion_study
 study = read_motion_study("shaken_dimer.toml")
 dimer = study.run(samples=201)
 print(dimer)
-ji.plot_motion(dimer, study.title, ["x", "y", "angle"])
+ji.plot.motion(dimer, study.title, ["x", "y", "angle"])
 
 # %% [markdown]
 # ## Parameters from a motion

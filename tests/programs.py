@@ -198,6 +198,20 @@ def derivatives(name, second=False):
 
 # ------------------------------------------------------------------------------- assertions
 
+CODE = {row.name: code for code, row in enumerate(ji.STATUS)}
+
+
+def as_matrix(matrix):
+    """A Delassus matrix in full; of a chain it is tridiagonal."""
+    return matrix.as_matrix() if hasattr(matrix, "as_matrix") else matrix
+
+
+def kinetic_norm(scene):
+    """`|grad f_j|` (m,) in the metric of M^-1, constraints or not."""
+    mass, n = np.asarray(scene.mass), np.asarray(scene.normals)
+    mass = np.diag(mass) if mass.ndim == 1 else mass
+    return np.sqrt(np.sum(n * np.linalg.solve(mass, n), axis=0))
+
 
 def names(status):
     """Names of status codes."""

@@ -6,12 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.optimize import minimize, nnls
+from scipy.optimize import minimize
 
 import jimpact as ji
-from jimpact.fits.capped_polyhedron import CappedPolyhedron, cone_facets, least_squares
-from jimpact.plot.admissible import plot_admissible_set
-from jimpact.theory.admissible import admissible_set
+from jimpact.plot import admissible_set as plot_admissible_set
+from jimpact.theory import admissible_set
 
 BALLS, V = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 THREE = admissible_set(BALLS, V)
@@ -347,48 +346,6 @@ def test_bad_input(call, message):
 
 
 # --- the geometry under it --------------------------------------------------------------------
-
-
-def test_least_squares_minimizes():
-    generator = np.random.default_rng(3)
-    for _ in range(50):
-        a = generator.normal(size=(6, 9))
-        a[:, 6:] = a[:, :3] + a[:, 3:6]  # dependent columns
-        b = generator.normal(size=6)
-        x = least_squares(a, b)
-        slope = a.T @ (a @ x - b)
-        assert x.min() >= 0
-        assert slope.min() >= -1e-10
-        close(x * slope, np.zeros(9), 1e-10)
-        close(np.linalg.norm(a @ x - b), nnls(a, b)[1], 1e-8)
-
-
-def test_projection_onto_cones():
-    """Moreau: u = projection onto the cone {rows w >= 0} + projection onto its polar."""
-    generator = np.random.default_rng(4)
-    for d in (2, 5, 11):
-        chain = np.asarray(ji.normalized_delassus(ji.chain(np.ones(d + 1))).as_matrix())
-        rows = np.linalg.cholesky(chain)
-        rows = np.vstack([rows, cone_facets(rows.T)])
-        cone = CappedPolyhedron(rows, np.zeros(2 * d), 1.0)
-        for point in 10 * generator.normal(size=(20, d)):
-            w = cone.project(point)
-            assert (rows @ w).min() >= -1e-12
-            close(w @ (point - w), 0.0, 1e-10)
-            tight = rows[rows @ w < 1e-9].T
-            push = least_squares(tight, w - point)
-            close(tight @ push, w - point, 1e-9)
-
-
-def test_cone_facets():
-    square = np.array([[1, 0, 1], [0, 1, 1], [-1, 0, 1], [0, -1, 1], [0, 0, 1.0]]).T
-    facets = cone_facets(square)
-    expected = np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]]) / np.sqrt(3)
-    assert facets.shape == (4, 3)
-    for row in expected:
-        assert np.abs(facets - row).sum(axis=1).min() < 1e-12
-    assert cone_facets(np.array([[1.0, -1.0]])).shape == (0, 1)  # the whole line
-    close(cone_facets(np.array([[2.0, 3.0]])), [[1.0]])
 
 
 # --- the picture ------------------------------------------------------------------------------

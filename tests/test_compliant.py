@@ -207,7 +207,7 @@ def test_same_pair_restitution_other_chain():
     np.testing.assert_allclose(outcome["linear, bistiffness"], lzb, atol=1e-7)
     spread = np.ptp(list(outcome.values()), axis=0)
     assert spread[0] > 0.08
-    figure = ji.plot_rheologies(found)
+    figure = ji.plot.rheologies(found)
     assert len(figure.axes[0].lines) == 5
 
 
@@ -250,7 +250,7 @@ def test_many_balls_strike_many():
 def test_bilateral_chain_and_newby():
     """(6.15) and the first openings (corrected 6.16); Newby's contacts open together."""
     motion = jax.jit(
-        lambda ratio, t: ji.bilateral_motion(
+        lambda ratio, t: ji.theory.bilateral_motion(
             ji.chain(jnp.ones(3)), jnp.stack([jnp.ones(()), ratio]), STRIKE, t
         )
     )
@@ -276,8 +276,8 @@ def test_bilateral_chain_and_newby():
             assert opening(float(ratio), j, t - 0.1, t + 0.1) == pytest.approx(t, rel=1e-12)
     exact = (2.241337913521566978102, 6.171292729553324410933, 11.45961201072390584258)
     for n, value in zip((2, 3, 4), exact):
-        assert ji.newby_ratio(n) == pytest.approx(value, rel=1e-14)
-    both = [opening(ji.newby_ratio(2), j, 2.5, 3.0) for j in (0, 1)]
+        assert ji.theory.newby_ratio(n) == pytest.approx(value, rel=1e-14)
+    both = [opening(ji.theory.newby_ratio(2), j, 2.5, 3.0) for j in (0, 1)]
     assert both[0] == pytest.approx(both[1], rel=1e-11)
 
 
@@ -368,7 +368,7 @@ def test_history_across_gaps():
     assert float(h.indentation[:, 0].max()) == pytest.approx(pair, rel=1e-3)
     np.testing.assert_allclose(np.asarray(h.velocity).sum(axis=1), 1.0, atol=1e-12)
     data = tomllib.loads((files("jimpact") / "data" / "bead_column.toml").read_text("utf-8"))
-    assert ji.plot_forces({"balls": h}).axes[0].get_ylabel() == "force [N]"
+    assert ji.plot.forces({"balls": h}).axes[0].get_ylabel() == "force [N]"
     assert data["bead_mass"] == 2.05e-3
 
 

@@ -4,22 +4,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import kinetic_norm
 
 import jimpact as ji
-from jimpact.contact import kinetic_norm, normalized_delassus
-from jimpact.scene import kinetic_energy, velocity_change
-from jimpact.theory.copositive import copositivity, margin
-from jimpact.theory.friction_consistency import (
+from jimpact import kinetic_energy, normalized_delassus, velocity_change
+from jimpact.theory import (
+    audit_matrix,
+    carnot_energy_loss,
+    copositivity,
+    dissipation_matrix,
     friction_bounds,
     friction_energy_change,
     friction_impulses,
+    from_quasi_velocities,
+    quasi_basis,
+    to_quasi_velocities,
 )
-from jimpact.theory.quasi_velocities import from_quasi_velocities, quasi_basis, to_quasi_velocities
-from jimpact.theory.restitution_audit import (
-    audit_matrix,
-    carnot_energy_loss,
-    dissipation_matrix,
-)
+from jimpact.theory.restitution_matrices import margin
 
 MARGIN = jax.jit(margin)
 HORN = np.array(
@@ -226,7 +227,7 @@ def random_scene(generator, m):
 def test_audit_agrees_with_sampled_velocities():
     generator = np.random.default_rng(5)
     seen = {"yes": 0, "no": 0, "sign": 0, "fine": 0}
-    for k in range(60):
+    for k in range(24):
         m = (2, 3)[k % 2]
         scene = random_scene(generator, m)
         e = generator.uniform(0.3, 1) * np.eye(m) + 0.2 * generator.uniform(-0.2, 1, (m, m))
@@ -256,7 +257,7 @@ def test_audit_agrees_with_sampled_velocities():
         seen["fine" if found.kinematic.holds and found.kinetic.holds else "sign"] += 1
         if found.singular_values:
             assert found.energetic.answer != "no"
-    assert min(seen.values()) >= 4, seen
+    assert min(seen.values()) >= 2, seen
 
 
 def test_spectral_radius_not_largest_eigenvalue():
@@ -271,7 +272,7 @@ def test_spectral_radius_not_largest_eigenvalue():
 
 def test_spectral_radius_of_self_adjoint_matrices():
     generator, seen = np.random.default_rng(6), set()
-    for _ in range(40):
+    for _ in range(16):
         s = generator.normal(size=(2, 2))
         scene = random_scene(generator, 2)
         g = dense(normalized_delassus(scene))

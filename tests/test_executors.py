@@ -10,14 +10,9 @@ import time
 import pytest
 
 import jimpact.montecarlo.executors
-from jimpact.laws.binary import Binary
-from jimpact.montecarlo.distributions import RandomLaw, Uniform
-from jimpact.montecarlo.executors import Executor, as_executor
-from jimpact.montecarlo.executors.devices import Devices
-from jimpact.montecarlo.executors.serial import Serial
-from jimpact.montecarlo.fingerprints import fingerprint
-from jimpact.montecarlo.running import monte_carlo
-from jimpact.scene import chain
+from jimpact import Binary, RandomLaw, Uniform, chain, monte_carlo
+from jimpact.montecarlo.executors import Devices, Executor, Serial, as_executor
+from jimpact.montecarlo.store import fingerprint
 
 BALLS = chain([0.25, 1.0, 0.25])
 
@@ -107,7 +102,7 @@ def test_one_two_and_four_devices(wanted):
 
 
 def dask_executor(client):
-    from jimpact.montecarlo.executors.dask_cluster import DaskExecutor
+    from jimpact.montecarlo.executors import DaskExecutor
 
     return DaskExecutor(client)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.csv_shots import UNITS
-from jimpact.defects import data_defects
+from jimpact.experiments import UNITS, data_defects
 
 DATA = files("jimpact") / "data"
 CHAIN = ji.chain([1.0, 1.0, 1.0])
@@ -116,11 +115,6 @@ def test_files_that_cannot_be_read(tmp_path):
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "shots": ["a", "b"]}, r"`shots` must have 1 labels"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "scenes": []}, r"`scenes` must have one scene per shot"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "scenes": [CHAIN]}, r"`scenes` must have 2 bodies"),
-        (
-            {"pre": [[1.0, 0.0]] * 2, "post": [[0.0, 1.0]] * 2,
-             "scenes": [ji.chain([1.0, 1.0]), ji.chain([1.0, 1.0], wall=True)]},
-            r"scenes of one kind .* shot 2 differs",
-        ),
     ],
 )  # fmt: skip
 def test_bad_experiments(arguments, message):

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from programs import CODE, as_matrix
 from scipy import stats
 
 import jimpact as ji
-from jimpact.law import Law
-from jimpact.solvers.tridiagonal import as_matrix
-from jimpact.status import CODE
+from jimpact import Law
 
 DATA = files("jimpact") / "data"
 PAIR = ji.chain([1.0, 2.0])
@@ -173,6 +172,7 @@ def test_one_shot_of_three_balls_determines_two_of_three(rank_2_of_3):
     found = rank_2_of_3
     assert found.names == ("restitution[1]", "restitution[2]", "stiffness[2]")
     assert found.rank == 2
+    assert found.degrees_of_freedom == 3 - 2  # measured values less rank, not less parameters
     assert np.isinf(found.standard_error).all()
     assert found.law.stiffness[0] == 1.0
     held, unseen = found.identifiability

@@ -204,7 +204,7 @@ def test_given_slip_agrees_with_the_law():
     """(6.54)-(6.57) with xi = 1: the law finds that slip by itself, and the same impulses."""
     e, mu, fast = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2, np.array([2.0, -0.6, -0.3])
     out = ji.impact(ji.RestitutionMatrix(e, friction=mu), FLAT, fast)
-    p, side = jax.jit(lambda v: ji.friction_impulses(FLAT, e, mu, 1.0, v))(fast)
+    p, side = jax.jit(lambda v: ji.theory.friction_impulses(FLAT, e, mu, 1.0, v))(fast)
     assert float((FLAT.tangents.T @ out.velocity)[0]) > 0  # still sliding: xi = 1 was right
     close(out.impulse, p, rtol=1e-12)
     close(out.tangential_impulse, side, rtol=1e-12)
@@ -220,7 +220,7 @@ def test_uneven_load_is_shared_as_friction_allows(name):
     close(out.impulse[0, 1], 0, atol=off)
     close(out.tangential_impulse[0, 1], 0, atol=off)
     close(np.asarray(scene.tangents)[:, 0] @ out.velocity[0], 0, atol=off)
-    close(out.velocity[0, 2], rate * ji.housner_restitution(3.0), rtol=10 * off)
+    close(out.velocity[0, 2], rate * ji.theory.housner_restitution(3.0), rtol=10 * off)
 
 
 def random_scenes(count, rows=1, n=3, seed=5, most=0.0, coupling=1.0):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.theory.han_gilmore_tree import han_gilmore
+from jimpact import han_gilmore
 
 
 def solve(a, b):

@@ -5,15 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import as_matrix
 from scipy.optimize import minimize
 
 import jimpact as ji
-from jimpact.contact import normalized_delassus
-from jimpact.fits.fitting import fit
-from jimpact.fits.matrix_fit import matrix_region
-from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.solvers.tridiagonal import as_matrix
-from jimpact.theory.copositive import margin
+from jimpact import RestitutionMatrix, fit, normalized_delassus
+from jimpact.theory.restitution_matrices import margin
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])
 E_TRUE = np.array([[0.3, 0.1], [0.5, 0.4]])
@@ -52,97 +49,6 @@ def fitted(data, start=START, **options):
 
 
 # -------------------------------------------------------------------------------- the set
-
-
-@pytest.fixture(scope="module")
-def region():
-    """Three contacts, a bound on one entry, another one held."""
-    scene = ji.chain([1.0, 0.7, 2.0, 1.5])
-    bounds = np.tile([[-np.inf], [np.inf]], (1, 9))
-    bounds[1, 3] = 0.25
-    mix = np.diag((np.arange(9) != 5).astype(float))
-    law = RestitutionMatrix(0.2 * np.eye(3))
-    return matrix_region(law, [scene], np.zeros(9), mix, bounds), inverse(scene)
-
-
-def test_points_outside_are_drawn_back_to_the_boundary(region):
-    region, g_inverse = region
-    rng = np.random.default_rng(1)
-    points = rng.normal(size=(300, 9)) * rng.uniform(0.1, 3, size=(300, 1))
-    points[100:] = np.abs(points[100:])
-    back = np.asarray(retract_of(region, jnp.asarray(points)))
-    edges = set()
-    for wild, y in zip(points, back):
-        e = y.reshape(3, 3) * (np.arange(9) != 5).reshape(3, 3)
-        free = np.delete(y, 5).min()
-        values = (free, *slacks(e, g_inverse)[1:], 0.25 - y[3])
-        assert min(values) > -1e-13
-        if not np.array_equal(wild, y):
-            edges.add(int(np.argmin(values)))
-            assert min(values) < 1e-11  # on the boundary
-    assert edges == {0, 2, 3}  # E >= 0, energy, the bound (of a chain G^-1 >= 0: no pull)
-    center = np.asarray(region.center)
-    np.testing.assert_array_equal(np.asarray(region.retract(region.center)), center)
-
-
-def test_conditions_are_the_definitions(region):
-    region, g_inverse = region
-    e = np.abs(np.random.default_rng(2).normal(size=(3, 3)))
-    e[1, 2] = 0.0
-    slack, rows = conditions_of(region, jnp.asarray(e.ravel()))
-    free = np.arange(9) != 5
-    np.testing.assert_allclose(slack[:9][free], e.ravel()[free], atol=1e-15)
-    np.testing.assert_allclose(slack[9:18], (g_inverse @ (np.eye(3) + e)).ravel(), atol=1e-13)
-    np.testing.assert_allclose(np.min(slack[-7:]), slacks(e, g_inverse)[2], atol=1e-12)
-    step = 1e-6 * np.random.default_rng(3).normal(size=9) * free
-    moved = conditions_of(region, jnp.asarray(e.ravel() + step))[0]
-    np.testing.assert_allclose(moved - slack, rows @ step, atol=1e-10)
-
-
-def test_curvature_is_the_second_derivative_of_the_least_energy(region):
-    region, g_inverse = region
-    e = np.array([[0.6, 0.3, 0.2], [0.2, 0.5, 0.0], [0.1, 0.3, 0.6]])  # minimizer inside a face
-    q = jnp.asarray(g_inverse - e.T @ g_inverse @ e)
-    x = np.asarray(least_margin(q)[1])
-    face = sum(int(x[i] > 1e-9) << (2 - i) for i in range(3)) - 1
-    pressure = jnp.zeros(7).at[face].set(1.0)
-    found = curvature_of(region, jnp.asarray(e.ravel()), pressure)
-    rng, step = np.random.default_rng(4), 1e-4
-    for _ in range(3):
-        way = rng.normal(size=9) * (np.arange(9) != 5)
-
-        def energy(t, way=way):
-            return slacks(e + t * way.reshape(3, 3), g_inverse)[2]
-
-        second = (energy(step) - 2 * energy(0) + energy(-step)) / step**2
-        np.testing.assert_allclose(-(way @ found @ way), second, rtol=2e-5)
-
-
-def test_every_scene_counts_and_open_contacts_do_not():
-    """A flat pair (impulses would pull: off-diagonal entries needed) beside a gapped chain."""
-    pair = ji.Scene([1.0, 1.0, 1.0], [[1.0, 0.5], [0.0, 1.0], [0.0, 0.0]])
-    gapped = ji.chain([1.0, 2.0, 1.0], gaps=[0.0, 1e-3])
-    g = np.asarray(normalized_delassus(pair))
-    start = 1.2 * g - np.eye(2)  # G^-1 (I + E) has zeros: a start on the boundary
-    bounds = np.tile([[-np.inf], [np.inf]], (1, 4))
-    law = RestitutionMatrix(start)
-    region = matrix_region(law, [pair, gapped, pair], np.zeros(4), np.eye(4), bounds)
-    assert region.inverse.shape[0] == 2
-    rng = np.random.default_rng(7)
-    back = np.asarray(retract_of(region, jnp.asarray(rng.uniform(-0.2, 2.0, size=(200, 4)))))
-    edges = set()
-    for y in back:
-        e = y.reshape(2, 2)
-        values = (*slacks(e, inverse(pair)), *slacks(e[:1, :1], np.eye(1))[1:])
-        assert min(values) > -1e-13
-        edges.add(int(np.argmin(values)))
-    assert edges >= {1, 2}
-    # a restitution of contact 2 above 1 is no gain for the chain, where contact 2 is open
-    tall = np.array([[0.5, 0.1], [0.1, 1.5]])
-    only = matrix_region(RestitutionMatrix(START), [gapped], np.zeros(4), np.eye(4), bounds)
-    np.testing.assert_array_equal(only.retract(jnp.asarray(tall.ravel())), tall.ravel())
-    over = np.asarray(only.retract(jnp.asarray([1.5, 0.1, 0.1, 0.5])))
-    np.testing.assert_allclose(over[0], 1.0, rtol=1e-12)
 
 
 # ---------------------------------------------------------------------------------- fits

@@ -1,4 +1,6 @@
-"""Whole motions against closed forms: events, derivatives, batches, contact, ledger, bad input."""
+"""Whole motions against closed forms: events, derivatives, batches, contact, ledger."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -6,24 +8,20 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.motion.record import EVENT_KINDS, KIND_CODE, MOTION_CODE
-from jimpact.motion.system import LinearPotential
 
 G = 9.80665
 
 
+def lane(batch, i):
+    return jax.tree.map(lambda x: x[i], batch)
+
+
 def kinds(motion):
-    return [EVENT_KINDS[k] for k in np.asarray(motion.events.kind)[: int(motion.events.count)]]
+    return motion.to_dict()["events"]["kind"]
 
 
-class Sliding(ji.Moreau):
-    """Moreau's law with a coefficient of friction for persistent contact."""
-
-    friction: jax.Array
-
-    def __init__(self, restitution, friction):
-        super().__init__(restitution)
-        self.friction = jnp.asarray(friction)
+def status(motion):
+    return motion.to_dict()["status"]
 
 
 # ---------------------------------------------------------------- bouncing ball
@@ -42,10 +40,6 @@ def balls():
     return run(jnp.array([0.8, 0.8, 0.8, 0.99, 0.5]), jnp.array([1.0, jnp.nan, -0.1, 1e-4, 0.5]))
 
 
-def lane(batch, i):
-    return jax.tree.map(lambda x: x[i], batch)
-
-
 def bounce_times(e, n=20):
     first = np.sqrt(2 / G)
     return first + 2 * first * jnp.concatenate([jnp.zeros(1), jnp.cumsum(e ** jnp.arange(1.0, n))])
@@ -60,7 +54,7 @@ def height(e, t):
     return jnp.where(i < 0, 1 - G * t * t / 2, v * s - G * s * s / 2)
 
 
-def test_bouncing_ball_event_times_and_their_derivative(balls):
+def test_bouncing_ball_events_and_their_derivative(balls):
     motion, slope = lane(balls[0], 0), lane(balls[1], 0)
     exact, exact_slope = jax.jvp(bounce_times, (0.8,), (1.0,))
     np.testing.assert_allclose(motion.events.time[:20], exact, rtol=0, atol=1e-12)
@@ -72,8 +66,9 @@ def test_bouncing_ball_between_events(balls):
     t = np.asarray(motion.time)
     t = t[t < float(bounce_times(0.8)[-1])]
     assert len(t) > 70
+    both = jax.jit(jax.vmap(lambda t: jax.jvp(lambda e: height(e, t), (0.8,), (1.0,))))
     with jax.numpy_dtype_promotion("standard"):
-        exact, exact_slope = jax.vmap(lambda t: jax.jvp(lambda e: height(e, t), (0.8,), (1.0,)))(t)
+        exact, exact_slope = both(t)
     np.testing.assert_allclose(motion.q[: len(t), 0], exact, rtol=0, atol=1e-12)
     np.testing.assert_allclose(slope.q[: len(t), 0], exact_slope, rtol=0, atol=1e-10)
 
@@ -94,9 +89,8 @@ def test_finite_accumulation_is_passed(balls):
 
 
 def test_a_bad_motion_ends_alone(balls):
-    status = np.asarray(balls[0].status)
-    names = ("ok", "not_finite", "penetration", "max_events", "ok")
-    assert status.tolist() == [MOTION_CODE[name] for name in names]
+    told = [status(lane(balls[0], i)) for i in range(5)]
+    assert told == ["ok", "not_finite", "penetration", "max_events", "ok"]
     with pytest.raises(RuntimeError, match=r"max_events.*\(1 at 3\)"):
         ji.raise_on_failed_motion(balls[0])
     assert str(balls[0]) == "5 motions: 2 ok, 1 max_events, 1 penetration, 1 not_finite"
@@ -105,13 +99,11 @@ def test_a_bad_motion_ends_alone(balls):
 
 
 def test_ledger_closes(balls):
-    for i in (0, 4):
+    for i, e in ((0, 0.8), (4, 0.5)):
         motion = lane(balls[0], i)
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
-        assert float(motion.energy[0]) > 4
         # all of it was taken by the contact, each impact took (1 - e^2) of what was left
         np.testing.assert_allclose(motion.contact_work[-1, 0, 0], -motion.energy[0], atol=1e-11)
-        e = (0.8, None, None, None, 0.5)[i]
         taken = -np.asarray(motion.events.energy)[:5, 0, 0]
         expected = float(motion.energy[0]) * (1 - e**2) * e ** (2 * np.arange(5.0))
         np.testing.assert_allclose(taken, expected, rtol=1e-11)
@@ -125,7 +117,8 @@ def test_ball_leaves_a_vibrating_plate():
     w, amplitude = 20.0, 0.03
 
     def run(a):
-        system = ji.ball_system(base=jax.tree_util.Partial(lambda a, t: a * jnp.sin(w * t), a))
+        base = ji.HarmonicBase(a, w / (2 * np.pi))
+        system = ji.ball_system(base=base)
         return ji.simulate(system, ji.Newton(0.0), [0.0], (a * w)[None], 0.7, samples=36)
 
     motion, slope = jax.jit(lambda a: jax.jvp(run, (a,), (1.0,)))(jnp.asarray(amplitude))
@@ -137,10 +130,8 @@ def test_ball_leaves_a_vibrating_plate():
     s = motion.events.time[1] - exact
     y = amplitude * np.sin(w * exact) + amplitude * w * np.cos(w * exact) * s - G * s**2 / 2
     np.testing.assert_allclose(y, amplitude * jnp.sin(w * motion.events.time[1]), atol=1e-12)
-    # period after period the same
-    np.testing.assert_allclose(
-        motion.events.time[2] - motion.events.time[0], 2 * np.pi / w, atol=1e-10
-    )
+    period = motion.events.time[2] - motion.events.time[0]
+    np.testing.assert_allclose(period, 2 * np.pi / w, atol=1e-10)  # period after period the same
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
     assert np.ptp(np.asarray(motion.base_work)) > 0.05
     together = np.asarray(motion.time) < float(exact)
@@ -149,28 +140,32 @@ def test_ball_leaves_a_vibrating_plate():
 
 
 @pytest.fixture(scope="module")
-def slide():
-    """A block on a slope of angle a: q0' = speed; one program for all."""
-    block = ji.block_system(0.2, 0.4)
+def slides():
+    """A block on a slope: slides to stick; is held; slips; tips about its corner."""
+    rows = [(0.0, 1.0, 0.3), (np.arctan(0.29), 0.0, 0.3), (np.arctan(0.31), 0.0, 0.3)]
+    rows += [(np.arctan(0.6), 0.0, 2.0)]
 
     @jax.jit
+    @jax.vmap
     def run(angle, speed, mu):
         weights = G * jnp.stack([-jnp.sin(angle), jnp.cos(angle), jnp.zeros_like(angle)])
+        block = ji.block_system(0.2, 0.4)
         system = ji.System(
             block.gap_function,
             block.mass,
-            potential=LinearPotential(weights),
+            potential=type(ji.gravity([0.0]))(weights),
             tangent_function=block.tangent_function,
         )
         v0 = jnp.stack([speed, 0 * speed, 0 * speed])
-        return ji.simulate(system, Sliding(0.0, mu), [0.0, 0.2, 0.0], v0, 1.0, samples=21)
+        return ji.simulate(
+            system, ji.Moreau(0.0), [0.0, 0.2, 0.0], v0, 1.0, samples=21, friction=mu
+        )
 
-    return lambda *x: run(*(jnp.asarray(float(y)) for y in x))
+    return run(*np.array(rows, float).T)
 
 
-@pytest.mark.slow
-def test_sliding_block_comes_to_stick(slide):
-    motion = slide(0.0, 1.0, 0.3)
+def test_sliding_block_comes_to_stick(slides):
+    motion = lane(slides, 0)
     assert kinds(motion) == ["friction"]
     np.testing.assert_allclose(motion.events.time[0], 1 / (0.3 * G), atol=1e-12)
     np.testing.assert_allclose(motion.q[-1], [1 / (2 * 0.3 * G), 0.2, 0.0], atol=1e-12)
@@ -179,28 +174,23 @@ def test_sliding_block_comes_to_stick(slide):
     np.testing.assert_allclose(motion.contact_work[-1, 1], [-0.5 * 0.8, -0.5 * 0.2], atol=1e-12)
 
 
-@pytest.mark.slow
-def test_stick_and_slip_on_a_slope(slide):
-    held = slide(np.arctan(0.29), 0.0, 0.3)
-    np.testing.assert_allclose(held.q[-1], [0.0, 0.2, 0.0], atol=1e-12)
-    angle = np.arctan(0.31)
-    slips = slide(angle, 0.0, 0.3)
+def test_stick_and_slip_on_a_slope(slides):
+    np.testing.assert_allclose(lane(slides, 1).q[-1], [0.0, 0.2, 0.0], atol=1e-12)
+    angle, slips = np.arctan(0.31), lane(slides, 2)
     x = 0.5 * G * (np.sin(angle) - 0.3 * np.cos(angle))
     np.testing.assert_allclose(slips.q[-1], [x, 0.2, 0.0], atol=1e-12)
     np.testing.assert_allclose(slips.ledger_residual, 0, atol=1e-12)
 
 
-@pytest.mark.slow
-def test_block_tips_about_its_corner(slide):
+def test_block_tips_about_its_corner(slides):
     """Steeper than width / height and rough: it turns about a fixed corner, energy conserved."""
-    motion = slide(np.arctan(0.6), 0.0, 2.0)
+    motion = lane(slides, 3)
     reached = np.asarray(motion.time) < 0.4
     np.testing.assert_allclose(np.asarray(motion.gaps)[reached, 0], 0, atol=1e-12)
     q, v = np.asarray(motion.q)[reached], np.asarray(motion.velocity)[reached]
     corner = q[:, 0] + 0.1 * np.cos(q[:, 2]) + 0.2 * np.sin(q[:, 2])
     np.testing.assert_allclose(corner, 0.1, atol=1e-9)
-    # energy: I_corner w^2 / 2 = work of gravity
-    inertia = (0.2**2 + 0.4**2) / 3
+    inertia = (0.2**2 + 0.4**2) / 3  # I_corner w^2 / 2 = work of gravity
     fallen = np.asarray(motion.potential_energy)[0] - np.asarray(motion.potential_energy)[reached]
     np.testing.assert_allclose(0.5 * inertia * v[:, 2] ** 2, fallen, atol=1e-9)
     assert v[-1, 2] < -1
@@ -209,21 +199,22 @@ def test_block_tips_about_its_corner(slide):
 # -------------------------------------------------------------------- time stepping
 
 
+@functools.cache
+def stepped(step):
+    return jax.jit(
+        lambda e: ji.simulate(
+            ji.ball_system(), ji.Newton(e), [1.0], [0.0], 2.0, samples=11,
+            method="time_stepping", step=step,
+        )
+    )  # fmt: skip
+
+
 def test_time_stepping_is_of_first_order():
     exact = [float(height(0.8, t)) for t in np.linspace(0, 2, 11)]
     errors = []
     for step in (1e-3, 1e-4):
-        motion = ji.simulate(
-            ji.ball_system(),
-            ji.Newton(0.8),
-            [1.0],
-            [0.0],
-            2.0,
-            samples=11,
-            method="time_stepping",
-            step=step,
-        )
-        assert int(motion.status) == 0
+        motion = stepped(step)(0.8)
+        assert status(motion) == "ok"
         errors.append(np.abs(np.asarray(motion.q)[:, 0] - exact).max())
     assert errors[1] < 2e-3
     assert 0.7 < np.log10(errors[0] / errors[1]) < 1.3
@@ -232,12 +223,11 @@ def test_time_stepping_is_of_first_order():
 @pytest.mark.slow
 def test_time_stepping_has_both_derivatives():
     def last(e):
-        given = (ji.ball_system(), ji.Newton(e), [1.0], [0.0], 1.0)
-        return ji.simulate(*given, method="time_stepping", step=1e-3, samples=5).q[-1, 0]
+        return stepped(1e-3)(e).q[-1, 0]
 
     forward, reverse = jax.jit(jax.jacfwd(last))(0.8), jax.jit(jax.jacrev(last))(0.8)
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
-    np.testing.assert_allclose(forward, jax.grad(height)(0.8, 1.0), rtol=0.01)
+    np.testing.assert_allclose(forward, jax.grad(height)(0.8, 2.0), rtol=0.02)
 
 
 @pytest.mark.slow
@@ -245,66 +235,16 @@ def test_time_stepping_of_many_beads_comes_to_rest():
     n = 20
     q = 0.01 + 0.02 * np.arange(n) + 0.05
     motion = ji.simulate(
-        ji.column_system(np.full(n, 0.1), 0.01),
-        ji.Moreau(0.5),
-        q,
-        np.zeros(n),
-        1.0,
-        method="time_stepping",
-        step=2e-4,
-        samples=11,
-    )
-    assert int(motion.status) == 0
+        ji.column_system(np.full(n, 0.1), 0.01), ji.Moreau(0.5), q, np.zeros(n), 1.0,
+        method="time_stepping", step=2e-4, samples=11,
+    )  # fmt: skip
+    assert status(motion) == "ok"
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-9)
     np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-3)
     assert int(motion.events.count) > 5
 
 
-# ------------------------------------------------------------------------ bad input
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"t_end": 0.0}, "`t_end` must be larger than `t_start` = 0"),
-        ({"t_end": np.nan}, "`t_end` must be finite"),
-        ({"q0": [-0.1]}, "no penetration"),
-        ({"q0": [np.nan]}, "`q0` must be finite"),
-        ({"q0": [[1.0]]}, r"`q0` must have shape \(n,\)"),
-        ({"v0": [0.0, 0.0]}, r"`v0` must have shape \(1,\)"),
-        ({"q0": [1.0, 2.0], "v0": [0.0, 0.0]}, "must have a mass of shape"),
-        ({"samples": 1}, "`samples` must be an int >= 2"),
-        ({"max_events": 0}, "`max_events` must be an int >= 1"),
-        ({"method": "euler"}, "`method` must be one of"),
-        ({"method": "time_stepping"}, "`step` must be given"),
-        ({"rtol": 1e-16}, "`rtol` must be at least 16 roundings of float64"),
-        ({"rtol": 0.0}, r"`rtol` must lie in \(0"),
-        ({"friction": 0.3}, "needs a system with a `tangent_function`"),
-        ({"slow": 2.0}, "`slow` must lie in"),
-    ],
-)
-def test_bad_input(change, message):
-    given = {"q0": [1.0], "v0": [0.0], "t_end": 1.0} | change
-    with pytest.raises(ValueError, match=message):
-        ji.simulate(ji.ball_system(), ji.Newton(0.5), **given)
-
-
-def test_bad_systems():
-    system = ji.ball_system(base=lambda t: jnp.where(t < 0.5, 0.0, jnp.nan))
-    with pytest.raises(ValueError, match=r"finite base motion.* at t = 0\.5"):
-        ji.simulate(system, ji.Newton(0.5), [1.0], [0.0], 1.0)
-    with pytest.raises(ValueError, match="`base_directions` must be given"):
-        ji.System(lambda q: q, [1.0], base=lambda t: t)
-    with pytest.raises(ValueError, match="`mass` must be positive definite"):
-        ji.System(lambda q: q, [[1.0, 2.0], [2.0, 1.0]])
-    with pytest.raises(TypeError, match="`gap_function` must be a function"):
-        ji.System(None, [1.0])
-    with pytest.raises(ValueError, match="`friction` must lie in"):
-        ji.simulate(
-            ji.block_system(1.0, 1.0), ji.Moreau(0.5), [0, 1, 0], [0] * 3, 1.0, friction=-0.1
-        )
-    with pytest.raises(ValueError, match="`mass` must lie in"):
-        ji.simulate(ji.System(lambda q: q, lambda q: 1 - q), ji.Newton(0.5), [2.0], [0.0], 1.0)
+# ---------------------------------------------------------------------------- at the edges
 
 
 @pytest.mark.slow
@@ -312,7 +252,7 @@ def test_contacts_that_still_approach_have_another_impact_at_once():
     """Moreau's law lets a separating contact close: the next impact is at the same instant."""
     system = ji.column_system([1.0, 1.0, 1.0])
     motion = ji.simulate(system, ji.Moreau(0.5), [0.0] * 3, [-1.0, -0.2, -0.2], 0.01, samples=2)
-    assert int(motion.status) == 0
+    assert status(motion) == "ok"
     times = np.asarray(motion.events.time)[: int(motion.events.count)]
     assert len(times) > 1
     assert (times[:2] == 0).all()
@@ -320,10 +260,10 @@ def test_contacts_that_still_approach_have_another_impact_at_once():
     pulls = ji.simulate(
         ji.column_system([1.0, 1.0]), ji.Newton(0.5), [0.0] * 2, [0.0, 1.0], 0.01, samples=2
     )
-    assert int(pulls.status) == 0
+    assert status(pulls) == "ok"
     assert int(pulls.events.count) == 0
     squeezed = ji.simulate(system, ji.Newton(0.9), [0.0] * 3, [-1.0, 5.0, 5.0], 0.01, samples=2)
-    assert int(squeezed.status) == MOTION_CODE["law_failed"]
+    assert status(squeezed) == "law_failed"
     with pytest.raises(RuntimeError, match="law_failed"):
         ji.raise_on_failed_motion(squeezed)
 
@@ -331,12 +271,17 @@ def test_contacts_that_still_approach_have_another_impact_at_once():
 @pytest.mark.slow
 def test_a_mass_matrix_that_turns_singular():
     system = ji.System(lambda q: q + 1, lambda q: 1 - q, force=lambda q, v, t: jnp.ones(1))
-    motion = ji.simulate(system, ji.Newton(0.5), [0.0], [1.0], 3.0)
-    assert int(motion.status) == MOTION_CODE["singular_mass"]
+    assert status(ji.simulate(system, ji.Newton(0.5), [0.0], [1.0], 3.0)) == "singular_mass"
     nan = ji.System(lambda q: q + 1, [1.0], force=lambda q, v, t: jnp.where(q < 0.5, 1.0, jnp.nan))
-    motion = ji.simulate(nan, ji.Newton(0.5), [0.0], [1.0], 3.0)
-    assert int(motion.status) == MOTION_CODE["not_finite"]
+    assert status(ji.simulate(nan, ji.Newton(0.5), [0.0], [1.0], 3.0)) == "not_finite"
 
 
-def test_kinds_have_codes():
-    assert [KIND_CODE[name] for name in EVENT_KINDS] == list(range(len(EVENT_KINDS)))
+def test_fit_through_event_times():
+    """Restitution from the times of six bounces; a motion that sees nothing says so."""
+    ball, first = ji.ball_system(), np.sqrt(2 / G)
+    times = first + 2 * first * np.cumsum(np.r_[0, 0.75 ** np.arange(1, 6)])
+    given = (ball, ji.Newton(0.7), times, [1.0], [0.0], 3.0)
+    found = ji.fit_motion(*given, observe=lambda m: m.events.time[:6], sigma=1e-3)
+    np.testing.assert_allclose(found.value, 0.75, atol=1e-9)
+    assert found.degrees_of_freedom == 5
+    assert found.rank == 1

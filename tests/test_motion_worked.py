@@ -1,6 +1,4 @@
-"""Worked motions: cradle, rocking block, shaken base, two balls; fits; pictures; the command."""
-
-import json
+"""Worked motions: cradle, rocking block, shaken base, two balls; fits through motions."""
 
 import jax
 import jax.numpy as jnp
@@ -9,16 +7,20 @@ import pytest
 from scipy.integrate import quad
 
 import jimpact as ji
-from jimpact.cli import main
-from jimpact.motion.record import EVENT_KINDS, MOTION_CODE
-from jimpact.motion.study_motion import read_motion_study
-from jimpact.theory.rocking_ratios import housner_restitution, rocking_matrix
 
 G = 9.80665
 
 
 def kinds(motion):
-    return [EVENT_KINDS[k] for k in np.asarray(motion.events.kind)[: int(motion.events.count)]]
+    return motion.to_dict()["events"]["kind"]
+
+
+def ended(motion):
+    """Names of the statuses of a motion, or of a batch's."""
+    lanes = [motion]
+    if np.ndim(motion.status):
+        lanes = [jax.tree.map(lambda x, i=i: x[i], motion) for i in range(len(motion.status))]
+    return [lane.to_dict()["status"] for lane in lanes]
 
 
 @pytest.mark.slow
@@ -32,7 +34,7 @@ def test_cradle_over_fifty_swings():
         return ji.simulate(system, law, [-0.3, 0, 0], [0.0] * 3, 50 * period, samples=1001)
 
     motion, again = swing(), swing()
-    assert int(motion.status) == MOTION_CODE["ok"]
+    assert ended(motion) == ["ok"]
     for a, b in zip(jax.tree.leaves(motion), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(a, b)
     energy = np.asarray(motion.energy)
@@ -56,17 +58,17 @@ def upright(theta, width=0.2, height=0.6):
 @pytest.mark.slow
 def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
-    e = float(housner_restitution(3.0))
+    e = float(ji.theory.housner_restitution(3.0))
     motion = ji.simulate(
         ji.block_system(0.2, 0.6),
-        ji.RestitutionMatrix(rocking_matrix(e)),
+        ji.RestitutionMatrix(ji.theory.rocking_matrix(e)),
         upright(0.15),
         [0.0] * 3,
         4.0,
         friction=5.0,
         samples=81,
     )
-    assert int(motion.status) == MOTION_CODE["ok"]
+    assert ended(motion) == ["ok"]
     last = int(motion.events.count) - 1
     assert kinds(motion) == ["impact"] * last + ["accumulation"]
     turning = np.abs(np.asarray(motion.events.velocity_after)[:20, 2])
@@ -103,7 +105,7 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
         samples=61,
         max_events=1000,
     )
-    assert int(motion.status) == MOTION_CODE["ok"]
+    assert ended(motion) == ["ok"]
     assert int(motion.steps) < 10 * int(motion.events.count)
     energy = np.asarray(motion.energy)
     assert np.diff(energy).max() < 1e-11 * energy[0]
@@ -116,7 +118,7 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
 @pytest.mark.slow
 def test_overturning_on_a_harmonic_base():
     """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
-    law = ji.RestitutionMatrix(rocking_matrix(0.85))
+    law = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))
 
     @jax.jit
     @jax.vmap
@@ -132,7 +134,7 @@ def test_overturning_on_a_harmonic_base():
     still, trembles, rocks, falls = np.nanmax(np.abs(np.asarray(motion.q)[..., 2]), axis=1)
     assert still < 1e-10
     # just above the threshold hops die out while the base shakes
-    assert int(motion.status[1]) == MOTION_CODE["ok"]
+    assert ended(motion)[1] == "ok"
     assert 1e-4 < trembles < np.pi / 2
     assert 0.1 < rocks < np.pi / 2 < falls
     np.testing.assert_allclose(motion.ledger_residual[:3], 0, atol=1e-9)
@@ -216,97 +218,11 @@ def test_friction_is_fitted_through_a_motion():
 
 
 @pytest.mark.slow
-def test_fit_of_event_times_and_bad_fits():
-    ball = ji.ball_system()
-    first = np.sqrt(2 / G)
-    times = first + 2 * first * np.cumsum(np.r_[0, 0.75 ** np.arange(1, 6)])
-    given = (ball, ji.Newton(0.7), times, [1.0], [0.0], 3.0)
-    found = ji.fit_motion(*given, observe=lambda m: m.events.time[:6], sigma=1e-3)
-    np.testing.assert_allclose(found.value, 0.75, atol=1e-9)
+def test_a_motion_that_sees_nothing():
     before = ji.fit_motion(
-        ball, ji.Newton(0.7), [[1.0], [0.9]], [1.0], [0.0], 0.1, bounds={"restitution": (0.1, 0.9)}
-    )
+        ji.ball_system(), ji.Newton(0.7), [[1.0], [0.9]], [1.0], [0.0], 0.1,
+        bounds={"restitution": (0.1, 0.9)},
+    )  # fmt: skip
     assert before.rank == 0
     assert np.isinf(before.standard_error[0])
     assert "cannot see restitution" in str(before)
-
-
-def test_bad_fits():
-    ball = ji.ball_system()
-    with pytest.raises(ValueError, match=r"`measured` must have shape \(S, 1\)"):
-        ji.fit_motion(ball, ji.Newton(0.7), [1.0, 2.0], [1.0], [0.0], 1.0)
-    with pytest.raises(ValueError, match="at least one value"):
-        ji.fit_motion(ball, ji.Newton(0.7), [[np.nan]], [1.0], [0.0], 1.0)
-    with pytest.raises(ValueError, match="must name parameters of Newton"):
-        ji.fit_motion(ball, ji.Newton(0.7), [[1.0]], [1.0], [0.0], 1.0, "stiffness")
-
-
-STUDY = """
-[system]
-kind = "block"
-width_m = 0.2
-height_m = 0.6
-[base]
-amplitude_m = 0.01
-frequency_hz = 1.0
-direction = "horizontal"
-[law]
-name = "moreau"
-restitution = 0.5
-[motion]
-q0 = [0.0, 0.3, 0.0]
-v0 = [0.0, 0.0, 0.0]
-t_end_s = 0.2
-samples = 5
-"""
-
-
-def test_motion_studies(tmp_path):
-    path = tmp_path / "study.toml"
-    path.write_text(STUDY)
-    study = read_motion_study(path)
-    assert study.title == "study"
-    assert study.arguments["t_end"] == 0.2
-    assert study.system.base(0.25).tolist() == [0.01, 0.0]
-    for old, new, message in (
-        ('kind = "block"', 'kind = "car"', "`kind` must be one of ball, column"),
-        ("width_m", "width", "may have the keys kind, width_m"),
-        ('"horizontal"', '"line"', "`direction` of a block must be vertical or horizontal"),
-        ("t_end_s", "t_end", "must have the key `t_end_s`"),
-        ("[law]", "[laws]", "must have the key `law`"),
-        ("0.2\nheight", "-0.2\nheight", "`width` must lie in"),
-    ):
-        path.write_text(STUDY.replace(old, new))
-        with pytest.raises(ValueError, match=message.replace("[", r"\[")):
-            read_motion_study(path)
-    with pytest.raises(FileNotFoundError, match=r"cradle_motion\.toml, shaken_dimer\.toml"):
-        read_motion_study("nothing.toml")
-
-
-@pytest.mark.slow
-def test_simulate_command(tmp_path, capsys):
-    out, gif, portrait = (tmp_path / name for name in ("m.png", "m.gif", "p.svg"))
-    options = ["--out", str(out), "--gif", str(gif), "--portrait", str(portrait), "--json"]
-    short = ["--t-end", "0.3", "--samples", "11", "--coordinate", "3"]
-    assert main(["simulate", "shaken_dimer.toml", *options, *short]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["status"] == "ok"
-    assert np.shape(told["q"]) == (11, 3)
-    assert set(told["events"]["kind"]) <= set(EVENT_KINDS)
-    assert len(told["events"]["time"]) == told["events"]["kind"].count("impact") > 3
-    assert out.stat().st_size > 10_000
-    assert gif.read_bytes().startswith(b"GIF89a")
-    assert "svg" in portrait.read_text()[:200]
-
-
-def test_simulate_command_refuses(tmp_path, capsys):
-    path = tmp_path / "study.toml"
-    path.write_text(STUDY.replace("0.3, 0.0]", "0.2, 0.0]"))
-    assert main(["simulate", str(path), "--out", str(tmp_path)]) == 2
-    assert "must have no penetration" in capsys.readouterr().err
-    assert main(["simulate", "--out", "picture.jpg"]) == 2
-    assert "--out must end in .png" in capsys.readouterr().err
-    assert main(["simulate", "--portrait", "portrait.gif"]) == 2
-    assert "--portrait must end in .png" in capsys.readouterr().err
-    assert main(["simulate", "--gif", "motion.mp4"]) == 2
-    assert "--gif must end in .gif" in capsys.readouterr().err

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import kinetic_norm
 
 import jimpact as ji
-from jimpact.contact import kinetic_norm
-from jimpact.theory.quasi_velocities import (
+from jimpact.theory import (
     contact_power,
     from_quasi_velocities,
     kinetic_energy_split,
@@ -104,7 +104,7 @@ def test_friction_block():
     np.testing.assert_allclose(work.total, change, atol=1e-14)
 
 
-@pytest.mark.parametrize("constraints", [0, 1, 2])
+@pytest.mark.parametrize("constraints", [0, 1])
 def test_identities_of_random_scenes(constraints):
     scene = random_scene(constraints)
     v = compatible(scene)

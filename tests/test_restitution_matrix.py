@@ -4,13 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import CODE, kinetic_norm
 
 import jimpact as ji
-from jimpact.contact import kinetic_norm, normalized_delassus
-from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.status import CODE
-from jimpact.theory.quasi_velocities import from_quasi_velocities, to_quasi_velocities
-from jimpact.theory.rocking_ratios import housner_restitution, rocking_matrix, rocking_ratios
+from jimpact import RestitutionMatrix, normalized_delassus
+from jimpact.theory import (
+    from_quasi_velocities,
+    housner_restitution,
+    rocking_matrix,
+    rocking_ratios,
+    to_quasi_velocities,
+)
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])
 E2 = jnp.array([[0.7, 0.1], [0.25, 0.6]])

@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import CODE
 
 import jimpact as ji
-from jimpact.status import CODE
-from jimpact.theory.rocking_ratios import housner_restitution
-from jimpact.theory.rocking_record import OUTCOMES, RockingDispersion
+from jimpact.montecarlo.statistics import OUTCOMES
+from jimpact.theory import RockingDispersion, housner_restitution
 
 MU = np.array([0.0, 0.3, 1.0])
 CRITICAL = [2**0.5, (8.81**0.5 - 0.9) / 2, 0.5**0.5]  # of these mu; the roots of the two forms
@@ -19,7 +19,7 @@ E = np.array([0.3, 0.8, 0.9, 1.0])
 def solved(aspect, e, exponent, stiffness=(1.0, 1.0)):
     """All of one shape, and parameters as arrays: one program for this file."""
     exponent, stiffness = jnp.asarray(float(exponent)), jnp.asarray(stiffness)
-    return ji.rocking_dispersion(aspect, MU, e, stiffness, exponent, rtol=1e-10)
+    return ji.theory.rocking_dispersion(aspect, MU, e, stiffness, exponent, rtol=1e-10)
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def test_the_tip_depends_on_friction_alone(found, exponent, stiffness):
         others = np.delete(size[:, j], 4 + j, axis=0)
         assert others.min() > 0.005
     np.testing.assert_allclose(
-        ji.critical_kinetic_angle(MU), ji.rocking_kinetic_angle(CRITICAL), rtol=1e-14
+        ji.theory.critical_kinetic_angle(MU), ji.theory.rocking_kinetic_angle(CRITICAL), rtol=1e-14
     )
 
 
@@ -101,7 +101,7 @@ def test_record_and_words():
     np.testing.assert_array_equal(record.dispersion[:4, 0, 0], [0, -0.4, -0.04, -0.4])
     np.testing.assert_allclose(record.over_housner[:, 0, 0], 1 / housner_restitution(a))
     assert "critical angle 79.42 degrees; 1 rest, 1 rocking, 1 half-rocking, 1 free" in str(record)
-    v = ji.plot_rocking_dispersion(record)
+    v = ji.plot.rocking_dispersion(record)
     np.testing.assert_allclose(v.axes[0].lines[0].get_ydata(), np.abs(gamma[:, 1]))
     np.testing.assert_allclose(v.axes[0].lines[1].get_xdata(), 79.42, atol=0.01)
 
@@ -109,7 +109,7 @@ def test_record_and_words():
 def test_kinetic_angle_is_that_of_the_scene():
     scene = ji.rocking_block(width=0.3, height=0.21, mass=2.0)
     angle = ji.kinetic_angles(scene)[0, 1]
-    np.testing.assert_allclose(ji.rocking_kinetic_angle(0.7), angle, rtol=1e-12)
+    np.testing.assert_allclose(ji.theory.rocking_kinetic_angle(0.7), angle, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -126,31 +126,31 @@ def test_kinetic_angle_is_that_of_the_scene():
 )
 def test_bad_input(arguments, named):
     with pytest.raises(ValueError, match=named):
-        ji.rocking_dispersion(**{"aspect": 1.0, **arguments})
+        ji.theory.rocking_dispersion(**{"aspect": 1.0, **arguments})
 
 
 def test_bad_input_of_the_angles():
     with pytest.raises(ValueError, match="`friction`"):
-        ji.critical_kinetic_angle(-0.1)
+        ji.theory.critical_kinetic_angle(-0.1)
     with pytest.raises(ValueError, match=r"`restitution`.*0, 1"):
-        ji.search_critical_angle(0.1, 0.0)
+        ji.theory.search_critical_angle(0.1, 0.0)
 
 
 @pytest.mark.slow
 def test_the_tip_is_found_by_impacts_alone():
     mu, e = [0.0, 0.3, 1.0], [0.3, 0.8, 1.0]
-    angle = ji.search_critical_angle(mu, e)
+    angle = ji.theory.search_critical_angle(mu, e)
     np.testing.assert_allclose(np.ptp(angle, axis=1), 0.0, atol=1e-7)  # in e
-    np.testing.assert_allclose(angle[:, 0], ji.critical_kinetic_angle(mu), atol=1e-7)
+    np.testing.assert_allclose(angle[:, 0], ji.theory.critical_kinetic_angle(mu), atol=1e-7)
 
 
 @pytest.mark.slow
 def test_it_is_a_v():
     a = np.linspace(0.3, 5.0, 60)
-    out = ji.rocking_dispersion(a, [0.0, 0.1, 0.3, 1.0], [0.5, 1.0])
+    out = ji.theory.rocking_dispersion(a, [0.0, 0.1, 0.3, 1.0], [0.5, 1.0])
     assert np.isin(np.asarray(out.status), [CODE["ok"], CODE["plastic_limit"]]).all()
     theta, size = np.asarray(out.kinetic_angle), np.abs(out.dispersion)
-    for j, tip in enumerate(np.asarray(ji.critical_kinetic_angle(out.friction))):
+    for j, tip in enumerate(np.asarray(ji.theory.critical_kinetic_angle(out.friction))):
         left = theta < tip
         assert (np.diff(size[left, j], axis=0) < 0).all()
         assert (np.diff(size[~left, j], axis=0) > 0).all()

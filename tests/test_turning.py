@@ -9,8 +9,8 @@ from jimpact.bodies.base import scene_from_gaps
 from jimpact.bodies.blocks import Block
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness, Hertz, HuntCrossley, LinearSpring
-from jimpact.motion.turning import turning_impact
+from jimpact.laws.forces import Hertz, HuntCrossley, LinearSpring
+from jimpact.motion.contact_dynamics import turning_impact
 from jimpact.scene import chain
 
 GAPS = Block(1.0, 1.0).gap_function
@@ -80,25 +80,26 @@ def test_mass_that_depends_on_the_configuration():
 
 
 @pytest.mark.slow
-def test_reverse_derivative():
+def test_derivative():
+    """Beside the kink at LANDING, where one corner neither approaches nor leaves."""
+
     def spin(v):
         return turning_impact(GAPS, MASS, FLAT, v, Hertz(1e6)).velocity[2]
 
-    slope = jax.jit(jax.grad(spin))(LANDING)
+    falling = LANDING + jnp.array([0.0, -0.02, 0.0])
+    slope = jax.jit(jax.jacfwd(spin))(falling)
     h = 1e-4
     value = jax.jit(spin)
     for i in (1, 2):
         step = h * jnp.eye(3)[i]
-        difference = (value(LANDING + step) - value(LANDING - step)) / (2 * h)
-        assert float(slope[i]) == pytest.approx(float(difference), abs=2e-4)
+        difference = (value(falling + step) - value(falling - step)) / (2 * h)
+        assert float(slope[i]) == pytest.approx(float(difference), abs=1e-6)
 
 
 def test_nothing_approaches_and_bad_input():
     out = turning_impact(GAPS, MASS, FLAT, -LANDING, Hertz(1e6))
     assert bool(out.ended)
     np.testing.assert_allclose(out.velocity, -LANDING, atol=1e-12)
-    with pytest.raises(ValueError, match="restitution"):
-        turning_impact(GAPS, MASS, FLAT, LANDING, Bistiffness(1e6, 1.5, 0.5))
     with pytest.raises(ValueError, match="penetration"):
         turning_impact(GAPS, MASS, FLAT - 0.1, LANDING, Hertz(1e6))
     with pytest.raises(TypeError, match="`force`"):

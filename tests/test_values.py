@@ -365,3 +365,64 @@ def test_binary_redundant_contacts():
     stays = chain([2], [1], "both", e=[0.3, 0.0], status="ok")
     out = check_held("binary", [*states, twice, stays])
     np.testing.assert_allclose(out.impulse[:2, 1], [float(s.name) for s in states], rtol=1e-10)
+
+
+# ------------------------------------------------------------------------------ held slopes
+
+# d v+ / d (k2/k1, e1, e2) at eta = 1, and d v+ / d (eta, k2/k1, e1, e2) at eta = 1.5; e = 0.9
+LINEAR = np.array(
+    [
+        [-0.12283533377629, 0.14545764544136, -0.022622311665065],
+        [-0.64376648585348, 0.23257752345323, 0.41118896240025],
+        [-1.2503440488269e-6, -0.4064937970789, 0.40649504742295],
+    ]
+)
+HERTZ = np.array(
+    [
+        [0.081076619093299, -0.083883554615527, 0.0028069355222283],
+        [-0.066928813512993, 0.068799893104474, -0.0018710795914811],
+        [-0.61311351473699, 0.16549672267969, 0.4476167920573],
+        [-3.3628027004369e-7, -0.44470679947149, 0.44470713575176],
+    ]
+)
+ELASTIC = [  # d v+ / d (k2/k1, eta) at e = 1, eta = 1.5, from rtol = 1e-12
+    (-0.082349731119, 0.095566227547, -0.013216496428),
+    (0.087622672930, -0.101685435831, 0.014062762901),
+]
+
+
+@pytest.mark.parametrize("name", ["lzb", "compliant"])
+def test_held_slopes(name):
+    three = {"velocity": [1, 0, 0], "masses": [1, 1, 1]}
+    states = [
+        chain(**three, e=0.9, eta=1.0),
+        chain(**three, e=0.9, eta=1.5),
+        chain(**three, e=1.0, eta=1.5),
+    ]
+    for _, e, k, eta in programs.derivatives(name)(states)[:2]:
+        by_k, by_e = k[:, :3, 1], e[:, :3, :2]
+        by_eta = eta[:, :3, :2].sum(axis=2)
+        if name == "lzb":  # losses: where contacts open twice the compliant law differs
+            np.testing.assert_allclose([by_k[0], *by_e[0].T], LINEAR, atol=1e-6)
+            np.testing.assert_allclose([by_eta[1], by_k[1], *by_e[1].T], HERTZ, atol=1e-6)
+        np.testing.assert_allclose([by_k[2], by_eta[2]], ELASTIC, atol=1e-6)
+
+
+def test_slopes_at_the_edges_are_finite_and_one_sided():
+    """e = 0, 0.05 and 1; touching contacts; events that coincide."""
+    states = [chain([1, 1, 1], v, e=e) for e in (0.0, 0.05, 1.0) for v in ([1, 0, 0], [1, 0.5, -1])]
+    symmetric = chain([0.25, 1, 0.25], [1, 0, -1], e=0.8)
+    at_zero = chain([3, 1, 2], [1, 0, -0.5], e=[0.95, 0.0], k=[1, 3])
+    found = programs.derivatives("lzb")([*states, symmetric, at_zero])[:2]
+    for mode in found:
+        for x in mode[:3]:
+            assert np.isfinite(x).all()
+    # the slope in e at 0 is one-sided: of second order from three values
+    near = [chain([3, 1, 2], [1, 0, -0.5], e=[0.95, e], k=[1, 3]) for e in (0.0, 2e-3, 4e-3)]
+    moved = [chain([0.25, 1, 0.25], [1 + h, 0, -1], e=0.8) for h in (1e-3, -1e-3)]
+    out, _ = programs.values("lzb")([*near, *moved])
+    v = out.velocity[:, :3]
+    slope = (-3 * v[0] + 4 * v[1] - v[2]) / 4e-3
+    for mode in found:
+        np.testing.assert_allclose(mode[1][7][:3, 1], slope, atol=2e-4)
+        np.testing.assert_allclose(mode[0][6][:3, 0], (v[3] - v[4]) / 2e-3, atol=2e-4)

@@ -1,22 +1,18 @@
 """`jimpact advise`: the simplest law that a scene needs, with the evidence and a picture."""
 
-import sys
-from json import dumps
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from jimpact.commands.compare import velocities
-from jimpact.commands.output import picture_path, save_picture
-from jimpact.methods.advice.advising import advise
-from jimpact.methods.advice.report import Advice
+from jimpact.commands.output import Answer, command, save_picture
+from jimpact.methods.advice import advise
+from jimpact.methods.advice_report import Advice
 from jimpact.study import Study, read_study
 
-PICTURE = "jimpact-advise.png"
 _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 
 
+@command("advise")
 def run(
     study: Path,
     velocity: tuple[float, ...] | None,
@@ -25,40 +21,25 @@ def run(
     stiffness_range: tuple[float, float] | None,
     samples: int,
     seed: int,
-    out: Path,
-    json: bool,
-) -> int:
-    """Run the command with the options of `AdviseCommand`; told in one line on stderr: 2 for bad
-    input, 1 where the reference law fails on the scene.
-    """
-    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
-    try:
-        path = picture_path(out, PICTURE)
-        given = read_study(study)
-        before, _ = velocities(given, velocity, shot)
-        found = advise(
-            given.scene,
-            before,
-            tolerance,
-            stiffness_range=stiffness_range,
-            samples=samples,
-            seed=seed,
-            **_parameters(given),
-        )
-        _draw(found, given.title, path)
-    except (ValueError, TypeError, OSError) as error:
-        print(f"jimpact advise: {error}", file=sys.stderr)
-        return 2
-    except RuntimeError as error:
-        print(f"jimpact advise: {error}", file=sys.stderr)
-        return 1
-    if json:
-        told = {"title": given.title, "velocity": before.tolist()} | found.to_dict()
-        print(dumps(told | {"picture": str(path)}, indent=2))
-    else:
-        before_told = ", ".join(f"{v:g}" for v in before)
-        print(f"{given.title}: v- = ({before_told}) m/s\n{found}\n\nPicture: {path}")
-    return 0
+    picture: Path,
+) -> Answer:
+    """Advise with the options of `AdviseCommand`."""
+    given = read_study(study)
+    before, _ = velocities(given, velocity, shot)
+    found = advise(
+        given.scene,
+        before,
+        tolerance,
+        stiffness_range=stiffness_range,
+        samples=samples,
+        seed=seed,
+        **_parameters(given),
+    )
+    _draw(found, given.title, picture)
+    data = {"title": given.title, "velocity": before.tolist()} | found.to_dict()
+    v = ", ".join(f"{x:g}" for x in before)
+    text = f"{given.title}: v- = ({v}) m/s\n{found}\n\nPicture: {picture}"
+    return Answer(data | {"picture": str(picture)}, lambda: print(text))
 
 
 def _parameters(study: Study) -> dict[str, Any]:
@@ -73,6 +54,6 @@ def _parameters(study: Study) -> dict[str, Any]:
 
 
 def _draw(found: Advice, title: str, path: Path) -> None:
-    from jimpact.plot.validity import plot_advice  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_advice(found, title), path)
+    save_picture(plot.advice(found, title), path)

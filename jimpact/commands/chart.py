@@ -1,28 +1,25 @@
 """`jimpact chart`: speed against accuracy on one scene; a table, a picture."""
 
-import sys
-from json import dumps
 from pathlib import Path
 
-import jax
 import numpy as np
 from rich import box
 from rich.markup import escape
 from rich.table import Table
 
 from jimpact.commands.compare import velocities
-from jimpact.commands.output import console_for, picture_path, save_picture
+from jimpact.commands.output import Answer, command, console_for, save_picture
 from jimpact.laws import REGISTRY
 from jimpact.laws.lzb import LZB
-from jimpact.methods.charts.chart import work_precision
-from jimpact.methods.charts.record import Point, Timing, WorkPrecision
+from jimpact.methods.chart import work_precision
+from jimpact.methods.chart_record import Point, Timing, WorkPrecision
 from jimpact.methods.contenders import METHODS
 from jimpact.study import Study, read_study
 
-PICTURE = "jimpact-chart.png"
 SLOW_TO_COMPILE = ("tsit5", "kvaerno5")  # left to --full
 
 
+@command("chart")
 def run(
     study: Path,
     velocity: tuple[float, ...] | None,
@@ -32,36 +29,19 @@ def run(
     no_gradients: bool,
     batch: int,
     repeats: int,
-    out: Path,
-    json: bool,
-) -> int:
-    """Run the command with the options of `ChartCommand`; 2 for bad input, told on stderr."""
-    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
-    try:
-        path = picture_path(out, PICTURE)
-        given = read_study(study)
-        law = _law(given)
-        before, _ = velocities(given, velocity, shot)
-        names = methods or _able(law, given, full)
-        found = work_precision(
-            given.scene,
-            before,
-            law,
-            names,
-            batch=batch,
-            repeats=repeats,
-            gradients=not no_gradients,
-        )
-        _draw(found, given.title, path)
-    except (ValueError, TypeError, OSError) as error:
-        print(f"jimpact chart: {error}", file=sys.stderr)
-        return 2
-    if json:
-        told = {"title": given.title} | found.to_dict() | {"picture": str(path)}
-        print(dumps(told, indent=2))
-    else:
-        _print(given, found, path)
-    return 0
+    picture: Path,
+) -> Answer:
+    """Measure with the options of `ChartCommand`."""
+    given = read_study(study)
+    law = _law(given)
+    before, _ = velocities(given, velocity, shot)
+    names = methods or _able(law, given, full)
+    found = work_precision(
+        given.scene, before, law, names, batch=batch, repeats=repeats, gradients=not no_gradients
+    )
+    _draw(found, given.title, picture)
+    data = {"title": given.title} | found.to_dict() | {"picture": str(picture)}
+    return Answer(data, lambda: _print(given, found, picture))
 
 
 def _law(study: Study) -> LZB:
@@ -83,9 +63,9 @@ def _able(law: LZB, study: Study, full: bool) -> tuple[str, ...]:
 
 
 def _draw(found: WorkPrecision, title: str, path: Path) -> None:
-    from jimpact.plot.chart import plot_work_precision  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_work_precision(found, title), path)
+    save_picture(plot.work_precision(found, title), path)
 
 
 def _print(study: Study, found: WorkPrecision, path: Path) -> None:

@@ -1,19 +1,16 @@
 """`jimpact compare`: every law on one scene; a table, a picture."""
 
-import sys
 from dataclasses import replace
-from json import dumps
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from rich import box
 from rich.markup import escape
 from rich.table import Table
 
 from jimpact.audits import nothing_approaches
-from jimpact.commands.output import console_for, picture_path, save_picture
+from jimpact.commands.output import Answer, command, console_for, save_picture
 from jimpact.comparison import (
     Comparison,
     compare,
@@ -25,33 +22,22 @@ from jimpact.comparison import (
 from jimpact.fits.fitting import Fit
 from jimpact.study import Study, read_study
 
-PICTURE = "jimpact-compare.png"
 
-
+@command("compare")
 def run(
-    study: Path, velocity: tuple[float, ...] | None, shot: int, fit: bool, out: Path, json: bool
-) -> int:
-    """Run the command with the options of `CompareCommand`; 2 for bad input, told on stderr."""
-    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
-    try:
-        path = picture_path(out, PICTURE)
-        given = read_study(study)
-        before, measured = velocities(given, velocity, shot)
-        laws, left_out = registered_laws(given.parameters)
-        found = replace(compare(given.scene, before, laws), left_out=left_out)
-        fits = _fits(given) if fit else {}
-        _draw(found, measured, given.title, path)
-    except (ValueError, TypeError, OSError) as error:
-        print(f"jimpact compare: {error}", file=sys.stderr)
-        return 2
-    if json:
-        told: dict[str, Any] = {"title": given.title, "velocity": before.tolist()}
-        told |= {"laws": found.to_dict(), "fits": {n: f.to_dict() for n, f in fits.items()}}
-        told |= {"left_out": found.left_out}
-        print(dumps(told | {"picture": str(path)}, indent=2))
-    else:
-        _print(given, found, measured, fits, path)
-    return 0
+    study: Path, velocity: tuple[float, ...] | None, shot: int, fit: bool, picture: Path
+) -> Answer:
+    """Compare with the options of `CompareCommand`."""
+    given = read_study(study)
+    before, measured = velocities(given, velocity, shot)
+    laws, left_out = registered_laws(given.parameters)
+    found = replace(compare(given.scene, before, laws), left_out=left_out)
+    fits = _fits(given) if fit else {}
+    _draw(found, measured, given.title, picture)
+    data: dict[str, Any] = {"title": given.title, "velocity": before.tolist()}
+    data |= {"laws": found.to_dict(), "fits": {n: f.to_dict() for n, f in fits.items()}}
+    data |= {"left_out": found.left_out, "picture": str(picture)}
+    return Answer(data, lambda: _print(given, found, measured, fits, picture))
 
 
 def velocities(
@@ -82,9 +68,9 @@ def _fits(study: Study) -> dict[str, Fit]:
 
 
 def _draw(found: Comparison, measured: np.ndarray | None, title: str, path: Path) -> None:
-    from jimpact.plot.comparison import plot_comparison  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_comparison(found, measured, title), path)
+    save_picture(plot.comparison(found, measured, title), path)
 
 
 def _print(
@@ -104,8 +90,8 @@ def _print(
         console.print(f"[bold]No impact:[/bold] {escape(quiet)}.", soft_wrap=True)
     for name, reason in found.left_out.items():
         console.print(f"{escape(name)} is left out: it {escape(reason)}.", soft_wrap=True)
-    told = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
-    console.print(f"Parameters: {escape(told)}.", soft_wrap=True)
+    values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
+    console.print(f"Parameters: {escape(values)}.", soft_wrap=True)
     console.print(
         "Dispersion: 0 all energy in one body, 1 equal shares. Time: one compiled call, its "
         "argument checks included.",

@@ -1,59 +1,46 @@
 """`jimpact fit`: the study's fit, its yardsticks, a report, a picture."""
 
-import sys
 from dataclasses import replace
-from json import dumps
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from jimpact.commands.output import console_for, picture_path, save_picture
+from jimpact.commands.output import Answer, command, console_for, save_picture
 from jimpact.fits.fitting import Fit
 from jimpact.laws import Newton
 from jimpact.laws.lzb import LZB
 from jimpact.study import Study, read_study
 
-PICTURE = "jimpact-fit.png"
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
+@command("fit")
 def run(
     study: Path,
     law: str | None,
     method: str | None,
     starts: int | None,
     seed: int | None,
-    out: Path,
-    json: bool,
-) -> int:
-    """Run the command with the options of `FitCommand`; 2 for bad input, told on stderr."""
-    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
-    try:
-        path = picture_path(out, PICTURE)
-        given = read_study(study, law)
-        fits = _all_fits(given, {"method": method, "starts": starts, "seed": seed})
-        _draw(given, fits, path)
-    except (ValueError, TypeError, OSError) as error:
-        print(f"jimpact fit: {error}", file=sys.stderr)
-        return 2
-    if json:
-        told = {name: fit.to_dict() for name, fit in fits.items()}
-        print(dumps({"title": given.title, "fits": told, "picture": str(path)}, indent=2))
-    else:
-        _print_report(given, fits, path)
-    return 0
+    picture: Path,
+) -> Answer:
+    """Fit with the options of `FitCommand`."""
+    given = read_study(study, law)
+    fits = _all_fits(given, {"method": method, "starts": starts, "seed": seed})
+    _draw(given, fits, picture)
+    found = {name: fit.to_dict() for name, fit in fits.items()}
+    data = {"title": given.title, "fits": found, "picture": str(picture)}
+    return Answer(data, lambda: _print_report(given, fits, picture))
 
 
 def _draw(study: Study, fits: dict[str, Fit], path: Path) -> None:
-    from jimpact.plot.fits import plot_fit  # matplotlib, late: bad input is told sooner
+    from jimpact import plot  # matplotlib, late: bad input is told sooner
 
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
-    save_picture(plot_fit(fits[RAW], others, study.title), path)
+    save_picture(plot.fit(fits[RAW], others, study.title), path)
 
 
 def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:

@@ -2,50 +2,28 @@
 
 import sys
 import warnings
-from json import dumps
 from pathlib import Path
 from typing import Any
 
-import jax
-
-from jimpact.commands.output import INTERRUPTED, picture_path, save_picture
-from jimpact.montecarlo.executors import Executor, as_executor
+from jimpact.commands.output import Answer, command, save_picture
+from jimpact.montecarlo.executors import DaskExecutor, Executor, as_executor
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.study import Study, read_study
 
-PICTURE = "jimpact-montecarlo.png"
 
-
-def run(study: Path, out: Path, json: bool, **options: Any) -> int:
-    """Run the command with the options of `MonteCarloCommand`; told in one line on stderr: 2 for
-    bad input, 1 where nothing could be used, 130 after ctrl-C.
-    """
-    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets nothing
-    try:
-        path = picture_path(out, PICTURE)
-        given = read_study(study)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", UserWarning)
-            found = monte_carlo(**_arguments(given, study, **options))
-        _draw(found, given.title, path)
-    except KeyboardInterrupt as stop:
-        print(f"jimpact montecarlo: {stop or 'stopped.'}", file=sys.stderr)
-        return INTERRUPTED
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        print(f"jimpact montecarlo: {error}", file=sys.stderr)
-        return 2
-    except RuntimeError as error:
-        print(f"jimpact montecarlo: {error}", file=sys.stderr)
-        return 1
+@command("montecarlo")
+def run(study: Path, picture: Path, **options: Any) -> Answer:
+    """Sample with the options of `MonteCarloCommand`."""
+    given = read_study(study)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        found = monte_carlo(**_arguments(given, study, **options))
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
-    if json:
-        told = {"title": given.title} | found.to_dict() | {"picture": str(path)}
-        print(dumps(told, indent=2))
-    else:
-        print(f"{given.title}\n{found}\n\nPicture: {path}")
-    return 0
+    _draw(found, given.title, picture)
+    data = {"title": given.title} | found.to_dict() | {"picture": str(picture)}
+    return Answer(data, lambda: print(f"{given.title}\n{found}\n\nPicture: {picture}"))
 
 
 def _arguments(
@@ -72,12 +50,10 @@ def _executor(name: str, scheduler: str | None) -> Executor:
         return as_executor(name)
     if name != "dask":
         raise ValueError(f"--scheduler needs --executor dask, but it is {name}.")
-    from jimpact.montecarlo.executors.dask_cluster import DaskExecutor
-
     return DaskExecutor(scheduler)
 
 
 def _draw(found: MonteCarlo, title: str, path: Path) -> None:
-    from jimpact.plot.montecarlo import plot_monte_carlo  # matplotlib, late
+    from jimpact import plot  # matplotlib, late
 
-    save_picture(plot_monte_carlo(found, title), path)
+    save_picture(plot.monte_carlo(found, title), path)

@@ -22,6 +22,7 @@ may be SLACK: x > 0, and no force.
 
 import dataclasses
 import functools
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -190,6 +191,7 @@ class ContactFlow:
     root: int = 2
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
 
+    longest = math.inf  # no rate is large beside the others
     near = 0.0  # landings start from anywhere in a step
 
     @property
@@ -232,6 +234,10 @@ class ContactFlow:
         return modes, jnp.concatenate([x, g, jnp.zeros_like(g), jnp.zeros_like(g[:1])])
 
     # ---- the protocol
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
+        """Tolerances that the error of each row may be."""
+        return 1.0
 
     def constants(self, modes: jax.Array) -> Frozen:
         phase = modes[: self.contacts]

@@ -28,6 +28,7 @@ from jimpact.events.contact_flow import (
     unit,
 )
 from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.slip import SlipFlow
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -40,7 +41,7 @@ QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is 
 WIDE_SPREAD = 5.0
 METHODS = ("time", "impulse")
 ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
-SWEEPS = 60  # of the search for the contacts that carry the remainder of a plastic limit
+CHOICES = 8  # rounds of the search for the contacts that carry the remainder of a plastic limit
 
 
 class Problem(NamedTuple):
@@ -176,7 +177,8 @@ def flow_of(
         flow = ContactFlow(**parts)
         return flow, *flow.start(problem.gamma, x)
     across, along, friction, slip = problem.sides
-    frictional = FrictionFlow(**parts, across=across, along=along, friction=friction)
+    kind = FrictionFlow if len(slip) == m else SlipFlow
+    frictional = kind(**parts, across=across, along=along, friction=friction)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
 
 
@@ -211,7 +213,7 @@ class Outcome:
         else:
             moving, state = flow, jnp.where(over, flow.finish(last, end.y)[1], end.y)
         p = state[2 * m : 3 * m]
-        rest = at_rest(flow, still.gamma, p, over, last, end)
+        rest = at_rest(flow, jax.lax.stop_gradient(state), over, last, end.plan[3:4])
         p = settled(moving, problem.gamma, p, rest, exactly=self.repeats)
         side = state[3 * m + self.sides : -1][: self.sides]
         if self.repeats:
@@ -268,19 +270,15 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
 
 
 def at_rest(
-    flow: ContactFlow,
-    gamma: jax.Array,
-    p: jax.Array,
-    over: jax.Array,
-    modes: jax.Array,
-    end: stepper.Carry,
+    flow: ContactFlow, state: jax.Array, over: jax.Array, modes: jax.Array, passes: jax.Array
 ) -> jax.Array:
     """Contacts (m, B) as good as at rest where some re-closed again and again."""
     m = flow.contacts
-    after = gamma + flow.coupling.times(jax.lax.stop_gradient(p))
-    quiet = jnp.abs(after) <= QUIET * flow.patience(end.plan[3:4])
+    _, gamma, _ = flow.rows(state)
+    # no wider than what ended the impact: a ball of a long chain may be slower
+    quiet = jnp.abs(gamma) <= QUIET * flow.patience(passes)
     endless = quiet & (modes[m : 2 * m] >= ENDLESS)
-    return over & (endless | (any_of(endless) & quiet & (after < 0)))
+    return over & (endless | (any_of(endless) & quiet & (gamma < 0)))
 
 
 def settled(
@@ -288,40 +286,37 @@ def settled(
 ) -> jax.Array:
     """Impulses once endless re-closing has come to its limit, gamma+ = 0 at contacts at rest.
 
-    They carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, a remainder of
-    the size of the tolerance; `exactly`, as derivatives need it, or to a part of it.
+    They carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`. Who carries is
+    a decision; `exactly`: dp is a smooth function of the rest.
     """
 
     def come_to_rest(p: jax.Array) -> jax.Array:
-        times = flow.coupling.times
-        after = gamma + times(p)
-        still = jax.lax.stop_gradient(jnp.where(rest, after, 0.0))
-        bound = jax.lax.stop_gradient(flow.coupling.magnitude())
-        # projected steps, shorter than 1 / |G| so that they converge
-        reach = jnp.max(bound.times(jnp.ones_like(still)), axis=0, keepdims=True)
-        frozen = jax.lax.stop_gradient(flow.coupling)
+        still, frozen = jax.lax.stop_gradient((gamma + flow.coupling.times(p), flow.coupling))
 
-        def sweep(_: int, dp: jax.Array) -> jax.Array:
-            down = still + jnp.where(rest, frozen.times(dp), 0.0)
-            return jnp.where(rest, jnp.maximum(dp - down / reach, 0.0), 0.0)
+        def choose(_: int, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            """Those that would pull leave, those that still approach carry, too."""
+            carries, dp = both
+            left = still + frozen.times(dp)
+            carries = rest & jnp.where(carries, dp > 0, left < 0)
+            return carries, remainder(frozen, carries, still)
 
-        dp = jax.lax.fori_loop(0, SWEEPS, sweep, jnp.zeros_like(still))
-        if not exactly:
-            return p + dp
-        carries = rest & (dp > 0)
-        return p + conjugate_gradients(
-            lambda z: jnp.where(carries, times(z), 0.0), jnp.where(carries, -after, 0.0)
-        )
+        first = rest & (still < 0)
+        start = (first, remainder(frozen, first, still))
+        carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
+        if exactly:
+            dp = remainder(flow.coupling, carries, gamma + flow.coupling.times(p))
+        return p + dp
 
     return jax.lax.cond(jnp.any(rest), come_to_rest, lambda p: p, p)
 
 
-def conjugate_gradients(apply: Any, right: jax.Array) -> jax.Array:
-    """The solution of least effort of `apply(z) = right` (m, B), symmetric and consistent."""
+def remainder(coupling: Chain | Dense, carries: jax.Array, after: jax.Array) -> jax.Array:
+    """dp (m, B) of the contacts that carry, with which their gamma+ is 0: conjugate gradients."""
+    right = jnp.where(carries, -after, 0.0)
 
     def step(carry: Any, _: None) -> tuple[Any, None]:
         z, residual, direction, size = carry
-        image = apply(direction)
+        image = jnp.where(carries, coupling.times(direction), 0.0)
         curvature = total(direction * image)
         length = jnp.where(curvature > 0, size / jnp.where(curvature > 0, curvature, 1.0), 0.0)
         z, residual = z + length * direction, residual - length * image

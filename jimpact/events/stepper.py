@@ -14,6 +14,8 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
     over(modes, y, passes)     -> (1, B): nothing is left to integrate
     finish(modes, y)           -> (modes, y) where it is over
+    allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
+    longest                    the longest step in the flow's own time that is stable
     tolerance (1, B) or (n, B), snap (1, B), root, contacts
     near                       share of a step from which landings start, 0: from anywhere
 
@@ -74,6 +76,7 @@ class Flow(Protocol):
 
     tolerance: jax.Array
     root: int
+    longest: float
     near: float
 
     @property
@@ -87,6 +90,7 @@ class Flow(Protocol):
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]: ...
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float: ...
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array: ...
     def coasts(self, modes: jax.Array) -> jax.Array | None: ...
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array: ...
@@ -149,16 +153,17 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
         xi = start + c * length
         now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
         dy = flow.field(const, s.modes, now)
-        dc = jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))[1]
+        margins = lambda z: flow.margins(const, s.modes, z)
+        value, dc = jax.jvp(margins, (now,), (dy,))
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate
-        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), dc if ends else None
+        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), (value, dc) if ends else None
 
     none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     slopes, rates = jax.lax.scan(stage, none, rows)
-    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates, const
+    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates
 
 
 class Carry(NamedTuple):
@@ -197,15 +202,14 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
-    sums, c0, rates, const = _stages(flow, s, y, ends=True)
-    d0, d1 = rates[0], rates[-1]
+    sums, c0, (values, rates) = _stages(flow, s, y, ends=True)
+    c1, d0, d1 = values[-1], rates[0], rates[-1]
     end = y + sums[0, :n]
-    c1 = flow.margins(const, s.modes, end)
     eps = float(jnp.finfo(dtype).eps)
     full = FULL * flow.contacts
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
-    scale = local + COARSE_ROUNDING * eps * jnp.abs(y)
+    scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
     ok = error2 <= 1
@@ -222,20 +226,24 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
     bottom = jnp.where(crossed, c0 - c1, jnp.where(turns, d1 - d0, -d1))
     u = top / jnp.where(bottom > 0, bottom, jnp.inf)
+    # what rises from 0 and falls back: as in a parabola
+    u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
     if flow.near:
         # steps in time go before: exact in a parabola, where dt/dxi has a singularity at the top
-        u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
         u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
     v = 1 - u
     low = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
     dipped = turns & (low < DOUBT * (d1 - d0) - snap)
     at_once = (c0 <= snap) & (d0 <= 0)
     direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > snap))
-    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & ~lands
+    # ahead by a parabola: a margin that only creeps towards 0 is not about to reach it
+    left = d1 * d1 - 2 * (d1 - d0) * c1
+    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
+    soon = 2 * c1 / (jnp.sqrt(jnp.where(ahead, left, 1.0)) - jnp.where(ahead, d1, 0.0))
     at = jnp.where(
         crossed,
         jnp.where(direct & (again == 0), jnp.where(at_once, 0.0, u), u - 2),
-        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + u, jnp.inf)),
+        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + soon, jnp.inf)),
     )
     at = at + TIE * jnp.arange(c0.shape[0], dtype=dtype)[:, None]
     first = jnp.min(at, axis=0, keepdims=True)
@@ -257,6 +265,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     restart = root_of(jnp.minimum(RESTART * span, FIRST), r)
     in_root, xi = in_root | fresh, jnp.where(fresh, 0.0, xi)
     h = jnp.where(fresh & (restart > 0), restart, h)
+    h = jnp.where(in_root, h, jnp.minimum(h, flow.longest))
     new_span = jnp.where(in_root, (xi + h) ** r - xi**r, h)
     coasts = flow.coasts(s.modes)
     reached = (first - 1) * span < new_span

@@ -92,8 +92,8 @@ class CappedPolyhedron(NamedTuple):
             low, high = _chord(points, step, self.radius)
             high = np.minimum(high, np.where(rate < 0, reach, np.inf).min(1, initial=np.inf))
             low = np.maximum(low, np.where(rate > 0, reach, -np.inf).max(1, initial=-np.inf))
-            along = low + (high - low) * generator.random(count)
-            points = points + along[:, None] * step
+            position = low + (high - low) * generator.random(count)
+            points = points + position[:, None] * step
         return points
 
     def arc(self) -> tuple[float, float] | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,15 +14,15 @@ from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Search, search
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
+    AnyLaw,
     Parameters,
     bounds_of,
     free_parameters,
     with_entries,
 )
 from jimpact.fits.problem import Problem, build_problem
-from jimpact.fits.report import report, to_json
+from jimpact.fits.report import fit_warnings, report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
-from jimpact.fits.warned import fit_warnings
 from jimpact.law import Law
 from jimpact.scene import Scene
 
@@ -37,7 +37,7 @@ class Start:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(Generic[AnyLaw]):
     """What `fit` found. `print(fit)` is a report.
 
     P free parameters `names`, contacts numbered from 1; K shots of n velocities.
@@ -47,7 +47,7 @@ class Fit:
     degree of freedom is left, 1 where `sigma` was given.
     """
 
-    law: Law
+    law: AnyLaw
     method: str
     names: tuple[str, ...]
     value: np.ndarray
@@ -99,7 +99,7 @@ class Fit:
 
 
 def fit(
-    law: Law,
+    law: AnyLaw,
     scene: Scene | None,
     experiments: Experiments,
     free: Any = DEFAULT_FREE,
@@ -110,7 +110,7 @@ def fit(
     seed: int = 0,
     max_steps: int | None = None,
     progress: bool | None = None,
-) -> Fit:
+) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
 
     Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured values.
@@ -167,7 +167,7 @@ def _as_fit(
     limits: tuple[np.ndarray, np.ndarray],
     method: Method,
     notes: list[str],
-) -> Fit:
+) -> Fit[Any]:
     measured, sigma_known = experiments.measured, experiments.sigma is not None
     size = float(problem.size)
     spread = uncertainty(

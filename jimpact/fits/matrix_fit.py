@@ -1,6 +1,13 @@
-"""Fits of a restitution matrix: the region in which it is consistent for every approach."""
+"""Fits of a restitution matrix: the region in which it is consistent for every approach.
 
-from typing import Any
+The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is convex (each x >= 0
+asks `|E x| <= |x|` in the norm of G^-1), so points outside are drawn back along the ray to a
+point inside, and steps are cut by the conditions linearized at the current matrix. Only the
+energy bends; its second derivatives make the steps converge quadratically.
+"""
+
+from itertools import product
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,20 +16,214 @@ import numpy as np
 from scipy.optimize import linprog
 
 from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
-from jimpact.fits.matrix_region import AdmissibleMatrices
 from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene
+from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.tridiagonal import as_matrix, scaled
+
+# A point drawn back stops short of the boundary by this share of the way, times eps.
+_SHORT = 16.0
+# Least damping, relative to the largest curvature: keeps the matrix of the dual problem regular
+# where shots are too few to determine E.
+_LEAST_DAMPING = {"float64": 1e-8, "float32": 1e-4}
+_SCALINGS = 60  # of the ray: each closes in on the boundary quadratically
+_TIE = 1e-10  # eigenvalues of Q closer than this, relative to G^-1, are not told apart
 
 # Every support of m contacts gives a condition on the energy, 2^m - 1 in all.
 LARGEST = 6
-
 # Conditions may be broken by rounding, in units of the entries of G^-1.
 _ROUNDING = {"float64": 1e-9, "float32": 1e-4}
 _REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no inverse
 _HALVINGS = 40  # from a start on the boundary towards the inside
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
+
+
+class Approaches(NamedTuple):
+    """x (S, F, m), and the eigenvectors (columns) and eigenvalues of Q on the faces they lie on."""
+
+    x: jax.Array
+    vectors: jax.Array
+    values: jax.Array
+
+
+class AdmissibleMatrices(eqx.Module):
+    """The y whose matrix `E = origin + map y` is admissible in S scenes and inside its bounds.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.2 and 6.3.
+    """
+
+    origin: jax.Array  # (m m,)
+    map: jax.Array  # (m m, Q)
+    inverse: jax.Array  # G^-1 (S, m, m), the identity for open contacts
+    closed: jax.Array  # (S, m) zeros and ones
+    bounds: jax.Array | None  # (2, Q) of y
+    center: jax.Array  # y strictly inside
+    moving: jax.Array  # which of the elementwise conditions depend on y
+
+    def matrices(self, y: jax.Array) -> jax.Array:
+        """E (S, m, m), with zeros for open contacts."""
+        m = self.closed.shape[1]
+        e = (self.origin + self.map @ y).reshape(m, m)
+        return e[None] * (self.closed[:, :, None] * self.closed[:, None, :])
+
+    def elementwise(self, y: jax.Array) -> jax.Array:
+        """All that must be >= 0 and is linear in y: E, impulses, distances from the bounds.
+
+        1 for conditions that y cannot change.
+        """
+        e = self.matrices(y)
+        identity = jnp.eye(e.shape[1], dtype=e.dtype)[None]
+        impulses = self.inverse @ (identity + e)
+        slack = [self.origin + self.map @ y, impulses.reshape(-1)]
+        if self.bounds is not None:
+            slack += [y - self.bounds[0], self.bounds[1] - y]
+        return jnp.where(self.moving, jnp.concatenate(slack), 1.0)
+
+    def lost_energy(self, y: jax.Array, x: jax.Array) -> jax.Array:
+        """`x^T (G^-1 - E^T G^-1 E) x`, twice the energy lost at `qn- = -x` (S, F)."""
+        e, inverse = self.matrices(y), self.inverse
+        after = jnp.einsum("sij,sfj->sfi", e, x)
+        return _square(inverse, x) - _square(inverse, after)
+
+    def worst(self, y: jax.Array) -> Approaches:
+        """Approaches x >= 0 (S, F, m) among which each face has that of the least lost energy.
+
+        The minimizer with a given support is an eigenvector of the smallest eigenvalue there
+        (see `jimpact.theory.restitution_matrices`); the others are valid approaches all the same.
+        """
+        m = self.closed.shape[1]
+        q = self._dissipation(y)
+        faces = jnp.asarray(list(product((0, 1), repeat=m))[1:], q.dtype)
+        above = (m + 1.0) * (jnp.abs(q).max() + jnp.abs(self.inverse).max())
+        inside = faces[:, :, None] * faces[:, None, :]
+        outside = above * (1 - faces)[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
+        values, vectors = jnp.linalg.eigh(q[:, None] * inside[None] + outside[None])
+        x = vectors[..., 0] * faces[None]
+        x = jnp.maximum(x * jnp.where(jnp.sum(x, axis=-1) < 0, -1.0, 1.0)[..., None], 0.0)
+        x = x * self.closed[:, None, :]
+        norm = jnp.sqrt(jnp.sum(x**2, axis=-1, keepdims=True))
+        x = x / jnp.where(norm > 0, norm, 1.0)
+        return jax.lax.stop_gradient(Approaches(x, vectors * faces[None, :, :, None], values))
+
+    def _dissipation(self, y: jax.Array) -> jax.Array:
+        e = self.matrices(y)
+        return self.inverse - jnp.swapaxes(e, 1, 2) @ self.inverse @ e
+
+    def retract(self, y: jax.Array) -> jax.Array:
+        """y, or the last admissible point on the way to it from the center.
+
+        Differentiated (in line searches) as if the share of the way stayed the same.
+        """
+        share = self._share(jax.lax.stop_gradient(y))
+        short = 1 - _SHORT * jnp.finfo(y.dtype).eps
+        inside = self.center + short * share * (y - self.center)
+        return jnp.where(share < 1, inside, y)
+
+    def _share(self, y: jax.Array) -> jax.Array:
+        """How much of the way from the center to y is admissible, at most 1."""
+        here, there = self.elementwise(self.center), self.elementwise(y)
+        crossed = there < 0
+        share = jnp.where(crossed, here / jnp.where(crossed, here - there, 1.0), 1.0).min()
+
+        def closer(
+            state: tuple[jax.Array, jax.Array, jax.Array],
+        ) -> tuple[jax.Array, jax.Array, jax.Array]:
+            share, _, passes = state
+            x = self.worst(self.center + share * (y - self.center)).x
+            nearer = jnp.minimum(share, self._energy_share(y, x).min())
+            return nearer, nearer < share, passes + 1
+
+        start = (share, jnp.asarray(True), jnp.asarray(0))
+        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), closer, start)[0]
+
+    def _energy_share(self, y: jax.Array, x: jax.Array) -> jax.Array:
+        """Where on the ray the energy kept at the approaches x reaches 1; above the true end."""
+        start = jnp.einsum("sij,sfj->sfi", self.matrices(self.center), x)
+        rate = jnp.einsum("sij,sfj->sfi", self.matrices(y), x) - start
+        a, b = _square(self.inverse, rate), jnp.einsum("sfi,sij,sfj->sf", start, self.inverse, rate)
+        c = _square(self.inverse, x) - _square(self.inverse, start)  # > 0
+        root = jnp.sqrt(jnp.maximum(b**2 + a * c, 0.0))
+        # of a s^2 + 2 b s = c, in the form that does not cancel
+        above, below = jnp.where(b > 0, c, root - b), jnp.where(b > 0, root + b, a)
+        return jnp.where(below > 0, above / jnp.where(below > 0, below, 1.0), jnp.inf)
+
+    def conditions(self, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Slacks (C,), >= 0 but for rounding, of all conditions, and their derivatives (C, Q)."""
+        x = self.worst(y).x
+
+        def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+            value = jnp.concatenate([self.elementwise(y), self.lost_energy(y, x).reshape(-1)])
+            return value, value
+
+        rows, slack = jax.jacfwd(slacks, has_aux=True)(y)
+        return slack, rows
+
+    def curvature(self, y: jax.Array, pressure: jax.Array) -> jax.Array:
+        """Minus the second derivatives (Q, Q) of the lost energies, weighted; semidefinite.
+
+        The least eigenvalue of Q on a face bends with Q itself and as its eigenvector turns.
+        """
+        at = self.worst(y)
+
+        def moved(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+            after = jnp.einsum("sij,sfj->sfi", self.matrices(y), at.x)
+            turning = jnp.einsum("sij,sfj->sfi", self._dissipation(y), at.x)
+            return after, jnp.einsum("sfij,sfi->sfj", at.vectors, turning)
+
+        after, turning = jax.jacfwd(moved)(y)
+        apart = at.values - at.values[..., :1]
+        most = jnp.abs(self.inverse).max()
+        turns = jnp.where(apart > _TIE * most, 1 / jnp.where(apart > 0, apart, 1.0), 0.0)
+        weight = 2 * pressure.reshape(at.x.shape[:2])
+        bent = jnp.einsum("sf,sfip,sij,sfjq->pq", weight, after, self.inverse, after)
+        return bent + jnp.einsum("sf,sfj,sfjp,sfjq->pq", weight, turns, turning, turning)
+
+    def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
+        """Minus the step of steepest descent that the linearized conditions leave."""
+        slack, rows = self.conditions(y)
+        return -_quadratic(jnp.eye(y.shape[0], dtype=y.dtype), gradient, slack, rows)[0]
+
+    def step(
+        self, y: jax.Array, residual: jax.Array, jacobian: jax.Array, damping: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Damped Gauss-Newton step under the linearized conditions, and what it promises.
+
+        A second solve knows how the conditions bend where the first step pressed on them.
+        """
+        gradient, hessian = jacobian.T @ residual, jacobian.T @ jacobian
+        largest = jnp.max(jnp.diagonal(hessian))
+        least = jnp.maximum(damping, _LEAST_DAMPING[str(y.dtype)])
+        weight = least * jnp.where(largest > 0, largest, 1.0)
+        hessian = hessian + weight * jnp.eye(y.shape[0], dtype=y.dtype)
+        slack, rows = self.conditions(y)
+        first = len(self.moving)
+
+        def solve(_: int, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            bent = self.curvature(y, state[1][first:])
+            return _quadratic(hessian + bent, gradient, slack, rows)
+
+        start = (jnp.zeros_like(gradient), jnp.zeros_like(slack))
+        move, _ = jax.lax.fori_loop(0, 2, solve, start)
+        return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
+
+
+def _quadratic(
+    hessian: jax.Array, gradient: jax.Array, slack: jax.Array, rows: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """`min d^T H d / 2 + g^T d` with `slack + A d >= 0`: d and the multipliers, by the dual."""
+    factor = jax.scipy.linalg.cho_factor(hessian)
+    free = -jax.scipy.linalg.cho_solve(factor, gradient)
+    response = jax.scipy.linalg.cho_solve(factor, rows.T)
+    slack = jnp.maximum(slack, 0.0)
+    # positive semidefinite; the multipliers need not be unique, the step is
+    pressure = solve_lcp(rows @ response, slack + rows @ free, symmetric=False).z
+    return free + response @ pressure, pressure
+
+
+def _square(inverse: jax.Array, x: jax.Array) -> jax.Array:
+    """`x^T G^-1 x` of x (S, F, m)."""
+    return jnp.einsum("sfi,sij,sfj->sf", x, inverse, x)
 
 
 def matrix_region(
@@ -54,11 +255,17 @@ def matrix_region(
     inverse, closed = found[:, :m], found[:, m]
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
-    arrays = [None if a is None else jnp.asarray(a, dtype) for a in (inverse, closed, ends)]
     start = jnp.asarray(_start(law.matrix, origin, mix), dtype)
     every = jnp.ones((1 + len(inverse)) * m * m + (0 if ends is None else ends.size), bool)
-    affine = (jnp.asarray(origin, dtype), jnp.asarray(mix, dtype))
-    region = AdmissibleMatrices(*affine, *arrays, start, every)
+    region = AdmissibleMatrices(
+        origin=jnp.asarray(origin, dtype),
+        map=jnp.asarray(mix, dtype),
+        inverse=jnp.asarray(inverse, dtype),
+        closed=jnp.asarray(closed, dtype),
+        bounds=None if ends is None else jnp.asarray(ends, dtype),
+        center=start,
+        moving=every,
+    )
     slack, rows = _host_conditions(region, start)
     _check_start(region, slack)
     moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)

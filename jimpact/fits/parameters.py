@@ -3,7 +3,7 @@
 import dataclasses
 import operator
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from jimpact.law import Law, free_parameters_of, parameters_of
 from jimpact.laws.lzb import LZB
 
+AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 DEFAULT_FREE = ("restitution", "stiffness")
 
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
@@ -54,7 +55,7 @@ def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
 
 
-def with_entries(law: Law, fields: tuple[str, ...], values: jax.Array) -> Law:
+def with_entries(law: AnyLaw, fields: tuple[str, ...], values: jax.Array) -> AnyLaw:
     """The law with these entries (Q,)."""
     start = 0
     for field in fields:

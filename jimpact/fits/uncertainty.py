@@ -71,8 +71,8 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    told = tuple(_in_words(names, row, scale, log) for row in _reduced(null))
-    return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, told)
+    unseen = tuple(_in_words(names, row, scale, log) for row in _reduced(null))
+    return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, unseen)
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:

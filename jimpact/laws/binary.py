@@ -10,7 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_values, in_common_dtype
 from jimpact.contact import Contact, delassus_matrix
-from jimpact.law import Impulses, Law, check_law, option, parameter
+from jimpact.law import Impulses, Law, Values, check_law, option, parameter
 from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 from jimpact.solvers import collisions
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
@@ -73,7 +73,7 @@ class Binary(Law):
 
     uses_gaps: ClassVar[bool] = True
 
-    restitution: jax.Array = parameter(low=0.0, high=1.0)
+    restitution: Values = parameter(low=0.0, high=1.0)
     order: str | tuple[int, ...] = option("fastest", converter=_checked_order, kw_only=False)
     max_collisions: int = option(10_000, converter=lambda n: as_whole("max_collisions", n, 1))
 

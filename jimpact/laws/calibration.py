@@ -178,7 +178,12 @@ def _damped_spring(zeta: jax.Array) -> jax.Array:
     return jnp.exp(jnp.where(near, series, jnp.where(under, swinging, creeping)))
 
 
-def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> jax.Array:
+def _damping(
+    force: KelvinVoigt | HuntCrossley | KuwabaraKono,
+    mass: jax.Array,
+    speed: jax.Array,
+    e: jax.Array,
+) -> jax.Array:
     k = force.stiffness
     if isinstance(force, KelvinVoigt):
         unit = 2 * jnp.sqrt(k * mass)

@@ -11,7 +11,7 @@ from jimpact._checks import check_values
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
 from jimpact.events.impact_dynamics import dimensionless, sides_of, solve
-from jimpact.law import Impulses, Law, option, parameter
+from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.laws.lzb import check_rtol, default_rtol
 from jimpact.scene import Scene
@@ -53,8 +53,8 @@ class Compliant(Law):
     uses_gaps: ClassVar[bool] = True
 
     force: Force
-    friction: jax.Array | None = parameter(low=0.0, default=None, kw_only=True)
-    initial_energy: jax.Array = parameter(low=0.0, default=0.0, kw_only=True)
+    friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
+    initial_energy: Values = parameter(low=0.0, default=0.0, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
 

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array
-from jimpact.events.contact_flow import Exponent
-from jimpact.law import Declared, parameter
+from jimpact.law import Declared, StaticOrValues, Values, parameter
 
 _SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
 _BISECTIONS = 50  # of them, to about 1e-13 decades
@@ -66,9 +65,9 @@ class Bistiffness(Force):
     Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.1, (6.67).
     """
 
-    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
-    exponent: Exponent = parameter(low=1.0, static_numbers=True, default=1.5)
-    restitution: jax.Array = parameter(low=0.0, high=1.0, default=1.0)
+    stiffness: Values = parameter(low=0.0, open_low=True, log=True)
+    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    restitution: Values = parameter(low=0.0, high=1.0, default=1.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """Loading branch."""
@@ -110,8 +109,8 @@ class KelvinVoigt(Force):
 
     slackens: ClassVar[bool] = True
 
-    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
-    damping: jax.Array = parameter(low=0.0)
+    stiffness: Values = parameter(low=0.0, open_low=True, log=True)
+    damping: Values = parameter(low=0.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x + c x'`."""
@@ -129,9 +128,9 @@ class HuntCrossley(Force):
     Source: Hunt and Crossley (1975).
     """
 
-    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
-    damping: jax.Array = parameter(low=0.0)
-    exponent: Exponent = parameter(low=1.0, static_numbers=True, default=1.5)
+    stiffness: Values = parameter(low=0.0, open_low=True, log=True)
+    damping: Values = parameter(low=0.0)
+    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x^eta (1 + d x')`."""
@@ -153,8 +152,8 @@ class KuwabaraKono(Force):
 
     slackens: ClassVar[bool] = True
 
-    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True)
-    damping: jax.Array = parameter(low=0.0)
+    stiffness: Values = parameter(low=0.0, open_low=True, log=True)
+    damping: Values = parameter(low=0.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k sqrt(x) (x + 1.5 A x')`."""

@@ -1,16 +1,15 @@
 """The kinematic laws: what gap velocities become is said; Newton, Moreau, RestitutionMatrix."""
 
 import abc
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_shape, is_traced
 from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, option, parameter
+from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields, frictional_impulses
 from jimpact.scene import Scene, momentum
 from jimpact.solvers.lcp import solve_lcp
@@ -30,8 +29,15 @@ class Kinematic(Law):
 
     complementary: ClassVar[bool]
 
-    friction: eqx.AbstractVar[jax.Array | None]
-    tangential_restitution: eqx.AbstractVar[jax.Array | None]
+    if TYPE_CHECKING:  # fields of each law, in its own order
+
+        @property
+        def friction(self) -> OptionalValues:
+            """Coulomb's mu; None: no friction."""
+
+        @property
+        def tangential_restitution(self) -> OptionalValues:
+            """e_t; None: no friction."""
 
     @property
     @abc.abstractmethod
@@ -71,9 +77,9 @@ def prescribed_impulses(contact: Contact, required: jax.Array) -> Impulses:
 class _WithCoefficient(Kinematic):
     """E is one number, or one per contact."""
 
-    restitution: jax.Array = parameter(low=0.0, high=1.0)
-    friction: jax.Array | None = parameter(low=0.0)
-    tangential_restitution: jax.Array | None = parameter(low=-1.0, high=1.0)
+    restitution: Values = parameter(low=0.0, high=1.0)
+    friction: OptionalValues = parameter(low=0.0)
+    tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
 
     def __init__(self, restitution: Any, friction: Any = None, tangential_restitution: Any = 0.0):
         self.restitution = restitution
@@ -146,7 +152,7 @@ class Moreau(_WithCoefficient):
     complementary: ClassVar[bool] = True
     separable: ClassVar[bool] = True
 
-    restitution: jax.Array = parameter(low=0.0, high=1.0, matrix=True)
+    restitution: Values = parameter(low=0.0, high=1.0, matrix=True)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """A matrix must have one row and one column per contact."""
@@ -161,7 +167,7 @@ class RestitutionMatrix(Kinematic):
     Equation: with E (m, m): `qn+ = -E qn-`, `qn_j = gamma_j / |grad f_j|`, hence
     `pbar = -G^-1 (I + E) qn-`, `p_j = pbar_j / |grad f_j|`; tangential velocities are conserved.
     With E (m + k, m + k), k = n - m - b: `(qn+, qt+) = -E (qn-, qt-)` in the basis of
-    `ji.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
+    `ji.theory.quasi_basis`, E = [[E_nn, E_nt], [E_tn, E_tt]]. Impulses along the
     scene's tangents then carry the change of qt: `t_q^T H p_t = qt+ - qt-` (least p_t where
     several do), `pbar = G^-1 (qn+ - qn- - n_q^T H p_t)`. (Without friction E_tn = 0, E_tt = -I.)
     Bilateral constraints distort G and n_q as in (6.35). With friction, and E (m, m),
@@ -202,9 +208,9 @@ class RestitutionMatrix(Kinematic):
     complementary: ClassVar[bool] = False
     pulls: ClassVar[bool] = True
 
-    matrix: jax.Array = parameter(matrix=True)
-    friction: jax.Array | None = parameter(low=0.0)
-    tangential_restitution: jax.Array | None = parameter(low=-1.0, high=1.0)
+    matrix: Values = parameter(matrix=True)
+    friction: OptionalValues = parameter(low=0.0)
+    tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
     admissible: bool = option(True, converter=bool)
 
     def __init__(

@@ -7,9 +7,17 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
-from jimpact.events.contact_flow import Exponent
 from jimpact.events.impact_dynamics import METHODS, dimensionless, sides_of, solve
-from jimpact.law import Impulses, Law, StaticNumber, option, parameter
+from jimpact.law import (
+    Impulses,
+    Law,
+    OptionalValues,
+    StaticNumber,
+    StaticOrValues,
+    Values,
+    option,
+    parameter,
+)
 from jimpact.scene import Scene
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
@@ -107,11 +115,11 @@ class LZB(Law):
 
     separable: ClassVar[bool] = True
 
-    restitution: jax.Array = parameter(low=0.0, high=1.0)
-    stiffness: jax.Array = parameter(low=0.0, open_low=True, log=True, default=1.0)
-    exponent: Exponent = parameter(low=1.0, static_numbers=True, default=1.5)
-    initial_energy: jax.Array = parameter(low=0.0, default=0.0)
-    friction: jax.Array | None = parameter(low=0.0, default=None, kw_only=True)
+    restitution: Values = parameter(low=0.0, high=1.0)
+    stiffness: Values = parameter(low=0.0, open_low=True, log=True, default=1.0)
+    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    initial_energy: Values = parameter(low=0.0, default=0.0)
+    friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
     method: str = option("time", METHODS)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, option, parameter
+from jimpact.law import Impulses, Law, Values, option, parameter
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.linear import null_projector
 from jimpact.solvers.tridiagonal import as_matrix, is_regular
@@ -41,7 +41,7 @@ class Poisson(Law):
 
     separable: ClassVar[bool] = True
 
-    restitution: jax.Array = parameter(low=0.0, high=1.0, high_unless="allow_above_one")
+    restitution: Values = parameter(low=0.0, high=1.0, high_unless="allow_above_one")
     allow_above_one: bool = option(False, converter=bool)
 
     def impulses(self, contact: Contact) -> Impulses:

@@ -50,7 +50,7 @@ class Uniform(Distribution):
             raise ValueError(f"Argument `high` must be at least `low`, but has {self!r}.")
 
     def __repr__(self) -> str:
-        return f"Uniform(low={_told(self.low)}, high={_told(self.high)})"
+        return f"Uniform(low={_short(self.low)}, high={_short(self.high)})"
 
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
         """One draw (size,)."""
@@ -86,7 +86,7 @@ class Normal(Distribution):
         check_values("std", self.std, low=0.0, open_low=True)
 
     def __repr__(self) -> str:
-        return f"Normal(mean={_told(self.mean)}, std={_told(self.std)})"
+        return f"Normal(mean={_short(self.mean)}, std={_short(self.std)})"
 
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
         """One draw (size,)."""
@@ -154,8 +154,8 @@ class RandomLaw(eqx.Module):
         self.law, self.parameters = law, parameters
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
-        return f"{type(self.law).__name__}({told})"
+        given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"{type(self.law).__name__}({given})"
 
     def __call__(self, key: jax.Array) -> Law:
         """The law of this key."""
@@ -215,6 +215,6 @@ def _check_domain(name: str, distribution: Distribution, domain: Domain) -> None
         )
 
 
-def _told(value: jax.Array) -> str:
+def _short(value: jax.Array) -> str:
     entries = [f"{x:g}" for x in np.ravel(np.asarray(value))]
     return entries[0] if np.ndim(value) == 0 else f"[{', '.join(entries)}]"

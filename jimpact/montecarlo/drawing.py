@@ -63,7 +63,7 @@ def draw(
     `sizes` are (n, m), `key` is the chunk's, `rows` are those of given samples (C, n), (C, m).
     """
     keys = jax.vmap(lambda lane: jax.random.split(jax.random.fold_in(key, lane), 3))(lanes)
-    varies = tuple(map(is_random, (sources.law, sources.velocity, sources.gaps)))
+    varies = (is_random(sources.law), is_random(sources.velocity), is_random(sources.gaps))
     law = eqx.filter_vmap(sources.law)(keys[:, 0]) if varies[0] else sources.law
     velocity = _entries(sources.velocity, sizes[0], keys[:, 1], False)
     gaps = _entries(sources.gaps, sizes[1], keys[:, 2], True)

@@ -1,6 +1,14 @@
-"""From the arguments of `monte_carlo` to a run: checked, in one precision, and named by a hash."""
+"""From the arguments of `monte_carlo` to a run, checked, in one precision, named by a hash.
 
+A chunk is always computed at its full size, on one device, by the same program; the statistics are
+numpy's, in float64. So they depend neither on the executor nor on the number of devices. (A program
+that `shard_map` spreads over two devices has other last bits than that for one.)
+"""
+
+import contextlib
 import operator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -12,15 +20,126 @@ import jimpact
 from jimpact._checks import check_kind, in_common_dtype
 from jimpact.law import Law
 from jimpact.montecarlo.distributions import Rows, as_source
-from jimpact.montecarlo.drawing import Sources, is_random
-from jimpact.montecarlo.fingerprints import fingerprint
-from jimpact.montecarlo.plans import Plan, Run
-from jimpact.scene import Scene
+from jimpact.montecarlo.drawing import Drawn, Sources, draw, impacts, is_random
+from jimpact.montecarlo.statistics import Chunk, Task, reduced
+from jimpact.montecarlo.store import fingerprint
+from jimpact.scene import Scene, with_gaps
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
 LARGEST_CHUNK = 2**31  # lanes are numbered in uint32
 SAMPLES = 100_000
 BINS = 1000
+
+
+@dataclass(frozen=True)
+class Started:
+    """A chunk under way on a device."""
+
+    task: Task
+    drawn: Drawn
+    velocity: jax.Array
+    status: jax.Array
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Everything that determines the chunks; `plan(task)` computes one."""
+
+    sources: Sources
+    scene: Scene
+    key: np.ndarray  # of the run: its raw data
+    key_kind: str
+    size: int  # samples a chunk
+    bins: int
+    keep_samples: bool
+    x64: bool
+    threefry_partitionable: bool
+
+    def __call__(self, task: Task, device: jax.Device | None = None) -> Chunk:
+        """Compute one chunk on a device (None: the default one)."""
+        return self.finish(self.start(task, device))
+
+    def start(self, task: Task, device: jax.Device | None = None) -> Started:
+        """Enqueue a chunk on a device."""
+        with self._flags():
+            drawn, lanes, scene = self._drawn(task, device)
+            return Started(task, drawn, *impacts(drawn, scene, lanes))
+
+    def finish(self, started: Started) -> Chunk:
+        """Wait for a chunk and reduce it."""
+        drawn, empty = started.drawn, np.zeros((self.size, 0))
+        samples = {
+            "velocity": np.asarray(started.velocity),
+            "status": np.asarray(started.status),
+            "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
+            "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
+        }
+        return reduced(started.task, samples, self.bins, self.keep_samples)
+
+    def sample(self, task: Task, lane: int) -> tuple[Law, jax.Array, jax.Array | None]:
+        """Law, velocity and gaps of one sample, the same bits as in the run."""
+        with self._flags():
+            drawn, _, _ = self._drawn(task, None)
+
+        def own(part: Any) -> Any:
+            return jax.tree.map(lambda leaf: leaf[lane] if eqx.is_array(leaf) else leaf, part)
+
+        law, velocity, gaps = drawn.law, drawn.velocity, drawn.gaps
+        one, two, three = drawn.varies
+        return (
+            own(law) if one else law,
+            own(velocity) if two else velocity,
+            own(gaps) if three else gaps,
+        )
+
+    @contextlib.contextmanager
+    def _flags(self) -> Iterator[None]:
+        """What precision and draws depend on, in this thread only: workers have their own."""
+        partitionable = jax.threefry_partitionable(self.threefry_partitionable)
+        with jax.enable_x64(self.x64), partitionable:
+            yield
+
+    def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Drawn, jax.Array, Scene]:
+        """The draws of the task; where its inputs are, there a program runs."""
+        key = jax.random.wrap_key_data(jnp.asarray(self.key), impl=self.key_kind)
+        key = jax.random.fold_in(key, np.uint32(task.number))
+        lanes = np.arange(self.size, dtype=np.uint32)
+        sources, scene, key, lanes, rows = jax.tree.map(
+            lambda x: jax.device_put(x, device) if eqx.is_array_like(x) else x,
+            (self.sources, self.scene, key, lanes, task.rows),
+        )
+        return draw(sources, (scene.size, scene.contacts), key, lanes, rows), lanes, scene
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A plan, how many samples, and the rows of given samples, which travel with the tasks."""
+
+    plan: Plan
+    samples: int
+    rows: dict[str, np.ndarray]
+
+    @property
+    def chunks(self) -> int:
+        """Number of chunks, the last one perhaps not used whole."""
+        return -(-self.samples // self.plan.size)
+
+    def task(self, number: int, ends: np.ndarray | None = None) -> Task:
+        """The task of a chunk."""
+        size = self.plan.size
+        count = min(size, self.samples - number * size)
+        rows = {}
+        for name, values in self.rows.items():
+            own = values[number * size : (number + 1) * size]
+            rows[name] = np.pad(own, ((0, size - len(own)), (0, 0)), mode="edge")
+        return Task(number, count, ends, rows)
+
+    def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
+        """Law, scene and velocity of sample `index`, the same bits as in the run."""
+        number, lane = divmod(index, self.plan.size)
+        law, velocity, gaps = self.plan.sample(self.task(number), lane)
+        scene = self.plan.scene
+        return law, scene if gaps is None else with_gaps(scene, gaps), velocity
 
 
 def planned_run(
@@ -122,17 +241,17 @@ def description(run: Run) -> str:
     """The run in one line."""
     sources, scene = run.plan.sources, run.plan.scene
     law = sources.law
-    name = type(law).__name__ if isinstance(law, Law) else _told(law)
-    told = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
+    name = type(law).__name__ if isinstance(law, Law) else _source(law)
+    text = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
     for what in ("gaps", "velocity"):
         source = getattr(sources, what)
         if is_random(source):
             rows = run.rows.get(what)
-            told += f"; {what}: " + (_told(source) if rows is None else f"{len(rows)} given rows")
-    return told
+            text += f"; {what}: " + (_source(source) if rows is None else f"{len(rows)} given rows")
+    return text
 
 
-def _told(source: Any) -> str:
+def _source(source: Any) -> str:
     if isinstance(source, eqx.Module):
         return repr(source)
     return f"function {getattr(source, '__qualname__', type(source).__name__)}"

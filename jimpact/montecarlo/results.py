@@ -1,4 +1,4 @@
-"""What `monte_carlo` returns, and its report in words."""
+"""What `monte_carlo` returns, its report in words, and how chunks add up to it, always in order."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -8,9 +8,17 @@ import numpy as np
 
 from jimpact._checks import check_values
 from jimpact.law import Law
-from jimpact.montecarlo import histograms
-from jimpact.montecarlo.chunks import OUTCOMES
-from jimpact.montecarlo.plans import Run
+from jimpact.montecarlo.planning import Run
+from jimpact.montecarlo.statistics import (
+    LISTED,
+    OUTCOMES,
+    Chunk,
+    Moments,
+    bin_edges,
+    binned_quantile,
+    merged,
+    named,
+)
 from jimpact.scene import Scene
 
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
@@ -90,7 +98,7 @@ class MonteCarlo:
         check_values("q", q, low=0.0, high=1.0)
         ends = self.edges[:, [0, -1]]
         found = [
-            histograms.quantile(float(each), ends, self.counts, self.minimum, self.maximum)
+            binned_quantile(float(each), ends, self.counts, self.minimum, self.maximum)
             for each in np.ravel(q)
         ]
         return np.reshape(found, (*np.shape(q), len(self.mean)))
@@ -106,14 +114,14 @@ class MonteCarlo:
     def to_dict(self) -> dict[str, Any]:
         """Everything but samples and run, as a JSON file can hold it."""
         arrays = "mean covariance minimum maximum gap_mean gap_covariance cross_covariance"
-        told: dict[str, Any] = {"samples": self.samples, "count": self.count}
-        told |= {name: getattr(self, name).tolist() for name in arrays.split()}
-        told["standard_error"] = self.standard_error.tolist()
-        told["quantiles"] = {f"{q:g}": self.quantile(q).tolist() for q in REPORTED}
-        told["quantile_resolution"] = self.quantile_resolution.tolist()
-        told["histogram"] = {"edges": self.edges.tolist(), "counts": self.counts.tolist()}
-        told["statuses"] = self.statuses
-        told["bad"] = [
+        data: dict[str, Any] = {"samples": self.samples, "count": self.count}
+        data |= {name: getattr(self, name).tolist() for name in arrays.split()}
+        data["standard_error"] = self.standard_error.tolist()
+        data["quantiles"] = {f"{q:g}": self.quantile(q).tolist() for q in REPORTED}
+        data["quantile_resolution"] = self.quantile_resolution.tolist()
+        data["histogram"] = {"edges": self.edges.tolist(), "counts": self.counts.tolist()}
+        data["statuses"] = self.statuses
+        data["bad"] = [
             {
                 "index": bad.index,
                 "status": bad.status,
@@ -122,8 +130,8 @@ class MonteCarlo:
             }
             for bad in self.bad
         ]
-        told["gap_scale"] = None if self.gap_scale is None else self.gap_scale.tolist()
-        return told | {"rate": self.rate, "resumed": self.resumed}
+        data["gap_scale"] = None if self.gap_scale is None else self.gap_scale.tolist()
+        return data | {"rate": self.rate, "resumed": self.resumed}
 
     def __str__(self) -> str:
         lines = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
@@ -146,8 +154,8 @@ class MonteCarlo:
     def _rate(self) -> str:
         if self.resumed == self.samples:
             return "all read from the folder"
-        told = f"{self.rate:,.0f} samples/s"
-        return told + (f", {self.resumed:,} read from the folder" if self.resumed else "")
+        text = f"{self.rate:,.0f} samples/s"
+        return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
 
     def _gap_lines(self) -> list[str]:
         lines = []
@@ -176,3 +184,70 @@ class MonteCarlo:
 def _json_number(value: float) -> float | str:
     """JSON has no NaN."""
     return float(value) if np.isfinite(value) else str(float(value))
+
+
+class Totals:
+    """Sums over the chunks 0 .. `chunks` - 1."""
+
+    def __init__(self, run: Run):
+        self.run = run
+        self.chunks = 0
+        self.resumed = 0
+        self.moments: Moments | None = None
+        self.statuses = np.zeros(len(OUTCOMES), np.int64)
+        self.bad: list[BadSample] = []
+
+    def add(self, chunk: Chunk, resumed: bool) -> None:
+        """The next chunk."""
+        assert chunk.number == self.chunks  # floating-point sums depend on the order
+        if self.moments is None:
+            self.moments, self.ends = chunk.moments, chunk.ends
+            self.low, self.high, self.counts = chunk.low, chunk.high, chunk.counts
+            self.first = chunk.without_samples().samples
+        else:
+            self.moments = merged(self.moments, chunk.moments)
+            self.low, self.high = np.minimum(self.low, chunk.low), np.maximum(self.high, chunk.high)
+            self.counts = self.counts + chunk.counts
+        self.statuses = self.statuses + chunk.statuses
+        self.resumed += chunk.count if resumed else 0
+        self._list_bad(chunk)
+        self.chunks += 1
+
+    def _list_bad(self, chunk: Chunk) -> None:
+        room = max(LISTED - len(self.bad), 0)
+        for i, lane in enumerate(chunk.bad["lane"][:room]):
+            self.bad.append(
+                BadSample(
+                    index=chunk.number * self.run.plan.size + int(lane),
+                    status=OUTCOMES[int(chunk.bad["status"][i])].name,
+                    gaps=chunk.bad["gaps"][i],
+                    velocity=chunk.bad["velocity_before"][i],
+                )
+            )
+
+    def result(self, rate: float, description: str, gap_scale: np.ndarray | None) -> MonteCarlo:
+        """What is known of the run."""
+        assert self.moments is not None
+        n = len(self.ends)
+        covariance = self.moments.covariance
+        return MonteCarlo(
+            samples=self.run.samples,
+            count=self.moments.count,
+            mean=self.moments.mean[:n],
+            covariance=covariance[:n, :n],
+            minimum=self.low,
+            maximum=self.high,
+            gap_mean=self.moments.mean[n:],
+            gap_covariance=covariance[n:, n:],
+            cross_covariance=covariance[:n, n:],
+            edges=bin_edges(self.ends, self.run.plan.bins),
+            counts=self.counts,
+            statuses=named(self.statuses),
+            bad=tuple(self.bad),
+            first=self.first,
+            gap_scale=gap_scale,
+            rate=rate,
+            resumed=self.resumed,
+            description=description,
+            run=self.run,
+        )

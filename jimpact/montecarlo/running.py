@@ -13,16 +13,14 @@ import numpy as np
 from jimpact._checks import in_common_dtype
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
-from jimpact.montecarlo.bars import sample_bar
-from jimpact.montecarlo.chunks import Chunk
 from jimpact.montecarlo.drawing import Sources
 from jimpact.montecarlo.executors import Executor, as_executor
-from jimpact.montecarlo.gap_scales import gap_scale
-from jimpact.montecarlo.planning import BINS, CHUNK, description, identity, planned_run
-from jimpact.montecarlo.plans import Run
-from jimpact.montecarlo.results import MonteCarlo
+from jimpact.montecarlo.gaps import gap_scale
+from jimpact.montecarlo.planning import BINS, CHUNK, Run, description, identity, planned_run
+from jimpact.montecarlo.results import MonteCarlo, Totals
+from jimpact.montecarlo.statistics import Chunk
 from jimpact.montecarlo.store import Store
-from jimpact.montecarlo.totals import Totals
+from jimpact.progress import sample_bar
 from jimpact.scene import Scene
 
 
@@ -98,10 +96,10 @@ def monte_carlo(
     )
     failed = found.samples - found.count
     if failed:
-        told = ", ".join(f"{count} {name}" for name, count in found.statuses.items())
+        text = ", ".join(f"{count} {name}" for name, count in found.statuses.items())
         warnings.warn(
             f"{failed} of {found.samples} samples failed and are left out of the statistics "
-            f"({told}); see `bad` and `replay`.",
+            f"({text}); see `bad` and `replay`.",
             stacklevel=2,
         )
     return found
@@ -171,10 +169,10 @@ def _computed(
 
 
 def _interrupted(run: Run, store: Store | None, done: int) -> str:
-    told = f"stopped after {done:,} of {run.samples:,} samples; "
+    text = f"stopped after {done:,} of {run.samples:,} samples; "
     if store is None:
-        return told + "nothing is kept, because no `folder` was given."
-    return told + f"they are in '{store.folder}': the same call continues from there."
+        return text + "nothing is kept, because no `folder` was given."
+    return text + f"they are in '{store.folder}': the same call continues from there."
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:

@@ -1,25 +1,30 @@
-"""The folder of a run: one file a chunk, written whole or not at all, and a manifest.
+"""The folder of a run: one file a chunk, written whole or not at all, and a manifest of hashes.
 
 `manifest.json` names what the run is (a hash of each thing that determines its result); every
 `chunk-0000012.npz` carries that hash and a checksum of its own content.
 """
 
+import dataclasses
 import errno
+import functools
 import hashlib
+import inspect
 import io
 import json
 import os
+import pickle
 import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
-from jimpact.montecarlo.chunks import Chunk, chunk_from
+from jimpact.montecarlo.statistics import Chunk, chunk_from
 
 FORMAT = 1
 MANIFEST = "manifest.json"
@@ -37,6 +42,81 @@ UNUSABLE = (
 )
 
 
+def fingerprint(value: Any) -> str:
+    """Hexadecimal SHA-256 of everything that `value` holds.
+
+    A function counts as its qualified name, its source (its byte code where there is none), its
+    defaults, and the values it closes over; what it reads from globals is not seen.
+
+    >>> from jimpact.montecarlo.store import fingerprint
+    >>> fingerprint([1.0, "a"]) == fingerprint([1.0, "a"]) != fingerprint([2.0, "a"])
+    True
+    """
+    digest = hashlib.sha256()
+    for part in _parts(value, ()):
+        digest.update(len(part).to_bytes(8, "little") + part)
+    return digest.hexdigest()
+
+
+def _parts(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
+    """The value as byte strings; `inside` are the ids of what holds it (functions may recur)."""
+    if id(value) in inside:
+        yield b"itself"
+        return
+    inside = (*inside, id(value))
+    yield _name(type(value)).encode()
+    if isinstance(value, jax.Array | np.ndarray | np.generic):
+        array = np.asarray(value)
+        yield f"{array.dtype} {array.shape}".encode()
+        yield np.ascontiguousarray(array).tobytes()
+    elif value is None or isinstance(value, str | bytes | int | float | complex):
+        yield repr(value).encode()
+    elif isinstance(value, type):
+        yield _name(value).encode()
+    elif isinstance(value, Mapping):
+        for key in sorted(value, key=repr):
+            yield from _parts(key, inside)
+            yield from _parts(value[key], inside)
+    elif isinstance(value, list | tuple | set | frozenset):
+        for item in sorted(value, key=repr) if isinstance(value, set | frozenset) else value:
+            yield from _parts(item, inside)
+    elif isinstance(value, functools.partial):
+        yield from _parts((value.func, value.args, value.keywords), inside)
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield field.name.encode()
+            yield from _parts(getattr(value, field.name, None), inside)
+    elif inspect.ismethod(value):
+        yield from _parts((value.__func__, value.__self__), inside)
+    elif inspect.isfunction(value):
+        yield from _function(value, inside)
+    else:
+        yield _pickled(value)
+
+
+def _function(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
+    yield _name(value).encode()
+    try:
+        yield inspect.getsource(value).encode()
+    except (OSError, TypeError):
+        yield value.__code__.co_code + repr(value.__code__.co_names).encode()
+        yield from _parts([c for c in value.__code__.co_consts if not inspect.iscode(c)], inside)
+    yield from _parts((value.__defaults__, value.__kwdefaults__), inside)
+    for cell in value.__closure__ or ():
+        yield from _parts(cell.cell_contents, inside)
+
+
+def _pickled(value: Any) -> bytes:
+    try:
+        return pickle.dumps(value, protocol=4)
+    except Exception:
+        return _name(value).encode()
+
+
+def _name(value: Any) -> str:
+    return f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', type(value))}"
+
+
 class Store:
     """Chunks of one run in one folder.
 
@@ -51,8 +131,8 @@ class Store:
         self.folder.mkdir(parents=True, exist_ok=True)
         manifest = self.folder / MANIFEST
         if not any(self.folder.glob("chunk-*.npz")):  # nothing of any run is lost
-            told = {"format": FORMAT, "run": self.run, "identity": identity}
-            _write(manifest, json.dumps(told, indent=2).encode())
+            content = {"format": FORMAT, "run": self.run, "identity": identity}
+            _write(manifest, json.dumps(content, indent=2).encode())
         elif manifest.exists():
             _check_same(manifest, identity)
         else:
@@ -84,9 +164,9 @@ class Store:
             if int(arrays["number"]) != number:
                 raise ValueError(f"it is chunk {int(arrays['number'])} of this run")
         except UNUSABLE as error:
-            told = str(error) or type(error).__name__
+            text = str(error) or type(error).__name__
             warnings.warn(
-                f"'{path}' is not used, its samples are computed again: {told}.", stacklevel=2
+                f"'{path}' is not used, its samples are computed again: {text}.", stacklevel=2
             )
             return None
         chunk = chunk_from(arrays)
@@ -150,15 +230,15 @@ def _checksum(arrays: dict[str, np.ndarray], run: str) -> bytes:
 
 def _manifest(path: Path) -> dict[str, Any]:
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["format"] != FORMAT or not isinstance(told["identity"], dict):
-            raise ValueError(f"format {told['format']}")
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["format"] != FORMAT or not isinstance(content["identity"], dict):
+            raise ValueError(f"format {content['format']}")
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"'{path}' is damaged or of another version ({error}): give another folder, or delete "
             "this one."
         ) from None
-    return told
+    return content
 
 
 def _check_same(path: Path, identity: dict[str, str]) -> None:

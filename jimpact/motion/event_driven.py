@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jimpact.law import Law
 from jimpact.motion.contact_forces import Modes, no_modes
 from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
-from jimpact.motion.flow import Course, Flight, Scales, Settings, first_flight, fly
+from jimpact.motion.flow import Course, Flight, Scales, Settings, State, encoded, first_flight, fly
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.motion.transitions import Outcome, resolve
@@ -40,9 +40,12 @@ def event_driven(
     """The motion from `times[0]` to `times[-1]`, sampled at `times` (S,)."""
     n = q0.shape[0]
     m = gaps(system, q0, times[0]).shape[0]
-    begin = first_flight(settings, q0, v0, times, m)
+    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
+    rest = jnp.zeros((2, m), dtype)
+    state = State(q0, v0, times[0], zero, zero, rest, rest[:0])
+    watched = 2 * m if settings.friction else m
+    begin = first_flight(state, encoded(no_modes(m, dtype)), watched, times)
     events = no_events(max_events, n, m, q0.dtype)
-    zero = jnp.zeros((), q0.dtype)
     penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
@@ -97,12 +100,13 @@ def _next_event(
     flown = fly(system, mu, settings, found.modes, found.scales, times, ready)
     stuck = flown.stuck & ~over
     status = jnp.where(
-        stuck, _why_stuck(system, flown, jax.lax.stop_gradient(times)), status
+        stuck, why_stuck(system, flown, jax.lax.stop_gradient(times)), status
     ).astype(jnp.int32)
     return _Run(flown, found.modes, found.scales, found.struck, events, status)
 
 
-def _why_stuck(system: System, flight: Flight, times: jax.Array) -> jax.Array:
+def why_stuck(system: System, flight: Flight, times: jax.Array) -> jax.Array:
+    """The status of a motion whose steps vanish or are too many."""
     state = jax.lax.stop_gradient(flight.state)
     # where steps vanish before something that is not a number, it is a few roundings ahead
     ahead = AHEAD * (times[-1] - times[0])

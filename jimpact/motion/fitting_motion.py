@@ -11,8 +11,13 @@ import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
 from jimpact.fits.least_squares import Box, State, advance, begin
-from jimpact.fits.parameters import Parameters, bounds_of, entries, free_parameters
-from jimpact.fits.parameters import with_entries as law_with
+from jimpact.fits.parameters import (
+    Parameters,
+    bounds_of,
+    entries,
+    free_parameters,
+    with_entries as law_with,
+)
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.law import Law
 from jimpact.motion.record import MOTION_STATUS, Motion
@@ -172,12 +177,12 @@ def _problem(
     first = parameters.first
     with np.errstate(divide="ignore", invalid="ignore"):
         low, high = (np.where(log[first], np.log(x), x / scale[first]) for x in limits)
-    problem = _Problem(
+    problem = _Problem(  # type: ignore[call-arg]
         system,
         law,
         arguments,
         observe,
-        *(jnp.asarray(x) for x in (*given, offset, scale, groups, log)),
+        *(jnp.asarray(x) for x in (*given, offset, scale, groups, log)),  # type: ignore[arg-type]
         parameters.fields,
     )
     return problem, jnp.asarray(scaled[first]), Box(jnp.asarray(low), jnp.asarray(high))

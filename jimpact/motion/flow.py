@@ -1,6 +1,7 @@
 """Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,13 +17,16 @@ from jimpact.motion.contact_forces import (
     forces,
     powers,
 )
-from jimpact.motion.dynamics import definite, mass_at, user_force
+from jimpact.motion.dynamics import definite, free_acceleration, mass_at, user_force
 from jimpact.motion.modes import REST_ACCELERATION
 from jimpact.motion.record import Events
 from jimpact.motion.system import System
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
 ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is rounding
+# Error allowed in the ledger, of what the errors allowed in q and v are worth: ten times more, and
+# the steps of a body that rests on a moving base are those of the base's motion only.
+LEDGER = 0.01
 
 
 class State(NamedTuple):
@@ -33,7 +37,8 @@ class State(NamedTuple):
     t: jax.Array  # ()
     work: jax.Array  # ()
     base_work: jax.Array  # ()
-    contact_work: jax.Array  # (2, m): normal (impacts), tangential
+    contact_work: jax.Array  # (2, m): normal, tangential
+    contact: jax.Array  # (2, m): indentation, impulse of compliant contacts; (0, m) of rigid ones
 
 
 class Settings(NamedTuple):
@@ -80,18 +85,14 @@ def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales)
     return jnp.concatenate([normal, side])
 
 
-class MechanicalFlow(eqx.Module):
-    """A system with frozen modes of contact, an instance of the protocol of the stepper.
+class MotionFlow(eqx.Module):
+    """What flights have in common; an instance of the protocol of the stepper.
 
-    State (rows): q, v, t and the ledger. Modes (rows): for each contact, whether it is persistent,
-    whether it sticks, the sign of its sliding. Margins: gaps of open contacts, normal forces of
-    persistent ones, then friction (the cone, or the speed of sliding), then the time left to the
-    next sample; all in units of their rounding.
+    State (rows): q, v, t, the ledger, and what contacts remember. The last of the margins is the
+    time left to the next sample. Margins are in units of their rounding.
     """
 
     system: System
-    mu: jax.Array | None
-    scales: Scales
     rounding: jax.Array  # (k,)
     sample: jax.Array  # time of the next sample ()
     tolerance: jax.Array  # (rows, 1)
@@ -99,40 +100,20 @@ class MechanicalFlow(eqx.Module):
 
     root = 1
     contacts = 1
-    near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
+    near = 0.0
 
     @property
     def snap(self) -> jax.Array:
         """Margins are in units of their rounding."""
         return jnp.ones((1, 1), self.tolerance.dtype)
 
-    def constants(self, modes: jax.Array) -> Modes:
-        """The modes, of each contact."""
-        active, stick, sign = modes[:, 0].reshape(3, -1)
-        return Modes(active > 0, stick > 0, sign.astype(self.tolerance.dtype))
+    def from_margins(self, margins: jax.Array, at: State) -> jax.Array:
+        """Rows (k, 1) of margins, with that of the next sample."""
+        return (jnp.append(margins, self.sample - at.t) / self.rounding)[:, None]
 
-    def _contacts(self, at: State) -> Contacts:
-        return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
-
-    def field(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of the state; NaN where M is not positive definite."""
-        at = unpacked(self.like, y)
-        given = self._contacts(at)
-        found = forces(given, self.mu, const)
-        friction, base = powers(self.system, given, found, at.t)
-        power = user_force(self.system, at.q, at.v, at.t) @ at.v
-        per_contact = jnp.stack([jnp.zeros_like(friction), friction])
-        rates = State(at.v, found.acceleration, jnp.ones_like(at.t), power, base, per_contact)
-        if callable(self.system.mass):
-            regular = definite(mass_at(self.system, at.q))
-            return jnp.where(regular, packed(rates), jnp.nan)
-        return packed(rates)
-
-    def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """What must stay positive, and the time to the next sample."""
-        at = unpacked(self.like, y)
-        seen = watched(self._contacts(at), self.mu, const, self.scales)
-        return (jnp.append(seen, self.sample - at.t) / self.rounding)[:, None]
+    def projected(self, const: Any, at: State) -> State:
+        """The state back on the constraints of its modes."""
+        return at
 
     def rooted(self, modes: jax.Array) -> jax.Array:
         """None: forces are smooth where modes change."""
@@ -141,7 +122,7 @@ class MechanicalFlow(eqx.Module):
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Nothing: what happens at events is decided in `transitions.py`."""
+        """Nothing: what happens at events is decided between flights."""
         return modes, y
 
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
@@ -153,12 +134,71 @@ class MechanicalFlow(eqx.Module):
         return None
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Never: a flight ends at its first event."""
+        """Never: it is seen from outside."""
         return jnp.zeros((1, 1), bool)
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Nothing."""
         return modes, y
+
+    def regular(self, rates: State, at: State) -> jax.Array:
+        """Rows of rates; NaN where M is not positive definite."""
+        if callable(self.system.mass):
+            return jnp.where(definite(mass_at(self.system, at.q)), packed(rates), jnp.nan)
+        return packed(rates)
+
+
+class MechanicalFlow(MotionFlow):
+    """Rigid contacts with frozen modes: open, or persistent and sticking or sliding.
+
+    Modes (rows): for each contact, whether it is persistent, whether it sticks, the sign of its
+    sliding. Margins: gaps of open contacts, normal forces of persistent ones, then friction (the
+    cone, or the speed of sliding).
+    """
+
+    mu: jax.Array | None
+    scales: Scales
+
+    near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
+
+    def constants(self, modes: jax.Array) -> Modes:
+        """The modes, of each contact."""
+        active, stick, sign = modes[:, 0].reshape(3, -1)
+        return Modes(active > 0, stick > 0, sign.astype(self.tolerance.dtype))
+
+    def _contacts(self, at: State) -> Contacts:
+        return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
+
+    def field(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of the state."""
+        at = unpacked(self.like, y)
+        given = self._contacts(at)
+        found = forces(given, self.mu, const)
+        friction, base = powers(self.system, given, found, at.t)
+        power = user_force(self.system, at.q, at.v, at.t) @ at.v
+        per_contact = jnp.stack([jnp.zeros_like(friction), friction])
+        still = jnp.zeros_like(at.contact)
+        one = jnp.ones_like(at.t)
+        return self.regular(
+            State(at.v, found.acceleration, one, power, base, per_contact, still), at
+        )
+
+    def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """What must stay positive."""
+        at = unpacked(self.like, y)
+        seen = watched(self._contacts(at), self.mu, const, self.scales)
+        return self.from_margins(seen, at)
+
+    def projected(self, const: Modes, at: State) -> State:
+        """Gaps and velocities of persistent contacts set to 0, in the metric of M."""
+        given = self._contacts(at)
+        value, rate = given.normal.value, given.normal.rate
+        if given.tangent is not None:  # tangentially only velocities drift
+            value = jnp.concatenate([value, jnp.zeros_like(value)])
+            rate = jnp.concatenate([rate, given.tangent.rate])
+        p = constraint_impulse(given, self.mu, const, jnp.stack([value, rate], axis=1))
+        move = given.moved @ p
+        return at._replace(q=at.q + move[:, 0], v=at.v + move[:, 1])
 
 
 def packed(state: State) -> jax.Array:
@@ -177,18 +217,6 @@ def encoded(modes: Modes) -> jax.Array:
     return jnp.concatenate([x.astype(jnp.int32) for x in rows])[:, None]
 
 
-def project(system: System, mu: jax.Array | None, friction: bool, modes: Modes, y: State) -> State:
-    """Gaps and velocities of persistent contacts set to 0, in the metric of M."""
-    given = contacts_at(system, y.q, y.v, y.t, friction)
-    value, rate = given.normal.value, given.normal.rate
-    if given.tangent is not None:  # tangentially only velocities drift
-        value = jnp.concatenate([value, jnp.zeros_like(value)])
-        rate = jnp.concatenate([rate, given.tangent.rate])
-    p = constraint_impulse(given, mu, modes, jnp.stack([value, rate], axis=1))
-    move = given.moved @ p
-    return y._replace(q=y.q + move[:, 0], v=y.v + move[:, 1])
-
-
 class Flight(NamedTuple):
     """A flight under way."""
 
@@ -201,22 +229,100 @@ class Flight(NamedTuple):
     stuck: jax.Array
 
 
-def first_flight(
-    settings: Settings, q0: jax.Array, v0: jax.Array, times: jax.Array, m: int
-) -> Flight:
-    """A flight at the beginning, with the first of the samples written down."""
-    dtype, samples = q0.dtype, times.shape[0]
-    zero = jnp.zeros((), dtype)
-    state = State(q0, v0, times[0], zero, zero, jnp.zeros((2, m), dtype))
+def first_flight(state: State, rows: jax.Array, events: int, times: jax.Array) -> Flight:
+    """A flight at the beginning: `rows` of modes, so many `events`, the first sample written."""
+    dtype, samples = state.q.dtype, times.shape[0]
     unknown = jax.tree.map(lambda x: jnp.full((samples, *x.shape), jnp.nan, x.dtype), state)
     first = jax.tree.map(lambda all_, x: all_.at[0].set(x), unknown, state)
-    k = 2 * m if settings.friction else m
     step = jax.lax.stop_gradient(times[1] - times[0])
     clock = jnp.stack([0 * step, step, 0 * step, 0 * step])[:, None]
-    aim = stepper.Step(jnp.zeros((3 * m, 1), jnp.int32), jnp.zeros((k + 1, 1), bool), clock)
+    aim = stepper.Step(rows, jnp.zeros((events + 1, 1), bool), clock)
     plan = stepper.Carry(packed(state), aim, jnp.zeros((4, 1), dtype))
     none = jnp.int32(0)
-    return Flight(state, plan, jnp.zeros(k, bool), jnp.int32(1), first, none, jnp.asarray(False))
+    return Flight(
+        state, plan, jnp.zeros(events, bool), jnp.int32(1), first, none, jnp.asarray(False)
+    )
+
+
+def toward_sample(flight: Flight, targets: jax.Array) -> Flight:
+    """The next step lands on the sample if it reaches it."""
+    _, step, plan = flight.plan
+    left = targets[jnp.minimum(flight.sample, targets.shape[0] - 1)] - flight.state.t
+    h = step.clock[1, 0]
+    lands = left <= h
+    target = jnp.zeros_like(step.target).at[-1].set(lands)
+    clock = jnp.stack([0 * h, h, 0 * h, lands.astype(h.dtype)])[:, None]
+    plan = plan.at[0, 0].set(jnp.where(lands, left, h)).at[1].set(0.0)
+    new = stepper.Carry(packed(flight.state), step._replace(target=target, clock=clock), plan)
+    return flight._replace(plan=jax.lax.stop_gradient(new))
+
+
+def one_pass(
+    flow: MotionFlow, settings: Settings, allowed: jax.Array, targets: jax.Array, flight: Flight
+) -> Flight:
+    """One pass of the stepper; `allowed` are the errors of all rows but q and v."""
+    state, before, last = flight.state, flight.plan, targets.shape[0] - 1
+    size = jnp.abs(jnp.concatenate([state.q, state.v]))
+    tolerance = jnp.concatenate([settings.atol + settings.rtol * size, allowed])
+    flow = dataclasses.replace(
+        flow,
+        sample=targets[jnp.minimum(flight.sample, last)],
+        tolerance=jax.lax.stop_gradient(tolerance)[:, None],
+    )
+    # passes are counted here: their number does not lower the tolerance
+    carry = before._replace(y=packed(state), plan=before.plan.at[2:].set(0.0))
+    after, accept = stepper.advance(flow, carry, 2)
+    accept = accept[0, 0]
+    new = unpacked(flow.like, after.y)
+    new = flow.projected(flow.constants(after.step.modes), new)
+    landed = before.step.target[:, 0] & accept
+    sampled = landed[-1]
+    new = new._replace(t=jnp.where(sampled, flow.sample, new.t))
+    state = jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, state)
+    row = (jnp.arange(last + 1, dtype=flight.sample.dtype) == flight.sample) & sampled
+    samples = jax.tree.map(
+        lambda all_, x: jnp.where(row.reshape((-1,) + (1,) * x.ndim), x[None], all_),
+        flight.samples,
+        state,
+    )
+    steps = flight.steps + 1
+    span = jnp.abs(targets[0]) + jnp.abs(targets[-1])
+    vanishes = ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * span)
+    moved = flight._replace(
+        state=state,
+        plan=jax.lax.stop_gradient(after)._replace(y=before.y),
+        event=landed[:-1],
+        sample=flight.sample + sampled.astype(flight.sample.dtype),
+        samples=samples,
+        steps=steps,
+        stuck=vanishes | (steps >= settings.max_steps),
+    )
+    aimed = toward_sample(moved, targets)
+    plan = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), aimed.plan, moved.plan)
+    return moved._replace(plan=plan)
+
+
+def allowed_errors(
+    system: System, settings: Settings, at: State, share: float = LEDGER
+) -> jax.Array:
+    """Errors allowed in all rows of the state but q and v; in the ledger a `share` of theirs."""
+    mass = mass_at(system, at.q)
+    free = free_acceleration(system, at.q, at.v, user_force(system, at.q, at.v, at.t), mass)
+    both = jnp.stack([free, at.v], axis=1)
+    pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)
+    of_q, of_v = (settings.atol + settings.rtol * jnp.abs(x) for x in (at.q, at.v))
+    ledger = share * (of_q @ pushed[:, 0] + of_v @ pushed[:, 1])
+    rows = packed(at).shape[0] - 2 * at.q.shape[0]
+    # at least a number: nothing moves and nothing is pulled
+    return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)  # time: none
+
+
+def roundings(settings: Settings, margins: jax.Array, targets: jax.Array) -> jax.Array:
+    """Roundings of these margins and of the time to the next sample (k,)."""
+    span = jnp.abs(targets[0]) + jnp.abs(targets[-1])
+    least = float(jnp.finfo(span.dtype).tiny) ** 0.5
+    every = jnp.append(margins, SMALLEST_STEP * span)
+    return jax.lax.stop_gradient(jnp.maximum(every, least))
 
 
 def fly(
@@ -229,76 +335,24 @@ def fly(
     begin: Flight,
 ) -> Flight:
     """Integrate until something watched crosses zero, or to the last of `targets` (S,)."""
-    n_targets = targets.shape[0]
-    n = begin.state.q.shape[0]
-    dtype = begin.state.q.dtype
-    span = jnp.abs(targets[0]) + jnp.abs(targets[-1])
     slack = REST_ACCELERATION * scales.acceleration
-    tiny = jnp.finfo(dtype).tiny
     normal = jnp.where(modes.active, slack, ROUNDING_GAP * settings.closed_below)
     side = jnp.where(modes.stick, slack, REST_ACCELERATION * scales.speed)
-    parts = [normal, side] if settings.friction else [normal]
-    rounding = jnp.concatenate([*parts, SMALLEST_STEP * span[None]])
-    rounding = jax.lax.stop_gradient(jnp.maximum(rounding, jnp.sqrt(tiny)))
-    rows = encoded(modes)
-    k = rounding.shape[0]
-
-    def flow_at(flight: Flight) -> MechanicalFlow:
-        state = flight.state
-        size = jnp.concatenate([jnp.abs(state.q), jnp.abs(state.v)])
-        free = jnp.full(packed(state).shape[0] - 2 * n, jnp.inf, dtype)
-        tolerance = jnp.concatenate([settings.atol + settings.rtol * size, free])[:, None]
-        target = targets[jnp.minimum(flight.sample, n_targets - 1)]
-        return MechanicalFlow(
-            system, mu, scales, rounding, target, jax.lax.stop_gradient(tolerance), state
-        )
-
-    def toward_sample(flight: Flight) -> Flight:
-        """The next step lands on the sample if it reaches it."""
-        _, step, plan = flight.plan
-        left = targets[jnp.minimum(flight.sample, n_targets - 1)] - flight.state.t
-        h = step.clock[1, 0]
-        lands = left <= h
-        target = jnp.zeros((k, 1), bool).at[-1].set(lands)
-        clock = jnp.stack([0 * h, h, 0 * h, lands.astype(dtype)])[:, None]
-        plan = plan.at[0, 0].set(jnp.where(lands, left, h)).at[1].set(0.0)
-        new = stepper.Carry(packed(flight.state), stepper.Step(rows, target, clock), plan)
-        return flight._replace(plan=jax.lax.stop_gradient(new))
+    margins = jnp.concatenate([normal, side]) if settings.friction else normal
+    state = begin.state
+    allowed = jax.lax.stop_gradient(allowed_errors(system, settings, state))
+    blank = jnp.zeros((packed(state).shape[0], 1), state.q.dtype)
+    flow = MechanicalFlow(
+        system, roundings(settings, margins, targets), state.t, blank, state, mu, scales
+    )
 
     def going(flight: Flight) -> jax.Array:
-        return ~jnp.any(flight.event) & (flight.sample < n_targets) & ~flight.stuck
+        return ~jnp.any(flight.event) & (flight.sample < targets.shape[0]) & ~flight.stuck
 
-    def one(flight: Flight) -> Flight:
-        flow = flow_at(flight)
-        before = flight.plan
-        carry = before._replace(y=packed(flight.state), plan=before.plan.at[2:].set(0.0))
-        after, accept = stepper.advance(flow, carry, 2)
-        accept = accept[0, 0]
-        new = project(system, mu, settings.friction, modes, unpacked(flow.like, after.y))
-        state = jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, flight.state)
-        landed = before.step.target[:, 0] & accept
-        sampled = landed[-1]
-        state = state._replace(t=jnp.where(sampled, flow.sample, state.t))
-        row = (jnp.arange(n_targets, dtype=flight.sample.dtype) == flight.sample) & sampled
-        samples = jax.tree.map(
-            lambda all_, x: jnp.where(row.reshape((-1,) + (1,) * x.ndim), x[None], all_),
-            flight.samples,
-            state,
-        )
-        steps = flight.steps + 1
-        short = ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * span)
-        moved = flight._replace(
-            state=state,
-            plan=jax.lax.stop_gradient(after)._replace(y=before.y),
-            event=landed[:-1],
-            sample=flight.sample + sampled.astype(flight.sample.dtype),
-            samples=samples,
-            steps=steps,
-            stuck=short | (steps >= settings.max_steps),
-        )
-        aimed = toward_sample(moved)
-        plan = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), aimed.plan, moved.plan)
-        return moved._replace(plan=plan)
-
-    start = toward_sample(begin)
-    return jax.lax.while_loop(going, one, start)
+    plan = begin.plan
+    modes_now = begin._replace(plan=plan._replace(step=plan.step._replace(modes=encoded(modes))))
+    return jax.lax.while_loop(
+        going,
+        lambda flight: one_pass(flow, settings, allowed, targets, flight),
+        toward_sample(modes_now, targets),
+    )

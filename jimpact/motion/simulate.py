@@ -17,7 +17,10 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.law import Law
+from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Force
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
+from jimpact.motion.contact_dynamics import contact_dynamics
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
 from jimpact.motion.event_driven import event_driven
 from jimpact.motion.flow import Course, Settings
@@ -30,7 +33,7 @@ CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
 RTOL, ATOL = 1e-10, 1e-12  # of the flights
 SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
 MAX_EVENTS, MAX_STEPS = 500, 100_000
-METHODS = ("events", "time_stepping")
+METHODS = ("events", "time_stepping", "contact_forces")
 _BASE_LOOKS = 64  # times at which the base is looked at before the motion starts
 
 
@@ -67,7 +70,8 @@ def simulate(
         t_start: [s].
         samples: number of equally spaced instants in the record, both ends included.
         method: 'events' (flights that land on each event), or 'time_stepping'
-            (Moreau-Jean, for many contacts; needs `step` [s]).
+            (Moreau-Jean, for many contacts; needs `step` [s]), or 'contact_forces' (the forces of
+            a `Compliant` law act throughout: contacts take time, and may start in penetration).
         step: of the time stepping [s].
         friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
             `tangent_function`; None: that of the law, if it has a field `friction`. Not in time
@@ -101,7 +105,8 @@ def simulate(
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
     dtype = jnp.result_type(q, v)
     start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))
-    _check_motion(system, q, v, start, end, closed_below)
+    deepest = np.inf if method == "contact_forces" else closed_below
+    _check_motion(system, q, v, start, end, deepest)
     count = as_whole("samples", samples, 2)
     as_whole("max_events", max_events, 1)
     as_whole("max_steps", max_steps, 1)
@@ -130,6 +135,9 @@ def simulate(
         substeps = _substeps_of(step, t_start, t_end, count)
         closed = settings.closed_below
         return _stepped(system, law, q, v, start, end, count, substeps, closed, max_events)
+    if method == "contact_forces":
+        force = _force_of(law, mu)
+        return _forced(system, force, settings, q, v, start, end, count, max_events)
     return _events(system, law, mu, settings, q, v, start, end, count, max_events)
 
 
@@ -153,6 +161,23 @@ def _events(
 
 
 @eqx.filter_jit
+def _forced(
+    system: System,
+    force: Force,
+    settings: Settings,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+    samples: int,
+    max_events: int,
+) -> Motion:
+    times = _equal_times(start, end, samples)
+    course, *_ = contact_dynamics(system, force, settings, q, v, times, max_events)
+    return _recorded(system, times, course)
+
+
+@eqx.filter_jit
 def _stepped(
     system: System,
     law: Law,
@@ -173,17 +198,17 @@ def _stepped(
 
 def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
     """The record of a course, with its energies and gaps."""
-    q, v, _, work, base_work, contact_work = course.samples
+    at = course.samples
     return Motion(
         time=times,
-        q=q,
-        velocity=v,
-        kinetic_energy=jax.vmap(lambda q, v: kinetic(system, q, v))(q, v),
-        potential_energy=jax.vmap(lambda q: potential(system, q))(q),
-        force_work=work,
-        base_work=base_work,
-        contact_work=contact_work,
-        gaps=jax.vmap(lambda q, t: gaps(system, q, t))(q, times),
+        q=at.q,
+        velocity=at.v,
+        kinetic_energy=jax.vmap(lambda q, v: kinetic(system, q, v))(at.q, at.v),
+        potential_energy=jax.vmap(lambda q: potential(system, q))(at.q),
+        force_work=at.work,
+        base_work=at.base_work,
+        contact_work=at.contact_work,
+        gaps=jax.vmap(lambda q, t: gaps(system, q, t))(at.q, times),
         events=course.events,
         steps=course.steps,
         status=course.status,
@@ -279,6 +304,15 @@ def _friction_of(system: System, law: Law, given: Any, q: jax.Array) -> jax.Arra
     if mu.shape not in ((), (m,)):
         raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
+
+
+def _force_of(law: Law, mu: jax.Array | None) -> Force:
+    """The contact force of a `Compliant` law, for motions without friction."""
+    check_kind("law", law, Compliant)
+    assert isinstance(law, Compliant)
+    if mu is not None:
+        raise ValueError("Argument `friction` must be 0 for method='contact_forces'.")
+    return law.force
 
 
 def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:

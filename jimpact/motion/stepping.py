@@ -52,7 +52,8 @@ def time_stepping(
     """The motion with `substeps` steps between neighbours of `times` (S,)."""
     m = gaps(system, q0, times[0]).shape[0]
     zero = jnp.zeros((), q0.dtype)
-    begin = State(q0, v0, times[0], zero, zero, jnp.zeros((2, m), q0.dtype))
+    rest = jnp.zeros((2, m), q0.dtype)
+    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     events = no_events(max_events, q0.shape[0], m, q0.dtype)
     status = jnp.where(
         jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)),
@@ -110,13 +111,13 @@ def _one_step(
     v, push, energy = _pressed(system, q, blow.v, middle, h, closed)
     carried = base_velocity(system, middle)
     base = blow.base_work + (0.0 if carried is None else push @ carried)
-    work = State(
-        q + 0.5 * h * v,
-        v,
-        t + h,
-        state.work + h * force @ (0.5 * (blow.v + v)),
-        state.base_work + base,
-        state.contact_work + blow.energy + energy,
+    work = state._replace(
+        q=q + 0.5 * h * v,
+        v=v,
+        t=t + h,
+        work=state.work + h * force @ (0.5 * (blow.v + v)),
+        base_work=state.base_work + base,
+        contact_work=state.contact_work + blow.energy + energy,
     )
     finite = jnp.all(jnp.isfinite(v))
     fails = jnp.asarray(FAILS)[blow.code]

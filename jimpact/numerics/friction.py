@@ -5,8 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics import friction_single
-from jimpact.numerics import friction_stepper as stepper
+from jimpact.numerics import friction_single, friction_stepper as stepper
 from jimpact.numerics.contacts import any_of
 from jimpact.numerics.dimensionless import (
     ENDLESS,

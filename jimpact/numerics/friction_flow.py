@@ -166,7 +166,7 @@ def field(flow: Frictional, modes: Modes, rates: Rates, state: State) -> State:
     """Rates of all of the state, with respect to time in units of `s*`; modes frozen."""
     force = normal_force(flow, modes, state.x)
     side, _ = tangential_force(flow, modes, force, state.u)
-    pull = times(flow.normal.coupling, force) + times(flow.across, side)
+    pull = times(flow.normal.coupling, force) + times(flow.across, side)  # type: ignore[arg-type]
     slip = times(jnp.swapaxes(flow.across, 0, 1), force) + times(flow.along, side)
     slip = jnp.where(per_row(modes.stick, flow.rows), 0.0, slip)
     unit = rates.unit

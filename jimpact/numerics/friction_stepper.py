@@ -11,11 +11,10 @@ from jimpact.numerics import friction_events as events
 from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import all_of, any_of, largest, of
 from jimpact.numerics.events import NEGLIGIBLE, SHORTEST, matters
-from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN, rates_of
+from jimpact.numerics.flow import COMPRESSION, EXPANSION, OPEN, START, rates_of
 from jimpact.numerics.friction_flow import (
     HOLDING,
     ROOT_X,
-    START,
     Frictional,
     Modes,
     State,

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 from jimpact.numerics import friction_events as events
 from jimpact.numerics.contacts import any_of, largest, of
 from jimpact.numerics.events import NEGLIGIBLE, margin_signs
-from jimpact.numerics.flow import OPEN
+from jimpact.numerics.flow import OPEN, START, TIME
 from jimpact.numerics.friction_flow import (
     HOLDING,
     MARGIN,
     ROOT_X,
-    START,
-    TIME,
     Frictional,
     Modes,
     State,

@@ -9,8 +9,7 @@ from each other and press no other contact, the rest follows from the energy in 
 import jax
 import jax.numpy as jnp
 
-from jimpact.numerics import columns, events, isolated
-from jimpact.numerics import flow as flows
+from jimpact.numerics import columns, events, flow as flows, isolated
 from jimpact.numerics.columns import by_itself
 from jimpact.numerics.contacts import all_of, any_of, first_least, least
 from jimpact.numerics.flow import (

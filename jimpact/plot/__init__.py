@@ -1,1 +1,11 @@
-"""Pictures: one function for each kind of result."""
+"""Pictures: one function for each kind of result; each returns a matplotlib figure.
+
+>>> import jimpact as ji
+>>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+>>> len(ji.plot.comparison(found).axes)
+2
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -9,15 +9,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jimpact.fits.fitting import Fit
+from jimpact.plot.style import COLOURS, GREY, SPREAD
 
-# Okabe and Ito's palette without yellow: told apart with every common colour blindness.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-_GREY = "#777777"
-_SPREAD = 0.6  # width that the bodies of one shot take, of the distance between shots
 _LABELLED = 16  # shots up to which every one gets its label
 
 
-def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
+def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
     """Velocities after every shot, measured and fitted, above their residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
@@ -25,12 +22,12 @@ def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "")
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.3, 0.7])
-    >>> figure = ji.plot_fit(ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data))
+    >>> figure = ji.plot.fit(ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data))
     >>> len(figure.axes)
     2
     """
     shots, bodies = fit.predicted.shape
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * _SPREAD / bodies
+    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
     figure = Figure(figsize=(float(np.clip(4 + 0.35 * shots * bodies, 6.4, 12)), 6.0))
@@ -46,10 +43,10 @@ def plot_fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "")
         top.plot(x[:, i], fit.predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
         bottom.errorbar(x[:, i], fit.residual[:, i], bars, **style)
     for j, other in enumerate((others or {}).values()):
-        top.plot(x, other.predicted, "x+*"[j % 3], color=_GREY, ms=0.8 * size)
+        top.plot(x, other.predicted, "x+*"[j % 3], color=GREY, ms=0.8 * size)
     top.set_ylabel("velocity after the impact [m/s]")
     bottom.set_ylabel("measured − fitted [m/s]")
-    bottom.axhline(0, color=_GREY, lw=0.8)
+    bottom.axhline(0, color=GREY, lw=0.8)
     _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
     top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g} m/s", loc="left")
@@ -71,7 +68,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     if len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
         axes.set_xlabel("body")
-        axes.set_xlim(-_SPREAD * 0.5, _SPREAD * 0.5)
+        axes.set_xlim(-SPREAD * 0.5, SPREAD * 0.5)
         return
     ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
     longest = max(len(labels[k]) for k in ticks)
@@ -88,7 +85,7 @@ def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool)
         Line2D([], [], marker="_", ms=14, mew=2, label=f"{type(fit.law).__name__} fitted", **plain),
     ]
     for j, label in enumerate(others):
-        handles.append(Line2D([], [], marker="x+*"[j % 3], ls="none", color=_GREY, label=label))
+        handles.append(Line2D([], [], marker="x+*"[j % 3], ls="none", color=GREY, label=label))
     if fit.predicted.shape[0] > 1:  # of a single shot the axis names the bodies
         for i in range(min(fit.predicted.shape[1], len(COLOURS))):
             handles.append(

@@ -5,16 +5,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact.montecarlo.chunks import FAILURE
 from jimpact.montecarlo.results import MonteCarlo
-from jimpact.plot.fits import COLOURS
+from jimpact.montecarlo.statistics import FAILURE
+from jimpact.plot.style import COLOURS
 
 _BARS = 100  # of a histogram in the picture
 _BODIES = 6  # with a histogram of their own; of more only the most scattered are shown
 _DOT = 9.0  # area of a sample in the map [points^2]
 
 
-def plot_monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
+def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
     The map shows the two gaps that vary most and the most scattered velocity; with one random
@@ -24,7 +24,7 @@ def plot_monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([1.0, 1.0, 1.0])
     >>> gaps = ji.Uniform(0.0, 1e-5)
     >>> found = ji.monte_carlo(law, balls, [1.0, 0.0, -1.0], gaps=gaps, samples=100)
-    >>> len(ji.plot_monte_carlo(found).axes)  # three bodies, map, its colour bar
+    >>> len(ji.plot.monte_carlo(found).axes)  # three bodies, map, its colour bar
     5
     """
     scattered = np.argsort(-found.std, kind="stable")
@@ -59,8 +59,8 @@ def _histogram(axes: Axes, found: MonteCarlo, body: int) -> None:
     axes.axvline(found.mean[body], color="black", lw=1)
     for limit in found.quantile([0.05, 0.95])[:, body]:
         axes.axvline(limit, color="black", lw=0.8, ls=":")
-    told = f"body {body + 1}: {found.mean[body]:.3f} ± {found.std[body]:.3f} m/s"
-    axes.set_title(told, loc="left", fontsize="medium", color=colour)
+    label = f"body {body + 1}: {found.mean[body]:.3f} ± {found.std[body]:.3f} m/s"
+    axes.set_title(label, loc="left", fontsize="medium", color=colour)
     axes.set_ylabel("samples [%]")
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", lw=0.4, alpha=0.5)
@@ -77,15 +77,15 @@ def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
     axes.set_xlabel(x[0][1])
     axes.set_title(f"{fine.sum():,} samples", loc="left", fontsize="medium")
     axes.spines[["top", "right"]].set_visible(False)
-    told = f"velocity of body {body + 1} [m/s]"
+    label = f"velocity of body {body + 1} [m/s]"
     if len(gaps) == 1:
         axes.plot(x[0][0], velocity, ".", ms=3, color=COLOURS[body % len(COLOURS)])
-        axes.set_ylabel(told)
+        axes.set_ylabel(label)
         return
     axes.set_ylabel(x[1][1])
     colours = matplotlib.colormaps["cividis"]
     dots = axes.scatter(x[0][0], x[1][0], s=_DOT, c=velocity, cmap=colours, lw=0, rasterized=True)
-    axes.figure.colorbar(dots, ax=axes, label=told)
+    axes.figure.colorbar(dots, ax=axes, label=label)
     axes.set_aspect("equal" if _alike(x[0][0], x[1][0]) else "auto")
 
 

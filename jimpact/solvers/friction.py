@@ -33,7 +33,8 @@ _COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8  # tolerances of the sweeps; each is 
 # What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
 # contacts that reach their cone while others hold them: sweeps bring those to rest slowly.
 _ROOM, _SLOW_ROOM = 10.0, 100.0
-SHARING_SWEEPS = 60  # of the projected Gauss-Seidel iteration of `distribute`
+SHARING_SWEEPS = 200  # of the projected Gauss-Seidel iteration of `distribute`, at most
+_SETTLED = 1e-13  # of the largest limit: a sweep of it that changes less is the last
 INSIDE = 1e-9  # part of the limit below which a force is inside the disc
 
 
@@ -523,27 +524,52 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
 # ------------------------------------------------------------------- known normal forces
 
 
+def _lengths(side: jax.Array, rows: int) -> jax.Array:
+    """|lambda_j| (m, B) of tangential rows (t, B)."""
+    return jnp.sqrt(jnp.sum(side.reshape(-1, rows, *side.shape[1:]) ** 2, axis=1))
+
+
 def distribute(
     matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Of the contacts `asked` (m, B): whether they stick, else the direction (t, B) of slip.
 
-    `matrix` (t, t, B), `rate` (t, B) of slip without their forces, `limit` mu F (m, B).
+    `matrix` (t, t, B), `rate` (t, B) of slip without their forces, `limit` mu F (m, B); t is m in
+    the plane, 2 m (contact-major) in space. A contact in space that others hold on the rim of its
+    disc counts as sliding, at speed 0; its direction is that against its force.
     """
-    m, rate = len(limit), jnp.where(asked, rate, 0.0)
+    m = len(limit)
+    rows = len(rate) // m
+    every = jnp.repeat(asked, rows, axis=0)
+    rate = jnp.where(every, rate, 0.0)
+    least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
 
     def slip(side: jax.Array) -> jax.Array:
-        return sum(matrix[:, i] * side[i : i + 1] for i in range(m)) + rate
+        return sum(matrix[:, i] * side[i : i + 1] for i in range(m * rows)) + rate
 
-    def sweep(_: int, side: jax.Array) -> jax.Array:
+    def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+        before, _, count = carry
+        side = before
         for j in range(m):
-            tried = side[j : j + 1] - slip(side)[j : j + 1] / matrix[j : j + 1, j]
-            tried = jnp.clip(tried, -limit[j : j + 1], limit[j : j + 1])
-            side = side.at[j : j + 1].set(jnp.where(asked[j : j + 1], tried, 0.0))
-        return side
+            at = slice(rows * j, rows * (j + 1))
+            total = sum(matrix[i, i] for i in range(at.start, at.stop))[None]  # no step is too long
+            tried = side[at] - slip(side)[at] / total
+            length = _lengths(tried, rows)
+            over = length > limit[j : j + 1]
+            tried = jnp.where(
+                over, tried * (limit[j : j + 1] / jnp.where(over, length, 1.0)), tried
+            )
+            side = side.at[at].set(jnp.where(asked[j : j + 1], tried, 0.0))
+        moves = jnp.any(jnp.abs(side - before) > least)
+        return side, moves, count + 1
 
-    side = jax.lax.fori_loop(0, SHARING_SWEEPS, sweep, jnp.zeros_like(rate))
-    left = jnp.where(asked, slip(side), 0.0)
-    scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
-    stick = (jnp.abs(side) < (1 - INSIDE) * limit) | (jnp.abs(left) <= INSIDE * scale)
-    return asked & stick, jnp.where(jnp.abs(side) > 0, -side, left)
+    side, _, _ = jax.lax.while_loop(
+        lambda c: c[1] & (c[2] < SHARING_SWEEPS), sweep, (jnp.zeros_like(rate), jnp.any(asked), 0)
+    )
+    left = jnp.where(every, slip(side), 0.0)
+    stick = _lengths(side, rows) < (1 - INSIDE) * limit
+    if rows == 1:
+        scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
+        stick = stick | (jnp.abs(left) <= INSIDE * scale)
+    pushed = jnp.repeat(_lengths(side, rows) > 0, rows, axis=0)
+    return asked & stick, jnp.where(pushed, -side, left)

@@ -31,7 +31,7 @@ def bilateral_motion(
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.14)-(6.15).
 
     >>> import jimpact as ji
-    >>> x, v = ji.bilateral_motion(ji.chain([1.0, 1.0]), 0.5, [1.0, 0.0], 3.141592653589793)
+    >>> x, v = ji.theory.bilateral_motion(ji.chain([1.0, 1.0]), 0.5, [1.0, 0.0], 3.141592653589793)
     >>> [round(abs(float(a)), 5) for a in v]  # half a period: exchanged
     [0.0, 1.0]
     """
@@ -68,7 +68,7 @@ def newby_ratio(n: int) -> float:
     Source: Newby, Am. J. Phys. 52 (1984) 745; Brogliato (2016), after (6.16).
 
     >>> import jimpact as ji
-    >>> round(ji.newby_ratio(2), 6), round(ji.newby_ratio(3), 6)
+    >>> round(ji.theory.newby_ratio(2), 6), round(ji.theory.newby_ratio(3), 6)
     (2.241338, 6.171293)
     """
     if not isinstance(n, int | np.integer) or n < 2:

@@ -21,6 +21,11 @@ _SINGULAR = 100.0
 # rounding; the first one is taken, so that a basis does not depend on the last digit.
 _EQUAL_SHARE = 1e-3
 
+_REDUNDANT = (
+    "Argument `scene` must have independent contact normals and constraints to define "
+    "quasi-velocities, but has {}."
+)
+
 
 class ContactPower(eqx.Module):
     """Power of contact forces [W]: the terms of (6.40) and their sum."""
@@ -53,7 +58,7 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.22)-(6.23).
 
     >>> import jimpact as ji
-    >>> normal, tangent = ji.quasi_basis(ji.chain([2.0, 2.0]))
+    >>> normal, tangent = ji.theory.quasi_basis(ji.chain([2.0, 2.0]))
     >>> [round(float(x), 6) for x in normal[:, 0]], [round(float(x), 6) for x in tangent[:, 0]]
     ([-0.5, 0.5], [0.5, 0.5])
     """
@@ -88,7 +93,8 @@ def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Arr
     Source: Brogliato (2016), (6.22).
 
     >>> import jimpact as ji
-    >>> qn, qt = ji.to_quasi_velocities(ji.chain([2.0, 2.0, 2.0, 2.0]), [0.3, -0.2, 0.5, 0.7])
+    >>> four = ji.chain([2.0, 2.0, 2.0, 2.0])
+    >>> qn, qt = ji.theory.to_quasi_velocities(four, [0.3, -0.2, 0.5, 0.7])
     >>> [round(float(q), 6) for q in qn], round(float(qt[0]), 6)
     ([-0.5, 0.7, 0.2], 0.919239)
     """
@@ -113,7 +119,8 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
     Source: Brogliato (2016), (6.31)-(6.32), with (6.35) for bilateral constraints.
 
     >>> import jimpact as ji
-    >>> [round(float(v), 6) for v in ji.from_quasi_velocities(ji.chain([2.0, 2.0]), [-1.0], [2.0])]
+    >>> v = ji.theory.from_quasi_velocities(ji.chain([2.0, 2.0]), [-1.0], [2.0])
+    >>> [round(float(each), 6) for each in v]
     [1.5, 0.5]
     """
     qn, qt = as_float_array("normal", normal), as_float_array("tangential", tangential)
@@ -132,7 +139,8 @@ def kinetic_energy_split(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Ar
     Source: Brogliato (2016), (6.33)-(6.35).
 
     >>> import jimpact as ji
-    >>> [round(float(t), 6) for t in ji.kinetic_energy_split(ji.chain([2.0, 2.0]), [1.5, 0.5])]
+    >>> split = ji.theory.kinetic_energy_split(ji.chain([2.0, 2.0]), [1.5, 0.5])
+    >>> [round(float(t), 6) for t in split]
     [0.5, 2.0]
     """
     qn, qt = to_quasi_velocities(scene, velocity)
@@ -162,7 +170,7 @@ def contact_power(
     Source: Brogliato (2016), (6.36)-(6.41).
 
     >>> import jimpact as ji
-    >>> float(ji.contact_power(ji.chain([2.0, 2.0]), [1.5, 0.5], [3.0]).total)
+    >>> float(ji.theory.contact_power(ji.chain([2.0, 2.0]), [1.5, 0.5], [3.0]).total)
     -3.0
     """
     v, normal_force = as_float_array("velocity", velocity), as_float_array("force", force)
@@ -192,12 +200,6 @@ def _directions(scene: Scene) -> Scene:
     if fixed.shape[1] > scene.size:
         raise ValueError(_REDUNDANT.format(f"{fixed.shape[1]} of them for {scene.size} velocities"))
     return Scene(scene.mass, fixed)
-
-
-_REDUNDANT = (
-    "Argument `scene` must have independent contact normals and constraints to define "
-    "quasi-velocities, but has {}."
-)
 
 
 def check_independent(scene: Scene) -> None:

@@ -12,8 +12,7 @@ from jimpact.methods.contenders import (
     event_aligned,
     fixed_step,
     impulse,
-    with_diffrax,
-    with_scipy,
+    libraries,
 )
 from jimpact.methods.contenders.base import (
     UNCOUNTED,
@@ -32,8 +31,8 @@ METHODS: dict[str, Method] = {
         fixed_step.RK4,
         fixed_step.VERLET,
         *event_aligned.METHODS,
-        *with_diffrax.METHODS,
-        *with_scipy.METHODS,
+        *libraries.DIFFRAX,
+        *libraries.SCIPY,
     )
 }
 

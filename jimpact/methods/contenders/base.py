@@ -183,9 +183,9 @@ def lzb_only(law: Law, scene: Scene) -> str | None:
 def finite_rate(law: Law, scene: Scene) -> str | None:
     """As `lzb_only`; and the plain time form divides by e."""
     reason = lzb_only(law, scene)
-    if reason is None and not is_traced(law) and bool(jnp.any(law.restitution == 0)):
-        return "it divides by e^2, and a restitution is 0"
-    return reason
+    if not isinstance(law, LZB) or reason is not None or is_traced(law):
+        return reason
+    return "it divides by e^2, and a restitution is 0" if jnp.any(law.restitution == 0) else None
 
 
 def checked(law: Law, scene: Scene, method: Method) -> None:

@@ -61,7 +61,7 @@ def _solver(
 
 def _linear_only(law: Law, scene: Scene) -> str | None:
     reason = lzb_only(law, scene)
-    if reason is None and law.exponent != StaticNumber(1.0):
+    if reason is None and isinstance(law, LZB) and law.exponent != StaticNumber(1.0):
         return "it is exact for the exponent 1.0 (a number, not an array) only"
     return reason
 

@@ -1,0 +1,105 @@
+"""Public names and where they live: read by type checkers, and on import by `lazy_loader`."""
+
+from . import plot as plot, theory as theory
+from .audits import audit as audit, summary as summary
+from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
+from .bodies.blocks import Block as Block, rocking_block as rocking_block
+from .bodies.dimers import (
+    Dimer as Dimer,
+    SpatialDimer as SpatialDimer,
+    dimer as dimer,
+    dimer_3d as dimer_3d,
+)
+from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
+from .bodies.particles import Column as Column, Corner as Corner, corner as corner
+from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
+from .comparison import (
+    compare as compare,
+    dispersion_index as dispersion_index,
+    energy_ratio as energy_ratio,
+)
+from .contact import (
+    Contact as Contact,
+    delassus_matrix as delassus_matrix,
+    kinetic_angles as kinetic_angles,
+    normalized_delassus as normalized_delassus,
+    normalized_gap_velocity as normalized_gap_velocity,
+)
+from .experiments import Experiments as Experiments, read_experiments as read_experiments
+from .fits.fitting import Fit as Fit, fit as fit
+from .histories import history as history
+from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
+from .law import (
+    REGISTRY as REGISTRY,
+    Impulses as Impulses,
+    Law as Law,
+    option as option,
+    parameter as parameter,
+    register as register,
+)
+from .laws.binary import Binary as Binary
+from .laws.calibration import (
+    calibrate as calibrate,
+    compare_rheologies as compare_rheologies,
+    measured_restitution as measured_restitution,
+)
+from .laws.compliant import Compliant as Compliant
+from .laws.forces import (
+    Bistiffness as Bistiffness,
+    Force as Force,
+    Hertz as Hertz,
+    HuntCrossley as HuntCrossley,
+    KelvinVoigt as KelvinVoigt,
+    KuwabaraKono as KuwabaraKono,
+    LinearSpring as LinearSpring,
+    PowerLaw as PowerLaw,
+    UserForce as UserForce,
+)
+from .laws.kinematic import (
+    Moreau as Moreau,
+    Newton as Newton,
+    RestitutionMatrix as RestitutionMatrix,
+)
+from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
+from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
+from .laws.poisson import Poisson as Poisson
+from .methods.advice import advise as advise
+from .methods.chart import work_precision as work_precision
+from .methods.stability import stability_map as stability_map
+from .methods.validity import validity_map as validity_map
+from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
+from .montecarlo.gaps import (
+    crossover as crossover,
+    gap_scale as gap_scale,
+    gap_sensitivity as gap_sensitivity,
+)
+from .montecarlo.results import MonteCarlo as MonteCarlo
+from .montecarlo.running import monte_carlo as monte_carlo
+from .montecarlo.store import read_samples as read_samples
+from .motion.contact_dynamics import turning_impact as turning_impact
+from .motion.fitting_motion import fit_motion as fit_motion
+from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
+from .motion.simulate import simulate as simulate
+from .motion.system import (
+    HarmonicBase as HarmonicBase,
+    System as System,
+    ball_system as ball_system,
+    block_system as block_system,
+    column_system as column_system,
+    cradle_system as cradle_system,
+    dimer_system as dimer_system,
+    gravity as gravity,
+)
+from .scene import (
+    Scene as Scene,
+    chain as chain,
+    column as column,
+    gap_velocity as gap_velocity,
+    kinetic_energy as kinetic_energy,
+    momentum as momentum,
+    velocity_change as velocity_change,
+)
+from .status import STATUS as STATUS
+from .theory.han_gilmore_tree import han_gilmore as han_gilmore
+
+__version__: str

@@ -1,0 +1,417 @@
+"""Contacts with Coulomb friction in space: the flow of `friction_flow.py` with two tangents each.
+
+With c = mu F, the direction d of slip, and n at right angles to it, slip u = r d obeys
+
+    r' = d . a,   r angle' = n . a,   a = K_tn F + K_tt lambda,   lambda = -c d
+
+whose angle turns at a rate ~ c K_tt / r: stiff where slip is slow. A loaded contact has therefore
+one of three modes, and its two rows of slip mean
+
+    STICKS   0
+    SLIPS    ln r and angle, while the whole field advances in a time that is shortened by
+             1 + sum (|a| + c K_tt) / r over the contacts that slip: no rate is large then, and
+             slip comes to a stop at the FLOOR after a few steps, as ln r falls at a steady rate
+    CREEPS   r and angle, 0 included: r is so small that the direction follows from the forces, to
+             first order in r. It obeys n . a = r angle': the angle is a state that drifts as the
+             solution drifts, and one step of Newton's method beside it gives the direction.
+
+and of a contact without load the Cartesian slip velocity. Slip sets in by creeping, from r = 0
+where stick ends; where the stiffness c K_tt / r has fallen enough, it SLIPS. Where several contacts
+stick redundantly (two corners of one body) one may reach its cone while others hold it: it
+creeps with r = 0. Sticking forces are eliminated from the field once a step.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.events.contact_flow import ContactFlow, Frozen, times, unit
+from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse
+from jimpact.events.stepper import any_of, total
+from jimpact.solvers.friction import distribute
+
+STICKS, SLIPS, CREEPS = 0, 1, 2
+
+FLOOR = 1e-3  # of the tolerance: speed at which slip has stopped, and creep back ends
+REST = 1e-2  # of the tolerance: slower contacts are asked whether they stick when others stop
+# Creep ends where the rate c K_tt / r has fallen to tolerance^-1/2 / CREEP: its direction is then
+# wrong by the square of that, and a tolerance of the velocity.
+CREEP = 1.0
+RELAXES = 1.0  # rate at which the angle of creep returns to the corrected one
+# An explicit step of order 8 is stable up to 6 over the rate; values hide when it is longer,
+# derivatives do not.
+STABLE = 4.0
+LOOSE = 1e-3  # most that errors of ln r and angle may be, however slow the slip
+SLOW_ANGLE = 1e-2  # square roots of the tolerance that the angle of creep, soon corrected, may err
+SINGULAR = 4.0  # square roots of rounding: smaller parts of K_tt than that are none
+REFINEMENTS = 3
+LEAST_STIFFNESS = 1e-10  # of the largest, where friction does not turn directions back at all
+
+
+class Reduced(NamedTuple):
+    """The field with sticking forces eliminated: `a = pull F + along lambda` of those that slide.
+
+    gamma' = coupling F + across lambda;  forces of sticking -(held F + carried lambda).
+    """
+
+    frozen: Frozen
+    coupling: jax.Array  # (m, m, B)
+    across: jax.Array  # (m, t, B)
+    pull: jax.Array  # (t, m, B)
+    along: jax.Array  # (t, t, B)
+    held: jax.Array  # (t, m, B)
+    carried: jax.Array  # (t, t, B)
+
+
+class Motion(NamedTuple):
+    """Forces and the rates of slip in the flow's own time before it is shortened."""
+
+    force: jax.Array  # F (m, B)
+    sliding: jax.Array  # lambda of those that slide (t, B)
+    holding: jax.Array  # lambda of those that stick (t, B)
+    rate: jax.Array  # of the rows of slip (m, 2, B)
+    stiffness: jax.Array  # mu F K_tt (m, B)
+    haste: jax.Array  # (1, B) >= 1: by how much time is shortened
+
+
+def pairs(rows: jax.Array) -> jax.Array:
+    """Rows (2 m, B) of contacts as (m, 2, B)."""
+    return rows.reshape(-1, 2, *rows.shape[1:])
+
+
+def flat(pair: jax.Array) -> jax.Array:
+    """The inverse of `pairs`."""
+    return pair.reshape(-1, *pair.shape[2:])
+
+
+def twice(rows: jax.Array) -> jax.Array:
+    """Values (m, B) of contacts for both of their tangents (2 m, B)."""
+    return jnp.repeat(rows, 2, axis=0)
+
+
+def length(pair: jax.Array) -> jax.Array:
+    """|u_j| (m, B) of (m, 2, B), with derivative 0 at 0."""
+    square = pair[:, 0] ** 2 + pair[:, 1] ** 2
+    some = square > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+
+
+def polar(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Unit vectors (m, 2, B) along and at right angles."""
+    cosine, sine = jnp.cos(angle), jnp.sin(angle)
+    return jnp.stack([cosine, sine], 1), jnp.stack([-sine, cosine], 1)
+
+
+def angle_of(pair: jax.Array) -> jax.Array:
+    """Direction (m, B) of (m, 2, B); 0, without a derivative, of the zero vector."""
+    some = (pair[:, 0] != 0) | (pair[:, 1] != 0)
+    return jnp.arctan2(jnp.where(some, pair[:, 1], 0.0), jnp.where(some, pair[:, 0], 1.0))
+
+
+def dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Scalar products (m, B) of (m, 2, B)."""
+    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]
+
+
+def product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Matrices (n, k, B) times (k, l, B)."""
+    return jnp.stack([times(a, b[:, j]) for j in range(b.shape[1])], axis=1)
+
+
+def solve(matrix: jax.Array, *right: jax.Array) -> list[jax.Array]:
+    """Gauss-Jordan without pivots for right sides (n, B)."""
+    n = len(matrix)
+    rows = [jnp.concatenate([matrix[i], *(b[i : i + 1] for b in right)]) for i in range(n)]
+    for k in range(n):
+        rows[k] = rows[k] / rows[k][k][None]
+        rows = [row if i == k else row - row[k][None] * rows[k] for i, row in enumerate(rows)]
+    return list(jnp.stack([row[n:] for row in rows], axis=1))
+
+
+def pseudoinverse(k: jax.Array, held: jax.Array) -> jax.Array:
+    """Of the positive semidefinite rows and columns `held` of (t, t, B): least forces."""
+    both = held[:, None] & held[None]
+    k = jnp.where(both, k, 0.0)
+    size = jnp.max(jnp.abs(k), axis=(0, 1), keepdims=True)
+    part = SINGULAR * math.sqrt(float(jnp.finfo(k.dtype).eps)) * jnp.where(size > 0, size, 1.0)
+    damped = inverse(k + unit(k) * jnp.where(held[:, None], part, 1.0))
+    z = product(damped, product(k, damped))
+    for _ in range(REFINEMENTS):  # of Newton and Schulz
+        z = 2 * z - product(z, product(k, z))
+    return z
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=(
+        "coupling",
+        "omega",
+        "restitution",
+        "exponent_array",
+        "tolerance",
+        "viscous",
+        "across",
+        "along",
+        "friction",
+    ),
+    meta_fields=("exponent_static", "gapped", "root", "closed_form"),
+)
+@dataclasses.dataclass(kw_only=True)
+class SlipFlow(FrictionFlow):
+    """Contacts with friction in space, an instance of the protocol of `stepper.py`."""
+
+    # across: K_nt (m, 2 m, B); along: K_tt (2 m, 2 m, B)
+
+    longest = STABLE
+
+    # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
+
+    def slip(self, y: jax.Array) -> jax.Array:
+        m = self.contacts
+        return pairs(y[3 * m : 5 * m])
+
+    def with_slip(self, y: jax.Array, q: jax.Array) -> jax.Array:
+        m = self.contacts
+        return jnp.concatenate([y[: 3 * m], flat(q), y[5 * m :]])
+
+    def start_with(
+        self, gamma: jax.Array, x: jax.Array, u: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        m = self.contacts
+        modes, y = self.start(gamma, x)
+        modes = jnp.concatenate([modes, jnp.zeros_like(modes[:m])])
+        y = jnp.concatenate([y[: 3 * m], u, jnp.zeros_like(u), y[3 * m :]])
+        loaded = self.loaded(modes)
+        return self.decided(modes, y, jnp.zeros_like(loaded), loaded)
+
+    def sliding(self, modes: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Which loaded contacts (m, B) stick, slip and creep."""
+        slip, loaded = modes[2 * self.contacts :], self.loaded(modes)
+        return loaded & (slip == STICKS), loaded & (slip == SLIPS), loaded & (slip == CREEPS)
+
+    def speed(self, modes: jax.Array, q: jax.Array) -> jax.Array:
+        """r (m, B) of loaded contacts; 0 of those that stick."""
+        _, slips, creeps = self.sliding(modes)
+        return jnp.where(
+            slips, jnp.exp(jnp.where(slips, q[:, 0], 0.0)), jnp.where(creeps, q[:, 0], 0.0)
+        )
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Tolerances that errors of each row may be; of ln r and angle times r."""
+        m, one = self.contacts, jnp.ones_like(y[: self.contacts])
+        _, slips, creeps = self.sliding(modes)
+        relative = LOOSE / self.tolerance
+        steep = jnp.where(slips, jnp.exp(-jnp.where(slips, self.slip(y)[:, 0], 0.0)), 1.0)
+        steep = jnp.clip(steep, 1.0, jnp.maximum(relative, 1.0))
+        turning = jnp.where(creeps, SLOW_ANGLE / jnp.sqrt(self.tolerance), steep)
+        rows = flat(jnp.stack([steep, turning], 1))
+        return jnp.concatenate([one, one, one, rows, jnp.ones_like(y[5 * m :])])
+
+    # ---- the protocol
+
+    def constants(self, modes: jax.Array) -> Any:
+        stick, slips, creeps = self.sliding(modes)
+        free = twice(slips | creeps | ~self.loaded(modes))
+        z = pseudoinverse(self.along, twice(stick))
+        up = jnp.swapaxes(self.across, 0, 1)
+        held, carried = product(z, up), product(z, self.along)
+        coupling = self.coupling.matrix  # type: ignore[union-attr]
+        pull = up - product(self.along, held)
+        along = self.along - product(self.along, carried)
+        return Reduced(
+            frozen=super().constants(modes),
+            coupling=coupling - product(self.across, held),
+            across=self.across - product(self.across, carried),
+            pull=jnp.where(free[:, None], pull, 0.0),
+            along=jnp.where(free[:, None] & free[None], along, 0.0),
+            held=held,
+            carried=carried,
+        )
+
+    def motion(self, const: Reduced, modes: jax.Array, y: jax.Array) -> Motion:
+        """Forces, and how fast slip changes."""
+        frozen = const.frozen
+        x, g, _ = self.rows(y)
+        stick, slips, creeps = self.sliding(modes)
+        slides, q = slips | creeps, self.slip(y)
+        f = self.force(frozen, x, g)
+        c = jnp.where(slides, self.friction * f, 0.0)
+        angle, r = jnp.where(slides, q[:, 1], 0.0), self.speed(modes, q)
+        over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
+        drift, correction = self._creep(const, modes, y, f, c, angle, over_r)
+        along, right = polar(angle + correction)
+        side = flat(-c[:, None] * along)
+        a = pairs(times(const.pull, f) + times(const.along, side))
+        grows, turns = dot(along, a), dot(right, a)
+        rate = jnp.stack(
+            [
+                jnp.where(slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)),
+                jnp.where(slips, over_r * turns, drift + RELAXES * correction),
+            ],
+            1,
+        )
+        rate = jnp.where(
+            self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
+        )
+        own = self._blocks(const)
+        stiffness = c * jnp.stack([own[j, 0, j, 0] + own[j, 1, j, 1] for j in range(len(c))]) / 2
+        haste = 1 + total(over_r * (length(a) + 2 * stiffness))
+        holding = -(times(const.held, f) + times(const.carried, side))
+        return Motion(f, side, jnp.where(twice(stick), holding, 0.0), rate, stiffness, haste)
+
+    def _blocks(self, const: Reduced) -> jax.Array:
+        """K_tt (m, 2, m, 2, B)."""
+        m = self.contacts
+        return const.along.reshape(m, 2, m, 2, *const.along.shape[2:])
+
+    def _creep(
+        self,
+        const: Reduced,
+        modes: jax.Array,
+        y: jax.Array,
+        f: jax.Array,
+        c: jax.Array,
+        angle: jax.Array,
+        over_r: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        """How fast the directions (m, B) of creep drift, and where they are beside `angle`.
+
+        With G = n . a of all contacts that creep, G' at fixed angles and J = -dG/d angle, the
+        quasi-static solution G = 0 drifts by J^-1 G'. The directions lag behind it by
+        (J + diag(r'))^-1 r drift, as r angle' = G and r grows at the rate r'.
+        """
+        frozen = const.frozen
+        x, g, _ = self.rows(y)
+        *_, creeps = self.sliding(modes)
+        r = jnp.where(creeps, self.slip(y)[:, 0], 0.0)
+        along, right = polar(angle)
+
+        def acceleration(f: jax.Array, side: jax.Array) -> jax.Array:
+            return pairs(times(const.pull, f) + times(const.along, flat(side)))
+
+        side = -c[:, None] * along
+        a = acceleration(f, side)
+        grows, turns = dot(along, a), dot(right, a)
+        pull = times(const.coupling, f) + times(const.across, flat(side))
+        rates = (frozen.closing * g, frozen.ratio * pull)
+        _, df = jax.jvp(lambda x, g: self.force(frozen, x, g), (x, g), rates)
+        dc = jnp.where(c > 0, self.friction * df, 0.0)
+        turned = (c * over_r * turns)[:, None] * right  # of those that slip
+        changes = dot(right, acceleration(df, -dc[:, None] * along - turned))
+        # all in units of the largest entry: forces begin at 0
+        blocks = self._blocks(const)
+        j = sum(
+            right[:, i][:, None] * blocks[:, i, :, k] * right[:, k][None]
+            for i in range(2)
+            for k in range(2)
+        )
+        j = jnp.where(creeps[:, None] & creeps[None], j * c[None], 0.0)
+        size = jnp.max(jnp.max(jnp.abs(j), axis=1) + jnp.abs(grows), axis=0, keepdims=True)
+        size = jnp.where(size > 0, size, 1.0)
+        growth = jnp.where(creeps, grows / size, 0.0)
+        j, eye = j / size[None], unit(j)
+        turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
+        away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
+        drift, newton = solve(j + eye * (growth + away)[:, None], changes, turns)
+        lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
+            j + eye * (2 * growth + away)[:, None]
+        )
+        (lag,) = solve(lagging + eye * LEAST_STIFFNESS, r * drift / size)
+        correction = jnp.clip(newton - lag, -1.0, 1.0)
+        return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
+
+    def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
+        _, g, _ = self.rows(y)
+        frozen, motion = const.frozen, self.motion(const, modes, y)
+        pull = times(const.coupling, motion.force) + times(const.across, motion.sliding)
+        dy = jnp.concatenate(
+            [
+                frozen.closing * g,
+                frozen.ratio * pull,
+                frozen.unit * motion.force,
+                flat(motion.rate),
+                frozen.unit * (motion.sliding + motion.holding),
+                frozen.unit,
+            ]
+        )
+        return dy / motion.haste
+
+    def margins(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Beside those of the normal flow: until slip stops; until stick, or creep, ends."""
+        motion, r = self.motion(const, modes, y), self.slip(y)[:, 0]
+        stick, slips, creeps = self.sliding(modes)
+        floor = FLOOR * self.tolerance
+        stops = jnp.where(slips, r - jnp.log(floor), jnp.where(creeps, r + floor, 1.0))
+        # all forces of an impact vanish together: the room in the cone is one in parts of them
+        size = total(motion.force)
+        room = self.friction * motion.force - length(pairs(motion.holding))
+        room = jnp.where(size > 0, room / jnp.where(size > 0, size, 1.0), 1.0)
+        slow = CREEP * jnp.sqrt(self.tolerance) * const.frozen.unit * motion.stiffness
+        creep = jnp.where(creeps, r, 0.0) - 2 * floor
+        slow = (slow - creep) / (slow + jnp.abs(creep))
+        ends = jnp.where(stick, room, jnp.where(creeps, slow, 1.0))
+        return jnp.concatenate([ContactFlow.margins(self, const.frozen, modes, y), stops, ends])
+
+    def switch(
+        self, modes: jax.Array, y: jax.Array, which: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        m = self.contacts
+        stopped, ended = which[2 * m : 3 * m], which[3 * m :]
+        stick, slips, creeps = self.sliding(modes)
+        loaded, q, slip = self.loaded(modes), self.slip(y), modes[2 * m :]
+        cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        breaks, grows = stick & ended, creeps & ended
+        # a contact breaks loose against the force that held it, and Newton's method sees to the rest
+        const = self.constants(modes)
+        f = self.force(const.frozen, *self.rows(y)[:2])
+        side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * polar(q[:, 1])[0]
+        pulled = pairs(times(const.held, f) + times(const.carried, flat(side)))
+        away = angle_of(jnp.where(breaks[:, None], pulled, 0.0))
+        logarithm = jnp.log(jnp.where(grows, q[:, 0], 1.0))
+        q = jnp.where(breaks[:, None], jnp.stack([jnp.zeros_like(away), away], 1), q)
+        q = jnp.where(grows[:, None], jnp.stack([logarithm, q[:, 1]], 1), q)
+        slip = jnp.where(breaks, CREEPS, jnp.where(grows, SLIPS, slip))
+        after, y = ContactFlow.switch(self, modes, y, which[: 2 * m])
+        after = jnp.concatenate([after[: 2 * m], slip.astype(after.dtype)])
+        remains = self.loaded(after)
+        q = jnp.where((loaded & ~remains)[:, None], cartesian, q)
+        return self.decided(after, self.with_slip(y, q), stopped & remains, remains & ~loaded)
+
+    def decided(
+        self, modes: jax.Array, y: jax.Array, stopped: jax.Array, closed: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Who sticks and who creeps where to, once contacts have stopped to slip or have closed."""
+        m = self.contacts
+        q, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
+        stick = loaded & (slip == STICKS) & ~closed
+        r = jnp.where(closed, length(q), self.speed(modes, q))
+        resting = loaded & (r <= REST * self.tolerance) & ~stick
+        slips = closed & ~resting
+        moving = jnp.where(slips[:, None], q, 1.0)
+        q = jnp.where(slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q)
+        slip = jnp.where(slips, SLIPS, slip)
+        ask = any_of(stopped | (closed & resting))
+        asked = ask & loaded & (stopped | resting | stick)
+        still = jax.lax.stop_gradient(self)
+        frozen = ContactFlow.constants(still, modes)
+        x, g, _ = jax.lax.stop_gradient(self.rows(y))
+        soon = jnp.maximum(x + AHEAD * frozen.closing * g, 0.0)
+        f = still.force(frozen, soon, g)
+        top = jnp.max(f, axis=0, keepdims=True)
+        f = f / jnp.where(top > 0, top, 1.0)
+        most = still.friction * f
+        slides = jnp.where(
+            (asked | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
+        )
+        b = times(jnp.swapaxes(still.across, 0, 1), f)
+        b = b - times(still.along, flat(most[:, None] * slides))
+        inside, towards = distribute(still.along, b, most, asked)
+        towards = angle_of(pairs(towards))
+        begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
+        q = jnp.where(asked[:, None], begins, q)
+        slip = jnp.where(asked, jnp.where(inside, STICKS, CREEPS), slip).astype(modes.dtype)
+        return jnp.concatenate([modes[: 2 * m], slip]), self.with_slip(y, q)

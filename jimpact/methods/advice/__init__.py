@@ -1,1 +1,0 @@
-"""The simplest law that a scene needs."""

@@ -1,0 +1,326 @@
+"""What `advise` found, in words with the numbers of the scene: half a page."""
+
+import math
+import textwrap
+from typing import Any
+
+import jax
+import numpy as np
+
+from jimpact.law import Law
+from jimpact.laws import REGISTRY
+from jimpact.laws.binary import Binary
+from jimpact.laws.compliant import Compliant
+from jimpact.laws.kinematic import Newton
+from jimpact.laws.lzb import LZB
+from jimpact.methods.advice_evidence import Findings
+from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
+
+_WIDTH = 92  # of the printed lines
+_BODIES = 5  # in the printed table
+
+_TOLD = 4  # stiffness ratios named one by one
+_PERCENT_FROM = 1e-4
+_ROUNDING = 1e-12
+_NONE = 1e-6  # a change of v+ below, relative to max |v-|, is told as none
+NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
+
+
+class Advice(Findings):
+    """What `advise` found; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
+
+    `within`: the law keeps the tolerance; `reason` in words; `candidates[name]` the evidence, from
+    the simplest law to the `reference`; `unknown` and `effects` of the stiffnesses not known.
+    """
+
+    @property
+    def reason(self) -> str:
+        """Why this law, with numbers of this scene."""
+        return reason(self)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, as a JSON file can hold it; contacts counted from 1."""
+        laws = {
+            name: {
+                "law": as_code(c.law),
+                "velocity": c.velocity.tolist(),
+                "low": c.low.tolist(),
+                "high": c.high.tolist(),
+                "median_error": c.median,
+                "worst_error": c.worst,
+                "status": c.status,
+                "usable": c.usable,
+                "cost": c.cost,
+            }
+            for name, c in self.candidates.items()
+        }
+        return {
+            "advice": self.name,
+            "law": as_code(self.law),
+            "within": self.within,
+            "tolerance": self.tolerance,
+            "reason": self.reason,
+            "reference": self.reference,
+            "laws": laws,
+            "blocks": [
+                {
+                    "contacts": [j + 1 for j in block.contacts],
+                    "approaches": block.approaches,
+                    "kinetic_angles_deg": block.angles,
+                    "law": block.law,
+                }
+                for block in self.blocks
+            ],
+            "unknown": [
+                {"name": u.name, "nominal": u.nominal, "low": u.low, "high": u.high}
+                | {"alone": e.alone, "slope": e.slope}
+                | {"needed": e.needed if math.isfinite(e.needed) else None}
+                for u, e in zip(self.unknown, self.effects)
+            ],
+            "rows": self.rows,
+            "gaps_in_delta_c": None if self.gap_ratio is None else self.gap_ratio.tolist(),
+        }
+
+    def __str__(self) -> str:
+        verdict = "within" if self.within else "NOT within"
+        lines = [
+            f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}",
+            *_wrapped("because", self.reason),
+            *_wrapped("scene", structure(self)),
+        ]
+        if len(self.unknown) > 1:
+            lines += _wrapped("unknown", f"{ratios(self)}; {effects(self)}")
+        if also := agreeing(self):
+            lines += _wrapped("also", also)
+        return "\n".join([*lines, "", *self._table(), "", self._footnote()])
+
+    def _table(self) -> list[str]:
+        shown = min(len(self.velocity), _BODIES)
+        title_v = "v+" if shown == len(self.velocity) else f"v+ (first {shown})"
+        head = f" {'law':10s}{'median':>9s}{'worst':>9s}{'cost':>7s}"
+        lines = [f"{head}  {title_v:>8s}{'':{9 * shown - 8}s}  status"]
+        for name, c in self.candidates.items():
+            v = "".join(f"{x:9.4f}" for x in c.velocity[:shown])
+            cost = "" if c.cost is None else f"{c.cost:.{0 if c.cost >= 10 else 1}f}"
+            mark = "*" if name == self.name else " "
+            error = f"{share(c.median):>9s}{share(c.worst):>9s}"
+            lines.append(f"{mark}{name:10s}{error}{cost:>7s} {v}  {c.status}")
+        return lines
+
+    def _footnote(self) -> str:
+        over = f"; median and worst over {self.rows} stiffnesses" if self.rows > 1 else ""
+        timed = all(c.cost is not None for c in self.candidates.values())
+        cost = "; cost of an impact in a batch, cheapest = 1" if timed else ""
+        words = f"Error of v+ against {title(self.reference)}, relative to max |v-|{over}{cost}."
+        return textwrap.fill(words, _WIDTH)
+
+
+def _wrapped(key: str, text: str) -> list[str]:
+    """Lines behind a key word; a number keeps its unit."""
+    whole = f"{text}.".replace(" %", "\u00a0%")
+    lines = textwrap.wrap(whole, _WIDTH, initial_indent=f"{key:9s}", subsequent_indent=" " * 9)
+    return [line.replace("\u00a0%", " %") for line in lines]
+
+
+def title(name: str) -> str:
+    """A law's name as it is written in a sentence."""
+    return NAMES.get(name, name)
+
+
+def share(x: float) -> str:
+    """A part of max |v-|, rounded up to two digits: 2 %, 3e-05.
+
+    >>> from jimpact.methods.advice_report import share
+    >>> share(0.0191), share(2.01e-5), share(0.0)
+    ('2 %', '2.1e-05', 'rounding')
+    """
+    if not x > _ROUNDING:
+        return "rounding" if x <= _ROUNDING else "nan"
+    unit = 10.0 ** (math.floor(math.log10(x)) - 1)
+    up = math.ceil(x / unit * (1 - _ROUNDING)) * unit
+    return f"{100 * up:.3g} %" if x >= _PERCENT_FROM else f"{up:.2g}"
+
+
+def as_code(law: Law) -> str:
+    """The law as one writes it: `LZB(0.9, 1, 1.5, rtol=0.001)`."""
+
+    def value(x: object) -> str:
+        array = np.asarray(x)
+        if array.size and (array == array.flat[0]).all():
+            return f"{array.flat[0]:.6g}"
+        return f"[{', '.join(f'{z:.6g}' for z in array)}]"
+
+    if isinstance(law, LZB):
+        given = f"{value(law.restitution)}, {value(law.stiffness)}, {value(law.exponent)}"
+        return f"LZB({given}{_rtol(law.rtol)})"
+    if isinstance(law, Compliant):
+        force = ", ".join(
+            value(getattr(law.force, key)) for key in ("stiffness", "exponent", "restitution")
+        )
+        return f"Compliant(Bistiffness({force}){_rtol(law.rtol)})"
+    order = f", {law.order!r}" if isinstance(law, Binary) and law.order != "fastest" else ""
+    return f"{type(law).__name__}({value(jax.tree.leaves(law)[0])}{order})"
+
+
+def _rtol(rtol: float | None) -> str:
+    return "" if rtol is None else f", rtol={rtol:g}"
+
+
+def structure(found: Findings) -> str:
+    """Which contacts are coupled: one sentence a block of several, one for all others."""
+    words = []
+    for block in found.blocks:
+        if len(block.contacts) == 1 or not block.approaches:
+            continue
+        assert block.angles is not None
+        low, high = block.angles
+        angle = f"angle {low:.4g}" if high - low < 0.05 else f"angles {low:.4g} to {high:.4g}"
+        law = f"{title(block.law)} is enough" if block.law else "no law is within tolerance"
+        words.append(f"contacts {block.name} are coupled (kinetic {angle} degrees): {law}")
+    groups: dict[str, list[int]] = {}
+    for block in found.blocks:
+        if not block.approaches:
+            what = "without an approach"
+        elif len(block.contacts) == 1:
+            what = f"decoupled: {title(block.law or 'no law')} is enough"
+        else:
+            continue
+        groups.setdefault(what, []).extend(j + 1 for j in block.contacts)
+    for what, contacts in groups.items():
+        named = ", ".join(str(j) for j in contacts)
+        words.append(f"contact{'s' * (len(contacts) > 1)} {named} {what}")
+    return "; ".join(words)
+
+
+def effects(found: Findings) -> str:
+    """What each unknown stiffness does by itself, the strongest first."""
+    strongest = sorted(found.effects, key=lambda effect: -effect.alone)[:_TOLD]
+    words = [
+        f"{e.name} {share(e.alone)}"
+        + (f" (know it within {100 * e.needed:.2g} %)" if e.needed < 1 else "")
+        for e in strongest
+    ]
+    return f"alone they move v+ by: {', '.join(words)}"
+
+
+def agreeing(found: Findings) -> str:
+    """Other laws, not more complex than the reference, that keep the tolerance too."""
+    others = [
+        title(name)
+        for name, c in found.candidates.items()
+        if name not in (found.name, found.reference)
+        and c.usable
+        and c.worst <= found.tolerance
+        and found.within
+    ]
+    return f"within {share(found.tolerance)}: {', '.join(others)}" if others else ""
+
+
+def ratios(found: Findings) -> str:
+    """The stiffness ratios this advice is about."""
+    coupled = [b for b in found.blocks if b.approaches and len(b.contacts) > 1]
+    if found.unknown:
+        names = [u.name for u in found.unknown[:_TOLD]]
+        more = ", ..." if len(found.unknown) > _TOLD else ""
+        ends = {(u.low, u.high) for u in found.unknown}
+        first = found.unknown[0]
+        where = f"in [{first.low:.3g}, {first.high:.3g}]" if len(ends) == 1 else "in their ranges"
+        many = len(found.unknown) > 1
+        kind = "stiffness" + (" ratio" + "s" * many if first.of is not None else "es" * many)
+        return f"{kind} {', '.join(names)}{more} {where}"
+    pairs = [(b.contacts[0], j) for b in coupled for j in b.contacts[1:]]
+    names = [f"k{j + 1}/k{i + 1}" for i, j in pairs[:_TOLD]]
+    values = [f"{found.stiffness[j] / found.stiffness[i]:.3g}" for i, j in pairs[:_TOLD]]
+    more = ", ..." if len(pairs) > _TOLD else ""
+    return f"stiffness ratio{'s' * (len(pairs) > 1)} {', '.join(names)} = {', '.join(values)}{more}"
+
+
+def reason(found: Findings) -> str:
+    """Why this law, in one sentence or two."""
+    if not any(block.approaches for block in found.blocks):
+        slowest = float(found.gap_velocity.min())
+        return f"no approach: nothing happens (smallest gap velocity {slowest:.3g} m/s)"
+    head = _head(found)
+    closest = _closest_simpler(found)
+    return f"{head}; {closest}" if closest else head
+
+
+def _head(found: Findings) -> str:
+    name, worst = found.name, share(found.candidates[found.name].worst)
+    at_work = [block for block in found.blocks if block.approaches]
+    if all(len(block.contacts) == 1 for block in at_work):
+        if found.contacts == 1:
+            return "single contact: every law is Newton's"
+        if len(at_work) == 1:
+            only = f"only contact {at_work[0].name} takes part: a single contact"
+        else:
+            only = "contacts decoupled: kinetic angle 90 degrees"
+        if name == "newton":
+            return f"{only}, all laws agree"
+        return f"{only}; {title(name)} leaves separating contacts alone"
+    if not found.within:
+        return _undecided(found)
+    if found.reference == "compliant":
+        return _gaps(found, worst)
+    if name == "lzb":
+        if not found.unknown:
+            return f"{ratios(found)}: no simpler law is within {share(found.tolerance)}"
+        return f"{ratios(found)}: whatever they are, LZB at the nominal ones is within {worst}"
+    if isinstance(found.law, Newton) and not np.asarray(found.law.restitution).any():
+        return f"plastic contacts (restitution 0) that stay together: Newton is within {worst}"
+    return f"{ratios(found)}{_idle(found)}: {title(name)} is within {worst}"
+
+
+def _idle(found: Findings) -> str:
+    """Where unknown ratios make no difference, and where angles above 90 degrees explain it."""
+    if not found.effects or max(effect.alone for effect in found.effects) > _NONE:
+        return ""
+    wide = [b.angles[1] for b in found.blocks if b.approaches and b.angles is not None]
+    why = ""
+    if max(wide) > 90 + _NONE:
+        why = f" (kinetic angle {max(wide):.4g} degrees: pushing one contact opens the other)"
+    return f" make{'s' * (len(found.effects) == 1)} no difference{why}"
+
+
+def _gaps(found: Findings, worst: str) -> str:
+    """Where gaps matter: how wide they are, and what that allows."""
+    assert found.gap_ratio is not None
+    low, high = (float(f(found.gap_ratio)) for f in (np.min, np.max))
+    both = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+    verb = f"{title(found.name)} is within {worst}"
+    if found.name == "binary" and low > WIDE:
+        return f"gaps exceed {WIDE:g} delta_c (they are {both} delta_c): {verb}"
+    if found.name == "compliant":
+        return f"gaps of {both} delta_c decide the outcome: only contacts with real gaps follow"
+    if high < NEARLY_TOUCHING:
+        return f"gaps below {NEARLY_TOUCHING:g} delta_c ({both}) are much as if touching: {verb}"
+    return f"gaps of {both} delta_c: {verb}"
+
+
+def _undecided(found: Findings) -> str:
+    """Nothing is within tolerance, because the stiffnesses are not known."""
+    moved, bound = share(found.candidates[found.name].worst), share(found.tolerance)
+    many = len(found.effects) > 1
+    words = (
+        f"{ratios(found)} decide{'' if many else 's'}: no law is within {bound}, because "
+        f"{'they move' if many else 'it moves'} v+ by up to {moved}"
+    )
+    most = max(found.effects, key=lambda effect: effect.alone)
+    if many:
+        return f"{words}; measure {most.name} first (alone {share(most.alone)})"
+    if most.needed < 1:
+        return f"{words}; it would have to be known within {100 * most.needed:.2g} %"
+    return words
+
+
+def _closest_simpler(found: Findings) -> str:
+    """How far off the best of the simpler laws is, or what it breaks."""
+    names = list(found.candidates)
+    simpler = names[: names.index(found.name)]
+    if not simpler:
+        return ""
+    best = min(simpler, key=lambda n: (not found.candidates[n].usable, found.candidates[n].worst))
+    other = found.candidates[best]
+    if not other.usable:
+        return f"{title(best)} fails: {other.status}"
+    return f"of the simpler laws {title(best)} comes closest and is off by {share(other.worst)}"

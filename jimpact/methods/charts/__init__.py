@@ -1,1 +1,0 @@
-"""Error against time and work."""

@@ -1,0 +1,194 @@
+"""The plain time form handed to diffrax and to scipy, ended by an event, as without jimpact.
+
+Steps do not know of the changes of phase: the step-size control has to find them. The impact is
+over when no contact holds or approaches by more than the tolerance; the event must be crossed
+downwards, for it begins at the approach itself.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from jimpact.laws.lzb import LZB
+from jimpact.methods.contenders.base import (
+    UNCOUNTED,
+    Method,
+    MethodResult,
+    finite_rate,
+    held_open,
+    in_si,
+    problem,
+    setup,
+    time_form,
+)
+from jimpact.numerics.flow import Flow
+from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import as_matrix
+from jimpact.status import CODE
+
+EVENT_TOLERANCE = 1e-10  # of the root finder, in units of the impact's time scale
+
+FINEST = 100 * float(np.finfo(float).eps)  # scipy takes no smaller rtol
+GIVE_UP = 5000  # evaluations a contact: LSODA may creep without end at an opening
+FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts about pi
+
+
+def _diffrax_solver(
+    solver: diffrax.AbstractSolver,
+    stages: int | None,
+    tally: Callable[[], None] | None = None,
+) -> Callable[[LZB, Scene, Any, Any], MethodResult]:
+    """`solve` by a diffrax solver of so many new stages a step (None: not known beforehand)."""
+
+    def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+        given = problem(law, scene, velocity)
+        inputs, flow = given.inputs, given.flow
+        rtol = jnp.asarray(setting, inputs.gamma.dtype)
+        static = None if isinstance(flow.exponent, jax.Array) else flow.exponent
+        eta = flow.exponent if static is None else None
+
+        def rates(t: Any, y: Any, args: Any) -> tuple[jax.Array, jax.Array]:
+            if tally is not None:
+                jax.debug.callback(tally)
+            gamma, coupling, omega, restitution, eta, _ = args
+            exponent = eta if static is None else static
+            flow = Flow(coupling, omega, restitution, exponent)
+            closing, force = time_form(flow, gamma, *y)
+            return held_open(y[0], closing), force
+
+        def at_work(t: Any, y: Any, args: Any, **_: Any) -> jax.Array:
+            x, p = y
+            gamma, coupling, rtol = args[0], args[1], args[-1]
+            return jnp.maximum(jnp.max(x), jnp.max(-(gamma + coupling @ p))) - rtol
+
+        found = diffrax.diffeqsolve(
+            diffrax.ODETerm(rates),
+            solver,
+            t0=jnp.zeros_like(rtol),
+            t1=jnp.full_like(rtol, jnp.inf),
+            dt0=None,
+            y0=(given.x, jnp.zeros_like(inputs.gamma)),
+            args=(inputs.gamma, flow.coupling, flow.omega, flow.restitution, eta, rtol),
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
+            event=diffrax.Event(
+                at_work,
+                optx.Bisection(EVENT_TOLERANCE, EVENT_TOLERANCE, flip="detect"),
+                direction=False,
+            ),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=given.max_steps,
+            throw=False,
+        )
+        assert found.ys is not None
+        assert found.ts is not None
+        ended = found.result == diffrax.RESULTS.event_occurred
+        steps = found.stats["num_steps"]
+        evaluations = jnp.full_like(steps, UNCOUNTED) if stages is None else stages * steps + 1
+        code = jnp.where(ended, CODE["ok"], CODE["max_steps"])
+        return in_si(given, found.ys[1][-1], found.ts[-1], evaluations, code)
+
+    return solve
+
+
+def _diffrax_method(
+    name: str, solver: Any, stages: int | None, ladder: tuple[float, ...]
+) -> Method:
+    label = f"diffrax {type(solver).__name__} with Event"
+    counting = None if stages is not None else functools.partial(_diffrax_solver, solver, None)
+    solve = _diffrax_solver(solver, stages)
+    return Method(name, label, "rtol", ladder, True, finite_rate, solve, counting=counting)
+
+
+DIFFRAX = (
+    _diffrax_method("tsit5", diffrax.Tsit5(), 6, (1e-3, 1e-5, 1e-7, 1e-9)),
+    _diffrax_method("dopri8", diffrax.Dopri8(), 13, (1e-3, 1e-5, 1e-7, 1e-9, 1e-11)),
+    _diffrax_method("kvaerno5", diffrax.Kvaerno5(), None, (1e-3, 1e-5, 1e-7)),
+)
+
+
+class _GaveUpError(Exception):
+    """More evaluations than the law allows steps."""
+
+
+def _scipy_solver(name: str) -> Callable[[LZB, Scene, Any, Any], MethodResult]:
+    """`solve` by one of the solvers of `scipy.integrate.solve_ivp`."""
+
+    def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+        from scipy.integrate import solve_ivp  # late: scipy is slow to import
+
+        given = setup(law, scene, velocity)
+        inputs, flow = given.inputs, given.flow
+        gamma, omega, e = (
+            np.asarray(a, float)
+            for a in (
+                inputs.gamma,
+                flow.omega,
+                jnp.broadcast_to(inputs.restitution, inputs.gamma.shape),
+            )
+        )
+        coupling = np.asarray(as_matrix(flow.coupling), float)
+        eta = np.asarray(flow.exponent, float)
+        m = len(gamma)
+        rtol = max(float(setting), FINEST)
+
+        count, reached = 0, (0.0, np.zeros(2 * m))
+
+        def rates(t: float, y: np.ndarray) -> np.ndarray:
+            nonlocal count, reached
+            count, reached = count + 1, (t, y)
+            if count > min(given.max_steps, GIVE_UP * m):
+                raise _GaveUpError
+            x, now = y[:m], gamma + coupling @ y[m:]
+            closing = -omega * np.where(now > 0, 1 / e**2, 1.0) * now
+            closing = np.where((x <= 0) & (closing < 0), 0.0, closing)
+            return np.concatenate([closing, (eta + 1) / 2 * omega * np.maximum(x, 0.0) ** eta])
+
+        def at_work(_: float, y: np.ndarray) -> float:
+            return max(y[:m].max(), -(gamma + coupling @ y[m:]).min()) - rtol
+
+        at_work.terminal, at_work.direction = True, -1.0  # type: ignore[attr-defined]
+        start = np.concatenate([np.asarray(given.x, float), np.zeros(m)])
+        options = {"method": name, "rtol": rtol, "atol": rtol, "events": at_work}
+        try:
+            found = solve_ivp(rates, (0.0, FOREVER), start, **options)
+        except _GaveUpError:
+            p, t, code = reached[1][m:], reached[0], CODE["max_steps"]
+        else:
+            code = CODE["ok"] if found.status == 1 else CODE["max_steps"]
+            p, t = found.y[m:, -1], found.t[-1]
+        dtype = inputs.gamma.dtype
+        # `nfev`, and what LSODA's own differences take
+        return in_si(
+            given,
+            jnp.asarray(p, dtype),
+            jnp.asarray(t, dtype),
+            jnp.asarray(count),
+            jnp.asarray(code),
+        )
+
+    return solve
+
+
+def _scipy_method(name: str, solver: str, ladder: tuple[float, ...]) -> Method:
+    return Method(
+        name,
+        f"scipy {solver} with event",
+        "rtol",
+        ladder,
+        False,
+        finite_rate,
+        _scipy_solver(solver),
+        no_gradient="host code: finite differences only",
+    )
+
+
+SCIPY = (
+    _scipy_method("scipy_dop853", "DOP853", (1e-3, 1e-5, 1e-7, 1e-9)),
+    _scipy_method("scipy_lsoda", "LSODA", (1e-3, 1e-4, 1e-5)),
+)

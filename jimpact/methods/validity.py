@@ -1,0 +1,168 @@
+"""Validity map: for which stiffness ratios Moreau's law, or binary collisions, are right."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_per_contact, check_values
+from jimpact.comparison import dispersion_index
+from jimpact.impacts import impact
+from jimpact.law import Law
+from jimpact.laws.binary import Binary
+from jimpact.laws.kinematic import Moreau
+from jimpact.laws.lzb import LZB
+from jimpact.scene import Scene, as_velocity
+from jimpact.status import STATUS
+
+RATIOS = (1e-3, 1e3, 121)  # of a map where none are given: from, to, how many
+
+
+@dataclass(frozen=True)
+class ValidityMap:
+    """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), beside laws without them.
+
+    `velocity` (x, r, n), `dispersion` and `status` (x, r); `laws[name]` holds v+ (n,) of Moreau's
+    law and of binary collisions, `law_dispersion[name]` its index.
+    """
+
+    scene: Scene
+    before: np.ndarray
+    ratios: np.ndarray
+    exponents: np.ndarray
+    velocity: np.ndarray
+    dispersion: np.ndarray
+    status: np.ndarray
+    laws: dict[str, np.ndarray]
+    law_dispersion: dict[str, float]
+
+    def error(self, law: str) -> np.ndarray:
+        """Error of v+ of 'moreau' or 'binary' against LZB (x, r), relative to max |v-|."""
+        if law not in self.laws:
+            raise ValueError(
+                f"Argument `law` must be one of {', '.join(self.laws)}, but has value {law!r}."
+            )
+        scale = np.abs(self.before).max()
+        return np.abs(self.velocity - self.laws[law]).max(axis=-1) / scale
+
+    def limit(self, law: str, tolerance: float = 1e-2) -> np.ndarray:
+        """Ratio (x,) from which on Moreau's law, or up to which binary, is within `tolerance`.
+
+        The last sampled ratio of the unbroken run from that end of the map; NaN: not even there.
+        """
+        check_values("tolerance", tolerance, low=0.0, open_low=True)
+        inside = self.error(law) <= tolerance
+        order = slice(None, None, -1) if law == "moreau" else slice(None)
+        run = np.logical_and.accumulate(inside[:, order], axis=1).sum(axis=1)
+        at = self.ratios[order][np.maximum(run - 1, 0)]
+        return np.where(run > 0, at, np.nan)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, as a JSON file can hold it."""
+        return {
+            "velocity_before": self.before.tolist(),
+            "ratios": self.ratios.tolist(),
+            "exponents": self.exponents.tolist(),
+            "velocity": self.velocity.tolist(),
+            "dispersion": self.dispersion.tolist(),
+            "status": [[STATUS[code].name for code in row] for row in self.status],
+            "laws": {
+                name: {"velocity": v.tolist(), "dispersion": self.law_dispersion[name]}
+                for name, v in self.laws.items()
+            },
+        }
+
+    def __str__(self) -> str:
+        lines = ["exponent   binary within 1 %     Moreau within 1 %"]
+        low, high = self.limit("binary"), self.limit("moreau")
+        for i, eta in enumerate(self.exponents):
+            below = "nowhere" if np.isnan(low[i]) else f"ratio <= {low[i]:.3g}"
+            above = "nowhere" if np.isnan(high[i]) else f"ratio >= {high[i]:.3g}"
+            lines.append(f"{eta:8.3g}   {below:21s} {above}")
+        return "\n".join(lines)
+
+
+def validity_map(
+    scene: Scene,
+    velocity: Any,
+    ratios: Any = None,
+    exponents: Any = (1.0, 1.5, 2.0, 3.0),
+    restitution: Any = 1.0,
+) -> ValidityMap:
+    """Dispersion and v+ of LZB against the stiffness ratio, beside Moreau's law and binary.
+
+    Equation: `k_j = ratio^(j - 1)`: with two contacts ratio = k2/k1, with more the stiffness
+    rises (ratio > 1) or falls from each contact to the next.
+
+    Args:
+        scene: n coordinates, m >= 2 contacts without gaps.
+        velocity: v- (n,) [m/s], not at rest.
+        ratios: (r,) > 0, rising; default: 121 from 1e-3 to 1e3.
+        exponents: (x,) >= 1.
+        restitution: e in [0, 1], scalar or (m,).
+
+    Returns:
+        `ValidityMap`; `ji.plot.validity_map` draws it, `print` tells where which law holds.
+
+    Source: the kind of Brogliato, Nonsmooth Mechanics (2016), figure 6.9.
+
+    >>> import jimpact as ji
+    >>> balls = ji.chain([1.0, 1.0, 1.0])
+    >>> found = ji.validity_map(balls, [1.0, 0.0, 0.0], ratios=[1e-3, 1.0, 1e3], exponents=[1.0])
+    >>> found.velocity[0, :, 1:].round(3).tolist()  # binary, dispersed, Moreau
+    [[0.0, 1.0], [0.15, 0.98], [0.666, 0.667]]
+    """
+    v = as_velocity(scene, velocity)
+    check_values("velocity", v)
+    if not np.asarray(v).any():
+        raise ValueError("Argument `velocity` must not be zero: nothing happens at rest.")
+    if scene.contacts < 2 or not np.asarray(scene.closed).all():
+        raise ValueError(
+            "Argument `scene` must have two or more contacts, all closed, but has "
+            f"{scene.contacts}, {int(np.asarray(scene.closed).sum())} of them closed."
+        )
+    over = np.geomspace(*RATIOS[:2], int(RATIOS[2])) if ratios is None else ratios
+    ratio, eta = _axis("ratios", over, v, 0.0, True), _axis("exponents", exponents, v, 1.0, False)
+    if (np.diff(np.asarray(ratio)) <= 0).any():
+        raise ValueError("Argument `ratios` must rise, but does not.")
+    e = as_float_array("restitution", restitution)
+    check_values("restitution", e, low=0.0, high=1.0)
+    check_per_contact("restitution", e, scene.contacts)
+    velocities, spread, status = _grid(scene, v, ratio, eta, e.astype(v.dtype))
+    laws: dict[str, Law] = {"moreau": Moreau(e), "binary": Binary(e)}
+    found = {name: impact(law, scene, v).velocity for name, law in laws.items()}
+    return ValidityMap(
+        scene=scene,
+        before=np.asarray(v),
+        ratios=np.asarray(ratio),
+        exponents=np.asarray(eta),
+        velocity=np.asarray(velocities),
+        dispersion=np.asarray(spread),
+        status=np.asarray(status),
+        laws={name: np.asarray(x) for name, x in found.items()},
+        law_dispersion={name: float(dispersion_index(scene, x)) for name, x in found.items()},
+    )
+
+
+def _axis(name: str, values: Any, like: jax.Array, low: float, open_low: bool) -> jax.Array:
+    axis = as_float_array(name, values).astype(like.dtype)
+    if axis.ndim != 1 or axis.size == 0:
+        raise ValueError(f"Argument `{name}` must have shape (r,), but has shape {axis.shape}.")
+    check_values(name, axis, low=low, open_low=open_low)
+    return axis
+
+
+@eqx.filter_jit
+def _grid(
+    scene: Scene, v: jax.Array, ratios: jax.Array, exponents: jax.Array, e: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    step = jnp.arange(scene.contacts).astype(v.dtype)
+
+    def one(ratio: jax.Array, eta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        out = impact(LZB(e, ratio**step, eta), scene, v)
+        return out.velocity, dispersion_index(scene, out.velocity), out.status
+
+    return jax.vmap(lambda eta: jax.vmap(lambda q: one(q, eta))(ratios))(exponents)

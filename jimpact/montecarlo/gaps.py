@@ -1,0 +1,273 @@
+"""Gaps in units of the indentation, and the outcome linearized in the gaps."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.contact import delassus_matrix
+from jimpact.impacts import impact
+from jimpact.law import Law, check_law
+from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Bistiffness
+from jimpact.laws.lzb import LZB
+from jimpact.montecarlo.results import MonteCarlo
+from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
+from jimpact.solvers.tridiagonal import diagonal
+from jimpact.status import STATUS
+
+NEARLY_TOUCHING, WIDE = 0.1, 2.0  # gaps below and above so many delta_c are told in these words
+
+# Linearized and sampled standard deviations that differ by more than this are reported.
+AGREES = 0.2
+CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
+
+
+class GapScale(eqx.Module):
+    """`delta` (m,) [m], indentation scale of each contact, and the scene's `gaps` (m,) [m]."""
+
+    delta: jax.Array
+    gaps: jax.Array
+
+    @property
+    def ratio(self) -> jax.Array:
+        """Gaps in units of delta_c (m,)."""
+        return self.gaps / self.delta
+
+    def __str__(self) -> str:
+        if is_traced(self.delta):
+            return repr(self)
+        return "\n".join(
+            f"gap {j + 1} is {_in_words(gap, delta)}"
+            for j, (gap, delta) in enumerate(zip(np.asarray(self.gaps), np.asarray(self.delta)))
+        )
+
+
+def _in_words(gap: float, delta: float) -> str:
+    if delta == 0:
+        return f"{_length(gap)}: nothing approaches"
+    scale = f"delta_c = {_length(delta)}"
+    if gap == 0:
+        return f"closed ({scale})"
+    ratio = gap / delta
+    if ratio < NEARLY_TOUCHING:
+        meaning = "much as if touching"
+    elif ratio < WIDE:
+        meaning = "the collisions overlap, and the gap decides the outcome"
+    else:
+        meaning = "wide, its collisions come one after another"
+    return f"{ratio:.3g} delta_c ({scale}): {meaning}"
+
+
+def _length(metres: float) -> str:
+    for unit, size in (("m", 1.0), ("mm", 1e-3), ("um", 1e-6)):
+        if metres >= size or metres == 0:
+            return f"{metres / size:.3g} {unit}"
+    return f"{metres / 1e-9:.3g} nm"
+
+
+def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
+    """Indentation scale `delta_c` of every contact, by which a gap is small or large.
+
+    Equation: `delta_c = (m v^2 / k)^(1 / (eta + 1))` with the largest approach speed v of the
+    scene and `m_j = 2 / W_jj`, the mass of two equal balls (in general `2 m1 m2 / (m1 + m2)`); for
+    forces that are no power law `F(delta_c) delta_c = m v^2`.
+
+    Args:
+        scene: its gaps, None: all closed.
+        law: a `Compliant` or an `LZB`.
+        velocity: v- (n,) [m/s].
+
+    Returns:
+        `GapScale`; `print` says it in words. 0 where nothing approaches.
+
+    Raises:
+        TypeError: a law without indentation.
+
+    >>> import jimpact as ji
+    >>> scene = ji.chain([0.0665, 0.0665, 0.0665], gaps=[0.0, 1e-4])  # one-inch steel balls
+    >>> print(ji.gap_scale(scene, ji.Compliant(ji.Hertz(1.2e10)), [1.0, 0.0, 0.0]))
+    gap 1 is closed (delta_c = 31.4 um)
+    gap 2 is 3.18 delta_c (delta_c = 31.4 um): wide, its collisions come one after another
+    """
+    v = as_velocity(scene, velocity)
+    check_values("velocity", v)
+    if not isinstance(law, Compliant | LZB):
+        raise TypeError(
+            f"Argument `law` must be a Compliant or an LZB, whose contacts indent, but is {law!r}."
+        )
+    force = law.force if isinstance(law, Compliant) else Bistiffness(law.stiffness, law.exponent)
+    check_law(law, scene, v.dtype)
+    speed = jnp.maximum(jnp.max(-gap_velocity(scene, v)), 0.0)
+    work = 2 / diagonal(delassus_matrix(scene)) * speed**2
+    if isinstance(force, Bistiffness):
+        eta = jnp.asarray(force.exponent, work.dtype)
+        delta = (work / force.stiffness) ** (1 / (eta + 1))
+    else:
+        delta = force.indentation_scale(0.5 * work)
+    gaps = jnp.zeros_like(work) if scene.gaps is None else scene.gaps
+    return GapScale(jnp.where(speed > 0, delta, 0.0), gaps)
+
+
+class Crossover(eqx.Module):
+    """Outcomes (s, n) over `offset` (s,), the difference of two gaps in units of delta_c."""
+
+    offset: jax.Array
+    velocity: jax.Array
+    status: jax.Array
+
+
+def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Crossover:
+    """Outcome of a two-contact scene against the difference of its gaps.
+
+    Which contact closes first decides what follows; laws of instantaneous collisions jump where
+    both close at once. With indentation the jump is a smooth crossover, about 2 delta_c wide.
+
+    Args:
+        scene: with two contacts; the mean of its gaps (none: closed) is widened as needed.
+        law: a `Compliant`.
+        velocity: v- (n,) [m/s].
+        offset: (s,) values of `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.1.1: balls of mass (m/4, m, m/4).
+
+    >>> import jimpact as ji
+    >>> balls = ji.chain([0.25, 1.0, 0.25])
+    >>> found = ji.crossover(balls, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0, -1.0], [-9.0, 0.0, 9.0])
+    >>> (found.velocity.round(4) + 0.0).tolist()  # one by one, both at once, the mirror image
+    [[-0.6, -0.16, 1.24], [-1.0, 0.0, 1.0], [-1.24, 0.16, 0.6]]
+    """
+    if scene.contacts != 2:
+        raise ValueError(f"Argument `scene` must have two contacts, but has {scene.contacts}.")
+    if not isinstance(law, Compliant):
+        raise TypeError(f"Argument `law` must be a Compliant, but is {law!r}.")
+    s = as_float_array("offset", offset)
+    if s.ndim != 1:
+        raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
+    check_values("offset", s)
+    scale = gap_scale(scene, law, velocity)
+    delta = jnp.max(scale.delta)
+    mean = jnp.maximum(jnp.mean(scale.gaps), 0.5 * delta * jnp.max(jnp.abs(s)))
+    gaps = mean + 0.5 * delta * s[:, None] * jnp.array([1.0, -1.0], s.dtype)[None, :]
+    return _crossover(law, scene, as_float_array("velocity", velocity), s, jnp.maximum(gaps, 0.0))
+
+
+@eqx.filter_jit
+def _crossover(
+    law: Compliant, scene: Scene, v: jax.Array, offset: jax.Array, gaps: jax.Array
+) -> Crossover:
+    def at(g: jax.Array) -> tuple[jax.Array, jax.Array]:
+        out = impact(law, with_gaps(scene, g), v)
+        return out.velocity, out.status
+
+    velocity, status = jax.vmap(at)(gaps)
+    return Crossover(offset, velocity, status)
+
+
+@dataclass(frozen=True, eq=False)
+class GapSensitivity:
+    """The outcome at given gaps (m,) [m] and its derivatives in them; `print` gives a report.
+
+    Attributes:
+        gaps, velocity: (m,) [m], where it is linearized, and (n,) [m/s], the outcome there.
+        jacobian: (n, m) [1/s], `d v+_i / d gap_j`.
+        status: name of the impact's status.
+        sampled: the Monte Carlo run to compare with, or None.
+    """
+
+    gaps: np.ndarray
+    velocity: np.ndarray
+    jacobian: np.ndarray
+    status: str
+    sampled: MonteCarlo | None = None
+
+    def covariance(self, gap_covariance: Any) -> np.ndarray:
+        """Linearized covariance (n, n) of the velocities, `J Sigma J^T`, of gaps with Sigma."""
+        sigma = np.asarray(gap_covariance, float)
+        m = len(self.gaps)
+        check_shape("gap_covariance", sigma, (m, m), "a row and a column per contact")
+        return self.jacobian @ sigma @ self.jacobian.T
+
+    @property
+    def explained(self) -> np.ndarray:
+        """Linearized over sampled standard deviation (n,): 1 where the linearization holds."""
+        if self.sampled is None:
+            raise ValueError("Argument `sampled` must be given for a comparison, but is None.")
+        linear = np.sqrt(np.diag(self.covariance(self.sampled.gap_covariance)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return linear / self.sampled.std
+
+    def __str__(self) -> str:
+        m = len(self.gaps)
+        at = ", ".join(f"{gap:g}" for gap in self.gaps)
+        lines = [f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"]
+        for i in range(len(self.velocity)):
+            row = "".join(f"{self.jacobian[i, j]:13.5g}" for j in range(m))
+            lines.append(f"v{i + 1}+ = {self.velocity[i]:10.6f} m/s: {row}")
+        return "\n".join(lines + ([] if self.sampled is None else self._comparison()))
+
+    def _comparison(self) -> list[str]:
+        assert self.sampled is not None
+        ratio = self.explained
+        largest = np.max(np.abs([self.sampled.minimum, self.sampled.maximum]), initial=0.0)
+        if np.all(self.sampled.std <= CONSTANT * largest):
+            return ["The outcome does not depend on the gaps."]
+        lines = ["standard deviations [m/s], linearized against sampled:"]
+        for i, (std, part) in enumerate(zip(self.sampled.std, ratio)):
+            lines.append(f"v{i + 1}+: {part * std:.3g} against {std:.3g}")
+        if np.all(np.abs(ratio - 1) <= AGREES):
+            lines.append("The outcome is nearly linear over the spread of the gaps.")
+        elif not self.jacobian.any():
+            lines.append(
+                "The outcome does not change with small changes of the gaps, yet it varies: it "
+                "jumps where the order of the collisions changes. Trust the samples."
+            )
+        else:
+            lines.append(
+                "The linearization fails over this spread: the gaps reach across a crossover or a "
+                "curved part. Trust the samples."
+            )
+        return lines
+
+
+def gap_sensitivity(
+    law: Law, scene: Scene, velocity: Any, gaps: Any, sampled: MonteCarlo | None = None
+) -> GapSensitivity:
+    """Jacobian of the outcome in the gaps, and the linearized covariance beside Monte Carlo's.
+
+    Equation: `J = d v+ / d gap`, `cov(v+) ~ J Sigma J^T`. It holds where the outcome is nearly
+    linear over the spread of the gaps, so not across a crossover of the order of contacts; for
+    laws that see gaps only in the order of collisions (Binary) J = 0, for laws that ignore the
+    sizes of gaps too.
+
+    Args:
+        law, scene: as in `impact`.
+        velocity: v- (n,) [m/s].
+        gaps: (m,) >= 0 [m], where to linearize: often `sampled.gap_mean`.
+        sampled: a run of `monte_carlo` with random gaps to compare with.
+
+    >>> import jimpact as ji
+    >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25])
+    >>> ji.gap_sensitivity(law, balls, [1.0, 0.0, -1.0], [1e-6, 2e-6]).velocity.round(6).tolist()
+    [-0.6, -0.16, 1.24]
+    """
+    at, v = as_float_array("gaps", gaps), as_float_array("velocity", velocity)
+    check_shape("gaps", at, (scene.contacts,), "one gap per contact")
+    check_values("gaps", at, low=0.0)
+
+    def outcome(gaps: jax.Array) -> tuple[jax.Array, Any]:
+        out = impact(law, with_gaps(scene, gaps), v)
+        return out.velocity, (out.velocity, out.status)
+
+    jacobian, (after, status) = jax.jacfwd(outcome, has_aux=True)(at)
+    return GapSensitivity(
+        gaps=np.asarray(at),
+        velocity=np.asarray(after),
+        jacobian=np.asarray(jacobian),
+        status=STATUS[int(status)].name,
+        sampled=sampled,
+    )

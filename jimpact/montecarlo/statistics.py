@@ -1,0 +1,240 @@
+"""Statistics in float64 on the host: mean and covariance, histograms, what a chunk reduces to."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from jimpact.montecarlo.drawing import BAD_INPUTS
+from jimpact.status import STATUS, Status
+
+MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
+FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
+LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
+SHOWN = 4096  # first samples of a run that are kept in memory for pictures
+# name, message and whether it is a failure, of every code
+OUTCOMES = [*STATUS, *(Status(*row, True) for row in BAD_INPUTS.values())]
+FAILURE = np.array([row.failure for row in OUTCOMES])
+_SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
+_PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean (d,) and the sum of products of deviations from the mean (d, d)."""
+
+    count: int
+    mean: np.ndarray
+    products: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Sample covariance (d, d), divided by count - 1; NaN for fewer than two."""
+        if self.count < 2:
+            return np.full(self.products.shape, np.nan)
+        return self.products / (self.count - 1)
+
+
+def moments(values: np.ndarray) -> Moments:
+    """Of `values` (d, count), one row a quantity; in float64 whatever their type.
+
+    >>> import numpy as np
+    >>> from jimpact.montecarlo.statistics import moments
+    >>> moments(np.array([[1.0, 2.0, 3.0]])).covariance.tolist()
+    [[1.0]]
+    """
+    values = np.ascontiguousarray(values, dtype=np.float64)
+    count = values.shape[1]
+    if count == 0:
+        return Moments(0, np.zeros(len(values)), np.zeros((len(values),) * 2))
+    mean = values.sum(axis=1) / count  # along contiguous rows: pairwise
+    deviation = values - mean[:, None]
+    # not BLAS: its summation order depends on the number of threads
+    return Moments(count, mean, np.einsum("ik,jk->ij", deviation, deviation))
+
+
+def merged(a: Moments, b: Moments) -> Moments:
+    """Moments of both together.
+
+    Equation: `mean = mean_a + d n_b / n`, `S = S_a + S_b + d d^T n_a n_b / n`, with
+    `d = mean_b - mean_a`. Not associative in floating point: merge in a fixed order.
+
+    Source: Chan, Golub and LeVeque, Am. Statistician 37 (1983) 242.
+
+    >>> import numpy as np
+    >>> from jimpact.montecarlo.statistics import merged, moments
+    >>> whole = merged(moments(np.array([[1.0]])), moments(np.array([[3.0]])))
+    >>> whole.count, whole.mean.tolist(), whole.covariance.tolist()
+    (2, [2.0], [[2.0]])
+    """
+    if a.count == 0 or b.count == 0:
+        return a if b.count == 0 else b
+    count = a.count + b.count
+    d = b.mean - a.mean
+    products = a.products + b.products + np.outer(d, d) * (a.count * b.count / count)
+    return Moments(count, a.mean + d * (b.count / count), products)
+
+
+def bin_range(values: np.ndarray) -> np.ndarray:
+    """Low and high ends (d, 2) for the bins of `values` (d, count), with a margin."""
+    low, high = values.min(axis=1).astype(float), values.max(axis=1).astype(float)
+    margin = MARGIN * (high - low)
+    size = np.maximum(np.abs(low), np.abs(high))
+    flat = FLAT * np.where(size > 0, size, 1.0)
+    margin = np.maximum(margin, flat)  # also where the range is rounding
+    return np.stack([low - margin, high + margin], axis=1)
+
+
+def bin_counts(values: np.ndarray, ends: np.ndarray, bins: int) -> np.ndarray:
+    """Counts (d, bins + 2): below `ends`, in each bin, at or above the upper end.
+
+    >>> import numpy as np
+    >>> from jimpact.montecarlo.statistics import bin_counts
+    >>> bin_counts(np.array([[-1.0, 0.1, 0.6, 0.7, 1.0]]), np.array([[0.0, 1.0]]), 2).tolist()
+    [[1, 1, 2, 1]]
+    """
+    counts = np.empty((len(values), bins + 2), np.int64)
+    for row, (low, high), count in zip(values, ends, counts):
+        place = np.floor((np.asarray(row, float) - low) * (bins / (high - low)))
+        place = np.clip(place, -1, bins).astype(np.int64) + 1
+        count[:] = np.bincount(place, minlength=bins + 2)
+    return counts
+
+
+def bin_edges(ends: np.ndarray, bins: int) -> np.ndarray:
+    """Bin edges (d, bins + 1)."""
+    return np.linspace(ends[:, 0], ends[:, 1], bins + 1, axis=1)
+
+
+def binned_quantile(
+    q: float, ends: np.ndarray, counts: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """The q-quantiles (d,), right to one bin width where they lie inside the bins.
+
+    Linear inside the bin; `low` and `high` (d,), the smallest and largest values, bound what lies
+    outside the bins.
+
+    >>> import numpy as np
+    >>> from jimpact.montecarlo.statistics import binned_quantile
+    >>> counts, ends = np.array([[0, 1, 1, 0]]), np.array([[0.0, 1.0]])
+    >>> binned_quantile(0.75, ends, counts, np.array([0.1]), np.array([0.9])).tolist()
+    [0.75]
+    """
+    inner = bin_edges(ends, counts.shape[1] - 2)
+    left = np.concatenate([np.minimum(low, inner[:, 0])[:, None], inner], axis=1)
+    right = np.concatenate([inner, np.maximum(high, inner[:, -1])[:, None]], axis=1)
+    found = np.empty(len(counts))
+    for i, count in enumerate(counts):
+        after = np.cumsum(count)
+        wanted = q * after[-1]
+        k = int(np.searchsorted(after, wanted))
+        k = k if count[k] else int(np.flatnonzero(count)[0])  # q = 0: the first bin in use
+        part = (wanted - (after[k] - count[k])) / count[k]
+        found[i] = left[i, k] + part * (right[i, k] - left[i, k])
+    return np.clip(found, low, high)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a chunk needs beside the plan: its number, how many samples count, bins, given rows."""
+
+    number: int
+    count: int
+    ends: np.ndarray | None  # (n, 2) of the histograms; None: from this chunk
+    rows: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Statistics of one chunk; `values` are the velocities after (n), then the random gaps (m).
+
+    Attributes:
+        statuses: how many samples ended with each code.
+        moments: of the samples that did not fail.
+        low, high: smallest and largest velocities (n,); inf, -inf without any.
+        ends, counts: histogram ranges (n, 2) and counts (n, bins + 2).
+        bad: lanes, codes, gaps and velocities before of the first failed samples.
+        samples: all samples, or the first few (`SHOWN`), or none.
+    """
+
+    number: int
+    count: int
+    statuses: np.ndarray
+    moments: Moments
+    low: np.ndarray
+    high: np.ndarray
+    ends: np.ndarray
+    counts: np.ndarray
+    bad: dict[str, np.ndarray]
+    samples: dict[str, np.ndarray]
+
+    def without_samples(self) -> "Chunk":
+        """Without raw samples but the few first ones of a run."""
+        shown = {k: v[:SHOWN].copy() for k, v in self.samples.items()} if self.number == 0 else {}
+        return dataclasses.replace(self, samples=shown)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything as named arrays, for a file."""
+        plain = {name: np.asarray(getattr(self, name)) for name in _PLAIN}
+        parts = {f"moments.{k}": np.asarray(v) for k, v in vars(self.moments).items()}
+        bad = {f"bad.{k}": v for k, v in self.bad.items()}
+        return plain | parts | bad | {f"samples.{k}": v for k, v in self.samples.items()}
+
+
+def chunk_from(arrays: dict[str, np.ndarray]) -> Chunk:
+    """The inverse of `Chunk.arrays`."""
+
+    def part(prefix: str) -> dict[str, np.ndarray]:
+        start = f"{prefix}."
+        return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
+
+    own: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
+    own |= {name: int(own[name]) for name in ("number", "count")}
+    m = part("moments")
+    whole = Moments(int(m["count"]), m["mean"], m["products"])
+    return Chunk(**own, moments=whole, bad=part("bad"), samples=part("samples"))
+
+
+def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples: bool) -> Chunk:
+    """The statistics of the first `task.count` samples of a chunk."""
+    failed = FAILURE[samples["status"]]
+    whole = np.concatenate([samples["velocity"].T, samples["gaps"].T]).astype(np.float64)
+    n = samples["velocity"].shape[1]
+    ends = task.ends
+    if ends is None:
+        ends = _first_ends(whole[:n, ~failed], samples["status"])
+    count = task.count
+    failed = failed[:count]
+    used = whole[:, :count] if not failed.any() else whole[:, :count][:, ~failed]
+    velocity = used[:n]
+    lanes = np.flatnonzero(failed)[:LISTED]
+    bad = {"lane": lanes} | {name: samples[name][lanes] for name in _SAMPLE_FIELDS}
+    kept = count if keep_samples else (min(count, SHOWN) if task.number == 0 else 0)
+    return Chunk(
+        number=task.number,
+        count=count,
+        statuses=np.bincount(samples["status"][:count], minlength=len(FAILURE)),
+        moments=moments(used),
+        low=velocity.min(axis=1, initial=np.inf),
+        high=velocity.max(axis=1, initial=-np.inf),
+        ends=ends,
+        counts=bin_counts(velocity, ends, bins),
+        bad=bad,
+        samples={k: v[:kept].copy() for k, v in samples.items()} if kept else {},
+    )
+
+
+def _first_ends(velocity: np.ndarray, status: np.ndarray) -> np.ndarray:
+    """Histogram ranges from the first chunk; an error where not one of its samples is usable."""
+    if velocity.shape[1] == 0:
+        counts = ", ".join(f"{count} {name}" for name, count in named(np.bincount(status)).items())
+        raise RuntimeError(
+            f"Not one of the first {len(status)} samples gave a usable outcome: {counts}."
+        )
+    return bin_range(velocity)
+
+
+def named(counts: np.ndarray) -> dict[str, int]:
+    """Status counts by name, those that occurred."""
+    return {OUTCOMES[code].name: int(counts[code]) for code in np.flatnonzero(counts)}

@@ -1,0 +1,328 @@
+"""Motions in which contact forces of a `Compliant` law act, instead of impacts at an instant."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from jimpact._checks import as_float_array, check_kind, check_shape, check_values
+from jimpact.bodies.base import Body, GivenBody
+from jimpact.contact import delassus_matrix
+from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK, root_order
+from jimpact.events.stepper import any_of
+from jimpact.laws.forces import Bistiffness, Force
+from jimpact.motion.contact_forces import Contacts, contacts_at
+from jimpact.motion.dynamics import base_velocity, kinematics, user_force
+from jimpact.motion.event_driven import why_stuck
+from jimpact.motion.flow import (
+    Course,
+    Flight,
+    MotionFlow,
+    Settings,
+    State,
+    allowed_errors,
+    first_flight,
+    one_pass,
+    packed,
+    roundings,
+    toward_sample,
+    unpacked,
+)
+from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
+from jimpact.motion.system import System
+from jimpact.scene import gap_velocity
+
+SNAP = 1e-2  # of the errors allowed: margins closer to 0 are 0
+SLOWEST = 1e-12  # [m/s] unit of speed of contacts that have not moved yet: any small one
+
+
+class Units(NamedTuple):
+    """Scales of each contact (m,), from its fastest approach so far."""
+
+    speed: jax.Array  # [m/s]
+    depth: jax.Array  # [m] indentation at that speed
+    force: jax.Array  # [N] at that indentation
+    impulse: jax.Array  # [N s]
+
+
+def _units(force: Force, given: Contacts, fastest: jax.Array) -> Units:
+    """The units that belong to these speeds (m,)."""
+    speed, w = jnp.maximum(fastest, SLOWEST), jnp.diagonal(given.delassus)
+    depth = force.indentation_scale(0.5 * speed**2 / w)
+    return jax.lax.stop_gradient(
+        Units(speed, depth, force.force(depth, jnp.zeros_like(depth)), speed / w)
+    )
+
+
+class CompliantFlow(MotionFlow):
+    """Forces of contacts of which each is open, in compression, in expansion, or slack.
+
+    Equation: `M q'' = (loads) + N F(x, x')`, `x' = -f'` (in expansion `-f' / e^2`).
+
+    The indentation x is a row of the state, -gap before the contact first closes: a plastic contact
+    keeps a residual indentation, at which it closes again. Modes (rows): the phase of each contact,
+    as in `events/contact_flow.py`. Margins: by indentation, then by velocity.
+    """
+
+    force: Force
+    units: Units
+
+    @property
+    def root(self) -> int:  # type: ignore[override]
+        """Forces set in like `x^eta`: see `root_order`."""
+        return root_order(self.force.exponent) if isinstance(self.force, Bistiffness) else 2
+
+    def constants(self, modes: jax.Array) -> jax.Array:
+        """The phase of each contact."""
+        return modes[:, 0]
+
+    def field(self, const: jax.Array, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of the state."""
+        at = unpacked(self.like, y)
+        given = contacts_at(self.system, at.q, at.v, at.t, False)
+        x, gamma = at.contact[0], given.normal.rate
+        loaded = (const == COMPRESSION) | (const == EXPANSION)
+        push = self.force.force(jnp.where(x >= 0, x, 0.0), -gamma)
+        push = jnp.where(loaded, jnp.maximum(push, 0.0), 0.0)
+        closing = -gamma
+        if isinstance(self.force, Bistiffness):
+            e = jnp.where(self.force.restitution > 0, self.force.restitution, 1.0)
+            closing = jnp.where(const == EXPANSION, closing / e**2, closing)
+        carried = base_velocity(self.system, at.t)
+        base = jnp.zeros_like(at.t)
+        if carried is not None:
+            base = (given.normal.gradient @ push) @ carried
+        rates = State(
+            q=at.v,
+            v=given.free + given.moved @ push,
+            t=jnp.ones_like(at.t),
+            work=user_force(self.system, at.q, at.v, at.t) @ at.v,
+            base_work=base,
+            contact_work=jnp.stack([push * gamma, jnp.zeros_like(push)]),
+            contact=jnp.stack([closing, push]),
+        )
+        return self.regular(rates, at)
+
+    def margins(self, const: jax.Array, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Where a gap closes, a force ends or returns; where compression turns."""
+        at = unpacked(self.like, y)
+        rate, x = kinematics(self.system, at.q, at.v, at.t).rate, at.contact[0]
+        gamma, depth = rate / self.units.speed, x / self.units.depth
+        if self.force.slackens:
+            onset = self.force.onset(x, -rate) / self.units.force
+            by_x = jnp.where(const == COMPRESSION, onset, -onset)
+            by_g = jnp.where(const == SLACK, depth, 1.0)
+        else:
+            by_x = jnp.where(const == EXPANSION, depth, 1.0)
+            by_g = jnp.where(const == COMPRESSION, -gamma, gamma)
+        by_x = jnp.where(const == OPEN, -depth, by_x)
+        by_g = jnp.where(const == OPEN, 1.0, by_g)
+        return self.from_margins(jnp.concatenate([by_x, by_g]), at)
+
+    def rooted(self, modes: jax.Array) -> jax.Array:
+        """Openings, by the root of the indentation."""
+        opens = modes == EXPANSION
+        rest = jnp.zeros((self.rounding.shape[0] - modes.shape[0], 1), bool)
+        return jnp.concatenate([opens, rest])
+
+    def switch(
+        self, modes: jax.Array, y: jax.Array, which: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Phases after an event; a contact that closes or opens has no indentation."""
+        at, m = unpacked(self.like, y), modes.shape[0]
+        phase, by_x, by_g = modes[:, 0], which[:m, 0], which[m : 2 * m, 0]
+        closed = by_x & (phase == OPEN)
+        if self.force.slackens:
+            after = jnp.where(by_x & (phase == COMPRESSION), SLACK, phase)
+            after = jnp.where(by_x & (phase == SLACK), COMPRESSION, after)
+            opened = by_g & (phase == SLACK)
+        else:
+            turned = by_g & (phase == COMPRESSION)
+            after = jnp.where(turned, EXPANSION, phase)
+            after = jnp.where(by_g & (phase == EXPANSION), COMPRESSION, after)
+            opened = by_x & (phase == EXPANSION)
+            if isinstance(self.force, Bistiffness):  # e = 0 returns nothing
+                opened = opened | (turned & (self.force.restitution == 0))
+        after = jnp.where(opened, OPEN, jnp.where(closed, COMPRESSION, after))
+        x, impulse = at.contact
+        contact = jnp.stack([jnp.where(opened | closed, 0.0, x), jnp.where(closed, 0.0, impulse)])
+        return after[:, None].astype(modes.dtype), packed(at._replace(contact=contact))
+
+    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
+        """Where a force sets in."""
+        return any_of((after == COMPRESSION) & ((before == OPEN) | (before == SLACK)))
+
+
+class _Run(NamedTuple):
+    flight: Flight
+    fastest: jax.Array  # (m,) approach so far [m/s]
+    events: Events
+    status: jax.Array
+    apart: jax.Array  # whether all contacts are open and none closes
+
+
+def contact_dynamics(
+    system: System,
+    force: Force,
+    settings: Settings,
+    q0: jax.Array,
+    v0: jax.Array,
+    times: jax.Array,
+    max_events: int,
+    until_apart: bool = False,
+) -> tuple[Course, State, jax.Array]:
+    """The motion from `times[0]` to `times[-1]`, or until no contact works any more.
+
+    Returns:
+        The course, the last state, and whether all contacts are open and none closes in it.
+    """
+    given = contacts_at(system, q0, v0, times[0], False)
+    m, dtype = given.normal.value.shape[0], q0.dtype
+    zero, none = jnp.zeros((), dtype), jnp.zeros((2, m), dtype)
+    gap = given.normal.value
+    x = jnp.where(jnp.abs(gap) <= settings.closed_below, 0.0, -gap)
+    state = State(q0, v0, times[0], zero, zero, none, jnp.stack([x, jnp.zeros_like(x)]))
+    gamma = given.normal.rate
+    phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), COMPRESSION, OPEN)
+    if not force.slackens:
+        phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
+    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
+    status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"]).astype(jnp.int32)
+    begin = first_flight(state, phase[:, None].astype(jnp.int32), 2 * m, times)
+    events = no_events(max_events, q0.shape[0], m, dtype)
+    start = _Run(
+        toward_sample(begin, times),
+        jax.lax.stop_gradient(jnp.maximum(-gamma, 0.0)),
+        events,
+        status,
+        jnp.all((phase == OPEN) & (gamma >= 0)),
+    )
+    blank = jnp.zeros((packed(state).shape[0], 1), dtype)
+
+    def going(run: _Run) -> jax.Array:
+        on = (run.status == MOTION_CODE["ok"]) & (run.flight.sample < times.shape[0])
+        return on & ~run.apart if until_apart else on
+
+    def one(run: _Run) -> _Run:
+        flight = run.flight
+        given = contacts_at(system, flight.state.q, flight.state.v, flight.state.t, False)
+        units = _units(force, given, run.fastest)
+        share = jnp.full(2 * m, SNAP * settings.rtol, dtype)
+        flow = CompliantFlow(
+            system, roundings(settings, share, times), times[0], blank, state, force, units
+        )
+        ledger = allowed_errors(system, settings, flight.state, 1.0)[: -2 * m]
+        rows = jnp.concatenate([ledger, settings.rtol * units.depth, settings.rtol * units.impulse])
+        flown = one_pass(flow, settings, rows, times, flight)
+        before, after = (f.plan.step.modes[:, 0] for f in (flight, flown))
+        closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
+        at = flown.state
+        gamma = kinematics(system, at.q, at.v, at.t).rate
+        row = {
+            "time": at.t,
+            "kind": jnp.where(jnp.any(closed), KIND_CODE["contact"], KIND_CODE["detachment"]),
+            "contacts": closed | opened,
+            "q": at.q,
+            "velocity_before": at.v,
+            "velocity_after": at.v,
+            "impulse": jnp.where(opened, at.contact[1], 0.0),
+            "tangential_impulse": jnp.zeros_like(gamma),
+        }
+        happened = jnp.any(closed | opened)
+        full = happened & (run.events.count >= max_events)
+        status = jnp.where(full, MOTION_CODE["max_events"], run.status)
+        status = jnp.where(flown.stuck, why_stuck(system, flown, times), status)
+        fastest = jnp.maximum(run.fastest, jnp.maximum(-gamma, 0.0))
+        return _Run(
+            flown,
+            jax.lax.stop_gradient(fastest),
+            with_row(run.events, happened, row),
+            status.astype(jnp.int32),
+            jnp.all((after == OPEN) & (gamma >= 0)),
+        )
+
+    end = jax.lax.while_loop(going, one, start)
+    course = Course(end.flight.samples, end.events, end.flight.steps, end.status)
+    return course, end.flight.state, end.apart
+
+
+RTOL = 1e-9
+HORIZON = 200.0  # contact times after which an impact is given up
+
+
+class TurningImpact(eqx.Module):
+    """`velocity` and `position` (n,) when it is over, `duration` () [s], whether it `ended`."""
+
+    velocity: jax.Array
+    position: jax.Array
+    duration: jax.Array
+    ended: jax.Array
+
+
+def turning_impact(
+    gap_function: Body | Callable[[jax.Array], jax.Array],
+    mass: Any,
+    q: Any,
+    velocity: Any,
+    force: Force,
+    *,
+    rtol: float = RTOL,
+    max_steps: int = 20_000,
+) -> TurningImpact:
+    """Compliant impact with M(q) and the gaps f(q) followed: a motion without loads.
+
+    Equation: `M q'' + M' q' - grad_q(q'^T M q') / 2 = grad f(q) F`, until nothing is loaded and no
+    gap shrinks. `impact(Compliant(force), scene, velocity)` is the same with M and grad f frozen at
+    q; they differ by the order of indentation over size.
+
+    Args:
+        gap_function: a `Body` (then `mass` is None), or q (n,) -> gaps (m,) [m].
+        mass: M (n,) or (n, n), or a function q -> M(q).
+        q: (n,) configuration before, with no penetration.
+        velocity: (n,).
+        force: as in `Compliant`.
+        rtol: of q, q' and the indentations.
+        max_steps: of the integrator.
+
+    Returns:
+        `TurningImpact`; `ended` False where it went on for 200 contact times or `max_steps`.
+        Forward derivatives (a motion has no reverse ones).
+
+    >>> import jimpact as ji
+    >>> block, q, v = ji.Block(1.0, 1.0), [0.0, 0.5, 0.0], [0.0, -0.5, -1.0]
+    >>> out = ji.turning_impact(block, None, q, v, ji.Hertz(1e8))
+    >>> bool(out.ended), [round(float(v), 2) for v in out.velocity[1:]]
+    (True, [0.61, 0.49])
+    """
+    position, v = as_float_array("q", q), as_float_array("velocity", velocity)
+    check_shape("velocity", v, position.shape, "one per coordinate")
+    check_values("velocity", v)
+    check_kind("force", force, Force)
+    body = gap_function if isinstance(gap_function, Body) else GivenBody(gap_function, mass)
+    scene = body.scene(position)  # and its checks
+    gamma = gap_velocity(scene, v)
+    speed = jnp.max(jnp.where(gamma < 0, -gamma, 0.0))
+    speed = jnp.where(speed > 0, speed, 1.0)
+    reduced = jnp.max(1 / jnp.diagonal(jnp.asarray(delassus_matrix(scene))))
+    depth = force.indentation_scale(0.5 * reduced * speed**2 * jnp.ones_like(gamma))
+    unit = jax.lax.stop_gradient(jnp.max(depth) / speed)
+    return _turning(System(body), force, position, v, HORIZON * unit, rtol, max_steps)
+
+
+@eqx.filter_jit
+def _turning(
+    system: System,
+    force: Force,
+    q: jax.Array,
+    v: jax.Array,
+    horizon: jax.Array,
+    rtol: float,
+    max_steps: int,
+) -> TurningImpact:
+    zero = jnp.zeros_like(horizon)
+    settings = Settings(rtol, rtol * 1e-3, jnp.asarray(1e-12), max_steps, False, horizon, zero)
+    times = jnp.stack([zero, horizon])
+    _, end, apart = contact_dynamics(system, force, settings, q, v, times, 1000, True)
+    return TurningImpact(end.v, end.q, end.t, apart)

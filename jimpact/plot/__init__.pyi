@@ -1,0 +1,18 @@
+"""Public names of `ji.plot` and where they live."""
+
+from .charts import (
+    advice as advice,
+    stability_map as stability_map,
+    stability_pairs as stability_pairs,
+    validity_map as validity_map,
+    work_precision as work_precision,
+)
+from .fits import fit as fit
+from .laws import comparison as comparison, forces as forces, rheologies as rheologies
+from .montecarlo import monte_carlo as monte_carlo
+from .motions import animation as animation, motion as motion, phase_portrait as phase_portrait
+from .theory import (
+    admissible_set as admissible_set,
+    rocking_dispersion as rocking_dispersion,
+    rocking_outcomes as rocking_outcomes,
+)

@@ -1,0 +1,170 @@
+"""Pictures of laws side by side, of contact forces and of force histories."""
+
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.integrate import solve_ivp
+
+from jimpact.comparison import Comparison
+from jimpact.contact import delassus_matrix
+from jimpact.histories import History
+from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Bistiffness, Force
+from jimpact.plot.style import COLOURS, SPREAD
+from jimpact.scene import gap_velocity
+from jimpact.solvers.tridiagonal import diagonal
+
+_SAMPLES = 120  # points of a force-indentation loop
+
+
+def comparison(found: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
+    """Velocities after the impact by law, above the energy kept and how evenly it is spread.
+
+    Measured velocities are horizontal lines; a law whose outcome fails the audit is crossed.
+
+    >>> import jimpact as ji
+    >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+    >>> len(ji.plot.comparison(found).axes)
+    2
+    """
+    names, entries = list(found.entries), list(found.entries.values())
+    bodies = len(found.velocity)
+    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / max(bodies, 1)
+    figure = Figure(figsize=(float(np.clip(1.5 + 1.1 * len(names), 6.4, 14)), 6.0))
+    figure.set_layout_engine("constrained")
+    top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
+    x = np.arange(len(names))
+    velocity = np.array([np.asarray(entry.outcome.velocity) for entry in entries])
+    fine = np.array([bool(entry.audit.consistent) for entry in entries])
+    for i in range(bodies):
+        colour = COLOURS[i % len(COLOURS)]
+        top.plot(x + dodge[i], velocity[:, i], "o", color=colour, label=f"body {i + 1}")
+        if measured is not None and np.isfinite(measured[i]):
+            top.axhline(measured[i], color=colour, lw=1, ls="--", zorder=0)
+        if not fine.all():
+            wrong = (x + dodge[i])[~fine], velocity[~fine, i]
+            top.plot(*wrong, "x", color="black", ms=10, label="audit failed" if i == 0 else None)
+    if measured is not None:
+        top.plot([], [], color="black", lw=1, ls="--", label="measured")
+    top.axhline(0, color="black", lw=0.6)
+    top.set_ylabel("velocity after the impact [m/s]")
+    top.set_title(title, loc="left")
+    kept = [entry.energy_ratio for entry in entries]
+    spread = [entry.dispersion_index for entry in entries]
+    bottom.bar(x - 0.18, kept, 0.32, color="#777777", label="energy kept T+/T-")
+    bottom.bar(x + 0.18, spread, 0.32, color="#56B4E9", label="dispersion index")
+    bottom.set_xticks(x, names, rotation=30 if len(names) > 6 else 0)
+    for axes in (top, bottom):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis="y", lw=0.4, alpha=0.5)
+    figure.legend(loc="outside lower center", frameon=False, fontsize="small", ncols=5)
+    return figure
+
+
+def rheologies(found: Comparison, title: str = "") -> Figure:
+    """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
+
+    Args:
+        found: of `compare_rheologies`, or of `compare` with `Compliant` laws.
+
+    >>> import jimpact as ji
+    >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
+    >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], laws)
+    >>> len(ji.plot.rheologies(found).axes)
+    2
+    """
+    forces = {
+        name: e.law.force for name, e in found.entries.items() if isinstance(e.law, Compliant)
+    }
+    if len(forces) < len(found.entries):
+        raise TypeError("Argument `found` must hold `Compliant` laws only.")
+    mass = 1 / float(diagonal(delassus_matrix(found.scene))[0])
+    speed = float(np.max(-np.asarray(gap_velocity(found.scene, found.velocity))))
+    figure = Figure(figsize=(10, 4.4))
+    figure.set_layout_engine("constrained")
+    loops, outcome = figure.subplots(1, 2)
+    for (name, force), colour in zip(forces.items(), COLOURS):
+        first = jax.tree.map(lambda leaf: leaf.ravel()[0], force)
+        x, f = _loop(first, mass, speed)
+        loops.plot(x, f, color=colour, label=name, lw=1.4)
+    loops.set_xlabel("indentation [m]")
+    loops.set_ylabel("force [N]")
+    loops.set_title(title or "contact 1 alone", loc="left")
+    loops.legend(frameon=False, fontsize="small")
+    names = list(found.entries)
+    values = np.array([np.asarray(e.outcome.velocity) for e in found.entries.values()])
+    bodies = values.shape[1]
+    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
+    for i in range(bodies):
+        at = np.arange(len(names)) + dodge[i]
+        outcome.plot(at, values[:, i], "o", color=COLOURS[i % len(COLOURS)], label=f"body {i + 1}")
+    outcome.set_xticks(np.arange(len(names)), [name.replace(", ", ",\n") for name in names])
+    outcome.tick_params(axis="x", labelsize="small", rotation=20)
+    outcome.axhline(0, color="black", lw=0.6)
+    outcome.set_ylabel("velocity after the impact [m/s]")
+    outcome.set_title("all contacts together", loc="left")
+    outcome.legend(frameon=False, fontsize="small", ncols=max(1, bodies // 6))
+    for axes in (loops, outcome):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(lw=0.4, alpha=0.5)
+    return figure
+
+
+def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
+    """Force at one contact over impact time, one line a history.
+
+    >>> import jimpact as ji
+    >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])
+    >>> len(ji.plot.forces({"one ball": h}).axes[0].lines)
+    1
+    """
+    figure = Figure(figsize=(6.4, 4.2))
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    for j, (name, h) in enumerate(histories.items()):
+        colour = COLOURS[j % len(COLOURS)]
+        axes.plot(
+            1e6 * np.asarray(h.time), np.asarray(h.force[:, contact]), color=colour, label=name
+        )
+    axes.set_xlabel("impact time [us]")
+    axes.set_ylabel("force [N]")
+    axes.set_ylim(bottom=0)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(lw=0.4, alpha=0.5)
+    axes.legend(frameon=False, fontsize="small")
+    return figure
+
+
+def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indentation and force of one pair's collision."""
+    if isinstance(force, Bistiffness):
+        k, eta = float(force.stiffness), float(np.asarray(force.exponent))
+        deepest = ((eta + 1) * mass * speed**2 / (2 * k)) ** (1 / (eta + 1))
+        part = np.linspace(0, 1, _SAMPLES)
+        residual = (1 - float(force.restitution) ** 2) * deepest
+        loading, unloading = part * deepest, residual + part[::-1] * (deepest - residual)
+        f = k * deepest**eta * part**eta
+        return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
+
+    def push(x: float, rate: float) -> float:
+        return float(force.force(jnp.asarray(max(x, 0.0)), jnp.asarray(rate)))
+
+    def slack(_: float, y: np.ndarray) -> float:
+        return push(y[0], y[1]) if y[1] < 0 else 1.0
+
+    slack.terminal = True  # type: ignore[attr-defined]
+    horizon = 1e3 * float(force.indentation_scale(jnp.asarray(0.5 * mass * speed**2))) / speed
+    done = solve_ivp(
+        lambda _, y: [y[1], -max(push(y[0], y[1]), 0.0) / mass],
+        (0, horizon),
+        [0.0, speed],
+        events=slack,
+        rtol=1e-6,
+        atol=1e-12 * horizon * speed,
+        dense_output=True,
+    )
+    y = done.sol(np.linspace(0, done.t[-1], 2 * _SAMPLES))
+    return y[0], np.array([max(push(*row), 0.0) for row in y.T])

@@ -1,0 +1,298 @@
+"""Pictures of admissible sets and of rocking blocks."""
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from jimpact.contact import kinetic_norm
+from jimpact.plot.style import COLOURS, GREY
+from jimpact.scene import dense_mass
+from jimpact.theory.admissible import AdmissibleSet
+from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
+
+_FILL = "#DCE9F3"
+_MARKERS = "osD^vP*X"
+_MOST_CONTACTS = 4  # beyond two contacts: projections onto pairs of the first so many
+_SAMPLES = 2000
+_SHORTEST = 0.5  # a side shorter than this part of the radius is not drawn: its name would not fit
+
+_OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
+
+
+def admissible_set(
+    found: AdmissibleSet, outcomes: Mapping[str, Any] | None = None, title: str = ""
+) -> Figure:
+    """The set of admissible outcomes, and labelled outcomes v+ (n,) of laws.
+
+    Two contacts: the plane of kinetic coordinates, where energy is the squared distance from the
+    point of common velocity; the arc A-B conserves it (Brogliato 2016, Fig. 6.3). Otherwise
+    samples of the set, in the normalized gap velocities of pairs of contacts, coloured by the
+    energy kept; for one contact, against the energy kept.
+
+    Args:
+        found: what `admissible_set` returned.
+        outcomes: label -> v+ (n,) [m/s], an `Impact.velocity` for instance; drawn even when they
+            are not admissible (hollow).
+        title: empty for a default one.
+
+    Raises:
+        ValueError: an outcome of another size.
+
+    >>> import jimpact as ji
+    >>> found = ji.theory.admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+    >>> len(ji.plot.admissible_set(found, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
+    1
+    """
+    marked = {}
+    for name, velocity in (outcomes or {}).items():
+        v = np.asarray(velocity, float)
+        if v.shape != (found.scene.size,):
+            raise ValueError(
+                f"Argument `outcomes` must have arrays of shape ({found.scene.size},), but "
+                f"{name!r} has shape {v.shape}."
+            )
+        marked[name] = v
+    closed = np.flatnonzero(np.asarray(found.scene.closed))
+    plane = found.dimension == 2 and len(closed) == 2
+    closed = closed if len(closed) else np.arange(found.scene.contacts)
+    figure = _plane(found, marked, closed) if plane else _projections(found, marked, closed)
+    default = "Admissible outcomes: unilateral contact, pushing impulses, no energy gained"
+    figure.suptitle(title or default, x=0.01, ha="left", fontsize="medium")
+    return figure
+
+
+def _plane(found: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray) -> Figure:
+    frame = _Frame(found, closed)
+    figure = Figure(figsize=(6.4, 7.0), layout="constrained")
+    axes = figure.subplots()
+    circle = np.linspace(0, 2 * np.pi, 400)
+    r = frame.radius
+    axes.plot(r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3)))
+    axes.fill(*frame(found.boundary(400)).T, color=_FILL, lw=0)
+    for k in (0, 1):
+        _line(
+            axes, frame, np.zeros(2), frame.walls[k], f"contact {closed[k] + 1} stays closed", "-"
+        )
+        away = frame.push[1 - k]
+        _line(axes, frame, frame.before, away, f"no impulse at contact {closed[k] + 1}", ":")
+    arc = frame(found.conserving_arc(200))
+    axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
+    _write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
+    for name, end in (("A", arc[0]), ("B", arc[-1])):
+        _write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
+    axes.plot(*frame.before, "o", color="black", ms=8, ls="none", label="before the impact")
+    _mark(axes, frame(found.plastic), "plastic, least energy", -1, True)
+    for i, (name, v) in enumerate(marked.items()):
+        _mark(axes, frame(v), name, i, bool(found.contains(v)))
+    axes.set_aspect("equal")
+    axes.set_xlim(-1.22 * r, 1.22 * r)
+    axes.set_ylim(-1.22 * r, 1.22 * r)
+    axes.set_xlabel("kinetic coordinate $u_1$ [√J];  energy is $T^+ = T_c + |u|^2/2$")
+    axes.set_ylabel("kinetic coordinate $u_2$ [√J]")
+    axes.spines[["top", "right"]].set_visible(False)
+    _legend(figure, axes, 3)
+    return figure
+
+
+def _mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
+    """Outcome number i, hollow unless admissible; later ones smaller, so that equal ones show."""
+    colour = GREY if i < 0 else _colour(i)
+    axes.plot(
+        *point,
+        "s" if i < 0 else _MARKERS[i % len(_MARKERS)],
+        color=colour,
+        mfc=colour if admissible else "none",
+        ms=max(10 - i, 4),
+        mew=1.6,
+        ls="none",
+        label=name if admissible else f"{name} (not admissible)",
+    )
+
+
+def _write(axes: Axes, at: np.ndarray, text: str, **style: Any) -> None:
+    axes.annotate(
+        text, (at[0], at[1]), **{"ha": "center", "va": "center", "fontsize": "small"} | style
+    )
+
+
+def _legend(figure: Figure, axes: Axes, columns: int) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        figure.legend(
+            handles,
+            labels,
+            loc="outside lower center",
+            frameon=False,
+            fontsize="small",
+            ncols=min(columns, len(handles)),
+        )
+
+
+class _Frame:
+    """Kinetic coordinates turned so that the outcomes with gamma+ >= 0 open upwards."""
+
+    def __init__(self, found: AdmissibleSet, closed: np.ndarray):
+        self._found = found
+        self._metric = found.axes.T @ dense_mass(found.scene)
+        self.radius = found.coordinates.radius
+        normals = np.asarray(found.scene.normals, float)[:, closed].T @ found.axes
+        push = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+        up = push.sum(0) / np.linalg.norm(push.sum(0))
+        right = np.array([up[1], -up[0]])
+        if right @ push[0] < 0:
+            right = -right
+        self._turn = np.stack([right, up])
+        self.push = push @ self._turn.T  # directions of the impulses
+        # along wall k contact k stays closed and the other one opens
+        walls = np.stack([[-p[1], p[0]] for p in self.push])
+        self.walls = walls * np.sign(np.sum(walls * self.push[::-1], axis=1))[:, None]
+        self.before = self(found.velocity)
+
+    def __call__(self, velocity: np.ndarray) -> np.ndarray:
+        """(..., n) -> (..., 2)."""
+        return (velocity - self._found.center) @ self._metric.T @ self._turn.T
+
+
+def _line(
+    axes: Axes, frame: _Frame, start: np.ndarray, direction: np.ndarray, text: str, style: str
+) -> None:
+    """A side of the set as a ray up to the circle, named beside its outer part."""
+    b = start @ direction
+    length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
+    end = start + length * direction
+    if length < _SHORTEST * frame.radius:
+        return
+    axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
+    angle = np.degrees(np.arctan2(direction[1], direction[0]))
+    angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
+    share, side = (0.62, "top") if style == "-" else (0.3, "bottom")
+    turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
+    _write(axes, start + share * length * direction, text, color=GREY, **turned)
+
+
+def _projections(
+    found: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray
+) -> Figure:
+    shown = closed[:_MOST_CONTACTS]
+    samples = found.sample(0, _SAMPLES)
+    unit = np.asarray(found.scene.normals / kinetic_norm(found.scene)[None, :], float)[:, shown]
+    cloud, kept = samples @ unit, _energy_kept(found, samples)
+    pairs = list(combinations(range(len(shown)), 2)) or [(0, 0)]
+    columns = min(3, len(pairs))
+    rows = -(-len(pairs) // columns)
+    figure = Figure(figsize=(3.4 * columns + 2.6, 3.1 * rows + 0.8), layout="constrained")
+    grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
+    for spare in grid[len(pairs) :]:
+        spare.set_visible(False)
+    for axes, (i, j) in zip(grid, pairs):
+        single = i == j
+        y = kept if single else cloud[:, j]
+        dots = axes.scatter(cloud[:, i], y, c=kept, s=5, cmap="viridis", lw=0, vmin=0, vmax=1)
+        for k, (name, v) in enumerate(marked.items()):
+            point = v @ unit
+            height = _energy_kept(found, v) if single else point[j]
+            _mark(axes, (point[i], height), name, k, bool(found.contains(v)))
+        axes.set_xlabel(_gap_label(shown[i]))
+        axes.set_ylabel("$T^+ / T^-$" if single else _gap_label(shown[j]))
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.colorbar(dots, ax=grid[: len(pairs)].tolist(), label="energy kept $T^+ / T^-$")
+    _legend(figure, grid[0], 4)
+    return figure
+
+
+def _energy_kept(found: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
+    mass = np.asarray(found.scene.mass, float)
+    momentum = velocity * mass if mass.ndim == 1 else velocity @ mass
+    energy = 0.5 * np.sum(momentum * velocity, axis=-1)
+    return energy / found.energy if found.energy else np.ones_like(energy)
+
+
+def _gap_label(contact: int) -> str:
+    return f"normalized gap velocity {contact + 1} after [√J]"
+
+
+def _colour(i: int) -> str:
+    from jimpact.plot.style import COLOURS  # here: the module also loads the fit
+
+    return COLOURS[i % len(COLOURS)]
+
+
+def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
+    """|y_A'+ / y_B'-| against the kinetic angle: a panel for each mu, a line for each e.
+
+    The dotted line is `critical_kinetic_angle`.
+
+    >>> import jimpact as ji
+    >>> import numpy as np
+    >>> zero = np.zeros((2, 1, 1))
+    >>> axes = map(np.array, ([1.0, 2], [0.1], [0.5]))
+    >>> d = ji.theory.RockingDispersion(*axes, np.zeros((2, 1, 1, 2)), zero, zero, zero, zero)
+    >>> len(ji.plot.rocking_dispersion(d).axes)
+    1
+    """
+    figure, panels = _panels(found, title, 3.0)
+    theta, size = np.degrees(found.kinetic_angle), np.abs(found.dispersion)
+    for j, axes in enumerate(panels):
+        for k, e in enumerate(np.asarray(found.restitution)):
+            colour = COLOURS[k % len(COLOURS)]
+            axes.plot(theta, size[:, j, k], color=colour, lw=1.6, label=f"e = {e:g}")
+        axes.axvline(_critical(found, j), color="black", ls=":", lw=1)
+        axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
+        axes.grid(lw=0.4, alpha=0.5)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylim(bottom=0)  # shared by all, so last
+    panels[0].set_ylabel(r"$|\dot y_A^+ / \dot y_B^-|$")
+    handles = panels[0].get_legend_handles_labels()[0]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    return figure
+
+
+def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = STAYS) -> Figure:
+    """Rest, rocking, half-rocking, free over the kinetic angle and e: a panel for each mu.
+
+    The dotted line is `critical_kinetic_angle`; `stays` as in `RockingDispersion.outcomes`.
+
+    >>> import jimpact as ji
+    >>> import numpy as np
+    >>> zero = np.zeros((2, 1, 2))
+    >>> axes = map(np.array, ([1.0, 2], [0.1], [0.5, 1]))
+    >>> d = ji.theory.RockingDispersion(*axes, np.zeros((2, 1, 2, 2)), zero, zero, zero, zero)
+    >>> len(ji.plot.rocking_outcomes(d).axes)
+    1
+    """
+    figure, panels = _panels(found, title, 3.2)
+    codes = found.outcomes(stays)
+    colours = ListedColormap(_OUTCOME_COLOURS)
+    norm = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES))
+    theta, e = np.degrees(found.kinetic_angle), np.asarray(found.restitution)
+    for j, axes in enumerate(panels):
+        axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
+        axes.axvline(_critical(found, j), color="black", ls=":", lw=1)
+        axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
+    panels[0].set_ylabel("restitution e")
+    shown = np.unique(codes)
+    handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in shown]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    return figure
+
+
+def _panels(found: RockingDispersion, title: str, height: float) -> tuple:
+    count = len(found.friction)
+    figure = Figure(figsize=(1.2 + 2.9 * count, height + 0.5))
+    figure.set_layout_engine("constrained")
+    panels = figure.subplots(1, count, sharey=True, squeeze=False)[0]
+    for axes, mu in zip(panels, np.asarray(found.friction)):
+        axes.set_title(f"mu = {mu:g}", loc="left", fontsize="medium")
+    if title:
+        figure.suptitle(title, x=0.02, ha="left")
+    return figure, panels
+
+
+def _critical(found: RockingDispersion, j: int) -> float:
+    return float(np.degrees(critical_kinetic_angle(found.friction[j])))

@@ -1,0 +1,40 @@
+"""Public names of `ji.theory` and where they live."""
+
+from .admissible import AdmissibleSet as AdmissibleSet, admissible_set as admissible_set
+from .friction import (
+    FrictionBounds as FrictionBounds,
+    InclusionOutcome as InclusionOutcome,
+    contact_coupling as contact_coupling,
+    friction_bounds as friction_bounds,
+    friction_energy_change as friction_energy_change,
+    friction_impulses as friction_impulses,
+    restitution_inclusion as restitution_inclusion,
+)
+from .linear_chain import bilateral_motion as bilateral_motion, newby_ratio as newby_ratio
+from .quasi_velocities import (
+    ContactPower as ContactPower,
+    contact_power as contact_power,
+    from_quasi_velocities as from_quasi_velocities,
+    kinetic_energy_split as kinetic_energy_split,
+    quasi_basis as quasi_basis,
+    to_quasi_velocities as to_quasi_velocities,
+)
+from .restitution_matrices import (
+    Copositivity as Copositivity,
+    MatrixAudit as MatrixAudit,
+    audit_matrix as audit_matrix,
+    carnot_energy_loss as carnot_energy_loss,
+    copositivity as copositivity,
+    dissipation_matrix as dissipation_matrix,
+)
+from .rocking import (
+    RockingDispersion as RockingDispersion,
+    RockingRatio as RockingRatio,
+    critical_kinetic_angle as critical_kinetic_angle,
+    housner_restitution as housner_restitution,
+    rocking_dispersion as rocking_dispersion,
+    rocking_kinetic_angle as rocking_kinetic_angle,
+    rocking_matrix as rocking_matrix,
+    rocking_ratios as rocking_ratios,
+    search_critical_angle as search_critical_angle,
+)

@@ -1,0 +1,319 @@
+"""Restitution with friction: the normal-cone inclusion; bounds for dissipation (Theorem 6.2)."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
+from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.scene import Scene, velocity_change
+from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.tridiagonal import as_matrix
+from jimpact.theory.quasi_velocities import quasi_basis, to_quasi_velocities
+
+
+class InclusionOutcome(NamedTuple):
+    """Quasi-velocities v+ (n,), percussions (c,) along the columns of the coupling, status ()."""
+
+    velocity: jax.Array
+    percussion: jax.Array
+    status: jax.Array
+
+
+def contact_coupling(scene: Scene) -> jax.Array:
+    """`Gbar = [[G, n_q^T H], [0, t_q^T H]]` (n, m + t): what (pbar, p_t) do to (qn, qt).
+
+    Source: Brogliato (2016), (6.53), (6.64).
+
+    >>> import jimpact as ji
+    >>> rough = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    >>> ji.theory.contact_coupling(rough).shape
+    (2, 2)
+    """
+    n_q, t_q = quasi_basis(scene)
+    g = as_matrix(normalized_delassus(scene))
+    if scene.tangents is None:
+        return jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
+    right = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
+    left = jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
+    return jnp.concatenate([left, right], axis=1)
+
+
+def restitution_inclusion(
+    coupling: Any, metric: Any, restitution: Any, velocity: Any, low: Any = 0.0, high: Any = jnp.inf
+) -> InclusionOutcome:
+    """Solve `v+ - v- in -Gbar N_V(Gamma (v+ + Lambda v-))` with `Gamma = Gbar^T P`, V a box.
+
+    Equation: `v+ = -Lambda v- + R^-1 proj[{x: Gbar^T R x in V}; R (Lambda + I) v-]`, `R^2 = P`.
+    With the multipliers of the projection, y = Gamma (v+ + Lambda v-), it reads `v+ = v- + Gbar p`,
+    `p_i >= 0` where y_i is at its lower bound, `<= 0` at its upper one, else 0: one linear
+    complementarity problem, and no square root.
+
+    Args:
+        coupling: Gbar (n, c), see `contact_coupling`.
+        metric: P (n, n), symmetric positive definite.
+        restitution: Lambda, a scalar or (n, n).
+        velocity: v- (n,), quasi-velocities (`to_quasi_velocities`).
+        low: lower bounds of V, scalar or (c,); -inf for none.
+        high: upper bounds.
+
+    Returns:
+        `InclusionOutcome`; `status` is `infeasible` where V cannot be met.
+
+    Derivatives are one-sided where a percussion sets in.
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.63)-(6.65).
+
+    >>> import jimpact as ji
+    >>> out = ji.theory.restitution_inclusion([[1.0]], [[1.0]], 0.5, [-2.0])  # Newton's law
+    >>> float(out.velocity[0])
+    1.0
+    """
+    gbar, p = as_float_array("coupling", coupling), as_float_array("metric", metric)
+    v, lam = as_float_array("velocity", velocity), as_float_array("restitution", restitution)
+    low, high = as_float_array("low", low), as_float_array("high", high)
+    if gbar.ndim != 2:
+        raise ValueError(f"Argument `coupling` must be a matrix, but has shape {gbar.shape}.")
+    n, c = gbar.shape
+    check_shape("velocity", v, (n,), "one per row of `coupling`")
+    check_shape("metric", p, (n, n), "square, one row per row of `coupling`")
+    for name, value in (("coupling", gbar), ("metric", p), ("restitution", lam), ("velocity", v)):
+        check_values(name, value)
+    lam = lam * jnp.eye(n, dtype=lam.dtype) if lam.ndim == 0 else lam
+    check_shape("restitution", lam, (n, n), "or a scalar")
+    low, high = jnp.broadcast_to(low, (c,)), jnp.broadcast_to(high, (c,))
+    gamma = gbar.T @ p
+    y = gamma @ (v + lam @ v)
+    percussion, code = _in_box(gamma @ gbar, y, low, high)
+    return InclusionOutcome(v + gbar @ percussion, percussion, code.astype(jnp.int32))
+
+
+def _in_box(
+    s: jax.Array, y: jax.Array, low: jax.Array, high: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Multipliers that bring `y + S p` into the box; S symmetric positive semidefinite."""
+    bounded = jnp.isfinite(jnp.concatenate([low, high]))
+    room = jnp.concatenate([y - low, high - y])
+    room = jnp.where(bounded, room, 1.0)  # a bound at infinity never binds
+    matrix = jnp.concatenate([jnp.concatenate([s, -s], axis=1), jnp.concatenate([-s, s], axis=1)])
+    both = bounded[:, None] & bounded[None, :]
+    matrix = jnp.where(both, matrix, jnp.eye(2 * len(y), dtype=s.dtype))
+    # p = p_low - p_high is unique where S is regular, whatever the two parts are
+    found = solve_lcp(matrix, room, regular=True)
+    return found.z[: len(y)] - found.z[len(y) :], found.code
+
+
+class FrictionBounds(NamedTuple):
+    """Matrices and bounds of Prop. 6.6 and Theorem 6.2; `print(bounds)` says them in words.
+
+    `g_mu`, `k`, `m_bar` are the matrices G^mu, K and Mbar of (6.56) and (6.59) (all (m, m)).
+    Prop. 6.6 (1): `g_mu_bound` < 1 makes G^mu positive definite for every slip direction;
+    (3), sharpened: `restitution_bound` < 1 makes Mbar positive definite.
+    Theorem 6.2 (i): `m_bar_least > k_largest`, both eigenvalues; (ii): |qn-| / |qt-| at least
+    `least_ratio`, which is infinite where (i) fails, and 0 where friction does not couple.
+    """
+
+    g_mu: np.ndarray
+    k: np.ndarray
+    m_bar: np.ndarray
+    g_mu_bound: float
+    restitution_bound: float
+    m_bar_least: float
+    k_largest: float
+    least_ratio: float
+
+    @property
+    def condition_i(self) -> bool:
+        """Theorem 6.2 (i)."""
+        return self.m_bar_least > self.k_largest
+
+    def dissipates(self, scene: Scene, velocity: Any) -> bool:
+        """Whether Theorem 6.2 (sufficient) promises T+ <= T- for this v- (n,)."""
+        qn, qt = to_quasi_velocities(scene, velocity)
+        return self.condition_i and bool(
+            jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)
+        )
+
+    def __str__(self) -> str:
+        def word(holds: bool) -> str:
+            return "holds" if holds else "does not hold, which decides nothing"
+
+        first, third = self.g_mu_bound < 1, self.restitution_bound < 1
+        ratio = f"|qn-| / |qt-| >= {self.least_ratio:.6g}" if self.condition_i else "no bound"
+        return "\n".join(
+            [
+                f"Prop. 6.6 (1)    {self.g_mu_bound:.6g} < 1, so that G^mu > 0: {word(first)}",
+                f"Prop. 6.6 (3)    {self.restitution_bound:.6g} < 1, so that Mbar > 0: "
+                f"{word(third)}",
+                f"Theorem 6.2 (i)  lambda_min(Mbar) = {self.m_bar_least:.6g} > lambda_max(K) = "
+                f"{self.k_largest:.6g}: {word(self.condition_i)}",
+                f"Theorem 6.2 (ii) energy surely decreases where: {ratio}",
+            ]
+        )
+
+
+class _Coupling(NamedTuple):
+    """What friction needs of a scene: G, n_q^T H_t, t_q^T H_t, mubar xi, all with m columns."""
+
+    delassus: jax.Array
+    normal: jax.Array
+    tangential: jax.Array
+    friction: jax.Array  # mu_j xi_j / |grad f_j| (m,)
+
+    @property
+    def g_mu(self) -> jax.Array:
+        return self.delassus - self.normal * self.friction[None, :]
+
+
+def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -> FrictionBounds:
+    """Sufficient conditions for `qn+ = -E qn-` with `p_t = -[mubar][xi] pbar` to dissipate.
+
+    Equation: `G^mu = G - n_q^T H_t [mubar][xi]`, `mubar_i = mu_i / |grad f_i|`, and the bounds
+    `|G^-1| |n_q^T H_t| |mubar| < 1`, `|E|^2 cond(G) < 1`,
+    `lambda_min(Mbar) > lambda_max(K)`,
+    `|qn-| / |qt-| >= 2 |t_q^T H_t| |mubar| |(G^mu)^-1| |I + E| / (lambda_min - lambda_max)`,
+    where `Mbar = (I - E)^T G^-1 (I + E)` and `K = B^T B`, `B = t_q^T H_t [mubar][xi] (G^mu)^-1
+    (I + E)`. Spectral norms; eigenvalues of symmetric parts.
+
+    Args:
+        scene: n coordinates, m closed contacts, planar tangents H_t (n, m).
+        matrix: E (m, m).
+        friction: mu >= 0, scalar or (m,).
+        slip: xi in [-1, 1], scalar or (m,): the sign of sliding along H_t, inside it sticking.
+
+    Raises:
+        ValueError: shapes, ranges; no tangents, spatial ones, an open contact, redundant ones;
+            friction so large that G^mu is singular.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.6 and Theorem 6.2, corrected: with
+    G^-1 in (6.58) the matrix M of (6.59) is G^-1 itself, which empties Prop. 6.6 (2), turns (3)
+    into that of Prop. 6.5, and (6.61)(ii) lacks the factor |(G^mu)^-1|.
+
+    >>> import jimpact as ji
+    >>> particle = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    >>> round(friction_bounds(particle, [[0.5]], 0.3).least_ratio, 6)
+    1.643836
+    """
+    e = _restitution(scene, matrix)
+    coupling = _coupling(scene, friction, slip)
+    mu = as_float_array("friction", friction) * jnp.ones(scene.contacts) / kinetic_norm(scene)
+    one_plus = np.eye(len(e)) + e
+    g, g_mu = np.asarray(coupling.delassus, float), np.asarray(coupling.g_mu, float)
+    if np.linalg.cond(g_mu) > 1 / (len(g) * np.finfo(scene.mass.dtype).eps):
+        raise ValueError(
+            f"Argument `friction` must leave G^mu regular, but {np.asarray(friction)} makes it "
+            "singular."
+        )
+    inverse = np.linalg.inv(g)
+    m_bar = (np.eye(len(e)) - e).T @ inverse @ one_plus
+    slide = np.asarray(coupling.tangential, float) * np.asarray(coupling.friction)[None, :]
+    b = slide @ np.linalg.solve(g_mu, one_plus)
+    k = b.T @ b
+    least = float(np.linalg.eigvalsh(0.5 * (m_bar + m_bar.T))[0])
+    largest = float(np.linalg.eigvalsh(k)[-1])
+    largest_mu = float(jnp.abs(mu).max())
+    reach = 2 * _norm(coupling.tangential) * largest_mu
+    reach *= _norm(np.linalg.inv(g_mu)) * _norm(one_plus)
+    return FrictionBounds(
+        g_mu=g_mu,
+        k=k,
+        m_bar=m_bar,
+        g_mu_bound=_norm(inverse) * _norm(coupling.normal) * largest_mu,
+        restitution_bound=_norm(e) ** 2 * float(np.linalg.cond(g)),
+        m_bar_least=least,
+        k_largest=largest,
+        least_ratio=reach / (least - largest) if least > largest else float("inf"),
+    )
+
+
+def friction_impulses(
+    scene: Scene, matrix: Any, friction: Any, slip: Any, velocity: Any
+) -> tuple[jax.Array, jax.Array]:
+    """Normal impulses p (m,) and tangential p_t (m,) [N s] of the law for a given slip xi.
+
+    Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`, `p = pbar / |grad f|`.
+    The slip is taken as given: whether it agrees with the sliding after it is the caller's.
+
+    Source: Brogliato (2016), (6.54)-(6.56).
+
+    >>> import jimpact as ji
+    >>> particle = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    >>> p, side = friction_impulses(particle, [[0.5]], 0.3, 1.0, [1.0, -1.0])
+    >>> round(float(p[0]), 6), round(float(side[0]), 6)
+    (3.0, -0.9)
+    """
+    e = _restitution(scene, matrix)
+    coupling = _coupling(scene, friction, slip)
+    qn = normalized_gap_velocity(scene, velocity)
+    pbar = -jnp.linalg.solve(coupling.g_mu, qn + jnp.asarray(e, qn.dtype) @ qn)
+    return pbar / kinetic_norm(scene), -coupling.friction * pbar
+
+
+def friction_energy_change(
+    scene: Scene, velocity: Any, impulse: Any, tangential_impulse: Any
+) -> jax.Array:
+    """`T+ - T-` [J] of normal and tangential impulses, in kinetic quasi-velocities.
+
+    Equation: `(qn+ + qn-)^T (pbar + G^-1 n_q^T H_t p_t) / 2 + (qt+ + qt-)^T t_q^T H_t p_t / 2`.
+
+    Args:
+        scene: m contacts, planar tangents.
+        velocity: v- (n,) [m/s].
+        impulse: p (m,) [N s]; tangential_impulse: p_t (m,) [N s].
+
+    Source: Brogliato (2016), (6.58) with G^-1 in place of G.
+
+    >>> import jimpact as ji
+    >>> particle = ji.Scene([2.0, 2.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    >>> round(float(friction_energy_change(particle, [1.0, -1.0], [3.0], [-0.9])), 6)
+    -1.4475
+    """
+    coupling = _coupling(scene, 0.0, 0.0)
+    p = as_float_array("impulse", impulse)
+    side = as_float_array("tangential_impulse", tangential_impulse)
+    for name, value in (("impulse", p), ("tangential_impulse", side)):
+        check_shape(name, value, (scene.contacts,), "one per contact")
+    qn, qt = to_quasi_velocities(scene, velocity)
+    pbar = kinetic_norm(scene) * p
+    qn_plus = qn + coupling.delassus @ pbar + coupling.normal @ side
+    pushed = coupling.tangential @ side  # = qt+ - qt-
+    normal = pbar + jnp.linalg.solve(coupling.delassus, coupling.normal @ side)
+    return 0.5 * (qn_plus + qn) @ normal + 0.5 * (2 * qt + pushed) @ pushed
+
+
+def _norm(matrix: Any) -> float:
+    return float(np.linalg.norm(np.asarray(matrix, float), 2)) if np.size(matrix) else 0.0
+
+
+def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
+    e = as_float_array("matrix", matrix)
+    check_shape("matrix", e, (scene.contacts,) * 2, "one row and one column per contact")
+    check_values("matrix", e)
+    return np.asarray(e, float)
+
+
+def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
+    m = scene.contacts
+    if scene.tangents is None or scene.tangents.shape[1] != m:
+        raise ValueError(
+            f"Argument `scene` must have planar tangents, one column for each of its {m} contacts."
+        )
+    if not bool(np.all(scene.closed)):
+        raise ValueError("Argument `scene` must have closed contacts only: leave open ones out.")
+    mu, xi = as_float_array("friction", friction), as_float_array("slip", slip)
+    check_per_contact("friction", mu, m)
+    check_per_contact("slip", xi, m)
+    check_values("friction", mu, low=0.0)
+    check_values("slip", xi, low=-1.0, high=1.0)
+    _, tangent = quasi_basis(scene)
+    unit = jnp.eye(m, dtype=scene.mass.dtype)
+    none = jnp.zeros(m, scene.mass.dtype)
+    pushed = jax.vmap(lambda side: velocity_change(scene, none, side), 1, 1)(unit)
+    return _Coupling(
+        delassus=as_matrix(normalized_delassus(scene)),
+        normal=jax.vmap(partial(normalized_gap_velocity, scene), 1, 1)(pushed),
+        tangential=tangent.T @ scene.tangents,
+        friction=(mu * xi * jnp.ones(m, mu.dtype)) / kinetic_norm(scene),
+    )

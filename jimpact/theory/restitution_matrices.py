@@ -1,0 +1,334 @@
+"""Is a restitution matrix admissible for *all* pre-impact velocities? Props. 6.2-6.5, Carnot."""
+
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
+from jimpact.scene import Scene, kinetic_energy, velocity_change
+from jimpact.solvers.tridiagonal import as_matrix
+
+LARGEST = 12  # 2^12 supports of one eigenproblem each are still a fraction of a second
+# |margin| below this multiple of the matrix scale is "boundary": rounding of Q reaches about
+# m eps cond(G), so seven digits remain for the condition number in either precision.
+COPOSITIVITY_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}
+
+# G counts as singular when its smallest eigenvalue is below this multiple of eps * m * largest.
+_SINGULAR = 100.0
+
+
+class Copositivity(NamedTuple):
+    """The answer, the margin `min x^T Q x` over `x >= 0`, `|x| = 1`, and its minimizer."""
+
+    answer: Literal["yes", "no", "boundary"]
+    margin: float
+    witness: np.ndarray
+
+    def __bool__(self) -> bool:
+        """Copositive, the boundary included."""
+        return self.answer != "no"
+
+
+def margin(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Least `x^T Q x` over `x >= 0`, `|x| = 1`, and a minimizer x; pure, jit and vmap.
+
+    Let a minimizer have the smallest possible support S. It is a local minimum of the Rayleigh
+    quotient of Q_SS, hence an eigenvector of the *smallest* eigenvalue, as the quotient has no
+    other local minima. That eigenvalue is simple: else one could move inside its eigenspace
+    until a component vanishes, and S would not be smallest. So the lowest eigenvector of every
+    Q_SS holds the minimizer; clipped to `x >= 0` every one is feasible and none is rejected.
+
+    Args:
+        matrix: Q (m, m), m <= 12; only its symmetric part counts.
+
+    Returns:
+        The margin () and x (m,). The margin has the derivative `x^T dQ x` wherever the
+        minimizer is unique (not differentiable elsewhere); x is a constant to differentiation.
+
+    Raises:
+        ValueError: not square, or m > 12.
+
+    Source: Hadeler, On copositive matrices, Linear Algebra Appl. 49 (1983) 79-89.
+
+    >>> import jax.numpy as jnp
+    >>> value, x = margin(jnp.array([[1.0, -2.0], [-2.0, 1.0]]))
+    >>> round(float(value), 6), x.round(3).tolist()
+    (-1.0, [0.707..., 0.707...])
+    """
+    m = _size(matrix)
+    q = 0.5 * (matrix + matrix.T)
+    fixed = jax.lax.stop_gradient(q)
+    largest = jnp.abs(fixed).max()
+    fixed = fixed / jnp.where(largest > 0, largest, 1.0)
+    supports = _supports(m).astype(q.dtype)
+    inside = supports[:, :, None] * supports[:, None, :]
+    outside = (m + 1.0) * (1 - supports)  # above every eigenvalue of Q_SS, which are at most m
+    blocks = inside * fixed[None] + outside[:, :, None] * jnp.eye(m, dtype=q.dtype)[None]
+    lowest = jnp.linalg.eigh(blocks)[1][:, :, 0] * supports
+    lowest = lowest * jnp.where(jnp.sum(lowest, axis=1) < 0, -1.0, 1.0)[:, None]
+    x = jnp.maximum(lowest, 0.0)
+    x = x / jnp.linalg.norm(x, axis=1, keepdims=True)
+    best = x[jnp.argmin(jnp.einsum("si,ij,sj->s", x, fixed, x))]
+    return best @ q @ best, best
+
+
+def copositivity(
+    matrix: Any, tolerance: float | None = None, scale: float | None = None
+) -> Copositivity:
+    """Whether Q is copositive: "yes", "no" with a violating x >= 0, or "boundary".
+
+    Args:
+        matrix: Q (m, m), m <= 12.
+        tolerance: "boundary" where `|margin| <= tolerance * scale`; None: by its precision.
+        scale: None: the largest |Q_ij|. Give it where Q is a difference of larger matrices.
+
+    Raises:
+        ValueError: not square, m > 12, not finite, negative tolerance or scale.
+
+    >>> copositivity([[1.0, -1.0], [-1.0, 1.0]]).answer
+    'boundary'
+    """
+    q = as_float_array("matrix", matrix)
+    _size(q)
+    check_values("matrix", q)
+    check_values("tolerance", tolerance, low=0.0)
+    check_values("scale", scale, low=0.0)
+    value, witness = (np.asarray(part) for part in _compiled_margin(q))
+    if tolerance is None:
+        tolerance = COPOSITIVITY_TOLERANCE.get(str(q.dtype), 1e-4)
+    if scale is None:
+        scale = float(jnp.abs(q).max())
+    if abs(value) <= tolerance * scale:
+        return Copositivity("boundary", float(value), witness)
+    return Copositivity("yes" if value > 0 else "no", float(value), witness)
+
+
+def _size(matrix: jax.Array) -> int:
+    shape = np.shape(matrix)
+    if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
+        raise ValueError(f"Argument `matrix` must have shape (m, m), but has shape {shape}.")
+    if shape[0] > LARGEST:
+        raise ValueError(
+            f"Argument `matrix` must have at most {LARGEST} rows, as all 2^m supports are "
+            f"enumerated, but has {shape[0]}."
+        )
+    return int(shape[0])
+
+
+def _supports(m: int) -> np.ndarray:
+    """All nonempty subsets of m indices as rows of zeros and ones."""
+    return (np.arange(1, 2**m)[:, None] >> np.arange(m)[None, :]) & 1
+
+
+_compiled_margin = jax.jit(margin)
+
+
+class Sign(NamedTuple):
+    """Whether a matrix is nonnegative; its least entry and where; the qn- that shows it."""
+
+    holds: bool
+    worst: float
+    where: tuple[int, int]
+    velocity: np.ndarray
+
+
+class MatrixAudit(NamedTuple):
+    """What `audit_matrix` found; `print(audit)` says it in words.
+
+    `kinematic`, `kinetic`: Prop. 6.2 (i), (ii). `energetic`: Prop. 6.3; `bool` of it is True on
+    the boundary too. Of all approaches of one length |qn-|, `worst_normal_velocity` qn- (m,), with
+    `worst_velocity` v- (n,) [m/s], loses least: it gains energy where the answer is "no" and
+    conserves it where it is "boundary".
+    `spectral_radius` and `spectral` (Prop. 6.4) are None unless E is self-adjoint.
+    `singular_value <= singular_value_bound` is Prop. 6.5, sufficient only.
+    """
+
+    kinematic: Sign
+    kinetic: Sign
+    energetic: Copositivity
+    worst_normal_velocity: np.ndarray
+    worst_velocity: np.ndarray
+    spectral_radius: float | None
+    spectral: bool | None
+    singular_value: float
+    singular_value_bound: float
+
+    @property
+    def singular_values(self) -> bool:
+        """Whether the sufficient bound of Prop. 6.5 holds."""
+        return self.singular_value <= self.singular_value_bound
+
+    @property
+    def admissible(self) -> bool:
+        """Kinematic, kinetic and energetic consistency for every pre-impact velocity."""
+        return self.kinematic.holds and self.kinetic.holds and bool(self.energetic)
+
+    def __str__(self) -> str:
+        return _in_words(self)
+
+
+def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
+    """`Q = G^-1 - E^T G^-1 E` (m, m): the law qn+ = -E qn- loses the energy qn-^T Q qn- / 2.
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> ji.theory.dissipation_matrix(jnp.eye(2), jnp.diag(jnp.array([0.5, 1.0]))).tolist()
+    [[0.75, 0.0], [0.0, 0.0]]
+    """
+    return jnp.linalg.inv(delassus) - matrix.T @ jnp.linalg.solve(delassus, matrix)
+
+
+def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> MatrixAudit:
+    """Check the law `qn+ = -E qn-` for all pre-impact velocities `qn- <= 0` at once.
+
+    Equation: `E >= 0` (kinematic) and `G^-1 (I + E) >= 0` (kinetic), elementwise, necessary and
+    sufficient (Prop. 6.2); `Q = G^-1 - E^T G^-1 E` copositive (energetic, necessary and
+    sufficient, Prop. 6.3); where `G^-1 E` is symmetric, spectral radius `rho(E) <= 1`
+    (Prop. 6.4, for qn- of any sign); `sigma_max(E) <= 1 / sqrt(cond G)` (Prop. 6.5, sufficient).
+
+    Args:
+        scene: m contacts; open ones are left out, with their rows and columns of E.
+        matrix: E (m, m), dimensionless, between normalized gap velocities.
+        tolerance: relative size of what counts as zero; None: by the precision of the scene.
+
+    Raises:
+        ValueError: E not (m, m) or not finite; more than 12 closed contacts, or none;
+            redundant contacts (G singular): then not every qn- is possible.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Props. 6.2-6.5 (rho instead of lambda_max).
+
+    >>> import jimpact as ji
+    >>> found = audit_matrix(ji.chain([1.0, 1.0, 1.0]), [[0.0, 1.2], [0.2, 0.0]])
+    >>> found.admissible, found.energetic.answer, found.worst_velocity.round(2).tolist()
+    (False, 'no', [0.47, 0.47, -0.94])
+    """
+    g, norm, e, closed = _closed_problem(scene, matrix)
+    check_values("tolerance", tolerance, low=0.0)
+    if tolerance is None:
+        tolerance = COPOSITIVITY_TOLERANCE.get(str(scene.mass.dtype), 1e-4)
+    inverse = np.linalg.inv(g)
+    q = inverse - e.T @ inverse @ e
+    scale = max(np.abs(inverse).max(), np.abs(e.T @ inverse @ e).max())
+    energetic = copositivity(q, tolerance, scale)
+    impulse = np.zeros(len(closed))
+    impulse[closed] = inverse @ -energetic.witness / norm
+    # the v- without any motion along the contacts: v = M^-1 N p has qn = G pbar
+    worst = velocity_change(scene, jnp.asarray(impulse, scene.mass.dtype)) + 0.0
+    worst_normal = np.array(normalized_gap_velocity(scene, worst), float)
+    worst_normal[closed] = 0.0 - energetic.witness
+    skew = inverse @ e - (inverse @ e).T
+    self_adjoint = np.abs(skew).max() <= tolerance * max(np.abs(inverse @ e).max(), 1e-300)
+    radius = float(np.abs(np.linalg.eigvals(e)).max()) if self_adjoint else None
+    return MatrixAudit(
+        kinematic=_sign(e, tolerance * max(1.0, np.abs(e).max()), closed),
+        kinetic=_sign(inverse + inverse @ e, tolerance * scale, closed),
+        energetic=energetic,
+        worst_normal_velocity=worst_normal,
+        worst_velocity=np.asarray(worst),
+        spectral_radius=radius,
+        spectral=None if radius is None else radius <= 1 + tolerance,
+        singular_value=float(np.linalg.norm(e, 2)),
+        singular_value_bound=float(1 / np.sqrt(np.linalg.cond(g))),
+    )
+
+
+def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.Array:
+    """Energy lost, `T- - T+ = (1 - e)/(1 + e) |v+ - v-|_M^2 / 2` [J] (Carnot).
+
+    For e = 0 (persistent contact) the loss is the energy of the lost velocities, whatever the
+    contacts, redundant ones included. For one e at all contacts it holds for Newton's E = e I
+    and for Moreau's law, as both have `qn+^T pbar = -e qn-^T pbar`; else it does not apply.
+
+    Args:
+        scene: the scene of the impact.
+        jump: v+ - v- (n,) [m/s].
+        restitution: e in [0, 1], one for all contacts.
+
+    Source: Brogliato (2016), Theorem 6.1 (e = 0), generalized by (6.46).
+
+    >>> import jimpact as ji
+    >>> float(carnot_energy_loss(ji.chain([1.0, 1.0]), [-0.5, 0.5]))
+    0.25
+    """
+    change, e = as_float_array("jump", jump), as_float_array("restitution", restitution)
+    check_shape("jump", change, (scene.size,), "one per coordinate of the scene")
+    check_shape("restitution", e, (), "one for all contacts")
+    check_values("restitution", e, low=0.0, high=1.0)
+    return (1 - e) / (1 + e) * kinetic_energy(scene, change)
+
+
+def _closed_problem(
+    scene: Scene, matrix: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """G, norms and E of the closed contacts, and which those are."""
+    m = scene.contacts
+    array = as_float_array("matrix", matrix)
+    check_shape("matrix", array, (m, m), "one row and one column per contact")
+    check_values("matrix", array)
+    closed = np.asarray(scene.closed)
+    if not closed.any():
+        raise ValueError("Argument `scene` must have a closed contact, but all gaps are open.")
+    pick = np.ix_(closed, closed)
+    g = np.asarray(as_matrix(normalized_delassus(scene)), float)[pick]
+    eigenvalues = np.linalg.eigvalsh(g)
+    floor = _SINGULAR * np.finfo(scene.mass.dtype).eps * len(g) * eigenvalues[-1]
+    if eigenvalues[0] <= floor:
+        raise ValueError(
+            f"Argument `scene` must have independent contacts, but its {len(g)} closed contacts "
+            f"have rank {int((eigenvalues > floor).sum())}: G is singular, and a matrix law "
+            "cannot be consistent for every velocity."
+        )
+    return g, np.asarray(kinetic_norm(scene), float)[closed], np.asarray(array, float)[pick], closed
+
+
+def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
+    """Column j of `a` is what the approach qn- = -(unit vector j) leads to."""
+    at = np.unravel_index(np.argmin(a), a.shape)
+    contact = np.flatnonzero(closed)
+    velocity = np.zeros(len(closed))
+    velocity[contact[at[1]]] = -1.0
+    worst = float(a[at])
+    return Sign(worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity)
+
+
+def _in_words(found: MatrixAudit) -> str:
+    kinematic, kinetic, energetic = found.kinematic, found.kinetic, found.energetic
+    verdict = "admissible" if found.admissible else "NOT admissible"
+    lines = [f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"]
+    for title, sign, what in (
+        ("kinematic  (6.2 i)  E >= 0", kinematic, "still approaches"),
+        ("kinetic    (6.2 ii) G^-1 (I + E) >= 0", kinetic, "would have to pull"),
+    ):
+        i, j = (k + 1 for k in sign.where)
+        text = f"yes, least entry {sign.worst:.4g}"
+        if not sign.holds:
+            text = (
+                f"NO, entry ({i}, {j}) is {sign.worst:.4g}: contact {i} {what} when only {j} closes"
+            )
+        lines.append(f"{title}: {text}")
+    text = {
+        "yes": f"yes, every impact loses energy (margin {energetic.margin:.4g})",
+        "no": f"NO, energy grows (margin {energetic.margin:.4g})",
+        "boundary": "boundary, energy never grows but is conserved",
+    }[energetic.answer]
+    if energetic.answer != "yes":
+        text += f" for qn- = {_row(found.worst_normal_velocity)}, v- = {_row(found.worst_velocity)}"
+    lines.append(f"energetic  (6.3)    G^-1 - E^T G^-1 E copositive: {text}")
+    if found.spectral is None:
+        text = "not applicable, E is not self-adjoint (G^-1 E not symmetric)"
+    else:
+        text = f"{'yes' if found.spectral else 'NO'}, rho = {found.spectral_radius:.4g}"
+    lines.append(f"spectral   (6.4)    rho(E) <= 1: {text}")
+    holds = "yes" if found.singular_values else "does not hold, which decides nothing"
+    lines.append(
+        f"sufficient (6.5)    sigma_max(E) = {found.singular_value:.4g} <= "
+        f"{found.singular_value_bound:.4g}: {holds}"
+    )
+    return "\n".join(lines)
+
+
+def _row(vector: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.4g}" for x in vector) + ")"

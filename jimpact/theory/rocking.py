@@ -1,0 +1,320 @@
+"""The rocking block: outcomes of its impacts over its shape, restitution matrices, measurements."""
+
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact.bodies.blocks import rocking_block
+from jimpact.impacts import impact
+from jimpact.laws.lzb import LZB
+from jimpact.status import STATUS
+
+# After the impact a corner counts as staying on the ground where its gap velocity is at most this
+# part of the approach of B: real corners are not sharp, and slow ones touch down again at once.
+STAYS = 0.05
+OUTCOMES = ("rest", "rocking", "half-rocking", "free", "unresolved")
+_FAILS = np.array([row.failure for row in STATUS])
+_ZOOMS, _POINTS = 6, 41  # grids of the search, each twenty times finer than the one before
+
+
+class RockingRatio(NamedTuple):
+    """A measured restitution of angular velocity, as a multiple of Housner's rigid value."""
+
+    aspect: float
+    material: str
+    measured_over_housner: float
+
+    @property
+    def restitution(self) -> float:
+        """e_theta: the ratio times Housner's value. A conversion, not a fit."""
+        return self.measured_over_housner * float(housner_restitution(self.aspect))
+
+
+def housner_restitution(aspect: Any) -> jax.Array:
+    """Angular velocity after over before, of a rigid block that rocks from corner to corner.
+
+    Equation: `e_theta = 1 - (3/2) sin^2(alpha)`, `tan(alpha) = 1 / aspect`, which is
+    `(2 a^2 - 1) / (2 (a^2 + 1))`: conserved angular momentum about the corner that is hit.
+
+    Args:
+        aspect: a = height / width > 0; scalar or array. Below `1 / sqrt(2)` the value is
+            negative: such a block does not rock.
+
+    Source: Housner, Bull. Seism. Soc. Am. 53 (1963) 403-417.
+
+    >>> import jimpact as ji
+    >>> [round(float(ji.theory.housner_restitution(a)), 6) for a in (1.0, 2.0, 3.0)]
+    [0.25, 0.7, 0.85]
+    """
+    a = as_float_array("aspect", aspect)
+    check_values("aspect", a, low=0.0, open_low=True)
+    return 1 - 1.5 / (1 + a**2)
+
+
+def rocking_matrix(restitution: Any) -> jax.Array:
+    """Restitution matrix (3, 3) of a block that rocks without slip or rebound.
+
+    Equation: `E = [[0, e, 0], [e, 0, 0], [0, 0, -e]]` in (qn_1, qn_2, qt): rotating about one
+    corner and hitting with the other, `gamma_2+ = -e gamma_1-`, `gamma_1+ = 0`, `qt+ = e qt-`,
+    so that the angular velocity about the new corner is e times the old one.
+
+    Args:
+        restitution: e_theta in [0, 1], the ratio of angular velocities.
+
+    Returns:
+        E for `RestitutionMatrix`, on a planar scene of one block with its two corners.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.2.2, with the signs of
+    `v+ = -E v-`.
+
+    >>> import jimpact as ji
+    >>> (10 * ji.theory.rocking_matrix(0.7)).round().tolist()
+    [[0.0, 7.0, 0.0], [7.0, 0.0, 0.0], [0.0, 0.0, -7.0]]
+    """
+    e = as_float_array("restitution", restitution)
+    check_shape("restitution", e, (), "one ratio of angular velocities")
+    check_values("restitution", e, low=0.0, high=1.0)
+    return e * jnp.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]], e.dtype)
+
+
+def rocking_ratios() -> list[RockingRatio]:
+    """Measured ratios of freely rocking blocks, bundled with the package.
+
+    Times Housner's value they give e_theta, and with `rocking_matrix` a restitution matrix:
+    a conversion of published numbers, not a fit.
+
+    Source: ElGawady et al., as quoted in public abstracts; see data/README.md.
+
+    >>> import jimpact as ji
+    >>> for row in ji.theory.rocking_ratios():
+    ...     print(row.material, row.aspect, round(row.restitution, 4))
+    concrete 5.0 0.8952
+    rubber 5.0 0.6313
+    concrete 3.0 0.8245
+    """
+    rows = (files("jimpact") / "data" / "rocking_ratio.csv").read_text(encoding="utf-8")
+    lines = [line.split(",") for line in rows.splitlines()[1:]]
+    return [RockingRatio(float(a), material, float(ratio)) for a, material, ratio in lines]
+
+
+class RockingDispersion(eqx.Module):
+    """Impacts of a block that rocks about A and hits with B; arrays (aspects, mu, e, ...).
+
+    Args:
+        aspect: a = height / width (A,).
+        friction: mu (B,).
+        restitution: energetic e (C,).
+        gap_velocity: gamma+ / |gamma_B-| (A, B, C, 2), of B and A.
+        angular_ratio: theta'+ / theta'- (A, B, C); beside `housner_restitution(aspect)`.
+        slip_velocity: of both corners after, / |gamma_B-| (A, B, C).
+        energy_ratio: T+ / T- (A, B, C).
+        status: codes (A, B, C); values of failures are NaN.
+    """
+
+    aspect: jax.Array
+    friction: jax.Array
+    restitution: jax.Array
+    gap_velocity: jax.Array
+    angular_ratio: jax.Array
+    slip_velocity: jax.Array
+    energy_ratio: jax.Array
+    status: jax.Array
+
+    @property
+    def kinetic_angle(self) -> jax.Array:
+        """theta_12 (A,) [rad]."""
+        return rocking_kinetic_angle(self.aspect)
+
+    @property
+    def dispersion(self) -> jax.Array:
+        """d = y_A'+ / y_B'- <= 0 (A, B, C)."""
+        return -self.gap_velocity[..., 1]
+
+    @property
+    def over_housner(self) -> jax.Array:
+        """theta'+ / theta'- over Housner's value (A, B, C)."""
+        return self.angular_ratio / housner_restitution(self.aspect)[:, None, None]
+
+    def outcomes(self, stays: float = STAYS) -> np.ndarray:
+        """Rows of `OUTCOMES` (A, B, C): which corners leave, faster than `stays` |gamma_B-|.
+
+        rest: none; rocking: A only, the block goes on about B; half-rocking: B only, it turns
+        back about A; free: both; unresolved: the law failed.
+        """
+        leaves = np.asarray(self.gap_velocity) > stays
+        codes = leaves[..., 1] + 2 * leaves[..., 0]
+        return np.where(np.isnan(np.asarray(self.gap_velocity[..., 0])), 4, codes)
+
+    def __str__(self) -> str:
+        theta, found = np.degrees(self.kinetic_angle), self.outcomes()
+        lines = [
+            f"rocking block, kinetic angle {theta.min():.1f} to {theta.max():.1f} degrees "
+            f"({len(theta)} shapes), {len(self.restitution)} e",
+        ]
+        for j, mu in enumerate(np.asarray(self.friction)):
+            counts = np.bincount(found[:, j].ravel(), minlength=len(OUTCOMES))
+            shares = ", ".join(f"{n} {name}" for name, n in zip(OUTCOMES, counts) if n)
+            critical = float(np.degrees(critical_kinetic_angle(mu)))
+            lines.append(f"mu = {mu:g}: critical angle {critical:.2f} degrees; {shares}")
+        return "\n".join(lines)
+
+
+def rocking_kinetic_angle(aspect: Any) -> jax.Array:
+    """theta_12 [rad] of a homogeneous block flat on the ground, between its two corners.
+
+    Equation: `cos(theta_12) = -(a^2 - 2) / (a^2 + 4)`, a = height / width: pi / 3 flat, pi slender.
+
+    Source: Brogliato (2016), section 6.3.2.2.
+
+    >>> import jimpact as ji
+    >>> round(float(ji.theory.rocking_kinetic_angle(2.0**0.5)), 6)
+    1.570796
+    """
+    a = as_float_array("aspect", aspect)
+    check_values("aspect", a, low=0.0, open_low=True)
+    return jnp.arccos(-(a**2 - 2) / (a**2 + 4))
+
+
+def critical_kinetic_angle(friction: Any) -> jax.Array:
+    """Kinetic angle [rad] at which the hit at B leaves corner A alone: the tip of the V.
+
+    Equation: B alone is pressed, slips at mu < 3 a / (4 a^2 + 1) and sticks otherwise; A gets no
+    acceleration where `a^2 - 2 + 3 mu a = 0`, or where it sticks at `2 a^2 = 1`, Housner's zero:
+    `a_c = (sqrt(9 mu^2 + 8) - 3 mu) / 2` for mu <= 1 / sqrt(2), else 1 / sqrt(2). No restitution,
+    stiffness or exponent is in it. Above a_c, `gamma_B+ = e`, `gamma_A+ = (1 + e) r` in units of
+    the approach, `r = (a^2 - 2 + 3 mu a) / (a^2 + 4 - 3 mu a)` slipping, Housner's value sticking.
+
+    Args:
+        friction: mu >= 0, scalar or array.
+
+    >>> import jimpact as ji
+    >>> [round(float(ji.theory.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
+    [1.5708, 1.3862, 1.231]
+    """
+    mu = as_float_array("friction", friction)
+    check_values("friction", mu, low=0.0)
+    slips = jnp.minimum(mu, 0.5**0.5)  # beyond, B sticks
+    return rocking_kinetic_angle((jnp.sqrt(9 * slips**2 + 8) - 3 * slips) / 2)
+
+
+@eqx.filter_jit
+def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.Array, ...]:
+    """gamma+ (n, 2), theta'+, slip+, T+ / T-, status, of all (a, mu, e), at unit width and hit."""
+
+    def one(a: jax.Array, mu: jax.Array, e: jax.Array) -> tuple[jax.Array, ...]:
+        scene = rocking_block(jnp.ones_like(a), a, jnp.ones_like(a))
+        before = jnp.stack([a / 2, jnp.full_like(a, -0.5), jnp.full_like(a, -1.0)])
+        fields = (mu, e)
+        now = eqx.tree_at(lambda x: (x.friction, x.restitution), law, fields)
+        out = impact(now, scene, before)
+        after, energy = out.velocity, (before**2 * scene.mass).sum() / 2
+        slip = after[0] + a / 2 * after[2]
+        kept = 1 + out.energy_change / energy
+        return scene.normals.T @ after, -after[2], slip, kept, out.status
+
+    gamma, turns, slip, kept, status = jax.vmap(one)(a, mu, e)
+    bad = jnp.asarray(_FAILS)[status]
+    parts = [jnp.where(bad, jnp.nan, x) for x in (turns, slip, kept)]
+    return jnp.where(bad[:, None], jnp.nan, gamma), *parts, status
+
+
+def _law(stiffness: Any, exponent: Any, rtol: float | None) -> LZB:
+    return LZB(1.0, stiffness, exponent, friction=0.0, rtol=rtol)
+
+
+def rocking_dispersion(
+    aspect: Any,
+    friction: Any = 0.0,
+    restitution: Any = 1.0,
+    stiffness: Any = 1.0,
+    exponent: Any = 1.5,
+    rtol: float | None = None,
+) -> RockingDispersion:
+    """A block at theta = 0 that rocks about A and hits with B, by LZB with Coulomb friction.
+
+    Equation: `(gamma_B-, gamma_A-) = (-1, 0)`, no slip before; `d = y_A'+ / y_B'-` is 0 at the
+    critical angle (`critical_kinetic_angle`) and grows in size on either side of it: a V.
+
+    Args:
+        aspect: a = height / width > 0, scalar or (A,).
+        friction: mu >= 0, scalar or (B,), of both corners.
+        restitution: energetic e in [0, 1], scalar or (C,), of both corners. At e = 0 no corner
+            rebounds, and left of the critical angle d = 0: half a V.
+        stiffness: of the corners, scalar or (2,) for B and A.
+        exponent: 1 linear, 1.5 Hertz.
+        rtol: as in `LZB`.
+
+    Returns:
+        `RockingDispersion` over all combinations (A, B, C); NaN where LZB fails: `max_steps`, for a
+        few wide blocks left of the critical angle with e below about 0.1.
+
+    Raises:
+        ValueError: arguments out of range or with more than one axis.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.2.2; classes as in
+    `RockingDispersion.outcomes`.
+
+    >>> import jimpact as ji
+    >>> ji.theory.rocking_dispersion(-1.0)
+    Traceback (most recent call last):
+    ...
+    ValueError: Argument `aspect` must lie in (0, inf), but has value -1 at index 0.
+    """
+    a, mu, e = (
+        _axis("aspect", aspect),
+        _axis("friction", friction),
+        _axis("restitution", restitution),
+    )
+    check_values("aspect", a, low=0.0, open_low=True)
+    check_values("friction", mu, low=0.0)
+    check_values("restitution", e, low=0.0, high=1.0)
+    each_a, each_mu, each_e = (x.reshape(-1) for x in jnp.meshgrid(a, mu, e, indexing="ij"))
+    found = _impacts(each_a, each_mu, each_e, _law(stiffness, exponent, rtol))
+    shape = (len(a), len(mu), len(e))
+    parts = [x.reshape(shape + x.shape[1:]) for x in found]
+    return RockingDispersion(a, mu, e, *parts)
+
+
+def search_critical_angle(
+    friction: Any, restitution: Any, stiffness: Any = 1.0, exponent: Any = 1.5
+) -> jax.Array:
+    """The kinetic angle [rad] at which |d| is least, by impacts alone: for all (B, C) of mu and e.
+
+    Grids over 0.5 <= a <= 2, each around the best of the one before; to about 1e-7 where e > 0
+    (at e = 0 there is no V to search). Arguments as in `rocking_dispersion`.
+
+    >>> import jimpact as ji
+    >>> ji.theory.search_critical_angle(0.1, -0.5)
+    Traceback (most recent call last):
+    ...
+    ValueError: Argument `restitution` must lie in (0, 1], but has value -0.5 at index 0.
+    """
+    mu, e = _axis("friction", friction), _axis("restitution", restitution)
+    check_values("friction", mu, low=0.0)
+    check_values("restitution", e, low=0.0, high=1.0, open_low=True)
+    law = _law(stiffness, exponent, None)
+    mus, es = (x.reshape(-1) for x in jnp.meshgrid(mu, e, indexing="ij"))
+    low, high = jnp.full_like(mus, 0.5), jnp.full_like(mus, 2.0)
+    for _ in range(_ZOOMS):
+        a = jnp.linspace(low, high, _POINTS, axis=1)
+        each_mu, each_e = (jnp.repeat(x, _POINTS) for x in (mus, es))
+        gamma = _impacts(a.reshape(-1), each_mu, each_e, law)[0]
+        size = jnp.abs(gamma[:, 1]).reshape(a.shape)
+        best = jnp.take_along_axis(a, jnp.nanargmin(size, axis=1)[:, None], 1)[:, 0]
+        step = (high - low) / (_POINTS - 1)
+        low, high = best - step, best + step
+    return rocking_kinetic_angle(best).reshape(len(mu), len(e))
+
+
+def _axis(name: str, value: Any) -> jax.Array:
+    array = jnp.atleast_1d(as_float_array(name, value))
+    if array.ndim != 1 or not array.size:
+        raise ValueError(
+            f"Argument `{name}` must be a scalar or have one axis, but has shape {array.shape}."
+        )
+    return array

@@ -1,0 +1,347 @@
+"""One end-to-end call a command; what is refused is one line on stderr and exit code 2."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import jimpact as ji
+from jimpact.cli import main
+
+SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.4,1.6\n"
+STUDY = """
+[scene]
+masses_kg = [1.0, 1.0]
+[law]
+name = "Newton"
+restitution = 0.9
+[fit]
+free = ["restitution"]
+starts = 2
+[data]
+file = "shots.csv"
+"""
+SAMPLED = """
+title = "binary"
+[scene]
+masses_kg = [0.25, 1.0, 0.25]
+[law]
+name = "binary"
+restitution = 1.0
+order = "earliest"
+[monte_carlo]
+velocity_m_per_s = [1.0, 0.0, -1.0]
+samples = 600
+seed = 5
+chunk = 256
+[monte_carlo.gaps_m]
+low = 0.0
+high = [1e-5, 2e-5]
+"""
+MOTION = """
+[system]
+kind = "block"
+width_m = 0.2
+height_m = 0.6
+[base]
+amplitude_m = 0.01
+frequency_hz = 1.0
+direction = "horizontal"
+[law]
+name = "moreau"
+restitution = 0.5
+[motion]
+q0 = [0.0, 0.3, 0.0]
+v0 = [0.0, 0.0, 0.0]
+t_end_s = 0.2
+samples = 5
+"""
+
+
+@pytest.fixture(autouse=True)
+def in_its_own_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def written(folder, study=STUDY, shots=SHOTS):
+    (folder / "shots.csv").write_text(shots)
+    path = folder / "study.toml"
+    path.write_text(study)
+    return str(path)
+
+
+def call(capsys, *arguments):
+    code = main([str(x) for x in arguments])
+    return code, capsys.readouterr()
+
+
+# ------------------------------------------------------------------------------------ fit
+
+
+def test_fit_as_a_user_runs_it(tmp_path):
+    """The bundled three balls: one e; corrected; all free; the other laws; a picture."""
+    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    fits = json.loads(done.stdout)["fits"]
+    for name, rms in (("as measured", 0.0166), ("momentum corrected", 0.0089)):
+        np.testing.assert_allclose(fits[name]["parameters"][0]["value"], 0.9911, atol=1e-4)
+        np.testing.assert_allclose(fits[name]["rms"], rms, atol=5e-5)
+    assert fits["all free"]["rank"] == 2
+    assert len(fits["all free"]["parameters"]) == 3
+    np.testing.assert_allclose(fits["Newton"]["parameters"][0]["value"], 0.61185, atol=1e-5)
+    assert "1.0422" in fits["as measured"]["warnings"][0]
+    assert "1.0103" in fits["as measured"]["warnings"][1]
+    assert (tmp_path / "jimpact-fit.png").stat().st_size > 10_000
+
+
+def test_fit_of_a_study(tmp_path, capsys):
+    picture = tmp_path / "deep" / "a.svg"
+    code, said = call(capsys, "fit", written(tmp_path), "--out", picture, "--seed", "1")
+    assert code == 0
+    for words in ("study", "as measured", "corrected ", "restitution", "Warnings", "Picture: "):
+        assert words in said.out
+    assert picture.read_text().startswith("<?xml")
+    options = ["--law", "newton", "--method", "adam", "--starts", "1", "--json"]
+    code, said = call(capsys, "fit", "study.toml", "--out", tmp_path, *options)
+    told = json.loads(said.out)["fits"]["as measured"]
+    assert (code, told["method"]) == (0, "adam")
+    np.testing.assert_allclose(told["parameters"][0]["value"], 0.604, atol=2e-3)
+
+
+REFUSED = [
+    ("[scene]", "[scenery]", "the study must have the key `scene`"),
+    ("[fit]", "[fit]\ntolerance = 1", "[fit] may have the keys free, method"),
+    ("masses_kg", "masses", "[scene] must have the key `masses_kg`, but has masses"),
+    ("[law]", "gravity = 9.81\n[law]", "[scene] may have the keys masses_kg, wall, gaps_m"),
+    ('"Newton"', '"Aristotle"', "the law must be one of"),
+    ('name = "Newton"', "", "[law] must have the key `name`"),
+    ("restitution = 0.9", "restitution = 1.9", "`restitution` must lie in [0, 1], but has value 1.9"),
+    ("restitution = 0.9", 'restitution = "high"', "`restitution` must be numeric"),
+    ("[1.0, 1.0]", "[1.0, -1.0]", "`masses` must lie in (0, inf), but has value -1 at index 1"),
+    ("[1.0, 1.0]", "[1.0, 1.0]\nwall = [1]", "`wall` must be true, false or a side"),
+    ("[1.0, 1.0]", "[1.0, 1.0, 1.0]", "it has 2 a shot, but the scene has 3"),
+    ('["restitution"]', "1", "`free` must be a list of names or a table of masks"),
+    ("shots.csv", "none.csv", "none.csv' does not exist"),
+    ("file =", "path =", "[data] must have the key `file`"),
+    ("[scene]", "[scene", "must be a TOML file"),
+    ("[scene]\nmasses_kg = [1.0, 1.0]\n", "scene = 1\n", "`scene` must be a table, but is 1"),
+    ('[data]\nfile = "shots.csv"\n', "", "[data]"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("old", "new", "message"), REFUSED)
+def test_fit_refuses(tmp_path, capsys, old, new, message):
+    assert old in STUDY
+    code, said = call(capsys, "fit", written(tmp_path, STUDY.replace(old, new)))
+    assert code == 2
+    assert said.err.startswith("jimpact fit: ")
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+
+
+def test_fit_refuses_data(tmp_path, capsys):
+    path = written(tmp_path, STUDY, SHOTS.replace("0.21,", "fast,"))
+    code, said = call(capsys, "fit", path)
+    assert code == 2
+    assert "shots.csv, line 2, column `post_1[m/s]`: the value must be a number" in said.err
+
+
+# ------------------------------------------------------------------------- the other commands
+
+
+def test_compare(tmp_path, capsys):
+    code, said = call(capsys, "compare", "--out", tmp_path, "--json")
+    told = json.loads(said.out)
+    assert code == 0
+    np.testing.assert_allclose(told["laws"]["moreau"]["velocity"], [-0.3, 0.65, 0.65], atol=1e-12)
+    assert set(told["laws"]) >= {"lzb", "newton", "moreau", "poisson", "binary"}
+    assert (tmp_path / "jimpact-compare.png").stat().st_size > 10_000
+    code, said = call(capsys, "compare", "--velocity", "2", "0", "0", "--out", tmp_path / "a.svg")
+    assert code == 0
+    assert "measured" not in said.out
+    assert "-0.6000" in said.out
+
+
+def test_montecarlo(tmp_path, capsys):
+    path = written(tmp_path, SAMPLED)
+    code, said = call(capsys, "montecarlo", path, "--out", tmp_path / "new")
+    assert code == 0
+    assert "600 samples of Binary, 3 coordinates, 2 contacts" in said.out
+    assert "ok: 600" in said.out
+    assert (tmp_path / "new" / "jimpact-montecarlo.png").stat().st_size > 10_000
+    options = ["--json", "--out", "a.svg", "--folder", "run", "--keep-samples"]
+    first = json.loads(call(capsys, "montecarlo", path, *options)[1].out)
+    more = json.loads(call(capsys, "montecarlo", path, *options, "--samples", "700")[1].out)
+    assert (first["samples"], more["samples"], more["resumed"]) == (600, 700, 512)
+    code, said = call(capsys, "montecarlo", path, *options, "--seed", "6")
+    assert code == 2
+    assert "holds another run, which differs in key" in said.err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seed = 5", "seeds = 5", "[monte_carlo] may have the keys velocity_m_per_s"),
+        ("velocity_m_per_s = [1.0, 0.0, -1.0]", "", "must have the key `velocity_m_per_s`"),
+        ("low = 0.0", "least = 0.0", "`gaps_m` in [monte_carlo] must have low and high, or mean"),
+        ("low = 0.0", "low = -1.0", "initial_energy"),
+        ("samples = 600", "samples = 0", "`samples` must be at least 1"),
+        ("samples = 600", "law = 3", "[monte_carlo.law] must be a table"),
+        ('order = "earliest"', 'order = "latest"', "`order` must be"),
+        ("[monte_carlo]\n", "[montecarlo]\n", "may have the keys"),
+    ],
+)
+def test_montecarlo_refuses(tmp_path, capsys, old, new, message):
+    assert old in SAMPLED
+    code, said = call(capsys, "montecarlo", written(tmp_path, SAMPLED.replace(old, new)))
+    assert code == 2
+    assert said.err.startswith("jimpact montecarlo: ")
+    assert message in said.err
+
+
+def test_failed_samples_are_told_on_stderr(tmp_path, capsys):
+    """Newton's law lets contacts pull, for some of these velocities."""
+    text = SAMPLED[: SAMPLED.index("[monte_carlo.gaps_m]")].replace("binary", "newton")
+    text = text.replace('order = "earliest"', "").replace(
+        "[1.0, 0.0, -1.0]", "{ mean = [1.0, 0.0, -1.0], std = 1.0 }"
+    )
+    code, said = call(capsys, "montecarlo", written(tmp_path, text), "--out", tmp_path)
+    assert code == 0
+    assert "of 600 samples failed and are left out of the statistics" in said.err
+    assert ", left out (" in said.out
+
+
+@pytest.mark.slow
+def test_a_real_ctrl_c(tmp_path):
+    path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "jimpact.cli", "montecarlo", path, "--folder", str(folder)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    try:
+        end = time.monotonic() + 60
+        while len(list(folder.glob("chunk-*.npz"))) < 3 and time.monotonic() < end:
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGINT)
+        told = process.communicate(timeout=60)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "continues from there" in told
+    assert "Traceback" not in told
+
+
+def test_simulate(tmp_path, capsys):
+    options = ["--out", "m.png", "--gif", "m.gif", "--portrait", "p.svg", "--json"]
+    short = ["--t-end", "0.3", "--samples", "11", "--coordinate", "3"]
+    code, said = call(capsys, "simulate", "shaken_dimer.toml", *options, *short)
+    told = json.loads(said.out)
+    assert (code, told["status"]) == (0, "ok")
+    assert np.shape(told["q"]) == (11, 3)
+    assert len(told["events"]["time"]) == len(told["events"]["kind"]) > 3
+    assert "impact" in told["events"]["kind"]
+    assert (tmp_path / "m.png").stat().st_size > 10_000
+    assert (tmp_path / "m.gif").read_bytes().startswith(b"GIF89a")
+    assert "svg" in (tmp_path / "p.svg").read_text()[:200]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('kind = "block"', 'kind = "car"', "`kind` must be one of ball, column"),
+        ("width_m", "width", "may have the keys kind, width_m"),
+        ('"horizontal"', '"line"', "`direction` of a block must be vertical or horizontal"),
+        ("t_end_s", "t_end", "must have the key `t_end_s`"),
+        ("[law]", "[laws]", "must have the key `law`"),
+        ("0.2\nheight", "-0.2\nheight", "`width` must lie in"),
+        ("0.3, 0.0]", "0.2, 0.0]", "must have no penetration"),
+    ],
+)
+def test_simulate_refuses(tmp_path, capsys, old, new, message):
+    assert old in MOTION
+    code, said = call(capsys, "simulate", written(tmp_path, MOTION.replace(old, new)))
+    assert code == 2
+    assert message in said.err
+
+
+def test_advise(tmp_path, capsys):
+    code, said = call(capsys, "advise", "--samples", "32", "--out", tmp_path, "--json")
+    told = json.loads(said.out)
+    assert (code, told["advice"], told["within"]) == (0, "lzb", True)
+    assert told["laws"]["binary"]["worst_error"] > 0.01
+    assert (tmp_path / "jimpact-advise.png").stat().st_size > 10_000
+
+
+def test_chart(tmp_path, capsys):
+    options = ["--no-gradients", "--batch", "4", "--repeats", "1", "--methods", "verlet"]
+    code, said = call(capsys, "chart", *options, "--out", tmp_path, "--json")
+    told = json.loads(said.out)
+    assert code == 0
+    assert {"verlet", "newton", "moreau", "poisson", "binary"} <= set(told["points"])
+    assert (tmp_path / "jimpact-chart.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_stability(tmp_path, capsys):
+    code, said = call(capsys, "stability", "--methods", "verlet", "--out", tmp_path, "--json")
+    assert code == 0
+    assert json.loads(said.out)["methods"]["verlet"]["counts"]["right"] > 3
+
+
+def test_laws(capsys):
+    assert "restitution" in call(capsys, "laws")[1].out
+    assert set(json.loads(call(capsys, "laws", "--json")[1].out)) == set(ji.REGISTRY)
+    assert call(capsys, "laws", "--bibtex")[1].out.count("@book{brogliato2016") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["fit", "nowhere.toml"], "Study 'nowhere.toml' does not exist"),
+        (["fit", "--out", "fit.docx"], "--out must end in .png, .pdf or .svg"),
+        (["fit", "--law", "aristotle"], "the law must be one of"),
+        (["compare", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
+        (["compare", "--velocity", "1", "0"], "`velocity` must have shape (3,)"),
+        (["compare", "--velocity", "1", "nan", "0"], "`velocity` must be finite"),
+        (["compare", "--out", "a.txt"], "--out must end in"),
+        (["compare", "nowhere.toml"], "does not exist"),
+        (["montecarlo", "three_balls.toml"], "must have a [monte_carlo] table"),
+        (["montecarlo", "--scheduler", "tcp://nowhere:1"], "--scheduler needs --executor dask"),
+        (["montecarlo", "--out", "picture.txt"], "--out must end in"),
+        (["simulate", "nothing.toml"], "cradle_motion.toml, shaken_dimer.toml"),
+        (["simulate", "--out", "picture.jpg"], "--out must end in .png"),
+        (["simulate", "--portrait", "portrait.gif"], "--portrait must end in .png"),
+        (["simulate", "--gif", "motion.mp4"], "--gif must end in .gif"),
+        (["advise", "--tolerance", "2"], "`tolerance` must lie in"),
+        (["advise", "--shot", "2"], "--shot must lie in [1, 1]"),
+        (["advise", "--stiffness-range", "2", "1"], "low <= high"),
+        (["chart", "--methods", "magic"], "has 'magic'"),
+        (["chart", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
+        (["chart", "three_balls_gaps.toml"], "--velocity must be given"),
+        (["stability", "--methods", "rk5"], "`methods` must name some of"),
+    ],
+)
+def test_refused(capsys, arguments, message):
+    code, said = call(capsys, *arguments)
+    assert code == 2
+    assert said.err.startswith(f"jimpact {arguments[0]}: ")
+    assert message in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_version_and_help(capsys):
+    assert call(capsys, "--version")[1].out == f"jimpact {ji.__version__}\n"
+    code = (
+        "import sys\nfrom jimpact.cli import main\n"
+        "try: main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "print([m for m in ('jax', 'matplotlib', 'numpy', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "montecarlo" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"

@@ -1,0 +1,164 @@
+"""What is only faster gives the same: compared with the canonical program of the law.
+
+Canonical is: a dense scene, an array of exponents, padded contacts, one of a batch. Faster are
+numbers for exponents (1, 1.5, 2), tuples, chains, the exact propagator, single impacts; the impulse
+form is another formulation of first order.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import programs
+import pytest
+from programs import chain, failed, names
+
+import jimpact as ji
+
+V = [1.0, 0.4, 0.1, -0.6]
+E, K = [0.9, 0.7, 0.8], [1.0, 2.5, 0.7]
+
+
+def states(eta):
+    """Four balls without a wall: generic, at rest, precompressed, light in the middle."""
+    return [
+        chain([1.0, 2.0, 1.5, 0.7], V, e=E, k=K, eta=eta),
+        chain([1.0, 1.0, 1.0, 1.0], [1, 0, 0, 0], e=1.0, k=K, eta=eta),
+        chain([2.0, 1.0, 1.0, 3.0], [0, 0, 0, 0], e=E, eta=eta, stored=[0.1, 0.0, 0.3]),
+        chain([1.0, 1e-2, 1.0, 1.0], [1, 0, 0, -1], e=E, k=[1, 10, 1], eta=eta),
+    ]
+
+
+def faster(law):
+    """Compiled for chains of four balls: (masses, v, e, k, stored) -> outcome."""
+
+    @jax.jit
+    @jax.vmap
+    def run(masses, v, e, k, stored):
+        return ji.impact(law(e, k, stored), ji.chain(masses), v)
+
+    def of(states):
+        rows = [
+            (np.diag(s.mass), s.velocity, *(np.broadcast_to(x, 3) for x in (s.e, s.k, s.stored)))
+            for s in states
+        ]
+        return jax.tree.map(np.asarray, run(*(np.array(x, float) for x in zip(*rows))))
+
+    return of
+
+
+PATHS = {
+    "linear": (1.0, lambda e, k, u: ji.LZB(e, k, 1.0, u)),
+    "Hertz": (1.5, lambda e, k, u: ji.LZB(e, k, 1.5, u)),
+    "quadratic": (2.0, lambda e, k, u: ji.LZB(e, k, 2.0, u)),
+    "mixed": ([1.0, 1.5, 1.3], lambda e, k, u: ji.LZB(e, k, (1.0, 1.5, 1.3), u)),
+}
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_exponents_and_chains(path):
+    eta, law = PATHS[path]
+    given = states(eta)
+    out, (same, _) = faster(law)(given), programs.values("lzb")(given)
+    assert not failed(out.status).any()
+    np.testing.assert_allclose(out.velocity, same.velocity, atol=2e-7)
+    np.testing.assert_allclose(out.impulse, same.impulse, atol=4e-7)
+    np.testing.assert_allclose(out.energy_change, same.energy_change, atol=4e-7)
+    np.testing.assert_array_equal(out.status, same.status)
+
+
+def test_a_single_impact_is_one_of_a_batch():
+    """Not batched, not padded, eager; and on the dense scene of the chain."""
+    given = states(1.5)[:2]
+    (same, _) = programs.values("lzb")(given)
+    for i, s in enumerate(given):
+        law = ji.LZB(*(jnp.broadcast_to(jnp.asarray(x, float), 3) for x in (s.e, s.k)))
+        out = ji.impact(law, ji.chain(np.diag(s.mass)), jnp.asarray(s.velocity, float))
+        np.testing.assert_allclose(out.velocity, same.velocity[i], atol=2e-7)
+        assert int(out.status) == same.status[i]
+
+
+def light_and_stiff(count):
+    """Contacts that turn back twice within one period of the fastest: events inside a step."""
+    rng = np.random.default_rng(1)
+    rows = [chain([1.0, 1e-3, 1.0, 1.0], [1, 0, 0, 0.5], e=0.9, eta=1)]
+    for _ in range(count - 1):
+        rows.append(
+            chain(
+                10 ** rng.uniform(-3, 1, 4),
+                [1.0, 0, 0, 0],
+                e=rng.uniform(0.3, 1),
+                k=10 ** rng.uniform(-3, 3, 3),
+                eta=1,
+            )
+        )
+    return rows
+
+
+def test_propagator():
+    """Exact where contacts are linear; it sees events that no end of a step shows."""
+    given = light_and_stiff(48)
+    law = lambda e, k, u: ji.LZB(e, k, 1.0, u, method="propagator", max_steps=4000)  # noqa: E731
+    exact, (out, _) = faster(law)(given), programs.values("lzb")(given)
+    ended = ~failed(exact.status) & ~failed(out.status)
+    assert ended.mean() > 0.6, ended.mean()
+    np.testing.assert_allclose(out.velocity[ended], exact.velocity[ended], rtol=0, atol=1e-7)
+
+
+def test_impulse_form():
+    """Liu, Zhao and Brogliato's published scheme: of first order, the same law."""
+    given = states(1.5)[:2]
+    law = lambda e, k, u: ji.LZB(e, k, 1.5, u, method="impulse", rtol=1e-4)  # noqa: E731
+    out, (same, _) = faster(law)(given), programs.values("lzb")(given)
+    assert names(out.status) == ["ok"] * 2
+    np.testing.assert_allclose(out.velocity, same.velocity, atol=1e-3)
+    assert np.abs(out.velocity - same.velocity).max() > 1e-7  # it is not the same code
+
+
+@pytest.mark.parametrize(
+    ("eta", "force"), [(1.5, lambda k: ji.Hertz(k)), (1.0, lambda k: ji.LinearSpring(k))]
+)
+def test_forces_without_losses(eta, force):
+    given = [*states(eta)[1:2], chain([1.0, 2.0, 1.5, 0.7], V, k=K, eta=eta, gaps=[0.0, 0.3, 0.0])]
+
+    @jax.jit
+    @jax.vmap
+    def run(masses, v, k, gaps):
+        return ji.impact(ji.Compliant(force(k)), ji.chain(masses, gaps=gaps), v)
+
+    rows = [
+        (np.diag(s.mass), s.velocity, *(np.broadcast_to(x, 3) for x in (s.k, s.gaps)))
+        for s in given
+    ]
+    out = run(*(np.array(x, float) for x in zip(*rows)))
+    same, _ = programs.values("compliant")(given)
+    np.testing.assert_allclose(out.velocity, same.velocity, atol=2e-7)
+    np.testing.assert_array_equal(out.status, same.status)
+
+
+@functools.cache
+def long_chain(dense):
+    normals = ji.chain(jnp.ones(12)).normals
+
+    @jax.jit
+    def run(masses, v):
+        scene = ji.Scene(masses, normals) if dense else ji.chain(masses)
+        return ji.impact(ji.LZB(0.9), scene, v)
+
+    return run
+
+
+@pytest.mark.slow
+def test_windows_of_long_chains():
+    masses, v = np.linspace(1, 2, 12), np.eye(12)[0]
+    out, same = long_chain(False)(masses, v), long_chain(True)(masses, v)
+    np.testing.assert_allclose(out.velocity, same.velocity, atol=2e-7)
+    assert int(out.status) == int(same.status) == 0
+
+
+def test_a_chain_is_never_made_dense():
+    trace = jax.make_jaxpr(lambda v: ji.impact(ji.LZB(0.9), ji.chain(jnp.ones(137)), v).velocity)
+    text = str(trace(jnp.ones(137)))
+    assert "136" in text
+    assert "136,136" not in text

@@ -1,0 +1,547 @@
+"""Methods of integration: their order, speed against accuracy, hard points, the advice."""
+
+import dataclasses
+import functools
+import itertools
+import json
+import math
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from programs import failed, names
+
+import jimpact as ji
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+import stability_reference
+
+BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
+HERTZ = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.5)
+HERTZ_AFTER = [-0.0086153561548806457087, 0.10414279851550412011, 0.9044725576393765256]
+
+# -------------------------------------------------------------------------------- the chart
+
+# settings, and bounds of the order seen over all of them; a change of phase costs the fixed step
+# its order, and the rule at E = 0 that of the impulse form
+ORDERS = {
+    "impulse_euler": (np.logspace(-2, -3.5, 4), 0.8, 1.3, 3e-4),
+    "verlet": (np.logspace(-0.7, -2.5, 5), 1.7, 2.5, 5e-6),
+    "rk4": (np.logspace(-0.7, -2.5, 5), 1.7, 3.2, 5e-7),
+    "dop853": ([1e-4, 1e-6, 1e-8], 0.5, 1.8, 1e-7),
+    "scipy_dop853": ([1e-4, 1e-6, 1e-8], 0.5, 1.8, 1e-6),
+}
+
+
+@pytest.fixture(scope="module")
+def chart():
+    """All of them on three Hertz balls, e = 0.9, and a law that is another model."""
+    ladder = {name: list(map(float, row[0])) for name, row in ORDERS.items()}
+    laws = {"binary": ji.Binary(0.9)}
+    return ji.work_precision(
+        BALLS, STRIKE, HERTZ, list(ladder), ladder, laws, batch=8, repeats=2, gradients=False
+    )
+
+
+@pytest.mark.parametrize("name", ORDERS)
+def test_methods_converge_at_their_order(chart, name):
+    settings, least, most, finest = ORDERS[name]
+    row = chart.points[name]
+    error = np.array([point.error["velocity"] for point in row])
+    order = np.polyfit(np.log(settings), np.log(error), 1)[0]
+    assert least < order < most
+    assert error[-1] < finest
+    work = [point.evaluations for point in row]
+    assert all(a < b for a, b in itertools.pairwise(work))
+    for point in row:
+        assert point.single.low <= point.single.median <= point.single.high
+        assert point.batched.low <= point.batched.median <= point.batched.high
+
+
+def test_chart_in_words_and_picture(chart):
+    np.testing.assert_allclose(chart.reference.velocity, HERTZ_AFTER, atol=1e-11)
+    (binary,) = chart.points["binary"]  # the error of a model
+    after = np.asarray(ji.impact(ji.Binary(0.9), BALLS, STRIKE).velocity)
+    error = np.abs(after - np.array(HERTZ_AFTER)).max()
+    assert binary.error["velocity"] == pytest.approx(error, rel=1e-9)
+    assert math.isnan(binary.error["duration"])
+    assert "verlet" in str(chart)
+    told = json.loads(json.dumps(chart.to_dict()))
+    assert told["points"]["binary"][0]["evaluations"] is None
+    figure = ji.plot.work_precision(chart, "three balls")
+    assert figure.axes[-1].get_legend() is not None
+    assert all(axes.lines for axes in figure.axes[:-1])
+
+
+@pytest.mark.slow
+def test_gradients_and_the_other_methods():
+    linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
+    found = ji.work_precision(BALLS, STRIKE, linear, laws={}, batch=8, repeats=1)
+    assert not found.left_out
+    assert found.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
+    assert found.points["propagator"][0].error["velocity"] < 1e-12
+    for name, row in found.points.items():
+        assert all(point.evaluations > 0 for point in row), name
+    assert 1e-9 < found.points["verlet"][-1].error["gradient"] < 0.1
+    points = {
+        name: tuple(dataclasses.replace(point, gradient=None) for point in row)
+        for name, row in found.points.items()
+    }
+    bare = ji.plot.work_precision(dataclasses.replace(found, points=points))
+    assert all("gradient" not in axes.get_xlabel() for axes in bare.axes)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"velocity": [1.0, 0.0]}, ValueError, "`velocity` must have shape (3,)"),
+        ({"velocity": [0.0, 0.0, 1.0]}, ValueError, "`velocity` must let a closed contact"),
+        ({"velocity": [1.0, np.nan, 0.0]}, ValueError, "`velocity` must be finite"),
+        ({"law": ji.Newton(0.5)}, TypeError, "`law` must be an LZB law, but is Newton"),
+        ({"law": ji.LZB([1, 1, 1.0])}, ValueError, "`restitution` must have shape (2,)"),
+        ({"methods": ["magic"]}, ValueError, "has 'magic'"),
+        ({"methods": ["propagator"]}, ValueError, "'propagator': it is exact for the exponent"),
+        ({"law": ji.LZB(0.0), "methods": ["rk4"]}, ValueError, "it divides by e^2"),
+        ({"settings": {"rk4": [0.1]}}, ValueError, "`settings` must be of chosen methods"),
+        ({"settings": {"verlet": [0.0]}}, ValueError, "`settings['verlet']` must lie in (0"),
+        ({"reference": "verlet"}, ValueError, "`reference` must take an rtol"),
+        ({"batch": 0}, ValueError, "`batch` must be a whole number >= 1"),
+        ({"repeats": 1.5}, ValueError, "`repeats` must be a whole number >= 1"),
+    ],
+)
+def test_chart_refuses(change, error, message):
+    given = {"scene": BALLS, "velocity": STRIKE, "law": HERTZ, "methods": ["verlet"]}
+    with pytest.raises(error) as told:
+        ji.work_precision(**(given | change))
+    assert message in str(told.value)
+
+
+# ------------------------------------------------------------------------------- hard points
+
+HELD = np.load(Path(__file__).parent / "data" / "stability_points.npz")
+RTOL, HONEST = 1e-8, 10  # the default tolerance; right is within ten times of it
+STEPS, MANY_STEPS = 4000, 20_000  # in the default tests, in the slow ones
+# right only because the tolerance falls with the number of steps and with slow contacts
+HARD = {151: "mass ratio 2e-4, e = 1, six balls", 168: "stiffness ratio 1.7e-8, three balls"}
+HARD_LATER = {  # these take more than STEPS
+    4: "stiffness ratio 7e-6, e = 1, twenty balls: slow ones are not at rest",
+    22: "stiffness ratio 1.4e6, three balls",
+    209: "stiffness ratio 1.4e-4, mass ratio 5e-3, e = 9e-3",
+}
+
+
+@functools.cache
+def hypercube(n, steps):
+    """Indices of the points with n balls; outcome, consistency, and error by the oracle there."""
+    at = np.flatnonzero(HELD["points"][:, 4] == n)
+    kappa, mu, e, eta, _ = HELD["points"][at].T
+    chains = [stability_reference.chain_of(a, b, n) for a, b in zip(kappa, mu)]
+    mass, k = (np.array(rows) for rows in zip(*chains))
+
+    @jax.jit
+    @jax.vmap
+    def run(mass, k, e, eta):
+        scene, v = ji.chain(mass), jnp.eye(n)[0]
+        out = ji.impact(ji.LZB(e, k, eta, max_steps=steps), scene, v)
+        return out, ji.audit(scene, v, out).consistent
+
+    out, consistent = jax.tree.map(np.asarray, run(mass, k, e, eta))
+    return at, out, consistent, np.abs(out.velocity - HELD["velocity"][at, :n]).max(axis=1)
+
+
+def check_hypercube(n, steps):
+    """Right or flagged everywhere; what the oracle could not solve is consistent."""
+    at, out, consistent, error = hypercube(n, steps)
+    told = failed(out.status)
+    known = np.isfinite(HELD["uncertainty"][at])
+    wrong = known & ~told & ~(error <= HONEST * RTOL)
+    assert not wrong.any(), list(zip(at[wrong], error[wrong]))
+    assert consistent[~told].all()
+    lossless = ~told & (HELD["points"][at, 2] == 1)
+    assert np.abs(out.energy_change[lossless]).max(initial=0) < HONEST * RTOL
+    return np.mean(~told)
+
+
+@pytest.mark.parametrize(
+    ("n", "share"), [(3, 0.6), (6, 0.3), pytest.param(20, 0.1, marks=pytest.mark.slow)]
+)
+def test_right_or_flagged(n, share):
+    assert check_hypercube(n, STEPS) > share  # and not all flagged
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "share"), [(2, 0.99), (3, 0.7), (6, 0.6), (20, 0.15), (100, 0.0)])
+def test_right_or_flagged_with_more_steps(n, share):
+    assert check_hypercube(n, MANY_STEPS) >= share
+
+
+def check_right(point, steps):
+    at, out, _, error = hypercube(int(HELD["points"][point, 4]), steps)
+    i = int(np.flatnonzero(at == point)[0])
+    assert not failed(out.status[i])
+    assert error[i] <= HONEST * RTOL
+
+
+@pytest.mark.parametrize("point", HARD, ids=HARD.get)
+def test_hard_points(point):
+    check_right(point, STEPS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("point", HARD_LATER, ids=HARD_LATER.get)
+def test_hard_points_after_many_steps(point):
+    check_right(point, MANY_STEPS)
+
+
+def test_points_are_those_of_the_script():
+    assert len(HELD["points"]) == 300
+    np.testing.assert_allclose(HELD["points"], stability_reference.points(), rtol=1e-12)
+    assert HELD["uncertainty"][np.isfinite(HELD["uncertainty"])].max() < 0.1 * HONEST * RTOL
+
+
+# 10 and 30 equal Hertz balls by the oracle of tests/benchmarks/lzb_oracle.cpp
+TEN = {
+    1.0: "-0.07108501709 -0.03027378936 -0.01583339716 -0.00888569518 -0.00512658316 "
+    "-0.00298597820 -0.00173766842 0.00267195495 0.14739030720 0.98586586642",
+    0.9: "-0.00867062941 0.02377686943 0.03273912320 0.03351852905 0.03428229479 "
+    "0.03516695506 0.03530119785 0.03580539400 0.10718026205 0.67090000398",
+}
+THIRTY = {  # the first three and the last three
+    1.0: "-0.07108501709 -0.03027378936 -0.01583339716 0.00401251210 0.14860045199 0.98567885884",
+    0.9: "-0.00867062941 0.01579664307 0.01617678971 0.03547754352 0.04667986304 0.29175885712",
+}
+
+
+@pytest.mark.slow
+def test_long_chains():
+    """Right where Siconos ends with 981 times the energy; long chains re-close below e = 0.5."""
+
+    def after(n):
+        run = jax.vmap(lambda e: ji.impact(ji.LZB(e), ji.chain(jnp.ones(n)), jnp.eye(n)[0]))
+        return jax.jit(run)
+
+    out = after(10)(jnp.array([1.0, 0.9, 0.5, 0.4]))
+    for i, e in enumerate(TEN):
+        held = np.array(TEN[e].split(), float)
+        np.testing.assert_allclose(out.velocity[i], held, rtol=0, atol=HONEST * RTOL)
+    assert names(out.status) == ["ok"] * 3 + ["plastic_limit"]
+    assert abs(float(out.energy_change[0])) < HONEST * RTOL
+    assert (np.asarray(out.energy_change[1:]) < 0).all()
+    out = after(30)(jnp.array(list(THIRTY)))
+    assert names(out.status) == ["ok", "ok"]
+    for v, held in zip(np.asarray(out.velocity), THIRTY.values()):
+        ends = v[[0, 1, 2, -3, -2, -1]]
+        np.testing.assert_allclose(ends, np.array(held.split(), float), rtol=0, atol=1e-7)
+    out = after(100)(jnp.array([1.0]))
+    assert names(out.status) == ["ok"]
+    assert abs(float(out.energy_change[0])) < 1e-7
+    np.testing.assert_allclose(out.velocity[0, -1], 0.985679, atol=1e-6)
+
+
+def _random_chains(bodies, wall, count, seed):
+    rng = np.random.default_rng(seed)
+    m = bodies - 1 + bool(wall)
+    masses = np.exp(rng.uniform(0, np.log(10), (count, bodies)))
+    k = np.exp(rng.uniform(np.log(0.05), np.log(20), (count, m)))
+    e, v = rng.uniform(0.3, 1, (count, m)), rng.uniform(-1, 1, (count, bodies))
+    v[::3] = np.eye(bodies)[0]
+    return masses, k, e, v
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
+def test_honest_tolerance_over_random_scenes(rtol):
+    """99 % within 10 rtol; the worst within 100 rtol or flagged."""
+    errors = []
+    for seed, (bodies, wall, exponent) in enumerate(
+        [(2, True, 1.0), (3, False, 1.3), (4, True, 1.5), (5, False, 2.0), (6, True, 1.5)]
+    ):
+        if rtol != 1e-8 and bodies not in (3, 4):
+            continue
+        args = _random_chains(bodies, wall, 104, seed)
+
+        def outcome(rtol, exponent=exponent, wall=wall, args=args):
+            def one(masses, k, e, v):
+                law = ji.LZB(e, k, exponent, rtol=rtol)
+                return ji.impact(law, ji.chain(masses, wall=wall), v)
+
+            return jax.jit(jax.vmap(one))(*args)
+
+        exact, got = outcome(1e-13), outcome(rtol)
+        error = np.abs(got.velocity - exact.velocity).max(axis=1)
+        flagged = (np.asarray(got.status) > 0) | (np.asarray(exact.status) > 0)
+        assert flagged.mean() < 0.1
+        errors += list((error / np.abs(args[3]).max(axis=1) / rtol)[~flagged])
+    quantiles = np.quantile(errors, [0.5, 0.9, 0.99, 1.0])
+    print(f"error/rtol over {len(errors)} scenes at {rtol:g}: 50/90/99/100 % {quantiles}")
+    assert quantiles[2] < 10
+    assert quantiles[3] < 100
+
+
+# --------------------------------------------------------------------------- the stability map
+
+
+@pytest.mark.slow
+def test_stability_map():
+    axes = {"setting": [0.0, 0.6], "exponent": [1.5, 3.0], "restitution": [0.0, 0.9]}
+    found = ji.stability_map(("rk4", "verlet"), axes, slices="pairs", samples=3, max_steps=2000)
+    assert found.methods == ("rk4", "verlet")
+    for name in found.methods:
+        setting, exponent = found.slices[name][:2]
+        assert setting.error[1] < 1e-3
+        assert (exponent.codes == 0).all()
+        assert sum(found.counts(name).values()) == 6 + 3 * 4 + 3
+    assert found.confirmation.tried == found.confirmation.confirmed > 0
+    assert "step beyond the linear stability limit" in str(found)
+    assert json.loads(json.dumps(found.to_dict()))["methods"]["rk4"]["counts"]["right"] > 3
+    assert ji.plot.stability_map(found, "title").axes
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ji.stability_map(["rk5"]), "`methods` must name some of"),
+        (lambda: ji.stability_map(axes={"mass": [1]}), "`axes` must name some of"),
+        (lambda: ji.stability_map(axes={"balls": [2.5]}), "whole numbers"),
+        (lambda: ji.stability_map(axes={"restitution": [1.1]}), r"lie in \[0, 1\]"),
+        (lambda: ji.stability_map(base={"exponent": 0.5}), r"lie in \[1, 5\]"),
+        (lambda: ji.stability_map(base={"speed": 1}), "`base` must name some of"),
+        (lambda: ji.stability_map(slices="all"), "`slices` must be one of"),
+        (lambda: ji.stability_map(samples=-1), "`samples`"),
+        (lambda: ji.stability_map(resolution=1), "`resolution`"),
+    ],
+)
+def test_stability_map_refuses(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+# ------------------------------------------------------------------------------------ advice
+
+
+def quick(scene, velocity, tolerance=1e-2, **options):
+    return ji.advise(scene, velocity, tolerance, timing=False, samples=32, **options)
+
+
+@pytest.fixture(scope="module")
+def unknown():
+    return quick(BALLS, STRIKE)
+
+
+def test_unknown_ratio_decides(unknown):
+    """Nothing is within 1 % where k2/k1 is anywhere in [0.1, 10]; LZB is told, and what it lacks."""
+    assert (unknown.name, unknown.within, unknown.reference) == ("lzb", False, "lzb")
+    assert "stiffness ratio k2/k1 in [0.1, 10] decides" in unknown.reason
+    nominal = [-0.070952353651436871, 0.076403039071206993, 0.99454931458022988]
+    np.testing.assert_allclose(unknown.candidates["lzb"].velocity, nominal, atol=1e-7)
+    for name, c in unknown.candidates.items():
+        assert c.usable, name
+        assert c.worst > 0.1, name
+        assert c.median <= c.worst
+    (effect,) = unknown.effects
+    assert 0 < effect.needed < 0.2
+    assert unknown.candidates["lzb"].worst >= effect.alone
+
+
+# known ratio, tolerance: law; at 1e3 the contacts act together, at 0.01 one after the other
+@pytest.mark.parametrize(
+    ("ratio", "tolerance", "name"),
+    [(1e3, 0.02, "newton"), (50.0, 0.02, "lzb"), (1.0, 0.02, "lzb"), (0.01, 0.02, "binary")],
+)
+def test_known_ratio(ratio, tolerance, name):
+    found = quick(BALLS, STRIKE, tolerance, stiffness=[1.0, ratio])
+    exact = found.candidates["lzb"].velocity
+    assert (found.name, found.within, found.unknown) == (name, True, ())
+    assert np.abs(found.candidates[name].velocity - exact).max() <= tolerance
+    simple = ["newton", "moreau", "poisson", "binary"]
+    for other in simple[: simple.index(name)] if name in simple else simple:
+        assert np.abs(found.candidates[other].velocity - exact).max() > tolerance
+    assert f"k2/k1 = {ratio:.3g}" in found.reason
+
+
+def test_tolerance_from_both_sides():
+    """At the error of binary collisions the advice changes, and nowhere near it."""
+    known = {"stiffness": [1.0, 0.5]}
+    edge = quick(BALLS, STRIKE, 0.5, **known).candidates["binary"].worst
+    assert 0.02 < edge < 0.05
+    assert quick(BALLS, STRIKE, 1.001 * edge, **known).name == "binary"
+    below = quick(BALLS, STRIKE, 0.999 * edge, **known)
+    assert (below.name, below.within) == ("lzb", True)
+    assert "binary comes closest and is off by" in below.reason
+
+
+def test_special_scenes():
+    """Plastic contacts, no approach, a law that breaks a property."""
+    found = quick(BALLS, STRIKE, restitution=0.0)
+    assert (found.name, found.within) == ("newton", True)
+    assert "plastic contacts" in found.reason
+    found = quick(BALLS, [-1.0, 0.0, 2.0])
+    assert found.reason.startswith("no approach: nothing happens")
+    both = quick(ji.chain([0.25, 1.0, 0.25]), [1.0, 0.0, -1.0], 0.9, stiffness=[1.0, 1.0])
+    assert both.candidates["binary"].status == "order_dependent"
+    assert not both.candidates["binary"].usable
+    assert both.name == "newton"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("gap", "tolerance", "name"),
+    [(2e-3, 1e-3, "binary"), (1e-6, 1e-2, "lzb"), (1e-4, 1e-2, "compliant")],
+)
+def test_gaps(gap, tolerance, name):
+    scene = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, gap])
+    found = quick(scene, STRIKE, tolerance, stiffness=1.2e8)
+    exact = ji.impact(ji.Compliant(ji.Bistiffness(1.2e8, 1.5, 1.0)), scene, STRIKE).velocity
+    assert (found.name, found.within) == (name, True)
+    got = np.asarray(ji.impact(found.law, found.scene, STRIKE).velocity)
+    assert np.abs(got - exact).max() <= tolerance
+
+
+@pytest.mark.slow
+def test_several_ratios():
+    """Five unknown ratios: which of them matters."""
+    found = quick(ji.chain(jnp.ones(7)), [1.0, 0, 0, 0, 0, 0, 0])
+    assert [u.name for u in found.unknown] == [f"k{j}/k1" for j in range(2, 7)]
+    strongest = max(found.effects, key=lambda effect: effect.alone)
+    assert f"measure {strongest.name} first" in found.reason
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"tolerance": 0.0}, ValueError, "`tolerance` must lie in"),
+        ({"tolerance": [0.1]}, ValueError, "`tolerance` must have shape"),
+        ({"stiffness_range": (2.0, 1.0)}, ValueError, "`stiffness_range` must have low <= high"),
+        ({"stiffness_range": (0.0, 1.0)}, ValueError, "`stiffness_range` must lie in"),
+        ({"samples": 0}, ValueError, "`samples` must be an int >= 1"),
+        ({"seed": -1}, ValueError, "`seed` must be an int >= 0"),
+        ({"restitution": 1.5}, ValueError, "`restitution` must lie in"),
+        ({"stiffness": [1.0, 2.0, 3.0]}, ValueError, "`stiffness` must be a scalar or"),
+        ({"exponent": 0.5}, ValueError, "`exponent` must lie in"),
+        ({"exponent": (1.0, 1.5)}, ValueError, "`stiffness` must be given where exponents differ"),
+        ({"law": ji.Newton(0.5)}, TypeError, "`law` must be an LZB"),
+        ({"law": ji.LZB(1.0), "exponent": 1.5}, ValueError, "`exponent` must be None"),
+        ({"law": ji.LZB(1.0, initial_energy=1.0)}, ValueError, "no initial_energy"),
+        (
+            {"scene": ji.chain([1.0] * 3, gaps=[0.0, 2e-3])},
+            ValueError,
+            r"`stiffness` must be given .* \(contact 2\)",
+        ),
+    ],
+)
+def test_advice_refuses(options, error, message):
+    with pytest.raises(error, match=message):
+        ji.advise(**({"scene": BALLS, "velocity": STRIKE} | options))
+
+
+def test_advice_in_words_and_picture(unknown):
+    told = json.loads(json.dumps(unknown.to_dict()))
+    assert told["laws"]["lzb"]["worst_error"] == unknown.candidates["lzb"].worst
+    assert told["unknown"][0]["name"] == "k2/k1"
+    text = str(unknown)
+    assert max(len(line) for line in text.splitlines()) <= 100
+    assert len(text.splitlines()) < 25
+    assert "NOT within 1 %" in text
+    axes = ji.plot.advice(unknown, "balls").axes
+    assert len(axes) == 2
+    assert "not within 1 %" in axes[0].get_title(loc="left")
+
+
+# ------------------------------------------------------------------------------ validity map
+
+EXACT = {  # three equal balls, exponent 1, e = 1: unilateral springs, closed form
+    0.25: (-0.0301850562872225066, 0.0311254645544743804, 0.99905959173274812616),
+    1.0: (-0.1302616950645210470, 0.1502295694347740893, 0.98003212562972695774),
+    2.0: (-0.2454016724823200310, 0.3361128425708038889, 0.90928882991151614209),
+    10.0: (-0.3309938917272272135, 0.6171716226279141425, 0.71382226909931307106),
+}
+RATIOS = [1e-6, 1e-3, *EXACT, 1e3, 1e6]
+
+
+@pytest.fixture(scope="module")
+def valid():
+    return ji.validity_map(BALLS, STRIKE, RATIOS, (1.0, 1.5, 2.0, 3.0))
+
+
+def test_validity_map(valid):
+    """Closed form; k2/k1 -> 0: binary; -> inf: Moreau; the larger the exponent, the later."""
+    assert not valid.status.any()
+    np.testing.assert_allclose(valid.velocity[0, 2:-2], list(EXACT.values()), atol=1e-7)
+    hertz = [-0.070952353651436871, 0.076403039071206993, 0.99454931458022988]
+    np.testing.assert_allclose(valid.velocity[1, RATIOS.index(1.0)], hertz, atol=1e-7)
+    assert valid.law_dispersion["moreau"] == pytest.approx(2 / 3)
+    assert valid.law_dispersion["binary"] == pytest.approx(0.0)
+    binary = valid.error("binary")
+    np.testing.assert_allclose(binary[:, 0] / binary[:, 1], 1e-3, rtol=0.01)  # first order in k2/k1
+    assert (np.diff(binary[:, 1]) < 0).all()
+    moreau = valid.error("moreau")[:, -2:]
+    assert (moreau[:, 1] < moreau[:, 0]).all()
+    assert (np.diff(moreau[:, 1]) > 0).all()
+    for law, step in (("binary", 1), ("moreau", -1)):
+        error, limit = valid.error(law), valid.limit(law, 0.05)
+        for i in range(4):
+            at = RATIOS.index(limit[i])
+            run = error[i, : at + 1] if step == 1 else error[i, at:]
+            assert (run <= 0.05).all()
+            assert error[i, at + step] > 0.05
+    assert len(ji.plot.validity_map(valid).axes) == 2
+    json.dumps(valid.to_dict())
+    with pytest.raises(ValueError, match="`law` must be one of moreau, binary"):
+        valid.error("newton")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((ji.chain([1.0, 1.0]), [1.0, 0.0]), "`scene` must have two or more contacts"),
+        ((BALLS, [0.0, 0.0, 0.0]), "`velocity` must not be zero"),
+        ((BALLS, STRIKE, [2.0, 1.0]), "`ratios` must rise"),
+        ((BALLS, STRIKE, [0.0, 1.0]), "`ratios` must lie in"),
+        ((BALLS, STRIKE, [1.0], [0.5]), "`exponents` must lie in"),
+        ((BALLS, STRIKE, [1.0], [1.0], 2.0), "`restitution` must lie in"),
+    ],
+)
+def test_validity_map_refuses(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ji.validity_map(*arguments)
+
+
+# --------------------------------------------------------------------------------- laws compared
+
+
+def test_compare_gives_every_law_its_outcome():
+    found = ji.compare(BALLS, STRIKE, restitution=0.9, stiffness=[1.0, 2.0])
+    assert {"lzb", "newton", "moreau", "poisson", "binary"} <= set(found.entries)
+    for name, entry in found.entries.items():
+        assert entry.time > 0
+        kept = 2 * (0.5 + float(entry.outcome.energy_change))
+        assert entry.energy_ratio == pytest.approx(kept)
+        assert name in str(found)
+    assert float(found.entries["lzb"].law.stiffness[1]) == 2.0
+    told = json.loads(json.dumps(found.to_dict()))
+    assert told["moreau"]["consistent"] is True
+    slender = ji.Scene(np.linalg.inv([[1.0, 0.25], [0.25, 1.0]]), np.eye(2))
+    table = str(ji.compare(slender, [0.0, -1.0], {"mine": ji.Newton(0.5)}))
+    assert "kinetic violated, negative_impulse" in table
+
+
+def test_dispersion_index_and_energy_ratio():
+    for v, index in (([0, 0, 1.0], 0.0), ([-1 / 3, 2 / 3, 2 / 3], 2 / 3), ([1, -1, 1.0], 1.0)):
+        assert float(ji.dispersion_index(BALLS, v)) == pytest.approx(index, abs=1e-14)
+    heavy = ji.chain([4.0, 1.0])
+    assert float(ji.dispersion_index(heavy, [1.0, -2.0])) == pytest.approx(1.0)
+    assert float(ji.energy_ratio(heavy, [1.0, 0.0], [0.5, 0.0])) == pytest.approx(0.25)
+
+
+@pytest.mark.slow
+def test_readme_holds_the_chooser_table():
+    import chooser
+
+    lines, silent = chooser.table()
+    assert silent == 0  # whatever a law breaks, a status tells
+    text = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    for line in lines:
+        assert line in text

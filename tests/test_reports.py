@@ -1,0 +1,102 @@
+"""Reports and pictures of canned results: no impact is computed."""
+
+import json
+
+import numpy as np
+import pytest
+
+import jimpact as ji
+from jimpact.fits.fitting import Fit, Start
+
+
+def canned(shots, **change):
+    """A fit of two parameters to a pair of balls, as if found."""
+    rng = np.random.default_rng(0)
+    pre = np.stack([rng.uniform(1, 2, shots), np.zeros(shots)], axis=1)
+    predicted = np.stack([0.2 * pre[:, 0], 0.8 * pre[:, 0]], axis=1)
+    post = predicted + 0.01 * rng.normal(size=predicted.shape)
+    if shots > 1:
+        post[0, 0] = np.nan
+    given = {
+        "law": ji.LZB([0.6], [2.0]),
+        "method": "levenberg-marquardt",
+        "names": ("restitution[1]", "stiffness[1]"),
+        "value": np.array([0.6, 2.0]),
+        "standard_error": np.array([0.01, np.inf]),
+        "covariance": np.array([[1e-4, np.nan], [np.nan, np.inf]]),
+        "correlation": np.eye(2),
+        "bounds": (np.zeros(2), np.array([1.0, np.inf])),
+        "at_bound": np.array([False, False]),
+        "predicted": predicted,
+        "residual": post - predicted,
+        "rms": 0.01,
+        "noise": 0.0101,
+        "degrees_of_freedom": 2 * shots - 2,
+        "rank": 1,
+        "singular_values": np.array([3.0, 0.0]),
+        "identifiability": (
+            "The data cannot see stiffness[1]: no measured velocity depends on it.",
+        ),
+        "starts": (start(0.6, 3), start(0.4, 5)),
+        "status": np.zeros(shots, int),
+        "converged": True,
+        "steps": 17,
+        "lost_starts": 0,
+        "warnings": ("The data gain energy.",),
+        "experiments": ji.Experiments(pre, post),
+    }
+    return Fit(**(given | change))
+
+
+def start(value, count):
+    fields = {name: None for name in Start.__annotations__}
+    known = {"value": np.array([value, 2.0]), "sum_of_squares": 1e-4, "count": count}
+    return Start(**(fields | {k: v for k, v in known.items() if k in fields}))
+
+
+@pytest.mark.parametrize("shots", [1, 2, 50])
+def test_picture_of_a_fit(shots, tmp_path):
+    found = canned(shots)
+    figure = ji.plot.fit(found, {"the same": found}, title="simulated")
+    top, bottom = figure.axes
+    assert top.get_ylabel().endswith("[m/s]")
+    assert bottom.get_ylabel().endswith("[m/s]")
+    assert len(bottom.get_xticklabels()) == {1: 2, 2: 2, 50: 13}[shots]
+    figure.savefig(tmp_path / "fit.png")
+    assert (tmp_path / "fit.png").stat().st_size > 5_000
+
+
+def test_report_of_a_fit():
+    text = str(canned(4))
+    for words in ("restitution[1]", "0.6", "unseen", "rank", "1 of 2", "6 degrees of freedom"):
+        assert words in text, words
+    assert "The data gain energy." in text
+    assert "NOT converged" in str(canned(4, converged=False))
+    assert max(map(len, text.splitlines())) < 200
+
+
+def test_json_of_a_fit():
+    told = json.loads(json.dumps(canned(4).to_dict(), allow_nan=False))
+    assert told["rank"] == 1
+    assert told["degrees_of_freedom"] == 6
+    assert [row["seen"] for row in told["parameters"]] == [True, False]
+    assert told["parameters"][1]["standard_error"] is None
+
+
+def test_confidence_intervals_are_cut_at_the_bounds():
+    edge = canned(4, value=np.array([0.995, 2.0])).confidence_interval()
+    assert edge[0, 1] == 1.0
+    assert 0.9 < edge[0, 0] < 0.99
+    with pytest.raises(ValueError, match=r"`level` must lie in \(0, 1\)"):
+        canned(4).confidence_interval(95)
+
+
+def test_picture_of_a_rocking_record():
+    a, one = np.array([0.4, 1.0, 2.0, 3.0, 4.0]), np.ones((5, 1, 1))
+    gamma = np.array([[0.0, 0.0], [0.0, 0.4], [0.5, 0.04], [0.5, 0.4], [np.nan, np.nan]])
+    record = ji.theory.RockingDispersion(
+        a, np.array([0.3]), np.array([0.5]), gamma[:, None, None], one, one, one, one
+    )
+    v = ji.plot.rocking_dispersion(record)
+    np.testing.assert_allclose(v.axes[0].lines[0].get_ydata(), np.abs(gamma[:, 1]))
+    assert "critical angle 79.42 degrees" in str(record)

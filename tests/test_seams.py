@@ -1,0 +1,158 @@
+"""What lies between a law and a scene: rounding, no approach, redundant contacts, padded shots."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jimpact as ji
+from jimpact.contact import coupled_groups
+from jimpact.status import CODE
+
+FOUR = ji.chain(np.ones(4))
+ULP = np.spacing(0.7)
+# four balls side by side, their velocities apart by a few units in the last place
+SIDE_BY_SIDE = 0.7 + ULP * np.array(list(itertools.product(range(-2, 3), repeat=4)))
+
+
+def statuses(law, scene, states):
+    return np.asarray(jax.jit(jax.vmap(lambda v: ji.impact(law, scene, v).status))(states))
+
+
+def test_one_unit_in_the_last_place_is_no_impact():
+    v = np.array([0.7, 0.1 * 7, 0.7, 0.7])
+    out = ji.impact(ji.Moreau(0.9), FOUR, v)
+    assert int(out.status) == 0
+    assert np.array_equal(out.velocity, v)
+    assert not out.impulse.any()
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        ji.Newton(0.9),
+        ji.Newton([0.9, 0.5, 0.2]),
+        ji.RestitutionMatrix(0.9 * np.eye(3)),
+        ji.Binary(0.9),
+        pytest.param(ji.Poisson(0.9), marks=pytest.mark.slow),
+        pytest.param(ji.LZB(0.9), marks=pytest.mark.slow),
+        pytest.param(ji.Compliant(ji.Hertz(1.0)), marks=pytest.mark.slow),
+    ],
+    ids=lambda law: type(law).__name__,
+)
+def test_velocities_that_differ_by_rounding_are_equal(law):
+    assert not statuses(law, FOUR, SIDE_BY_SIDE).any()
+
+
+def test_a_common_velocity_does_not_hide_an_approach():
+    """2e-12 m/s of approach at 1 m/s is an impact, and its gap velocity is reversed."""
+    v = 1.0 + 1e-12 * np.array([1.0, 0.0, -1.0, -2.0])
+    out = ji.impact(ji.Newton(0.5), FOUR, v)
+    assert int(out.status) == 0
+    after = ji.gap_velocity(FOUR, out.velocity)
+    np.testing.assert_allclose(after, 0.5e-12, atol=3e-15)
+
+
+def test_rounding_keeps_its_derivative():
+    """A contact at rest that is touched: gamma- = 0 within rounding, d gamma-/dv is N^T all the same."""
+    balls, v = ji.chain(np.ones(3)), jnp.array([1.0, 0.7, 0.1 * 7])
+    exact = jnp.array([1.0, 0.7, 0.7])
+    slopes = jax.jit(jax.jacfwd(lambda v: ji.impact(ji.Newton(0.5), balls, v).velocity))
+    np.testing.assert_allclose(slopes(v), slopes(exact), atol=1e-14)
+
+
+def test_poisson_on_redundant_contacts():
+    """Two contacts of one pair of bodies: v+ depends on how they share p_c, if their e differ."""
+    pair = ji.Scene([1.0, 1.0], [[-1.0, -1.0], [1.0, 1.0]])
+
+    @jax.jit
+    def status(e):
+        return ji.impact(ji.Poisson(e), pair, jnp.array([1.0, 0.0])).status
+
+    assert int(status(jnp.array([0.5, 0.5]))) == CODE["impulse_not_unique"]
+    assert int(status(jnp.array([0.5, 0.6]))) == CODE["several_outcomes"]
+    scalar = ji.impact(ji.Poisson(0.5), pair, [1.0, 0.0])
+    assert int(scalar.status) == CODE["impulse_not_unique"]
+
+
+def test_summary_says_that_nothing_approaches():
+    pair = ji.chain([1.0, 1.0])
+    law, v = ji.Newton(0.5), np.array([-1.0, 0.0])
+    told = ji.summary(ji.impact(law, pair, v), pair, v)
+    assert "nothing approaches" in told
+    assert "none:" not in ji.summary(ji.impact(law, pair, -v), pair, -v)
+    gapped = ji.chain([1.0, 1.0], gaps=[0.1])
+    assert "only open ones do" in ji.summary(ji.impact(law, gapped, -v), gapped, -v)
+    assert "nothing approaches" in str(ji.compare(pair, v, {"newton": law}))
+
+
+def test_shots_with_different_numbers_of_contacts_are_fitted_together():
+    scenes = [
+        ji.chain([1.0, 1.0, 2.0]),
+        ji.chain([1.0, 1.0, 2.0], wall=True),
+        ji.Scene([1.0, 1.0, 2.0], [[-1.0], [1.0], [0.0]]),
+    ]
+    pre = np.array([[1.0, 0.0, -0.3], [1.0, 0.2, 0.1], [1.0, 0.2, 0.3]])
+    true = np.array([0.8, 0.6, 0.5])
+    post = [ji.impact(ji.Newton(true[: s.contacts]), s, v).velocity for s, v in zip(scenes, pre)]
+    data = ji.Experiments(pre, np.array(post), scenes=scenes)
+    found = ji.fit(ji.Newton([0.7, 0.7, 0.7]), None, data, starts=1)
+    np.testing.assert_allclose(found.value, true, atol=1e-9)
+    assert not found.status.any()
+    assert found.predicted.shape == (3, 3)
+    assert found.warnings == ()
+    excess = data.momentum_excess()
+    assert np.isnan(excess[1]).all()
+    np.testing.assert_allclose(excess[[0, 2]][:, 0], 0.0, atol=1e-14)
+
+
+def test_padding_with_friction():
+    """A cube's corner and its edge in one fit: contacts that are not there change nothing."""
+    corner = ji.Scene([1.0, 1.0, 0.5], [[0.0], [1.0], [0.4]], tangents=[[1.0], [0.0], [0.3]])
+    both = np.array([[0.0, 0.0], [1.0, 1.0], [0.4, -0.3]])
+    edge = ji.Scene([1.0, 1.0, 0.5], both, tangents=[[1.0, 1.0], [0.0, 0.0], [0.3, 0.3]])
+    pre = np.array([[0.5, -1.0, 0.1], [0.3, -1.0, 0.0]])
+    post = [ji.impact(ji.Moreau(0.4, 0.2), s, v).velocity for s, v in zip((corner, edge), pre)]
+    data = ji.Experiments(pre, np.array(post), scenes=[corner, edge])
+    found = ji.fit(ji.Moreau(0.6, 0.3), None, data, ("restitution", "friction"), starts=1)
+    np.testing.assert_allclose(found.value, [0.4, 0.2], atol=1e-8)
+
+
+def test_scenes_that_cannot_be_fitted_together():
+    tangents = [[0.0], [1.0]]
+    one = ji.Scene([1.0, 1.0], [[1.0], [0.0]], tangents=tangents)
+    with pytest.raises(ValueError, match="equally many tangents a contact"):
+        ji.Experiments(np.ones((2, 2)), np.ones((2, 2)), scenes=[one, ji.chain([1.0, 1.0])])
+
+
+PAIRS = np.array([[-1.0, 0.0, 0], [1, 0, 0], [0, -1, -1], [0, 1, 0], [0, 0, 1]])
+
+
+def test_contacts_that_do_not_feel_each_other_are_solved_apart():
+    """A pair and three balls in one scene; concrete it is solved in groups, traced as a whole."""
+    balls = ji.Scene([1.0, 2.0, 1.0, 0.5, 0.7], PAIRS)
+    assert [g.tolist() for g in coupled_groups(balls)] == [[[0, 3], [1, 2]]]
+    assert coupled_groups(ji.Scene(np.ones(3), [[-1.0, 0], [1, -1], [0, 1]])) is None
+    v, e = np.array([1.0, 0.2, 0.5, 0.1, -0.3]), np.array([0.9, 0.5, 0.3])
+    whole = jax.jit(lambda scene: ji.impact(ji.Newton(e), scene, v))(balls)
+    apart = ji.impact(ji.Newton(e), balls, v)
+    np.testing.assert_allclose(apart.velocity, whole.velocity, atol=1e-14)
+    np.testing.assert_allclose(apart.impulse, whole.impulse, atol=1e-14)
+
+
+def test_groups_with_friction_and_open_contacts():
+    normals, tangents = np.zeros((6, 3)), np.zeros((6, 3))
+    for j in range(3):
+        normals[2 * j + 1, j] = tangents[2 * j, j] = 1.0
+    tangents[1, 0] = 0.3
+    three = ji.Scene(np.linspace(1.0, 2.0, 6), normals, tangents=tangents, gaps=[0.0, 0.0, 0.1])
+    assert [g.tolist() for g in coupled_groups(three)] == [[[0], [1]]]
+    v = np.array([0.5, -1.0, 0.1, -1.0, 1.0, -1.0])
+    law = ji.Moreau([0.5, 0.2, 0.1], [0.3, 0.2, 0.1])
+    whole = jax.jit(lambda scene: ji.impact(law, scene, v))(three)
+    apart = ji.impact(law, three, v)
+    for name in ("velocity", "impulse", "tangential_impulse", "energy_change"):
+        np.testing.assert_allclose(getattr(apart, name), getattr(whole, name), atol=1e-14)
+    assert apart.velocity[4:].tolist() == [1.0, -1.0]
