@@ -149,10 +149,6 @@ class MotionFlow(eqx.Module):
         """Never: see `rooted`."""
         return jnp.zeros((1, 1), bool)
 
-    def allowance(self, modes: jax.Array, y: jax.Array) -> float:
-        """No row may err by more than the tolerance."""
-        return 1.0
-
     def coasts(self, modes: jax.Array) -> jax.Array | None:
         """Never: there are loads."""
         return None
