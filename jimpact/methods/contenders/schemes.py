@@ -37,9 +37,9 @@ from jimpact.events.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import (
+    GivenImpact,
     Method,
     MethodResult,
-    Problem,
     finite_rate,
     in_si,
     lzb_only,
@@ -74,7 +74,7 @@ DOP853_ALIGNED = Method(
 )
 
 
-class _State(NamedTuple):
+class _TimeWalk(NamedTuple):
     """Indentation, impulse, gap velocity and force (m,), steps taken."""
 
     x: jax.Array
@@ -89,7 +89,7 @@ def _solve_time_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Meth
     flow, before = given.flow, given.inputs.gamma
     h = jnp.asarray(setting, before.dtype)
 
-    def advance(walk: _State) -> _State:
+    def advance(walk: _TimeWalk) -> _TimeWalk:
         def at(part: jax.Array, dx: jax.Array, dp: jax.Array) -> tuple[jax.Array, jax.Array]:
             return time_form(flow, before, walk.x + part * dx, walk.p + part * dp)
 
@@ -103,7 +103,7 @@ def _solve_time_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Meth
         )
         p = walk.p + dp
         x = jnp.maximum(walk.x + dx, 0.0)
-        return _State(x, p, before + flow.coupling @ p, walk.force, walk.steps + 1)
+        return _TimeWalk(x, p, before + flow.coupling @ p, walk.force, walk.steps + 1)
 
     end = _run(given, advance)
     return in_si(given, end.p, h * end.steps.astype(h.dtype), 4 * end.steps, _code(end))
@@ -114,13 +114,13 @@ def _solve_verlet(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Method
     flow, before = given.flow, given.inputs.gamma
     h = jnp.asarray(setting, before.dtype)
 
-    def advance(walk: _State) -> _State:
+    def advance(walk: _TimeWalk) -> _TimeWalk:
         p = walk.p + 0.5 * h * walk.force
         closing, _ = time_form(flow, before, walk.x, p)  # compression or expansion: at mid-step
         x = jnp.maximum(walk.x + h * closing, 0.0)
         _, force = time_form(flow, before, x, p)
         p = p + 0.5 * h * force
-        return _State(x, p, before + flow.coupling @ p, force, walk.steps + 1)
+        return _TimeWalk(x, p, before + flow.coupling @ p, force, walk.steps + 1)
 
     end = _run(given, advance)
     return in_si(
@@ -128,21 +128,21 @@ def _solve_verlet(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Method
     )  # one force a step
 
 
-def _run(given: Problem, advance: Any) -> _State:
+def _run(given: GivenImpact, advance: Any) -> _TimeWalk:
     x, gamma, zero = given.x, given.inputs.gamma, jnp.zeros_like(given.inputs.gamma)
     _, force = time_form(given.flow, gamma, x, zero)
     return jax.lax.while_loop(
         lambda w: _at_work(w) & (w.steps < given.max_steps),
         advance,
-        _State(x, zero, gamma, force, jnp.zeros((), jnp.int32)),
+        _TimeWalk(x, zero, gamma, force, jnp.zeros((), jnp.int32)),
     )
 
 
-def _at_work(walk: _State) -> jax.Array:
+def _at_work(walk: _TimeWalk) -> jax.Array:
     return jnp.any((walk.x > 0) | (walk.gamma < 0))
 
 
-def _code(end: _State) -> jax.Array:
+def _code(end: _TimeWalk) -> jax.Array:
     return jnp.where(_at_work(end), CODE["max_steps"], CODE["ok"])
 
 
@@ -184,14 +184,14 @@ def _solve_impulse_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> M
     return _result(given, end, len(_NODES))
 
 
-def _start(given: Problem) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _start(given: GivenImpact) -> tuple[jax.Array, jax.Array, jax.Array]:
     x = given.x
     eta = jnp.asarray(given.flow.exponent, x.dtype)
     energy = 0.5 * jnp.where(x > 0, jnp.where(x > 0, x, 1.0) ** (eta + 1), 0.0)
     return given.inputs.gamma, energy, given.inputs.step[0]
 
 
-def _result(given: Problem, end: Walk, stages: int) -> MethodResult:
+def _result(given: GivenImpact, end: Walk, stages: int) -> MethodResult:
     code = jnp.where(impulse_form.at_work(end), CODE["max_steps"], CODE["ok"])
     return in_si(given, end.p, jnp.full_like(end.p[0], jnp.nan), stages * end.steps, code)
 
