@@ -113,7 +113,7 @@ def _block(
 
 
 class Unknown(NamedTuple):
-    """A stiffness that is only known within a range: of `contact`, over that of contact `base` (None: SI)."""
+    """A stiffness known within a range only: of `contact`, over that of `base` (None: SI)."""
 
     contact: int
     base: int | None
