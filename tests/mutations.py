@@ -76,7 +76,7 @@ MUTATIONS = [
     # --- data, sampling, motion
     Mutation("a unit", r"\"in/s\": 0\.0254", '"in/s": 0.254', ("test_experiments.py",), "experiments.py"),
     Mutation("the seed of a chunk", r"jax\.random\.fold_in\(key, np\.uint32\(task\.number\)\)", "key", ("test_montecarlo.py",), "planning.py"),
-    Mutation("variance by n", r"/ \(([^)]*count[^)]*) - 1\)", r"/ (\1)", ("test_montecarlo.py",), "m*.py"),
+    Mutation("variance by n", r"/ \(([^)]*count[^)]*) - 1\)", r"/ (\1)", ("test_montecarlo.py",), "statistics.py"),
     Mutation("restitution in the base's frame", r"velocity_after = ", "velocity_after = 0.999 * ", ("test_motion.py",), "*.py"),
 ]  # fmt: skip
 
