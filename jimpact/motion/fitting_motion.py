@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
-from jimpact.fits.least_squares import Box, State, advance, begin
+from jimpact.fits.least_squares import Box, SolverState, advance, begin
 from jimpact.fits.parameters import (
     Parameters,
     bounds_of,
@@ -213,7 +213,7 @@ def _evaluate(problem: _Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, ja
 
 
 @eqx.filter_jit
-def _solve(problem: _Problem, box: Box, y: jax.Array, passes: int) -> State:
+def _solve(problem: _Problem, box: Box, y: jax.Array, passes: int) -> SolverState:
     def evaluate(y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         return _evaluate(problem, y)
 
@@ -225,7 +225,7 @@ def _solve(problem: _Problem, box: Box, y: jax.Array, passes: int) -> State:
 
 def _report(
     problem: _Problem,
-    state: State,
+    state: SolverState,
     parameters: Parameters,
     here: np.ndarray,
     size: float,
