@@ -79,23 +79,6 @@ def test_a_single_impact_is_one_of_a_batch():
         assert int(out.status) == same.status[i]
 
 
-def light_and_stiff(count):
-    """Contacts that turn back twice within one period of the fastest: events inside a step."""
-    rng = np.random.default_rng(1)
-    rows = [chain([1.0, 1e-3, 1.0, 1.0], [1, 0, 0, 0.5], e=0.9, eta=1)]
-    for _ in range(count - 1):
-        rows.append(
-            chain(
-                10 ** rng.uniform(-3, 1, 4),
-                [1.0, 0, 0, 0],
-                e=rng.uniform(0.3, 1),
-                k=10 ** rng.uniform(-3, 3, 3),
-                eta=1,
-            )
-        )
-    return rows
-
-
 def test_impulse_form():
     """Liu, Zhao and Brogliato's published scheme: of first order, the same law."""
     given = states(1.5)[:2]

@@ -1,5 +1,6 @@
 """Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
 
+import abc
 import dataclasses
 import math
 from typing import Any, NamedTuple
@@ -103,6 +104,7 @@ class MotionFlow(eqx.Module):
     root = 1
     longest = math.inf
     near = 0.0
+    longest = math.inf  # no rate is large beside the others
 
     @property
     def contacts(self) -> int:
@@ -134,6 +136,22 @@ class MotionFlow(eqx.Module):
     def snap(self) -> jax.Array:
         """Margins are in units of their rounding."""
         return jnp.ones((1, 1), self.errors.dtype)
+
+    @abc.abstractmethod
+    def constants(self, modes: jax.Array) -> Any:
+        """What of the field does not change while the modes last."""
+
+    @abc.abstractmethod
+    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of all rows."""
+
+    @abc.abstractmethod
+    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Each is >= 0 while its mode lasts; the last is the time left to the next sample."""
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> float:
+        """Tolerances that the error of each row may be."""
+        return 1.0
 
     def from_margins(self, margins: jax.Array, at: State) -> jax.Array:
         """Rows (k, 1) of margins, with that of the next sample."""

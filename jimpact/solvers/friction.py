@@ -101,8 +101,9 @@ def solve(
         looked for. `impulse_not_unique`: only the impulses differ. `infeasible`: no modes are
         consistent; `max_steps`: none were found (in space, above 3 contacts).
 
-    Derivatives of any order hold the modes, which is one-sided where they are about to change;
-    those of shared impulses take the singular matrix to keep its rank.
+    Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are
+    about to change, and take a singular matrix to keep its rank; those of impulses that are not
+    unique hold the directions in which they are free.
 
     Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247 (planar existence).
 
@@ -136,8 +137,6 @@ def solve(
     shared = jnp.any(jnp.abs(inverted.pairs) > 0)
     status = jnp.maximum(status, jnp.where(shared, CODE["impulse_not_unique"], CODE["ok"]))
     x = _on_modes(problem, modes, inverted, x)
-    wrong = _misfit(fixed, jax.lax.stop_gradient(x)[..., None])[0] > problem.tolerance
-    status = jnp.where(wrong, jnp.maximum(status, CODE["infeasible"]), status)
     x = x * scale * size
     return FrictionImpulses(x[:, 0], x[:, 1:].reshape(-1), status)
 
@@ -252,10 +251,11 @@ def _solved(problem: _Problem, modes: _Modes) -> jax.Array:
         return jnp.where(gone, 0.0, inverse) - spread
 
     inverse = jax.lax.fori_loop(0, m, pivot, matrix)
-    x = _times(inverse, right)
-    for _ in range(2):
-        x = x + _times(inverse, right - _times(matrix, x))
-    return x
+
+    def refine(_: int, x: jax.Array) -> jax.Array:
+        return x + _times(inverse, right - _times(matrix, x))
+
+    return jax.lax.fori_loop(0, 3, refine, jnp.zeros_like(right))
 
 
 def _inverse(block: jax.Array, perturbed: float) -> jax.Array:
@@ -405,26 +405,21 @@ def _most_at_rest(problem: _Problem, modes: _Modes, x: jax.Array) -> tuple[_Mode
 def _on_modes(problem: _Problem, modes: _Modes, inverted: _Inverted, x: jax.Array) -> jax.Array:
     """x (m, b) on its modes, with derivatives up to the third, by as many chord steps.
 
-    With y = x / D and N the null space of B it solves `B y = f`, `N^T (D W D) y = 0`, or holds
-    `N^T y`.
+    With y = x / D it solves `B y = f` and `V_0^T (D W D) y = 0`, or holds `V_0^T y`.
     """
     shape, n = x.shape, x.size
-    pairs, weight = inverted.pairs, inverted.weight.reshape(n)
+    weight = inverted.weight.reshape(n)
+    start = x.reshape(n) / weight
 
-    def step(_: int, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        y, null = state
+    def step(_: int, y: jax.Array) -> jax.Array:
         x = (weight * y).reshape(shape)
         matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
-        scaled = matrix.reshape(n, n) * weight[None]
-        shared = weight * _weights(problem, x).reshape(n) * weight
-        null = null - inverted.inverse @ (scaled @ null + pairs @ null - pairs)
-        least = jnp.where(inverted.held, y - start, null.T @ (shared * y))
-        missed = scaled @ y - right.reshape(n) + pairs @ least
-        return y - inverted.inverse @ missed, null
+        shared = weight**2 * _weights(problem, x).reshape(n) * y
+        free = inverted.pairs @ jnp.where(inverted.held, y - start, shared)
+        missed = matrix.reshape(n, n) @ x.reshape(n) - right.reshape(n) + free
+        return y - inverted.inverse @ missed
 
-    start = x.reshape(n) / weight
-    y, _ = jax.lax.fori_loop(0, 3, step, (start, pairs.T @ pairs))
-    return (weight * y).reshape(shape)
+    return (weight * jax.lax.fori_loop(0, 3, step, start)).reshape(shape)
 
 
 # ------------------------------------------------------------------- many contacts

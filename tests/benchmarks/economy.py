@@ -6,6 +6,7 @@ unless said otherwise. `saving` = full / lean, median and quartiles of the repea
 should cost the same (what is not asked for costs nothing) the aim is 1.
 """
 
+import functools
 from unittest import mock
 
 from harness import alternating, arguments, quartiles, save_figure, show, stage, timed, write_csv

@@ -1,0 +1,271 @@
+"""The friction solver against brute force: every outcome, how many there are, and derivatives.
+
+Scenes of fewer contacts are padded with contacts that take no part, so that all planar questions
+share one compiled program for each of the two laws, and all spatial ones another.
+"""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jimpact as ji
+from jimpact.solvers.friction import solve
+from jimpact.status import CODE
+
+PLANAR, SPATIAL, LANES = 3, 2, 128
+CONTACTS = {1: PLANAR, 2: SPATIAL}
+close = np.testing.assert_allclose
+
+
+def question(rows, complementary):
+    return jax.jit(jax.vmap(lambda *given: solve(*given, complementary=complementary)))
+
+
+ASK = {key: question(*key) for key in itertools.product((1, 2), (True, False))}
+
+
+def padded(rows, scenes):
+    """Lanes of (A, a, b, mu) from scenes of (A, a, b, mu) with fewer contacts."""
+    most = CONTACTS[rows]
+    lanes = []
+    for a, normal, slip, mu in scenes:
+        m = len(normal)
+        index = np.concatenate([np.arange(m), most + np.arange(rows * m)])
+        matrix = np.eye((1 + rows) * most)
+        matrix[np.ix_(index, index)] = a
+        lanes.append(
+            (
+                matrix,
+                np.pad(normal, (0, most - m)),
+                np.pad(slip, (0, rows * (most - m))),
+                np.pad(mu, (0, most - m)),
+            )
+        )
+    lanes += [lanes[-1]] * (LANES - len(lanes))
+    return [np.stack(x) for x in zip(*lanes, strict=True)]
+
+
+def random_scene(rng, m, rows, most_mu=1.5):
+    size = (1 + rows) * m
+    directions = rng.normal(size=(size + 1, size))
+    v = rng.normal(size=size + 1)
+    gap = directions.T @ v
+    return (
+        directions.T @ directions,
+        1.5 * gap[:m],
+        1.1 * gap[m:],
+        rng.uniform(0, most_mu, m),
+    )
+
+
+def random_scenes(rows, seed=1):
+    rng = np.random.default_rng(seed)
+    counts = np.arange(LANES) % CONTACTS[rows] + 1
+    return padded(rows, [random_scene(rng, m, rows) for m in counts])
+
+
+def rates(lanes, found):
+    x = np.concatenate([found.normal, found.tangential], axis=1)
+    return x, np.concatenate(lanes[1:3], axis=1) + np.einsum("bij,bj->bi", lanes[0], x)
+
+
+# ------------------------------------------------------------------------- all outcomes
+
+
+def outcomes(a, normal, slip, mu, complementary):
+    """Velocities of all planar modes that are consistent."""
+    m, given, found = len(mu), np.concatenate([normal, slip]), []
+    for modes in itertools.product((0, 1, -1, None), repeat=m):
+        matrix, right, unit = a.copy(), -given, np.eye(2 * m)
+        for i, xi in enumerate(modes):
+            if xi != 0:
+                matrix[m + i], right[m + i] = unit[m + i], 0.0
+                matrix[m + i, i] = 0.0 if xi is None else mu[i] * xi
+            if xi is None and complementary:
+                matrix[i], right[i] = unit[i], 0.0
+        if abs(np.linalg.det(matrix)) < 1e-12:
+            continue
+        x = np.linalg.solve(matrix, right)
+        w = a @ x + given
+        room = 1e-9 * (1 + np.abs(x).max())
+        p, side, r, s = x[:m], x[m:], w[:m], w[m:]
+        fits = all(
+            (r[i] >= -room if complementary else p[i] <= room)
+            if xi is None
+            else p[i] >= -room
+            and (xi * s[i] >= -room if xi else abs(side[i]) <= mu[i] * p[i] + room)
+            for i, xi in enumerate(modes)
+        )
+        if fits and not any(np.abs(w - other).max() < 1e3 * room for other in found):
+            found.append(w)
+    return found
+
+
+@pytest.mark.parametrize("complementary", [True, False])
+def test_planar_outcomes_are_those_of_brute_force(complementary):
+    seen = {"several_outcomes": 0, "ok": 0, "infeasible": 0}
+    rng = np.random.default_rng(2)
+    scenes = [random_scene(rng, 1 + i % 3, 1, 3.0) for i in range(LANES)]
+    lanes = padded(1, scenes)
+    found = ASK[1, complementary](*lanes)
+    x, w = rates(lanes, found)
+    for i, (a, normal, slip, mu) in enumerate(scenes):
+        m, all_of_them = len(mu), outcomes(a, normal, slip, mu, complementary)
+        expected = ("infeasible", "ok", "several_outcomes")[min(len(all_of_them), 2)]
+        assert int(found.status[i]) == CODE[expected]
+        seen[expected] += 1
+        if all_of_them:
+            own = w[i][np.r_[:m, PLANAR : PLANAR + m]]
+            assert min(np.abs(own - one).max() for one in all_of_them) <= 1e-11 * np.abs(x[i]).max()
+    assert seen["several_outcomes"] >= 3
+
+
+def misfit(lanes, found, rows, complementary):
+    """How far outcomes are from the law: complementarity, the disc, and greatest dissipation."""
+    x, w = rates(lanes, found)
+    m = CONTACTS[rows]
+    p, r = x[:, :m], w[:, :m]
+    side, slip = (y[:, m:].reshape(-1, m, rows) for y in (x, w))
+    bound = lanes[3] * np.maximum(p, 0)
+    normal = np.abs(np.minimum(p, r) if complementary else r)
+    outside = np.linalg.norm(side, axis=2) - bound
+    power = np.abs(bound * np.linalg.norm(slip, axis=2) + np.sum(side * slip, axis=2))
+    return np.maximum(np.maximum(normal, outside), power).max(axis=1) / (1 + np.abs(x).max(axis=1))
+
+
+@pytest.mark.parametrize("complementary", [True, False])
+def test_spatial_outcomes_satisfy_the_law(complementary):
+    lanes = random_scenes(2)
+    found = ASK[2, complementary](*lanes)
+    solved = np.asarray(found.status) <= CODE["several_outcomes"]
+    assert solved.mean() > 0.98
+    assert misfit(lanes, found, 2, complementary)[solved].max() < 1e-10
+    side = np.linalg.norm(np.asarray(found.tangential).reshape(LANES, SPATIAL, 2), axis=2)
+    sticks = (side < 0.99 * lanes[3] * found.normal).sum()
+    assert 20 < sticks < LANES  # both modes are there
+
+
+def test_a_scene_in_space_may_have_several_outcomes():
+    """Planar scenes that do, with a second tangential direction that nothing moves along."""
+    rng = np.random.default_rng(4)
+    scenes = []
+    while len(scenes) < 8:
+        a, normal, slip, mu = random_scene(rng, 2, 1, 3.0)
+        if len(outcomes(a, normal, slip, mu, True)) > 1:
+            index = np.array([0, 1, 2, 4])
+            matrix = np.eye(6)
+            matrix[np.ix_(index, index)] = a
+            scenes.append((matrix, normal, np.array([slip[0], 0, slip[1], 0]), mu))
+    found = ASK[2, True](*padded(2, scenes))
+    assert (np.asarray(found.status)[:8] == CODE["several_outcomes"]).all()
+
+
+def test_three_solutions_of_moreau():
+    """25 of 381 random scenes with two contacts were like this one, and said ok."""
+    scene = ji.Scene(
+        [1.0] * 4,
+        [[2.0, 0.0], [0.0, 0.0], [2.0, 1.0], [0.0, 1.0]],
+        tangents=[[-2.0, 2.0], [0.0, 1.0], [0.0, 1.0], [0.0, 2.0]],
+    )
+    v = np.array([-2.0, 2.0, -2.0, 1.0])
+    out = ji.impact(ji.Moreau(0.0, friction=1.0), scene, v)
+    assert int(out.status) == CODE["several_outcomes"]
+
+
+# ------------------------------------------------------------------------- shared impulses
+
+
+def test_a_block_lying_flat_shares_by_its_load():
+    """Both tangential directions are the same: only the sum of what the corners hold counts."""
+    rng = np.random.default_rng(5)
+    for rows in (1, 2):
+        scenes, loads = [], rng.uniform(0.2, 1, (LANES, 2))
+        hold = 0.5 * loads.sum(axis=1)  # with mu = 1 half of what friction could
+        for load, push in zip(loads, hold, strict=True):
+            side = np.kron(np.ones((2, 2)), np.eye(rows))
+            a = np.block([[np.eye(2), np.zeros((2, 2 * rows))], [np.zeros((2 * rows, 2)), side]])
+            scenes.append((a, -load, -push * np.tile(np.eye(rows)[0], 2), np.ones(2)))
+        found = ASK[rows, True](*padded(rows, scenes))
+        assert (np.asarray(found.status) == CODE["impulse_not_unique"]).all()
+        close(found.normal[:, :2], loads, rtol=1e-13)
+        side = np.asarray(found.tangential)[:, [0, rows]]
+        close(side, 0.5 * loads, rtol=1e-12)
+
+
+def test_redundant_supports_press_least():
+    """Three contacts in a line under one body, no slip: p of least norm, where it may push."""
+    x = np.array([-1.0, 0.0, 1.0])
+    normals = np.stack([np.ones(3), x])  # height and turn
+    a = np.eye(6)
+    a[:3, :3] = normals.T @ normals
+    rng = np.random.default_rng(6)
+    loads = normals.T @ np.stack([-np.ones(LANES), rng.uniform(-1.4, 1.4, LANES)])
+    zero = np.zeros(3)
+    lanes = padded(1, [(a, load, zero, zero) for load in loads.T])
+    found = ASK[1, True](*lanes)
+    norm = np.sqrt(np.diag(a)[:3])  # least are the normalized impulses |grad f| p
+    least = -np.linalg.pinv(a[:3, :3] / norm) @ loads / norm[:, None]
+    pushes = (least > 0).all(axis=0)
+    close(np.asarray(found.normal)[pushes], least.T[pushes], atol=1e-12)
+    assert misfit(lanes, found, 1, True).max() < 1e-12
+    assert 0 < pushes.sum() < LANES
+
+
+# ------------------------------------------------------------------------- derivatives
+
+
+def along(rows, complementary):
+    """First and second derivatives along a direction: forward, reverse, forward over reverse."""
+
+    def one(start, way, weight):
+        def at(h):
+            given = jax.tree.map(lambda x, dx: x + h * dx, start, way)
+            found = solve(*given, complementary=complementary)
+            return jnp.concatenate([found.normal, found.tangential])
+
+        def slope(h):
+            return jax.jvp(at, (h,), (jnp.ones_like(h),))[1]
+
+        zero = jnp.zeros(())
+        both = jax.jvp(slope, (zero,), (jnp.ones(()),))
+        back = jax.jvp(jax.grad(lambda h: at(h) @ weight), (zero,), (jnp.ones(()),))
+        return *both, *back
+
+    return jax.jit(jax.vmap(one))
+
+
+@pytest.mark.parametrize(("rows", "complementary"), [(1, True), (2, True), (2, False)])
+def test_derivatives(rows, complementary):
+    rng = np.random.default_rng(7)
+    lanes = random_scenes(rows, seed=8)
+    m = CONTACTS[rows]
+    there = lanes[3] > 0
+    every = np.concatenate([there, np.repeat(there, rows, axis=1)], axis=1)
+    way = [rng.normal(size=x.shape) for x in lanes]
+    way[0] = (way[0] + way[0].transpose(0, 2, 1)) * every[:, :, None] * every[:, None]
+    way = [way[0], way[1] * there, way[2] * every[:, m:], way[3] * there]
+    weight = rng.normal(size=every.shape)
+    slope, bend, back, back_bend = along(rows, complementary)(lanes, way, weight)
+
+    def values(h):
+        found = ASK[rows, complementary](*(x + h * dx for x, dx in zip(lanes, way, strict=True)))
+        return np.concatenate([found.normal, found.tangential], axis=1), np.asarray(found.status)
+
+    h = 2e-4
+    (low2, _), (low, s0), (mid, s1), (high, s2), (high2, _) = (
+        values(k * h) for k in (-2, -1, 0, 1, 2)
+    )
+    first = (8 * (high - low) - (high2 - low2)) / (12 * h)
+    second = (16 * (high + low) - (high2 + low2) - 30 * mid) / (12 * h**2)
+    # generic lanes: one outcome, and no change of modes within the differences
+    size = 1 + np.abs(second).max(axis=1, keepdims=True)
+    rough = (high - 2 * mid + low) / h**2
+    smooth = (np.abs(rough - second) < 1e-3 * size).all(axis=1) & ((s0 + s1 + s2) == 0)
+    assert smooth.mean() > 0.8
+    close((slope / size)[smooth], (first / size)[smooth], atol=1e-8)
+    close((bend / size)[smooth], (second / size)[smooth], atol=1e-4)
+    close(back, np.sum(slope * weight, axis=1), rtol=1e-9, atol=1e-9)
+    close(back_bend / size[:, 0], np.sum(bend * weight, axis=1) / size[:, 0], atol=1e-9)
