@@ -102,7 +102,6 @@ class MotionFlow(eqx.Module):
     like: State  # of its shapes
 
     root = 1
-    longest = math.inf
     near = 0.0
     longest = math.inf  # no rate is large beside the others
 
@@ -120,18 +119,6 @@ class MotionFlow(eqx.Module):
         """Errors that a step may make in each row (rows, 1)."""
         return self.errors
 
-    def constants(self, modes: jax.Array) -> Any:
-        """What of the field does not change while the modes last."""
-        raise NotImplementedError
-
-    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of the state."""
-        raise NotImplementedError
-
-    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """What must stay positive."""
-        raise NotImplementedError
-
     @property
     def snap(self) -> jax.Array:
         """Margins are in units of their rounding."""
@@ -148,10 +135,6 @@ class MotionFlow(eqx.Module):
     @abc.abstractmethod
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Each is >= 0 while its mode lasts; the last is the time left to the next sample."""
-
-    def allowance(self, modes: jax.Array, y: jax.Array) -> float:
-        """Tolerances that the error of each row may be."""
-        return 1.0
 
     def from_margins(self, margins: jax.Array, at: State) -> jax.Array:
         """Rows (k, 1) of margins, with that of the next sample."""
