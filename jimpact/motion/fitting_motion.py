@@ -36,7 +36,8 @@ class MotionFit:
     """What `fit_motion` found; `print(fit)` is a report.
 
     `standard_error` is inf for parameters that the record does not determine (`unseen` says
-    which combinations); `noise` is the estimated error of the measurement, or 1 with `sigma`.
+    which combinations); `degrees_of_freedom` is measured values less `rank`; `noise` is the
+    estimated error of the measurement, or 1 with `sigma`.
     """
 
     law: Law
@@ -45,6 +46,7 @@ class MotionFit:
     standard_error: np.ndarray
     covariance: np.ndarray
     rank: int
+    degrees_of_freedom: int
     unseen: tuple[str, ...]
     noise: float
     predicted: np.ndarray
@@ -256,6 +258,7 @@ def _report(
         standard_error=lines.standard_error,
         covariance=lines.covariance,
         rank=lines.rank,
+        degrees_of_freedom=int(here.sum()) - lines.rank,
         unseen=tuple(s.replace("measured velocity", "measured value") for s in lines.unseen),
         noise=lines.noise,
         predicted=predicted,
