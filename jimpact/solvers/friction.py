@@ -12,6 +12,7 @@ singular on the modes (both corners of a block lying flat), sticking contacts sh
 in proportion to mu p, and normal impulses are the least, wherever that is allowed.
 """
 
+import functools
 import itertools
 from typing import NamedTuple
 
@@ -33,9 +34,10 @@ _COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8  # tolerances of the sweeps; each is 
 # What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
 # contacts that reach their cone while others hold them: sweeps bring those to rest slowly.
 _ROOM, _SLOW_ROOM = 10.0, 100.0
-SHARING_SWEEPS = 200  # of the projected Gauss-Seidel iteration of `distribute`, at most
-_SETTLED = 1e-13  # of the largest limit: a sweep of it that changes less is the last
-INSIDE = 1e-9  # part of the limit below which a force is inside the disc
+# `distribute`: part of the stiffness beside K that decides only where K is singular; sweeps over
+# the contacts, at most; change in one, in the largest limit, with which they end; part of the scale
+# below which a force is inside its disc, and a rate is none
+_SHARING, _RELAXATIONS, _SETTLED, _INSIDE = 1e-7, 200, 1e-13, 1e-9
 
 
 class FrictionImpulses(NamedTuple):
@@ -524,52 +526,132 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
 # ------------------------------------------------------------------- known normal forces
 
 
-def _lengths(side: jax.Array, rows: int) -> jax.Array:
-    """|lambda_j| (m, B) of tangential rows (t, B)."""
-    return jnp.sqrt(jnp.sum(side.reshape(-1, rows, *side.shape[1:]) ** 2, axis=1))
-
-
 def distribute(
     matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Of the contacts `asked` (m, B): whether they stick, else the direction (t, B) of slip.
+    """Of the contacts `asked`: who sticks, and where the others slide to; the forces are known.
 
-    `matrix` (t, t, B), `rate` (t, B) of slip without their forces, `limit` mu F (m, B); t is m in
-    the plane, 2 m (contact-major) in space. A contact in space that others hold on the rim of its
-    disc counts as sliding, at speed 0; its direction is that against its force.
+    Equation: `u' = rate + K lambda`, lambda in the discs |lambda_j| <= limit_j,
+    `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. Where K is singular
+    lambda is shared in proportion to the limits. A decision, without derivatives.
+
+    Args:
+        matrix: K (t, t, B), positive semidefinite, t = m (planar) or 2 m, contact-major.
+        rate: (t, B) u' without the forces of these contacts.
+        limit: mu F (m, B).
+        asked: (m, B); other contacts have no force here.
+
+    Returns:
+        Who sticks (m, B), and the directions (t, B) of slip of the others. A contact in
+        space that others hold on the rim of its disc counts as sliding, at speed 0, against its
+        force. Planar with up to 3 contacts all modes are compared. Otherwise contacts are relaxed
+        in turn; of strongly coupled ones near the rim the last to settle may be wrong.
+
+    >>> import jax.numpy as jnp
+    >>> from jimpact.solvers.friction import distribute
+    >>> k, asked = jnp.ones((2, 2, 1)), jnp.ones((2, 1), bool)  # both corners of a block
+    >>> stick, slip = distribute(k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), asked)
+    >>> stick[:, 0].tolist(), slip[:, 0].tolist()
+    ([False, False], [1.0, 1.0])
     """
-    m = len(limit)
-    rows = len(rate) // m
-    every = jnp.repeat(asked, rows, axis=0)
-    rate = jnp.where(every, rate, 0.0)
-    least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
-
-    def slip(side: jax.Array) -> jax.Array:
-        return sum(matrix[:, i] * side[i : i + 1] for i in range(m * rows)) + rate
-
-    def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
-        before, _, count = carry
-        side = before
-        for j in range(m):
-            at = slice(rows * j, rows * (j + 1))
-            total = sum(matrix[i, i] for i in range(at.start, at.stop))[None]  # no step is too long
-            tried = side[at] - slip(side)[at] / total
-            length = _lengths(tried, rows)
-            over = length > limit[j : j + 1]
-            tried = jnp.where(
-                over, tried * (limit[j : j + 1] / jnp.where(over, length, 1.0)), tried
-            )
-            side = side.at[at].set(jnp.where(asked[j : j + 1], tried, 0.0))
-        moves = jnp.any(jnp.abs(side - before) > least)
-        return side, moves, count + 1
-
-    side, _, _ = jax.lax.while_loop(
-        lambda c: c[1] & (c[2] < SHARING_SWEEPS), sweep, (jnp.zeros_like(rate), jnp.any(asked), 0)
-    )
-    left = jnp.where(every, slip(side), 0.0)
-    stick = _lengths(side, rows) < (1 - INSIDE) * limit
+    matrix, rate, limit = jax.lax.stop_gradient((matrix, rate, limit))
+    m, rows = len(limit), len(matrix) // len(limit)
+    limit = jnp.where(asked, limit, 0.0)
+    each = jnp.repeat(asked, rows, axis=0)
+    matrix = jnp.where(each[:, None] & each[None], matrix, 0.0)
+    rate = jnp.where(each, rate, 0.0)
+    if rows == 1 and m <= ENUMERATED:
+        slip = _compared(matrix, rate, limit, asked)
+        return asked & (slip == 0), slip
+    force = _relaxed(matrix, rate, limit)
+    slip = rate + _times_rows(matrix, force)
+    stick = _lengths(force, rows) < (1 - _INSIDE) * limit
     if rows == 1:
         scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
-        stick = stick | (jnp.abs(left) <= INSIDE * scale)
-    pushed = jnp.repeat(_lengths(side, rows) > 0, rows, axis=0)
-    return asked & stick, jnp.where(pushed, -side, left)
+        stick = stick | (jnp.abs(slip) <= _INSIDE * scale)
+    pushed = jnp.repeat(_lengths(force, rows) > 0, rows, axis=0)
+    return asked & stick, jnp.where(pushed, -force, slip)
+
+
+def _compared(matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array) -> jax.Array:
+    """Signs of slip (m, B): of all modes (N, first axis) those that break the law least.
+
+    Written out by contacts, so that it compiles to a few kernels.
+    """
+    m = len(limit)
+    table = np.array(sorted(itertools.product((0, 1, -1), repeat=m), key=np.count_nonzero))
+    every = range(m)
+    mode = [jnp.asarray(table[:, j, None], matrix.dtype) for j in every]
+    sticks = [mode[j] == 0 for j in every]
+    most, pull = [limit[None, j] for j in every], [rate[None, j] for j in every]
+    k = [[matrix[None, i, j] for j in every] for i in every]
+    top = functools.reduce(jnp.maximum, most)
+    root = [jnp.sqrt(x / jnp.where(top > 0, top, 1.0)) for x in most]
+    stiffness = functools.reduce(jnp.maximum, [k[j][j] for j in every])
+    share = _SHARING * jnp.where(stiffness > 0, stiffness, 1.0)
+    a = [
+        [jnp.where(sticks[i] & sticks[j], root[i] * root[j] * k[i][j], 0.0) for j in every]
+        for i in every
+    ]
+    for j in every:
+        a[j][j] = a[j][j] + jnp.where(sticks[j], share, 1.0)
+    for p in every:  # L D L^T of a positive definite matrix
+        for i in range(p + 1, m):
+            factor = a[p][i] / a[p][p]
+            for j in range(i, m):
+                a[i][j] = a[i][j] - factor * a[p][j]
+            a[i][p] = factor
+    force = [-mode[j] * most[j] for j in every]
+
+    def slips() -> list[jax.Array]:
+        return [sum((k[i][j] * force[j] for j in every), pull[i]) for i in every]
+
+    for _ in range(2):  # the first solves, the second takes back what the sharing has changed
+        y = [jnp.where(sticks[j], -root[j] * slip, 0.0) for j, slip in enumerate(slips())]
+        for i in every:
+            y[i] = sum((-a[i][j] * y[j] for j in range(i)), y[i])
+        for i in reversed(every):
+            y[i] = sum((-a[i][j] * y[j] for j in range(i + 1, m)), y[i]) / a[i][i]
+        force = [force[j] + root[j] * y[j] for j in every]
+    worst, scale = jnp.zeros_like(force[0]), jnp.zeros_like(top)
+    for j, slip in enumerate(slips()):
+        beyond = k[j][j] * (jnp.abs(force[j]) - most[j])
+        wrong = jnp.where(sticks[j], jnp.maximum(beyond, jnp.abs(slip)), -mode[j] * slip)
+        wrong = jnp.where(sticks[j] | asked[None, j], wrong, jnp.inf)
+        worst = jnp.maximum(worst, wrong)
+        scale = jnp.maximum(scale, jnp.abs(pull[j]) + k[j][j] * most[j])
+    best = jnp.argmin(jnp.where(worst <= _INSIDE * scale, 0.0, worst), axis=0)
+    return jnp.asarray(table.T, matrix.dtype)[:, best]
+
+
+def _times_rows(matrix: jax.Array, force: jax.Array) -> jax.Array:
+    """`K lambda` (t, B)."""
+    return functools.reduce(jnp.add, [matrix[:, i] * force[i][None] for i in range(len(force))])
+
+
+def _lengths(force: jax.Array, rows: int) -> jax.Array:
+    """|lambda_j| (m, B) of tangential rows (t, B)."""
+    return jnp.sqrt(jnp.sum(force.reshape(-1, rows, *force.shape[1:]) ** 2, axis=1))
+
+
+def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
+    """lambda (t, B) by projected Gauss-Seidel sweeps."""
+    rows = len(rate) // len(limit)
+    least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
+    State = tuple[jax.Array, jax.Array, jax.Array]
+
+    def sweep(state: State) -> State:
+        before, _, count = state
+        force = before
+        for j in range(len(limit)):
+            at, most = slice(rows * j, rows * (j + 1)), limit[j : j + 1]
+            stiffness = functools.reduce(jnp.add, [matrix[i, i] for i in range(at.start, at.stop)])
+            stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[None]  # no step is too long
+            tried = force[at] - (rate[at] + _times_rows(matrix[at], force)) / stiffness
+            length = _lengths(tried, rows)
+            shrink = jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
+            force = force.at[at].set(tried * shrink)
+        return force, jnp.any(jnp.abs(force - before) > least), count + 1
+
+    start = (jnp.zeros_like(rate), jnp.any(limit > 0), jnp.asarray(0))
+    return jax.lax.while_loop(lambda s: s[1] & (s[2] < _RELAXATIONS), sweep, start)[0]
