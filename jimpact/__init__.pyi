@@ -30,13 +30,12 @@ from .fits.fitting import Fit as Fit, fit as fit
 from .histories import history as history
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .law import (
-    REGISTRY as REGISTRY,
     Impulses as Impulses,
     Law as Law,
     option as option,
     parameter as parameter,
-    register as register,
 )
+from .laws import REGISTRY as REGISTRY, register as register
 from .laws.binary import Binary as Binary
 from .laws.calibration import (
     calibrate as calibrate,

@@ -108,6 +108,11 @@ class Contact(eqx.Module):
         return 0 if self.slip is None else self.slip.shape[0] // self.contacts
 
     @property
+    def chain(self) -> bool:
+        """Whether W is stored as that of a chain."""
+        return isinstance(self.delassus, Tridiagonal)
+
+    @property
     def normalized_delassus(self) -> Symmetric:
         """G: W between unit normals."""
         return scaled(self.delassus, 1 / self.norm)

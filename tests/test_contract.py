@@ -251,7 +251,8 @@ def test_derivatives(name):
     states = SMOOTH
     if name == "poisson":
         states = [dataclasses.replace(s, e=np.max(s.e)) for s in SMOOTH]
-    forward, reverse = programs.derivatives(name)(states)[:2]
+    found = programs.derivatives(name)(states)
+    forward, reverse = found[0], found[-1]
     for a, b in zip(forward, reverse):
         np.testing.assert_allclose(a, b, rtol=0, atol=LAWS[name].slope * (1 + np.abs(a).max()))
         assert np.isfinite(a).all()

@@ -20,7 +20,6 @@ LAWS = [
     (lambda: ji.LZB(0.9, initial_energy=-1.0), r"`initial_energy`.*-1"),
     (lambda: ji.LZB(0.9, rtol=0.0), r"`rtol`"),
     (lambda: ji.LZB(0.9, method="euler"), r"`method` must be one of .*'euler'"),
-    (lambda: ji.LZB(0.9, method="propagator"), r"`exponent` must be the float 1\.0"),
     (lambda: ji.LZB("high"), r"`restitution` must be numeric"),
     (lambda: ji.Newton(-0.1), r"`restitution`"),
     (lambda: ji.Moreau(-0.1), r"`restitution` must lie in \[0, 1\], but has value -0\.1"),

@@ -97,7 +97,15 @@ def test_stated_errors_that_are_too_small_are_noticed():
 # --------------------------------------------------------------------- methods, bounds
 
 
-@pytest.mark.parametrize("method", ["adam", "sgd", "lbfgs", optax.rmsprop(0.01)])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "adam",
+        "lbfgs",
+        pytest.param("sgd", marks=pytest.mark.slow),
+        pytest.param(optax.rmsprop(0.01), marks=pytest.mark.slow),
+    ],
+)
 def test_gradient_descent_agrees_with_levenberg_marquardt(method):
     post = simulated(ji.Newton([0.6, 0.3]), BALLS, PRE_3, noise=0.01)
     data = ji.Experiments(PRE_3, post)
@@ -221,10 +229,11 @@ def test_masks_groups_and_held_contacts():
     assert tied.names == ("restitution", "stiffness[2]")
     np.testing.assert_allclose(tied.law.restitution, [0.9, 0.9], rtol=1e-6)
     np.testing.assert_allclose(tied.law.stiffness, [3.0, 6.0], rtol=1e-6)
-    masked = ji.fit(start, BALLS, data, {"restitution": [True, False], "stiffness": [False, True]})
-    assert masked.names == ("restitution[1]", "stiffness[2]")
-    np.testing.assert_allclose(masked.value, [0.9, 6.0], rtol=1e-6)
-    assert masked.law.restitution[1] == 0.9
+    law = ji.Newton([0.5, 0.9])
+    data = ji.Experiments(PRE_3, simulated(ji.Newton([0.7, 0.9]), BALLS, PRE_3))
+    masked = ji.fit(law, BALLS, data, {"restitution": [True, False]})
+    assert masked.names == ("restitution[1]",)
+    np.testing.assert_allclose(masked.law.restitution, [0.7, 0.9], rtol=1e-9)
 
 
 @pytest.mark.slow

@@ -82,7 +82,6 @@ def test_gradients_and_the_other_methods():
     found = ji.work_precision(BALLS, STRIKE, linear, laws={}, batch=8, repeats=1)
     assert not found.left_out
     assert found.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
-    assert found.points["propagator"][0].error["velocity"] < 1e-12
     for name, row in found.points.items():
         assert all(point.evaluations > 0 for point in row), name
     assert 1e-9 < found.points["verlet"][-1].error["gradient"] < 0.1
@@ -103,7 +102,6 @@ def test_gradients_and_the_other_methods():
         ({"law": ji.Newton(0.5)}, TypeError, "`law` must be an LZB law, but is Newton"),
         ({"law": ji.LZB([1, 1, 1.0])}, ValueError, "`restitution` must have shape (2,)"),
         ({"methods": ["magic"]}, ValueError, "has 'magic'"),
-        ({"methods": ["propagator"]}, ValueError, "'propagator': it is exact for the exponent"),
         ({"law": ji.LZB(0.0), "methods": ["rk4"]}, ValueError, "it divides by e^2"),
         ({"settings": {"rk4": [0.1]}}, ValueError, "`settings` must be of chosen methods"),
         ({"settings": {"verlet": [0.0]}}, ValueError, "`settings['verlet']` must lie in (0"),

@@ -451,8 +451,7 @@ def test_a_killed_process_continues_with_the_same_bits(tmp_path, whole):
     code = f"""
 import jax; jax.config.update("jax_enable_x64", True)
 import time, jimpact as ji
-from jimpact.montecarlo.running import monte_carlo
-from jimpact.montecarlo.distributions import Uniform
+from jimpact import (monte_carlo, Uniform)
 class Slow:
     def run(self, plan, tasks):
         for task in tasks:

@@ -6,8 +6,8 @@ import pytest
 from programs import CODE
 
 import jimpact as ji
-from jimpact.montecarlo.statistics import OUTCOMES
 from jimpact.theory import RockingDispersion, housner_restitution
+from jimpact.theory.rocking import OUTCOMES
 
 MU = np.array([0.0, 0.3, 1.0])
 CRITICAL = [2**0.5, (8.81**0.5 - 0.9) / 2, 0.5**0.5]  # of these mu; the roots of the two forms

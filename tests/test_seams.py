@@ -156,3 +156,45 @@ def test_groups_with_friction_and_open_contacts():
     for name in ("velocity", "impulse", "tangential_impulse", "energy_change"):
         np.testing.assert_allclose(getattr(apart, name), getattr(whole, name), atol=1e-14)
     assert apart.velocity[4:].tolist() == [1.0, -1.0]
+
+
+def test_poisson_with_friction():
+    """Coulomb's law in both phases, on random planar scenes; compression is a plastic Moreau impact."""
+    rng = np.random.default_rng(0)
+    count, e_t = 64, 0.3
+    v, mass = rng.normal(size=(count, 4)), rng.uniform(0.5, 2, (count, 4))
+    normals, tangents = rng.normal(size=(2, count, 4, 2))
+    e, mu = rng.uniform(size=(2, count, 2))
+
+    @jax.jit
+    @jax.vmap
+    def run(mass, normals, tangents, v, e, mu):
+        scene = ji.Scene(mass, normals, tangents=tangents)
+        plastic = ji.impact(ji.Moreau(0.0, mu), scene, v)
+        return ji.impact(ji.Poisson(e, mu, e_t), scene, v), plastic
+
+    out, first = run(mass, normals, tangents, v, e, mu)
+    assert not np.isin(out.status, [c for c, row in enumerate(ji.STATUS) if row.failure]).any()
+    expansion = out.impulse - first.impulse
+    supplement = expansion - e * first.impulse
+    side = out.tangential_impulse - first.tangential_impulse
+    gamma = np.einsum("knm,kn->km", normals, out.velocity)
+    slip = np.einsum("knm,kn->km", tangents, out.velocity + e_t * v)
+    np.testing.assert_allclose(np.minimum(supplement, gamma), 0.0, atol=1e-12)
+    assert (np.abs(side) <= mu * expansion + 1e-12).all()
+    slides = np.abs(slip) > 1e-10
+    np.testing.assert_allclose((side + mu * expansion * np.sign(slip))[slides], 0.0, atol=1e-12)
+    assert slides.any()
+    assert not slides.all()
+
+
+def test_poisson_of_one_contact_in_space():
+    """A sphere that does not roll: with e_t = 0 both phases together are Moreau's impact."""
+    sphere = ji.Scene(np.ones(3), [[0.0], [0.0], [1.0]], tangents=np.eye(3)[:, :2])
+    v = jnp.array([2.0, 0.5, -1.0])
+    outcome = jax.jit(lambda law: ji.impact(law, sphere, v).velocity)
+    for mu in (0.2, 5.0):
+        expected = outcome(ji.Moreau(0.6, mu))
+        np.testing.assert_allclose(outcome(ji.Poisson(0.6, mu)), expected, atol=1e-14)
+    back = outcome(ji.Poisson(0.6, 5.0, 0.5))
+    np.testing.assert_allclose(back, [-1.0, -0.25, 0.6], atol=1e-14)

@@ -37,7 +37,7 @@ def test_slopes(name):
     allowed = max(1e-10, 10 * LAWS[name].accuracy)
     for begin in range(0, len(keys), programs.FEW):
         part = keys[begin : begin + programs.FEW]
-        both = programs.derivatives(name)([systems[key].state() for key in part])[:2]
+        both = programs.derivatives(name)([systems[key].state() for key in part])
         for i, key in enumerate(part):
             n, m = systems[key].state().size
             for argument, expected in systems[key].slopes().items():

@@ -60,6 +60,11 @@ def test_no_module_is_named_like_a_public_name(package):
     assert not modules & set(package.__all__) - {"plot", "theory"}
 
 
+def test_the_registry_holds_our_laws_at_first_use():
+    code = "import jimpact as ji; assert 'lzb' in ji.REGISTRY; assert ji.register.__module__"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_unknown_names_are_attribute_errors():
     with pytest.raises(AttributeError, match="no_such_name"):
         _ = ji.no_such_name

@@ -171,6 +171,19 @@ class Frozen(NamedTuple):
     scale: jax.Array  # (m, B) s_j = gamma / g
 
 
+class Measured(NamedTuple):
+    """Of a state F, x, p, gamma (m, B), lambda, its impulse, slip (t, B), rate of time (1, B)."""
+
+    force: jax.Array
+    indentation: jax.Array
+    impulse: jax.Array
+    gap_velocity: jax.Array
+    tangential_force: jax.Array
+    tangential_impulse: jax.Array
+    slip: jax.Array
+    rate: jax.Array
+
+
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("coupling", "omega", "restitution", "exponent_array", "tolerance", "viscous"),
@@ -264,13 +277,13 @@ class ContactFlow:
             return const.stiffness * power(x, self.exponent)
         return jnp.where(const.stiffness > 0, self.viscous.push(x, g), 0.0)
 
-    def field(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
+    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         x, g, _ = self.rows(y)
         f = self.force(const, x, g)
         dg = const.ratio * self.coupling.times(f)
         return jnp.concatenate([const.closing * g, dg, const.unit * f, const.unit])
 
-    def margins(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
+    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         """By indentation (an opening, a gap that closes, the onset of a force), by velocity."""
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
@@ -337,6 +350,15 @@ class ContactFlow:
             return None
         phase = modes[: self.contacts]
         return ~any_of((phase == COMPRESSION) | (phase == EXPANSION))
+
+    # ---- what is looked at
+
+    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+        """Forces, velocities and the rate of time in a state."""
+        const, none = self.constants(modes), y[:0]
+        x, g, p = self.rows(y)
+        force = self.force(const, x, g)
+        return Measured(force, x, p, const.scale * g, none, none, none, const.unit)
 
     # ---- the end
 

@@ -14,6 +14,7 @@ break loose together.
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +26,7 @@ from jimpact.events.contact_flow import (
     SNAP,
     ContactFlow,
     Frozen,
+    Measured,
     times,
     unit,
 )
@@ -121,7 +123,7 @@ class FrictionFlow(ContactFlow):
             z = z + times(inverted, right - times(k, z))
         return weight * z
 
-    def field(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
+    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         _, g, _ = self.rows(y)
         f, _, side, stick = self.forces(const, modes, y)
         pull = self.coupling.times(f) + times(self.across, side)
@@ -137,7 +139,7 @@ class FrictionFlow(ContactFlow):
             ]
         )
 
-    def margins(self, const: Frozen, modes: jax.Array, y: jax.Array) -> jax.Array:
+    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         m = self.contacts
         _, most, side, stick = self.forces(const, modes, y)
         slides = ~stick & self.loaded(modes)
@@ -191,6 +193,14 @@ class FrictionFlow(ContactFlow):
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
         slip = jnp.where(asked, towards, slip)
         return jnp.concatenate([modes[: 2 * m], slip]), jnp.concatenate([y[: 3 * m], u, y[4 * m :]])
+
+    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+        m, side = self.contacts, self.forces(self.constants(modes), modes, y)[2]
+        return (
+            super()
+            .measured(modes, y)
+            ._replace(tangential_force=side, tangential_impulse=y[4 * m : 5 * m], slip=self.slip(y))
+        )
 
     # ---- the end: a contact with friction is never alone
 

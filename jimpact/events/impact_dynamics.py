@@ -187,20 +187,26 @@ DENSE_CHAIN = 4  # contacts: up to so many a dense product is faster than shifts
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """From the leaves of a `Problem` in columns to impulses (m, B), status and passes (1, B)."""
+    """From the leaves of a `Problem` in columns to impulses (m, B), (t, B), and of (1, B) the time
+    (of the last event; of the end where `whole`: no closed form ends it), status and passes."""
 
     tree: Any
     exponent: float | tuple[float, ...] | None
     chain: bool
     most: int
     sides: int = 0  # tangential rows
+    whole: bool = False
     repeats: bool = False  # walk the steps once more, for derivatives
+
+    def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
+        flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
+        return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         problem = jax.tree.unflatten(self.tree, leaves)
         still = jax.lax.stop_gradient(problem)
         tighten = GRADIENT_TIGHTENING if self.repeats else 1.0
-        flow, modes, y = flow_of(still, self.exponent, self.chain, tighten)
+        flow, modes, y = self.flow(still, tighten)
         if self.repeats:
             end, plan = stepper.record(flow, modes, y, self.most)
         else:
@@ -208,47 +214,62 @@ class Outcome:
         over, last = end.plan[2:3] > 0, end.step.modes
         m = flow.contacts
         if self.repeats:
-            moving, _, y = flow_of(problem, self.exponent, self.chain, tighten)
+            moving, _, y = self.flow(problem, tighten)
             state = stepper.repeat(moving, modes, y, plan, last, over)
         else:
             moving, state = flow, jnp.where(over, flow.finish(last, end.y)[1], end.y)
         p = state[2 * m : 3 * m]
         rest = at_rest(flow, jax.lax.stop_gradient(state), over, last, end.plan[3:4])
         p = settled(moving, problem.gamma, p, rest, exactly=self.repeats)
-        side = state[3 * m + self.sides : -1][: self.sides]
+        side, time = state[3 * m + self.sides : -1][: self.sides], state[-1:]
         if self.repeats:
-            return p, side
-        code = jnp.where(any_of(rest), CODE["plastic_limit"], CODE["ok"])
-        code = jnp.where(over, code, CODE["max_steps"]).astype(jnp.int32)
-        return p, side, code, end.plan[3:4].astype(jnp.int32)
+            return p, side, time
+        code = code_of(over, rest)
+        return p, side, time, code, end.plan[3:4].astype(jnp.int32)
+
+
+class Dynamics(NamedTuple):
+    """What a law with impact dynamics gives: its problem, the units, and what is compiled in."""
+
+    problem: Problem
+    units: Units
+    exponent: Exponent
+    chain: bool
+
+    @property
+    def static_exponent(self) -> float | tuple[float, ...] | None:
+        """The exponent that is compiled in, None for an array."""
+        return None if isinstance(self.exponent, jax.Array) else self.exponent
+
+    @property
+    def tangents(self) -> int:
+        """Tangential rows t."""
+        return 0 if self.problem.sides is None else self.problem.sides.slip.shape[0]
+
+    def columns(self) -> tuple[tuple[jax.Array, ...], Any]:
+        """The arrays of the problem with the batch last, and its structure."""
+        leaves, tree = jax.tree.flatten(self.problem)
+        return tuple(x[..., None] for x in leaves), tree
 
 
 def solve(
-    problem: Problem,
-    units: Units,
-    exponent: Exponent,
-    delassus: Symmetric,
-    max_steps: int,
-    method: str = "time",
+    given: Dynamics, max_steps: int, method: str = "time"
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
     """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
     Differentiable in both modes; method 'time' in all orders.
     """
-    static = None if isinstance(exponent, jax.Array) else exponent
-    chain = isinstance(delassus, Tridiagonal)
+    units, static = given.units, given.static_exponent
     if method == "impulse":
-        p, code = impulse_form.solve(problem, static, chain, max_steps)
+        p, code = impulse_form.solve(given.problem, static, given.chain, max_steps)
         return p * units.momentum, None, code
-    leaves, tree = jax.tree.flatten(problem)
-    rows = 0 if problem.sides is None else problem.sides.slip.shape[0]
-    p, side, code, _ = outcome(
-        Outcome(tree, static, chain, max_steps, rows), tuple(x[..., None] for x in leaves)
-    )
-    if rows == 0:
+    leaves, tree = given.columns()
+    found = outcome(Outcome(tree, static, given.chain, max_steps, given.tangents), leaves)
+    p, side, _, code, _ = found
+    if given.tangents == 0:
         return p[:, 0] * units.momentum, None, code[0, 0]
-    each = rows // len(units.root)
-    return p[:, 0] * units.momentum, side[:, 0] * jnp.repeat(units.momentum, each), code[0, 0]
+    momentum = jnp.repeat(units.momentum, given.tangents // len(units.root))
+    return p[:, 0] * units.momentum, side[:, 0] * momentum, code[0, 0]
 
 
 def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -262,9 +283,9 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
     def _(primals: Any, tangents: Any) -> Any:
         again = dataclasses.replace(function, repeats=True)
         rates = jax.jvp(lambda *x: in_columns(again, *x), primals, tangents)[1]
-        p, side, *whole = value(*primals)
-        still = [np.zeros(x.shape, jax.dtypes.float0) for x in whole]
-        return (p, side, *whole), (*rates, *still)
+        outs = value(*primals)
+        whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
+        return outs, (*rates, *whole)
 
     return value(*leaves)
 
@@ -279,6 +300,18 @@ def at_rest(
     quiet = jnp.abs(gamma) <= QUIET * flow.patience(passes)
     endless = quiet & (modes[m : 2 * m] >= ENDLESS)
     return over & (endless | (any_of(endless) & quiet & (gamma < 0)))
+
+
+def code_of(over: jax.Array, rest: jax.Array) -> jax.Array:
+    """Status (1, B) of impacts that are over, or not, with contacts left at rest."""
+    code = jnp.where(any_of(rest), CODE["plastic_limit"], CODE["ok"])
+    return jnp.where(over, code, CODE["max_steps"]).astype(jnp.int32)
+
+
+def status_of(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
+    """Status (1, B) of a run."""
+    over = end.plan[2:3] > 0
+    return code_of(over, at_rest(flow, end.y, over, end.step.modes, end.plan[3:4]))
 
 
 def settled(

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.contact_flow import ContactFlow, Frozen, times, unit
+from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, times, unit
 from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.friction import distribute
@@ -324,6 +324,22 @@ class SlipFlow(FrictionFlow):
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
+    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+        m, (x, g, p) = self.contacts, self.rows(y)
+        const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
+        motion = self.motion(const, modes, y)
+        turned = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        return Measured(
+            force=motion.force,
+            indentation=x,
+            impulse=p,
+            gap_velocity=const.frozen.scale * g,
+            tangential_force=motion.sliding + motion.holding,
+            tangential_impulse=y[5 * m : 7 * m],
+            slip=flat(jnp.where(loaded[:, None], turned, q)),
+            rate=const.frozen.unit / motion.haste,
+        )
+
     def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
         _, g, _ = self.rows(y)
         frozen, motion = const.frozen, self.motion(const, modes, y)
@@ -365,7 +381,7 @@ class SlipFlow(FrictionFlow):
         loaded, q, slip = self.loaded(modes), self.slip(y), modes[2 * m :]
         cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
         breaks, grows = stick & ended, creeps & ended
-        # a contact breaks loose against the force that held it, and Newton's method sees to the rest
+        # a contact breaks loose against the force that held it, Newton's method sees to the rest
         const = self.constants(modes)
         f = self.force(const.frozen, *self.rows(y)[:2])
         side = jnp.where(slips | creeps, -self.friction * f, 0.0)[:, None] * polar(q[:, 1])[0]

@@ -148,13 +148,12 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
 
-    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, jax.Array | None]:
+    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, Any]:
         i, a, c = at
         xi = start + c * length
         now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
         dy = flow.field(const, s.modes, now)
-        margins = lambda z: flow.margins(const, s.modes, z)
-        value, dc = jax.jvp(margins, (now,), (dy,))
+        value, dc = jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate
@@ -365,25 +364,61 @@ def repeat(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, last: jax.Array, over: jax.Array
 ) -> jax.Array:
     """The state that `run` and `finish` end with, as a smooth function of `flow` and `y`."""
-    n, m = y.shape[0], modes.shape[0]
+    y, _ = _walk(flow, modes, y, plan, states=False)
+    return jnp.where(over, flow.finish(last, y)[1], y)
 
-    def step(y: jax.Array, row: Plan) -> tuple[jax.Array, None]:
-        accept = row.marks[-1:] > 0
-        s = Step(row.marks[:m].astype(modes.dtype), row.marks[m:-1] > 0, row.clock)
+
+def path(flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan) -> jax.Array:
+    """States (steps + 1, n, B) at the beginning and after each step of the plan, smooth as well."""
+    after: Any = _walk(flow, modes, y, plan, states=True)[1]
+    return jnp.concatenate([y[None], after.reshape(-1, *y.shape)])
+
+
+def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
+    """The state so long (1, B) after y, in the flow's own time, within the step from there."""
+    begun, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
+    in_root = in_root * (1 - lands)
+    begun, r = begun * in_root, flow.root
+    reached = begun**r + ahead
+    positive = reached > 0
+    root = jnp.where(positive, root_of(jnp.where(positive, reached, 1.0), r), 0.0)
+    h = jnp.where(in_root > 0, root - begun, ahead)
+    clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
+    sums, *_ = _stages(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y, ends=False)
+    return y + sums[0, :-1]
+
+
+def step_of(row: Plan, modes: int) -> tuple[Step, jax.Array]:
+    """A step of the plan, and whether (1, B) there is one."""
+    marks = row.marks
+    return Step(marks[:modes].astype(jnp.int32), marks[modes:-1] > 0, row.clock), marks[-1:] > 0
+
+
+def _walk(
+    flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
+) -> tuple[jax.Array, jax.Array | None]:
+    """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
+    n = y.shape[0]
+
+    def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
+        s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
             sums, *_ = _stages(flow, s, y, ends=False)
             end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
             return jnp.where(accept, end, y)
 
-        return jax.lax.cond(jnp.any(accept), walk, lambda y: y, y), None
+        y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
+        return y, y if states else None
 
-    def block(y: jax.Array, rows: Plan) -> tuple[jax.Array, None]:
-        def walk(y: jax.Array) -> jax.Array:
-            return jax.lax.scan(jax.checkpoint(step), y, rows)[0]
+    def block(y: jax.Array, rows: Plan) -> tuple[jax.Array, jax.Array | None]:
+        def walk(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            return jax.lax.scan(jax.checkpoint(step), y, rows)
 
-        return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, lambda y: y, y), None
+        def stay(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
+
+        return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, stay, y)
 
     rows = jax.tree.map(lambda x: x.reshape(BLOCKS, BLOCK, *x.shape[1:]), plan)
-    y, _ = jax.lax.scan(jax.checkpoint(block), y, rows)
-    return jnp.where(over, flow.finish(last, y)[1], y)
+    return jax.lax.scan(jax.checkpoint(block), y, rows)

@@ -1,7 +1,7 @@
 """Runge-Kutta tableaux: a method is data.
 
 `DOP853` is Dormand and Prince's 8(5,3) pair: 12 stages, order 8, with a fifth- and a third-order
-error estimate; `DOPRI5` is their 5(4) pair of 7 stages. Source: Hairer, Norsett and Wanner, Solving
+error estimate. Source: Hairer, Norsett and Wanner, Solving
 Ordinary Differential Equations I (2nd ed., 1993), II.5, II.10 and the coefficients of their code
 DOP853.
 """
@@ -56,21 +56,5 @@ DOP853 = Tableau(
         error_low=(-0.18980075407240762, 0.0, 0.0, 0.0, 0.0, 4.450312892752409,
         1.8915178993145003, -5.801203960010585, -0.4226823213237919, -0.1521609496625161,
         0.20136540080403034, 0.02265179219836082),
-)
-DOPRI5 = Tableau(
-    order=5,
-    a=(
-        (),
-        (1 / 5,),
-        (3 / 40, 9 / 40),
-        (44 / 45, -56 / 15, 32 / 9),
-        (19372 / 6561, -25360 / 2187, 64448 / 6561, -212 / 729),
-        (9017 / 3168, -355 / 33, 46732 / 5247, 49 / 176, -5103 / 18656),
-        (35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84),
-    ),
-    b=(35 / 384, 0.0, 500 / 1113, 125 / 192, -2187 / 6784, 11 / 84, 0.0),
-    c=(0.0, 1 / 5, 3 / 10, 4 / 5, 8 / 9, 1.0, 1.0),
-    error_high=(71 / 57600, 0.0, -71 / 16695, 71 / 1920, -17253 / 339200, 22 / 525, -1 / 40),
-    error_low=(0.0,) * 7,  # it has one estimate
 )
 # fmt: on

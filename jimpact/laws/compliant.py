@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jimpact._checks import check_values
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
-from jimpact.events.impact_dynamics import dimensionless, sides_of, solve
+from jimpact.events.impact_dynamics import Dynamics, dimensionless, sides_of, solve
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.laws.lzb import check_rtol, default_rtol
@@ -72,8 +72,8 @@ class Compliant(Law):
         """A tolerance that the precision can hold."""
         check_rtol(self.rtol, dtype)
 
-    def impulses(self, contact: Contact) -> Impulses:
-        """Impulses over the whole encounter, gaps included."""
+    def dynamics(self, contact: Contact) -> Dynamics:
+        """The dynamics of the whole encounter in units of their own."""
         gamma, force, viscous = contact.gap_velocity, self.force, None
         if isinstance(force, Bistiffness):
             k, e, exponent = force.stiffness, force.restitution, force.exponent
@@ -97,8 +97,11 @@ class Compliant(Law):
         problem = problem._replace(viscous=viscous)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        p, p_t, code = solve(problem, units, exponent, contact.delassus, self.max_steps)
-        return Impulses(p, p_t, code)
+        return Dynamics(problem, units, exponent, contact.chain)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Impulses over the whole encounter, gaps included."""
+        return Impulses(*solve(self.dynamics(contact), self.max_steps))
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

@@ -7,12 +7,11 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
-from jimpact.events.impact_dynamics import METHODS, dimensionless, sides_of, solve
+from jimpact.events.impact_dynamics import METHODS, Dynamics, dimensionless, sides_of, solve
 from jimpact.law import (
     Impulses,
     Law,
     OptionalValues,
-    StaticNumber,
     StaticOrValues,
     Values,
     option,
@@ -92,8 +91,8 @@ class LZB(Law):
             velocity is exactly 0 and `|lambda| <= mu F` (see `docs/friction.md`).
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
         max_steps: passes of the integrator (or steps, method 'impulse') before it gives up.
-        method: 'time' (default), event-aligned, order 8; 'propagator', exact, exponent 1 only;
-            'impulse', the published scheme in the impulse of a primary contact, order 1.
+        method: 'time' (default), event-aligned, order 8; 'impulse', the published scheme in the
+            impulse of a primary contact, order 1.
 
     Status: `plastic_limit` where contacts re-close without end; `max_steps`, also where large
     friction wedges contacts that then vibrate for long.
@@ -125,11 +124,6 @@ class LZB(Law):
     method: str = option("time", METHODS)
 
     def __check_init__(self) -> None:
-        if self.method == "propagator" and self.exponent != StaticNumber(1.0):
-            raise ValueError(
-                "Argument `exponent` must be the float 1.0 for method='propagator', "
-                f"but has value {self.exponent}."
-            )
         if self.method != "time" and self.friction is not None:
             raise ValueError(
                 f"Argument `method` must be 'time' with friction, but has value {self.method!r}."
@@ -139,8 +133,8 @@ class LZB(Law):
         """A tolerance finer than the precision can hold is an error."""
         check_rtol(self.rtol, dtype)
 
-    def impulses(self, contact: Contact) -> Impulses:
-        """Impulses at the end of the impact dynamics."""
+    def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
+        """The impact dynamics in units of their own; `rtol` in place of the law's."""
         problem, units = dimensionless(
             contact.delassus,
             contact.gap_velocity,
@@ -148,11 +142,14 @@ class LZB(Law):
             self.stiffness,
             self.exponent,
             contact.stored,
-            self.rtol or default_rtol(self.method, contact.gap_velocity.dtype),
+            self.rtol or default_rtol(self.method, contact.gap_velocity.dtype)
+            if rtol is None
+            else rtol,
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        p, p_t, code = solve(
-            problem, units, self.exponent, contact.delassus, self.max_steps, self.method
-        )
-        return Impulses(p, p_t, code)
+        return Dynamics(problem, units, self.exponent, contact.chain)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Impulses at the end of the impact dynamics."""
+        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method))

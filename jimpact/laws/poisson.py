@@ -1,12 +1,14 @@
 """Poisson's law in the two-stage form of Pfeiffer and Glocker."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
 from jimpact.contact import Contact
-from jimpact.law import Impulses, Law, Values, option, parameter
+from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
+from jimpact.laws.friction import friction_fields
+from jimpact.solvers.friction import FrictionImpulses, solve
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.linear import null_projector
 from jimpact.solvers.tridiagonal import as_matrix, is_regular
@@ -17,20 +19,24 @@ class Poisson(Law):
     """Poisson's restitution of impulses: compression to rest, then expansion.
 
     Equation: compression `0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0`; expansion
-    `p_e = e p_c + s`, `0 <= gamma+ = gamma_c + W p_e  _|_  s >= 0`; `p = p_c + p_e`.
+    `p_e = e p_c + s`, `0 <= gamma+ = gamma_c + W p_e  _|_  s >= 0`; `p = p_c + p_e`. With friction
+    (W_nt p_t added) `p_tc in -mu p_c Sgn(u_c)` and `p_te in -mu p_e Sgn(u+ + e_t u-)`.
 
     Args:
         restitution: kinetic coefficient e in [0, 1], scalar or one per contact (m,).
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
+        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking in expansion is
+            `v_t+ = -e_t v_t-`, as far as the expansion's friction reaches.
         allow_above_one: let e exceed 1, which dispersion in a chain would need.
 
     Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where, besides, their e
     differ: v+ then depends on how they share p_c (the least one is taken); `energy_gain` where
-    unequal or large e create energy.
+    unequal or large e create energy. With friction as in `Moreau`.
 
     Derivatives are one-sided where a contact is about to take part in either stage.
 
     Source: Pfeiffer and Glocker (1996); Brogliato, Nonsmooth Mechanics (2016), (6.76)-(6.79) with
-    the errata of `docs/equations.md`.
+    the errata of `docs/equations.md`; e_t as in the kinematic laws, (6.54).
 
     >>> import jimpact as ji
     >>> law = ji.Poisson([0.4, 1.0])
@@ -42,10 +48,28 @@ class Poisson(Law):
     separable: ClassVar[bool] = True
 
     restitution: Values = parameter(low=0.0, high=1.0, high_unless="allow_above_one")
+    friction: OptionalValues = parameter(low=0.0)
+    tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
     allow_above_one: bool = option(False, converter=bool)
 
+    def __init__(
+        self,
+        restitution: Any,
+        friction: Any = None,
+        tangential_restitution: Any = 0.0,
+        *,
+        allow_above_one: bool = False,
+    ):
+        self.restitution, self.allow_above_one = restitution, allow_above_one
+        self.friction, self.tangential_restitution = friction_fields(
+            friction, tangential_restitution
+        )
+
     def impulses(self, contact: Contact) -> Impulses:
-        """Two linear complementarity problems."""
+        """Two complementarity problems."""
+        mu, e_t = self.friction, self.tangential_restitution
+        if mu is not None and e_t is not None:
+            return self._with_friction(contact, mu, e_t)
         w, regular = as_matrix(contact.delassus), is_regular(contact.delassus)
         compression = solve_lcp(w, contact.gap_velocity, regular=regular)
         returned = self.restitution * compression.z
@@ -56,9 +80,60 @@ class Poisson(Law):
             code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
         return Impulses(compression.z + returned + supplement.z, None, code)
 
+    def _with_friction(self, contact: Contact, mu: jax.Array, e_t: jax.Array) -> Impulses:
+        """Two friction problems."""
+        assert contact.slip is not None  # see `check_law`
+        m, each, a = contact.contacts, contact.tangents, contact.whole_delassus
+        mu = mu * jnp.ones_like(contact.gap_velocity)
+        e_t = jnp.repeat(e_t * jnp.ones_like(mu), each)
+        given = contact.gap_velocity, contact.slip
+        first = solve(a, *given, mu, complementary=True)
+        returned = self.restitution * first.normal
+        rate = jnp.concatenate([contact.gap_velocity, (1 + e_t) * contact.slip])
+        rate = rate + a @ jnp.concatenate([first.normal + returned, first.tangential])
+        second = _with_load(a, rate[:m], rate[m:], mu, returned)
+        code = jnp.maximum(first.status, second.status)
+        if self.restitution.ndim == 1:
+            loaded = jnp.concatenate([first.normal > 0, jnp.repeat(first.normal > 0, each)])
+            e = jnp.concatenate([self.restitution, jnp.zeros_like(contact.slip)])
+            shared = _depends_on_sharing(a, e, loaded)
+            code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
+        p = first.normal + returned + second.normal
+        return Impulses(p, first.tangential + second.tangential, code)
+
+
+def _with_load(
+    a: jax.Array, normal: jax.Array, slip: jax.Array, mu: jax.Array, load: jax.Array
+) -> FrictionImpulses:
+    """s (m,) and p_t (t,) with `0 <= r _|_ s >= 0` and `p_t in -mu (s + load) Sgn(u)`.
+
+    A second contact with the same tangents takes the load: its normal velocity is its own and
+    starts at what `load` brings to rest. How both share p_t says nothing about the outcome.
+    """
+    m, t = len(normal), len(slip)
+    own = jnp.diagonal(a)[:m]
+    w, cross, sides = a[:m, :m], a[:m, m:], a[m:, m:]
+    none, no_cross = jnp.zeros_like(w), jnp.zeros_like(cross)
+    rows = [
+        [w, none, cross, cross],
+        [none, jnp.diag(own), no_cross, no_cross],
+        [cross.T, no_cross.T, sides, sides],
+        [cross.T, no_cross.T, sides, sides],
+    ]
+    found = solve(
+        jnp.block(rows),
+        jnp.concatenate([normal, -own * load]),
+        jnp.concatenate([slip, slip]),
+        jnp.concatenate([mu, mu]),
+        complementary=True,
+    )
+    sharing = found.status == CODE["impulse_not_unique"]
+    code = jnp.where(sharing, CODE["ok"], found.status)
+    return FrictionImpulses(found.normal[:m], found.tangential[:t] + found.tangential[t:], code)
+
 
 def _depends_on_sharing(w: jax.Array, e: jax.Array, loaded: jax.Array) -> jax.Array:
-    """Whether `W diag(e) p_c` differs among the p_c of loaded contacts with the same `W p_c`."""
+    """Whether `W diag(e) p_c` differs among the p_c of loaded rows with the same `W p_c`."""
     norm = jnp.sqrt(jnp.diagonal(w))
     g = jax.lax.stop_gradient(w / (norm[:, None] * norm[None, :]))
     both = loaded[:, None] & loaded[None, :]

@@ -67,8 +67,8 @@ def work_precision(
         settings: settings by method where its own ladder is not wanted.
         laws: algebraic laws by name, points with their *model* error against LZB on this impact;
             None: Newton, Moreau, Poisson and Binary with the law's restitution.
-        reference: method that errors are measured from, at rtol 1e-14; None: the exact propagator
-            for exponent 1, else the event-aligned order 8. Its uncertainty is its distance from
+        reference: method that errors are measured from, at rtol 1e-14; None: the
+            event-aligned order 8. Its uncertainty is its distance from
             a second solution: order 8 at 1e-12.
         batch: impacts in a batch. repeats: of every time. gradients: measure them, too.
         progress: bar on stderr; None: on a terminal.
@@ -251,10 +251,7 @@ def ladders_of(
 
 def reference_method(name: str | None, case: Case) -> Method:
     """The method that errors are measured from."""
-    if name is None:
-        linear = METHODS["propagator"].supports(case.law, case.scene) is None
-        name = "propagator" if linear else "dop853"
-    method = _method("reference", name)
+    method = _method("reference", name or "dop853")
     checked(case.law, case.scene, method)
     if method.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")

@@ -21,9 +21,9 @@ import numpy as np
 
 from jimpact._checks import check_values
 from jimpact.audits import audit
+from jimpact.events.impact_dynamics import solve
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
-from jimpact.numerics import dimensionless
 from jimpact.scene import Scene, chain
 from jimpact.status import CODE
 
@@ -174,11 +174,9 @@ def sample_points(
 def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     """What `ji.impact(ji.LZB(..., rtol=setting), ...)` does."""
     given = problem(law, scene, velocity, setting)
-    p, code = dimensionless.solve(
-        given.inputs, given.exponent, given.chain, given.max_steps, law.method
-    )
+    p, _, code = solve(given.dynamics, given.max_steps, law.method)
     unknown = jnp.full((), jnp.nan, p.dtype)
-    return in_si(given, p, unknown, jnp.asarray(-1), code)
+    return in_si(given, p / given.units.momentum, unknown, jnp.asarray(-1), code)
 
 
 DEFAULT = Method(

@@ -35,7 +35,7 @@ class Cause(NamedTuple):
 CAUSES = (
     Cause(
         "refused beforehand",
-        "the plain time form divides by e^2; the propagator is exact for exponent 1 only",
+        "the plain time form divides by e^2",
         "the default method",
     ),
     Cause(
@@ -115,7 +115,7 @@ def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
     e, balls = point[AXES.index("restitution")], point[AXES.index("balls")]
     highest, apart = frequencies(point)
     reach = setting * highest
-    if name == "flagged" and (e == 0 or method.name == "propagator"):
+    if name == "flagged" and e == 0:
         return _REFUSED
     if method.setting == "step" and reach > 1:
         return _UNSTABLE if reach > STABLE.get(method.name, np.inf) else _COARSE

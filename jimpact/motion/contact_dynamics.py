@@ -193,7 +193,7 @@ def contact_dynamics(
     begin = first_flight(state, phase[:, None].astype(jnp.int32), 2 * m, times)
     events = no_events(max_events, q0.shape[0], m, dtype)
     start = _Run(
-        toward_sample(begin, times),
+        toward_sample(begin, times, begin.free),
         jax.lax.stop_gradient(jnp.maximum(-gamma, 0.0)),
         events,
         status,

@@ -1,6 +1,8 @@
 """Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
 
+import abc
 import dataclasses
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,6 +29,7 @@ ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is round
 # Error allowed in the ledger, of what the errors allowed in q and v are worth: ten times more, and
 # the steps of a body that rests on a moving base are those of the base's motion only.
 LEDGER = 0.01
+FORGET = 0.5  # of the last free step, that shorter ones leave of it each
 
 
 class State(NamedTuple):
@@ -101,11 +104,28 @@ class MotionFlow(eqx.Module):
     root = 1
     contacts = 1
     near = 0.0
+    longest = math.inf  # no rate is large beside the others
 
     @property
     def snap(self) -> jax.Array:
         """Margins are in units of their rounding."""
         return jnp.ones((1, 1), self.tolerance.dtype)
+
+    @abc.abstractmethod
+    def constants(self, modes: jax.Array) -> Any:
+        """What of the field does not change while the modes last."""
+
+    @abc.abstractmethod
+    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of all rows."""
+
+    @abc.abstractmethod
+    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Each is >= 0 while its mode lasts; the last is the time left to the next sample."""
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> float:
+        """Tolerances that the error of each row may be."""
+        return 1.0
 
     def from_margins(self, margins: jax.Array, at: State) -> jax.Array:
         """Rows (k, 1) of margins, with that of the next sample."""
@@ -222,6 +242,7 @@ class Flight(NamedTuple):
 
     state: State
     plan: stepper.Carry  # the step to try
+    free: jax.Array  # length of steps that nothing shortens [s]
     event: jax.Array  # (k,) one-hot: what has happened
     sample: jax.Array  # number of samples reached
     samples: State
@@ -238,17 +259,14 @@ def first_flight(state: State, rows: jax.Array, events: int, times: jax.Array) -
     clock = jnp.stack([0 * step, step, 0 * step, 0 * step])[:, None]
     aim = stepper.Step(rows, jnp.zeros((events + 1, 1), bool), clock)
     plan = stepper.Carry(packed(state), aim, jnp.zeros((4, 1), dtype))
-    none = jnp.int32(0)
-    return Flight(
-        state, plan, jnp.zeros(events, bool), jnp.int32(1), first, none, jnp.asarray(False)
-    )
+    one, none, no = jnp.int32(1), jnp.int32(0), jnp.asarray(False)
+    return Flight(state, plan, step, jnp.zeros(events, bool), one, first, none, no)
 
 
-def toward_sample(flight: Flight, targets: jax.Array) -> Flight:
-    """The next step lands on the sample if it reaches it."""
+def toward_sample(flight: Flight, targets: jax.Array, h: jax.Array) -> Flight:
+    """The next step, of length h, lands on the sample if it reaches it."""
     _, step, plan = flight.plan
     left = targets[jnp.minimum(flight.sample, targets.shape[0] - 1)] - flight.state.t
-    h = step.clock[1, 0]
     lands = left <= h
     target = jnp.zeros_like(step.target).at[-1].set(lands)
     clock = jnp.stack([0 * h, h, 0 * h, lands.astype(h.dtype)])[:, None]
@@ -262,7 +280,12 @@ def one_pass(
 ) -> Flight:
     """One pass of the stepper; `allowed` are the errors of all rows but q and v."""
     state, before, last = flight.state, flight.plan, targets.shape[0] - 1
-    size = jnp.abs(jnp.concatenate([state.q, state.v]))
+    # sizes of q and v within the step, for those that cross 0
+    push = user_force(flow.system, state.q, state.v, state.t)
+    mass = mass_at(flow.system, state.q)
+    rates = free_acceleration(flow.system, state.q, state.v, push, mass)
+    change = before.plan[0, 0] * jnp.abs(jnp.concatenate([state.v, rates]))
+    size = jnp.abs(jnp.concatenate([state.q, state.v])) + change
     tolerance = jnp.concatenate([settings.atol + settings.rtol * size, allowed])
     flow = dataclasses.replace(
         flow,
@@ -288,8 +311,14 @@ def one_pass(
     steps = flight.steps + 1
     span = jnp.abs(targets[0]) + jnp.abs(targets[-1])
     vanishes = ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * span)
+    # what an event or a sample shortens says nothing of the steps after it
+    tried, lands = before.step.clock[1, 0], before.step.clock[3, 0] > 0
+    proposed = after.step.clock[1, 0]
+    longer = jnp.where(tried < flight.free, jnp.maximum(proposed, FORGET * flight.free), proposed)
+    free = jnp.where(accept & ~lands, jax.lax.stop_gradient(longer), flight.free)
     moved = flight._replace(
         state=state,
+        free=free,
         plan=jax.lax.stop_gradient(after)._replace(y=before.y),
         event=landed[:-1],
         sample=flight.sample + sampled.astype(flight.sample.dtype),
@@ -297,8 +326,10 @@ def one_pass(
         steps=steps,
         stuck=vanishes | (steps >= settings.max_steps),
     )
-    aimed = toward_sample(moved, targets)
-    plan = jax.tree.map(lambda a, b: jnp.where(sampled, a, b), aimed.plan, moved.plan)
+    aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
+    in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
+    plain = sampled | (accept & in_time)
+    plan = jax.tree.map(lambda a, b: jnp.where(plain, a, b), aimed.plan, moved.plan)
     return moved._replace(plan=plan)
 
 
@@ -354,5 +385,5 @@ def fly(
     return jax.lax.while_loop(
         going,
         lambda flight: one_pass(flow, settings, allowed, targets, flight),
-        toward_sample(modes_now, targets),
+        toward_sample(modes_now, targets, begin.free),
     )

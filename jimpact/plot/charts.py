@@ -19,7 +19,7 @@ from jimpact.status import CODE, STATUS
 
 _MARKERS = "osD^vP"
 _LEAST = 1e-16  # errors below are drawn here: rounding
-_OWN = ("dop853", "dop5", "propagator")  # jimpact's own methods: thick lines
+_OWN = ("dop853",)  # jimpact's own method: a thick line
 
 # right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
 # colours where a result is returned, greys where there is none

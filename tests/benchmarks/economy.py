@@ -6,6 +6,7 @@ unless said otherwise. `saving` = full / lean, median and quartiles of the repea
 should cost the same (what is not asked for costs nothing) the aim is 1.
 """
 
+import functools
 from unittest import mock
 
 from harness import alternating, arguments, quartiles, save_figure, show, stage, timed, write_csv
@@ -16,7 +17,7 @@ import numpy as np
 from three_balls import DOP853, DOP853_ALIGNED
 
 import jimpact as ji
-from jimpact.numerics import stepper
+from jimpact.events import impact_dynamics
 
 REPEATS, BATCH = 9, 128
 QUICK_REPEATS, QUICK_BATCH = 2, 4
@@ -122,8 +123,8 @@ def by_groups(balls, count):
 
 def compiled_without_closed_form(function, k):
     """`function` compiled with every contact integrated to its end."""
-    finish = stepper.isolated.finish
-    with mock.patch.object(stepper.isolated, "finish", lambda *a: finish(*a[:-1], False)):
+    whole = functools.partial(impact_dynamics.Outcome, whole=True)
+    with mock.patch.object(impact_dynamics, "Outcome", whole):
         jax.clear_caches()
         run = jax.jit(function).lower(k).compile()
     jax.clear_caches()

@@ -1,7 +1,7 @@
 """What every way to integrate the LZB impact has in common: its problem, its result, its table row.
 
-All work on the dimensionless flow of `numerics/flow.py`. In time form, with c_j = 1 in compression
-and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2,
+All work on the dimensionless flow of `events/contact_flow.py`. In time form, with c_j = 1 in
+compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2,
 
     x_j' = -omega_j c_j gamma_j,   p_j' = (eta_j + 1)/2 omega_j x_j^eta_j,   gamma = gamma- + G p
 """
@@ -16,20 +16,14 @@ import numpy as np
 
 from jimpact._checks import as_float_array, in_common_dtype, is_traced
 from jimpact.contact import Contact
+from jimpact.events import impact_dynamics
+from jimpact.events.contact_flow import power
+from jimpact.events.impact_dynamics import Dynamics, Units
+from jimpact.events.impulse_form import Rule, rule_of
 from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
 from jimpact.laws.lzb import LZB
-from jimpact.numerics.dimensionless import (
-    Inputs,
-    Units,
-    flow_of,
-    indentation,
-    to_dimensionless,
-)
-from jimpact.numerics.flow import Flow
-from jimpact.numerics.powers import Exponent, factor, power
 from jimpact.scene import Scene
-from jimpact.solvers.tridiagonal import Tridiagonal
 from jimpact.status import CODE
 
 UNCOUNTED = -1  # evaluations that the method cannot tell by itself
@@ -71,22 +65,31 @@ class Method(NamedTuple):
 class Problem(NamedTuple):
     """The dimensionless problem of an impact; the tolerances in `inputs` are those of rtol."""
 
-    inputs: Inputs
-    units: Units
-    exponent: Exponent
-    chain: bool
+    dynamics: Dynamics
     max_steps: int
     happens: jax.Array  # False: nothing approaches, nothing is stored; `inputs` then are a dummy
 
     @property
-    def x(self) -> jax.Array:
-        """Indentations (m,) before the impact."""
-        return indentation(self.inputs, self.flow.exponent)
+    def inputs(self) -> impact_dynamics.Problem:
+        """Arrays (m,) of the contacts."""
+        return self.dynamics.problem
 
     @property
-    def flow(self) -> Flow:
-        """The flow, `gamma-` and `x` of the inputs aside."""
-        return flow_of(self.inputs, self.exponent, self.chain)
+    def units(self) -> Units:
+        """Scales back to SI."""
+        return self.dynamics.units
+
+    @property
+    def x(self) -> jax.Array:
+        """Indentations (m,) before the impact."""
+        energy, eta = self.inputs.energy, jnp.asarray(self.dynamics.exponent)
+        loaded = energy > 0
+        return jnp.where(loaded, jnp.where(loaded, energy, 1.0) ** (1 / (eta + 1)), 0.0)
+
+    @property
+    def flow(self) -> Rule:
+        """G, omega, e and eta of the contacts."""
+        return rule_of(self.inputs, self.dynamics.static_exponent, self.dynamics.chain)
 
 
 def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
@@ -96,17 +99,10 @@ def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
     v = as_float_array("velocity", velocity)
     law, scene, v = in_common_dtype(law, scene, v)
     contact = law.contact(scene, v)
-    w, gamma, happens = contact.delassus, contact.gap_velocity, contact.happens
-    inputs, units = to_dimensionless(
-        w,
-        jnp.where(happens, gamma, -jnp.ones_like(gamma)),
-        law.restitution,
-        law.stiffness,
-        law.exponent,
-        contact.stored,
-        jnp.asarray(rtol, v.dtype),  # type: ignore[arg-type]
-    )
-    return Problem(inputs, units, law.exponent, isinstance(w, Tridiagonal), law.max_steps, happens)
+    gamma, happens = contact.gap_velocity, contact.happens
+    harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
+    contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
+    return Problem(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), law.max_steps, happens)
 
 
 def in_si(
@@ -127,7 +123,7 @@ def in_si(
 def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
     """Time [s] that 'step' settings are parts of: that of the fastest contact alone.
 
-    Equation: `min_j x_ref,j / (Q sqrt(W_jj))` (see `numerics/dimensionless.py`); a contact alone
+    Equation: `min_j x_ref,j / (Q sqrt(W_jj))` (see `events/impact_dynamics.py`); a contact alone
     with exponent 1 and e = 1 lasts pi of its own.
 
     >>> import jimpact as ji
@@ -155,13 +151,14 @@ def outcome(law: LZB, scene: Scene, velocity: Any, result: MethodResult) -> Impa
 
 
 def time_form(
-    flow: Flow, gamma: jax.Array, x: jax.Array, p: jax.Array
+    flow: Rule, gamma: jax.Array, x: jax.Array, p: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Rates `(x', p')` at indentations x and impulses p; `gamma`: gap velocities before."""
     now = gamma + flow.coupling @ p
     opening = 1 / flow.restitution**2
     closing = -flow.omega * jnp.where(now > 0, opening, 1.0) * now
-    return closing, factor(flow.exponent, x) * flow.omega * power(x, flow.exponent)
+    factor = (jnp.asarray(flow.exponent, x.dtype) + 1) / 2
+    return closing, factor * flow.omega * power(x, flow.exponent)
 
 
 def held_open(x: jax.Array, closing: jax.Array) -> jax.Array:

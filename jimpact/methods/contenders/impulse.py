@@ -4,7 +4,7 @@ With primary contact i (the one with the largest force; it may change from step 
 
     dp_j = F_j / F_i dp_i,   dE_j = -c_j gamma_j dp_j,   gamma = gamma- + G p
 
-`impulse_euler` is the published scheme (`numerics/impulse_form.py`). `impulse_rk4` advances the
+`impulse_euler` is the published scheme (`events/impulse_form.py`). `impulse_rk4` advances the
 same equations by the classical Runge-Kutta formula, with the same primary contact, the same
 closed-form first step of a contact that is touched for the first time (0/0 of the rule) and the
 same shortened step where the primary contact is unloaded. It stays far below order 4: the rule is
@@ -18,6 +18,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jimpact.events import impulse_form
+from jimpact.events.contact_flow import power
+from jimpact.events.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import (
     Method,
@@ -28,11 +31,6 @@ from jimpact.methods.contenders.base import (
     lzb_only,
     problem,
 )
-from jimpact.numerics import impulse_form
-from jimpact.numerics.dimensionless import impulse_step
-from jimpact.numerics.flow import Flow
-from jimpact.numerics.impulse_form import EMPTY, Walk, force
-from jimpact.numerics.powers import power
 from jimpact.scene import Scene
 from jimpact.status import CODE
 
@@ -43,7 +41,7 @@ _WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 def _solve_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     given = problem(law, scene, velocity, setting)
     gamma, energy, dp = _start(given)
-    end = impulse_form.solve(given.flow, dp, given.max_steps, gamma, energy)
+    end = impulse_form.walk(given.flow, dp, given.max_steps, gamma, energy)
     return _result(given, end, 1)
 
 
@@ -62,7 +60,7 @@ def _start(given: Problem) -> tuple[jax.Array, jax.Array, jax.Array]:
     x = given.x
     eta = jnp.asarray(given.flow.exponent, x.dtype)
     energy = 0.5 * jnp.where(x > 0, jnp.where(x > 0, x, 1.0) ** (eta + 1), 0.0)
-    return given.inputs.gamma, energy, impulse_step(given.inputs)
+    return given.inputs.gamma, energy, given.inputs.step[0]
 
 
 def _result(given: Problem, end: Walk, stages: int) -> MethodResult:
@@ -70,7 +68,7 @@ def _result(given: Problem, end: Walk, stages: int) -> MethodResult:
     return in_si(given, end.p, jnp.full_like(end.p[0], jnp.nan), stages * end.steps, code)
 
 
-def _advance(flow: Flow, dp: jax.Array, walk: Walk) -> Walk:
+def _advance(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
     """One Runge-Kutta step of `dp` in the primary impulse."""
     gamma, energy = walk.gamma, walk.energy
     eta = jnp.asarray(flow.exponent, gamma.dtype)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from jimpact.events.impulse_form import Rule
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import (
     UNCOUNTED,
@@ -27,7 +28,6 @@ from jimpact.methods.contenders.base import (
     setup,
     time_form,
 )
-from jimpact.numerics.flow import Flow
 from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.status import CODE
@@ -58,7 +58,7 @@ def _diffrax_solver(
                 jax.debug.callback(tally)
             gamma, coupling, omega, restitution, eta, _ = args
             exponent = eta if static is None else static
-            flow = Flow(coupling, omega, restitution, exponent)
+            flow = Rule(coupling, omega, restitution, exponent)
             closing, force = time_form(flow, gamma, *y)
             return held_open(y[0], closing), force
 

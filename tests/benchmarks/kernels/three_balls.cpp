@@ -1,8 +1,8 @@
 // LZB impacts of a three-ball Hertz chain, one after the other on one thread: the yardstick.
 //
-// The method of jimpact/numerics/stepper.py, specialised: two contacts, eta = 1.5, e > 0, masses
+// The method of jimpact/events/stepper.py, specialised: two contacts, eta = 1.5, e > 0, masses
 // fixed over the batch. Event-aligned DOP853 in the time form, closed form for the contact that is
-// left alone. `tableau.h` holds DOP853 and is written from jimpact/numerics/tableaux.py.
+// left alone. `tableau.h` holds DOP853 and is written from jimpact/events/tableaux.py.
 //
 // State: indentations x1, x2 and gap velocities g1, g2;  x' = -c g,  g' = W F,  F = k x^1.5, with
 // c = 1 in compression, 1/e^2 in expansion, and c = 0, F = 0 while open.

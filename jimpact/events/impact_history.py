@@ -1,0 +1,59 @@
+"""What a flow of contacts does over the time of an impact, sampled between its steps."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.events import stepper
+from jimpact.events.contact_flow import Measured
+from jimpact.events.impact_dynamics import Outcome, status_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """From the leaves of a `Problem` in columns to rows of samples (s, .., B) in time.
+
+    Results: the times (s, 1, B), twice the energy (s, m, B), the rows of `Measured`, the largest
+    force of each contact (m, B), the status (1, B) as a floating-point number.
+    """
+
+    outcome: Outcome  # `whole`: no closed form ends it
+    samples: int
+
+    def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
+        problem = jax.tree.unflatten(self.outcome.tree, leaves)
+        flow, modes, y = self.outcome.flow(jax.lax.stop_gradient(problem), 1.0)
+        end, plan = stepper.record(flow, modes, y, self.outcome.most)
+        moving, _, y = self.outcome.flow(problem, 1.0)
+        states = stepper.path(moving, modes, y, plan)
+        marks = jnp.where(plan.marks[:, -1:] > 0, plan.marks, 0)
+        last = end.step.modes[None]
+        kept = jnp.where(marks[:, -1:] > 0, marks[:, : len(modes)].astype(last.dtype), last)
+        phases = jnp.concatenate([kept, last])
+        clocks = jnp.concatenate([plan.clock, jnp.zeros_like(plan.clock[:1])])
+        times = states[:, -1]  # (steps + 1, B)
+        no_target = jnp.zeros(end.step.target.shape, bool)
+
+        def at(part: jax.Array) -> tuple[jax.Array, jax.Array, Measured]:
+            """A sample is one more step, in time, from the state before it."""
+            t = part * times[-1:]
+            before = jnp.sum((times <= jax.lax.stop_gradient(t)).astype(jnp.int32), axis=0) - 1
+
+            def of(rows: jax.Array) -> jax.Array:
+                return jnp.take_along_axis(rows, before[None, None], axis=0)[0]
+
+            state, now = of(states), of(phases)
+            rate = moving.measured(now, state).rate
+            ahead = jnp.where(rate > 0, (t - state[-1:]) / jnp.where(rate > 0, rate, 1.0), 0.0)
+            step = stepper.Step(now, no_target, of(clocks))
+            state = stepper.between(moving, step, state, ahead)
+            seen = moving.measured(now, state)
+            x = jnp.maximum(seen.indentation, 0.0)
+            return state[-1:], moving.energy(x, jnp.zeros_like(x)), seen._replace(indentation=x)
+
+        parts = jnp.linspace(0.0, 1.0, self.samples, dtype=y.dtype)
+        time, energy, seen = jax.lax.map(at, parts)
+        force = jax.lax.map(lambda both: moving.measured(*both).force, (phases, states))
+        code = status_of(flow, end).astype(y.dtype)
+        return time, energy, *seen, jnp.max(force, axis=0), code

@@ -1,1 +1,0 @@
-"""Numerical kernels: no physics beyond the equations each file states at its top."""

@@ -1,0 +1,118 @@
+"""A user's own law, in a user's own file: registered, it is fitted, compared, sampled and named."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jimpact as ji
+
+BALLS, V = ji.chain([1.0, 1.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
+
+
+class Blended(ji.Law):
+    """gamma+ = -e gamma- with a share taken by friction of no name; two required parameters."""
+
+    restitution: jax.Array = ji.parameter(low=0, high=1)
+    share: jax.Array = ji.parameter(low=0, high=0.5)
+
+    def impulses(self, contact):
+        change = -(1 + self.restitution * (1 - self.share)) * contact.gap_velocity
+        p = jnp.linalg.solve(contact.whole_delassus, change)
+        return ji.Impulses(p)
+
+
+@pytest.fixture
+def registered():
+    before = dict(ji.REGISTRY)
+    ji.register("blended", Blended, summary="for the tests", promises=("velocity_scaling",))
+    yield ji.REGISTRY["blended"]
+    ji.REGISTRY.clear()
+    ji.REGISTRY.update(before)
+
+
+def test_one_method_is_enough():
+    out = ji.impact(Blended(0.8, 0.25), BALLS, [1.0, 0.0, -0.5])
+    same = ji.impact(ji.Newton(0.6), BALLS, [1.0, 0.0, -0.5])
+    np.testing.assert_allclose(out.velocity, same.velocity, atol=1e-14)
+    np.testing.assert_allclose(out.energy_change, same.energy_change, atol=1e-14)
+
+
+def test_what_every_law_gets_for_nothing():
+    """Open contacts, nothing happening, NaN, batches, gradients, domains."""
+    law = Blended(0.8, 0.25)
+    gapped = ji.impact(law, ji.chain([1.0] * 3, gaps=[0.0, 1e-3]), [1.0, 0.0, -0.5])
+    assert float(gapped.impulse[1]) == 0.0
+    assert float(gapped.velocity[2]) == -0.5
+    away = ji.impact(law, BALLS, [0.0, 0.0, 1.0])
+    np.testing.assert_array_equal(away.velocity, [0.0, 0.0, 1.0])
+    slope = jax.jit(jax.grad(lambda law: ji.impact(law, BALLS, V).velocity[0]))(law)
+    assert type(slope) is Blended
+    assert float(slope.share) != 0
+    with pytest.raises(ValueError, match=r"`share` must lie in \[0, 0\.5\], but has value 0\.7"):
+        Blended(0.8, 0.7)
+    with pytest.raises(ValueError, match=r"`share` must have shape \(2,\)"):
+        ji.impact(Blended(0.8, [0.1, 0.2, 0.3]), BALLS, V)
+
+
+def test_compare_and_the_registry(registered):
+    """`compare` goes on for everyone once a law with a second required parameter is registered."""
+    assert registered.parameters == ("restitution", "share")
+    alone = ji.compare(BALLS, V, restitution=0.9)
+    assert "moreau" in alone.entries
+    assert "blended" not in alone.entries
+    both = ji.compare(BALLS, V, restitution=0.9, share=0.1)
+    same = ji.impact(Blended(0.9, 0.1), BALLS, V)
+    np.testing.assert_allclose(both.entries["blended"].outcome.velocity, same.velocity, atol=1e-14)
+    with pytest.raises((ValueError, TypeError)):
+        ji.register("blended", Blended, promises=("beauty",))
+    with pytest.raises(TypeError):
+        ji.register("nothing", 3.0)
+
+
+def test_it_is_fitted_within_its_domain():
+    pre = np.array([[1.0, 0.0, -0.5], [2.0, 0.5, 0.0], [1.0, 0.2, -1.0]])
+    post = np.array([ji.impact(Blended(0.8, 0.25), BALLS, v).velocity for v in pre])
+    found = ji.fit(Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2)
+    np.testing.assert_allclose(found.value, [0.25], atol=1e-9)
+    post = np.array([ji.impact(ji.Newton(0.1), BALLS, v).velocity for v in pre])
+    edge = ji.fit(Blended(0.8, 0.1), BALLS, ji.Experiments(pre, post), free=("share",), starts=2)
+    np.testing.assert_allclose(edge.value, [0.5])
+    assert edge.at_bound.all()
+
+
+def test_it_is_sampled():
+    law = ji.RandomLaw(Blended(0.8, 0.25), share=ji.Uniform(0.1, 0.3))
+    found = ji.monte_carlo(law, BALLS, [1.0, 0.0, -0.5], samples=64, chunk=64)
+    assert found.count > 0
+    assert found.std.min() > 0
+    with pytest.raises(ValueError, match=r"`share` must lie in \[0, 0\.5\]"):
+        ji.RandomLaw(Blended(0.8, 0.25), share=ji.Uniform(0.1, 0.6))
+
+
+def test_it_is_named_in_a_study(registered, tmp_path, capsys):
+    from jimpact.cli import main
+
+    (tmp_path / "shots.csv").write_text(
+        "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.2,0.8\n2,0,0.4,1.6\n"
+    )
+    study = tmp_path / "study.toml"
+    study.write_text(
+        '[scene]\nmasses_kg = [1.0, 1.0]\n[law]\nname = "blended"\nrestitution = 0.9\nshare = 0.1\n'
+        '[fit]\nfree = ["restitution"]\nstarts = 2\n[data]\nfile = "shots.csv"\n'
+    )
+    assert main(["fit", str(study), "--json", "--out", str(tmp_path)]) == 0
+    assert "0.6666" in capsys.readouterr().out  # 0.6 / (1 - 0.1)
+    assert main(["laws", "--json"]) == 0
+    assert "blended" in capsys.readouterr().out
+
+
+def test_declared_parameters_of_our_laws():
+    """Every registered law's parameters have a domain, and its required ones are few."""
+    for name, row in ji.REGISTRY.items():
+        assert row.parameters, name
+        assert set(row.required) <= set(row.parameters), name
+        for field in dataclasses.fields(row.law):
+            assert field.name in row.arguments or row.make is not None, (name, field.name)
