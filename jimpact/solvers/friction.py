@@ -34,10 +34,9 @@ _COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8  # tolerances of the sweeps; each is 
 # What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
 # contacts that reach their cone while others hold them: sweeps bring those to rest slowly.
 _ROOM, _SLOW_ROOM = 10.0, 100.0
-# `distribute`: part of the stiffness beside K that decides only where K is singular; sweeps over
-# the contacts, at most; change in one, in the largest limit, with which they end; part of the scale
-# below which a force is inside its disc, and a rate is none
-_SHARING, _RELAXATIONS, _SETTLED, _INSIDE = 1e-7, 200, 1e-13, 1e-9
+_RELAXATIONS = 200  # sweeps of `distribute` over the contacts, at most
+_SETTLED = 1e-13  # of the largest limit: a sweep of it that changes less is the last
+_INSIDE = 1e-9  # part of the limit below which a force is inside its disc, of a rate that is none
 
 
 class FrictionImpulses(NamedTuple):
@@ -532,8 +531,8 @@ def distribute(
     """Of the contacts `asked`: who sticks, and where the others slide to; the forces are known.
 
     Equation: `u' = rate + K lambda`, lambda in the discs |lambda_j| <= limit_j,
-    `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. Where K is singular
-    lambda is shared in proportion to the limits. A decision, without derivatives.
+    `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. A decision, without
+    derivatives: forces follow from the modes, to rounding.
 
     Args:
         matrix: K (t, t, B), positive semidefinite, t = m (planar) or 2 m, contact-major.
@@ -544,8 +543,8 @@ def distribute(
     Returns:
         Who sticks (m, B), and the directions (t, B) of slip of the others. A contact in
         space that others hold on the rim of its disc counts as sliding, at speed 0, against its
-        force. Planar with up to 3 contacts all modes are compared. Otherwise contacts are relaxed
-        in turn; of strongly coupled ones near the rim the last to settle may be wrong.
+        force. Contacts are relaxed in turn, 200 times at most: of strongly coupled ones near the
+        rim (of random pairs with nearly equal tangents 3 %) the last to settle may be wrong.
 
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.friction import distribute
@@ -560,9 +559,6 @@ def distribute(
     each = jnp.repeat(asked, rows, axis=0)
     matrix = jnp.where(each[:, None] & each[None], matrix, 0.0)
     rate = jnp.where(each, rate, 0.0)
-    if rows == 1 and m <= ENUMERATED:
-        slip = _compared(matrix, rate, limit, asked)
-        return asked & (slip == 0), slip
     force = _relaxed(matrix, rate, limit)
     slip = rate + _times_rows(matrix, force)
     stick = _lengths(force, rows) < (1 - _INSIDE) * limit
@@ -571,57 +567,6 @@ def distribute(
         stick = stick | (jnp.abs(slip) <= _INSIDE * scale)
     pushed = jnp.repeat(_lengths(force, rows) > 0, rows, axis=0)
     return asked & stick, jnp.where(pushed, -force, slip)
-
-
-def _compared(matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array) -> jax.Array:
-    """Signs of slip (m, B): of all modes (N, first axis) those that break the law least.
-
-    Written out by contacts, so that it compiles to a few kernels.
-    """
-    m = len(limit)
-    table = np.array(sorted(itertools.product((0, 1, -1), repeat=m), key=np.count_nonzero))
-    every = range(m)
-    mode = [jnp.asarray(table[:, j, None], matrix.dtype) for j in every]
-    sticks = [mode[j] == 0 for j in every]
-    most, pull = [limit[None, j] for j in every], [rate[None, j] for j in every]
-    k = [[matrix[None, i, j] for j in every] for i in every]
-    top = functools.reduce(jnp.maximum, most)
-    root = [jnp.sqrt(x / jnp.where(top > 0, top, 1.0)) for x in most]
-    stiffness = functools.reduce(jnp.maximum, [k[j][j] for j in every])
-    share = _SHARING * jnp.where(stiffness > 0, stiffness, 1.0)
-    a = [
-        [jnp.where(sticks[i] & sticks[j], root[i] * root[j] * k[i][j], 0.0) for j in every]
-        for i in every
-    ]
-    for j in every:
-        a[j][j] = a[j][j] + jnp.where(sticks[j], share, 1.0)
-    for p in every:  # L D L^T of a positive definite matrix
-        for i in range(p + 1, m):
-            factor = a[p][i] / a[p][p]
-            for j in range(i, m):
-                a[i][j] = a[i][j] - factor * a[p][j]
-            a[i][p] = factor
-    force = [-mode[j] * most[j] for j in every]
-
-    def slips() -> list[jax.Array]:
-        return [sum((k[i][j] * force[j] for j in every), pull[i]) for i in every]
-
-    for _ in range(2):  # the first solves, the second takes back what the sharing has changed
-        y = [jnp.where(sticks[j], -root[j] * slip, 0.0) for j, slip in enumerate(slips())]
-        for i in every:
-            y[i] = sum((-a[i][j] * y[j] for j in range(i)), y[i])
-        for i in reversed(every):
-            y[i] = sum((-a[i][j] * y[j] for j in range(i + 1, m)), y[i]) / a[i][i]
-        force = [force[j] + root[j] * y[j] for j in every]
-    worst, scale = jnp.zeros_like(force[0]), jnp.zeros_like(top)
-    for j, slip in enumerate(slips()):
-        beyond = k[j][j] * (jnp.abs(force[j]) - most[j])
-        wrong = jnp.where(sticks[j], jnp.maximum(beyond, jnp.abs(slip)), -mode[j] * slip)
-        wrong = jnp.where(sticks[j] | asked[None, j], wrong, jnp.inf)
-        worst = jnp.maximum(worst, wrong)
-        scale = jnp.maximum(scale, jnp.abs(pull[j]) + k[j][j] * most[j])
-    best = jnp.argmin(jnp.where(worst <= _INSIDE * scale, 0.0, worst), axis=0)
-    return jnp.asarray(table.T, matrix.dtype)[:, best]
 
 
 def _times_rows(matrix: jax.Array, force: jax.Array) -> jax.Array:
