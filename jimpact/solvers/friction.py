@@ -80,6 +80,7 @@ def solve(
     friction: jax.Array,
     *,
     complementary: bool,
+    sliding: jax.Array | None = None,
 ) -> FrictionImpulses:
     """Impulses `x = (p, p_t)` of contacts with Coulomb friction.
 
@@ -93,6 +94,8 @@ def solve(
         slip: (t,) `(1 + e_t) u-`.
         friction: mu (m,).
         complementary: contacts may part; otherwise they may pull (without friction).
+        sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
+            already: s, an acceleration, does not decide), 0 where it is asked for.
 
     Returns:
         p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are looked at, and
@@ -124,22 +127,32 @@ def solve(
     norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
     scale = 1 / jnp.repeat(norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows)
     given = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
+    friction = friction * norm[:, 1] / norm[:, 0]
+    of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
+    drag = jnp.zeros((m, rows), matrix.dtype)
+    if sliding is not None:
+        slides = jnp.any(sliding.reshape(m, rows) != 0, axis=1)
+        drag = -friction[:, None] * sliding.reshape(m, rows)
+        dragged = jnp.sum(of_contacts[..., 1:] * drag[None, None], axis=3)
+        of_contacts = of_contacts.at[..., 0].add(dragged)
+        decoupled = jnp.pad(jnp.repeat(slides[:, None], rows, axis=1), ((0, 0), (1, 0)))
+        apart = decoupled[:, :, None, None] | decoupled[None, None]
+        unit = jnp.eye(given.size, dtype=matrix.dtype).reshape(of_contacts.shape)
+        of_contacts = jnp.where(apart, unit, of_contacts)
+        given = jnp.where(decoupled, 0.0, given)
+        friction = jnp.where(slides, 0.0, friction)
     largest = jax.lax.stop_gradient(jnp.abs(given).max())
     size = jnp.where(largest > 0, largest, 1.0)
-    problem = _Problem(
-        of_contacts * scale[:, :, None, None] * scale[None, None],
-        given / size,
-        friction * norm[:, 1] / norm[:, 0],
-        complementary,
-    )
+    problem = _Problem(of_contacts, given / size, friction, complementary)
     fixed = _Problem(*jax.lax.stop_gradient(problem[:3]), complementary)
     modes, x, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
     modes, inverted = _most_at_rest(fixed, modes, x)
     shared = jnp.any(jnp.abs(inverted.pairs) > 0)
     status = jnp.maximum(status, jnp.where(shared, CODE["impulse_not_unique"], CODE["ok"]))
     x = _on_modes(problem, modes, inverted, x)
-    x = x * scale * size
-    return FrictionImpulses(x[:, 0], x[:, 1:].reshape(-1), status)
+    x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
+    p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
+    return FrictionImpulses(p, x[:, 1:].reshape(-1), status)
 
 
 # ------------------------------------------------------------------- the equations of modes
@@ -554,7 +567,7 @@ def distribute(
     ([False, False], [1.0, 1.0])
     """
     matrix, rate, limit = jax.lax.stop_gradient((matrix, rate, limit))
-    m, rows = len(limit), len(matrix) // len(limit)
+    rows = len(matrix) // len(limit)
     limit = jnp.where(asked, limit, 0.0)
     each = jnp.repeat(asked, rows, axis=0)
     matrix = jnp.where(each[:, None] & each[None], matrix, 0.0)
