@@ -195,7 +195,8 @@ def test_block_lying_flat(name):
     close(out.velocity @ np.asarray(FLAT.normals), -e * np.array([gamma] * 3), atol=1e-13)
     close(out.velocity[0, 0], v[0], atol=1e-14)  # without friction
     close(np.asarray(FLAT.tangents).T @ out.velocity[1], -0.2 * slip, atol=1e-13)  # it sticks
-    close(out.tangential_impulse[1, 0], out.tangential_impulse[1, 1], rtol=1e-11)
+    share = out.tangential_impulse[1] / out.impulse[1]  # in proportion to mu p
+    close(share[0], share[1], rtol=1e-10)
     close(out.tangential_impulse[2], -0.2 * out.impulse[2], atol=1e-13)  # it slides
     assert names(out.status) == ["ok", "impulse_not_unique", "ok"]
 
@@ -204,7 +205,7 @@ def test_given_slip_agrees_with_the_law():
     """(6.54)-(6.57) with xi = 1: the law finds that slip by itself, and the same impulses."""
     e, mu, fast = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2, np.array([2.0, -0.6, -0.3])
     out = ji.impact(ji.RestitutionMatrix(e, friction=mu), FLAT, fast)
-    p, side = jax.jit(lambda v: ji.theory.friction_impulses(FLAT, e, mu, 1.0, v))(fast)
+    p, side = ji.theory.friction_impulses(FLAT, e, mu, 1.0, fast)
     assert float((FLAT.tangents.T @ out.velocity)[0]) > 0  # still sliding: xi = 1 was right
     close(out.impulse, p, rtol=1e-12)
     close(out.tangential_impulse, side, rtol=1e-12)
