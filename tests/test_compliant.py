@@ -309,7 +309,7 @@ def histories():
 
     def one(mass, v, e, k, eta):
         law = ji.LZB(e, k, eta)
-        h = ji.history(law, ji.chain(mass, wall=True), v, samples=101, records=256)
+        h = ji.history(law, ji.chain(mass, wall=True), v, samples=101)
         return h, ji.impact(law, ji.chain(mass, wall=True), v)
 
     return jax.jit(jax.vmap(one))
@@ -359,7 +359,7 @@ def test_histories():
 @pytest.mark.slow
 def test_history_across_gaps():
     scene, law = ji.chain(jnp.ones(3), gaps=jnp.array([0.3, 4.0])), ji.Compliant(ji.Hertz(1.0))
-    h = ji.history(law, scene, STRIKE, samples=400, records=128)
+    h = ji.history(law, scene, STRIKE, samples=400)
     out = ji.impact(law, scene, STRIKE)
     np.testing.assert_allclose(h.velocity[-1], out.velocity, atol=1e-7)
     np.testing.assert_allclose(np.trapezoid(h.force, h.time, axis=0), h.impulse[-1], rtol=2e-3)

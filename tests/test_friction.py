@@ -26,7 +26,9 @@ LAWS = {
     "matrix": lambda e, mu, e_t, k: ji.RestitutionMatrix(
         jnp.diag(e), friction=mu, tangential_restitution=e_t
     ),
+    "poisson": lambda e, mu, e_t, k: ji.Poisson(e, friction=mu, tangential_restitution=e_t),
     "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu),
+    "compliant": lambda e, mu, e_t, k: ji.Compliant(ji.Bistiffness(k, 1.5, e), friction=mu),
 }
 KINEMATIC = ("newton", "moreau", "matrix")
 
@@ -85,10 +87,13 @@ DISK = (
 )  # (x, y, turn) of a disk on the ground
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] if x == "compliant" else []) for x in LAWS],
+)
 def test_disk_in_closed_form(name):
     """It sticks for `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of that."""
-    e_ts = (0.0,) if name == "lzb" else (-0.3, 0.0, 1.0)
+    e_ts = (-0.3, 0.0, 1.0) if name in KINEMATIC else (0.0,)
     grid = np.array(list(itertools.product((0.0, 0.1, 0.4, 50.0), e_ts, (-2.0, 0.3), (0.0, 1.5))))
     mu, e_t, x_rate, turn = grid.T
     e, y_rate, count = 0.6, -1.3, len(grid)
@@ -98,7 +103,7 @@ def test_disk_in_closed_form(name):
     slip = x_rate + RADIUS * turn
     p = MASS * (1 + e) * 1.3
     side = np.clip(-(1 + e_t) * slip / (1 / MASS + RADIUS**2 / INERTIA), -mu * p, mu * p)
-    off = 1e-8 if name == "lzb" else 1e-13
+    off = 1e-8 if name in ("lzb", "compliant") else 1e-13
     assert not out.status.any()
     close(out.impulse[:, 0], p, rtol=off)
     close(out.tangential_impulse[:, 0], side, atol=off)
@@ -458,11 +463,11 @@ def test_derivatives(name, kind):
     rng = np.random.default_rng(1)
     way = [0.3 * rng.normal(size=np.shape(y)) for y in x]
     step = 1e-3
-    moved = [[np.concatenate([y + s * step * d for s in (2, 1, -1, -2)]) for y, d in zip(x, way)]][
-        0
-    ]
+    v, *moved, stiff = (
+        np.concatenate([y + s * step * d for s in (2, 1, -1, -2)]) for y, d in zip(x, way)
+    )
     four = [np.concatenate([y] * 4) for y in scenes[:3]]
-    out, _ = run(name, *four, moved[0], moved[1], moved[2], k=moved[3])
+    out, _ = run(name, *four, v, *moved, k=stiff)
     f, fine = out.velocity.reshape(4, 8, n), ~failed(out.status).reshape(4, 8).any(axis=0)
     slope = (-f[0] + 8 * f[1] - 8 * f[2] + f[3]) / (12 * step)
     found = sum(np.einsum("cij,cj->ci", a, d) for a, d in zip(forward, way))
@@ -491,7 +496,6 @@ def test_frictionless_scenes_pay_nothing():
 
     plain = operations(bare)
     assert operations(block) < 1.25 * plain  # tangential rows, which the compiler drops
-    assert operations(block, friction=0.1) > 1.5 * plain
 
 
 BAD = {
