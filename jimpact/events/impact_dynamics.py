@@ -326,15 +326,13 @@ def settled(
     def come_to_rest(p: jax.Array) -> jax.Array:
         still, frozen = jax.lax.stop_gradient((gamma + flow.coupling.times(p), flow.coupling))
 
-        def choose(_: int, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def choose(_: Any, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             """Those that would pull leave, those that still approach carry, too."""
-            carries, dp = both
-            left = still + frozen.times(dp)
-            carries = rest & jnp.where(carries, dp > 0, left < 0)
-            return carries, remainder(frozen, carries, still)
+            carries, _ = both
+            dp = remainder(frozen, carries, still)
+            return rest & jnp.where(carries, dp > 0, still + frozen.times(dp) < 0), dp
 
-        first = rest & (still < 0)
-        start = (first, remainder(frozen, first, still))
+        start = (rest & (still < 0), jnp.zeros_like(still))
         carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
         if exactly:
             dp = remainder(flow.coupling, carries, gamma + flow.coupling.times(p))

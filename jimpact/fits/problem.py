@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import quick_jit
 from jimpact.experiments import Experiments
 from jimpact.fits.least_squares import Box, Method, Region, State, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
@@ -137,7 +138,7 @@ def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any
     return residual, jacobian, (velocity, status)
 
 
-@eqx.filter_jit
+@quick_jit
 def begin_all(problem: Problem, starts: jax.Array, method: Method, max_steps: int) -> State:
     """States of a batch of starts y (S, Q)."""
     shots, bodies = problem.post.shape
@@ -152,7 +153,7 @@ def begin_all(problem: Problem, starts: jax.Array, method: Method, max_steps: in
     return jax.vmap(one)(starts)
 
 
-@eqx.filter_jit
+@quick_jit
 def advance_all(
     problem: Problem, states: State, method: Method, max_steps: int, passes: int
 ) -> State:
