@@ -536,7 +536,6 @@ def test_bad_arguments(name):
         call()
 
 
-<<<<<<< HEAD
 @pytest.mark.slow
 def test_reverse_derivatives_of_lzb():
     scenes, e, mu, k = random_scenes(4, 1, 4, most=-0.5)
@@ -554,7 +553,8 @@ def test_reverse_derivatives_of_lzb():
             forward = slopes
     for a, b in zip(forward, slopes):
         close(a, b, atol=1e-9)
-=======
+
+
 # ------------------------------------------------------------------ a real cube, in space
 
 CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
@@ -621,4 +621,3 @@ def test_slopes_where_a_real_cube_comes_to_stick():
         close(slopes[:, :, i], (4 * difference(1e-4) - difference(2e-4)) / 3, atol=2e-2)
     sticks = rows["toss"] == 46
     assert np.abs(slopes[sticks, :, 0]).max() < 0.01
->>>>>>> slip
