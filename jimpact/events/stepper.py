@@ -143,8 +143,9 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     xi0 = total(jnp.where(s.target, xi0, 0.0))
     rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
     start = jnp.where(lands > 0, xi0, begun)
-    length = jnp.where(lands > 0, -xi0, h)
-    nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)  # a margin at rest at 0 takes no time
+    # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
+    nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
+    length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
     count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
