@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_kind, check_values, in_common_dtype, is_traced
+from jimpact.compiling import quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
 from jimpact.law import Impulses, Law, check_law, is_separable, of_contacts
 from jimpact.scene import Scene, as_velocity, momentum, velocity_change
@@ -91,7 +92,7 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
         )
 
 
-@eqx.filter_jit
+@quick_jit
 def _impact(
     law: Law, scene: Scene, v: jax.Array, groups: Groups | None, noise: jax.Array | None
 ) -> Impact:
@@ -205,6 +206,10 @@ def raise_on_failure(out: Impact) -> Impact:
     """Raise a RuntimeError naming every failed impact of `out` (batched or not); else return it.
 
     Codes that only inform (`plastic_limit`, `impulse_not_unique`, `order_dependent`) pass.
+
+    >>> import jimpact as ji
+    >>> scene = ji.chain([1.0, 1.0, 1.0])
+    >>> out = ji.raise_on_failure(ji.impact(ji.Moreau(0.5), scene, [1.0, 0.0, 0.0]))
     """
     codes = np.atleast_1d(np.asarray(out.status))
     lines = []
