@@ -57,7 +57,8 @@ class Contact(eqx.Module):
     Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
 
     >>> import jimpact as ji
-    >>> ji.Newton(0.5).impulses(ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])).normal.tolist()
+    >>> contact = ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])
+    >>> ji.Newton(0.5).impulses(contact).normal.round(6).tolist()
     [1.0, 0.5]
     """
 

@@ -206,6 +206,10 @@ def raise_on_failure(out: Impact) -> Impact:
     """Raise a RuntimeError naming every failed impact of `out` (batched or not); else return it.
 
     Codes that only inform (`plastic_limit`, `impulse_not_unique`, `order_dependent`) pass.
+
+    >>> import jimpact as ji
+    >>> scene = ji.chain([1.0, 1.0, 1.0])
+    >>> out = ji.raise_on_failure(ji.impact(ji.Moreau(0.5), scene, [1.0, 0.0, 0.0]))
     """
     codes = np.atleast_1d(np.asarray(out.status))
     lines = []

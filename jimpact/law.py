@@ -197,7 +197,7 @@ def parameter(
     ...
     ...     def __init__(self, loss):
     ...         self.loss = loss
-    ...         super().__init__(1 - self.loss / 2)
+    ...         super().__init__(restitution=0.5)
     >>> Lossy(1.5)
     Traceback (most recent call last):
         ...
@@ -229,6 +229,12 @@ def option(
     """A static field of a `Law` that says how it is solved: one of `choices`, or in an interval.
 
     `converter` takes the place of these checks.
+
+    >>> import jimpact as ji
+    >>> class Quick(ji.Newton):
+    ...     steps: int = ji.option(3, low=1)
+    >>> Quick.steps
+    3
     """
     declared = Option(choices, low, high, open_low=open_low, converter=converter)
     return _field(declared, default, kw_only, True)
