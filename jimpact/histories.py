@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import check_values, in_common_dtype
+from jimpact.compiling import quick_jit
 from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import Measured
 from jimpact.events.impact_dynamics import Outcome
@@ -83,7 +84,7 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     return _history(law, scene, v, samples)  # type: ignore[arg-type]
 
 
-@eqx.filter_jit
+@quick_jit
 def _history(law: LZB | Compliant, scene: Scene, v: jax.Array, samples: int) -> History:
     contact = law.contact(scene, v)
     happens, gamma = contact.happens, contact.gap_velocity

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_kind, check_values, in_common_dtype, is_traced
+from jimpact.compiling import quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
 from jimpact.law import Impulses, Law, check_law, is_separable, of_contacts
 from jimpact.scene import Scene, as_velocity, momentum, velocity_change
@@ -91,7 +92,7 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
         )
 
 
-@eqx.filter_jit
+@quick_jit
 def _impact(
     law: Law, scene: Scene, v: jax.Array, groups: Groups | None, noise: jax.Array | None
 ) -> Impact:

@@ -72,11 +72,11 @@ MUTATIONS = [
     Mutation("freedom counted with parameters, not rank", r"freedom = values - rank\n", "freedom = values - len(names)\n", ("test_fit.py",), "uncertainty.py"),
     Mutation("rank tolerance too coarse", r"\"float64\": 1e-6", '"float64": 1e-1', ("test_fit.py",), "uncertainty.py"),
     Mutation("standard errors without noise", r"covariance = noise\*\*2 \* ", "covariance = noise * ", ("test_fit.py",), "uncertainty.py"),
-    Mutation("a bound of a parameter", r"restitution: jax\.Array = parameter\(low=0\.0, high=1\.0\)\n    stiffness", "restitution: jax.Array = parameter(low=0.0, high=2.0)\n    stiffness", ("test_errors.py",), "lzb.py"),
+    Mutation("a bound of a parameter", r"restitution: Values = parameter\(low=0\.0, high=1\.0\)\n    stiffness", "restitution: Values = parameter(low=0.0, high=2.0)\n    stiffness", ("test_errors.py",), "lzb.py"),
     # --- data, sampling, motion
-    Mutation("a unit", r"\"in/s\": 0\.0254", '"in/s": 0.254', ("test_experiments.py",), "csv_shots.py"),
-    Mutation("the seed of a chunk", r"jax\.random\.fold_in\(key, np\.uint32\(task\.number\)\)", "key", ("test_montecarlo.py",), "plans.py"),
-    Mutation("variance by n", r"/ \(([^)]*count[^)]*) - 1\)", r"/ (\1)", ("test_montecarlo.py",), "m*.py"),
+    Mutation("a unit", r"\"in/s\": 0\.0254", '"in/s": 0.254', ("test_experiments.py",), "experiments.py"),
+    Mutation("the seed of a chunk", r"jax\.random\.fold_in\(key, np\.uint32\(task\.number\)\)", "key", ("test_montecarlo.py",), "planning.py"),
+    Mutation("variance by n", r"/ \(([^)]*count[^)]*) - 1\)", r"/ (\1)", ("test_montecarlo.py",), "statistics.py"),
     Mutation("restitution in the base's frame", r"velocity_after = ", "velocity_after = 0.999 * ", ("test_motion.py",), "*.py"),
 ]  # fmt: skip
 

@@ -246,6 +246,10 @@ class ContactFlow:
         modes = jnp.concatenate([phase, jnp.zeros_like(phase)]).astype(jnp.int32)
         return modes, jnp.concatenate([x, g, jnp.zeros_like(g), jnp.zeros_like(g[:1])])
 
+    def scales(self, modes: jax.Array) -> jax.Array:
+        """s_j = gamma_j / g_j (m, B)."""
+        return jnp.where(modes[: self.contacts] == EXPANSION, self.restitution, 1.0)
+
     # ---- the protocol
 
     def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
@@ -253,8 +257,7 @@ class ContactFlow:
         return 1.0
 
     def constants(self, modes: jax.Array) -> Frozen:
-        phase = modes[: self.contacts]
-        s = jnp.where(phase == EXPANSION, self.restitution, 1.0)
+        phase, s = modes[: self.contacts], self.scales(modes)
         # the least one makes e = 0 regular; of several one of them, whole: min() would share its
         # derivative among them
         least = (
@@ -376,7 +379,7 @@ class ContactFlow:
         """Contacts loaded or approaching by more than the tolerance, gamma, gamma once alone."""
         x, g, _ = self.rows(y)
         phase = modes[: self.contacts]
-        gamma = jnp.where(phase == EXPANSION, self.restitution, 1.0) * g
+        gamma = self.scales(modes) * g
         energy = self.energy(x, g)
         works = ((x > 0) | (gamma < 0)) & (energy > tolerance**2)
         if self.viscous is not None:

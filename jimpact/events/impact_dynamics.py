@@ -219,13 +219,12 @@ class Outcome:
         else:
             moving, state = flow, jnp.where(over, flow.finish(last, end.y)[1], end.y)
         p = state[2 * m : 3 * m]
-        rest = at_rest(flow, jax.lax.stop_gradient(state), over, last, end.plan[3:4])
+        rest = at_rest(flow, end)
         p = settled(moving, problem.gamma, p, rest, exactly=self.repeats)
         side, time = state[3 * m + self.sides : -1][: self.sides], state[-1:]
         if self.repeats:
             return p, side, time
-        code = code_of(over, rest)
-        return p, side, time, code, end.plan[3:4].astype(jnp.int32)
+        return p, side, time, status_of(end, rest), end.plan[3:4].astype(jnp.int32)
 
 
 class Dynamics(NamedTuple):
@@ -290,51 +289,41 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
     return value(*leaves)
 
 
-def at_rest(
-    flow: ContactFlow, state: jax.Array, over: jax.Array, modes: jax.Array, passes: jax.Array
-) -> jax.Array:
-    """Contacts (m, B) as good as at rest where some re-closed again and again."""
-    m = flow.contacts
-    _, gamma, _ = flow.rows(state)
+def at_rest(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
+    """Contacts (m, B) as good as at rest where some of them re-closed again and again."""
+    m, modes, over = flow.contacts, end.step.modes, end.plan[2:3] > 0
+    gamma = flow.scales(modes) * flow.rows(end.y)[1]
     # no wider than what ended the impact: a ball of a long chain may be slower
-    quiet = jnp.abs(gamma) <= QUIET * flow.patience(passes)
-    endless = quiet & (modes[m : 2 * m] >= ENDLESS)
-    return over & (endless | (any_of(endless) & quiet & (gamma < 0)))
+    quiet = jnp.abs(gamma) <= QUIET * flow.patience(end.plan[3:4])
+    return over & quiet & any_of(quiet & (modes[m : 2 * m] >= ENDLESS))
 
 
-def code_of(over: jax.Array, rest: jax.Array) -> jax.Array:
-    """Status (1, B) of impacts that are over, or not, with contacts left at rest."""
+def status_of(end: stepper.Carry, rest: jax.Array) -> jax.Array:
+    """Status (1, B) of a run with contacts left at rest."""
     code = jnp.where(any_of(rest), CODE["plastic_limit"], CODE["ok"])
-    return jnp.where(over, code, CODE["max_steps"]).astype(jnp.int32)
-
-
-def status_of(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
-    """Status (1, B) of a run."""
-    over = end.plan[2:3] > 0
-    return code_of(over, at_rest(flow, end.y, over, end.step.modes, end.plan[3:4]))
+    return jnp.where(end.plan[2:3] > 0, code, CODE["max_steps"]).astype(jnp.int32)
 
 
 def settled(
     flow: ContactFlow, gamma: jax.Array, p: jax.Array, rest: jax.Array, exactly: bool
 ) -> jax.Array:
-    """Impulses once endless re-closing has come to its limit, gamma+ = 0 at contacts at rest.
+    """Impulses once endless re-closing has come to its limit.
 
-    They carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`. Who carries is
-    a decision; `exactly`: dp is a smooth function of the rest.
+    Contacts at rest carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, on
+    the gamma+ that their impulses give: errors of many closings add up. Who carries is a decision;
+    `exactly`: dp is a smooth function of the rest.
     """
 
     def come_to_rest(p: jax.Array) -> jax.Array:
         still, frozen = jax.lax.stop_gradient((gamma + flow.coupling.times(p), flow.coupling))
 
-        def choose(_: int, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def choose(_: Any, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
             """Those that would pull leave, those that still approach carry, too."""
-            carries, dp = both
-            left = still + frozen.times(dp)
-            carries = rest & jnp.where(carries, dp > 0, left < 0)
-            return carries, remainder(frozen, carries, still)
+            carries, _ = both
+            dp = remainder(frozen, carries, still)
+            return rest & jnp.where(carries, dp > 0, still + frozen.times(dp) < 0), dp
 
-        first = rest & (still < 0)
-        start = (first, remainder(frozen, first, still))
+        start = (rest & (still < 0), jnp.zeros_like(still))
         carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
         if exactly:
             dp = remainder(flow.coupling, carries, gamma + flow.coupling.times(p))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jimpact.events import stepper
 from jimpact.events.contact_flow import Measured
-from jimpact.events.impact_dynamics import Outcome, status_of
+from jimpact.events.impact_dynamics import Outcome, at_rest, status_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,5 +55,5 @@ class Samples:
         parts = jnp.linspace(0.0, 1.0, self.samples, dtype=y.dtype)
         time, energy, seen = jax.lax.map(at, parts)
         force = jax.lax.map(lambda both: moving.measured(*both).force, (phases, states))
-        code = status_of(flow, end).astype(y.dtype)
+        code = status_of(end, at_rest(flow, end)).astype(y.dtype)
         return time, energy, *seen, jnp.max(force, axis=0), code

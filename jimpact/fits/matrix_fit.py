@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import linprog
 
+from jimpact.compiling import quick_jit
 from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
 from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -302,7 +303,7 @@ def _start(entries: Any, origin: Any, mix: Any) -> np.ndarray:
     return np.asarray(np.linalg.lstsq(np.asarray(mix, float), rest, rcond=None)[0])
 
 
-@eqx.filter_jit
+@quick_jit
 def _all_conditions(region: AdmissibleMatrices, y: jax.Array) -> tuple[jax.Array, jax.Array]:
     return region.conditions(y)
 

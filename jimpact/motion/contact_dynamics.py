@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_kind, check_shape, check_values
 from jimpact.bodies.base import Body, GivenBody
+from jimpact.compiling import quick_jit
 from jimpact.contact import delassus_matrix
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK, root_order
 from jimpact.events.stepper import any_of
@@ -311,7 +312,7 @@ def turning_impact(
     return _turning(System(body), force, position, v, HORIZON * unit, rtol, max_steps)
 
 
-@eqx.filter_jit
+@quick_jit
 def _turning(
     system: System,
     force: Force,

@@ -3,7 +3,6 @@
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from jimpact._checks import (
     check_values,
     is_traced,
 )
+from jimpact.compiling import quick_jit
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
@@ -141,7 +141,7 @@ def simulate(
     return _events(system, law, mu, settings, q, v, start, end, count, max_events)
 
 
-@eqx.filter_jit
+@quick_jit
 def _events(
     system: System,
     law: Law,
@@ -160,7 +160,7 @@ def _events(
     )
 
 
-@eqx.filter_jit
+@quick_jit
 def _forced(
     system: System,
     force: Force,
@@ -177,7 +177,7 @@ def _forced(
     return _recorded(system, times, course)
 
 
-@eqx.filter_jit
+@quick_jit
 def _stepped(
     system: System,
     law: Law,

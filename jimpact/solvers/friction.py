@@ -53,6 +53,7 @@ class _Problem(NamedTuple):
     matrix: jax.Array
     given: jax.Array
     friction: jax.Array
+    load: jax.Array | None
     complementary: bool
 
     @property
@@ -80,6 +81,7 @@ def solve(
     friction: jax.Array,
     *,
     complementary: bool,
+    load: jax.Array | None = None,
     sliding: jax.Array | None = None,
 ) -> FrictionImpulses:
     """Impulses `x = (p, p_t)` of contacts with Coulomb friction.
@@ -95,7 +97,10 @@ def solve(
         friction: mu (m,).
         complementary: contacts may part; otherwise they may pull (without friction).
         sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
-            already: s, an acceleration, does not decide), 0 where it is asked for.
+            already: s, an acceleration, does not decide), 0 where it is asked for. Not together
+            with `load`.
+        load: (m,) >= 0, normal impulses beside p that friction knows of: it is bounded by
+            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0.
 
     Returns:
         p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are looked at, and
@@ -143,8 +148,14 @@ def solve(
         friction = jnp.where(slides, 0.0, friction)
     largest = jax.lax.stop_gradient(jnp.abs(given).max())
     size = jnp.where(largest > 0, largest, 1.0)
-    problem = _Problem(of_contacts, given / size, friction, complementary)
-    fixed = _Problem(*jax.lax.stop_gradient(problem[:3]), complementary)
+    problem = _Problem(
+        of_contacts,
+        given / size,
+        friction,
+        None if load is None else load * norm[:, 0] / size,
+        complementary,
+    )
+    fixed = _Problem(*jax.lax.stop_gradient(problem[:4]), complementary)
     modes, x, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
     modes, inverted = _most_at_rest(fixed, modes, x)
     shared = jnp.any(jnp.abs(inverted.pairs) > 0)
@@ -186,8 +197,9 @@ def _in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
 
 
 def _bound(problem: _Problem, x: jax.Array) -> jax.Array:
-    """mu p (m, N)."""
-    return problem.friction[:, None] * jnp.maximum(x[:, 0], 0.0)
+    """mu (p + load) (m, N)."""
+    p = jnp.maximum(x[:, 0], 0.0)
+    return problem.friction[:, None] * (p if problem.load is None else p + problem.load[:, None])
 
 
 def _size(x: jax.Array) -> jax.Array:
@@ -207,7 +219,7 @@ def _misfit(problem: _Problem, x: jax.Array) -> jax.Array:
 def _equations(problem: _Problem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
     """Linear equations (m, b, m, b, N), (m, b, N) of modes: r = 0 or p = 0, and
 
-        Q s + (1 - Q) p_t + mu p d = 0
+        Q s + (1 - Q) p_t + mu (p + load) d = 0
 
     with Q = 1 where a contact sticks and Q = 0 where it is free or slides along a fixed direction.
     With Q = beta e e^T, e orthogonal to d, beta = mu p / (mu p + |s|), this is Newton's method for
@@ -227,6 +239,8 @@ def _equations(problem: _Problem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
     pressed = along[:, :, None, None] * own * first
     moved = jnp.sum(q[:, :, :, None, None] * (problem.matrix - unit)[:, None, ..., None], axis=2)
     right = -jnp.sum(q * problem.given[:, None, :, None], axis=2)
+    if problem.load is not None:
+        right = right - along * problem.load[:, None, None]
     return moved + pressed + unit[..., None], right
 
 
@@ -301,17 +315,27 @@ def _inverse(block: jax.Array, perturbed: float) -> jax.Array:
 # ------------------------------------------------------------------- the decision
 
 
-def _table(contacts: int, rows: int) -> np.ndarray:
-    """All modes (m, N), sticking before sliding before free: 0 sticks, 1 is free, 2... slide."""
-    kinds = itertools.product(range(2 + (2 if rows == 1 else _DIRECTIONS)), repeat=contacts)
-    return np.array(sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))).T
+def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarray]:
+    """All modes (m, N), sticking before sliding before free: 0 sticks, 1 is free, 2... slide.
+
+    And which take part: all that are not free, but with a load any other with p = 0 as well.
+    """
+    slides = 2 if rows == 1 else _DIRECTIONS
+    if not loaded:
+        kinds = itertools.product(range(2 + slides), repeat=contacts)
+        table = np.array(sorted(kinds, key=lambda k: (np.count_nonzero(k), k.count(1)))).T
+        return table, table != 1
+    each = [(kind, taking) for kind in (0, *range(2, 2 + slides)) for taking in (True, False)]
+    both = itertools.product(each, repeat=contacts)
+    table = np.array(sorted(both, key=lambda k: sum((kind > 0) for kind, _ in k))).T
+    return table[0], table[1] == 1
 
 
 def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     """The consistent modes (N = 1) that stick most, their x (m, b), and the status."""
     m, rows = len(problem.friction), problem.given.shape[1] - 1
     dtype = problem.matrix.dtype
-    kinds = _table(m, rows)
+    kinds, taking = _table(m, rows, problem.load is not None)
     angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
     turned = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
@@ -321,7 +345,7 @@ def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
         begin = jnp.where(_length(begin)[:, None] > 0, begin, 1.0)
         begin = _over(begin, _length(begin))
     modes = _Modes(
-        jnp.asarray((kinds != 1) | (not problem.complementary)),
+        jnp.asarray(taking | (not problem.complementary)),
         jnp.asarray(kinds == 0),
         jnp.sum(turn * begin.swapaxes(0, 1)[None], axis=1).swapaxes(0, 1),
         jnp.zeros(kinds.shape, dtype),
@@ -362,6 +386,8 @@ def _at_rest(problem: _Problem, x: jax.Array, room: jax.Array) -> _Modes:
     room = (room * _size(x[..., None]))[None]
     taking = rate[:, 0] <= room if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
     pushes = taking & (x[:, :1] >= -room)
+    if problem.load is not None:
+        pushes = pushes | (problem.load[:, None] > 0)
     speed = _length(rate[:, 1:])
     sticks = pushes & (speed <= room)
     slides = pushes & ~sticks
@@ -498,7 +524,8 @@ def _by_lemke(problem: _Problem) -> tuple[jax.Array, jax.Array]:
         ]
     )
     r, s = problem.given.T
-    found = solve_lcp(whole, jnp.concatenate([r, s, -s, jnp.zeros_like(r)]), symmetric=False)
+    room = jnp.zeros_like(r) if problem.load is None else problem.friction * problem.load
+    found = solve_lcp(whole, jnp.concatenate([r, s, -s, room]), symmetric=False)
     z = found.z.reshape(4, m)
     return jnp.stack([z[0], z[1] - z[2]], axis=1), found.code
 
@@ -515,7 +542,10 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
         p = x[i, 0] - rate[0] / own[i, 0, 0]
         p = jnp.maximum(p, 0.0) if problem.complementary else p
         rate = rate[1:] + own[i, 1:, 0] * (p - x[i, 0])
-        bound = problem.friction[i] * jnp.maximum(p, 0.0)
+        bound = (
+            jnp.maximum(p, 0.0) if problem.load is None else jnp.maximum(p, 0.0) + problem.load[i]
+        )
+        bound = problem.friction[i] * bound
         side = (x[i, 1:] - rate / stiffest[i])[None, :, None]
         side = _in_disc(side, bound[None, None])[0, :, 0]
         return x.at[i].set(jnp.concatenate([p[None], side]))
