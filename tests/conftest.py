@@ -96,12 +96,12 @@ def pytest_terminal_summary(terminalreporter, config):
 
 
 def pytest_collection_modifyitems(items):
-    """Tests that share a program run in one process: those of a law, those of a file."""
+    """Tests that share a program run in one process: those that name a law, those of a file."""
+    laws = sorted(programs_of_laws.LAWS, key=len, reverse=True)
     for item in items:
-        law = getattr(item, "callspec", None) and item.callspec.params.get("name")
-        shared = law if law in programs_of_laws.LAWS else Path(item.path).stem
         if not item.get_closest_marker("xdist_group"):
-            item.add_marker(pytest.mark.xdist_group(str(shared)))
+            shared = next((law for law in laws if law in item.nodeid), Path(item.path).stem)
+            item.add_marker(pytest.mark.xdist_group(shared))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -106,10 +106,15 @@ def test_against_the_plain_reference(order):
     lengths = set()
     for i in range(60):
         expected, done = plain(normals[i], mass[i], gaps[i], v[i], e[i], order)
+        if int(count[i]) < 0:  # hundreds of collisions are finished at once
+            assert len(done) > 100
+            assert names(out.status[i]) == ["plastic_limit"]
+            np.testing.assert_allclose(out.velocity[i], expected, rtol=0, atol=1e-7)
+            continue
         np.testing.assert_allclose(out.velocity[i], expected, rtol=0, atol=1e-11)
         assert int(count[i]) == len(done)
+        assert names(out.status[i]) == ["ok"]
         lengths.add(len(done))
-    assert set(names(out.status)) == {"ok"}
     assert len(lengths) > 4  # lanes of a batch end on their own
 
 

@@ -7,6 +7,7 @@ joined by idle ones, a scene of one contact by a second one, open.
 import dataclasses
 import functools
 import itertools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +27,9 @@ LAWS = {
     "matrix": lambda e, mu, e_t, k: ji.RestitutionMatrix(
         jnp.diag(e), friction=mu, tangential_restitution=e_t
     ),
+    "poisson": lambda e, mu, e_t, k: ji.Poisson(e, friction=mu, tangential_restitution=e_t),
     "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu),
+    "compliant": lambda e, mu, e_t, k: ji.Compliant(ji.Bistiffness(k, 1.5, e), friction=mu),
 }
 KINEMATIC = ("newton", "moreau", "matrix")
 
@@ -85,10 +88,13 @@ DISK = (
 )  # (x, y, turn) of a disk on the ground
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=[pytest.mark.slow] if x == "compliant" else []) for x in LAWS],
+)
 def test_disk_in_closed_form(name):
     """It sticks for `-(1 + e_t) v_t / W_tt`; friction gives at most mu p of that."""
-    e_ts = (0.0,) if name == "lzb" else (-0.3, 0.0, 1.0)
+    e_ts = (-0.3, 0.0, 1.0) if name in KINEMATIC else (0.0,)
     grid = np.array(list(itertools.product((0.0, 0.1, 0.4, 50.0), e_ts, (-2.0, 0.3), (0.0, 1.5))))
     mu, e_t, x_rate, turn = grid.T
     e, y_rate, count = 0.6, -1.3, len(grid)
@@ -98,7 +104,7 @@ def test_disk_in_closed_form(name):
     slip = x_rate + RADIUS * turn
     p = MASS * (1 + e) * 1.3
     side = np.clip(-(1 + e_t) * slip / (1 / MASS + RADIUS**2 / INERTIA), -mu * p, mu * p)
-    off = 1e-8 if name == "lzb" else 1e-13
+    off = 1e-8 if name in ("lzb", "compliant") else 1e-13
     assert not out.status.any()
     close(out.impulse[:, 0], p, rtol=off)
     close(out.tangential_impulse[:, 0], side, atol=off)
@@ -195,7 +201,8 @@ def test_block_lying_flat(name):
     close(out.velocity @ np.asarray(FLAT.normals), -e * np.array([gamma] * 3), atol=1e-13)
     close(out.velocity[0, 0], v[0], atol=1e-14)  # without friction
     close(np.asarray(FLAT.tangents).T @ out.velocity[1], -0.2 * slip, atol=1e-13)  # it sticks
-    close(out.tangential_impulse[1, 0], out.tangential_impulse[1, 1], rtol=1e-11)
+    share = out.tangential_impulse[1] / out.impulse[1]  # in proportion to mu p
+    close(share[0], share[1], rtol=1e-10)
     close(out.tangential_impulse[2], -0.2 * out.impulse[2], atol=1e-13)  # it slides
     assert names(out.status) == ["ok", "impulse_not_unique", "ok"]
 
@@ -204,7 +211,7 @@ def test_given_slip_agrees_with_the_law():
     """(6.54)-(6.57) with xi = 1: the law finds that slip by itself, and the same impulses."""
     e, mu, fast = np.array([[0.5, 0.1], [0.2, 0.3]]), 0.2, np.array([2.0, -0.6, -0.3])
     out = ji.impact(ji.RestitutionMatrix(e, friction=mu), FLAT, fast)
-    p, side = jax.jit(lambda v: ji.theory.friction_impulses(FLAT, e, mu, 1.0, v))(fast)
+    p, side = ji.theory.friction_impulses(FLAT, e, mu, 1.0, fast)
     assert float((FLAT.tangents.T @ out.velocity)[0]) > 0  # still sliding: xi = 1 was right
     close(out.impulse, p, rtol=1e-12)
     close(out.tangential_impulse, side, rtol=1e-12)
@@ -436,7 +443,7 @@ SLOPES = {"planar": (1, 4), "space": (2, 6)}
     ],
 )
 def test_derivatives(name, kind):
-    """In v, e, mu and k: forward equals reverse, and both the slope of the values."""
+    """In v, e, mu and k: the slope of the values; reverse, where it is compiled, is forward."""
     rows, n = SLOPES[kind]
     scenes, e, mu, k = random_scenes(8, rows, n, most=-0.5)
     e = np.minimum(e, 0.95)
@@ -446,19 +453,22 @@ def test_derivatives(name, kind):
         scene = ji.Scene(mass, normals, tangents=tangents, gaps=jnp.zeros(2))
         return ji.impact(LAWS[name](e, mu, jnp.zeros(2), k), scene, v).velocity
 
-    def both(*given):
-        return jax.jacfwd(after)(*given), jax.jacrev(after)(*given)
+    modes = (jax.jacfwd, jax.jacrev) if (name, kind) == ("moreau", "planar") else (jax.jacfwd,)
+
+    def each(*given):
+        return [mode(after)(*given) for mode in modes]
 
     x = (scenes[3], e, mu, k)
-    forward, reverse = jax.jit(jax.vmap(both))(x, *scenes[:3])
+    slopes = jax.jit(jax.vmap(each))(x, *scenes[:3])
+    forward, reverse = slopes[0], slopes[-1]
     rng = np.random.default_rng(1)
     way = [0.3 * rng.normal(size=np.shape(y)) for y in x]
     step = 1e-3
-    moved = [[np.concatenate([y + s * step * d for s in (2, 1, -1, -2)]) for y, d in zip(x, way)]][
-        0
-    ]
+    v, *moved, stiff = (
+        np.concatenate([y + s * step * d for s in (2, 1, -1, -2)]) for y, d in zip(x, way)
+    )
     four = [np.concatenate([y] * 4) for y in scenes[:3]]
-    out, _ = run(name, *four, moved[0], moved[1], moved[2], k=moved[3])
+    out, _ = run(name, *four, v, *moved, k=stiff)
     f, fine = out.velocity.reshape(4, 8, n), ~failed(out.status).reshape(4, 8).any(axis=0)
     slope = (-f[0] + 8 * f[1] - 8 * f[2] + f[3]) / (12 * step)
     found = sum(np.einsum("cij,cj->ci", a, d) for a, d in zip(forward, way))
@@ -486,8 +496,7 @@ def test_frictionless_scenes_pay_nothing():
         return count(program(np.array([1.0, -1.0, 0.0])).jaxpr)
 
     plain = operations(bare)
-    assert operations(block) <= plain + 5  # the push of tangential impulses that are 0
-    assert operations(block, friction=0.1) > 1.2 * plain
+    assert operations(block) < 1.25 * plain  # tangential rows, which the compiler drops
 
 
 BAD = {
@@ -525,3 +534,90 @@ def test_bad_arguments(name):
     call, message = BAD[name]
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.slow
+def test_reverse_derivatives_of_lzb():
+    scenes, e, mu, k = random_scenes(4, 1, 4, most=-0.5)
+
+    def after(x, mass, normals, tangents):
+        v, e, mu, k = x
+        scene = ji.Scene(mass, normals, tangents=tangents)
+        return ji.impact(ji.LZB(e, k, 1.5, friction=mu), scene, v).velocity
+
+    for mode in (jax.jacfwd, jax.jacrev):
+        slopes = jax.jit(jax.vmap(mode(after)))(
+            (scenes[3], np.minimum(e, 0.95), mu, k), *scenes[:3]
+        )
+        if mode is jax.jacfwd:
+            forward = slopes
+    for a, b in zip(forward, slopes):
+        close(a, b, atol=1e-9)
+
+
+# ------------------------------------------------------------------ a real cube, in space
+
+CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+
+@functools.cache
+def cube_impacts():
+    path = Path(__file__).parent / "data" / "cube_impacts.csv"
+    return np.genfromtxt(path, delimiter=",", names=True)
+
+
+def cube(row):
+    """Mass matrix, normals, tangents and velocity (board axes) of an impact of its lowest corners."""
+    quaternion = np.array([row[f"quat_{c}"] for c in "wxyz"])
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    turn = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn = np.eye(3) + 2 * (w * turn + turn @ turn)
+    mass = np.zeros((6, 6))
+    mass[:3, :3] = 0.37 * np.eye(3)
+    mass[3:, 3:] = turn @ np.diag([9.57e-4, 9.57e-4, 9.09e-4]) @ turn.T
+    gaps = [row[f"corner_{i}_gap_m"] for i in range(1, 9)]
+    lowest = np.sort(np.argsort(gaps, kind="stable")[: int(row["contacts"])])
+    arms = (0.0474 * CORNERS[lowest] - [0, 0, 0.0057]) @ turn.T - [0, 0, 0.0036]
+    points = np.array(  # velocity (3,) of each corner from that of the body
+        [np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]]) for x, y, z in arms]
+    )
+    v = [row[f"{name}_{c}_pre_{unit}"] for name, unit in RATES for c in "xyz"]
+    return mass, points[:, 2].T, points[:, :2].reshape(-1, 6).T, np.array(v)
+
+
+RATES = (("v", "m_s"), ("omega", "rad_s"))
+
+
+@pytest.mark.parametrize("contacts", [1, 2])
+def test_lzb_of_a_real_cube(contacts):
+    """Corners that slip, stop, stick (two of one body redundantly) and break loose."""
+    rows = cube_impacts()[cube_impacts()["contacts"] == contacts]
+    scenes = [np.stack(x) for x in zip(*map(cube, rows))]
+    out, found = run("lzb", *scenes, np.full(len(rows), 0.27), rows["mu"])
+    after = np.stack([rows[f"lzb_{name}_{c}"] for name, _ in RATES for c in "xyz"], axis=1)
+    assert not out.status.any()
+    assert found.consistent.all()
+    close(out.velocity, after, atol=5e-7)
+
+
+def test_slopes_where_a_real_cube_comes_to_stick():
+    """Derivatives in mu and e: once up to 1e223."""
+    rows = cube_impacts()[cube_impacts()["contacts"] == 1]
+    scenes = [np.stack(x) for x in zip(*map(cube, rows))]
+    given = np.stack([rows["mu"], np.full(len(rows), 0.27)], axis=1)
+
+    def after(given, mass, normals, tangents, v):
+        law = ji.LZB(given[1], friction=given[0])
+        return ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v).velocity
+
+    slopes = jax.jit(jax.vmap(jax.jacfwd(after)))(given, *scenes)
+    for i in range(2):
+
+        def difference(h, i=i):
+            ends = (given + s * h * np.eye(2)[i] for s in (1, -1))
+            plus, minus = (run("lzb", *scenes, x[:, 1], x[:, 0])[0].velocity for x in ends)
+            return (plus - minus) / (2 * h)
+
+        close(slopes[:, :, i], (4 * difference(1e-4) - difference(2e-4)) / 3, atol=2e-2)
+    sticks = rows["toss"] == 46
+    assert np.abs(slopes[sticks, :, 0]).max() < 0.01

@@ -96,11 +96,11 @@ def solve(
         slip: (t,) `(1 + e_t) u-`.
         friction: mu (m,).
         complementary: contacts may part; otherwise they may pull (without friction).
+        load: (m,) >= 0, normal impulses beside p that friction knows of: it is bounded by
+            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0.
         sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
             already: s, an acceleration, does not decide), 0 where it is asked for. Not together
             with `load`.
-        load: (m,) >= 0, normal impulses beside p that friction knows of: it is bounded by
-            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0.
 
     Returns:
         p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are looked at, and

@@ -190,7 +190,7 @@ def waves(eta):
     """Time and velocities (samples, balls) of a chain struck at its end; k = m = 1."""
     law = ji.LZB(jnp.asarray(1.0), jnp.asarray(1.0), jnp.asarray(float(eta)), jnp.asarray(0.0))
     v = jnp.eye(BALLS)[0]
-    h = ji.history(law, ji.chain(jnp.ones(BALLS)), v, samples=4001, records=2048)
+    h = ji.history(law, ji.chain(jnp.ones(BALLS)), v, samples=4001)
     return np.asarray(h.time), np.asarray(h.velocity), np.asarray(h.force)
 
 
