@@ -1,4 +1,4 @@
-"""The command line: `jimpact fit`, `compare`, `montecarlo`, `laws`.
+"""The command line: options of `jimpact fit`, `compare`, `montecarlo` and so on.
 
 Heavy imports wait until a command runs.
 """
@@ -6,8 +6,9 @@ Heavy imports wait until a command runs.
 import dataclasses
 import json as json_module
 import sys
+from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
@@ -16,9 +17,21 @@ from jimpact import __version__
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
 
 
+class _Command:
+    """Options of a command; `jimpact.commands.<name>` runs it, and imports what it needs."""
+
+    name: ClassVar[str]
+
+    def run(self) -> int:
+        """The exit code."""
+        return import_module(f"jimpact.commands.{self.name}").run(**vars(self))
+
+
 @dataclasses.dataclass(frozen=True)
-class FitCommand:
+class FitCommand(_Command):
     """Fit a law to measured velocities; without a file: the bundled three balls."""
+
+    name: ClassVar[str] = "fit"
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
         "three_balls.toml"
@@ -37,16 +50,12 @@ class FitCommand:
     json: bool = False
     """Print JSON instead of tables."""
 
-    def run(self) -> int:
-        """Fit, print, draw."""
-        from jimpact.commands.fit import run
-
-        return run(**vars(self))
-
 
 @dataclasses.dataclass(frozen=True)
-class CompareCommand:
+class CompareCommand(_Command):
     """Every law on one scene, side by side: velocities, energy, dispersion, audit, time."""
+
+    name: ClassVar[str] = "compare"
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
         "three_balls.toml"
@@ -63,16 +72,12 @@ class CompareCommand:
     json: bool = False
     """Print JSON instead of tables."""
 
-    def run(self) -> int:
-        """Compare, print, draw."""
-        from jimpact.commands.compare import run
-
-        return run(**vars(self))
-
 
 @dataclasses.dataclass(frozen=True)
-class MonteCarloCommand:
+class MonteCarloCommand(_Command):
     """Velocities after an impact whose gaps are random: statistics, histograms, outcome map."""
+
+    name: ClassVar[str] = "montecarlo"
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
         "three_balls_gaps.toml"
@@ -95,16 +100,12 @@ class MonteCarloCommand:
     json: bool = False
     """Print JSON instead of a report."""
 
-    def run(self) -> int:
-        """Sample, print, draw."""
-        from jimpact.commands.montecarlo import run
-
-        return run(**vars(self))
-
 
 @dataclasses.dataclass(frozen=True)
-class ChartCommand:
+class ChartCommand(_Command):
     """Speed against accuracy: methods of integration and laws on one scene."""
+
+    name: ClassVar[str] = "chart"
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
         "three_balls.toml"
@@ -129,16 +130,12 @@ class ChartCommand:
     json: bool = False
     """Print JSON instead of tables."""
 
-    def run(self) -> int:
-        """Measure, print, draw."""
-        from jimpact.commands.chart import run
-
-        return run(**vars(self))
-
 
 @dataclasses.dataclass(frozen=True)
-class StabilityCommand:
+class StabilityCommand(_Command):
     """Where methods of integration are right, wrong, gain energy or do not end."""
+
+    name: ClassVar[str] = "stability"
 
     methods: tuple[str, ...] | None = None
     """Methods by name; default: all that run in batches."""
@@ -149,16 +146,12 @@ class StabilityCommand:
     json: bool = False
     """Print JSON instead of tables."""
 
-    def run(self) -> int:
-        """Map, print, draw."""
-        from jimpact.commands.stability import run
-
-        return run(**vars(self))
-
 
 @dataclasses.dataclass(frozen=True)
-class AdviseCommand:
+class AdviseCommand(_Command):
     """The simplest law and method that a scene needs, with the evidence."""
+
+    name: ClassVar[str] = "advise"
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
         "three_balls.toml"
@@ -181,16 +174,12 @@ class AdviseCommand:
     json: bool = False
     """Print JSON instead of text."""
 
-    def run(self) -> int:
-        """Advise, print, draw."""
-        from jimpact.commands.advise import run
-
-        return run(**vars(self))
-
 
 @dataclasses.dataclass(frozen=True)
-class SimulateCommand:
+class SimulateCommand(_Command):
     """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
+
+    name: ClassVar[str] = "simulate"
 
     study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
         "cradle_motion.toml"
@@ -210,12 +199,6 @@ class SimulateCommand:
     """Picture (.png, .pdf, .svg), or a directory for it."""
     json: bool = False
     """Print JSON instead of a report."""
-
-    def run(self) -> int:
-        """Simulate, print, draw."""
-        from jimpact.commands.simulate import run
-
-        return run(**vars(self))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -261,13 +244,13 @@ class LawsCommand:
 
 
 Command = (
-    Annotated[FitCommand, tyro.conf.subcommand("fit")]
-    | Annotated[CompareCommand, tyro.conf.subcommand("compare")]
-    | Annotated[MonteCarloCommand, tyro.conf.subcommand("montecarlo")]
-    | Annotated[ChartCommand, tyro.conf.subcommand("chart")]
-    | Annotated[StabilityCommand, tyro.conf.subcommand("stability")]
-    | Annotated[AdviseCommand, tyro.conf.subcommand("advise")]
-    | Annotated[SimulateCommand, tyro.conf.subcommand("simulate")]
+    Annotated[FitCommand, tyro.conf.subcommand(FitCommand.name)]
+    | Annotated[CompareCommand, tyro.conf.subcommand(CompareCommand.name)]
+    | Annotated[MonteCarloCommand, tyro.conf.subcommand(MonteCarloCommand.name)]
+    | Annotated[ChartCommand, tyro.conf.subcommand(ChartCommand.name)]
+    | Annotated[StabilityCommand, tyro.conf.subcommand(StabilityCommand.name)]
+    | Annotated[AdviseCommand, tyro.conf.subcommand(AdviseCommand.name)]
+    | Annotated[SimulateCommand, tyro.conf.subcommand(SimulateCommand.name)]
     | Annotated[LawsCommand, tyro.conf.subcommand("laws")]
 )
 

@@ -160,6 +160,25 @@ class Contact(eqx.Module):
             after if self.cross is None or tangential is None else after + self.cross @ tangential
         )
 
+    def slip_after(self, normal: jax.Array, tangential: jax.Array) -> jax.Array:
+        """u+ (t,) [m/s] of impulses p (m,) and p_t (t,), where the scene has tangents."""
+        assert self.cross is not None
+        assert self.slip is not None
+        assert self.tangential is not None
+        return self.slip + self.cross.T @ normal + self.tangential @ tangential
+
+    def energy_change(self, normal: jax.Array, tangential: jax.Array | None = None) -> jax.Array:
+        """T+ - T- () [J] of impulses: their work at the mean of the velocities before and after."""
+        mean = 0.5 * (self.gap_velocity + self.gap_velocity_after(normal, tangential))
+        if tangential is None or self.slip is None:
+            return mean @ normal
+        return mean @ normal + 0.5 * (self.slip + self.slip_after(normal, tangential)) @ tangential
+
+    @property
+    def kinetic_angles(self) -> jax.Array:
+        """Angles (m, m) [rad] between contacts; pi/2: they do not feel each other."""
+        return _angles(self.delassus)
+
     def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """Rounding (m,) of gamma+: terms of W p may be large and cancel, as beside a light ball."""
         w = self.delassus
@@ -307,7 +326,10 @@ def kinetic_angles(scene: Scene) -> jax.Array:
     >>> float(ji.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))
     1.1071
     """
-    w = delassus_matrix(scene)
+    return _angles(delassus_matrix(scene))
+
+
+def _angles(w: Symmetric) -> jax.Array:
     cosine = as_matrix(scaled(w, 1 / jnp.sqrt(diagonal(w))))
     return jnp.pi - jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
 

@@ -197,7 +197,7 @@ def parameter(
     ...
     ...     def __init__(self, loss):
     ...         self.loss = loss
-    ...         super().__init__(1 - self.loss)
+    ...         super().__init__(1 - self.loss / 2)
     >>> Lossy(1.5)
     Traceback (most recent call last):
         ...

@@ -7,6 +7,7 @@ joined by idle ones, a scene of one contact by a second one, open.
 import dataclasses
 import functools
 import itertools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -552,3 +553,71 @@ def test_reverse_derivatives_of_lzb():
             forward = slopes
     for a, b in zip(forward, slopes):
         close(a, b, atol=1e-9)
+
+
+# ------------------------------------------------------------------ a real cube, in space
+
+CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+
+
+@functools.cache
+def cube_impacts():
+    path = Path(__file__).parent / "data" / "cube_impacts.csv"
+    return np.genfromtxt(path, delimiter=",", names=True)
+
+
+def cube(row):
+    """Mass matrix, normals, tangents and velocity (board axes) of an impact of its lowest corners."""
+    quaternion = np.array([row[f"quat_{c}"] for c in "wxyz"])
+    w, x, y, z = quaternion / np.linalg.norm(quaternion)
+    turn = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turn = np.eye(3) + 2 * (w * turn + turn @ turn)
+    mass = np.zeros((6, 6))
+    mass[:3, :3] = 0.37 * np.eye(3)
+    mass[3:, 3:] = turn @ np.diag([9.57e-4, 9.57e-4, 9.09e-4]) @ turn.T
+    gaps = [row[f"corner_{i}_gap_m"] for i in range(1, 9)]
+    lowest = np.sort(np.argsort(gaps, kind="stable")[: int(row["contacts"])])
+    arms = (0.0474 * CORNERS[lowest] - [0, 0, 0.0057]) @ turn.T - [0, 0, 0.0036]
+    points = np.array(  # velocity (3,) of each corner from that of the body
+        [np.hstack([np.eye(3), [[0, z, -y], [-z, 0, x], [y, -x, 0]]]) for x, y, z in arms]
+    )
+    v = [row[f"{name}_{c}_pre_{unit}"] for name, unit in RATES for c in "xyz"]
+    return mass, points[:, 2].T, points[:, :2].reshape(-1, 6).T, np.array(v)
+
+
+RATES = (("v", "m_s"), ("omega", "rad_s"))
+
+
+@pytest.mark.parametrize("contacts", [1, 2])
+def test_lzb_of_a_real_cube(contacts):
+    """Corners that slip, stop, stick (two of one body redundantly) and break loose."""
+    rows = cube_impacts()[cube_impacts()["contacts"] == contacts]
+    scenes = [np.stack(x) for x in zip(*map(cube, rows))]
+    out, found = run("lzb", *scenes, np.full(len(rows), 0.27), rows["mu"])
+    after = np.stack([rows[f"lzb_{name}_{c}"] for name, _ in RATES for c in "xyz"], axis=1)
+    assert not out.status.any()
+    assert found.consistent.all()
+    close(out.velocity, after, atol=5e-7)
+
+
+def test_slopes_where_a_real_cube_comes_to_stick():
+    """Derivatives in mu and e: once up to 1e223."""
+    rows = cube_impacts()[cube_impacts()["contacts"] == 1]
+    scenes = [np.stack(x) for x in zip(*map(cube, rows))]
+    given = np.stack([rows["mu"], np.full(len(rows), 0.27)], axis=1)
+
+    def after(given, mass, normals, tangents, v):
+        law = ji.LZB(given[1], friction=given[0])
+        return ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v).velocity
+
+    slopes = jax.jit(jax.vmap(jax.jacfwd(after)))(given, *scenes)
+    for i in range(2):
+
+        def difference(h, i=i):
+            ends = (given + s * h * np.eye(2)[i] for s in (1, -1))
+            plus, minus = (run("lzb", *scenes, x[:, 1], x[:, 0])[0].velocity for x in ends)
+            return (plus - minus) / (2 * h)
+
+        close(slopes[:, :, i], (4 * difference(1e-4) - difference(2e-4)) / 3, atol=2e-2)
+    sticks = rows["toss"] == 46
+    assert np.abs(slopes[sticks, :, 0]).max() < 0.01

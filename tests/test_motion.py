@@ -222,12 +222,14 @@ def test_time_stepping_is_of_first_order():
 
 @pytest.mark.slow
 def test_time_stepping_has_both_derivatives():
+    """After one impact: those of later ones do not know that impacts are late by up to h."""
+
     def last(e):
-        return stepped(1e-3)(e).q[-1, 0]
+        return stepped(1e-3)(e).q[5, 0]
 
     forward, reverse = jax.jit(jax.jacfwd(last))(0.8), jax.jit(jax.jacrev(last))(0.8)
     np.testing.assert_allclose(forward, reverse, rtol=1e-12)
-    np.testing.assert_allclose(forward, jax.grad(height)(0.8, 2.0), rtol=0.02)
+    np.testing.assert_allclose(forward, jax.grad(height)(0.8, 1.0), rtol=0.01)
 
 
 @pytest.mark.slow

@@ -53,6 +53,6 @@ assert_type(ji.theory.admissible_set(cradle, [1.0, 0.0, 0.0]), ji.theory.Admissi
 print(ji.LZB(0.9, stifness=1.0))  # type: ignore[call-arg]
 print(ji.impact(cradle, law, [1.0, 0.0, 0.0]))  # type: ignore[arg-type]
 print(ji.no_such_law)  # type: ignore[attr-defined]
-print(ji.plot.fit)  # type: ignore[attr-defined]
+print(ji.plot_fit)  # type: ignore[attr-defined]
 print(ji.plot.no_such_picture)  # type: ignore[attr-defined]
 print(out.velocty)  # type: ignore[attr-defined]

@@ -16,7 +16,7 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
     longest                    the longest step in the flow's own time that is stable
-    tolerance (1, B) or (n, B), snap (1, B), root, contacts
+    tolerance (1, B), snap (1, B), root, contacts
     near                       share of a step from which landings start, 0: from anywhere
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
@@ -74,11 +74,12 @@ _WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
 class Flow(Protocol):
     """What the stepper asks of a flow (see above)."""
 
-    tolerance: jax.Array
     root: int
     longest: float
     near: float
 
+    @property
+    def tolerance(self) -> jax.Array: ...
     @property
     def contacts(self) -> int: ...
     @property
@@ -153,7 +154,15 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
         xi = start + c * length
         now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
         dy = flow.field(const, s.modes, now)
-        value, dc = jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))
+
+        def seen() -> tuple[jax.Array, jax.Array]:
+            return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))
+
+        if flow.near:  # of costly margins: steps in time need them at their ends only
+            needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
+            value, dc = jax.lax.cond(needed, seen, lambda: (c0, jnp.zeros_like(c0)))
+        else:
+            value, dc = seen()
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate

@@ -20,7 +20,7 @@ from jimpact.fits.parameters import (
     free_parameters,
     with_entries,
 )
-from jimpact.fits.problem import Problem, build_problem
+from jimpact.fits.problem import FitProblem, build_problem
 from jimpact.fits.report import fit_warnings, report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.law import Law
@@ -159,7 +159,7 @@ def fit(
 
 
 def _as_fit(
-    problem: Problem,
+    problem: FitProblem,
     parameters: Parameters,
     experiments: Experiments,
     scene: Scene | None,

@@ -84,7 +84,7 @@ class Box(eqx.Module):
         return move, -(gradient @ move) - 0.5 * jnp.sum((jacobian @ move) ** 2)
 
 
-class State(eqx.Module):
+class SolverState(eqx.Module):
     """The best point so far, what the next pass tries, and the method's memory."""
 
     y: jax.Array
@@ -113,7 +113,7 @@ def default_steps(method: Method) -> int:
     return DEFAULT_STEPS[method if isinstance(method, str) else "adam"]
 
 
-def begin(y: jax.Array, first: tuple[Any, Any, Any], method: Method, max_steps: int) -> State:
+def begin(y: jax.Array, first: tuple[Any, Any, Any], method: Method, max_steps: int) -> SolverState:
     """State before the first pass from y (P,); `first` is shaped like what `evaluate` returns."""
     infinite = jnp.asarray(jnp.inf, y.dtype)
     if method == "levenberg-marquardt":
@@ -121,7 +121,7 @@ def begin(y: jax.Array, first: tuple[Any, Any, Any], method: Method, max_steps: 
     else:
         memory = _transformation(method, max_steps).init(y)
     steps, done = jnp.asarray(0), jnp.asarray(False)
-    return State(y, *first, infinite, infinite, y, memory, steps, done)
+    return SolverState(y, *first, infinite, infinite, y, memory, steps, done)
 
 
 def advance(
@@ -129,13 +129,13 @@ def advance(
     region: Region,
     method: Method,
     max_steps: int,
-    state: State,
+    state: SolverState,
     passes: int,
-) -> State:
+) -> SolverState:
     """Up to `passes` passes more, fewer if done or at the step limit."""
     last = jnp.minimum(state.steps + passes, max_steps)
 
-    def one(state: State) -> State:
+    def one(state: SolverState) -> SolverState:
         residual, jacobian, kept = evaluate(state.trial)
         cost = 0.5 * jnp.sum(residual**2)
         better = cost < state.cost
@@ -168,7 +168,7 @@ def advance(
         trial = region.retract(trial)
         dtype = str(y.dtype)
         done = stuck | (gain <= STOP_GAIN[dtype] * least + STOP_EXACT[dtype])
-        return State(y, r, jac, kept, least, gain, trial, memory, state.steps + 1, done)
+        return SolverState(y, r, jac, kept, least, gain, trial, memory, state.steps + 1, done)
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.fits.least_squares import Method, State
+from jimpact.fits.least_squares import Method, SolverState
 from jimpact.fits.parameters import Parameters, entries
-from jimpact.fits.problem import Problem, advance_all, begin_all, from_scaled, to_scaled
+from jimpact.fits.problem import FitProblem, advance_all, begin_all, from_scaled, to_scaled
 from jimpact.progress import progress_bar
 
 LANES = 4  # starts that run together; those that are done make room
@@ -48,7 +48,7 @@ CONVERGED = 1e-6
 
 
 class Search(NamedTuple):
-    """The best end point (weighted as in `Problem`), and all distinct minima, best first."""
+    """The best end point (weighted as in `FitProblem`), and all distinct minima, best first."""
 
     value: np.ndarray  # of the parameters (P,)
     entries: np.ndarray  # of all entries (Q,) of the named fields
@@ -65,7 +65,7 @@ class Search(NamedTuple):
 
 
 def search(
-    problem: Problem,
+    problem: FitProblem,
     parameters: Parameters,
     method: Method,
     starts: int,
@@ -92,12 +92,12 @@ def search(
 
 
 def _run(
-    problem: Problem,
+    problem: FitProblem,
     points: np.ndarray,
     method: Method,
     max_steps: int,
     show: Callable[[int, int], None],
-) -> State:
+) -> SolverState:
     """Solve from points (S, Q), a few at a time; the states come back to the host."""
     starts = jnp.asarray(points, problem.pre.dtype)
     states = jax.device_get(begin_all(problem, starts, method, max_steps))
@@ -124,7 +124,7 @@ def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray
     return leaf
 
 
-def _found(problem: Problem, parameters: Parameters, states: State) -> Search:
+def _found(problem: FitProblem, parameters: Parameters, states: SolverState) -> Search:
     """Pick the best end (the states are on the host)."""
     count, first = len(parameters.names), parameters.first
     scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
@@ -154,7 +154,7 @@ def _found(problem: Problem, parameters: Parameters, states: State) -> Search:
     )
 
 
-def _all_entries(problem: Problem, y: np.ndarray) -> np.ndarray:
+def _all_entries(problem: FitProblem, y: np.ndarray) -> np.ndarray:
     scaled = np.asarray(problem.offset, float) + np.asarray(problem.mix, float) @ y
     return from_scaled(scaled, np.asarray(problem.scale, float), np.asarray(problem.log))
 
@@ -183,7 +183,7 @@ def _groups(
 
 
 def _near(
-    problem: Problem, states: State, best: int, count: int, rng: np.random.Generator
+    problem: FitProblem, states: SolverState, best: int, count: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
     jacobian = np.asarray(states.jacobian[best], float)
@@ -196,7 +196,7 @@ def _near(
 
 
 def _start_points(
-    problem: Problem, parameters: Parameters, starts: int, rng: np.random.Generator
+    problem: FitProblem, parameters: Parameters, starts: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
     first = parameters.first

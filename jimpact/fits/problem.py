@@ -9,7 +9,7 @@ import numpy as np
 
 from jimpact.compiling import quick_jit
 from jimpact.experiments import Experiments
-from jimpact.fits.least_squares import Box, Method, Region, State, advance, begin
+from jimpact.fits.least_squares import Box, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import Parameters, entries, with_entries
 from jimpact.impacts import impact
@@ -23,7 +23,7 @@ UNUSABLE = ("infeasible", "max_steps", "not_finite")
 PENALTY = 1e3  # times the largest velocity
 
 
-class Problem(eqx.Module):
+class FitProblem(eqx.Module):
     """Law, shots and box of one fit: a pytree that compiled functions take as argument.
 
     Solvers work on y (Q,), of which the first P count, the rest is 0. The entries of the law's
@@ -55,7 +55,7 @@ def build_problem(
     experiments: Experiments,
     parameters: Parameters,
     limits: tuple[np.ndarray, np.ndarray],
-) -> Problem:
+) -> FitProblem:
     """Arrays, weights and natural scales of a fit."""
     own = [experiments.scene_of(scene, k) for k in range(len(experiments.shots))]
     per_shot = experiments.scenes is not None
@@ -85,7 +85,7 @@ def build_problem(
     arrays |= {"pre": pre, "post": post, "weight": weight / size, "size": size, "unit": unit}
     shown = own if per_shot else own[:1]
     region = matrix_region(law, shown, scale * offset, scale[:, None] * mix, bounds)
-    return Problem(
+    return FitProblem(
         law=law,
         region=region or Box(*(jnp.asarray(end, dtype) for end in bounds)),
         log=jnp.asarray(log),
@@ -117,7 +117,7 @@ def from_scaled(scaled: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.nd
     return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled * scale)
 
 
-def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
+def _evaluate(problem: FitProblem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
     """Weighted residual (K n,), its Jacobian (K n, Q), and v+ (K, n), status (K,)."""
 
     def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
@@ -139,11 +139,13 @@ def _evaluate(problem: Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any
 
 
 @quick_jit
-def begin_all(problem: Problem, starts: jax.Array, method: Method, max_steps: int) -> State:
+def begin_all(
+    problem: FitProblem, starts: jax.Array, method: Method, max_steps: int
+) -> SolverState:
     """States of a batch of starts y (S, Q)."""
     shots, bodies = problem.post.shape
 
-    def one(y: jax.Array) -> State:
+    def one(y: jax.Array) -> SolverState:
         y = problem.region.retract(y)
         velocity, status = jnp.zeros_like(problem.post), jnp.zeros(shots, jnp.int32)
         residual = jnp.zeros(shots * bodies, y.dtype)
@@ -155,11 +157,11 @@ def begin_all(problem: Problem, starts: jax.Array, method: Method, max_steps: in
 
 @quick_jit
 def advance_all(
-    problem: Problem, states: State, method: Method, max_steps: int, passes: int
-) -> State:
+    problem: FitProblem, states: SolverState, method: Method, max_steps: int, passes: int
+) -> SolverState:
     """Up to `passes` passes more of every start."""
 
-    def one(state: State) -> State:
+    def one(state: SolverState) -> SolverState:
         return advance(
             lambda y: _evaluate(problem, y),
             problem.region,

@@ -9,7 +9,7 @@ from jimpact.experiments import Experiments, data_defects
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.parameters import Parameters
-from jimpact.fits.problem import Problem
+from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -163,7 +163,7 @@ def _plain(value: Any) -> Any:
 
 def fit_warnings(
     law: Law,
-    problem: Problem,
+    problem: FitProblem,
     parameters: Parameters,
     experiments: Experiments,
     scene: Scene | None,
@@ -225,7 +225,7 @@ def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
     return lines
 
 
-def _matrix(law: Law, problem: Problem, scene: Scene, found: Search) -> list[str]:
+def _matrix(law: Law, problem: FitProblem, scene: Scene, found: Search) -> list[str]:
     """Where the conditions on a restitution matrix hold it back, or are not asked for."""
     edges = boundary(problem.region, found.entries)
     if edges:
@@ -241,7 +241,7 @@ def _matrix(law: Law, problem: Problem, scene: Scene, found: Search) -> list[str
     return []
 
 
-def _equally_good(problem: Problem, found: Search, spread: Uncertainty) -> int:
+def _equally_good(problem: FitProblem, found: Search, spread: Uncertainty) -> int:
     noise = spread.noise / float(problem.size) if np.isfinite(spread.noise) else 0.0
     more = max(EQUALLY_GOOD * noise**2, EXACT[str(problem.pre.dtype)])
     return sum(cost <= found.minima[0][0] + more for cost, _, _ in found.minima)

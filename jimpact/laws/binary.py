@@ -51,7 +51,8 @@ class Binary(Law):
             that do not approach are skipped.
         max_collisions: the law gives up after so many.
 
-    In every order but 'earliest' gap sizes do not matter: open contacts that approach collide too.
+    There is no friction: tangential velocities stay. In every order but 'earliest' gap sizes do
+    not matter: open contacts that approach collide too.
 
     Status: `order_dependent` where two coupled contacts were equally fast (early) within rounding
     (the lower index went first); `plastic_limit` where collisions go on forever: for two contacts

@@ -201,7 +201,7 @@ class RestitutionMatrix(Kinematic):
     >>> import jimpact as ji
     >>> law = ji.RestitutionMatrix([[0.1, 0.0], [0.8, 0.5]])  # the striker's impact moves ball 3
     >>> out = ji.impact(law, ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
-    >>> [round(float(v), 6) for v in out.velocity]
+    >>> [round(float(v), 6) + 0.0 for v in out.velocity]
     [0.0, 0.1, 0.9]
     """
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
-from jimpact.solvers.friction import FrictionImpulses, solve
+from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.linear import null_projector
 from jimpact.solvers.tridiagonal import as_matrix, is_regular
@@ -91,7 +91,7 @@ class Poisson(Law):
         returned = self.restitution * first.normal
         rate = jnp.concatenate([contact.gap_velocity, (1 + e_t) * contact.slip])
         rate = rate + a @ jnp.concatenate([first.normal + returned, first.tangential])
-        second = _with_load(a, rate[:m], rate[m:], mu, returned)
+        second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=returned)
         code = jnp.maximum(first.status, second.status)
         if self.restitution.ndim == 1:
             loaded = jnp.concatenate([first.normal > 0, jnp.repeat(first.normal > 0, each)])
@@ -100,36 +100,6 @@ class Poisson(Law):
             code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
         p = first.normal + returned + second.normal
         return Impulses(p, first.tangential + second.tangential, code)
-
-
-def _with_load(
-    a: jax.Array, normal: jax.Array, slip: jax.Array, mu: jax.Array, load: jax.Array
-) -> FrictionImpulses:
-    """s (m,) and p_t (t,) with `0 <= r _|_ s >= 0` and `p_t in -mu (s + load) Sgn(u)`.
-
-    A second contact with the same tangents takes the load: its normal velocity is its own and
-    starts at what `load` brings to rest. How both share p_t says nothing about the outcome.
-    """
-    m, t = len(normal), len(slip)
-    own = jnp.diagonal(a)[:m]
-    w, cross, sides = a[:m, :m], a[:m, m:], a[m:, m:]
-    none, no_cross = jnp.zeros_like(w), jnp.zeros_like(cross)
-    rows = [
-        [w, none, cross, cross],
-        [none, jnp.diag(own), no_cross, no_cross],
-        [cross.T, no_cross.T, sides, sides],
-        [cross.T, no_cross.T, sides, sides],
-    ]
-    found = solve(
-        jnp.block(rows),
-        jnp.concatenate([normal, -own * load]),
-        jnp.concatenate([slip, slip]),
-        jnp.concatenate([mu, mu]),
-        complementary=True,
-    )
-    sharing = found.status == CODE["impulse_not_unique"]
-    code = jnp.where(sharing, CODE["ok"], found.status)
-    return FrictionImpulses(found.normal[:m], found.tangential[:t] + found.tangential[t:], code)
 
 
 def _depends_on_sharing(w: jax.Array, e: jax.Array, loaded: jax.Array) -> jax.Array:

@@ -113,10 +113,10 @@ def _block(
 
 
 class Unknown(NamedTuple):
-    """A stiffness that is only known within a range: of `contact`, over that of `of` (None: SI)."""
+    """A stiffness known within a range only: of `contact`, over that of `base` (None: SI)."""
 
     contact: int
-    of: int | None
+    base: int | None
     nominal: float
     low: float
     high: float
@@ -124,7 +124,7 @@ class Unknown(NamedTuple):
     @property
     def name(self) -> str:
         """`k2/k1`, contacts counted from 1."""
-        return f"k{self.contact + 1}" + ("" if self.of is None else f"/k{self.of + 1}")
+        return f"k{self.contact + 1}" + ("" if self.base is None else f"/k{self.base + 1}")
 
 
 class Rows(NamedTuple):
@@ -149,10 +149,10 @@ def unknowns(
         return ()
     found = []
     for block in at.coupled:
-        of = None if absolute else block.contacts[0]
+        base = None if absolute else block.contacts[0]
         for j in block.contacts if absolute else block.contacts[1:]:
-            nominal = float(stiffness[j] / (1.0 if of is None else stiffness[of]))
-            found.append(Unknown(j, of, nominal, nominal * span[0], nominal * span[1]))
+            nominal = float(stiffness[j] / (1.0 if base is None else stiffness[base]))
+            found.append(Unknown(j, base, nominal, nominal * span[0], nominal * span[1]))
     return tuple(found)
 
 

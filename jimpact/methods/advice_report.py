@@ -226,7 +226,7 @@ def ratios(found: Findings) -> str:
         first = found.unknown[0]
         where = f"in [{first.low:.3g}, {first.high:.3g}]" if len(ends) == 1 else "in their ranges"
         many = len(found.unknown) > 1
-        kind = "stiffness" + (" ratio" + "s" * many if first.of is not None else "es" * many)
+        kind = "stiffness" + (" ratio" + "s" * many if first.base is not None else "es" * many)
         return f"{kind} {', '.join(names)}{more} {where}"
     pairs = [(b.contacts[0], j) for b in coupled for j in b.contacts[1:]]
     names = [f"k{j + 1}/k{i + 1}" for i, j in pairs[:_TOLD]]

@@ -164,11 +164,11 @@ def _times(
     tasks: list[tuple[Callable[[], Any], int]] = []
     places: list[list[int]] = []
     for name, value in rows:
-        of = programs[name]
+        timed = programs[name]
         own: list[tuple[Callable[[Any], Any] | None, int]] = [
-            (of.single, 1),
-            (of.batched, of.batch),
-            (of.gradient, min(SAMPLE, of.batch)),
+            (timed.single, 1),
+            (timed.batched, timed.batch),
+            (timed.gradient, min(SAMPLE, timed.batch)),
         ]
         places.append([])
         for run, impacts in own:

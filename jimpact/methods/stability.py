@@ -83,7 +83,7 @@ class StabilityMap:
 
     def counts(self, method: str) -> dict[str, int]:
         """Points of each class, over all slices and samples."""
-        codes = np.concatenate([s.codes.ravel() for s in self._of(method)])
+        codes = np.concatenate([s.codes.ravel() for s in self._all_slices(method)])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
     def silent(self, method: str) -> int:
@@ -93,11 +93,11 @@ class StabilityMap:
 
     def causes(self, method: str) -> dict[str, int]:
         """Points that are not right, by cause."""
-        found = np.concatenate([s.cause.ravel() for s in self._of(method)])
+        found = np.concatenate([s.cause.ravel() for s in self._all_slices(method)])
         counts = np.bincount(found[found >= 0], minlength=len(CAUSES)).tolist()
         return {cause.name: count for cause, count in zip(CAUSES, counts) if count}
 
-    def _of(self, method: str) -> tuple[Slice, ...]:
+    def _all_slices(self, method: str) -> tuple[Slice, ...]:
         return (*self.slices[method], self.sampled[method])
 
     def to_dict(self) -> dict[str, Any]:

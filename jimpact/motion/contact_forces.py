@@ -95,9 +95,9 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     # columns of open contacts multiply forces that are 0
     right = jnp.where(held, -given.approach, 0.0)
     first = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right
-    # redundant sticking contacts share the load by what presses them: least sum of
-    # lambda_t^2 / lambda_n, which is in the cone wherever a solution is for equal mu
-    press = jnp.maximum(first[:m], 0.0)
+    # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
+    # `solvers.friction`: they break loose together
+    press = mu * jnp.maximum(first[:m], 0.0)
     share = jnp.maximum(press / jnp.maximum(jnp.max(press), jnp.finfo(k.dtype).tiny), _LEAST_SHARE)
     weight = jax.lax.stop_gradient(jnp.concatenate([jnp.ones(m, k.dtype), jnp.sqrt(share)]))
     both = weight * (jnp.linalg.pinv(k * weight[None, :], rtol=_REDUNDANT) @ right)

@@ -134,11 +134,11 @@ def _written(events: Events, flight: Flight, found: Outcome) -> Events:
         "contacts": found.contacts,
         "q": flight.state.q,
         "velocity_before": flight.state.v,
-        "velocity_after": found.blow.v,
-        "impulse": found.blow.impulse,
-        "tangential_impulse": found.blow.tangential,
-        "energy": found.blow.energy,
-        "status": found.blow.code,
+        "velocity_after": found.jump.v,
+        "impulse": found.jump.impulse,
+        "tangential_impulse": found.jump.tangential,
+        "energy": found.jump.energy,
+        "status": found.jump.code,
         "accumulation_end": found.accumulation_end,
     }
     return with_row(events, found.kind != KIND_CODE["none"], values)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
-from jimpact.fits.least_squares import Box, State, advance, begin
+from jimpact.fits.least_squares import Box, SolverState, advance, begin
 from jimpact.fits.parameters import (
     Parameters,
     bounds_of,
@@ -36,7 +36,8 @@ class MotionFit:
     """What `fit_motion` found; `print(fit)` is a report.
 
     `standard_error` is inf for parameters that the record does not determine (`unseen` says
-    which combinations); `noise` is the estimated error of the measurement, or 1 with `sigma`.
+    which combinations); `degrees_of_freedom` is measured values less `rank`; `noise` is the
+    estimated error of the measurement, or 1 with `sigma`.
     """
 
     law: Law
@@ -45,6 +46,7 @@ class MotionFit:
     standard_error: np.ndarray
     covariance: np.ndarray
     rank: int
+    degrees_of_freedom: int
     unseen: tuple[str, ...]
     noise: float
     predicted: np.ndarray
@@ -213,7 +215,7 @@ def _evaluate(problem: _Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, ja
 
 
 @eqx.filter_jit
-def _solve(problem: _Problem, box: Box, y: jax.Array, passes: int) -> State:
+def _solve(problem: _Problem, box: Box, y: jax.Array, passes: int) -> SolverState:
     def evaluate(y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         return _evaluate(problem, y)
 
@@ -225,7 +227,7 @@ def _solve(problem: _Problem, box: Box, y: jax.Array, passes: int) -> State:
 
 def _report(
     problem: _Problem,
-    state: State,
+    state: SolverState,
     parameters: Parameters,
     here: np.ndarray,
     size: float,
@@ -256,6 +258,7 @@ def _report(
         standard_error=lines.standard_error,
         covariance=lines.covariance,
         rank=lines.rank,
+        degrees_of_freedom=int(here.sum()) - lines.rank,
         unseen=tuple(s.replace("measured velocity", "measured value") for s in lines.unseen),
         noise=lines.noise,
         predicted=predicted,

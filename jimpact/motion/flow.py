@@ -98,18 +98,31 @@ class MotionFlow(eqx.Module):
     system: System
     rounding: jax.Array  # (k,)
     sample: jax.Array  # time of the next sample ()
-    tolerance: jax.Array  # (rows, 1)
+    errors: jax.Array  # (rows, 1) that a step may make
     like: State  # of its shapes
 
     root = 1
-    contacts = 1
     near = 0.0
     longest = math.inf  # no rate is large beside the others
 
     @property
+    def contacts(self) -> int:
+        """One: the number of passes does not matter here."""
+        return 1
+
+    @property
+    def tolerance(self) -> jax.Array:
+        """One `allowance`."""
+        return jnp.ones((1, 1), self.errors.dtype)
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Errors that a step may make in each row (rows, 1)."""
+        return self.errors
+
+    @property
     def snap(self) -> jax.Array:
         """Margins are in units of their rounding."""
-        return jnp.ones((1, 1), self.tolerance.dtype)
+        return jnp.ones((1, 1), self.errors.dtype)
 
     @abc.abstractmethod
     def constants(self, modes: jax.Array) -> Any:
@@ -122,10 +135,6 @@ class MotionFlow(eqx.Module):
     @abc.abstractmethod
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Each is >= 0 while its mode lasts; the last is the time left to the next sample."""
-
-    def allowance(self, modes: jax.Array, y: jax.Array) -> float:
-        """Tolerances that the error of each row may be."""
-        return 1.0
 
     def from_margins(self, margins: jax.Array, at: State) -> jax.Array:
         """Rows (k, 1) of margins, with that of the next sample."""
@@ -184,7 +193,7 @@ class MechanicalFlow(MotionFlow):
     def constants(self, modes: jax.Array) -> Modes:
         """The modes, of each contact."""
         active, stick, sign = modes[:, 0].reshape(3, -1)
-        return Modes(active > 0, stick > 0, sign.astype(self.tolerance.dtype))
+        return Modes(active > 0, stick > 0, sign.astype(self.errors.dtype))
 
     def _contacts(self, at: State) -> Contacts:
         return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
@@ -286,11 +295,11 @@ def one_pass(
     rates = free_acceleration(flow.system, state.q, state.v, push, mass)
     change = before.plan[0, 0] * jnp.abs(jnp.concatenate([state.v, rates]))
     size = jnp.abs(jnp.concatenate([state.q, state.v])) + change
-    tolerance = jnp.concatenate([settings.atol + settings.rtol * size, allowed])
+    errors = jnp.concatenate([settings.atol + settings.rtol * size, allowed])
     flow = dataclasses.replace(
         flow,
         sample=targets[jnp.minimum(flight.sample, last)],
-        tolerance=jax.lax.stop_gradient(tolerance)[:, None],
+        errors=jax.lax.stop_gradient(errors)[:, None],
     )
     # passes are counted here: their number does not lower the tolerance
     carry = before._replace(y=packed(state), plan=before.plan.at[2:].set(0.0))

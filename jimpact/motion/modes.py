@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.motion.contact_forces import Contacts, Modes, forces
+from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
+from jimpact.status import CODE
 
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
 REST_ACCELERATION = 1e-11
-_PASSES = 6  # changes of mode tried per contact with friction, before giving up
+_PASSES = 3  # choices: contacts that would not slide as they are taken to are asked again
 
 
 class Choice(NamedTuple):
@@ -45,18 +47,49 @@ def choose_with_friction(
     assert given.tangent is not None
     m = touching.shape[0]
     slid = before.active & ~before.stick
-    broken = released[m:] & before.stick
+    broken = released[m:] & before.stick & ~sliding
     ended = jnp.any(released[m:] & slid)
     # where sticking breaks at one contact of a body, those that began to slide before go on
-    goes_on = slid & jnp.any(broken) & ~ended & ~sliding
-    start = Modes(touching & ~released[:m], ~sliding & ~broken & ~goes_on, before.sign)
+    goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
+    now = Modes(touching, ~sliding & ~goes_on, jnp.where(goes_on, before.sign, 0.0))
+    now = now._replace(sign=jnp.where(sliding, jnp.sign(given.tangent.rate), now.sign))
     # sliding begins against the last force of sticking
-    held = forces(given, mu, start._replace(stick=start.stick | (broken & ~sliding)))
+    held = forces(given, mu, now._replace(active=touching & ~released[:m]))
     assert held.tangential is not None
-    begun = jnp.where(goes_on, before.sign, jnp.where(held.tangential > 0, -1.0, 1.0))
-    sign = jnp.where(sliding, jnp.sign(given.tangent.rate), begun)
-    start = start._replace(sign=sign)
-    return _pivot(given, mu, start, touching, sliding, slack)
+    sign = jnp.where(broken, jnp.where(held.tangential > 0, -1.0, 1.0), now.sign)
+    there = jnp.tile(touching, 2)
+    w = jnp.where(there[:, None] & there[None], given.delassus, jnp.eye(2 * m, dtype=sign.dtype))
+    free = jnp.where(there, given.approach, 0.0)
+    diagonal = jnp.diagonal(w)[:m]
+
+    def choose(tried: _Tried) -> _Tried:
+        known = tried.known
+        found = solve(
+            w, free[:m], free[m:], mu * jnp.ones(m, sign.dtype), complementary=True, sliding=known
+        )
+        rate = free + w @ jnp.concatenate([found.normal, found.tangential])
+        active = touching & (rate[:m] <= slack)
+        active = active & (~released[:m] | (found.normal * diagonal > slack))
+        slips = (known != 0) | (jnp.abs(rate[m:]) > slack)
+        modes = Modes(active, active & ~slips, jnp.where(known != 0, known, jnp.sign(rate[m:])))
+        # what was taken to slide from rest must do so
+        returns = active & (known != 0) & ~sliding & (known * rate[m:] < -slack)
+        solved = found.status <= CODE["several_outcomes"]
+        known = jnp.where(jnp.where(solved, returns, ~sliding), 0.0, known)
+        return _Tried(modes, known, solved, solved & ~jnp.any(returns), tried.passes + 1)
+
+    no = jnp.asarray(False)
+    start = _Tried(now, sign, no, no, jnp.asarray(0))
+    end = jax.lax.while_loop(lambda t: ~t.done & (t.passes < _PASSES), choose, start)
+    return Choice(end.modes, end.solved)
+
+
+class _Tried(NamedTuple):
+    modes: Modes
+    known: jax.Array  # directions of slip that are not asked for
+    solved: jax.Array
+    done: jax.Array
+    passes: jax.Array
 
 
 def pressed_together(
@@ -76,57 +109,3 @@ def pressed_together(
     found = solve_lcp(jnp.where(both, w, eye), b, regular=True)
     pressed = touching & (found.z * jnp.diagonal(w) > slack)
     return pressed, touching & ~pressed & (found.w <= slack)
-
-
-class _Search(NamedTuple):
-    modes: Modes
-    worst: jax.Array
-    passes: jax.Array
-
-
-def _pivot(
-    given: Contacts,
-    mu: jax.Array,
-    start: Modes,
-    touching: jax.Array,
-    sliding: jax.Array,
-    slack: jax.Array,
-) -> Choice:
-    """Change the worst violation until none is left."""
-    m = touching.shape[0]
-    w = jnp.diagonal(given.delassus)
-    number = jnp.arange(m)
-
-    def violations(modes: Modes) -> tuple[jax.Array, jax.Array]:
-        found = forces(given, mu, modes)
-        assert found.tangential is not None
-        rate = given.approach + given.directions.T @ (found.acceleration - given.free)
-        pulls = jnp.where(modes.active, -found.normal * w[:m], 0.0)
-        sinks = jnp.where(touching & ~modes.active, -rate[:m], 0.0)
-        excess = (jnp.abs(found.tangential) - mu * found.normal) * w[m:]
-        breaks = jnp.where(modes.active & modes.stick, excess, 0.0)
-        # sliding from rest must move the way it was assumed to
-        back = modes.active & ~modes.stick & ~sliding
-        returns = jnp.where(back, -modes.sign * rate[m:], 0.0)
-        # what pulls or sinks is settled first: cones of pulling contacts mean nothing
-        settled = ~jnp.any(jnp.maximum(pulls, sinks) > slack)
-        sides = jnp.where(settled, jnp.stack([breaks, returns]), 0.0)
-        return jnp.concatenate([jnp.stack([pulls, sinks]), sides]), found.tangential
-
-    def one(state: _Search) -> _Search:
-        modes = state.modes
-        size, tangential = violations(modes)
-        worst = jnp.max(size)
-        at = jnp.argmax(size)
-        kind, contact = at // m, at % m
-        here = (number == contact) & (worst > slack)
-        active = jnp.where(here & (kind == 0), False, modes.active)
-        active = jnp.where(here & (kind == 1), True, active)
-        stick = jnp.where(here & (kind == 2), False, modes.stick)
-        stick = jnp.where(here & (kind == 3), True, stick)
-        sign = jnp.where(here & (kind == 2), -jnp.sign(tangential), modes.sign)
-        return _Search(Modes(active, stick, sign), worst, state.passes + 1)
-
-    begin = one(_Search(start, jnp.asarray(jnp.inf, w.dtype), jnp.asarray(0)))
-    end = jax.lax.while_loop(lambda s: (s.worst > slack) & (s.passes < _PASSES * m + 2), one, begin)
-    return Choice(end.modes, end.worst <= slack)

@@ -23,7 +23,7 @@ from jimpact.motion.dynamics import base_velocity, gaps, user_force
 from jimpact.motion.flow import Course, State
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
-from jimpact.motion.transitions import FAILS, blow_of, no_blow
+from jimpact.motion.transitions import FAILS, impact_jump, no_jump
 from jimpact.solvers.lcp import solve_lcp
 
 # Gap velocities below this share of the largest speed of the motion, or below so many roundings of
@@ -32,7 +32,7 @@ from jimpact.solvers.lcp import solve_lcp
 _ROUNDING, _ROUNDINGS = 1e-12, 64
 
 
-class _Now(NamedTuple):
+class _Progress(NamedTuple):
     state: State
     speed: jax.Array  # the largest that velocities could give a gap so far
     events: Events
@@ -64,18 +64,18 @@ def time_stepping(
     status = jnp.where(penetrates, MOTION_CODE["penetration"], status).astype(jnp.int32)
     h = (times[1] - times[0]) / substeps
 
-    def one(course: _Now, t: jax.Array) -> tuple[_Now, None]:
+    def one(course: _Progress, t: jax.Array) -> tuple[_Progress, None]:
         moved = _one_step(system, law, h, closed_below, course, t)
         going = course.status == MOTION_CODE["ok"]
         return jax.tree.map(lambda a, b: jnp.where(going, a, b), moved, course), None
 
-    def to_sample(course: _Now, t: jax.Array) -> tuple[_Now, State]:
+    def to_sample(course: _Progress, t: jax.Array) -> tuple[_Progress, State]:
         steps = t + h * jnp.arange(substeps, dtype=t.dtype)
         course, _ = jax.lax.scan(one, course, steps)
         fine = course.status == MOTION_CODE["ok"]
         return course, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), course.state)
 
-    end, rows = jax.lax.scan(to_sample, _Now(begin, zero, events, status), times[:-1])
+    end, rows = jax.lax.scan(to_sample, _Progress(begin, zero, events, status), times[:-1])
     samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, rows)
     steps = jnp.int32(substeps * (times.shape[0] - 1))
     return Course(samples, end.events, steps, end.status)
@@ -86,9 +86,9 @@ def _one_step(
     law: Law,
     h: jax.Array,
     closed_below: jax.Array,
-    course: _Now,
+    course: _Progress,
     t: jax.Array,
-) -> _Now:
+) -> _Progress:
     state = course.state
     middle = t + 0.5 * h
     q = state.q + 0.5 * h * state.v
@@ -102,40 +102,40 @@ def _one_step(
     noise = share * speed
     strikes = jnp.any(closed & (given.normal.rate < -noise))
     at_middle = state._replace(q=q)
-    blow = jax.lax.cond(
+    jump = jax.lax.cond(
         strikes,
-        lambda: blow_of(system, law, middle, at_middle, closed, noise),
-        lambda: no_blow(at_middle, m),
+        lambda: impact_jump(system, law, middle, at_middle, closed, noise),
+        lambda: no_jump(at_middle, m),
     )
-    force = user_force(system, q, blow.v, middle)
-    v, push, energy = _pressed(system, q, blow.v, middle, h, closed)
+    force = user_force(system, q, jump.v, middle)
+    v, push, energy = _pressed(system, q, jump.v, middle, h, closed)
     carried = base_velocity(system, middle)
-    base = blow.base_work + (0.0 if carried is None else push @ carried)
+    base = jump.base_work + (0.0 if carried is None else push @ carried)
     work = state._replace(
         q=q + 0.5 * h * v,
         v=v,
         t=t + h,
-        work=state.work + h * force @ (0.5 * (blow.v + v)),
+        work=state.work + h * force @ (0.5 * (jump.v + v)),
         base_work=state.base_work + base,
-        contact_work=state.contact_work + blow.energy + energy,
+        contact_work=state.contact_work + jump.energy + energy,
     )
     finite = jnp.all(jnp.isfinite(v))
-    fails = jnp.asarray(FAILS)[blow.code]
+    fails = jnp.asarray(FAILS)[jump.code]
     status = jnp.where(fails, MOTION_CODE["law_failed"], course.status)
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
     row = {
         "time": middle,
         "kind": jnp.int32(KIND_CODE["impact"]),
-        "contacts": blow.impulse != 0,
+        "contacts": jump.impulse != 0,
         "q": q,
         "velocity_before": state.v,
-        "velocity_after": blow.v,
-        "impulse": blow.impulse,
-        "tangential_impulse": blow.tangential,
-        "energy": blow.energy,
-        "status": blow.code,
+        "velocity_after": jump.v,
+        "impulse": jump.impulse,
+        "tangential_impulse": jump.tangential,
+        "energy": jump.energy,
+        "status": jump.code,
     }
-    return _Now(work, speed, with_row(course.events, strikes, row), status)
+    return _Progress(work, speed, with_row(course.events, strikes, row), status)
 
 
 def _pressed(

@@ -30,7 +30,7 @@ REST_SPEED = 1e-9
 ROUNDINGS = 64  # of the time: velocities that arise within them are 0
 
 
-class Blow(NamedTuple):
+class Jump(NamedTuple):
     """What the contacts do to the velocities at one event; all impulses [N s]."""
 
     v: jax.Array
@@ -41,14 +41,14 @@ class Blow(NamedTuple):
     code: jax.Array  # of the law
 
 
-def no_blow(state: State, m: int) -> Blow:
+def no_jump(state: State, m: int) -> Jump:
     """Nothing happens."""
     zero = jnp.zeros_like(state.work)
     none = jnp.zeros(m, state.v.dtype)
-    return Blow(state.v, none, none, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
+    return Jump(state.v, none, none, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
 
 
-def scene_now(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
+def scene_at(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
     """The scene that a law sees: normals and tangents at q, gaps 0 where `closed`."""
     normal = kinematics(system, q, v, t)
     tangents = system.body.tangents(seen_from_base(system, q, t))
@@ -56,15 +56,15 @@ def scene_now(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: 
     return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
 
 
-def blow_of(
+def impact_jump(
     system: System, law: Law, t: jax.Array, state: State, closed: jax.Array, noise: jax.Array
-) -> Blow:
+) -> Jump:
     """`impact` in the frame of the base, and what it does to energies.
 
     Gap velocities up to `noise` are rounding, on the scale of the motion.
     """
     m = closed.shape[0]
-    scene = scene_now(system, state.q, state.v, t, closed)
+    scene = scene_at(system, state.q, state.v, t, closed)
     carried = base_velocity(system, t)
     carried = jnp.zeros_like(state.v) if carried is None else carried
     relative = state.v - carried
@@ -78,7 +78,7 @@ def blow_of(
         side = (scene.tangents.T @ mean) * tangential
         push = push + scene.tangents @ tangential
     energy = jnp.stack([normal, side])
-    return Blow(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
+    return Jump(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
 
 
 class Outcome(NamedTuple):
@@ -88,7 +88,7 @@ class Outcome(NamedTuple):
     modes: Modes
     scales: Scales
     struck: jax.Array  # (2, m) times of the last two impacts of each contact
-    blow: Blow
+    jump: Jump
     kind: jax.Array
     contacts: jax.Array  # (m,)
     accumulation_end: jax.Array
@@ -119,12 +119,12 @@ def resolve(
     rounding = ROUNDINGS * float(jnp.finfo(t.dtype).eps) * jnp.abs(settings.duration)
     rest = jax.lax.stop_gradient(REST_SPEED * scales.speed + rounding * scales.acceleration)
     strikes = jnp.any(closed & (given.normal.rate < -rest))
-    blow = jax.lax.cond(
+    jump = jax.lax.cond(
         strikes,
-        lambda: blow_of(system, law, t, state, closed, rest),
-        lambda: no_blow(state, m),
+        lambda: impact_jump(system, law, t, state, closed, rest),
+        lambda: no_jump(state, m),
     )
-    given = contacts_at(system, state.q, blow.v, t, settings.friction)
+    given = contacts_at(system, state.q, jump.v, t, settings.friction)
     gamma = given.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
     # a hop below the rounding of gaps is none: it would strike faster than it left
@@ -136,32 +136,32 @@ def resolve(
     pressed, resting = pressed_together(given, slow, slack)
     held = tight | (slow & pressed)
     carried = base_velocity(system, t)
-    carried = jnp.zeros_like(blow.v) if carried is None else carried
-    blow = _brought_to_rest(given, mu, held, slowly, carried, blow)
+    carried = jnp.zeros_like(jump.v) if carried is None else carried
+    jump = _brought_to_rest(given, mu, held, slowly, carried, jump)
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strikes
     if mu is None:
         active = pressed | (tight & resting & ~released)
         choice = Choice(no_modes(m, gamma.dtype)._replace(active=active), jnp.asarray(True))
     else:
-        choice = _with_friction(given, mu, before, held, released, blow.v - carried, rest, slack)
+        choice = _with_friction(given, mu, before, held, released, jump.v - carried, rest, slack)
     # a contact accumulates if it was brought to rest from more than rounding
     ends = held & ~tight & strikes
-    fails = jnp.asarray(FAILS)[blow.code]
+    fails = jnp.asarray(FAILS)[jump.code]
     status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
     status = jnp.where(fails, MOTION_CODE["law_failed"], status)
-    took = jnp.where(strikes, blow.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
+    took = jnp.where(strikes, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
     work = state._replace(
-        v=blow.v,
-        base_work=state.base_work + blow.base_work,
-        contact_work=state.contact_work + blow.energy,
+        v=jump.v,
+        base_work=state.base_work + jump.base_work,
+        contact_work=state.contact_work + jump.energy,
     )
     return Outcome(
         work,
         choice.modes,
         scales,
         jnp.where(took & strikes, jnp.stack([jnp.full(m, t), struck[0]]), struck),
-        blow,
+        jump,
         _kind(strikes, jnp.any(ends), released, fired, m),
         took,
         _accumulation_end(t, struck, ends),
@@ -204,11 +204,11 @@ def _brought_to_rest(
     held: jax.Array,
     slowly: jax.Array,
     carried: jax.Array,
-    blow: Blow,
-) -> Blow:
+    jump: Jump,
+) -> Jump:
     """Gap velocities of `held` contacts set to 0, and with friction what slides as slowly."""
     m = held.shape[0]
-    modes, rates = no_modes(m, blow.v.dtype)._replace(active=held), given.normal.rate
+    modes, rates = no_modes(m, jump.v.dtype)._replace(active=held), given.normal.rate
     if given.tangent is not None:
         modes = modes._replace(stick=jnp.abs(given.tangent.rate) <= slowly)
         rates = jnp.concatenate([rates, given.tangent.rate])
@@ -216,12 +216,12 @@ def _brought_to_rest(
     # work at the mean velocity: half of that before, 0 after
     energy = jnp.pad(0.5 * p * rates, (0, 2 * m - p.shape[0])).reshape(2, m)
     side = jnp.pad(p, (0, 2 * m - p.shape[0]))[m:]
-    return blow._replace(
-        v=blow.v + given.moved @ p,
-        impulse=blow.impulse + p[:m],
-        tangential=blow.tangential + side,
-        energy=blow.energy + energy,
-        base_work=blow.base_work + (given.directions @ p) @ carried,
+    return jump._replace(
+        v=jump.v + given.moved @ p,
+        impulse=jump.impulse + p[:m],
+        tangential=jump.tangential + side,
+        energy=jump.energy + energy,
+        base_work=jump.base_work + (given.directions @ p) @ carried,
     )
 
 

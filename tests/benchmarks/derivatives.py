@@ -27,7 +27,7 @@ import numpy as np
 from three_balls import SCENE, V, law_of, one_impact, problem, steps
 
 import jimpact as ji
-from jimpact.methods.contenders.event_aligned import DOP853_ALIGNED
+from jimpact.methods.contenders.schemes import DOP853_ALIGNED
 from jimpact.scene import velocity_change
 
 BATCH, REPEATS = 4096, 7

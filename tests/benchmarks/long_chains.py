@@ -17,7 +17,7 @@ import numpy as np
 
 import jimpact as ji
 from jimpact.events.tableaux import DOP853
-from jimpact.methods.contenders.event_aligned import DOP853_ALIGNED
+from jimpact.methods.contenders.schemes import DOP853_ALIGNED
 
 LENGTHS = (10, 30, 100, 300, 1000)
 RESTITUTIONS = (1.0, 0.9)

@@ -28,7 +28,7 @@ from kernels import compiled, diffrax_event, siconos
 
 import jimpact as ji
 from jimpact.events.tableaux import DOP853
-from jimpact.methods.contenders.event_aligned import DOP853_ALIGNED
+from jimpact.methods.contenders.schemes import DOP853_ALIGNED
 from jimpact.scene import velocity_change
 
 BATCH, CHUNK, REPEATS = 4096, 256, 11

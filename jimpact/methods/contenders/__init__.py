@@ -9,10 +9,8 @@
 """
 
 from jimpact.methods.contenders import (
-    event_aligned,
-    fixed_step,
-    impulse,
     libraries,
+    schemes,
 )
 from jimpact.methods.contenders.base import (
     UNCOUNTED,
@@ -26,11 +24,11 @@ from jimpact.methods.contenders.base import (
 METHODS: dict[str, Method] = {
     method.name: method
     for method in (
-        impulse.EULER,
-        impulse.RK4,
-        fixed_step.RK4,
-        fixed_step.VERLET,
-        *event_aligned.METHODS,
+        schemes.IMPULSE_EULER,
+        schemes.IMPULSE_RK4,
+        schemes.TIME_RK4,
+        schemes.VERLET,
+        schemes.DOP853_ALIGNED,
         *libraries.DIFFRAX,
         *libraries.SCIPY,
     )

@@ -62,7 +62,7 @@ class Method(NamedTuple):
     counting: Callable[[Callable[[], None]], Callable[..., MethodResult]] | None = None
 
 
-class Problem(NamedTuple):
+class GivenImpact(NamedTuple):
     """The dimensionless problem of an impact; the tolerances in `inputs` are those of rtol."""
 
     dynamics: Dynamics
@@ -92,7 +92,7 @@ class Problem(NamedTuple):
         return rule_of(self.inputs, self.dynamics.static_exponent, self.dynamics.chain)
 
 
-def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
+def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> GivenImpact:
     """The impact in units of its own, open contacts left out."""
     if law.friction is not None:
         raise TypeError("Argument `law` must have no friction: these methods have none.")
@@ -102,11 +102,11 @@ def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> Problem:
     gamma, happens = contact.gap_velocity, contact.happens
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
-    return Problem(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), law.max_steps, happens)
+    return GivenImpact(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), law.max_steps, happens)
 
 
 def in_si(
-    given: Problem, p: jax.Array, t: jax.Array, evaluations: jax.Array, code: jax.Array
+    given: GivenImpact, p: jax.Array, t: jax.Array, evaluations: jax.Array, code: jax.Array
 ) -> MethodResult:
     """The result in SI units, nothing where nothing happens, `not_finite` where it is not."""
     impulse = jnp.where(given.happens, p * given.units.velocity / given.units.root, 0.0)
