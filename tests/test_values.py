@@ -441,7 +441,7 @@ ELASTIC = [  # d v+ / d (k2/k1, eta) at e = 1, eta = 1.5, from rtol = 1e-12
 ]
 
 
-@pytest.mark.parametrize("name", ["lzb", "compliant"])
+@pytest.mark.parametrize("name", ["lzb", pytest.param("compliant", marks=pytest.mark.slow)])
 def test_held_slopes(name):
     three = {"velocity": [1, 0, 0], "masses": [1, 1, 1]}
     states = [
