@@ -29,7 +29,7 @@ MANY_MAPS = 30_000
 WORTH_SHARING = "0.2"  # seconds
 
 # A program counts if its compilation took longer; single operations, run eagerly, take less.
-COUNTS_FROM = 0.1  # seconds
+COUNTS_FROM = 0.2  # seconds
 BUDGET = 250  # programs of the default suite, over all processes
 COMPILED = "/jax/core/compile/backend_compile_duration"
 

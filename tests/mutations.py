@@ -52,7 +52,13 @@ MUTATIONS = [
     # --- the flow of LZB and Compliant
     Mutation("sign in the flow", r"-ratio \* self\.omega", "ratio * self.omega", FLOW, "contact_flow.py"),
     Mutation("wrong exponent of the force", r"const\.stiffness \* power\(x, self\.exponent\)", "const.stiffness * power(x, plus_one(self.exponent))", FLOW, "contact_flow.py"),
-    Mutation("missing square of e", r"(s = jnp\.where\(phase == EXPANSION, )self\.restitution(, 1\.0\))", r"\1jnp.sqrt(self.restitution)\2", FLOW, "contact_flow.py"),
+    Mutation(
+        "missing square of e",
+        r"(return jnp\.where\(modes\[: self\.contacts\] == EXPANSION, )self\.restitution",
+        r"\1jnp.sqrt(self.restitution)",
+        FLOW,
+        "contact_flow.py",
+    ),
     Mutation("(eta + 1)/2 becomes eta/2", r"\(per_row\(self\.exponent, self\.omega\) \+ 1\) / 2", "per_row(self.exponent, self.omega) / 2", FLOW, "contact_flow.py"),
     Mutation("no recompression", r"after = jnp\.where\(by_g & \(phase == EXPANSION\), COMPRESSION, after\)", "pass", FLOW, "contact_flow.py"),
     Mutation("no re-closing", r"closed = \(by_x \| by_g\) & \(phase == OPEN\)", "closed = by_x & (phase == OPEN)", FLOW, "contact_flow.py"),

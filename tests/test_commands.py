@@ -277,6 +277,7 @@ def test_advise(tmp_path, capsys):
     assert (tmp_path / "jimpact-advise.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_chart(tmp_path, capsys):
     options = ["--no-gradients", "--batch", "4", "--repeats", "1", "--methods", "verlet"]
     code, said = call(capsys, "chart", *options, "--out", tmp_path, "--json")

@@ -118,7 +118,10 @@ def draw(number=COUNT, seed=1):
     return k, c, mass, v, np.where(closed, 0, 10 ** rng.uniform(-2, 1, (number, 2)))
 
 
-@pytest.mark.parametrize("force", FORCES)
+@pytest.mark.parametrize(
+    "force",
+    [pytest.param(x, marks=[pytest.mark.slow] if x == "kuwabara-kono" else []) for x in FORCES],
+)
 def test_damped_chains_against_scipy(force):
     """Forces that slacken at x > 0 and are loaded again, at any damping; none of it elastic."""
     k, c, mass, v, gaps = draw()

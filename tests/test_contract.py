@@ -245,7 +245,13 @@ SMOOTH = [
 STEP = 4e-3  # of differences of fourth order, relative
 
 
-@each_law
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=[pytest.mark.slow] if x in ("compliant", "binary-left") else [])
+        for x in LAWS
+    ],
+)
 def test_derivatives(name):
     """Forward equals reverse, and both are the slope of the values."""
     states = SMOOTH

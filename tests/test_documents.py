@@ -52,7 +52,18 @@ def as_a_user_runs_them(tmp_path, monkeypatch):
     jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 
-@pytest.mark.parametrize("module", WITH_EXAMPLES)
+LONG = (  # all rheologies, laws or methods are compiled
+    "laws.calibration", "plot.laws", "plot.charts", "methods.", "motion.fitting_motion", "comparison",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        pytest.param(x, marks=[pytest.mark.slow] if any(y in x for y in LONG) else [])
+        for x in WITH_EXAMPLES
+    ],
+)
 def test_docstrings_run(module):
     runner = doctest.DocTestRunner(optionflags=OPTIONS)
     tests = examples(module)

@@ -151,9 +151,8 @@ class Watched(RestitutionMatrix):
         return super().impulses(contact)
 
 
-@pytest.mark.parametrize(
-    "method", ["levenberg-marquardt", pytest.param("adam", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["levenberg-marquardt", "adam"])
 def test_every_iterate_is_admissible(method):
     """... and gradient descent ends where Levenberg-Marquardt does."""
     data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)

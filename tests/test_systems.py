@@ -29,7 +29,13 @@ def test_outcomes(name):
     assert not wrong, wrong
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(x, marks=[pytest.mark.slow] if x in ("compliant", "binary-left") else [])
+        for x in LAWS
+    ],
+)
 def test_slopes(name):
     """dv+ by velocities, restitution, stiffness, exponent: forward and reverse, exact slopes."""
     systems = {key: s for key, s in claimed(name).items() if s.by}
