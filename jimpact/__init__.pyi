@@ -75,7 +75,7 @@ from .montecarlo.gaps import (
 from .montecarlo.results import MonteCarlo as MonteCarlo
 from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
-from .motion.contact_dynamics import turning_impact as turning_impact
+from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
 from .motion.simulate import simulate as simulate

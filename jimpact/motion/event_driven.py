@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.law import Law
-from jimpact.motion.contact_forces import Modes, no_modes
 from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
 from jimpact.motion.flow import Course, Flight, Scales, Settings, State, encoded, first_flight, fly
+from jimpact.motion.persistent_contact import Modes, no_modes
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.motion.transitions import Outcome, resolve

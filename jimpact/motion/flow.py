@@ -11,7 +11,9 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jimpact.events import stepper
-from jimpact.motion.contact_forces import (
+from jimpact.motion.dynamics import definite, free_acceleration, mass_at, user_force
+from jimpact.motion.persistent_contact import (
+    REST_ACCELERATION,
     Contacts,
     Modes,
     constraint_impulse,
@@ -19,8 +21,6 @@ from jimpact.motion.contact_forces import (
     forces,
     powers,
 )
-from jimpact.motion.dynamics import definite, free_acceleration, mass_at, user_force
-from jimpact.motion.modes import REST_ACCELERATION
 from jimpact.motion.record import Events
 from jimpact.motion.system import System
 

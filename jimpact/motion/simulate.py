@@ -20,7 +20,7 @@ from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
-from jimpact.motion.contact_dynamics import contact_dynamics
+from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
 from jimpact.motion.event_driven import event_driven
 from jimpact.motion.flow import Course, Settings
@@ -173,7 +173,7 @@ def _forced(
     max_events: int,
 ) -> Motion:
     times = _equal_times(start, end, samples)
-    course, *_ = contact_dynamics(system, force, settings, q, v, times, max_events)
+    course, *_ = compliant_motion(system, force, settings, q, v, times, max_events)
     return _recorded(system, times, course)
 
 

@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.law import Law
-from jimpact.motion.contact_forces import contacts_at
 from jimpact.motion.dynamics import base_velocity, gaps, user_force
 from jimpact.motion.flow import Course, State
+from jimpact.motion.persistent_contact import contacts_at
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.motion.transitions import FAILS, impact_jump, no_jump

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 
 from jimpact.impacts import impact
 from jimpact.law import Law
-from jimpact.motion.contact_forces import Contacts, Modes, constraint_impulse, contacts_at, no_modes
 from jimpact.motion.dynamics import (
     base_velocity,
     gaps,
@@ -17,7 +16,17 @@ from jimpact.motion.dynamics import (
     seen_from_base,
 )
 from jimpact.motion.flow import ROUNDING_GAP, Scales, Settings, State
-from jimpact.motion.modes import REST_ACCELERATION, Choice, choose_with_friction, pressed_together
+from jimpact.motion.persistent_contact import (
+    REST_ACCELERATION,
+    Choice,
+    Contacts,
+    Modes,
+    choose_with_friction,
+    constraint_impulse,
+    contacts_at,
+    no_modes,
+    pressed_together,
+)
 from jimpact.motion.record import KIND_CODE, MOTION_CODE
 from jimpact.motion.system import System
 from jimpact.scene import Scene

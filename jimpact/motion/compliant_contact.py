@@ -14,7 +14,6 @@ from jimpact.contact import delassus_matrix
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK, root_order
 from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Bistiffness, Force
-from jimpact.motion.contact_forces import Contacts, contacts_at
 from jimpact.motion.dynamics import base_velocity, kinematics, user_force
 from jimpact.motion.event_driven import why_stuck
 from jimpact.motion.flow import (
@@ -31,6 +30,7 @@ from jimpact.motion.flow import (
     toward_sample,
     unpacked,
 )
+from jimpact.motion.persistent_contact import Contacts, contacts_at
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.scene import gap_velocity
@@ -164,7 +164,7 @@ class _Run(NamedTuple):
     apart: jax.Array  # whether all contacts are open and none closes
 
 
-def contact_dynamics(
+def compliant_motion(
     system: System,
     force: Force,
     settings: Settings,
@@ -325,5 +325,5 @@ def _turning(
     zero = jnp.zeros_like(horizon)
     settings = Settings(rtol, rtol * 1e-3, jnp.asarray(1e-12), max_steps, False, horizon, zero)
     times = jnp.stack([zero, horizon])
-    _, end, apart = contact_dynamics(system, force, settings, q, v, times, 1000, True)
+    _, end, apart = compliant_motion(system, force, settings, q, v, times, 1000, True)
     return TurningImpact(end.v, end.q, end.t, apart)
