@@ -229,6 +229,12 @@ def option(
     """A static field of a `Law` that says how it is solved: one of `choices`, or in an interval.
 
     `converter` takes the place of these checks.
+
+    >>> import jimpact as ji
+    >>> ji.LZB(0.9, method="euler")
+    Traceback (most recent call last):
+        ...
+    ValueError: Argument `method` must be one of ('time', 'impulse'), but has value 'euler'.
     """
     declared = Option(choices, low, high, open_low=open_low, converter=converter)
     return _field(declared, default, kw_only, True)
