@@ -208,8 +208,12 @@ def raise_on_failure(out: Impact) -> Impact:
     Codes that only inform (`plastic_limit`, `impulse_not_unique`, `order_dependent`) pass.
 
     >>> import jimpact as ji
-    >>> scene = ji.chain([1.0, 1.0, 1.0])
-    >>> out = ji.raise_on_failure(ji.impact(ji.Moreau(0.5), scene, [1.0, 0.0, 0.0]))
+    >>> apart = ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 1.0])
+    >>> ji.raise_on_failure(apart)
+    Traceback (most recent call last):
+        ...
+    RuntimeError: Failed impacts among 1:
+      negative_impulse: a contact would have to pull (p < 0) (1)
     """
     codes = np.atleast_1d(np.asarray(out.status))
     lines = []

@@ -231,10 +231,10 @@ def option(
     `converter` takes the place of these checks.
 
     >>> import jimpact as ji
-    >>> class Quick(ji.Newton):
-    ...     steps: int = ji.option(3, low=1)
-    >>> Quick.steps
-    3
+    >>> ji.LZB(0.9, method="euler")
+    Traceback (most recent call last):
+        ...
+    ValueError: Argument `method` must be one of ('time', 'impulse'), but has value 'euler'.
     """
     declared = Option(choices, low, high, open_low=open_low, converter=converter)
     return _field(declared, default, kw_only, True)

@@ -1,6 +1,6 @@
-"""The chooser table of the README: how often a law breaks a property on random scenes.
+"""The chooser table of `docs/laws.md`: how often a law breaks a property on random scenes.
 
-`python tests/chooser.py` prints it; a test holds the README to it. Per law 300 chains of four
+`python tests/chooser.py` prints it; a test holds the page to it. Per law 300 chains of four
 balls (masses and stiffnesses over two decades, one e per contact) and 200 general scenes of two
 contacts in three coordinates, all with random velocities in which something approaches.
 """

@@ -91,17 +91,17 @@ def Hertz(stiffness: Any) -> Bistiffness:
     """Hertz contact `F = k x^1.5`, k in [N / m^1.5] (see `hertz_stiffness`).
 
     >>> import jimpact as ji
-    >>> ji.Hertz(2.0).exponent
+    >>> float(ji.Hertz(2.0).exponent)
     1.5
     """
     return Bistiffness(stiffness, 1.5)
 
 
 def LinearSpring(stiffness: Any) -> Bistiffness:
-    """Linear spring `F = k x`, k in [N / m].
+    """Linear spring `F = k x`, k in [N/m].
 
     >>> import jimpact as ji
-    >>> ji.LinearSpring(2.0).exponent
+    >>> float(ji.LinearSpring(2.0).exponent)
     1.0
     """
     return Bistiffness(stiffness, 1.0)
