@@ -77,17 +77,25 @@ def test_readme_runs():
     done = doctest.testfile(str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS)
     assert done.attempted > 10
     assert done.failed == 0
-    assert len(README.splitlines()) <= 150
+    assert len(README.splitlines()) <= 170
 
 
 def code_of(path):
     """Python code of a page: fenced blocks, those with prompts by doctest."""
     text = path.read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
-    return [block for block in blocks if ">>>" not in block], ">>>" in text
+    own = [block for block in blocks if ">>>" not in block and "tcp://" not in block]
+    return own, ">>>" in text  # (a cluster is nobody's own machine)
 
 
-@pytest.mark.parametrize("path", [p for p in DOCS if any(code_of(p))], ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(p, id=p.stem, marks=[pytest.mark.slow] if p.stem == "speed_accuracy" else [])
+        for p in DOCS
+        if any(code_of(p))
+    ],
+)
 def test_docs_run(path):
     blocks, prompts = code_of(path)
     space = {}
