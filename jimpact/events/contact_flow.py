@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jimpact.events.stepper import any_of
 
@@ -69,17 +68,6 @@ def per_row(values: Exponent, like: jax.Array) -> jax.Array:
 def plus_one(exponent: Exponent) -> Exponent:
     """`exponent + 1`, static where `exponent` is."""
     return tuple(e + 1 for e in exponent) if isinstance(exponent, tuple) else exponent + 1
-
-
-def root_order(exponent: Exponent) -> int:
-    """`r` of the rooted variables: powers `xi^(r eta)` are then smooth enough.
-
-    At 4 other than whole and half exponents take half the steps, but the errors of many closings
-    reach 100 tolerances.
-    """
-    known = isinstance(exponent, (float, tuple))
-    etas = np.atleast_1d(np.asarray(exponent)) if known else np.array([0.1])
-    return 2 if np.all(2 * etas == np.round(2 * etas)) else 8
 
 
 class Viscous(NamedTuple):
@@ -187,7 +175,7 @@ class Measured(NamedTuple):
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=("coupling", "omega", "restitution", "exponent_array", "tolerance", "viscous"),
-    meta_fields=("exponent_static", "gapped", "root", "closed_form"),
+    meta_fields=("exponent_static", "gapped", "closed_form"),
 )
 @dataclasses.dataclass
 class ContactFlow:
@@ -201,7 +189,6 @@ class ContactFlow:
     viscous: Viscous | None = None
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
-    root: int = 2
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
 
     longest = math.inf  # no rate is large beside the others
@@ -342,9 +329,9 @@ class ContactFlow:
         return jnp.where(by_g & (phase == SLACK), OPEN, after)
 
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
-        """Without gaps a contact closes with x ~ t^2: t^(2 eta) is smooth if 2 eta is whole."""
+        """Behind a gap x sets in like t; without gaps like t^2, and forces are smooth enough."""
         m = self.contacts
-        if self.root == 2 and not self.gapped:
+        if not self.gapped:
             return jnp.zeros((1, *before.shape[1:]), bool)
         return any_of(after[m : 2 * m] > before[m : 2 * m])
 

@@ -65,7 +65,7 @@ def inverse(matrix: jax.Array) -> jax.Array:
         "along",
         "friction",
     ),
-    meta_fields=("exponent_static", "gapped", "root", "closed_form"),
+    meta_fields=("exponent_static", "gapped", "closed_form"),
 )
 @dataclasses.dataclass(kw_only=True)
 class FrictionFlow(ContactFlow):

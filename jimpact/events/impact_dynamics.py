@@ -24,7 +24,6 @@ from jimpact.events.contact_flow import (
     Exponent,
     Viscous,
     per_row,
-    root_order,
     unit,
 )
 from jimpact.events.friction_flow import FrictionFlow
@@ -165,7 +164,6 @@ def flow_of(
         viscous=viscous,
         exponent_static=None if problem.exponent is not None else exponent,
         gapped=problem.gap is not None,
-        root=root_order(eta),
         closed_form=viscous is None,
     )
     loaded = problem.energy > 0

@@ -158,7 +158,7 @@ def pseudoinverse(k: jax.Array, held: jax.Array) -> jax.Array:
         "along",
         "friction",
     ),
-    meta_fields=("exponent_static", "gapped", "root", "closed_form"),
+    meta_fields=("exponent_static", "gapped", "closed_form"),
 )
 @dataclasses.dataclass(kw_only=True)
 class SlipFlow(FrictionFlow):

@@ -8,20 +8,20 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     constants(modes)           what of the field does not change while the modes last
     field(const, modes, y)     -> dy (n, B), in the flow's own time
     margins(const, modes, y)   -> c (k, B): each is >= 0 while its mode lasts
-    rooted(modes)              -> (k, B): margins whose root c^(1/root) is the variable of a landing
+    rooted(modes)              -> (k, B): margins whose root is the variable of a landing
     switch(modes, y, which)    -> (modes, y) after the events `which` (k, B), one-hot
-    begins(before, after)      -> (1, B): forces set in like t^(1/root), so steps begin in that root
+    begins(before, after)      -> (1, B): forces set in like powers of t, so steps begin in its root
     coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
     over(modes, y, passes)     -> (1, B): nothing is left to integrate
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
     longest                    the longest step in the flow's own time that is stable
-    tolerance (1, B), snap (1, B), root, contacts
+    tolerance (1, B), snap (1, B), contacts
     near                       share of a step from which landings start, 0: from anywhere
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
 
-    N = root xi^(root - 1) where xi is a root, else 1;   R = dc_k/dt on landings, else 1.
+    N = 2 xi where xi is a root, else 1;   R = dc_k/dt on landings, else 1.
 
 A landing on margin k runs from xi = c_k (or its root) to exactly 0 (Henon): no root is searched
 for, and its length is differentiated. An event where a step begins is a landing of length 0; an
@@ -74,7 +74,6 @@ _WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
 class Flow(Protocol):
     """What the stepper asks of a flow (see above)."""
 
-    root: int
     longest: float
     near: float
 
@@ -111,11 +110,6 @@ def any_of(x: jax.Array) -> jax.Array:
     return jnp.any(x, axis=0, keepdims=True)
 
 
-def root_of(x: jax.Array, order: int) -> jax.Array:
-    """`x^(1/order)` of x > 0, for orders that are powers of 2."""
-    return x if order == 1 else root_of(jnp.sqrt(x), order // 2)
-
-
 def _put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_slice_in_dim(
         buffer, value[None], index, 0, allow_negative_indices=False
@@ -133,13 +127,13 @@ class Step(NamedTuple):
 def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     """Sums (3, n + 1, B) of the slopes of y and of time (weights b and both error estimates);
     margins at the beginning; their rates (stages, k, B); the constants of the field."""
-    dtype, r = y.dtype, flow.root
+    dtype = y.dtype
     const = flow.constants(s.modes)
     c0 = flow.margins(const, s.modes, y)
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     # from a margin that is 0 already a landing has length 0, and no root
     root = flow.rooted(s.modes) & (c0 > flow.snap)
-    xi0 = jnp.where(root, root_of(jnp.where(root, c0, 1.0), r), c0)
+    xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
     xi0 = total(jnp.where(s.target, xi0, 0.0))
     rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
     start = jnp.where(lands > 0, xi0, begun)
@@ -166,7 +160,7 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
             value, dc = seen()
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
-        dt = (1 + rooted * (r * xi ** (r - 1) - 1)) / rate
+        dt = (1 + rooted * (2 * xi - 1)) / rate
         return _put(slopes, jnp.concatenate([dy * dt, dt]), i), (value, dc) if ends else None
 
     none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
@@ -186,7 +180,7 @@ class Carry(NamedTuple):
 def begin(flow: Flow, modes: jax.Array, y: jax.Array) -> Carry:
     """The first step: short, in the root of time, for forces set in like a power of it."""
     one = jnp.ones_like(y[:1])
-    clock = jnp.concatenate([0 * one, FIRST ** (1 / flow.root) * one, one, 0 * one])
+    clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
     targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one).astype(y.dtype)
@@ -207,7 +201,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
          1 .. inf  it is expected to vanish so far ahead: land on it if the next step reaches it
     """
     y, s = carry.y, carry.step
-    n, r, dtype = y.shape[0], flow.root, y.dtype
+    n, dtype = y.shape[0], y.dtype
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
@@ -267,15 +261,15 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     in_root = in_root & ~lands
     xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
     cut = jnp.where(ok & (first < 0), (1 - flow.near if flow.near else CUT) * (first + 2), 0.5)
-    shorter = jnp.where(in_root, root_of(cut, r) * h, cut * jnp.where(lands, span, h))
+    shorter = jnp.where(in_root, jnp.sqrt(cut) * h, cut * jnp.where(lands, span, h))
     kept = jnp.where(first < 0, shorter, h)
     h = jnp.where(ok & event, kept, jnp.where(lands, jnp.where(ok, h, shorter), factor * h))
     fresh = accept & flow.begins(s.modes, modes)
-    restart = root_of(jnp.minimum(RESTART * span, FIRST), r)
+    restart = jnp.sqrt(jnp.minimum(RESTART * span, FIRST))
     in_root, xi = in_root | fresh, jnp.where(fresh, 0.0, xi)
     h = jnp.where(fresh & (restart > 0), restart, h)
     h = jnp.where(in_root, h, jnp.minimum(h, flow.longest))
-    new_span = jnp.where(in_root, (xi + h) ** r - xi**r, h)
+    new_span = jnp.where(in_root, (xi + h) ** 2 - xi**2, h)
     coasts = flow.coasts(s.modes)
     reached = (first - 1) * span < new_span
     reached = reached if coasts is None else reached | (coasts & (first < jnp.inf))
@@ -388,10 +382,10 @@ def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     """The state so long (1, B) after y, in the flow's own time, within the step from there."""
     begun, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
     in_root = in_root * (1 - lands)
-    begun, r = begun * in_root, flow.root
-    reached = begun**r + ahead
+    begun = begun * in_root
+    reached = begun**2 + ahead
     positive = reached > 0
-    root = jnp.where(positive, root_of(jnp.where(positive, reached, 1.0), r), 0.0)
+    root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
     h = jnp.where(in_root > 0, root - begun, ahead)
     clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
     sums, *_ = _stages(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y, ends=False)

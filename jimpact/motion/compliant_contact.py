@@ -11,7 +11,7 @@ from jimpact._checks import as_float_array, check_kind, check_shape, check_value
 from jimpact.bodies.base import Body, GivenBody
 from jimpact.compiling import quick_jit
 from jimpact.contact import delassus_matrix
-from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK, root_order
+from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
 from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Bistiffness, Force
 from jimpact.motion.dynamics import base_velocity, kinematics, user_force
@@ -69,11 +69,6 @@ class CompliantFlow(MotionFlow):
 
     force: Force
     units: Units
-
-    @property
-    def root(self) -> int:  # type: ignore[override]
-        """Forces set in like `x^eta`: see `root_order`."""
-        return root_order(self.force.exponent) if isinstance(self.force, Bistiffness) else 2
 
     def constants(self, modes: jax.Array) -> jax.Array:
         """The phase of each contact."""

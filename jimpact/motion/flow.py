@@ -101,7 +101,6 @@ class MotionFlow(eqx.Module):
     errors: jax.Array  # (rows, 1) that a step may make
     like: State  # of its shapes
 
-    root = 1
     near = 0.0
     longest = math.inf  # no rate is large beside the others
 

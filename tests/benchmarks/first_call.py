@@ -1,0 +1,79 @@
+"""What one waits for before the first number, beside diffrax: CPU time of tracing and compiling.
+
+Each row is a process of its own, without a compilation cache; what it imports and JAX's own start
+are not counted. `python tests/benchmarks/first_call.py [repeats]` prints medians and their ratio
+to one impact of three balls by diffrax (Dopri8, an Event at the end).
+"""
+
+import resource
+import statistics
+import subprocess
+import sys
+from pathlib import Path
+
+TARGETS = {  # times diffrax
+    "diffrax": None,
+    "impact": 1.5,
+    "another number of balls": None,
+    "Jacobian": 2.5,
+    "friction": 4.0,
+    "fit": 4.0,
+}
+
+
+def cpu():
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def measure(row):
+    """CPU seconds of the first call of a row."""
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    import jimpact as ji
+
+    sys.path.insert(0, str(Path(__file__).parent / "kernels"))
+    import diffrax_event
+
+    jnp.linalg.solve(jnp.eye(2), jnp.ones(2)).block_until_ready()
+    balls, v, e = ji.chain([1.0] * 3), jnp.array([1.0, 0.0, 0.0]), jnp.full(2, 0.9)
+    more, faster = ji.chain([1.0] * 4), jnp.array([1.0, 0.0, 0.0, 0.0])
+    block = ji.rocking_block(1.0, 2.0)
+    shots = ji.Experiments(pre=[[1.0, 0, 0]], post=[[-0.0605, 0.1049, 0.9978]])
+    if row == "another number of balls":
+        ji.impact(ji.LZB(0.9), balls, v)
+    run = diffrax_event.dopri8()
+    first = {
+        "diffrax": lambda: run(jnp.ones((1, 2)), e[None], 1e-8),
+        "impact": lambda: ji.impact(ji.LZB(0.9), balls, v).velocity,
+        "another number of balls": lambda: ji.impact(ji.LZB(0.9), more, faster).velocity,
+        "Jacobian": lambda: jax.jacfwd(lambda e: ji.impact(ji.LZB(e), balls, v).velocity)(e),
+        "friction": lambda: ji.impact(ji.LZB(0.9, friction=0.3), block, v).velocity,
+        "fit": lambda: ji.fit(ji.LZB(0.9), balls, shots, free=("restitution",)).law.restitution,
+    }[row]
+    begun = cpu()
+    jax.block_until_ready(first())
+    return cpu() - begun
+
+
+def main(repeats=3):
+    found = {row: [] for row in TARGETS}
+    for _ in range(repeats):
+        for row in TARGETS:
+            command = [sys.executable, __file__, "--row", row]
+            out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+            found[row].append(float(out.split()[-1]))
+    unit = statistics.median(found["diffrax"])
+    for row, target in TARGETS.items():
+        middle = statistics.median(found[row])
+        wanted = "" if target is None else f"   wanted <= {target}"
+        print(f"{row:26s} {middle:6.2f} s CPU   {middle / unit:5.2f} x diffrax{wanted}")
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--row"]:
+        print(measure(sys.argv[2]))
+    else:
+        main(*map(int, sys.argv[1:]))
