@@ -126,7 +126,6 @@ def test_lzb_edges():
     ji.raise_on_failure(out)
 
 
-@pytest.mark.xfail(reason="ends short of the plastic limit", strict=True)
 def test_many_closings():
     """200 closings of contact 1 while contact 2 presses."""
     g = 0.9908170287626599
@@ -140,15 +139,7 @@ def test_many_closings():
 PLASTIC = [chain([1, 1, 1], [1, 0, 0], e=0.0), chain([3, 1, 2], [1, 0.4, -0.5], e=0.0)]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "lzb",
-        pytest.param(
-            "compliant", marks=pytest.mark.xfail(reason="array exponents: max_steps", strict=True)
-        ),
-    ],
-)
+@pytest.mark.parametrize("name", ["lzb", "compliant"])
 def test_plastic_contacts_share_a_velocity(name):
     out, _ = programs.values(name)(PLASTIC)
     for i, state in enumerate(PLASTIC):
@@ -158,7 +149,6 @@ def test_plastic_contacts_share_a_velocity(name):
     assert set(programs.names(out.status)) <= {"ok", "plastic_limit"}
 
 
-@pytest.mark.xfail(reason="NaN where exponents are an array", strict=True)
 def test_slopes_of_plastic_contacts():
     for v, *_ in programs.derivatives("lzb")(PLASTIC):
         for i, state in enumerate(PLASTIC):
@@ -459,8 +449,8 @@ def test_held_slopes(name):
 
 
 def test_slopes_at_the_edges_are_finite_and_one_sided():
-    """e = 0.1 and 1; touching contacts; events that coincide; one-sided at e = 0."""
-    states = [chain([1, 1, 1], v, e=e) for e in (0.1, 1.0) for v in ([1, 0, 0], [1, 0.5, -1])]
+    """e = 0.05 and 1; touching contacts; events that coincide; one-sided at e = 0."""
+    states = [chain([1, 1, 1], v, e=e) for e in (0.05, 1.0) for v in ([1, 0, 0], [1, 0.5, -1])]
     symmetric = chain([0.25, 1, 0.25], [1, 0, -1], e=0.8)
     at_zero = chain([3, 1, 2], [1, 0, -0.5], e=[0.95, 0.0], k=[1, 3])
     found = programs.derivatives("lzb")([*states, symmetric, at_zero])

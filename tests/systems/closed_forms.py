@@ -108,7 +108,7 @@ class HeadOn(System):
 class Plastic(System):
     """e = 0, all contacts approach: the common velocity sum m v / sum m."""
 
-    laws = ("newton", "moreau", "poisson", "matrix", "binary")  # others: test_values, at e = 0
+    laws = ("newton", "moreau", "poisson", "matrix", "lzb", "compliant", "binary")
     by = ("v",)
     status = None  # `ok`, or `plastic_limit` of the laws that come there in the limit
 
