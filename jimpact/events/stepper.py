@@ -53,6 +53,7 @@ FIRST = 0.05  # first step, in the time of the fastest contact: none can turn ar
 RESTART = 0.1  # first rooted step after a contact has closed, as a part of the step before it
 CUT = 0.7  # part of the way to an event that a step is shortened to where it cannot land
 DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
+SHORTEST = 1e-13  # step: a shorter one cannot be told from none
 TIE = 1e-13  # of a step: events of one moment are taken in the order of their rows
 # Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
 # with the number of passes, or the errors of N steps would add up to N tolerances.
@@ -256,7 +257,9 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     landed = accept & lands
     which = s.target & landed
     modes, end = flow.switch(s.modes, end, which)
-    y = jnp.where(accept, end, y)
+    # however short the step, the field has no value: given up, for the status to say
+    broken = active & ~lands & ~(error2 < jnp.inf) & (h < SHORTEST)
+    y = jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
     # the next step
     in_root = in_root & ~lands
     xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
@@ -287,7 +290,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
         [
             jnp.where(aim, due, new_span),
             (aim & lands & event).astype(dtype),
-            jnp.where(over, 1.0, done),
+            jnp.where(over | broken, 1.0, done),
             passes,
         ]
     )
