@@ -63,7 +63,8 @@ def run(name, mass, normals, tangents, v, e, mu, e_t=0.0, k=1.0):
     v = np.pad(v, ((0, 0), (0, idle)))
     if m == 1:
         normals, tangents = (np.concatenate([x, x[:, :, :rows]], 2) for x in (normals, tangents))
-    gaps = np.tile([0.0, float(m == 1)], (count, 1))
+    # far from closing while the other one is indented: `compliant` would feel it
+    gaps = np.tile([0.0, 1e3 * (m == 1)], (count, 1))
     per = [
         np.broadcast_to(np.asarray(x, float).reshape(-1, *(1,) * (np.ndim(x) < 2), *np.shape(x)[1:]), (count, 2))
         for x in (e, mu, e_t, k)
