@@ -23,7 +23,7 @@ may be SLACK: x > 0, and no force.
 import dataclasses
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +39,7 @@ WIDENED = 100.0
 UNROLLED = 8  # products with a matrix of this size are written out, without a reduction
 LARGE = 6.0  # exponents below it that are whole or half are products
 
+T = TypeVar("T")
 Exponent = float | tuple[float, ...] | jax.Array
 
 
@@ -172,11 +173,17 @@ class Measured(NamedTuple):
     rate: jax.Array
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=("coupling", "omega", "restitution", "exponent_array", "tolerance", "viscous"),
-    meta_fields=("exponent_static", "gapped", "closed_form"),
-)
+COMPILED_IN = ("exponent_static", "gapped", "closed_form")  # fields that are no arrays
+
+
+def as_pytree(flow: type[T]) -> type[T]:
+    """A dataclass of arrays as a pytree; the fields COMPILED_IN belong to its structure."""
+    names = [field.name for field in dataclasses.fields(flow)]  # type: ignore[arg-type]
+    arrays = [name for name in names if name not in COMPILED_IN]
+    return jax.tree_util.register_dataclass(flow, arrays, list(COMPILED_IN))
+
+
+@as_pytree
 @dataclasses.dataclass
 class ContactFlow:
     """Contacts without friction, an instance of the protocol of `stepper.py`."""

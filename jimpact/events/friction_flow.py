@@ -13,7 +13,6 @@ break loose together.
 """
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -27,6 +26,7 @@ from jimpact.events.contact_flow import (
     ContactFlow,
     Frozen,
     Measured,
+    as_pytree,
     times,
     unit,
 )
@@ -52,21 +52,7 @@ def inverse(matrix: jax.Array) -> jax.Array:
     return jnp.stack([row[n:] for row in rows])
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=(
-        "coupling",
-        "omega",
-        "restitution",
-        "exponent_array",
-        "tolerance",
-        "viscous",
-        "across",
-        "along",
-        "friction",
-    ),
-    meta_fields=("exponent_static", "gapped", "closed_form"),
-)
+@as_pytree
 @dataclasses.dataclass(kw_only=True)
 class FrictionFlow(ContactFlow):
     """Contacts with planar friction, an instance of the protocol of `stepper.py`."""

@@ -22,14 +22,13 @@ creeps with r = 0. Sticking forces are eliminated from the field once a step.
 """
 
 import dataclasses
-import functools
 import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, times, unit
+from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, as_pytree, times, unit
 from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.friction import distribute
@@ -145,21 +144,7 @@ def pseudoinverse(k: jax.Array, held: jax.Array) -> jax.Array:
     return z
 
 
-@functools.partial(
-    jax.tree_util.register_dataclass,
-    data_fields=(
-        "coupling",
-        "omega",
-        "restitution",
-        "exponent_array",
-        "tolerance",
-        "viscous",
-        "across",
-        "along",
-        "friction",
-    ),
-    meta_fields=("exponent_static", "gapped", "closed_form"),
-)
+@as_pytree
 @dataclasses.dataclass(kw_only=True)
 class SlipFlow(FrictionFlow):
     """Contacts with friction in space, an instance of the protocol of `stepper.py`."""
