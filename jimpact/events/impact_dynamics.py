@@ -41,7 +41,9 @@ WIDE_SPREAD = 5.0
 METHODS = ("time", "impulse")
 ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
 CHOICES = 8  # rounds of the search for the contacts that carry the remainder of a plastic limit
-FINER = 0.01  # tolerance of the second run that shows how well an outcome is conditioned
+# The tolerance of a second run that shows how well an outcome is conditioned, as a multiple of that
+# of the first one: coarser where the precision can hold none that is APART finer.
+FINER, APART, COARSER = 0.01, 3.0, 10.0
 ILL = 10.0  # rtol that two runs may differ by
 
 
@@ -267,8 +269,8 @@ def solve(
         return p * units.momentum, None, code
     leaves, tree = given.columns()
     if doubted is not None:
-        finer = given._replace(problem=finer_problem(given.problem)).columns()[0]
-        leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, finer))
+        second = given._replace(problem=otherwise(given.problem)).columns()[0]
+        leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
     found = outcome(Outcome(tree, static, given.chain, max_steps, given.tangents), leaves)
     p, side, _, code, _ = found
     p, code = p * units.momentum[:, None], code[0]
@@ -283,16 +285,21 @@ def solve(
     return p[:, 0], None if sides is None else sides[:, 0], code[0]
 
 
-def finer_problem(problem: Problem) -> Problem:
-    """The same at FINER tolerance, gamma- changed in the last digits that the precision can hold.
+def otherwise(problem: Problem) -> Problem:
+    """The same at another tolerance, gamma- changed in the last digits that the precision can hold.
 
     That tells what errors grow to also where it is rounding, not the tolerance, that limits them.
     """
     still = jax.lax.stop_gradient(problem)
-    gamma = still.gamma
+    gamma, tolerance = still.gamma, still.tolerance
     last = stepper.FINEST * float(jnp.finfo(gamma.dtype).eps)
+    finer = jnp.maximum(FINER * tolerance, last)
+    coarser = COARSER * jnp.maximum(tolerance, last)
     signs = 1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2)
-    return still._replace(gamma=gamma * (1 + last * signs), tolerance=FINER * still.tolerance)
+    return still._replace(
+        gamma=gamma * (1 + last * signs),
+        tolerance=jnp.where(APART * finer <= tolerance, finer, coarser),
+    )
 
 
 def velocity_changes(contact: Contact, p: jax.Array, sides: jax.Array | None) -> jax.Array:
