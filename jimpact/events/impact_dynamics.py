@@ -91,8 +91,9 @@ def dimensionless(
     stored: jax.Array,
     rtol: float,
     gaps: jax.Array | None = None,
+    count: Any = None,
 ) -> tuple[Problem, Units]:
-    """The dimensionless problem and the units to return from it."""
+    """The dimensionless problem and the units to return from it; `count` contacts take part."""
     m, dtype = gamma.shape[0], gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
     root = jnp.sqrt(diagonal(delassus))
@@ -111,7 +112,8 @@ def dimensionless(
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
-    step = jax.lax.stop_gradient(rtol * min(1.0, 2 / m) / jnp.max(weight))
+    share = jnp.minimum(1.0, 2 / jnp.maximum(m if count is None else count, 1))
+    step = jax.lax.stop_gradient(rtol * share / jnp.max(weight))
     problem = Problem(
         beside=beside,
         omega=omega,
