@@ -90,7 +90,7 @@ def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
 def _filled_up(law: Law, scene: Scene, v: jax.Array, noise: jax.Array | None) -> Impact:
     """The impact by the program for SHARED contacts, only some of which are closed."""
     filled = filled_up(scene, SHARED)
-    velocity = np.zeros(filled.scene.size, v.dtype)
+    velocity: Any = np.zeros(filled.scene.size, v.dtype)
     velocity[filled.coordinates] = v
     on_host = of_contacts(jax.tree.map(np.asarray, law), filled.copied)
     out = _impact(on_host, filled.scene, velocity, None, noise)

@@ -233,7 +233,7 @@ def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool
     )
 
 
-def _open_behind(scene: Scene, missing: int) -> np.ndarray:
+def _open_behind(scene: Scene, missing: int) -> Any:
     """Gaps of the scene, and of so many open contacts."""
     gaps = np.zeros(scene.contacts) if scene.gaps is None else np.asarray(scene.gaps)
     return np.pad(gaps, (0, missing), constant_values=1).astype(scene.mass.dtype)
@@ -245,7 +245,7 @@ class Filled(NamedTuple):
     scene: Scene
     coordinates: slice
     contacts: slice
-    copied: np.ndarray
+    copied: Any
 
 
 def filled_up(scene: Scene, contacts: int) -> Filled:
@@ -257,7 +257,8 @@ def filled_up(scene: Scene, contacts: int) -> Filled:
         size = -(-(n + missing) // contacts) * contacts
         grown = _with_open_contacts(scene, contacts, size, False)
         return Filled(grown, slice(n), slice(m), copied)
-    mass, gaps = np.asarray(scene.mass), _open_behind(scene, missing)
+    mass: Any = np.asarray(scene.mass)
+    gaps = _open_behind(scene, missing)
     if scene.walls[1]:  # what is added comes before it, in mirror image
         mass = np.concatenate([np.resize(mass[1::-1], missing)[::-1], mass])
         gaps, copied = np.roll(gaps, missing), m - 1 - copied[::-1]

@@ -16,7 +16,7 @@ import numpy as np
 
 from jimpact.contact import Contact
 from jimpact.events import impulse_form, stepper
-from jimpact.events.batches import in_columns
+from jimpact.events.batches import in_columns, tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -196,18 +196,27 @@ class Outcome:
     most: int
     sides: int = 0  # tangential rows
     whole: bool = False
+    finely: bool = False  # at the tolerance of derivatives
     repeats: bool = False  # walk the steps once more, for derivatives
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
         return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
+    def shapes(self, *leaves: Any) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """Of the results, from those of the leaves."""
+        contacts, batch = jax.tree.unflatten(self.tree, leaves).omega.shape
+        smooth = (leaves[0].dtype,) * 3
+        kinds = smooth if self.repeats else (*smooth, jnp.int32, jnp.int32)
+        rows = contacts, self.sides, 1, 1, 1
+        return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
+
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         problem = jax.tree.unflatten(self.tree, leaves)
         still = jax.lax.stop_gradient(problem)
-        tighten = GRADIENT_TIGHTENING if self.repeats else 1.0
+        tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         flow, modes, y = self.flow(still, tighten)
-        if self.repeats:
+        if self.finely:
             end, plan = stepper.record(flow, modes, y, self.most)
         else:
             end = stepper.run(flow, modes, y, self.most)
@@ -221,6 +230,8 @@ class Outcome:
         p = state[2 * m : 3 * m]
         rest = at_rest(flow, end)
         p = settled(moving, problem.gamma, p, rest, exactly=self.repeats)
+        if self.finely:
+            p = stepper.with_plan(p, plan)
         side, time = state[3 * m + self.sides : -1][: self.sides], state[-1:]
         if self.repeats:
             return p, side, time
@@ -278,14 +289,16 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
     def value(*leaves: jax.Array) -> tuple[jax.Array, ...]:
         return in_columns(function, *leaves)
 
-    @value.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        again = dataclasses.replace(function, repeats=True)
-        rates = jax.jvp(lambda *x: in_columns(again, *x), primals, tangents)[1]
-        outs = value(*primals)
+    def rule(primals: Any, tangents: Any) -> Any:
+        # the same steps give both: one loop where they are one program
+        fine = dataclasses.replace(function, finely=True)
+        outs = outcome(fine, primals)
+        again = dataclasses.replace(fine, repeats=True)
+        rates = tangents_in_columns(again, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 
+    value.defjvp(rule, symbolic_zeros=True)
     return value(*leaves)
 
 

@@ -367,6 +367,16 @@ def record(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> tuple[Carry
     return end, Plan(plan.marks, jnp.where(lost[None], jnp.nan, plan.clock))
 
 
+def with_plan(x: jax.Array, plan: Plan) -> jax.Array:
+    """x, of a program that has to keep the plan although nothing else is asked of it.
+
+    Values and their derivatives record the same steps. The compiler makes one loop of two that are
+    the same; it would strip one of them of the plan first.
+    """
+    marks, clock = plan.marks[0, -1:], plan.clock[0, 2:3]  # each is 0 or 1
+    return jnp.where((marks < 0) | (clock < 0), jnp.nan, x)
+
+
 def repeat(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, last: jax.Array, over: jax.Array
 ) -> jax.Array:
