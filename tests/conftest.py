@@ -1,7 +1,9 @@
 """Strict JAX flags for every test, and the count of the programs that the tests compile.
 
-Compiling is what the suite's time goes into: a session tells the tests that compile most, and a
-session of the whole default suite fails beyond BUDGET programs.
+Compiling is what the suite's time goes into. So the default suite compiles with little
+optimization, in half the time (`programs.values`, the held values, and the slow tests with all of
+it). A session tells the tests that compile most; one of the whole default suite fails beyond
+BUDGET programs.
 """
 
 import os
@@ -35,6 +37,17 @@ COUNTS_FROM = 0.2  # seconds
 BUDGET = 700
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
+BY_LAW = ("test_contract", "test_systems", "test_values")  # their tests share a program by law
+DEAR = (  # groups that take longest begin first, so that no process is left alone at the end
+    "test_documents",
+    "test_friction",
+    "lzb",
+    "test_methods",
+    "test_motion",
+    "test_commands",
+    "test_fit",
+)
+
 programs, seconds = Counter(), Counter()  # of each test, in this process
 running = ["imports"]
 
@@ -48,6 +61,9 @@ def compiled(event, duration, **_):
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
     jax.monitoring.register_event_duration_secs_listener(compiled)
+    quick = config.option.markexpr == "not slow"
+    jax.config.update("jax_disable_most_optimizations", quick)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(quick)  # for what tests run as commands
     if hasattr(config, "workerinput"):
         return
     config.pluginmanager.register(Workers())
@@ -97,18 +113,26 @@ def pytest_terminal_summary(terminalreporter, config):
         write(f"FAILED: {total} programs are more than the budget of {BUDGET}")
 
 
+@pytest.hookimpl(tryfirst=True)  # before xdist reads the marks
 def pytest_collection_modifyitems(items):
-    """Tests that share a program run in one process: those that name a law, those of a file."""
+    """Tests that share programs run in one process: those of a law, those of a file; dear first."""
     laws = sorted(programs_of_laws.LAWS, key=len, reverse=True)
     for item in items:
         if not item.get_closest_marker("xdist_group"):
-            shared = next((law for law in laws if law in item.nodeid), Path(item.path).stem)
+            stem = Path(item.path).stem
+            names = laws if stem in BY_LAW else []
+            shared = next((law for law in names if law in item.name), stem)
             item.add_marker(pytest.mark.xdist_group(shared))
+    items.sort(key=lambda item: DEAR.index(group(item)) if group(item) in DEAR else len(DEAR))
+
+
+def group(item):
+    return item.get_closest_marker("xdist_group").args[0]
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    running[0] = item.nodeid
+    running[0] = item.nodeid.split("@")[0]
 
 
 @pytest.fixture(autouse=True)

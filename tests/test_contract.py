@@ -113,11 +113,15 @@ def test_promises(name):
     "name",
     [
         *SEQUENTIAL,
-        pytest.param(
-            "lzb", marks=pytest.mark.xfail(reason="ends with an approach of 1e-7", strict=True)
-        ),
-        pytest.param(
-            "compliant", marks=pytest.mark.xfail(reason="ends with an approach", strict=True)
+        *(
+            pytest.param(
+                name,
+                marks=[
+                    pytest.mark.slow,
+                    pytest.mark.xfail(reason="ends with an approach", strict=True),
+                ],
+            )
+            for name in ("lzb", "compliant")
         ),
     ],
 )
