@@ -37,7 +37,12 @@ COUNTS_FROM = 0.2  # seconds
 BUDGET = 700
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
-BY_LAW = ("test_contract", "test_systems", "test_values")  # their tests share a program by law
+BY_LAW = ("test_contract", "test_systems", "test_values")  # a law's tests share its programs
+OF_LAW = {
+    "test_compliant": "compliant",
+    "test_complementarity": "moreau",
+    "test_fast_paths": "lzb",
+}
 DEAR = (  # groups that take longest begin first, so that no process is left alone at the end
     "test_documents",
     "test_friction",
@@ -113,26 +118,33 @@ def pytest_terminal_summary(terminalreporter, config):
         write(f"FAILED: {total} programs are more than the budget of {BUDGET}")
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the marks
+def group(nodeid):
+    """Tests that share programs run in one process: those of a law, else those of a file."""
+    stem = Path(nodeid.split("::")[0]).stem
+    laws = sorted(programs_of_laws.LAWS, key=len, reverse=True) if stem in BY_LAW else ()
+    return next((law for law in laws if law in nodeid), OF_LAW.get(stem, stem))
+
+
 def pytest_collection_modifyitems(items):
-    """Tests that share programs run in one process: those of a law, those of a file; dear first."""
-    laws = sorted(programs_of_laws.LAWS, key=len, reverse=True)
-    for item in items:
-        if not item.get_closest_marker("xdist_group"):
-            stem = Path(item.path).stem
-            names = laws if stem in BY_LAW else []
-            shared = next((law for law in names if law in item.name), stem)
-            item.add_marker(pytest.mark.xdist_group(shared))
-    items.sort(key=lambda item: DEAR.index(group(item)) if group(item) in DEAR else len(DEAR))
+    """The dearest groups first, so that no process is left alone with one at the end."""
+    items.sort(key=lambda item: [*DEAR, group(item.nodeid)].index(group(item.nodeid)))
 
 
-def group(item):
-    return item.get_closest_marker("xdist_group").args[0]
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Groups of our own: with pytest 9.2 the marks of `--dist loadgroup` have no effect."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Groups(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return group(nodeid)
+
+    return Groups(config, log)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    running[0] = item.nodeid.split("@")[0]
+    running[0] = item.nodeid
 
 
 @pytest.fixture(autouse=True)

@@ -13,8 +13,6 @@ from scipy.optimize import linprog, nnls
 
 import jimpact as ji
 
-pytestmark = pytest.mark.xdist_group("moreau")
-
 
 def enumerate_supports(a, q):
     """Oracle: try every support."""

@@ -16,8 +16,6 @@ from programs import chain, failed, names
 
 import jimpact as ji
 
-pytestmark = pytest.mark.xdist_group("lzb")
-
 V = [1.0, 0.4, 0.1, -0.6]
 E, K = [0.9, 0.7, 0.8], [1.0, 2.5, 0.7]
 
