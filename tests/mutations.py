@@ -71,9 +71,8 @@ MUTATIONS = [
     Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", (*FLOW, "test_methods.py::test_right_or_flagged"), "stepper.py"),
     Mutation("every step accepted", r"ok = error2 <= 1\n", "ok = error2 <= 1e6\n", FLOW, "stepper.py"),
     # --- complementarity
-    Mutation("LCP: tie rules removed", r"own = kept & \(state\.basis == artificial\)", "own = kept & False", KINEMATIC, "lcp.py"),
-    Mutation("LCP: no lexicographic order", r"least = jax\.lax\.fori_loop\(0, m \+ 1, keep_least, candidates\)", "least = jax.lax.fori_loop(0, 1, keep_least, candidates)", KINEMATIC, "lcp.py"),
-    Mutation("LCP: the least ratio becomes the first", r"ratio <= jnp\.min\(ratio\) \+ tolerance", "ratio < jnp.inf", KINEMATIC, "lcp.py"),
+    Mutation("LCP: tie rules removed", r"own = candidates & ", "own = (candidates & False) & ", KINEMATIC, "lcp.py"),
+    Mutation("LCP: the least ratio becomes the first", r"jnp\.argmin\(jnp\.where\(own, -jnp\.inf, ratio\)\)", "jnp.argmax(candidates)", KINEMATIC, "lcp.py"),
     Mutation("LCP: no solution is not told", r"CODE\[\"infeasible\"\], CODE\[\"max_steps\"\]\), CODE\[\"ok\"\]\)", 'CODE["ok"], CODE["max_steps"]), CODE["ok"])', KINEMATIC, "lcp.py"),
     Mutation("LCP: least norm forgotten", r"return jnp\.where\(singular, rest \+ projector @ y, z\), singular", "return z, singular", KINEMATIC, "lcp.py"),
     # --- laws
