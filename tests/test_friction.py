@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from friction_reference import routh, small_steps
-from programs import failed, names
+from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
 
@@ -43,7 +43,9 @@ def program(name):
         out = ji.impact(LAWS[name](e, mu, e_t, k), scene, v)
         return out, ji.audit(scene, v, out)
 
-    return jax.jit(jax.vmap(one))
+    # long runs: what compiling well takes is saved
+    options = OPTIMIZED if name in ("lzb", "compliant") else None
+    return jax.jit(jax.vmap(one), compiler_options=options)
 
 
 LANES = 64
@@ -339,25 +341,31 @@ def test_none_and_several_outcomes_are_told():
 # ---------------------------------------------------------------------------------- LZB
 
 
-def check_random(name_rows, most_failed):
-    rows, count = name_rows, 64
+def check_random(rows, most_failed):
+    """Random scenes, with the contacts in the other order, and faster: three lanes each."""
+    count = 32
     scenes, e, mu, k = random_scenes(count, rows, n=3 * rows)
-    _, normals, tangents, v = scenes
-    out, found = run("lzb", *scenes, e, mu, k=k)
+    mass, normals, tangents, v = scenes
+    swapped = tangents.reshape(count, -1, 2, rows)[:, :, ::-1].reshape(tangents.shape)
+    lanes = [
+        (*scenes, e, mu, k),
+        (mass, normals[:, :, ::-1], swapped, v, e[:, ::-1], mu[:, ::-1], k[:, ::-1]),
+        (mass, normals, tangents, 1e3 * v, e, mu, k),
+    ]
+    *given, stiff = (np.concatenate(x) for x in zip(*lanes))
+    out, found = run("lzb", *given, k=stiff)
+    out, turned, faster = (
+        jax.tree.map(lambda x, i=i: x[i : i + count], out) for i in (0, count, 2 * count)
+    )
     good = ~failed(out.status)
     assert (~good).mean() <= most_failed
     p, side = out.impulse, np.linalg.norm(out.tangential_impulse.reshape(count, 2, rows), axis=2)
-    assert found.consistent[good].all()
+    assert found.consistent[:count][good].all()
     assert (p >= 0)[good].all()
     assert (side <= mu * p + 1e-6)[good].all()
     assert (out.energy_change <= 0)[good].all()
-    swapped = tangents.reshape(count, -1, 2, rows)[:, :, ::-1].reshape(tangents.shape)
-    turned, _ = run(
-        "lzb", scenes[0], normals[:, :, ::-1], swapped, v, e[:, ::-1], mu[:, ::-1], k=k[:, ::-1]
-    )
     both = good & ~failed(turned.status)
     close(turned.velocity[both], out.velocity[both], atol=5e-7)
-    faster, _ = run("lzb", scenes[0], normals, tangents, 1e3 * v, e, mu, k=k)
     both = good & ~failed(faster.status)
     close(faster.velocity[both] / 1e3, out.velocity[both], atol=1e-8)
     return scenes, e, mu, k, out, good
@@ -365,7 +373,7 @@ def check_random(name_rows, most_failed):
 
 def test_lzb_in_the_plane():
     scenes, e, mu, k, out, good = check_random(1, 0.02)
-    for i in np.flatnonzero(good)[:6]:
+    for i in np.flatnonzero(good)[:3]:
         mass, normals, tangents, v = (x[i] for x in scenes)
         scene = ji.Scene(mass, normals, tangents=tangents)
         found = small_steps(scene, v, k[i], 1.5, e[i], mu[i], steps=2000)
@@ -384,7 +392,7 @@ def test_lzb_of_a_flat_block():
     v, e, mu = (np.array(x) for x in zip(*rows))
     out, _ = run("lzb", *(np.tile(x, (4, 1, 1)) for x in block), v, e, mu)
     assert not failed(out.status).any()
-    for i, (v, e, mu) in enumerate(rows):
+    for i, (v, e, mu) in enumerate(rows[:2]):
         scene = ji.Scene(block[0], block[1], tangents=block[2])
         found = small_steps(scene, v, np.ones(2), 1.5, e, mu, steps=2000)
         close(out.velocity[i], found, atol=1e-3)
@@ -403,19 +411,18 @@ def test_lzb_in_space():
     both = good & ~failed(again.status)
     close(again.velocity[both], out.velocity[both], atol=5e-7)
     # x, y, z and the spins of a rolling ball: along (.6, .8) it is the disk
-    ball = np.diag([1.0, 1.0, 1.0, 0.4, 0.4, 1.0])[None]
-    up = np.array([0, 0, 1.0, 0, 0, 0])[None, :, None]
-    both = np.zeros((1, 6, 2))
-    both[0, [0, 3], 0] = both[0, [1, 4], 1] = 1.0
-    v = np.array([[0.6, 0.8, -1, 0.18, 0.24, 0.5]])
-    for mu in (0.1, 5.0):
-        space, _ = run("lzb", ball, up, both, v, np.full(1, 0.8), np.full(1, mu))
-        p = 1.8
-        side = -min(mu * p, 1.3 / 3.5)
-        expected = [1 + side, p - 1, 0.3 + side / 0.4]
-        along = [0.6, 0.8] @ space.velocity[0, :2], space.velocity[0, 2]
-        close([*along, [0.6, 0.8] @ space.velocity[0, 3:5]], expected, atol=1e-7)
-        assert space.velocity[0, 5] == 0.5
+    ball = np.diag([1.0, 1.0, 1.0, 0.4, 0.4, 1.0])
+    up = np.array([0, 0, 1.0, 0, 0, 0])[:, None]
+    both = np.zeros((6, 2))
+    both[[0, 3], 0] = both[[1, 4], 1] = 1.0
+    mu, p = np.array([0.1, 5.0]), 1.8
+    twice = (np.stack([x, x]) for x in (ball, up, both, [0.6, 0.8, -1, 0.18, 0.24, 0.5]))
+    space, _ = run("lzb", *twice, np.full(2, 0.8), mu)
+    side = -np.minimum(mu * p, 1.3 / 3.5)
+    close(space.velocity[:, :2] @ [0.6, 0.8], 1 + side, atol=1e-7)
+    close(space.velocity[:, 2], p - 1, atol=1e-7)
+    close(space.velocity[:, 3:5] @ [0.6, 0.8], 0.3 + side / 0.4, atol=1e-7)
+    assert (space.velocity[:, 5] == 0.5).all()
 
 
 def test_lzb_without_friction():
