@@ -63,6 +63,7 @@ LAWS = {
     ),
 }
 SEQUENTIAL = ("binary", "binary-earliest", "binary-left")
+SLOW_SLOPES = ("compliant", "binary-earliest", "binary-left")  # LZB's and Binary's code again
 
 
 # ----------------------------------------------------------------------------------- states
