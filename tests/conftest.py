@@ -39,11 +39,12 @@ BUDGET = 700
 LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # just before
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
-BY_LAW = ("test_contract", "test_systems", "test_values")  # a law's tests share its programs
+BY_LAW = ("test_contract", "test_systems")  # a law's tests share its programs
 OF_LAW = {
     "test_compliant": "compliant",
     "test_complementarity": "moreau",
     "test_fast_paths": "lzb",
+    "test_values": "lzb",  # most of it
 }
 DEAR = (  # groups that take longest begin first, so that no process is left alone at the end
     "test_documents",
