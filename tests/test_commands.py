@@ -273,7 +273,7 @@ def test_advise(tmp_path, capsys):
     code, said = call(capsys, "advise", "--samples", "32", "--out", tmp_path, "--json")
     told = json.loads(said.out)
     assert (code, told["advice"], told["within"]) == (0, "lzb", True)
-    assert told["laws"]["binary"]["worst_error"] > 0.01
+    assert told["laws"]["binary"]["worst"] > 0.01
     assert (tmp_path / "jimpact-advise.png").stat().st_size > 10_000
 
 

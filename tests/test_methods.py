@@ -106,8 +106,8 @@ def test_gradients_and_the_other_methods():
         ({"settings": {"rk4": [0.1]}}, ValueError, "`settings` must be of chosen methods"),
         ({"settings": {"verlet": [0.0]}}, ValueError, "`settings['verlet']` must lie in (0"),
         ({"reference": "verlet"}, ValueError, "`reference` must take an rtol"),
-        ({"batch": 0}, ValueError, "`batch` must be a whole number >= 1"),
-        ({"repeats": 1.5}, ValueError, "`repeats` must be a whole number >= 1"),
+        ({"batch": 0}, ValueError, "`batch` must be an int >= 1"),
+        ({"repeats": 1.5}, ValueError, "`repeats` must be an int >= 1"),
     ],
 )
 def test_chart_refuses(change, error, message):
@@ -341,7 +341,7 @@ def test_unknown_ratio_decides(unknown):
         assert c.usable, name
         assert c.worst > 0.1, name
         assert c.median <= c.worst
-    (effect,) = unknown.effects
+    (effect,) = unknown.unknown
     assert 0 < effect.needed < 0.2
     assert unknown.candidates["lzb"].worst >= effect.alone
 
@@ -405,7 +405,7 @@ def test_several_ratios():
     """Five unknown ratios: which of them matters."""
     found = quick(ji.chain(jnp.ones(7)), [1.0, 0, 0, 0, 0, 0, 0])
     assert [u.name for u in found.unknown] == [f"k{j}/k1" for j in range(2, 7)]
-    strongest = max(found.effects, key=lambda effect: effect.alone)
+    strongest = max(found.unknown, key=lambda u: u.alone)
     assert f"measure {strongest.name} first" in found.reason
 
 
@@ -439,7 +439,7 @@ def test_advice_refuses(options, error, message):
 
 def test_advice_in_words_and_picture(unknown):
     told = json.loads(json.dumps(unknown.to_dict()))
-    assert told["laws"]["lzb"]["worst_error"] == unknown.candidates["lzb"].worst
+    assert told["laws"]["lzb"]["worst"] == unknown.candidates["lzb"].worst
     assert told["unknown"][0]["name"] == "k2/k1"
     text = str(unknown)
     assert max(len(line) for line in text.splitlines()) <= 100

@@ -1,45 +1,34 @@
 """`jimpact advise`: the simplest law that a scene needs, with the evidence and a picture."""
 
-from pathlib import Path
 from typing import Any
 
-from jimpact.commands.compare import velocities
-from jimpact.commands.output import Answer, command, save_picture
+from jimpact import plot
+from jimpact.cli import AdviseCommand
+from jimpact.commands.output import Answer, picture_path, save_picture, titled, velocities
 from jimpact.methods.advice import advise
-from jimpact.methods.advice_report import Advice
 from jimpact.study import Study, read_study
 
 _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 
 
-@command("advise")
-def run(
-    study: Path,
-    velocity: tuple[float, ...] | None,
-    shot: int,
-    tolerance: float,
-    stiffness_range: tuple[float, float] | None,
-    samples: int,
-    seed: int,
-    picture: Path,
-) -> Answer:
-    """Advise with the options of `AdviseCommand`."""
-    given = read_study(study)
-    before, _ = velocities(given, velocity, shot)
+def run(given: AdviseCommand) -> Answer:
+    """Advise."""
+    path = picture_path(given.out, given.name)
+    study = read_study(given.study)
+    before, _ = velocities(study, given)
     found = advise(
-        given.scene,
+        study.scene,
         before,
-        tolerance,
-        stiffness_range=stiffness_range,
-        samples=samples,
-        seed=seed,
-        **_parameters(given),
+        given.tolerance,
+        stiffness_range=given.stiffness_range,
+        samples=given.samples,
+        seed=given.seed,
+        **_parameters(study),
     )
-    _draw(found, given.title, picture)
-    data = {"title": given.title, "velocity": before.tolist()} | found.to_dict()
-    v = ", ".join(f"{x:g}" for x in before)
-    text = f"{given.title}: v- = ({v}) m/s\n{found}\n\nPicture: {picture}"
-    return Answer(data | {"picture": str(picture)}, lambda: print(text))
+    save_picture(plot.advice(found, study.title), path)
+    data = {"title": study.title, "velocity": before.tolist(), "picture": str(path)}
+    text = f"{titled(study, before)}\n{found}\n\nPicture: {path}"
+    return Answer(data | found.to_dict(), text)
 
 
 def _parameters(study: Study) -> dict[str, Any]:
@@ -51,9 +40,3 @@ def _parameters(study: Study) -> dict[str, Any]:
             "contacts only the compliant law knows."
         )
     return {key: value for key, value in study.parameters.items() if key in _TAKEN}
-
-
-def _draw(found: Advice, title: str, path: Path) -> None:
-    from jimpact import plot  # matplotlib, late
-
-    save_picture(plot.advice(found, title), path)

@@ -1,46 +1,32 @@
 """`jimpact fit`: the study's fit, its yardsticks, a report, a picture."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.markup import escape
-from rich.table import Table
 
-from jimpact.commands.output import Answer, command, console_for, save_picture
+from jimpact import plot
+from jimpact.cli import FitCommand
+from jimpact.commands.output import Answer, picture_path, save_picture
 from jimpact.fits.fitting import Fit
 from jimpact.laws import Newton
 from jimpact.laws.lzb import LZB
+from jimpact.records import as_data, table
 from jimpact.study import Study, read_study
 
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
-@command("fit")
-def run(
-    study: Path,
-    law: str | None,
-    method: str | None,
-    starts: int | None,
-    seed: int | None,
-    picture: Path,
-) -> Answer:
-    """Fit with the options of `FitCommand`."""
-    given = read_study(study, law)
-    fits = _all_fits(given, {"method": method, "starts": starts, "seed": seed})
-    _draw(given, fits, picture)
-    found = {name: fit.to_dict() for name, fit in fits.items()}
-    data = {"title": given.title, "fits": found, "picture": str(picture)}
-    return Answer(data, lambda: _print_report(given, fits, picture))
-
-
-def _draw(study: Study, fits: dict[str, Fit], path: Path) -> None:
-    from jimpact import plot  # matplotlib, late: bad input is told sooner
-
+def run(given: FitCommand) -> Answer:
+    """Fit."""
+    path = picture_path(given.out, given.name)
+    study = read_study(given.study, given.law)
+    fits = _all_fits(study, {"method": given.method, "starts": given.starts, "seed": given.seed})
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     save_picture(plot.fit(fits[RAW], others, study.title), path)
+    data = {"title": study.title, "fits": fits, "picture": str(path)}
+    text = "\n".join([study.title, *_summary(fits), "", str(fits[RAW]), "", f"Picture: {path}"])
+    return Answer(as_data(data), text)
 
 
 def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:
@@ -82,37 +68,24 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
     return own, replace(own, free=dict.fromkeys(fields, True))
 
 
-def _print_report(study: Study, fits: dict[str, Fit], path: Path) -> None:
-    table = _table(fits)
-    console = console_for(table)
-    console.print(f"[bold]{escape(study.title)}[/bold]")
-    console.print(table)
+def _summary(fits: dict[str, Fit]) -> list[str]:
+    """A line a parameter of each fit, and what the data see of all parameters."""
+    rows = []
+    for what, fit in fits.items():
+        data = "corrected" if what == CORRECTED else RAW
+        last = [f"{fit.rms:.4f}", f"{fit.rank} of {len(fit.names)}"]
+        for i, name in enumerate(fit.names):
+            first = [type(fit.law).__name__, data] if i == 0 else ["", ""]
+            rows.append([*first, name, _value(fit, i), *(last if i == 0 else ["", ""])])
+    heads = ["law", "data", "parameter", "value", "rms [m/s]", "rank"]
+    lines = table(heads, rows, left=["data", "parameter", "value"])
     if CORRECTED in fits:
-        console.print("corrected: changed as little as possible so that momentum is conserved")
-    everything = fits.get(ALL_FREE)
-    if everything is not None:
-        names, count = ", ".join(everything.names), len(everything.names)
-        console.print(
-            f"With {escape(names)} free the rank is {everything.rank} of {count}.", soft_wrap=True
-        )
-        for line in everything.identifiability:
-            console.print(escape(line), soft_wrap=True)
-    console.print()
-    console.print(escape(str(fits[RAW])), soft_wrap=True)
-    console.print(f"\nPicture: {escape(str(path))}", soft_wrap=True)
-
-
-def _table(fits: dict[str, Fit]) -> Table:
-    table = Table("law", "data", "parameter", "value", box=box.SIMPLE_HEAD, pad_edge=False)
-    table.add_column("rms [m/s]", justify="right")
-    table.add_column("rank", justify="right")
-    for name, fit in fits.items():
-        data = "corrected" if name == CORRECTED else RAW
-        values = "\n".join(_value(fit, i) for i in range(len(fit.names)))
-        rank = f"{fit.rank} of {len(fit.names)}"
-        names = escape("\n".join(fit.names))
-        table.add_row(type(fit.law).__name__, data, names, values, f"{fit.rms:.4f}", rank)
-    return table
+        lines.append("corrected: changed as little as possible so that momentum is conserved")
+    if everything := fits.get(ALL_FREE):
+        names = everything.names
+        lines.append(f"With {', '.join(names)} free the rank is {everything.rank} of {len(names)}.")
+        lines += everything.identifiability
+    return lines
 
 
 def _value(fit: Fit, i: int) -> str:

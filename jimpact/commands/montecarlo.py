@@ -2,58 +2,39 @@
 
 import sys
 import warnings
-from pathlib import Path
 from typing import Any
 
-from jimpact.commands.output import Answer, command, save_picture
-from jimpact.montecarlo.executors import DaskExecutor, Executor, as_executor
-from jimpact.montecarlo.results import MonteCarlo
+from jimpact import plot
+from jimpact.cli import MonteCarloCommand
+from jimpact.commands.output import Answer, picture_path, save_picture
+from jimpact.montecarlo.executors import DaskExecutor
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.study import Study, read_study
 
 
-@command("montecarlo")
-def run(study: Path, picture: Path, **options: Any) -> Answer:
-    """Sample with the options of `MonteCarloCommand`."""
-    given = read_study(study)
+def run(given: MonteCarloCommand) -> Answer:
+    """Sample."""
+    path = picture_path(given.out, given.name)
+    study = read_study(given.study)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = monte_carlo(**_arguments(given, study, **options))
+        found = monte_carlo(**_arguments(study, given))
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
-    _draw(found, given.title, picture)
-    data = {"title": given.title} | found.to_dict() | {"picture": str(picture)}
-    return Answer(data, lambda: print(f"{given.title}\n{found}\n\nPicture: {picture}"))
+    save_picture(plot.monte_carlo(found, study.title), path)
+    data = {"title": study.title, "picture": str(path)} | found.to_dict()
+    return Answer(data, f"{study.title}\n{found}\n\nPicture: {path}")
 
 
-def _arguments(
-    study: Study,
-    path: Path,
-    samples: int | None,
-    seed: int | None,
-    executor: str,
-    scheduler: str | None,
-    folder: Path | None,
-    keep_samples: bool,
-) -> dict[str, Any]:
+def _arguments(study: Study, given: MonteCarloCommand) -> dict[str, Any]:
     """Of `monte_carlo`: those of the study, or in their place those of the command line."""
     if not study.monte_carlo:
-        raise ValueError(f"the study '{path}' must have a [monte_carlo] table.")
-    given = {"samples": samples, "key": seed}
-    chosen = {name: value for name, value in given.items() if value is not None}
-    own = {"folder": folder, "keep_samples": keep_samples}
-    return study.monte_carlo | chosen | own | {"executor": _executor(executor, scheduler)}
-
-
-def _executor(name: str, scheduler: str | None) -> Executor:
-    if scheduler is None:
-        return as_executor(name)
-    if name != "dask":
-        raise ValueError(f"--scheduler needs --executor dask, but it is {name}.")
-    return DaskExecutor(scheduler)
-
-
-def _draw(found: MonteCarlo, title: str, path: Path) -> None:
-    from jimpact import plot  # matplotlib, late
-
-    save_picture(plot.monte_carlo(found, title), path)
+        raise ValueError(f"the study '{given.study}' must have a [monte_carlo] table.")
+    executor: Any = given.executor
+    if given.scheduler is not None:
+        if executor != "dask":
+            raise ValueError(f"--scheduler needs --executor dask, but it is {executor}.")
+        executor = DaskExecutor(given.scheduler)
+    options = {"samples": given.samples, "key": given.seed, "folder": given.folder}
+    chosen = {name: value for name, value in options.items() if value is not None}
+    return study.monte_carlo | chosen | {"executor": executor, "keep_samples": given.keep_samples}

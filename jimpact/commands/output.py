@@ -1,23 +1,22 @@
-"""What commands have in common: exit codes, pictures, tables."""
+"""What commands have in common: exit codes, pictures, what is printed."""
 
-import functools
 import sys
-from collections.abc import Callable
+from importlib import import_module
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
-from rich.console import Console
-from rich.measure import Measurement
-from rich.table import Table
+import numpy as np
+
+from jimpact.cli import Command, ShotCommand
+from jimpact.study import Study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
 KINDS = (".png", ".pdf", ".svg")
 DPI = 150
-WIDEST = 10_000  # columns that a table may ask for
 BAD_INPUT, FAILURE = 2, 1  # exit codes
 INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
 
@@ -26,49 +25,33 @@ class Answer(NamedTuple):
     """What a command found: for --json, for people, and what went wrong all the same."""
 
     data: dict[str, Any]
-    show: Callable[[], None]
+    text: str
     failure: str = ""
 
 
-def command(name: str) -> Callable[[Callable[..., Answer]], Callable[..., int]]:
-    """Make an exit code of `run(picture, **options)`: 0, and 1, 2 or 130, told on stderr.
-
-    Wrong input is 2, a method or law that fails 1, ctrl-C 130. The options of the command line
-    `out` and `json` are dealt with here; `picture` is the file to draw.
-    """
-
-    def decorate(run: Callable[..., Answer]) -> Callable[..., int]:
-        @functools.wraps(run)
-        def exit_code(*given: Any, out: Path, json: bool, **options: Any) -> int:
-            jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
-            try:
-                path = picture_path(out, f"jimpact-{name}.png")
-                answer = run(*given, picture=path, **options)
-            except KeyboardInterrupt as stop:
-                return _refuse(name, str(stop) or "stopped.", INTERRUPTED)
-            except (ValueError, TypeError, OSError, ImportError) as error:
-                return _refuse(name, str(error), BAD_INPUT)
-            except RuntimeError as error:
-                return _refuse(name, str(error), FAILURE)
-            if json:
-                print(dumps(answer.data, indent=2))
-            else:
-                answer.show()
-            return _refuse(name, answer.failure, FAILURE) if answer.failure else 0
-
-        return exit_code
-
-    return decorate
+def run(given: Command) -> int:
+    """The exit code of a command: 0; wrong input 2, a method or law that fails 1, ctrl-C 130."""
+    jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
+    try:
+        answer = import_module(f"jimpact.commands.{given.name}").run(given)
+    except KeyboardInterrupt as stop:
+        return _refuse(given, str(stop) or "stopped.", INTERRUPTED)
+    except (ValueError, TypeError, OSError, ImportError) as error:
+        return _refuse(given, str(error), BAD_INPUT)
+    except RuntimeError as error:
+        return _refuse(given, str(error), FAILURE)
+    print(dumps(answer.data, indent=2) if given.json else answer.text)
+    return _refuse(given, answer.failure, FAILURE) if answer.failure else 0
 
 
-def _refuse(name: str, reason: str, code: int) -> int:
-    print(f"jimpact {name}: {reason}", file=sys.stderr)
+def _refuse(given: Command, reason: str, code: int) -> int:
+    print(f"jimpact {given.name}: {reason}", file=sys.stderr)
     return code
 
 
 def picture_path(out: Path, name: str, option: str = "--out") -> Path:
-    """The file `out`, or `name` in the directory `out`; other endings are refused."""
-    path = out if out.suffix else out / name
+    """The file `out`, or the command's own in the directory `out`; other endings are refused."""
+    path = out if out.suffix else out / f"jimpact-{name}.png"
     if path.suffix not in KINDS:
         raise ValueError(
             f"{option} must end in .png, .pdf or .svg or be a directory, but is '{out}'."
@@ -82,9 +65,18 @@ def save_picture(figure: "Figure", path: Path) -> None:
     figure.savefig(path, dpi=DPI)
 
 
-def console_for(*tables: Table) -> Console:
-    """As wide as the terminal, or as the tables: a number cut short tells nothing."""
-    console = Console(highlight=False)
-    options = console.options.update(max_width=WIDEST)
-    needed = [Measurement.get(console, options, table).maximum for table in tables]
-    return Console(highlight=False, width=max(console.width, *needed))
+def velocities(study: Study, given: ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
+    """Velocities before the impact, and after it where they were measured."""
+    if given.velocity is not None:
+        return np.asarray(given.velocity, float), None
+    data = study.experiments
+    if data is None:
+        raise ValueError("--velocity must be given, because the study has no [data].")
+    if not 1 <= given.shot <= len(data.shots):
+        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
+    return np.asarray(data.pre[given.shot - 1]), np.asarray(data.post[given.shot - 1])
+
+
+def titled(study: Study, before: np.ndarray) -> str:
+    """The first line of what is printed of one impact."""
+    return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) m/s"

@@ -1,42 +1,30 @@
 """`jimpact stability`: where methods of integration are right, and where they are not; pictures."""
 
-from pathlib import Path
+from typing import Any
 
-from jimpact.commands.output import Answer, command, save_picture
-from jimpact.methods.stability import StabilityMap, stability_map
+from jimpact import plot
+from jimpact.cli import StabilityCommand
+from jimpact.commands.output import Answer, picture_path, save_picture
+from jimpact.methods.stability import stability_map
 
-QUICK_RESOLUTION, QUICK_STEPS = 7, 5_000
-FULL_RESOLUTION, FULL_STEPS, FULL_SAMPLES = 9, 5_000, 300
+STEPS = 5_000  # of a run
+QUICK_RESOLUTION, FULL_RESOLUTION, FULL_SAMPLES = 7, 9, 300
+TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
 
 
-@command("stability")
-def run(methods: tuple[str, ...] | None, full: bool, picture: Path) -> Answer:
-    """Map with the options of `StabilityCommand`."""
-    if full:
-        found = stability_map(
-            methods,
-            resolution=FULL_RESOLUTION,
-            slices="pairs",
-            samples=FULL_SAMPLES,
-            max_steps=FULL_STEPS,
-        )
-    else:
-        found = stability_map(methods, resolution=QUICK_RESOLUTION, max_steps=QUICK_STEPS)
-    written = [str(path) for path in draw(found, picture)]
+def run(given: StabilityCommand) -> Answer:
+    """Map; the picture of single axes, and where there are pairs, one more beside it a method."""
+    path = picture_path(given.out, given.name)
+    size: dict[str, Any] = {"resolution": QUICK_RESOLUTION}
+    if given.full:
+        size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
+    found = stability_map(given.methods, **size, max_steps=STEPS)
+    pictures = {path: plot.stability_map(found, TITLE)}
+    for name in found.methods if given.full else ():
+        beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
+        pictures[beside] = plot.stability_pairs(found, name)
+    for file, figure in pictures.items():
+        save_picture(figure, file)
+    written = [str(file) for file in pictures]
     text = f"{found}\n\nPictures: {', '.join(written)}"
-    return Answer(found.to_dict() | {"pictures": written}, lambda: print(text))
-
-
-def draw(found: StabilityMap, path: Path) -> list[Path]:
-    """Write the picture over single axes to `path`; where the map has pairs, one more a method."""
-    from jimpact import plot  # matplotlib, late
-
-    title = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
-    save_picture(plot.stability_map(found, title), path)
-    written = [path]
-    if any(len(each.axes) == 2 for each in found.slices[found.methods[0]]):
-        for name in found.methods:
-            beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
-            save_picture(plot.stability_pairs(found, name), beside)
-            written.append(beside)
-    return written
+    return Answer(found.to_dict() | {"pictures": written}, text)

@@ -15,18 +15,18 @@ from jimpact.methods.advice_evidence import (
     NUDGE,
     Block,
     Candidate,
-    Effect,
     Outcomes,
     Rows,
     Situation,
+    Trial,
+    Unknown,
     block_errors,
     candidate,
-    candidates,
     costs,
-    one_outcome,
     outcomes,
     rows,
     situation,
+    trials,
     unknowns,
 )
 from jimpact.methods.advice_report import Advice
@@ -105,57 +105,47 @@ def advise(
     if absolute and not known:
         raise ValueError(missing_stiffness(at))
     k = np.broadcast_to(np.asarray(parameters["stiffness"], v.dtype), (scene.contacts,))
+    laws = trials(at, parameters["restitution"], k, parameters["exponent"])
     tried = rows(k, unknowns(at, k, span, absolute), samples, seed)
-    return _found(at, parameters, tried, float(tolerance), timing, progress)
+    return _found(at, laws, tried, float(tolerance), timing, progress)
 
 
 def _found(
     at: Situation,
-    parameters: dict[str, Any],
+    laws: dict[str, Trial],
     tried: Rows,
     tolerance: float,
     timing: bool,
     progress: bool | None,
 ) -> Advice:
-    laws = candidates(at, parameters)
     name = list(laws)[-1]
-    own = {
-        key: one_outcome(law, at, scene)
-        if key not in ("lzb", "compliant")
-        else outcomes(law, at, scene, tried.stiffness, progress)
-        for key, (law, scene) in laws.items()
-    }
+    own = {key: outcomes(law, at, tried.stiffness, progress) for key, law in laws.items()}
     reference = _usable_rows(own[name], name)
     evidence = {
-        key: candidate(law, at, scene, own[key], reference, tried.random)
-        for key, (law, scene) in laws.items()
+        key: candidate(law, at, own[key], reference, tried.random) for key, law in laws.items()
     }
     if timing:
-        for key, cost in costs(laws, at, tried).items():
+        for key, cost in costs(laws, at, tried.stiffness).items():
             evidence[key] = replace(evidence[key], cost=cost)
     fit = [key for key, c in evidence.items() if c.usable and c.worst <= tolerance]
     chosen = fit[0] if fit else name
-    if chosen in ("lzb", "compliant"):
+    if laws[chosen].knows_stiffness:
         evidence[chosen] = _loosened(evidence[chosen], at, reference, tolerance)
-    blocks = _blocks(at, evidence, own, reference, tolerance)
     gap_ratio = None
     if at.gapped.any():
-        scale = gap_scale(at.scene, laws["compliant"][0], at.velocity)
+        scale = gap_scale(at.scene, laws["compliant"].law, at.velocity)
         gap_ratio = np.asarray(scale.ratio)[at.gapped]
     return Advice(
         name=chosen,
-        law=evidence[chosen].law,
-        scene=evidence[chosen].scene,
-        velocity=at.velocity,
-        gap_velocity=at.gap_velocity,
         tolerance=tolerance,
         within=bool(fit),
         reference=name,
+        velocity=at.velocity,
+        gap_velocity=at.gap_velocity,
         candidates=evidence,
-        blocks=blocks,
+        blocks=_blocks(at, evidence, own, reference, tolerance),
         stiffness=tried.stiffness[0],
-        unknown=tried.unknown,
-        effects=_effects(at, tried, reference, tolerance),
+        unknown=_effects(at, tried, reference, tolerance),
         rows=len(tried.stiffness),
         gap_ratio=gap_ratio,
     )
@@ -223,15 +213,15 @@ def _blocks(
 
 def _effects(
     at: Situation, tried: Rows, reference: Outcomes, tolerance: float
-) -> tuple[Effect, ...]:
-    """What each unknown stiffness does by itself, the strongest first."""
+) -> tuple[Unknown, ...]:
+    """The unknown stiffnesses with what each does by itself."""
     v, found = reference.velocity, []
     for i, unknown in enumerate(tried.unknown):
         alone = float(np.nanmax(np.abs(v[tried.alone[i]] - v[0]))) / at.scale
         up, down = v[tried.nudged[i]]
         slope = float(np.abs(up - down).max()) / (2 * NUDGE) / at.scale
         needed = tolerance / slope if slope > 0 else math.inf
-        found.append(Effect(unknown.name, alone, slope, needed))
+        found.append(unknown._replace(alone=alone, slope=slope, needed=needed))
     return tuple(found)
 
 

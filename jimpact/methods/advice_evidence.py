@@ -1,7 +1,7 @@
 """The evidence of `advise`: blocks, gaps, unknown stiffnesses; laws on the scene, with errors."""
 
 import itertools
-import time
+import math
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -21,9 +21,10 @@ from jimpact.laws.forces import Bistiffness
 from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB
 from jimpact.laws.poisson import Poisson
-from jimpact.progress import sample_bar
+from jimpact.progress import counting_bar
 from jimpact.scene import Scene, gap_velocity, velocity_change, with_gaps
 from jimpact.status import CODE, STATUS
+from jimpact.timing import in_turns
 
 # cos(kinetic angle) below so many roundings is 0: the rounding of normals and of M^-1
 DECOUPLED_IN_EPS = 64
@@ -34,7 +35,7 @@ NUDGE = 0.02  # change of ln k for the sensitivity; its square is far below what
 CHUNK = 64  # rows computed together
 CHEAP = 8  # contacts up to which a chunk is always full
 LANES = 2048  # impacts of a batch, over m^2, of the laws that take no time
-ROUNDS, ROUNDS_SECONDS = 7, 1.0  # of the timing, and after how long there is no further one
+ROUNDS = 7  # of the timing
 
 
 class Block(NamedTuple):
@@ -113,13 +114,21 @@ def _block(
 
 
 class Unknown(NamedTuple):
-    """A stiffness known within a range only: of `contact`, over that of `base` (None: SI)."""
+    """A stiffness known within a range only: of `contact`, over that of `base` (None: SI).
+
+    What it does to v+ by itself, relative to max |v-|: `alone`: largest change over its range;
+    `slope`: |d v+ / d ln k|; `needed`: relative accuracy of k at which it moves v+ by the
+    tolerance (inf: it does not).
+    """
 
     contact: int
     base: int | None
     nominal: float
     low: float
     high: float
+    alone: float = math.nan
+    slope: float = math.nan
+    needed: float = math.nan
 
     @property
     def name(self) -> str:
@@ -215,26 +224,30 @@ class Outcomes(NamedTuple):
     status: np.ndarray
 
 
-def candidates(at: Situation, parameters: dict[str, Any]) -> dict[str, tuple[Law, Scene]]:
-    """Laws by name with their scenes; the last one is the reference."""
-    shape, dtype = at.gap_velocity.shape, at.gap_velocity.dtype
-    e, k = (
-        jnp.broadcast_to(jnp.asarray(parameters[key], dtype), shape)
-        for key in ("restitution", "stiffness")
-    )
-    eta = parameters["exponent"]
-    gapped = bool(at.gapped.any())
-    binary = (Binary(e, "earliest"), at.scene) if gapped else (Binary(e), at.touching)
-    found: dict[str, tuple[Law, Scene]] = {
-        "newton": (Newton(e), at.touching),
-        "moreau": (Moreau(e), at.touching),
-        "poisson": (Poisson(e), at.touching),
-        "binary": binary,
-        "lzb": (LZB(e, k, eta), at.touching),
-    }
-    if gapped:
-        found["compliant"] = Compliant(Bistiffness(k, eta, e)), at.scene
-    return found
+class Trial(NamedTuple):
+    """A law to try, and the scene to try it on: contacts taken as closed or not."""
+
+    law: Law
+    scene: Scene
+
+    @property
+    def knows_stiffness(self) -> bool:
+        """Whether stiffnesses are parameters of the law."""
+        return isinstance(self.law, LZB | Compliant)
+
+    def lanes(self, rows: int) -> int:
+        """Impacts computed together for so many rows of stiffness: enough to hide a call's cost."""
+        return rows if self.knows_stiffness else max(1, LANES // self.scene.contacts**2)
+
+    def run(self, at: Situation, stiffness: np.ndarray) -> tuple[jax.Array, ...]:
+        """v+, p and status over rows of stiffness, or of the same impact many times."""
+        v = jnp.tile(jnp.asarray(at.velocity), (self.lanes(len(stiffness)), 1))
+        scene = self.scene
+        if scene.gaps is None:  # scenes with and without gaps share one compiled program
+            scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
+        return _batch(
+            self.law, scene, v, jnp.asarray(stiffness, v.dtype) if self.knows_stiffness else None
+        )
 
 
 @eqx.filter_jit
@@ -248,16 +261,34 @@ def _batch(
     return jax.vmap(one)(velocity, stiffness)
 
 
-def outcomes(
-    law: Law, at: Situation, scene: Scene, stiffness: np.ndarray, progress: bool | None
-) -> Outcomes:
-    """Outcomes over rows of stiffness (r, m), a chunk at a time."""
-    r, chunk = len(stiffness), _chunk(stiffness)
+def trials(at: Situation, restitution: Any, stiffness: np.ndarray, eta: Any) -> dict[str, Trial]:
+    """Laws by name with their scenes; the last one is the reference."""
+    e, k = (
+        jnp.broadcast_to(jnp.asarray(x, at.gap_velocity.dtype), at.gap_velocity.shape)
+        for x in (restitution, stiffness)
+    )
+    gapped = bool(at.gapped.any())
+    found = {
+        "newton": Trial(Newton(e), at.touching),
+        "moreau": Trial(Moreau(e), at.touching),
+        "poisson": Trial(Poisson(e), at.touching),
+        "binary": Trial(Binary(e, "earliest" if gapped else "fastest"), at.touching),
+        "lzb": Trial(LZB(e, k, eta), at.touching),
+    }
+    if gapped:
+        found["binary"] = found["binary"]._replace(scene=at.scene)
+        found["compliant"] = Trial(Compliant(Bistiffness(k, eta, e)), at.scene)
+    return found
+
+
+def outcomes(trial: Trial, at: Situation, stiffness: np.ndarray, progress: bool | None) -> Outcomes:
+    """Outcomes over rows of stiffness (r, m), a chunk at a time; one of a law that knows none."""
+    r, chunk = len(stiffness) if trial.knows_stiffness else 1, _chunk(stiffness)
     parts = []
-    with sample_bar(r, 0, progress) as advance:
+    with counting_bar(r, "impacts", progress) as advance:
         for first in range(0, r, chunk):
             chosen = np.minimum(np.arange(first, first + chunk), r - 1)
-            parts.append([np.asarray(x) for x in _rows(law, at, scene, stiffness[chosen])])
+            parts.append([np.asarray(x) for x in trial.run(at, stiffness[chosen])])
             advance(min(chunk, r - first))
     return Outcomes(*(np.concatenate(x)[:r] for x in zip(*parts)))
 
@@ -268,38 +299,14 @@ def _chunk(stiffness: np.ndarray) -> int:
     return CHUNK if m <= CHEAP else min(r, CHUNK)
 
 
-def _rows(law: Law, at: Situation, scene: Scene, stiffness: np.ndarray) -> tuple[jax.Array, ...]:
-    v = jnp.tile(jnp.asarray(at.velocity), (len(stiffness), 1))
-    return _batch(law, _with_gaps(scene), v, jnp.asarray(stiffness, v.dtype))
-
-
-def _with_gaps(scene: Scene) -> Scene:
-    """The scene with gaps of 0 where it names none: both kinds share one compiled program."""
-    if scene.gaps is not None:
-        return scene
-    none = jnp.zeros(scene.contacts, scene.mass.dtype)
-    return with_gaps(scene, none)
-
-
-def one_outcome(law: Law, at: Situation, scene: Scene) -> Outcomes:
-    """The outcome of a law that knows no stiffness."""
-    return Outcomes(*(np.asarray(x)[:1] for x in _lanes(law, at, scene)))
-
-
-def _lanes(law: Law, at: Situation, scene: Scene) -> tuple[jax.Array, ...]:
-    """The same impact as many times as hide the cost of a call."""
-    v = jnp.tile(jnp.asarray(at.velocity), (max(1, LANES // scene.contacts**2), 1))
-    return _batch(law, _with_gaps(scene), v, None)
-
-
 def candidate(
-    law: Law, at: Situation, scene: Scene, own: Outcomes, reference: Outcomes, random: slice
+    trial: Trial, at: Situation, own: Outcomes, reference: Outcomes, random: slice
 ) -> Candidate:
     """The record of a law with the outcomes `own` (one row for all, or one each)."""
     error = np.abs(own.velocity[:1] - reference.velocity).max(axis=1) / at.scale
     return Candidate(
-        law=law,
-        scene=scene,
+        law=trial.law,
+        scene=trial.scene,
         velocity=own.velocity[0],
         low=np.nanmin(own.velocity, axis=0),
         high=np.nanmax(own.velocity, axis=0),
@@ -322,68 +329,9 @@ def block_errors(at: Situation, own: Outcomes, reference: Outcomes) -> list[floa
     return [error(block) for block in at.blocks]
 
 
-def costs(laws: dict[str, tuple[Law, Scene]], at: Situation, tried: Rows) -> dict[str, float]:
-    """Time of one impact in a batch over the cheapest law's: median of rounds, side by side."""
-    few = tried.stiffness[np.arange(_chunk(tried.stiffness)) % len(tried.stiffness)]
-
-    def run(law: Law, scene: Scene) -> int:
-        knows = isinstance(law, LZB | Compliant)
-        out = _rows(law, at, scene, few) if knows else _lanes(law, at, scene)
-        return len(jax.block_until_ready(out)[0])
-
-    def seconds(name: str) -> float:
-        begin = time.perf_counter()
-        count = run(*laws[name])
-        return (time.perf_counter() - begin) / count
-
-    begin = time.perf_counter()
-    rounds: list[list[float]] = []
-    while not rounds or (len(rounds) < ROUNDS and time.perf_counter() - begin < ROUNDS_SECONDS):
-        times = {name: seconds(name) for name in laws}
-        cheapest = min(times.values())
-        rounds.append([times[name] / cheapest for name in laws])
-    return dict(zip(laws, np.median(rounds, axis=0).tolist()))
-
-
-@dataclass(frozen=True)
-class Effect:
-    """What one unknown stiffness does to v+ by itself, relative to max |v-|.
-
-    `alone`: largest change over its range; `slope`: |d v+ / d ln k|; `needed`: relative accuracy
-    of k at which it moves v+ by the tolerance (inf: it does not).
-    """
-
-    name: str
-    alone: float
-    slope: float
-    needed: float
-
-
-@dataclass(frozen=True)
-class Findings:
-    """The simplest law, and how all of them fare.
-
-    `within`: the law keeps the tolerance; `candidates[name]` the evidence, from the simplest law
-    to the `reference`; `unknown` and `effects` of the stiffnesses not known.
-    """
-
-    name: str
-    law: Law
-    scene: Scene
-    velocity: np.ndarray
-    gap_velocity: np.ndarray
-    tolerance: float
-    within: bool
-    reference: str
-    candidates: dict[str, Candidate]
-    blocks: tuple[Block, ...]
-    stiffness: np.ndarray
-    unknown: tuple[Unknown, ...]
-    effects: tuple[Effect, ...]
-    rows: int
-    gap_ratio: np.ndarray | None
-
-    @property
-    def contacts(self) -> int:
-        """Number m of contacts."""
-        return len(self.gap_velocity)
+def costs(laws: dict[str, Trial], at: Situation, stiffness: np.ndarray) -> dict[str, float]:
+    """Time of one impact in a batch over the cheapest law's: medians, side by side."""
+    few = stiffness[np.arange(_chunk(stiffness)) % len(stiffness)]
+    taken = in_turns([partial(trial.run, at, few) for trial in laws.values()], ROUNDS)
+    each = [np.median(t) / trial.lanes(len(few)) for t, trial in zip(taken, laws.values())]
+    return {name: float(x / min(each)) for name, x in zip(laws, each)}

@@ -2,60 +2,53 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_values
-from jimpact.methods.contenders import METHODS
-from jimpact.methods.contenders.base import Method
+from jimpact._checks import as_whole, check_values
+from jimpact.methods.contenders import METHODS, Method
 from jimpact.methods.stability_points import (
     AXES,
-    CLASSES,
-    DEFAULT,
-    FALLS,
-    FINER,
-    FIXED_STEP_RIGHT,
-    FLAGGED,
-    HONEST,
-    STALLS,
-    WRONG,
-    checked_axes,
-    checked_base,
-    classify,
-    error_of,
-    refused,
-    sample_points,
-    setting_of,
-    slice_points,
-    threshold,
-)
-from jimpact.methods.stability_references import (
     CAUSES,
+    CLASSES,
     CONFIRMED,
+    DEFAULT,
+    FIXED_STEP_RIGHT,
+    HONEST,
     REFERENCE_RTOL,
     Confirmation,
-    Runners,
-    cause_of,
-    groups,
+    Slice,
+    classes_of,
     references,
+    runner,
 )
-from jimpact.progress import sample_bar
-from jimpact.status import CODE
+from jimpact.progress import counting_bar
+from jimpact.records import as_data, fields_as_data, table
 
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 SLICES = ("one", "pairs")
-
-
-class Slice(NamedTuple):
-    """Classes and errors over one axis (K,) or two (K1, K2); index of CLASSES, of CAUSES."""
-
-    axes: tuple[str, ...]
-    codes: np.ndarray
-    error: np.ndarray
-    cause: np.ndarray
+BASE = {  # three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
+    "setting": 0.6,
+    "stiffness_ratio": 1.0,
+    "exponent": 1.5,
+    "restitution": 0.9,
+    "mass_ratio": 1.0,
+    "balls": 3.0,
+}
+BALLS = (2, 3, 5, 10, 30, 100)
+_FEW_BALLS, _FEW = (2, 3, 10), 8  # every number of balls is compiled apart: few where it is coarse
+_RANGES = {
+    "setting": (0.0, 1.0),
+    "stiffness_ratio": (1e-8, 1e8),
+    "exponent": (1.0, 5.0),
+    "restitution": (0.0, 1.0),
+    "mass_ratio": (1e-6, 1e6),
+    "balls": (2, 1000),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,54 +79,34 @@ class StabilityMap:
         codes = np.concatenate([s.codes.ravel() for s in self._all_slices(method)])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
-    def silent(self, method: str) -> int:
-        """Points that are not right without a word: wrong or stalled."""
-        found = self.counts(method)
-        return found["wrong"] + found["stalls"]
-
     def causes(self, method: str) -> dict[str, int]:
         """Points that are not right, by cause."""
         found = np.concatenate([s.cause.ravel() for s in self._all_slices(method)])
         counts = np.bincount(found[found >= 0], minlength=len(CAUSES)).tolist()
-        return {cause.name: count for cause, count in zip(CAUSES, counts) if count}
+        return {cause: count for cause, count in zip(CAUSES, counts) if count}
 
     def _all_slices(self, method: str) -> tuple[Slice, ...]:
         return (*self.slices[method], self.sampled[method])
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it."""
-
-        def as_data(found: Slice) -> dict[str, Any]:
-            error = np.where(np.isfinite(found.error), found.error, -1.0)  # JSON has no NaN
-            return {
-                "axes": list(found.axes),
-                "codes": found.codes.tolist(),
-                "error": error.tolist(),
-                "cause": found.cause.tolist(),
+        by_method = {
+            name: {
+                "counts": self.counts(name),
+                "causes": self.causes(name),
+                "slices": self.slices[name],
+                "sampled": self.sampled[name],
             }
-
-        return {
-            "classes": list(CLASSES),
-            "causes": [cause.name for cause in CAUSES],
-            "axes": {name: values.tolist() for name, values in self.axes.items()},
-            "base": self.base,
-            "max_steps": self.max_steps,
-            "confirmation": self.confirmation._asdict(),
-            "samples": self.samples.tolist(),
-            "methods": {
-                name: {
-                    "counts": self.counts(name),
-                    "causes": self.causes(name),
-                    "slices": [as_data(each) for each in self.slices[name]],
-                    "sampled": as_data(self.sampled[name]),
-                }
-                for name in self.methods
-            },
+            for name in self.methods
         }
+        known = {"classes": CLASSES, "causes": CAUSES, "methods": by_method}
+        return fields_as_data(self, "slices", "sampled") | as_data(known)
 
     def __str__(self) -> str:
         base = ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items())
         found = self.confirmation
+        counts = [[m, *(str(x or "") for x in self.counts(m).values())] for m in self.methods]
+        causes = [[m, str(x), cause] for m in self.methods for cause, x in self.causes(m).items()]
         lines = [
             f"base: {base}; at most {self.max_steps:,} steps",
             f"reference: {found.points} points at rtol {REFERENCE_RTOL:g}; of {found.tried} "
@@ -142,15 +115,14 @@ class StabilityMap:
             f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for fixed steps, "
             "of the largest |v-|",
             "",
-            f"{'points':14s}" + "".join(f"{name:>15s}" for name in CLASSES),
+            *table(["method", *CLASSES], counts),
+            "",
+            *table(
+                ["method", "points", "cause where not right"],
+                causes,
+                left=["cause where not right"],
+            ),
         ]
-        for name in self.methods:
-            row = "".join(f"{count or '':>15}" for count in self.counts(name).values())
-            lines.append(f"{name:14s}{row}")
-        lines += ["", "causes where not right"]
-        for name in self.methods:
-            for cause, count in self.causes(name).items():
-                lines.append(f"{name:14s}{count:6d}  {cause}")
         return "\n".join(lines)
 
 
@@ -203,41 +175,38 @@ def stability_map(
     """
     if slices not in SLICES:
         raise ValueError(f"Argument `slices` must be one of {SLICES}, but has value {slices!r}.")
-    check_values("samples", samples, low=0)
-    check_values("max_steps", max_steps, low=1)
+    samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    chosen, lines = _methods(methods), checked_axes(axes, int(resolution))
-    start = checked_base(base)
+    chosen, lines = _methods(methods), _axes(axes, as_whole("resolution", resolution, 2))
+    start = BASE | {name: float(x) for name, x in _known("base", base or {}).items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
     if slices == "pairs":
         axis_sets += list(combinations(lines, 2))
-    parts = [slice_points(start, lines, names) for names in axis_sets]
-    sampled = sample_points(start, lines, int(samples), seed)
+    parts = [_slice_points(start, lines, names) for names in axis_sets]
+    sampled = _sample_points(start, lines, samples, seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
+    runners = cache(partial(runner, max_steps))
     total = len(points) * (len(chosen) + 1)
-    with sample_bar(total, 0, progress) as advance:
-        runners = Runners(int(max_steps), advance)
-        exact, confirmation = references(points, runners)
-        found = {method.name: classes_of(method, points, exact, runners) for method in chosen}
-    cut = np.cumsum([len(part.reshape(-1, len(AXES))) for part in parts])
-
-    def split(name: str) -> tuple[tuple[Slice, ...], Slice]:
-        columns = [np.split(column, cut) for column in found[name]]
-        cuts = [
+    with counting_bar(total, "impacts", progress) as advance:
+        exact, confirmation = references(points, runners, advance)
+        found = {m.name: classes_of(m, points, exact, runners, advance) for m in chosen}
+    cut = np.cumsum([part[..., 0].size for part in parts])
+    own, last = {}, {}
+    for name, results in found.items():
+        columns = [np.split(column, cut) for column in results]
+        own[name] = tuple(
             Slice(names, *(column[i].reshape(part.shape[:-1]) for column in columns))
             for i, (names, part) in enumerate(zip(axis_sets, parts))
-        ]
-        return tuple(cuts), Slice(("samples",), *(column[-1] for column in columns))
-
-    both = {name: split(name) for name in found}
+        )
+        last[name] = Slice(("samples",), *(column[-1] for column in columns))
     return StabilityMap(
         methods=tuple(found),
         axes=lines,
         base=start,
-        slices={name: first for name, (first, _) in both.items()},
+        slices=own,
         samples=sampled,
-        sampled={name: last for name, (_, last) in both.items()},
+        sampled=last,
         confirmation=confirmation,
         max_steps=max_steps,
     )
@@ -252,25 +221,61 @@ def _methods(names: Sequence[str] | None) -> list[Method]:
     return [known[name] for name in names]
 
 
-def classes_of(
-    method: Method, points: np.ndarray, exact: list[np.ndarray], runners: Runners
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Class, error and cause of every point."""
-    codes = np.full(len(points), FLAGGED)
-    errors, level = np.full(len(points), np.nan), points[:, AXES.index("setting")]
-    setting = setting_of(method.setting, level)
-    for group, balls, linear in groups(points):
-        at = group[~refused(method, points[group], linear)]
-        if len(at):
-            truth, allowed = np.stack([exact[i] for i in at]), threshold(method, level[at])
-            found = runners.run(method, balls, linear, points[at], setting[at])
-            errors[at] = error_of(found, truth)
-            codes[at] = classify(found, errors[at], allowed)
-        wrong = at[codes[at] == WRONG]
-        if len(wrong):
-            finer = runners.run(method, balls, linear, points[wrong], FINER * setting[wrong])
-            error = error_of(finer, np.stack([exact[i] for i in wrong]))
-            stalls = (finer.code == CODE["ok"]) & ~(error < FALLS * errors[wrong])
-            codes[wrong[stalls]] = STALLS
-        runners.advance(len(group))
-    return codes, errors, cause_of(method, points, codes, setting)
+def _known(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Values by axis, checked."""
+    unknown = sorted(set(values) - set(AXES))
+    if unknown:
+        raise ValueError(f"Argument `{argument}` must name some of {AXES}, but has {unknown}.")
+    for name, value in values.items():
+        low, high = _RANGES[name]
+        check_values(f"{argument}[{name!r}]", value, low=low, high=high)
+    return values
+
+
+def _axes(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str, np.ndarray]:
+    """The axes to map: those given, or r values of each (number of balls: at most six)."""
+    if axes is None:
+        return {
+            "setting": np.linspace(0, 1, r),
+            "stiffness_ratio": np.logspace(-8, 8, r),
+            "exponent": np.linspace(1, 5, r),
+            "restitution": np.append(0.0, np.logspace(-3, 0, r - 1)),
+            "mass_ratio": np.logspace(-6, 6, r),
+            "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
+        }
+    if not axes:
+        raise ValueError(f"Argument `axes` must name some of {AXES}, but is empty.")
+    found = {name: np.unique(np.asarray(x, float)) for name, x in _known("axes", axes).items()}
+    balls = found.get("balls", np.zeros(0))
+    if (balls != np.round(balls)).any():
+        raise ValueError(f"Argument `axes['balls']` must hold whole numbers, but has {balls}.")
+    return {name: found[name] for name in AXES if name in found}
+
+
+def _slice_points(
+    base: Mapping[str, float], axes: Mapping[str, np.ndarray], varied: tuple[str, ...]
+) -> np.ndarray:
+    """Points (K_1 .. K_d, 6) in which the axes `varied` run over their values."""
+    columns = [axes[name] if name in varied else np.array([base[name]]) for name in AXES]
+    grid = np.stack(np.meshgrid(*columns, indexing="ij"), axis=-1)
+    return grid.reshape(*(len(axes[name]) for name in varied), len(AXES))
+
+
+def _sample_points(
+    base: Mapping[str, float], axes: Mapping[str, np.ndarray], samples: int, seed: int
+) -> np.ndarray:
+    """Latin-hypercube points (samples, 6), between the values of `axes`; others from `base`."""
+    from scipy.stats import qmc  # late: slow to import
+
+    found = np.tile([base[name] for name in AXES], (samples, 1))
+    unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(samples)
+    for column, (name, values) in zip(unit.T, axes.items()):
+        place = column * (len(values) - 1)
+        if name == "balls":
+            found[:, AXES.index(name)] = values[np.round(place).astype(int)]
+            continue
+        powers = bool((values > 0).all()) and name != "exponent"
+        scaled = np.log(values) if powers else values
+        between = np.interp(place, np.arange(len(values)), scaled)
+        found[:, AXES.index(name)] = np.exp(between) if powers else between
+    return found

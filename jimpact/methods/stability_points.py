@@ -1,4 +1,4 @@
-"""Points of a stability map: scenes, slices, samples; methods run on many points, classified.
+"""Points of a stability map: methods run on many of them, classified, and why they fail.
 
 # notation: a point is a row (6,) of AXES
 #   setting           0 coarse .. 1 fine, log-linear in what the method takes (`setting_of`)
@@ -12,17 +12,17 @@ A batch is one compiled function a method and number of balls, over lanes of poi
 one chunk wait for the slowest, so the number of steps is bounded.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_values
 from jimpact.audits import audit
 from jimpact.events.impact_dynamics import solve
 from jimpact.laws.lzb import LZB
+from jimpact.methods.contenders import METHODS
 from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
 from jimpact.scene import Scene, chain
 from jimpact.status import CODE
@@ -30,24 +30,6 @@ from jimpact.status import CODE
 AXES = ("setting", "stiffness_ratio", "exponent", "restitution", "mass_ratio", "balls")
 # kind of setting (see `jimpact.methods.contenders.Method`): value at level 0 and at level 1
 SETTINGS = {"rtol": (1e-2, 1e-12), "step": (3.0, 3e-3), "impulse step": (0.3, 3e-5)}
-BASE = {  # three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
-    "setting": 0.6,
-    "stiffness_ratio": 1.0,
-    "exponent": 1.5,
-    "restitution": 0.9,
-    "mass_ratio": 1.0,
-    "balls": 3.0,
-}
-BALLS = (2, 3, 5, 10, 30, 100)
-_FEW_BALLS, _FEW = (2, 3, 10), 8  # every number of balls is compiled apart: few where it is coarse
-_RANGES = {
-    "setting": (0.0, 1.0),
-    "stiffness_ratio": (1e-8, 1e8),
-    "exponent": (1.0, 5.0),
-    "restitution": (0.0, 1.0),
-    "mass_ratio": (1e-6, 1e6),
-    "balls": (2, 1000),
-}
 
 CLASSES = (
     "right",
@@ -65,6 +47,28 @@ FIXED_STEP_RIGHT = 1e-3  # the same of methods with a step: error in v+ over the
 FINER = 0.1  # setting at which a wrong result is tried again: it stalls if the error does
 FALLS = 0.5  # not fall below this part
 LANES = 32
+
+REFERENCE_RTOL = 1e-12
+CHECK_RTOL = 1e-11  # of the run by scipy
+CONFIRMED = 1e-7  # difference from it up to which the reference counts as confirmed
+CHECKED = 12  # points
+QUICK_UP_TO, QUICK_BALLS = 1e3, 10  # frequencies over the slowest contact's, size of a chain
+
+CAUSES = (  # limits, formulas and remedies: docs/stability.md
+    "refused beforehand",
+    "step beyond the linear stability limit",
+    "a contact's whole stroke lies within one step",
+    "contacts re-close without end",
+    "time scales far apart",
+    "many contacts at once",
+    "first order at E = 0",
+    "steps straddle changes of phase",
+)
+(_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
+STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # step sqrt(lambda_max)
+RECLOSING = 0.1  # e below which three balls re-close (nearly) without end
+_LONG, _CLUSTERED = 10, 0.9  # chains this long stay clustered up to about this e
+_FAR = 100.0  # times between the frequencies of contacts
 
 
 def setting_of(kind: str, level: Any) -> Any:
@@ -94,81 +98,7 @@ def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
     return mass, stiffness
 
 
-def default_axes(resolution: int) -> dict[str, np.ndarray]:
-    """Values of every axis, `resolution` of each (number of balls: at most six)."""
-    r = resolution
-    return {
-        "setting": np.linspace(0, 1, r),
-        "stiffness_ratio": np.logspace(-8, 8, r),
-        "exponent": np.linspace(1, 5, r),
-        "restitution": np.append(0.0, np.logspace(-3, 0, r - 1)),
-        "mass_ratio": np.logspace(-6, 6, r),
-        "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
-    }
-
-
-def checked_axes(
-    axes: Mapping[str, Sequence[float]] | None, resolution: int
-) -> dict[str, np.ndarray]:
-    """The axes to map: those given, or all of the default ones."""
-    check_values("resolution", resolution, low=2)
-    if axes is None:
-        return default_axes(resolution)
-    unknown = sorted(set(axes) - set(AXES))
-    if unknown or not axes:
-        raise ValueError(f"Argument `axes` must name some of {AXES}, but has {unknown}.")
-    found = {}
-    for name, values in axes.items():
-        low, high = _RANGES[name]
-        check_values(f"axes[{name!r}]", values, low=low, high=high)
-        row = np.atleast_1d(np.asarray(values, float))
-        if name == "balls" and np.any(row != np.round(row)):
-            raise ValueError(f"Argument `axes['balls']` must hold whole numbers, but has {row}.")
-        found[name] = np.unique(row)
-    return {name: found[name] for name in AXES if name in found}
-
-
-def checked_base(base: Mapping[str, float] | None) -> dict[str, float]:
-    """The base point: BASE with what `base` puts in its place."""
-    unknown = sorted(set(base or {}) - set(AXES))
-    if unknown:
-        raise ValueError(f"Argument `base` must name some of {AXES}, but has {unknown}.")
-    for name, value in (base or {}).items():
-        low, high = _RANGES[name]
-        check_values(f"base[{name!r}]", value, low=low, high=high)
-    return BASE | {name: float(value) for name, value in (base or {}).items()}
-
-
-def slice_points(
-    base: Mapping[str, float], axes: Mapping[str, np.ndarray], varied: tuple[str, ...]
-) -> np.ndarray:
-    """Points (K_1 .. K_d, 6) in which the axes `along` run over their values."""
-    grids = np.meshgrid(*(axes[name] for name in varied), indexing="ij")
-    rows = [
-        grids[varied.index(name)] if name in varied else np.full(grids[0].shape, base[name])
-        for name in AXES
-    ]
-    return np.stack(rows, axis=-1)
-
-
-def sample_points(
-    base: Mapping[str, float], axes: Mapping[str, np.ndarray], samples: int, seed: int
-) -> np.ndarray:
-    """Latin-hypercube points (samples, 6), between the values of `axes`; others from `base`."""
-    from scipy.stats import qmc  # late: slow to import
-
-    found = np.tile([base[name] for name in AXES], (samples, 1))
-    unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(samples)
-    for column, (name, values) in zip(unit.T, axes.items()):
-        place = column * (len(values) - 1)
-        if name == "balls":
-            found[:, AXES.index(name)] = values[np.round(place).astype(int)]
-            continue
-        powers = bool((values > 0).all()) and name != "exponent"
-        scaled = np.log(values) if powers else values
-        between = np.interp(place, np.arange(len(values)), scaled)
-        found[:, AXES.index(name)] = np.exp(between) if powers else between
-    return found
+# --------------------------------------------------------------------------- running methods
 
 
 def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
@@ -180,13 +110,7 @@ def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Metho
 
 
 DEFAULT = Method(
-    name="default",
-    label="jimpact's default",
-    setting="rtol",
-    ladder=(1e-4, 1e-8, 1e-12),
-    jax=True,
-    supports=lzb_only,
-    solve=_solve_default,
+    "default", "jimpact's default", "rtol", (1e-4, 1e-8, 1e-12), _solve_default, lzb_only
 )
 
 
@@ -199,17 +123,12 @@ class Found(NamedTuple):
     gain: np.ndarray
 
 
-def threshold(method: Method, level: np.ndarray) -> np.ndarray:
-    """Error up to which a result of `method` at these settings is right."""
-    if method.setting != "rtol":
-        return np.full(np.shape(level), FIXED_STEP_RIGHT)
-    return HONEST * np.asarray(setting_of("rtol", level))
+Runner = Callable[[np.ndarray, Any], Found]  # of points (L, 6) and settings () or (L,)
+Runners = Callable[[Method, int, bool], Runner]
 
 
-def runner(
-    method: Method, balls: int, linear: bool, max_steps: int
-) -> Callable[[np.ndarray, np.ndarray], Found]:
-    """`run(points (L, 6), settings (L,))` of one method on chains of so many balls.
+def runner(max_steps: int, method: Method, balls: int, linear: bool) -> Runner:
+    """One method on chains of so many balls.
 
     `linear`: the exponent is the static 1.0, which some methods ask for.
     """
@@ -225,8 +144,8 @@ def runner(
 
     batch = jax.jit(jax.vmap(one))
 
-    def run(points: np.ndarray, settings: np.ndarray) -> Found:
-        rows = []
+    def run(points: np.ndarray, settings: Any) -> Found:
+        settings, rows = np.broadcast_to(settings, len(points)), []
         for begin in range(0, len(points), LANES):
             lanes = np.arange(begin, begin + LANES).clip(max=len(points) - 1)  # the last repeats
             out = batch(jnp.asarray(points[lanes]), jnp.asarray(settings[lanes]))
@@ -236,30 +155,180 @@ def runner(
     return run
 
 
-def refused(method: Method, points: np.ndarray, linear: bool) -> np.ndarray:
+def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int, bool]]:
+    """Points (indices) of equal shapes, their number of balls, whether they are linear."""
+    balls, linear = points[:, AXES.index("balls")], points[:, AXES.index("exponent")] == 1.0
+    for n, kind in np.unique(np.stack([balls, linear], axis=1), axis=0):
+        yield np.flatnonzero((balls == n) & (linear == kind)), int(n), bool(kind)
+
+
+# --------------------------------------------------------------------------- the references
+
+
+class Confirmation(NamedTuple):
+    """How many references another integrator could confirm, and the largest difference there."""
+
+    points: int
+    tried: int
+    confirmed: int
+    difference: float
+
+
+def references(
+    points: np.ndarray, runners: Runners, advance: Callable[[int], None]
+) -> tuple[np.ndarray, Confirmation]:
+    """v+ of every point (P, most balls), NaN where no run ends; how many scipy confirms."""
+    exact = np.full((len(points), int(points[:, AXES.index("balls")].max())), np.nan)
+    for at, balls, linear in _groups(points):
+        unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
+        rows = np.column_stack([np.zeros(len(unique)), unique])
+        found = runners(DEFAULT, balls, linear)(rows, REFERENCE_RTOL)
+        ended = (found.code == CODE["ok"]) | (found.code == CODE["plastic_limit"])
+        exact[at, :balls] = np.where(ended[:, None], found.velocity, np.nan)[np.ravel(back)]
+        advance(len(at))
+    return exact, _confirm(points, exact)
+
+
+def _confirm(points: np.ndarray, exact: np.ndarray) -> Confirmation:
+    """Differences from scipy's integrator at points spread over those that it solves quickly."""
+    quick = np.array([_is_quick(point) for point in points])
+    candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
+    _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
+    candidates = candidates[np.sort(first)]
+    every = max(1, -(-len(candidates) // CHECKED))
+    apart = np.array([_by_scipy(points[i], exact[i]) for i in candidates[::every]])
+    largest = float(apart.max(initial=0.0)) if len(apart) else float("nan")
+    return Confirmation(len(points), len(apart), int((apart <= CONFIRMED).sum()), largest)
+
+
+def _is_quick(point: np.ndarray) -> bool:
+    highest, apart = frequencies(point)
+    parts = point[AXES.index("restitution")] >= RECLOSING  # else scipy may end it too early
+    few = point[AXES.index("balls")] <= QUICK_BALLS
+    return bool(parts and few and highest * apart < QUICK_UP_TO)
+
+
+def _by_scipy(point: np.ndarray, exact: np.ndarray) -> float:
+    _, kappa, eta, e, mu, balls = map(float, point)
+    mass, stiffness = chain_of(kappa, mu, int(balls))
+    scene, v = chain(mass), np.eye(int(balls))[0]
+    law = LZB(e, stiffness, eta)
+    found = METHODS["scipy_dop853"].solve(law, scene, v, CHECK_RTOL)
+    return float(np.abs(outcome(law, scene, v, found).velocity - exact[: len(v)]).max())
+
+
+# ------------------------------------------------------------------------ classes and causes
+
+
+class Slice(NamedTuple):
+    """Classes and errors over one axis (K,) or two (K1, K2); index of CLASSES, of CAUSES."""
+
+    axes: tuple[str, ...]
+    codes: np.ndarray
+    error: np.ndarray
+    cause: np.ndarray
+
+
+def classes_of(
+    method: Method,
+    points: np.ndarray,
+    exact: np.ndarray,
+    runners: Runners,
+    advance: Callable[[int], None],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Class, error (over the largest |v-|, which is 1) and cause of every point."""
+    codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
+    level = points[:, AXES.index("setting")]
+    setting = setting_of(method.setting, level)
+    allowed = np.full(len(points), FIXED_STEP_RIGHT)
+    if method.setting == "rtol":
+        allowed = HONEST * setting
+    for group, balls, linear in _groups(points):
+        run = runners(method, balls, linear)
+
+        def off(found: Found, at: np.ndarray, balls: int = balls) -> np.ndarray:
+            return np.abs(found.velocity - exact[at, :balls]).max(axis=1)
+
+        at = group[~_refused(method, points[group], linear)]
+        if len(at):
+            found = run(points[at], setting[at])
+            errors[at] = off(found, at)
+            codes[at] = _classified(found, errors[at], allowed[at])
+        wrong = at[codes[at] == WRONG]
+        if len(wrong):
+            finer = run(points[wrong], FINER * setting[wrong])
+            falls = off(finer, wrong) < FALLS * errors[wrong]
+            codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
+        advance(len(group))
+    causes = np.full(len(points), -1)
+    for i in np.flatnonzero(codes != RIGHT):
+        causes[i] = _cause(method, points[i], CLASSES[codes[i]], float(setting[i]))
+    return codes, errors, causes
+
+
+def _refused(method: Method, points: np.ndarray, linear: bool) -> np.ndarray:
     """Points (L,) on which the method says beforehand that it cannot work."""
+    pair, exponent = chain(jnp.ones(2)), 1.0 if linear else jnp.asarray(1.5)
+    at_0, at_1 = (method.supports(LZB(e, exponent=exponent), pair) for e in (0.0, 1.0))
     e = points[:, AXES.index("restitution")]
-    reasons = {}
-    for value in (0.0, 1.0):
-        law = LZB(value, exponent=1.0 if linear else jnp.asarray(1.5))
-        reasons[value] = method.supports(law, chain(jnp.ones(2))) is not None
-    return np.where(e == 0, reasons[0.0], reasons[1.0])
+    return np.where(e == 0, at_0 is not None, at_1 is not None)
 
 
-def error_of(found: Found, exact: np.ndarray) -> np.ndarray:
-    """Largest error in v+ (L,) over the largest |v-|, which is 1."""
-    return np.abs(found.velocity - exact).max(axis=1)
-
-
-def classify(found: Found, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+def _classified(found: Found, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
     """Classes (L,) before a finer setting is tried; `error` NaN where there is no reference."""
     status = np.where(found.code == CODE["ok"], found.status, found.code)
-    cases = [
-        (status == CODE["not_finite"], NOT_FINITE),
-        (status == CODE["max_steps"], ENDLESS),
-        (error <= allowed, RIGHT),
-        ((status == CODE["energy_gain"]) | (found.gain > allowed), GAINS_ENERGY),
-        (status != CODE["ok"], FLAGGED),
-        (np.isfinite(error), WRONG),
-    ]
-    return np.select([case for case, _ in cases], [code for _, code in cases], UNCHECKED)
+    cases = {
+        NOT_FINITE: status == CODE["not_finite"],
+        ENDLESS: status == CODE["max_steps"],
+        RIGHT: error <= allowed,
+        GAINS_ENERGY: (status == CODE["energy_gain"]) | (found.gain > allowed),
+        FLAGGED: status != CODE["ok"],
+        WRONG: np.isfinite(error),
+    }
+    return np.select(list(cases.values()), list(cases), UNCHECKED)
+
+
+def frequencies(point: np.ndarray) -> tuple[float, float]:
+    """`sqrt(lambda_max)` of the linearized flow in units of the fastest contact, and the ratio of
+    the fastest contact's frequency to the slowest's.
+
+    lambda: eigenvalues of `omega G omega eta (eta + 1) / (2 e^2)`, the slope of the force at x = 1.
+
+    >>> import numpy as np
+    >>> from jimpact.methods.stability_points import frequencies
+    >>> [round(x, 3) for x in frequencies(np.array([0.5, 1.0, 1.0, 1.0, 1.0, 2]))]
+    [1.0, 1.0]
+    """
+    _, kappa, eta, e, mu, balls = map(float, point)
+    mass, k = (np.asarray(x, float) for x in chain_of(kappa, mu, int(balls)))
+    w = 1 / mass[:-1] + 1 / mass[1:]
+    # 1 / t_ref at the largest normalized speed, up to a common factor
+    omega = k ** (1 / (eta + 1)) * np.sqrt(w)
+    slowest = omega.max() / omega.min()
+    omega = omega / omega.max()
+    beside = -1 / mass[1:-1] / np.sqrt(w[:-1] * w[1:])
+    g = np.eye(len(w)) + np.diag(beside, 1) + np.diag(beside, -1)
+    largest = np.linalg.eigvalsh(omega[:, None] * g * omega[None, :])[-1]
+    with np.errstate(divide="ignore"):
+        return float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf, float(slowest)
+
+
+def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
+    """Index of CAUSES."""
+    e, balls = point[AXES.index("restitution")], point[AXES.index("balls")]
+    highest, apart = frequencies(point)
+    reach = setting * highest
+    if name == "flagged" and e == 0:
+        return _REFUSED
+    if method.setting == "step" and reach > 1:
+        return _UNSTABLE if reach > STABLE.get(method.name, np.inf) else _COARSE
+    if name in ("does not end", "flagged", "unchecked"):
+        if e < RECLOSING:
+            return _RECLOSES
+        if apart > _FAR or point[AXES.index("mass_ratio")] < 1 / _FAR:
+            return _APART
+        if balls >= _LONG and e < _CLUSTERED:
+            return _CLUSTER
+    if method.setting == "impulse step":
+        return _FIRST_ORDER
+    return _STRADDLES if name in ("wrong", "stalls", "gains energy") else _APART

@@ -20,7 +20,7 @@ from jimpact.montecarlo.planning import BINS, CHUNK, Run, description, identity,
 from jimpact.montecarlo.results import MonteCarlo, Totals
 from jimpact.montecarlo.statistics import Chunk
 from jimpact.montecarlo.store import Store
-from jimpact.progress import sample_bar
+from jimpact.progress import counting_bar
 from jimpact.scene import Scene
 
 
@@ -120,7 +120,8 @@ def _totals(run: Run, executor: Executor, store: Store | None, progress: bool | 
     finished = done
     try:
         computing = closing(_computed(run, executor, missing, read))
-        with sample_bar(run.samples, done, progress) as advance, computing as chunks:
+        bar = counting_bar(run.samples, "samples", progress, done)
+        with bar as advance, computing as chunks:
             for computed in chunks:
                 if store is not None:
                     store.write(computed)

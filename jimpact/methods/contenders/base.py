@@ -38,28 +38,51 @@ class MethodResult(NamedTuple):
     code: jax.Array
 
 
+def lzb_only(law: Law, scene: Scene) -> str | None:
+    """Whether the law has LZB's dynamics, and fits the scene."""
+    if not isinstance(law, LZB):
+        return f"it integrates the LZB law, and the law is {type(law).__name__}"
+    for name in ("restitution", "stiffness"):
+        shape = np.shape(getattr(law, name))[-1:]
+        if shape not in ((), (scene.contacts,)) and not is_traced(law):
+            return f"`{name}` has {shape[0]} entries for {scene.contacts} contacts"
+    return None
+
+
+def finite_rate(law: Law, scene: Scene) -> str | None:
+    """As `lzb_only`; and the plain time form divides by e."""
+    reason = lzb_only(law, scene)
+    if not isinstance(law, LZB) or reason is not None or is_traced(law):
+        return reason
+    return "it divides by e^2, and a restitution is 0" if jnp.any(law.restitution == 0) else None
+
+
+Solve = Callable[[LZB, Scene, Any, Any], MethodResult]
+
+
 class Method(NamedTuple):
     """A way to integrate an LZB impact.
 
     `setting` says what the number handed to `solve` is: 'rtol', a tolerance on velocities relative
     to the largest |v-|; 'step', the time step in units of `time_scale`; or 'impulse step', the
     step in the primary impulse, in units of the impact's own. `ladder`: settings from coarse to
-    fine. `jax`: `solve(law, scene, velocity, setting)` can be jitted, vmapped and differentiated
-    forward, over the setting too; otherwise it takes concrete values. `supports(law, scene)` is
-    None or says why not. `duration_apart`: the duration takes a run of its own. `counting(tally)`:
-    where `solve` gives no evaluations, one that calls `tally()` at each (one impact at a time).
+    fine. `supports(law, scene)` is None or says why not. `jax`: `solve(law, scene, velocity,
+    setting)` can be jitted, vmapped and differentiated forward, over the setting too; otherwise it
+    takes concrete values. `duration_apart`: the duration takes a run of its own.
+    `counting(tally)`: where `solve` gives no evaluations, one that calls `tally()` at each (one
+    impact at a time).
     """
 
     name: str
     label: str
     setting: str
     ladder: tuple[float, ...]
-    jax: bool
-    supports: Callable[[Law, Scene], str | None]
-    solve: Callable[[LZB, Scene, Any, Any], MethodResult]
+    solve: Solve
+    supports: Callable[[Law, Scene], str | None] = finite_rate
+    jax: bool = True
     no_gradient: str | None = None  # why there is none that is meaningful
     duration_apart: bool = False
-    counting: Callable[[Callable[[], None]], Callable[..., MethodResult]] | None = None
+    counting: Callable[[Callable[[], None]], Solve] | None = None
 
 
 class GivenImpact(NamedTuple):
@@ -164,25 +187,6 @@ def time_form(
 def held_open(x: jax.Array, closing: jax.Array) -> jax.Array:
     """`x'` of a code that cannot clamp: an open contact keeps its x <= 0."""
     return jnp.where((x <= 0) & (closing < 0), 0.0, closing)
-
-
-def lzb_only(law: Law, scene: Scene) -> str | None:
-    """Whether the law has LZB's dynamics, and fits the scene."""
-    if not isinstance(law, LZB):
-        return f"it integrates the LZB law, and the law is {type(law).__name__}"
-    for name in ("restitution", "stiffness"):
-        shape = np.shape(getattr(law, name))[-1:]
-        if shape not in ((), (scene.contacts,)) and not is_traced(law):
-            return f"`{name}` has {shape[0]} entries for {scene.contacts} contacts"
-    return None
-
-
-def finite_rate(law: Law, scene: Scene) -> str | None:
-    """As `lzb_only`; and the plain time form divides by e."""
-    reason = lzb_only(law, scene)
-    if not isinstance(law, LZB) or reason is not None or is_traced(law):
-        return reason
-    return "it divides by e^2, and a restitution is 0" if jnp.any(law.restitution == 0) else None
 
 
 def checked(law: Law, scene: Scene, method: Method) -> None:
