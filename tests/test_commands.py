@@ -191,7 +191,7 @@ def test_montecarlo(tmp_path, capsys):
         ("velocity_m_per_s = [1.0, 0.0, -1.0]", "", "must have the key `velocity_m_per_s`"),
         ("low = 0.0", "least = 0.0", "`gaps_m` in [monte_carlo] must have low and high, or mean"),
         ("low = 0.0", "low = -1.0", "initial_energy"),
-        ("samples = 600", "samples = 0", "`samples` must be at least 1"),
+        ("samples = 600", "samples = 0", "`samples` must be an int >= 1"),
         ("samples = 600", "law = 3", "[monte_carlo.law] must be a table"),
         ('order = "earliest"', 'order = "latest"', "`order` must be"),
         ("[monte_carlo]\n", "[montecarlo]\n", "may have the keys"),

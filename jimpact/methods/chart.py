@@ -347,14 +347,32 @@ class Programs:
 def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
     if not method.jax:
         return _on_host(method, case)
+
+    def whole(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Answer:
+        law = with_entries(law, ("stiffness",), k)
+        found = method.solve(law, scene, v, setting)
+        return _answer(outcome(law, scene, v, found), found.duration, found.evaluations)
+
+    def fast(*given: Any) -> Answer:
+        answer = whole(*given)
+        return answer._replace(duration=jnp.nan) if method.duration_apart else answer
+
+    def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
+        def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
+            moved = with_entries(law, ("restitution",), e)
+            return fast(k * jnp.exp(stretch), moved, scene, v, setting).velocity
+
+        both = jax.jacfwd(velocity, argnums=(0, 1))(jnp.zeros_like(k), law.restitution)
+        return jnp.concatenate(both, axis=-1)
+
     seconds: dict[str, float] = {}
+    constant = (case.law, case.scene, case.velocity)
 
     def program(name: str, function: Callable[..., Any], rows: int | None) -> Callable[[Any], Any]:
         k = case.stiffness[0] if rows is None else case.stiffness[:rows]
-        whole = function if rows is None else jax.vmap(function, in_axes=(0, *[None] * 4))
-        return _compiled(seconds, name, whole, k, case.law, case.scene, case.velocity)
+        each = function if rows is None else jax.vmap(function, in_axes=(0, *[None] * 4))
+        return _compiled(seconds, name, each, k, *constant)
 
-    whole, fast, slopes = _functions(method)
     batched = program("batched", fast, len(case.stiffness))
     account = program("errors", whole, case.sample) if method.duration_apart else batched
     count = _counter(method, program) if method.counting else None
@@ -365,14 +383,13 @@ def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
             return answer
         return answer._replace(evaluations=np.full(case.sample, count(setting)))
 
+    wanted = gradients and not method.no_gradient
     return Programs(
         single=program("single", fast, None),
         batched=batched,
         batch=len(case.stiffness),
         account=accounted,
-        gradient=program("gradient", slopes, case.sample)
-        if gradients and not method.no_gradient
-        else None,
+        gradient=program("gradient", slopes, case.sample) if wanted else None,
         compile_time=seconds,
     )
 
@@ -392,29 +409,6 @@ def _compiled(
     return lambda setting: ready()(
         *given, jnp.asarray(np.nan if setting is None else setting, float)
     )
-
-
-def _functions(method: Method) -> tuple[Callable[..., Any], ...]:
-    """The whole answer, what is timed of it, and the Jacobian of v+, of one impact."""
-
-    def whole(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Answer:
-        law = with_entries(law, ("stiffness",), k)
-        found = method.solve(law, scene, v, setting)
-        return _answer(outcome(law, scene, v, found), found.duration, found.evaluations)
-
-    def fast(*given: Any) -> Answer:
-        answer = whole(*given)
-        return answer._replace(duration=jnp.nan) if method.duration_apart else answer
-
-    def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
-        def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
-            moved = with_entries(law, ("restitution",), e)
-            return fast(k * jnp.exp(stretch), moved, scene, v, setting).velocity
-
-        both = jax.jacfwd(velocity, argnums=(0, 1))(jnp.zeros_like(k), law.restitution)
-        return jnp.concatenate(both, axis=-1)
-
-    return whole, fast, slopes
 
 
 def _counter(method: Method, program: Callable[..., Callable[[Any], Any]]) -> Callable[[Any], int]:

@@ -14,18 +14,16 @@ from jimpact.impacts import impact
 from jimpact.law import Law, free_parameters_of
 from jimpact.montecarlo.distributions import Distribution, Source
 from jimpact.scene import Scene, with_gaps
-from jimpact.status import STATUS
+from jimpact.status import STATUS, Status
 
-# Further outcomes of a sample: it never reached the law.
-BAD_GAP, BAD_VELOCITY, BAD_LAW = range(len(STATUS), len(STATUS) + 3)
-BAD_INPUTS = {
-    BAD_GAP: (
-        "bad_gap",
-        "a drawn gap is not finite or negative, that is an overlap: see LZB's `initial_energy`",
-    ),
-    BAD_VELOCITY: ("bad_velocity", "a drawn velocity is not finite"),
-    BAD_LAW: ("bad_law", "a drawn parameter is not finite or outside its domain"),
-}
+# Outcomes of a sample: those of an impact, and further ones where it never reached the law.
+OUTCOMES = (
+    *STATUS,
+    Status("bad_gap", "a drawn gap is not finite or an overlap: see LZB's `initial_energy`", True),
+    Status("bad_velocity", "a drawn velocity is not finite", True),
+    Status("bad_law", "a drawn parameter is not finite or outside its domain", True),
+)
+BAD_GAP, BAD_VELOCITY, BAD_LAW = range(len(STATUS), len(OUTCOMES))
 
 
 class Sources(eqx.Module):
@@ -79,7 +77,7 @@ def _entries(source: Source, size: int, keys: jax.Array, non_negative: bool) -> 
 
 @eqx.filter_jit
 def impacts(drawn: Drawn, scene: Scene, lanes: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Velocities (C, n) and statuses (C,) of a chunk, those of `BAD_INPUTS` included."""
+    """Velocities (C, n) and statuses (C,) of a chunk, those of bad draws included."""
     law_axis = eqx.if_array(0) if drawn.varies[0] else None
     axes = (law_axis, *(0 if each else None for each in drawn.varies[1:]), None)
     run = eqx.filter_vmap(_outcome, in_axes=axes, axis_size=len(lanes))

@@ -51,10 +51,10 @@ class Serial:
         for task in tasks:
             started = plan.start(task)
             if before is not None:
-                yield plan.finish(before)
+                yield before()
             before = started
         if before is not None:
-            yield plan.finish(before)
+            yield before()
 
 
 @dataclass(frozen=True)
@@ -132,19 +132,12 @@ class DaskExecutor:
             for task in tasks:
                 running.add(client.submit(_compute, shipped, plan.x64, task, pure=False))
                 if running.count() >= window:
-                    yield _result(running)
-            while running.count():
-                yield _result(running)
+                    yield next(running).result()
+            for future in running:
+                yield future.result()
         finally:
             if own:
                 client.close()  # and with it the cluster that it started
-
-
-def _result(running: Any) -> Chunk:
-    future = next(running)
-    chunk = future.result()
-    future.release()
-    return chunk
 
 
 def _compute(shipped: bytes, x64: bool, task: Task) -> Chunk:

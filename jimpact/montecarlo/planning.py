@@ -6,8 +6,7 @@ that `shard_map` spreads over two devices has other last bits than that for one.
 """
 
 import contextlib
-import operator
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact._checks import check_kind, in_common_dtype
+from jimpact._checks import as_whole, check_kind, in_common_dtype
 from jimpact.law import Law
 from jimpact.montecarlo.distributions import Rows, as_source
 from jimpact.montecarlo.drawing import Drawn, Sources, draw, impacts, is_random
@@ -26,19 +25,8 @@ from jimpact.montecarlo.store import fingerprint
 from jimpact.scene import Scene, with_gaps
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
-LARGEST_CHUNK = 2**31  # lanes are numbered in uint32
 SAMPLES = 100_000
 BINS = 1000
-
-
-@dataclass(frozen=True)
-class Started:
-    """A chunk under way on a device."""
-
-    task: Task
-    drawn: Drawn
-    velocity: jax.Array
-    status: jax.Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,46 +45,42 @@ class Plan:
 
     def __call__(self, task: Task, device: jax.Device | None = None) -> Chunk:
         """Compute one chunk on a device (None: the default one)."""
-        return self.finish(self.start(task, device))
+        return self.start(task, device)()
 
-    def start(self, task: Task, device: jax.Device | None = None) -> Started:
-        """Enqueue a chunk on a device."""
+    def start(self, task: Task, device: jax.Device | None = None) -> Callable[[], Chunk]:
+        """Enqueue a chunk on a device; call the result to wait for it and reduce it."""
         with self._flags():
             drawn, lanes, scene = self._drawn(task, device)
-            return Started(task, drawn, *impacts(drawn, scene, lanes))
+            velocity, status = impacts(drawn, scene, lanes)
 
-    def finish(self, started: Started) -> Chunk:
-        """Wait for a chunk and reduce it."""
-        drawn, empty = started.drawn, np.zeros((self.size, 0))
-        samples = {
-            "velocity": np.asarray(started.velocity),
-            "status": np.asarray(started.status),
-            "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
-            "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
-        }
-        return reduced(started.task, samples, self.bins, self.keep_samples)
+        def finish() -> Chunk:
+            empty = np.zeros((self.size, 0))
+            samples = {
+                "velocity": np.asarray(velocity),
+                "status": np.asarray(status),
+                "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
+                "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
+            }
+            return reduced(task, samples, self.bins, self.keep_samples)
+
+        return finish
 
     def sample(self, task: Task, lane: int) -> tuple[Law, jax.Array, jax.Array | None]:
         """Law, velocity and gaps of one sample, the same bits as in the run."""
         with self._flags():
             drawn, _, _ = self._drawn(task, None)
 
-        def own(part: Any) -> Any:
-            return jax.tree.map(lambda leaf: leaf[lane] if eqx.is_array(leaf) else leaf, part)
+        def own(part: Any, varies: bool) -> Any:
+            return jax.tree.map(lambda x: x[lane] if varies and eqx.is_array(x) else x, part)
 
-        law, velocity, gaps = drawn.law, drawn.velocity, drawn.gaps
-        one, two, three = drawn.varies
-        return (
-            own(law) if one else law,
-            own(velocity) if two else velocity,
-            own(gaps) if three else gaps,
-        )
+        parts = (drawn.law, drawn.velocity, drawn.gaps)
+        law, velocity, gaps = map(own, parts, drawn.varies)
+        return law, velocity, gaps
 
     @contextlib.contextmanager
     def _flags(self) -> Iterator[None]:
         """What precision and draws depend on, in this thread only: workers have their own."""
-        partitionable = jax.threefry_partitionable(self.threefry_partitionable)
-        with jax.enable_x64(self.x64), partitionable:
+        with jax.enable_x64(self.x64), jax.threefry_partitionable(self.threefry_partitionable):
             yield
 
     def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Drawn, jax.Array, Scene]:
@@ -154,8 +138,8 @@ def planned_run(
     """The run of these arguments; raises where one of them is bad."""
     check_kind("scene", scene, Scene)
     sources = _sources(given, scene)
-    chunk = _positive_int("chunk", chunk, LARGEST_CHUNK)
-    bins = _positive_int("bins", bins)
+    chunk = as_whole("chunk", chunk, 1)
+    bins = as_whole("bins", bins, 1)
     rows = {
         name: np.asarray(source.values)
         for name in ("velocity", "gaps")
@@ -164,7 +148,7 @@ def planned_run(
     fewest = min((len(values) for values in rows.values()), default=None)
     if samples is None:
         samples = SAMPLES if fewest is None else fewest
-    samples = _positive_int("samples", samples)
+    samples = as_whole("samples", samples, 1)
     for name, values in rows.items():
         if len(values) < samples:
             raise ValueError(
@@ -195,28 +179,17 @@ def _sources(given: Sources, scene: Scene) -> Sources:
     law = given.law
     if not isinstance(law, Law) and not callable(law):
         raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
-    if given.gaps is None and not (is_random(given.law) or _varies(given.velocity)):
+    velocity = as_source("velocity", given.velocity, scene.size, non_negative=False)
+    gaps = as_source("gaps", given.gaps, scene.contacts, non_negative=True)
+    if gaps is None and not (is_random(law) or is_random(velocity)):
         raise ValueError(
             "Argument `gaps` must be given where neither the velocity nor the law is random: all "
             "samples would be the same."
         )
-    velocity = as_source("velocity", given.velocity, scene.size, non_negative=False)
-    gaps = given.gaps
-    if gaps is not None:
-        gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
-    sources = Sources(law, velocity, gaps)
     drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
     if not isinstance(drawn, Law):
         raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
-    return in_common_dtype(sources, scene, drawn)[0]
-
-
-def _varies(value: Any) -> bool:
-    return (
-        callable(value)
-        or not isinstance(value, list | tuple | np.ndarray | jax.Array)
-        or (np.ndim(value) == 2)
-    )
+    return in_common_dtype(Sources(law, velocity, gaps), scene, drawn)[0]
 
 
 def identity(run: Run) -> dict[str, str]:
@@ -272,14 +245,3 @@ def _key(key: Any) -> tuple[np.ndarray, str]:
 
 def _flag(name: str) -> bool:
     return bool(getattr(jax.config, name))
-
-
-def _positive_int(name: str, value: Any, most: int | None = None) -> int:
-    try:
-        number = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        raise TypeError(f"Argument `{name}` must be an integer, but has value {value!r}.") from None
-    if number < 1 or (most is not None and number > most):
-        upper = "" if most is None else f" and at most {most}"
-        raise ValueError(f"Argument `{name}` must be at least 1{upper}, but has value {value!r}.")
-    return number

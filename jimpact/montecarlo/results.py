@@ -8,22 +8,22 @@ import numpy as np
 
 from jimpact._checks import check_values
 from jimpact.law import Law
+from jimpact.montecarlo.drawing import OUTCOMES
 from jimpact.montecarlo.planning import Run
 from jimpact.montecarlo.statistics import (
     LISTED,
-    OUTCOMES,
     Chunk,
     Moments,
     bin_edges,
-    binned_quantile,
+    binned_quantiles,
     merged,
     named,
 )
+from jimpact.records import as_data, fields_as_data, table
 from jimpact.scene import Scene
 
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
-_FAILED = {name for name, _, failure in OUTCOMES if failure}
-_MESSAGE = {name: message for name, message, _ in OUTCOMES}
+_OUTCOMES = {row.name: row for row in OUTCOMES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +97,7 @@ class MonteCarlo:
         """Quantiles (..., n) [m/s] of the velocities after, from the histograms; q in [0, 1]."""
         check_values("q", q, low=0.0, high=1.0)
         ends = self.edges[:, [0, -1]]
-        found = [
-            binned_quantile(float(each), ends, self.counts, self.minimum, self.maximum)
-            for each in np.ravel(q)
-        ]
-        return np.reshape(found, (*np.shape(q), len(self.mean)))
+        return binned_quantiles(q, ends, self.counts, self.minimum, self.maximum)
 
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
         """Law, scene and velocity of sample `index`: `ji.impact(*found.replay(index))`."""
@@ -113,43 +109,29 @@ class MonteCarlo:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but samples and run, as a JSON file can hold it."""
-        arrays = "mean covariance minimum maximum gap_mean gap_covariance cross_covariance"
-        data: dict[str, Any] = {"samples": self.samples, "count": self.count}
-        data |= {name: getattr(self, name).tolist() for name in arrays.split()}
-        data["standard_error"] = self.standard_error.tolist()
-        data["quantiles"] = {f"{q:g}": self.quantile(q).tolist() for q in REPORTED}
-        data["quantile_resolution"] = self.quantile_resolution.tolist()
-        data["histogram"] = {"edges": self.edges.tolist(), "counts": self.counts.tolist()}
-        data["statuses"] = self.statuses
-        data["bad"] = [
-            {
-                "index": bad.index,
-                "status": bad.status,
-                "gaps": [_json_number(x) for x in bad.gaps],
-                "velocity": [_json_number(x) for x in bad.velocity],
-            }
-            for bad in self.bad
-        ]
-        data["gap_scale"] = None if self.gap_scale is None else self.gap_scale.tolist()
-        return data | {"rate": self.rate, "resumed": self.resumed}
+        quantiles = {f"{q:g}": self.quantile(q) for q in REPORTED}
+        derived = {"standard_error": self.standard_error, "quantiles": quantiles}
+        derived |= {"quantile_resolution": self.quantile_resolution}
+        return fields_as_data(self, "first", "run", "description") | as_data(derived)
 
     def __str__(self) -> str:
-        lines = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
-        lines += [
-            f"{'[m/s]':8s}{'mean':>12s}{'± error':>10s}{'std':>11s}"
-            + "".join(f"{f'{100 * q:g} %':>11s}" for q in REPORTED)
-            + f"{'least':>11s}{'largest':>11s}"
+        heads = ["[m/s]", "mean", "± error", "std", *(f"{100 * q:g} %" for q in REPORTED)]
+        columns = [self.std, *self.quantile(REPORTED), self.minimum, self.maximum]
+        rows = [
+            [f"v{i + 1}+", f"{mean:.6f}", f"{error:.1g}", *(f"{x[i]:.5f}" for x in columns)]
+            for i, (mean, error) in enumerate(zip(self.mean, self.standard_error))
         ]
-        quantiles = self.quantile(REPORTED)
-        for i in range(len(self.mean)):
-            row = [self.std[i], *quantiles[:, i], self.minimum[i], self.maximum[i]]
-            lines.append(
-                f"v{i + 1}+".ljust(8)
-                + f"{self.mean[i]:12.6f}{self.standard_error[i]:10.1g}"
-                + "".join(f"{x:11.5f}" for x in row)
-            )
-        lines += [f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.", ""]
-        return "\n".join([*lines, *self._gap_lines(), *self._status_lines()])
+        lines = [
+            f"{self.samples:,} samples of {self.description}",
+            self._rate(),
+            "",
+            *table([*heads, "least", "largest"], rows),
+            f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.",
+            "",
+            *self._gap_lines(),
+            *self._status_lines(),
+        ]
+        return "\n".join(lines)
 
     def _rate(self) -> str:
         if self.resumed == self.samples:
@@ -173,17 +155,12 @@ class MonteCarlo:
     def _status_lines(self) -> list[str]:
         lines = []
         for name, count in self.statuses.items():
-            left_out = ", left out" if name in _FAILED else ""
-            lines.append(f"{name}: {count:,}{left_out} ({_MESSAGE[name]})")
+            left_out = ", left out" if _OUTCOMES[name].failure else ""
+            lines.append(f"{name}: {count:,}{left_out} ({_OUTCOMES[name].message})")
         for bad in self.bad[:5]:
             gaps = f", gaps {np.array2string(bad.gaps, precision=6)} m" if bad.gaps.size else ""
             lines.append(f"  sample {bad.index}: {bad.status}{gaps}; replay({bad.index})")
         return lines
-
-
-def _json_number(value: float) -> float | str:
-    """JSON has no NaN."""
-    return float(value) if np.isfinite(value) else str(float(value))
 
 
 class Totals:

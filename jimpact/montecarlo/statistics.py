@@ -6,15 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.montecarlo.drawing import BAD_INPUTS
-from jimpact.status import STATUS, Status
+from jimpact.montecarlo.drawing import OUTCOMES
 
 MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
 FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
 LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
 SHOWN = 4096  # first samples of a run that are kept in memory for pictures
-# name, message and whether it is a failure, of every code
-OUTCOMES = [*STATUS, *(Status(*row, True) for row in BAD_INPUTS.values())]
 FAILURE = np.array([row.failure for row in OUTCOMES])
 _SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
 _PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")
@@ -107,32 +104,29 @@ def bin_edges(ends: np.ndarray, bins: int) -> np.ndarray:
     return np.linspace(ends[:, 0], ends[:, 1], bins + 1, axis=1)
 
 
-def binned_quantile(
-    q: float, ends: np.ndarray, counts: np.ndarray, low: np.ndarray, high: np.ndarray
+def binned_quantiles(
+    q: Any, ends: np.ndarray, counts: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """The q-quantiles (d,), right to one bin width where they lie inside the bins.
+    """The q-quantiles (..., d), right to one bin width where they lie inside the bins.
 
     Linear inside the bin; `low` and `high` (d,), the smallest and largest values, bound what lies
     outside the bins.
 
     >>> import numpy as np
-    >>> from jimpact.montecarlo.statistics import binned_quantile
+    >>> from jimpact.montecarlo.statistics import binned_quantiles
     >>> counts, ends = np.array([[0, 1, 1, 0]]), np.array([[0.0, 1.0]])
-    >>> binned_quantile(0.75, ends, counts, np.array([0.1]), np.array([0.9])).tolist()
+    >>> binned_quantiles(0.75, ends, counts, np.array([0.1]), np.array([0.9])).tolist()
     [0.75]
     """
     inner = bin_edges(ends, counts.shape[1] - 2)
-    left = np.concatenate([np.minimum(low, inner[:, 0])[:, None], inner], axis=1)
-    right = np.concatenate([inner, np.maximum(high, inner[:, -1])[:, None]], axis=1)
-    found = np.empty(len(counts))
-    for i, count in enumerate(counts):
-        after = np.cumsum(count)
-        wanted = q * after[-1]
-        k = int(np.searchsorted(after, wanted))
-        k = k if count[k] else int(np.flatnonzero(count)[0])  # q = 0: the first bin in use
-        part = (wanted - (after[k] - count[k])) / count[k]
-        found[i] = left[i, k] + part * (right[i, k] - left[i, k])
-    return np.clip(found, low, high)
+    first, last = np.minimum(low, inner[:, 0]), np.maximum(high, inner[:, -1])
+    edges = np.column_stack([first, inner, last])
+    below = np.cumsum(np.column_stack([np.zeros(len(counts)), counts]), axis=1)
+    # from above: of an empty stretch between two bins the lower end is taken
+    found = [
+        np.interp(-np.asarray(q) * b[-1], -b[::-1], edge[::-1]) for b, edge in zip(below, edges)
+    ]
+    return np.clip(np.stack(found, axis=-1), low, high)
 
 
 @dataclass(frozen=True)
