@@ -10,7 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_square, check_values, is_traced
+from jimpact._checks import (
+    as_float_array,
+    check_choice,
+    check_shape,
+    check_square,
+    check_values,
+    is_traced,
+)
 from jimpact.contact import Contact, contact_of
 from jimpact.scene import Scene
 from jimpact.status import CODE
@@ -120,10 +127,8 @@ class Option:
         """The value, checked; None stays None."""
         if self.converter is not None:
             return self.converter(value)
-        if self.choices is not None and value not in self.choices:
-            raise ValueError(
-                f"Argument `{self.name}` must be one of {self.choices}, but has value {value!r}."
-            )
+        if self.choices is not None:
+            check_choice(self.name, value, self.choices)
         if self.low is not None and value is not None:
             check_values(self.name, value, low=self.low, high=self.high, open_low=self.open_low)
         return value
@@ -191,7 +196,7 @@ def option(
     >>> ji.LZB(0.9, method="euler")
     Traceback (most recent call last):
         ...
-    ValueError: Argument `method` must be one of ('time', 'impulse'), but has value 'euler'.
+    ValueError: Argument `method` must be one of time, impulse, but has value 'euler'.
     """
     declared = Option(choices, low, high, open_low, converter)
     return _field(declared, default, kw_only, True)

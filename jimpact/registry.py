@@ -4,6 +4,7 @@ import inspect
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
+from jimpact._checks import check_choice
 from jimpact.law import Law, options_of
 
 EVERY_PROPERTY = frozenset(
@@ -101,12 +102,8 @@ def register(
             raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
         if name != name.lower() or not name:
             raise ValueError(f"Argument `name` must be in small letters, but has value {name!r}.")
-        unknown = set(promises) - EVERY_PROPERTY
-        if unknown:
-            raise ValueError(
-                f"Argument `promises` must be among {', '.join(sorted(EVERY_PROPERTY))}, but has "
-                f"{sorted(unknown)[0]!r}."
-            )
+        for promise in promises:
+            check_choice("promises", promise, sorted(EVERY_PROPERTY))
         other = REGISTRY.get(name)  # of the same place: a module that is read again
         if other is not None and _place(other.law) != _place(law):
             raise ValueError(

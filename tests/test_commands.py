@@ -321,10 +321,10 @@ def test_laws(capsys):
         (["advise", "--tolerance", "2"], "`tolerance` must lie in"),
         (["advise", "--shot", "2"], "--shot must lie in [1, 1]"),
         (["advise", "--stiffness-range", "2", "1"], "low <= high"),
-        (["chart", "--methods", "magic"], "has 'magic'"),
+        (["chart", "--methods", "magic"], "`methods` must be one of"),
         (["chart", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["chart", "three_balls_gaps.toml"], "--velocity must be given"),
-        (["stability", "--methods", "rk5"], "`methods` must name some of"),
+        (["stability", "--methods", "rk5"], "`methods` must be one of"),
     ],
 )
 def test_refused(capsys, arguments, message):

@@ -4,7 +4,7 @@ from typing import Any
 
 from jimpact import plot
 from jimpact.cli import AdviseCommand
-from jimpact.commands.output import Answer, picture_path, save_picture, titled, velocities
+from jimpact.commands.output import Answer, picture_path, titled, velocities
 from jimpact.methods.advice import advise
 from jimpact.study import Study, read_study
 
@@ -13,7 +13,7 @@ _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 
 def run(given: AdviseCommand) -> Answer:
     """Advise."""
-    path = picture_path(given.out, given.name)
+    path = picture_path(given)
     study = read_study(given.study)
     before, _ = velocities(study, given)
     found = advise(
@@ -25,10 +25,8 @@ def run(given: AdviseCommand) -> Answer:
         seed=given.seed,
         **_parameters(study),
     )
-    save_picture(plot.advice(found, study.title), path)
-    data = {"title": study.title, "velocity": before.tolist(), "picture": str(path)}
-    text = f"{titled(study, before)}\n{found}\n\nPicture: {path}"
-    return Answer(data | found.to_dict(), text)
+    picture = plot.advice(found, study.title)
+    return Answer(titled(study, before), found.to_dict(), str(found), {path: picture})
 
 
 def _parameters(study: Study) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from jimpact import plot
 from jimpact.cli import ChartCommand
-from jimpact.commands.output import Answer, picture_path, save_picture, titled, velocities
+from jimpact.commands.output import Answer, picture_path, titled, velocities
 from jimpact.laws import REGISTRY
 from jimpact.laws.lzb import LZB
 from jimpact.methods.chart import work_precision
@@ -14,7 +14,7 @@ SLOW_TO_COMPILE = ("tsit5", "kvaerno5")  # left to --full
 
 def run(given: ChartCommand) -> Answer:
     """Measure."""
-    path = picture_path(given.out, given.name)
+    path = picture_path(given)
     study = read_study(given.study)
     law = _law(study)
     before, _ = velocities(study, given)
@@ -27,9 +27,8 @@ def run(given: ChartCommand) -> Answer:
         repeats=given.repeats,
         gradients=not given.no_gradients,
     )
-    save_picture(plot.work_precision(found, study.title), path)
-    text = f"{titled(study, before)}\n{found}\n\nPicture: {path}"
-    return Answer({"title": study.title, "picture": str(path)} | found.to_dict(), text)
+    picture = plot.work_precision(found, study.title)
+    return Answer(titled(study, before), found.to_dict(), str(found), {path: picture})
 
 
 def _law(study: Study) -> LZB:

@@ -6,7 +6,7 @@ import numpy as np
 
 from jimpact import plot
 from jimpact.cli import CompareCommand
-from jimpact.commands.output import Answer, picture_path, save_picture, titled, velocities
+from jimpact.commands.output import Answer, picture_path, titled, velocities
 from jimpact.comparison import compare, registered_laws
 from jimpact.fits.fitting import Fit
 from jimpact.records import as_data, table
@@ -15,27 +15,24 @@ from jimpact.study import Study, read_study
 
 def run(given: CompareCommand) -> Answer:
     """Compare."""
-    path = picture_path(given.out, given.name)
+    path = picture_path(given)
     study = read_study(given.study)
     before, measured = velocities(study, given)
     laws, left_out = registered_laws(study.parameters)
     found = compare(study.scene, before, laws)
     found = replace(found, left_out=left_out, measured=measured)
     fits = _fits(study) if given.fit else {}
-    save_picture(plot.comparison(found, measured, study.title), path)
     values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     lines = [
-        titled(study, before),
         str(found),
         *(_table(fits) if fits else []),
         f"Parameters: {values}.",
         "Dispersion: 0 all energy in one body, 1 equal shares. Time: one compiled call, its "
         "argument checks included.",
-        f"Picture: {path}",
     ]
-    data = {"title": study.title, "velocity": before, "laws": found, "fits": fits}
-    data |= {"left_out": left_out, "picture": str(path)}
-    return Answer(as_data(data), "\n".join(lines))
+    data = {"velocity": before, "laws": found, "fits": fits, "left_out": left_out}
+    picture = plot.comparison(found, measured, study.title)
+    return Answer(titled(study, before), as_data(data), "\n".join(lines), {path: picture})
 
 
 def _fits(study: Study) -> dict[str, Fit]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from jimpact import plot
 from jimpact.cli import FitCommand
-from jimpact.commands.output import Answer, picture_path, save_picture
+from jimpact.commands.output import Answer, picture_path
 from jimpact.fits.fitting import Fit
 from jimpact.laws import Newton
 from jimpact.laws.lzb import LZB
@@ -19,14 +19,13 @@ RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newt
 
 def run(given: FitCommand) -> Answer:
     """Fit."""
-    path = picture_path(given.out, given.name)
+    path = picture_path(given)
     study = read_study(given.study, given.law)
     fits = _all_fits(study, {"method": given.method, "starts": given.starts, "seed": given.seed})
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
-    save_picture(plot.fit(fits[RAW], others, study.title), path)
-    data = {"title": study.title, "fits": fits, "picture": str(path)}
-    text = "\n".join([study.title, *_summary(fits), "", str(fits[RAW]), "", f"Picture: {path}"])
-    return Answer(as_data(data), text)
+    picture = plot.fit(fits[RAW], others, study.title)
+    text = "\n".join([*_summary(fits), "", str(fits[RAW]), ""])
+    return Answer(study.title, as_data({"fits": fits}), text, {path: picture})
 
 
 def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:

@@ -19,7 +19,8 @@ def run(given: LawsCommand) -> Answer:
         import_laws(given.module, Path())
     rows = {name: {k: getattr(row, k) for k in COLUMNS} for name, row in REGISTRY.items()}
     if given.bibtex:
-        return Answer(rows, "\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values())))
+        entries = dict.fromkeys(row.bibtex for row in REGISTRY.values())
+        return Answer("", rows, "\n\n".join(entries), {})
     table = Table()
     for title in ("law", "parameters", "says", "right when", "fails when"):
         table.add_column(title, overflow="fold")
@@ -29,4 +30,4 @@ def run(given: LawsCommand) -> Answer:
     console = Console()
     with console.capture() as text:
         console.print(table)
-    return Answer(rows, text.get().rstrip())
+    return Answer("", rows, text.get().rstrip(), {})

@@ -6,7 +6,7 @@ from typing import Any
 
 from jimpact import plot
 from jimpact.cli import MonteCarloCommand
-from jimpact.commands.output import Answer, picture_path, save_picture
+from jimpact.commands.output import Answer, picture_path
 from jimpact.montecarlo.executors import DaskExecutor
 from jimpact.montecarlo.running import monte_carlo
 from jimpact.study import Study, read_study
@@ -14,16 +14,15 @@ from jimpact.study import Study, read_study
 
 def run(given: MonteCarloCommand) -> Answer:
     """Sample."""
-    path = picture_path(given.out, given.name)
+    path = picture_path(given)
     study = read_study(given.study)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
         found = monte_carlo(**_arguments(study, given))
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
-    save_picture(plot.monte_carlo(found, study.title), path)
-    data = {"title": study.title, "picture": str(path)} | found.to_dict()
-    return Answer(data, f"{study.title}\n{found}\n\nPicture: {path}")
+    picture = plot.monte_carlo(found, study.title)
+    return Answer(study.title, found.to_dict(), str(found), {path: picture})
 
 
 def _arguments(study: Study, given: MonteCarloCommand) -> dict[str, Any]:

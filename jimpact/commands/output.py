@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from jimpact.cli import Command, ShotCommand
+from jimpact.cli import Command, DrawingCommand, ShotCommand
 from jimpact.study import Study
 
 if TYPE_CHECKING:
@@ -22,10 +22,12 @@ INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
 
 
 class Answer(NamedTuple):
-    """What a command found: for --json, for people, and what went wrong all the same."""
+    """What a command found: for --json, for people, as pictures; what went wrong all the same."""
 
+    title: str
     data: dict[str, Any]
     text: str
+    pictures: dict[Path, "Figure"]
     failure: str = ""
 
 
@@ -34,13 +36,22 @@ def run(given: Command) -> int:
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
     try:
         answer = import_module(f"jimpact.commands.{given.name}").run(given)
+        for path, figure in answer.pictures.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            figure.savefig(path, dpi=DPI)
     except KeyboardInterrupt as stop:
         return _refuse(given, str(stop) or "stopped.", INTERRUPTED)
     except (ValueError, TypeError, OSError, ImportError) as error:
         return _refuse(given, str(error), BAD_INPUT)
     except RuntimeError as error:
         return _refuse(given, str(error), FAILURE)
-    print(dumps(answer.data, indent=2) if given.json else answer.text)
+    pictures = [str(path) for path in answer.pictures]
+    if given.json:
+        about = {"title": answer.title, "pictures": pictures} if pictures else {}
+        print(dumps(about | answer.data, indent=2))
+    else:
+        lines = [answer.title, answer.text, *(f"Picture: {path}" for path in pictures)]
+        print("\n".join(line for line in lines if line))
     return _refuse(given, answer.failure, FAILURE) if answer.failure else 0
 
 
@@ -49,20 +60,18 @@ def _refuse(given: Command, reason: str, code: int) -> int:
     return code
 
 
-def picture_path(out: Path, name: str, option: str = "--out") -> Path:
-    """The file `out`, or the command's own in the directory `out`; other endings are refused."""
-    path = out if out.suffix else out / f"jimpact-{name}.png"
+def picture_path(given: DrawingCommand) -> Path:
+    """The file --out, or the command's own in the directory --out."""
+    return checked(given.out if given.out.suffix else given.out / f"jimpact-{given.name}.png")
+
+
+def checked(path: Path, option: str = "--out") -> Path:
+    """The path of a picture; other endings are refused."""
     if path.suffix not in KINDS:
         raise ValueError(
-            f"{option} must end in .png, .pdf or .svg or be a directory, but is '{out}'."
+            f"{option} must end in .png, .pdf or .svg or be a directory, but is '{path}'."
         )
     return path
-
-
-def save_picture(figure: "Figure", path: Path) -> None:
-    """Write it; missing folders are made."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=DPI)
 
 
 def velocities(study: Study, given: ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:

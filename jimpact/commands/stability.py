@@ -4,7 +4,7 @@ from typing import Any
 
 from jimpact import plot
 from jimpact.cli import StabilityCommand
-from jimpact.commands.output import Answer, picture_path, save_picture
+from jimpact.commands.output import Answer, picture_path
 from jimpact.methods.stability import stability_map
 
 STEPS = 5_000  # of a run
@@ -14,7 +14,7 @@ TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at 
 
 def run(given: StabilityCommand) -> Answer:
     """Map; the picture of single axes, and where there are pairs, one more beside it a method."""
-    path = picture_path(given.out, given.name)
+    path = picture_path(given)
     size: dict[str, Any] = {"resolution": QUICK_RESOLUTION}
     if given.full:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
@@ -23,8 +23,4 @@ def run(given: StabilityCommand) -> Answer:
     for name in found.methods if given.full else ():
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
         pictures[beside] = plot.stability_pairs(found, name)
-    for file, figure in pictures.items():
-        save_picture(figure, file)
-    written = [str(file) for file in pictures]
-    text = f"{found}\n\nPictures: {', '.join(written)}"
-    return Answer(found.to_dict() | {"pictures": written}, text)
+    return Answer("", found.to_dict(), str(found), pictures)

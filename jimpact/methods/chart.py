@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_values, in_common_dtype
+from jimpact._checks import as_whole, check_choice, check_values, in_common_dtype
 from jimpact.comparison import registered_laws
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
@@ -274,10 +274,7 @@ def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict
 
 
 def _able(argument: str, name: str, case: Case) -> Method:
-    if name not in METHODS:
-        raise ValueError(
-            f"Argument `{argument}` must be among {', '.join(METHODS)}, but has {name!r}."
-        )
+    check_choice(argument, name, METHODS)
     checked(case.law, case.scene, METHODS[name])
     return METHODS[name]
 
@@ -287,8 +284,7 @@ def _ladders(
 ) -> dict[str, tuple[float, ...]]:
     """Settings by method."""
     for name, values in settings.items():
-        if name not in [method.name for method in chosen]:
-            raise ValueError(f"Argument `settings` must be of chosen methods, but has {name!r}.")
+        check_choice("settings", name, [method.name for method in chosen])
         check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
     return {m.name: tuple(settings.get(m.name, m.ladder)) for m in chosen}
 

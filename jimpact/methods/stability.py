@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_values
+from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.methods.contenders import METHODS, Method
 from jimpact.methods.stability_points import (
     AXES,
@@ -173,8 +173,7 @@ def stability_map(
     >>> found.counts("verlet")["right"]
     1
     """
-    if slices not in SLICES:
-        raise ValueError(f"Argument `slices` must be one of {SLICES}, but has value {slices!r}.")
+    check_choice("slices", slices, SLICES)
     samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
@@ -215,18 +214,15 @@ def stability_map(
 def _methods(names: Sequence[str] | None) -> list[Method]:
     known = {"default": DEFAULT} | {name: m for name, m in METHODS.items() if m.jax}
     names = NAMES if names is None else tuple(names)
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        raise ValueError(f"Argument `methods` must name some of {tuple(known)}, but has {unknown}.")
+    for name in names or ("",):
+        check_choice("methods", name, known)
     return [known[name] for name in names]
 
 
 def _known(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
     """Values by axis, checked."""
-    unknown = sorted(set(values) - set(AXES))
-    if unknown:
-        raise ValueError(f"Argument `{argument}` must name some of {AXES}, but has {unknown}.")
     for name, value in values.items():
+        check_choice(argument, name, AXES)
         low, high = _RANGES[name]
         check_values(f"{argument}[{name!r}]", value, low=low, high=high)
     return values
@@ -243,9 +239,8 @@ def _axes(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str, np.nd
             "mass_ratio": np.logspace(-6, 6, r),
             "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
         }
-    if not axes:
-        raise ValueError(f"Argument `axes` must name some of {AXES}, but is empty.")
-    found = {name: np.unique(np.asarray(x, float)) for name, x in _known("axes", axes).items()}
+    axes = _known("axes", axes or {"": ()})
+    found = {name: np.unique(np.asarray(x, float)) for name, x in axes.items()}
     balls = found.get("balls", np.zeros(0))
     if (balls != np.round(balls)).any():
         raise ValueError(f"Argument `axes['balls']` must hold whole numbers, but has {balls}.")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_values
+from jimpact._checks import as_float_array, check_choice, check_per_contact, check_values
 from jimpact.comparison import dispersion_index
 from jimpact.impacts import impact
 from jimpact.law import Law
@@ -42,10 +42,7 @@ class ValidityMap:
 
     def error(self, law: str) -> np.ndarray:
         """Error of v+ of 'moreau' or 'binary' against LZB (x, r), relative to max |v-|."""
-        if law not in self.laws:
-            raise ValueError(
-                f"Argument `law` must be one of {', '.join(self.laws)}, but has value {law!r}."
-            )
+        check_choice("law", law, self.laws)
         scale = np.abs(self.before).max()
         return np.abs(self.velocity - self.laws[law]).max(axis=-1) / scale
 
