@@ -3,7 +3,7 @@
 import math
 import textwrap
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -14,10 +14,10 @@ from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.kinematic import Newton
 from jimpact.laws.lzb import LZB
-from jimpact.methods.advice_evidence import Block, Candidate, Unknown
 from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
 from jimpact.records import as_data, fields_as_data, number, table
 from jimpact.scene import Scene
+from jimpact.status import CODE, STATUS
 
 _WIDTH = 92  # of the printed lines
 _BODIES = 5  # in the printed table
@@ -27,6 +27,69 @@ _PERCENT_FROM = 1e-4
 _ROUNDING = 1e-12
 _NONE = 1e-6  # a change of v+ below, relative to max |v-|, is told as none
 NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
+
+
+class Block(NamedTuple):
+    """Contacts that feel each other, 0-based; the kinetic angles [deg] between coupled ones."""
+
+    contacts: tuple[int, ...]
+    approaches: bool
+    angles: tuple[float, float] | None
+    law: str | None = None  # the simplest one that is within tolerance in this block
+
+    @property
+    def name(self) -> str:
+        """Contacts counted from 1."""
+        return ", ".join(str(j + 1) for j in self.contacts)
+
+
+class Unknown(NamedTuple):
+    """A stiffness known within a range only: of `contact`, over that of `base` (None: SI).
+
+    What it does to v+ by itself, relative to max |v-|: `alone`: largest change over its range;
+    `slope`: |d v+ / d ln k|; `needed`: relative accuracy of k at which it moves v+ by the
+    tolerance (inf: it does not).
+    """
+
+    contact: int
+    base: int | None
+    nominal: float
+    low: float
+    high: float
+    alone: float = math.nan
+    slope: float = math.nan
+    needed: float = math.nan
+
+    @property
+    def name(self) -> str:
+        """`k2/k1`, contacts counted from 1."""
+        return f"k{self.contact + 1}" + ("" if self.base is None else f"/k{self.base + 1}")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A law, the scene to use it on (contacts taken as closed or not), and how it fares.
+
+    `velocity` (n,) at the nominal stiffness; `low`, `high` (n,) over the unknown ratios; `median`
+    and `worst` error of v+ against the reference over them, relative to max |v-|; `cost` per
+    impact in a batch, in units of the cheapest law's (None: not timed).
+    """
+
+    law: Law
+    scene: Scene
+    velocity: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    median: float
+    worst: float
+    status: str
+    cost: float | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether the status allows to use the outcome, whatever order contacts are numbered in."""
+        code = CODE[self.status]
+        return not STATUS[code].failure and self.status != "order_dependent"
 
 
 @dataclass(frozen=True)

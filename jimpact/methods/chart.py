@@ -17,7 +17,7 @@ from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
-from jimpact.methods.contenders import METHODS, UNCOUNTED, Method, checked, outcome
+from jimpact.methods.contenders import METHODS, UNCOUNTED, Method, outcome
 from jimpact.progress import counting_bar
 from jimpact.records import fields_as_data, number, table
 from jimpact.scene import Scene, as_velocity, kinetic_energy
@@ -275,7 +275,11 @@ def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict
 
 def _able(argument: str, name: str, case: Case) -> Method:
     check_choice(argument, name, METHODS)
-    checked(case.law, case.scene, METHODS[name])
+    reason = METHODS[name].supports(case.law, case.scene)
+    if reason is not None:
+        raise ValueError(
+            f"Argument `{argument}` must be able to solve the impact, but has {name!r}: {reason}."
+        )
     return METHODS[name]
 
 

@@ -1,54 +1,119 @@
-"""`stability_map`: where a method of integration is right, flagged, wrong, or worse."""
+"""`stability_map`: where a method of integration is right, flagged, wrong, or worse.
 
-from collections.abc import Mapping, Sequence
+# notation: a point is a row (6,) of AXES
+#   setting           0 coarse .. 1 fine, log-linear in what the method takes (`setting_of`)
+#   stiffness_ratio   kappa: stiffness of the right half of the contacts; the left half has 1
+#   exponent          eta of all contacts
+#   restitution       e of all contacts
+#   mass_ratio        mu: mass of the middle ball; all others have 1
+#   balls             N, a touching chain without walls; v- = (1, 0, .., 0)
+
+A batch is one compiled function a method and number of balls, over lanes of points; lanes of
+one chunk wait for the slowest, so the number of steps is bounded.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values
-from jimpact.methods.contenders import METHODS, Method
-from jimpact.methods.stability_points import (
-    AXES,
-    CAUSES,
-    CLASSES,
-    CONFIRMED,
-    DEFAULT,
-    FIXED_STEP_RIGHT,
-    HONEST,
-    REFERENCE_RTOL,
-    Confirmation,
-    Slice,
-    classes_of,
-    references,
-    runner,
-)
+from jimpact.audits import audit
+from jimpact.events.impact_dynamics import solve
+from jimpact.laws.lzb import LZB
+from jimpact.methods.contenders import METHODS
+from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
 from jimpact.progress import counting_bar
 from jimpact.records import as_data, fields_as_data, table
+from jimpact.scene import Scene, chain
+from jimpact.status import CODE
 
+
+class Axis(NamedTuple):
+    """Value of an axis at the base point of the slices, and the ends of its range."""
+
+    base: float
+    low: float
+    high: float
+
+
+_AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
+    "setting": Axis(0.6, 0.0, 1.0),
+    "stiffness_ratio": Axis(1.0, 1e-8, 1e8),
+    "exponent": Axis(1.5, 1.0, 5.0),
+    "restitution": Axis(0.9, 0.0, 1.0),
+    "mass_ratio": Axis(1.0, 1e-6, 1e6),
+    "balls": Axis(3.0, 2.0, 1000.0),
+}
+AXES = tuple(_AXES)
+# kind of setting (see `jimpact.methods.contenders.Method`): value at level 0 and at level 1
+SETTINGS = {"rtol": (1e-2, 1e-12), "step": (3.0, 3e-3), "impulse step": (0.3, 3e-5)}
+
+CLASSES = (
+    "right",
+    "flagged",
+    "wrong",
+    "gains energy",
+    "stalls",
+    "does not end",
+    "not finite",
+    "unchecked",
+)
+(RIGHT, FLAGGED, WRONG, GAINS_ENERGY, STALLS, ENDLESS, NOT_FINITE, UNCHECKED) = range(8)
+HONEST = 10.0  # error over tolerance up to which a result counts as right
+FIXED_STEP_RIGHT = 1e-3  # the same of methods with a step: error in v+ over the largest |v-|
+FINER = 0.1  # setting at which a wrong result is tried again: it stalls if the error does
+FALLS = 0.5  # not fall below this part
+LANES = 32
+
+REFERENCE_RTOL = 1e-12
+CHECK_RTOL = 1e-11  # of the run by scipy
+CONFIRMED = 1e-7  # difference from it up to which the reference counts as confirmed
+CHECKED = 12  # points
+QUICK_UP_TO, QUICK_BALLS = 1e3, 10  # frequencies over the slowest contact's, size of a chain
+
+CAUSES = (  # limits, formulas and remedies: docs/stability.md
+    "refused beforehand",
+    "step beyond the linear stability limit",
+    "a contact's whole stroke lies within one step",
+    "contacts re-close without end",
+    "time scales far apart",
+    "many contacts at once",
+    "first order at E = 0",
+    "steps straddle changes of phase",
+)
+(_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
+STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # step sqrt(lambda_max)
+RECLOSING = 0.1  # e below which three balls re-close (nearly) without end
+_LONG, _CLUSTERED = 10, 0.9  # chains this long stay clustered up to about this e
+_FAR = 100.0  # times between the frequencies of contacts
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 SLICES = ("one", "pairs")
-BASE = {  # three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
-    "setting": 0.6,
-    "stiffness_ratio": 1.0,
-    "exponent": 1.5,
-    "restitution": 0.9,
-    "mass_ratio": 1.0,
-    "balls": 3.0,
-}
 BALLS = (2, 3, 5, 10, 30, 100)
 _FEW_BALLS, _FEW = (2, 3, 10), 8  # every number of balls is compiled apart: few where it is coarse
-_RANGES = {
-    "setting": (0.0, 1.0),
-    "stiffness_ratio": (1e-8, 1e8),
-    "exponent": (1.0, 5.0),
-    "restitution": (0.0, 1.0),
-    "mass_ratio": (1e-6, 1e6),
-    "balls": (2, 1000),
-}
+
+
+class Slice(NamedTuple):
+    """Classes and errors over one axis (K,) or two (K1, K2); index of CLASSES, of CAUSES."""
+
+    axes: tuple[str, ...]
+    codes: np.ndarray
+    error: np.ndarray
+    cause: np.ndarray
+
+
+class Confirmation(NamedTuple):
+    """How many references another integrator could confirm, and the largest difference there."""
+
+    points: int
+    tried: int
+    confirmed: int
+    difference: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +124,7 @@ class StabilityMap:
         methods: the names.
         axes, base: values along every axis; the base point of the slices.
         slices: by method, first those over one axis, then pairs.
-        samples: Latin-hypercube points (S, 6), columns `jimpact.methods.stability_points.AXES`.
+        samples: Latin-hypercube points (S, 6), columns `jimpact.methods.stability.AXES`.
         sampled: by method, a `Slice` over the samples.
         confirmation: of the reference, by an integrator that shares no code with it.
         max_steps: of every run.
@@ -178,7 +243,8 @@ def stability_map(
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
     chosen, lines = _methods(methods), _axes(axes, as_whole("resolution", resolution, 2))
-    start = BASE | {name: float(x) for name, x in _known("base", base or {}).items()}
+    start = {name: axis.base for name, axis in _AXES.items()}
+    start |= {name: float(x) for name, x in _known("base", base or {}).items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
     if slices == "pairs":
         axis_sets += list(combinations(lines, 2))
@@ -223,8 +289,8 @@ def _known(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
     """Values by axis, checked."""
     for name, value in values.items():
         check_choice(argument, name, AXES)
-        low, high = _RANGES[name]
-        check_values(f"{argument}[{name!r}]", value, low=low, high=high)
+        axis = _AXES[name]
+        check_values(f"{argument}[{name!r}]", value, low=axis.low, high=axis.high)
     return values
 
 
@@ -274,3 +340,248 @@ def _sample_points(
         between = np.interp(place, np.arange(len(values)), scaled)
         found[:, AXES.index(name)] = np.exp(between) if powers else between
     return found
+
+
+# --------------------------------------------------------------------------- running methods
+
+
+def setting_of(kind: str, level: Any) -> Any:
+    """The number a method takes at `level` in [0, 1].
+
+    >>> from jimpact.methods.stability import setting_of
+    >>> round(float(setting_of("rtol", 0.6)), 12)
+    1e-08
+    """
+    coarse, fine = SETTINGS[kind]
+    return coarse * (fine / coarse) ** level
+
+
+def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
+    """Masses (N,) [kg] and stiffnesses (N - 1,) of a point.
+
+    Contact j = 1..N-1 belongs to the right half where j > N // 2; ball N // 2 + 1 is the middle.
+
+    >>> from jimpact.methods.stability import chain_of
+    >>> [values.tolist() for values in chain_of(10.0, 0.5, 4)]
+    [[1.0, 1.0, 0.5, 1.0], [1.0, 1.0, 10.0]]
+    """
+    kappa, mu = jnp.asarray(kappa, float), jnp.asarray(mu, float)
+    middle = balls // 2
+    mass = jnp.where(jnp.arange(balls) == middle, mu, jnp.ones_like(mu))
+    stiffness = jnp.where(jnp.arange(balls - 1) >= middle, kappa, jnp.ones_like(kappa))
+    return mass, stiffness
+
+
+def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+    """What `ji.impact(ji.LZB(..., rtol=setting), ...)` does."""
+    given = problem(law, scene, velocity, setting)
+    p, _, code = solve(given.dynamics, given.max_steps, law.method)
+    unknown = jnp.full((), jnp.nan, p.dtype)
+    return in_si(given, p / given.units.momentum, unknown, jnp.asarray(-1), code)
+
+
+DEFAULT = Method(
+    "default", "jimpact's default", "rtol", (1e-4, 1e-8, 1e-12), _solve_default, lzb_only
+)
+
+
+class Found(NamedTuple):
+    """Velocities after (L, n), status of the method and of the impact, energy gained over T-."""
+
+    velocity: np.ndarray
+    code: np.ndarray
+    status: np.ndarray
+    gain: np.ndarray
+
+
+Runner = Callable[[np.ndarray, Any], Found]  # of points (L, 6) and settings () or (L,)
+Runners = Callable[[Method, int, bool], Runner]
+
+
+def runner(max_steps: int, method: Method, balls: int, linear: bool) -> Runner:
+    """One method on chains of so many balls.
+
+    `linear`: the exponent is the static 1.0, which some methods ask for.
+    """
+
+    def one(point: jax.Array, setting: jax.Array) -> tuple[jax.Array, ...]:
+        _, kappa, eta, e, mu, _ = point
+        mass, stiffness = chain_of(kappa, mu, balls)
+        scene, v = chain(mass), jnp.zeros_like(mass).at[0].set(1.0)
+        law = LZB(e, stiffness, 1.0 if linear else eta, max_steps=max_steps)
+        found = method.solve(law, scene, v, setting)
+        out = outcome(law, scene, v, found)
+        return out.velocity, found.code, out.status, audit(scene, v, out).energy_gain
+
+    batch = jax.jit(jax.vmap(one))
+
+    def run(points: np.ndarray, settings: Any) -> Found:
+        settings, rows = np.broadcast_to(settings, len(points)), []
+        for begin in range(0, len(points), LANES):
+            lanes = np.arange(begin, begin + LANES).clip(max=len(points) - 1)  # the last repeats
+            out = batch(jnp.asarray(points[lanes]), jnp.asarray(settings[lanes]))
+            rows.append([np.asarray(x)[: len(points) - begin] for x in out])
+        return Found(*(np.concatenate(column) for column in zip(*rows)))
+
+    return run
+
+
+def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int, bool]]:
+    """Points (indices) of equal shapes, their number of balls, whether they are linear."""
+    balls, linear = points[:, AXES.index("balls")], points[:, AXES.index("exponent")] == 1.0
+    for n, kind in np.unique(np.stack([balls, linear], axis=1), axis=0):
+        yield np.flatnonzero((balls == n) & (linear == kind)), int(n), bool(kind)
+
+
+# --------------------------------------------------------------------------- the references
+
+
+def references(
+    points: np.ndarray, runners: Runners, advance: Callable[[int], None]
+) -> tuple[np.ndarray, Confirmation]:
+    """v+ of every point (P, most balls), NaN where no run ends; how many scipy confirms."""
+    exact = np.full((len(points), int(points[:, AXES.index("balls")].max())), np.nan)
+    for at, balls, linear in _groups(points):
+        unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
+        rows = np.column_stack([np.zeros(len(unique)), unique])
+        found = runners(DEFAULT, balls, linear)(rows, REFERENCE_RTOL)
+        ended = (found.code == CODE["ok"]) | (found.code == CODE["plastic_limit"])
+        exact[at, :balls] = np.where(ended[:, None], found.velocity, np.nan)[np.ravel(back)]
+        advance(len(at))
+    return exact, _confirm(points, exact)
+
+
+def _confirm(points: np.ndarray, exact: np.ndarray) -> Confirmation:
+    """Differences from scipy's integrator at points spread over those that it solves quickly."""
+    quick = np.array([_is_quick(point) for point in points])
+    candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
+    _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
+    candidates = candidates[np.sort(first)]
+    every = max(1, -(-len(candidates) // CHECKED))
+    apart = np.array([_by_scipy(points[i], exact[i]) for i in candidates[::every]])
+    largest = float(apart.max(initial=0.0)) if len(apart) else float("nan")
+    return Confirmation(len(points), len(apart), int((apart <= CONFIRMED).sum()), largest)
+
+
+def _is_quick(point: np.ndarray) -> bool:
+    highest, apart = frequencies(point)
+    parts = point[AXES.index("restitution")] >= RECLOSING  # else scipy may end it too early
+    few = point[AXES.index("balls")] <= QUICK_BALLS
+    return bool(parts and few and highest * apart < QUICK_UP_TO)
+
+
+def _by_scipy(point: np.ndarray, exact: np.ndarray) -> float:
+    _, kappa, eta, e, mu, balls = map(float, point)
+    mass, stiffness = chain_of(kappa, mu, int(balls))
+    scene, v = chain(mass), np.eye(int(balls))[0]
+    law = LZB(e, stiffness, eta)
+    found = METHODS["scipy_dop853"].solve(law, scene, v, CHECK_RTOL)
+    return float(np.abs(outcome(law, scene, v, found).velocity - exact[: len(v)]).max())
+
+
+# ------------------------------------------------------------------------ classes and causes
+
+
+def classes_of(
+    method: Method,
+    points: np.ndarray,
+    exact: np.ndarray,
+    runners: Runners,
+    advance: Callable[[int], None],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Class, error (over the largest |v-|, which is 1) and cause of every point."""
+    codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
+    level = points[:, AXES.index("setting")]
+    setting = setting_of(method.setting, level)
+    allowed = np.full(len(points), FIXED_STEP_RIGHT)
+    if method.setting == "rtol":
+        allowed = HONEST * setting
+    for group, balls, linear in _groups(points):
+        run = runners(method, balls, linear)
+
+        def off(found: Found, at: np.ndarray, balls: int = balls) -> np.ndarray:
+            return np.abs(found.velocity - exact[at, :balls]).max(axis=1)
+
+        at = group[~_refused(method, points[group], linear)]
+        if len(at):
+            found = run(points[at], setting[at])
+            errors[at] = off(found, at)
+            codes[at] = _classified(found, errors[at], allowed[at])
+        wrong = at[codes[at] == WRONG]
+        if len(wrong):
+            finer = run(points[wrong], FINER * setting[wrong])
+            falls = off(finer, wrong) < FALLS * errors[wrong]
+            codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
+        advance(len(group))
+    causes = np.full(len(points), -1)
+    for i in np.flatnonzero(codes != RIGHT):
+        causes[i] = _cause(method, points[i], CLASSES[codes[i]], float(setting[i]))
+    return codes, errors, causes
+
+
+def _refused(method: Method, points: np.ndarray, linear: bool) -> np.ndarray:
+    """Points (L,) on which the method says beforehand that it cannot work."""
+    pair, exponent = chain(jnp.ones(2)), 1.0 if linear else jnp.asarray(1.5)
+    at_0, at_1 = (method.supports(LZB(e, exponent=exponent), pair) for e in (0.0, 1.0))
+    e = points[:, AXES.index("restitution")]
+    return np.where(e == 0, at_0 is not None, at_1 is not None)
+
+
+def _classified(found: Found, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Classes (L,) before a finer setting is tried; `error` NaN where there is no reference."""
+    status = np.where(found.code == CODE["ok"], found.status, found.code)
+    cases = {
+        NOT_FINITE: status == CODE["not_finite"],
+        ENDLESS: status == CODE["max_steps"],
+        RIGHT: error <= allowed,
+        GAINS_ENERGY: (status == CODE["energy_gain"]) | (found.gain > allowed),
+        FLAGGED: status != CODE["ok"],
+        WRONG: np.isfinite(error),
+    }
+    return np.select(list(cases.values()), list(cases), UNCHECKED)
+
+
+def frequencies(point: np.ndarray) -> tuple[float, float]:
+    """`sqrt(lambda_max)` of the linearized flow in units of the fastest contact, and the ratio of
+    the fastest contact's frequency to the slowest's.
+
+    lambda: eigenvalues of `omega G omega eta (eta + 1) / (2 e^2)`, the slope of the force at x = 1.
+
+    >>> import numpy as np
+    >>> from jimpact.methods.stability import frequencies
+    >>> [round(x, 3) for x in frequencies(np.array([0.5, 1.0, 1.0, 1.0, 1.0, 2]))]
+    [1.0, 1.0]
+    """
+    _, kappa, eta, e, mu, balls = map(float, point)
+    mass, k = (np.asarray(x, float) for x in chain_of(kappa, mu, int(balls)))
+    w = 1 / mass[:-1] + 1 / mass[1:]
+    # 1 / t_ref at the largest normalized speed, up to a common factor
+    omega = k ** (1 / (eta + 1)) * np.sqrt(w)
+    slowest = omega.max() / omega.min()
+    omega = omega / omega.max()
+    beside = -1 / mass[1:-1] / np.sqrt(w[:-1] * w[1:])
+    g = np.eye(len(w)) + np.diag(beside, 1) + np.diag(beside, -1)
+    largest = np.linalg.eigvalsh(omega[:, None] * g * omega[None, :])[-1]
+    with np.errstate(divide="ignore"):
+        return float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf, float(slowest)
+
+
+def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
+    """Index of CAUSES."""
+    e, balls = point[AXES.index("restitution")], point[AXES.index("balls")]
+    highest, apart = frequencies(point)
+    reach = setting * highest
+    if name == "flagged" and e == 0:
+        return _REFUSED
+    if method.setting == "step" and reach > 1:
+        return _UNSTABLE if reach > STABLE.get(method.name, np.inf) else _COARSE
+    if name in ("does not end", "flagged", "unchecked"):
+        if e < RECLOSING:
+            return _RECLOSES
+        if apart > _FAR or point[AXES.index("mass_ratio")] < 1 / _FAR:
+            return _APART
+        if balls >= _LONG and e < _CLUSTERED:
+            return _CLUSTER
+    if method.setting == "impulse step":
+        return _FIRST_ORDER
+    return _STRADDLES if name in ("wrong", "stalls", "gains energy") else _APART

@@ -8,10 +8,10 @@ import numpy as np
 
 from jimpact._checks import check_values
 from jimpact.law import Law
-from jimpact.montecarlo.drawing import OUTCOMES
 from jimpact.montecarlo.planning import Run
 from jimpact.montecarlo.statistics import (
     LISTED,
+    OUTCOMES,
     Chunk,
     Moments,
     bin_edges,

@@ -13,10 +13,9 @@ import numpy as np
 from jimpact._checks import in_common_dtype
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
-from jimpact.montecarlo.drawing import Sources
 from jimpact.montecarlo.executors import Executor, as_executor
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.planning import BINS, CHUNK, Run, description, identity, planned_run
+from jimpact.montecarlo.planning import BINS, CHUNK, Run, Sources, planned_run
 from jimpact.montecarlo.results import MonteCarlo, Totals
 from jimpact.montecarlo.statistics import Chunk
 from jimpact.montecarlo.store import Store
@@ -85,13 +84,13 @@ def monte_carlo(
     chosen = as_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
-    store = None if folder is None else Store(folder, identity(run))
+    store = None if folder is None else Store(folder, run.identity)
     begin = time.perf_counter()
     totals = _totals(run, chosen, store, progress)
     seconds = time.perf_counter() - begin
     found = totals.result(
         rate=(run.samples - totals.resumed) / seconds,
-        description=description(run),
+        description=run.description,
         gap_scale=_gap_scale(run.plan.sources, scene),
     )
     failed = found.samples - found.count

@@ -6,12 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.montecarlo.drawing import OUTCOMES
+from jimpact.status import STATUS, Status
 
 MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
 FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
 LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
 SHOWN = 4096  # first samples of a run that are kept in memory for pictures
+# Outcomes of a sample: those of an impact, and further ones where it never reached the law.
+OUTCOMES = (
+    *STATUS,
+    Status("bad_gap", "a drawn gap is not finite or an overlap: see LZB's `initial_energy`", True),
+    Status("bad_velocity", "a drawn velocity is not finite", True),
+    Status("bad_law", "a drawn parameter is not finite or outside its domain", True),
+)
+BAD_GAP, BAD_VELOCITY, BAD_LAW = range(len(STATUS), len(OUTCOMES))
 FAILURE = np.array([row.failure for row in OUTCOMES])
 _SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
 _PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")

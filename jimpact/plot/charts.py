@@ -11,8 +11,7 @@ from matplotlib.patches import Patch
 
 from jimpact.methods.advice_report import Advice, as_code, share
 from jimpact.methods.chart import Point, Timing, WorkPrecision
-from jimpact.methods.stability import StabilityMap
-from jimpact.methods.stability_points import CLASSES, Slice
+from jimpact.methods.stability import CLASSES, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
 from jimpact.plot.style import COLOURS, GREY, SPREAD
 from jimpact.status import CODE, STATUS

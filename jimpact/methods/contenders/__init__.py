@@ -11,7 +11,6 @@
 from jimpact.methods.contenders.base import (
     UNCOUNTED as UNCOUNTED,
     Method as Method,
-    checked as checked,
     outcome as outcome,
     time_scale as time_scale,
 )

@@ -189,14 +189,4 @@ def held_open(x: jax.Array, closing: jax.Array) -> jax.Array:
     return jnp.where((x <= 0) & (closing < 0), 0.0, closing)
 
 
-def checked(law: Law, scene: Scene, method: Method) -> None:
-    """Raise where the method does not support the law on this scene."""
-    reason = method.supports(law, scene)
-    if reason is not None:
-        raise ValueError(
-            f"Argument `methods` must be able to solve the impact, but has "
-            f"{method.name!r}: {reason}."
-        )
-
-
 setup = eqx.filter_jit(problem)
