@@ -201,7 +201,7 @@ def work_precision(
     points: dict[str, list[Point]] = {name: [] for name, _ in rows}
     for (name, value), each, timed in zip(rows, found, times):
         answer, error = each[0], _errors(case, each, truth)
-        status = STATUS[int(np.max(answer.status))].name
+        status = STATUS[int(np.max(answer.out.status))].name
         work = float(np.mean(answer.evaluations))
         points[name].append(Point(labels[name], value, error, work, status, *timed))
     return WorkPrecision(
@@ -210,8 +210,8 @@ def work_precision(
         reference=Reference(
             how=f"{exact.name} at rtol {FINEST:g} against {second.name} at {SECOND:g}",
             uncertainty=_errors(case, other_truth, truth),
-            velocity=truth[0].velocity[0],
-            impulse=truth[0].impulse[0],
+            velocity=np.asarray(truth[0].out.velocity[0]),
+            impulse=np.asarray(truth[0].out.impulse[0]),
             duration=float(truth[0].duration[0]),
         ),
         compile_time={name: programs[name].compile_time for name in points},
@@ -305,18 +305,11 @@ def _reference(name: str | None, case: Case) -> Method:
 
 
 class Answer(NamedTuple):
-    """v+ (..., n), p (..., m), energy change, duration, evaluations, status; JAX or numpy."""
+    """An outcome or a batch of them, duration [s] and field evaluations; JAX or numpy."""
 
-    velocity: Any
-    impulse: Any
-    energy: Any
+    out: Impact
     duration: Any
     evaluations: Any
-    status: Any
-
-
-def _answer(out: Impact, duration: Any, evaluations: Any) -> Answer:
-    return Answer(out.velocity, out.impulse, out.energy_change, duration, evaluations, out.status)
 
 
 Moment = tuple[Answer, np.ndarray | None]  # answers of a sample, and their gradients
@@ -338,7 +331,7 @@ class Programs:
 
     def at(self, setting: float | None) -> Moment:
         """Answer and gradient of the sample, as numpy; evaluations NaN where not counted."""
-        answer = Answer(*(np.asarray(a) for a in self.account(setting)))
+        answer = jax.tree.map(np.asarray, self.account(setting))
         work = np.where(answer.evaluations == UNCOUNTED, np.nan, answer.evaluations)
         slopes = None if self.gradient is None else np.asarray(self.gradient(setting))
         return answer._replace(evaluations=work), slopes
@@ -351,7 +344,7 @@ def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
     def whole(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Answer:
         law = with_entries(law, ("stiffness",), k)
         found = method.solve(law, scene, v, setting)
-        return _answer(outcome(law, scene, v, found), found.duration, found.evaluations)
+        return Answer(outcome(law, scene, v, found), found.duration, found.evaluations)
 
     def fast(*given: Any) -> Answer:
         answer = whole(*given)
@@ -360,7 +353,7 @@ def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
     def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
         def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
             moved = with_entries(law, ("restitution",), e)
-            return fast(k * jnp.exp(stretch), moved, scene, v, setting).velocity
+            return fast(k * jnp.exp(stretch), moved, scene, v, setting).out.velocity
 
         both = jax.jacfwd(velocity, argnums=(0, 1))(jnp.zeros_like(k), law.restitution)
         return jnp.concatenate(both, axis=-1)
@@ -450,7 +443,7 @@ def _on_host(method: Method, case: Case) -> Programs:
         for law in laws[: case.sample]:
             found = one(law, setting)
             out = outcome(law, case.scene, case.velocity, found)
-            answers.append(_answer(out, found.duration, found.evaluations))
+            answers.append(Answer(out, found.duration, found.evaluations))
         return jax.tree.map(lambda *a: jnp.stack(a), *answers)
 
     return Programs(
@@ -469,7 +462,7 @@ def _of_law(law: Law, case: Case) -> Programs:
     seconds: dict[str, float] = {}
 
     def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Answer:
-        return _answer(impact(law, scene, v), jnp.nan, UNCOUNTED)
+        return Answer(impact(law, scene, v), jnp.nan, UNCOUNTED)
 
     many = jax.vmap(run, in_axes=(0, None, None, None))
     velocities = jnp.tile(case.velocity[None, :], (batch, 1))
@@ -489,20 +482,22 @@ def _of_law(law: Law, case: Case) -> Programs:
 
 def _errors(case: Case, moment: Moment, truth: Moment) -> dict[str, float]:
     """Relative errors, the largest over as many impacts as `moment` has."""
-    (found, slopes), (exact, exact_slopes) = moment, truth
-    fastest = float(jnp.max(jnp.abs(case.velocity))) or float(np.abs(exact.velocity).max())
-    before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(exact.energy).max()
+    (answer, slopes), (true_answer, true_slopes) = moment, truth
+    found, exact = answer.out, true_answer.out
+    fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(exact.velocity).max()
+    before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(exact.energy_change).max()
 
-    def largest(a: Any, b: Any, scale: Any) -> float:
+    def largest(a: Any, b: Any, scale: Any = None) -> float:
+        scale = np.abs(b).max() if scale is None else scale
         return float(np.abs(a - b[: len(found.velocity)]).max() / scale)
 
-    known = slopes is not None and exact_slopes is not None
+    known = slopes is not None and true_slopes is not None
     return {
         "velocity": largest(found.velocity, exact.velocity, fastest),
-        "impulse": largest(found.impulse, exact.impulse, np.abs(exact.impulse).max()),
-        "energy": largest(found.energy, exact.energy, before),
-        "duration": largest(found.duration, exact.duration, np.abs(exact.duration).max()),
-        "gradient": largest(slopes, exact_slopes, fastest) if known else float("nan"),
+        "impulse": largest(found.impulse, exact.impulse),
+        "energy": largest(found.energy_change, exact.energy_change, before),
+        "duration": largest(answer.duration, true_answer.duration),
+        "gradient": largest(slopes, true_slopes, fastest) if known else float("nan"),
     }
 
 
