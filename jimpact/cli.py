@@ -9,7 +9,7 @@ import operator
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -19,14 +19,21 @@ Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
 StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
 
 
+def _name(kind: type) -> str:
+    return kind.__name__.removesuffix("Command").lower()
+
+
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Options of every command; `jimpact.commands.<name>` runs it, and imports what it needs."""
 
-    name: ClassVar[str]
-
     json: bool = False
     """Print JSON instead of text."""
+
+    @property
+    def name(self) -> str:
+        """The command's name."""
+        return _name(type(self))
 
     def run(self) -> int:
         """The exit code."""
@@ -57,8 +64,6 @@ class ShotCommand(DrawingCommand):
 class FitCommand(DrawingCommand):
     """Fit a law to measured velocities; without a file: the bundled three balls."""
 
-    name: ClassVar[str] = "fit"
-
     study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one (three_balls.toml, air_track.toml)."""
     law: str | None = None
@@ -75,8 +80,6 @@ class FitCommand(DrawingCommand):
 class CompareCommand(ShotCommand):
     """Every law on one scene, side by side: velocities, energy, dispersion, audit, time."""
 
-    name: ClassVar[str] = "compare"
-
     fit: bool = False
     """Fit every law to the data too, with one coefficient and with one per contact."""
 
@@ -84,8 +87,6 @@ class CompareCommand(ShotCommand):
 @dataclasses.dataclass(frozen=True)
 class MonteCarloCommand(DrawingCommand):
     """Velocities after an impact whose gaps are random: statistics, histograms, outcome map."""
-
-    name: ClassVar[str] = "montecarlo"
 
     study: StudyFile = Path("three_balls_gaps.toml")
     """Study file with a [monte_carlo] table, or the name of a bundled one."""
@@ -107,8 +108,6 @@ class MonteCarloCommand(DrawingCommand):
 class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
-    name: ClassVar[str] = "chart"
-
     methods: tuple[str, ...] | None = None
     """Methods by name; default: those that the scene allows and that compile fast."""
     full: bool = False
@@ -125,8 +124,6 @@ class ChartCommand(ShotCommand):
 class StabilityCommand(DrawingCommand):
     """Where methods of integration are right, wrong, gain energy or do not end."""
 
-    name: ClassVar[str] = "stability"
-
     methods: tuple[str, ...] | None = None
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: bool = False
@@ -136,8 +133,6 @@ class StabilityCommand(DrawingCommand):
 @dataclasses.dataclass(frozen=True)
 class AdviseCommand(ShotCommand):
     """The simplest law and method that a scene needs, with the evidence."""
-
-    name: ClassVar[str] = "advise"
 
     tolerance: float = 1e-2
     """Model error that is allowed, over the largest velocity before."""
@@ -152,8 +147,6 @@ class AdviseCommand(ShotCommand):
 @dataclasses.dataclass(frozen=True)
 class SimulateCommand(DrawingCommand):
     """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
-
-    name: ClassVar[str] = "simulate"
 
     study: StudyFile = Path("cradle_motion.toml")
     """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml)."""
@@ -172,8 +165,6 @@ class SimulateCommand(DrawingCommand):
 @dataclasses.dataclass(frozen=True)
 class LawsCommand(Command):
     """List the laws: what they say, when they are right and when they fail."""
-
-    name: ClassVar[str] = "laws"
 
     module: str | None = None
     """File (.py) or module that registers further laws, see `ji.register`."""
@@ -199,7 +190,7 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"jimpact {__version__}")
         return 0
-    commands: list[Any] = [Annotated[x, tyro.conf.subcommand(x.name)] for x in COMMANDS]
+    commands: list[Any] = [Annotated[x, tyro.conf.subcommand(_name(x))] for x in COMMANDS]
     command = tyro.cli(
         functools.reduce(operator.or_, commands),
         prog="jimpact",
