@@ -1,4 +1,4 @@
-"""What `monte_carlo` returns, its report in words, and how chunks add up to it, always in order."""
+"""What `monte_carlo` returns, and its report in words."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,13 +10,10 @@ from jimpact._checks import check_values
 from jimpact.law import Law
 from jimpact.montecarlo.planning import Run
 from jimpact.montecarlo.statistics import (
-    LISTED,
     OUTCOMES,
     Chunk,
-    Moments,
     bin_edges,
     binned_quantiles,
-    merged,
     named,
 )
 from jimpact.records import as_data, fields_as_data, table
@@ -163,68 +160,35 @@ class MonteCarlo:
         return lines
 
 
-class Totals:
-    """Sums over the chunks 0 .. `chunks` - 1."""
-
-    def __init__(self, run: Run):
-        self.run = run
-        self.chunks = 0
-        self.resumed = 0
-        self.moments: Moments | None = None
-        self.statuses = np.zeros(len(OUTCOMES), np.int64)
-        self.bad: list[BadSample] = []
-
-    def add(self, chunk: Chunk, resumed: bool) -> None:
-        """The next chunk."""
-        assert chunk.number == self.chunks  # floating-point sums depend on the order
-        if self.moments is None:
-            self.moments, self.ends = chunk.moments, chunk.ends
-            self.low, self.high, self.counts = chunk.low, chunk.high, chunk.counts
-            self.first = chunk.without_samples().samples
-        else:
-            self.moments = merged(self.moments, chunk.moments)
-            self.low, self.high = np.minimum(self.low, chunk.low), np.maximum(self.high, chunk.high)
-            self.counts = self.counts + chunk.counts
-        self.statuses = self.statuses + chunk.statuses
-        self.resumed += chunk.count if resumed else 0
-        self._list_bad(chunk)
-        self.chunks += 1
-
-    def _list_bad(self, chunk: Chunk) -> None:
-        room = max(LISTED - len(self.bad), 0)
-        for i, lane in enumerate(chunk.bad["lane"][:room]):
-            self.bad.append(
-                BadSample(
-                    index=chunk.number * self.run.plan.size + int(lane),
-                    status=OUTCOMES[int(chunk.bad["status"][i])].name,
-                    gaps=chunk.bad["gaps"][i],
-                    velocity=chunk.bad["velocity_before"][i],
-                )
+def result(
+    run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
+) -> MonteCarlo:
+    """What is known of a run from the statistics of all its chunks."""
+    n, bad = len(total.ends), total.bad
+    mean, covariance = total.moments.mean, total.moments.covariance
+    return MonteCarlo(
+        samples=run.samples,
+        count=total.moments.count,
+        mean=mean[:n],
+        covariance=covariance[:n, :n],
+        minimum=total.low,
+        maximum=total.high,
+        gap_mean=mean[n:],
+        gap_covariance=covariance[n:, n:],
+        cross_covariance=covariance[:n, n:],
+        edges=bin_edges(total.ends, run.plan.bins),
+        counts=total.counts,
+        statuses=named(total.statuses),
+        bad=tuple(
+            BadSample(int(index), OUTCOMES[code].name, gaps, velocity)
+            for index, code, gaps, velocity in zip(
+                bad["index"], bad["status"], bad["gaps"], bad["velocity_before"]
             )
-
-    def result(self, rate: float, description: str, gap_scale: np.ndarray | None) -> MonteCarlo:
-        """What is known of the run."""
-        assert self.moments is not None
-        n = len(self.ends)
-        covariance = self.moments.covariance
-        return MonteCarlo(
-            samples=self.run.samples,
-            count=self.moments.count,
-            mean=self.moments.mean[:n],
-            covariance=covariance[:n, :n],
-            minimum=self.low,
-            maximum=self.high,
-            gap_mean=self.moments.mean[n:],
-            gap_covariance=covariance[n:, n:],
-            cross_covariance=covariance[:n, n:],
-            edges=bin_edges(self.ends, self.run.plan.bins),
-            counts=self.counts,
-            statuses=named(self.statuses),
-            bad=tuple(self.bad),
-            first=self.first,
-            gap_scale=gap_scale,
-            rate=rate,
-            resumed=self.resumed,
-            description=description,
-            run=self.run,
-        )
+        ),
+        first=total.samples,
+        gap_scale=gap_scale,
+        rate=rate,
+        resumed=resumed,
+        description=run.description,
+        run=run,
+    )

@@ -156,7 +156,7 @@ class Chunk:
         moments: of the samples that did not fail.
         low, high: smallest and largest velocities (n,); inf, -inf without any.
         ends, counts: histogram ranges (n, 2) and counts (n, bins + 2).
-        bad: lanes, codes, gaps and velocities before of the first failed samples.
+        bad: numbers, codes, gaps and velocities before of the first failed samples.
         samples: all samples, or the first few (`SHOWN`), or none.
     """
 
@@ -198,6 +198,24 @@ def chunk_from(arrays: dict[str, np.ndarray]) -> Chunk:
     return Chunk(**own, moments=whole, bad=part("bad"), samples=part("samples"))
 
 
+def joined(before: Chunk, chunk: Chunk) -> Chunk:
+    """The statistics of all chunks before and of the next one, with the first ones' samples."""
+    assert chunk.number == before.number + 1  # floating-point sums depend on the order
+    bad = {k: np.concatenate([v, chunk.bad[k]])[:LISTED] for k, v in before.bad.items()}
+    return Chunk(
+        number=chunk.number,
+        count=before.count + chunk.count,
+        statuses=before.statuses + chunk.statuses,
+        moments=merged(before.moments, chunk.moments),
+        low=np.minimum(before.low, chunk.low),
+        high=np.maximum(before.high, chunk.high),
+        ends=before.ends,
+        counts=before.counts + chunk.counts,
+        bad=bad,
+        samples=before.samples,
+    )
+
+
 def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples: bool) -> Chunk:
     """The statistics of the first `task.count` samples of a chunk."""
     failed = FAILURE[samples["status"]]
@@ -211,7 +229,8 @@ def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples:
     used = whole[:, :count] if not failed.any() else whole[:, :count][:, ~failed]
     velocity = used[:n]
     lanes = np.flatnonzero(failed)[:LISTED]
-    bad = {"lane": lanes} | {name: samples[name][lanes] for name in _SAMPLE_FIELDS}
+    bad = {"index": task.number * len(samples["status"]) + lanes}
+    bad |= {name: samples[name][lanes] for name in _SAMPLE_FIELDS}
     kept = count if keep_samples else (min(count, SHOWN) if task.number == 0 else 0)
     return Chunk(
         number=task.number,
