@@ -91,11 +91,11 @@ class Rows(NamedTuple):
 
 
 class Outcomes(NamedTuple):
-    """v+ (r, n), p (r, m), status (r,) of a batch."""
+    """v+ (r, n), p (r, m), status (r,) of a batch; JAX, then numpy."""
 
-    velocity: np.ndarray
-    impulse: np.ndarray
-    status: np.ndarray
+    velocity: Any
+    impulse: Any
+    status: Any
 
 
 class Trial(NamedTuple):
@@ -113,15 +113,14 @@ class Trial(NamedTuple):
         """Impacts computed together for so many rows of stiffness: enough to hide a call's cost."""
         return rows if self.knows_stiffness else max(1, LANES // self.scene.contacts**2)
 
-    def run(self, at: Situation, stiffness: np.ndarray) -> tuple[jax.Array, ...]:
+    def run(self, at: Situation, stiffness: np.ndarray) -> Outcomes:
         """v+, p and status over rows of stiffness, or of the same impact many times."""
         v = jnp.tile(jnp.asarray(at.velocity), (self.lanes(len(stiffness)), 1))
         scene = self.scene
         if scene.gaps is None:  # scenes with and without gaps share one compiled program
             scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
-        return _batch(
-            self.law, scene, v, jnp.asarray(stiffness, v.dtype) if self.knows_stiffness else None
-        )
+        rows = jnp.asarray(stiffness, v.dtype) if self.knows_stiffness else None
+        return _batch(self.law, scene, v, rows)
 
 
 def advise(
@@ -178,8 +177,9 @@ def advise(
     check_values("velocity", v)
     parameters, known = parameters_of(scene, law, restitution, stiffness, exponent)
     span = span_of(stiffness_range, known)
-    rtol = default_rtol("time", v.dtype)
-    check_tolerance(tolerance, FINEST_TOLERANCE * rtol)
+    finest = FINEST_TOLERANCE * default_rtol("time", v.dtype)
+    check_shape("tolerance", tolerance, (), "one number")
+    check_values("tolerance", tolerance, low=finest, high=1.0)
     as_whole("samples", samples, 1)
     as_whole("seed", seed, 0)
     at = situation(scene, np.asarray(v))
@@ -277,12 +277,6 @@ def span_of(given: tuple[float, float] | None, known: bool) -> tuple[float, floa
     return low, high
 
 
-def check_tolerance(tolerance: Any, finest: float) -> None:
-    """A number between what the reference can resolve and 1."""
-    check_shape("tolerance", tolerance, (), "one number")
-    check_values("tolerance", tolerance, low=finest, high=1.0)
-
-
 def missing_stiffness(at: Situation) -> str:
     """The message where ratios of stiffnesses are not enough."""
     if at.gapped.any():
@@ -369,12 +363,10 @@ def rows(stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed
 
 
 @eqx.filter_jit
-def _batch(
-    law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | None
-) -> tuple[jax.Array, ...]:
-    def one(v: jax.Array, k: jax.Array | None) -> tuple[jax.Array, ...]:
+def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | None) -> Outcomes:
+    def one(v: jax.Array, k: jax.Array | None) -> Outcomes:
         out = impact(law if k is None else with_entries(law, ("stiffness",), k), scene, v)
-        return out.velocity, out.impulse, out.status
+        return Outcomes(out.velocity, out.impulse, out.status)
 
     return jax.vmap(one)(velocity, stiffness)
 
@@ -406,9 +398,9 @@ def outcomes(trial: Trial, at: Situation, stiffness: np.ndarray, progress: bool 
     with counting_bar(r, "impacts", progress) as advance:
         for first in range(0, r, chunk):
             chosen = np.minimum(np.arange(first, first + chunk), r - 1)
-            parts.append([np.asarray(x) for x in trial.run(at, stiffness[chosen])])
+            parts.append(jax.device_get(trial.run(at, stiffness[chosen])))
             advance(min(chunk, r - first))
-    return Outcomes(*(np.concatenate(x)[:r] for x in zip(*parts)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:r], *parts)
 
 
 def _chunk(stiffness: np.ndarray) -> int:
@@ -434,19 +426,6 @@ def candidate(
     )
 
 
-def block_errors(at: Situation, own: Outcomes, reference: Outcomes) -> list[float]:
-    """Worst error of v+ that the impulses of each block cause, relative to max |v-|."""
-    m = own.impulse.shape[1]
-    change = jax.vmap(partial(velocity_change, at.scene))(jnp.eye(m, dtype=at.velocity.dtype))
-    wrong = own.impulse[:1] - reference.impulse
-
-    def error(block: Block) -> float:
-        chosen = list(block.contacts)
-        return float(np.nanmax(np.abs(wrong[:, chosen] @ np.asarray(change)[chosen]))) / at.scale
-
-    return [error(block) for block in at.blocks]
-
-
 def costs(laws: dict[str, Trial], at: Situation, stiffness: np.ndarray) -> dict[str, float]:
     """Time of one impact in a batch over the cheapest law's: medians, side by side."""
     few = stiffness[np.arange(_chunk(stiffness)) % len(stiffness)]
@@ -464,19 +443,12 @@ def _loosened(found: Candidate, at: Situation, reference: Outcomes, tolerance: f
     exact, best = reference.velocity[0], default_rtol("time", at.velocity.dtype)
     while True:
         rtol = max(rtol, best)
-        law = _with_rtol(found.law, rtol)
+        law: Any = replace(found.law, rtol=rtol)  # type: ignore[call-arg]
         own = np.asarray(impact(law, found.scene, at.velocity).velocity)
         error = float(np.abs(own - exact).max()) / at.scale
         if rtol == best or error <= tolerance / RTOL_PART:
             return replace(found, law=law, worst=max(found.worst, error))
         rtol /= 10
-
-
-def _with_rtol(law: Law, rtol: float) -> Law:
-    if isinstance(law, Compliant):
-        return Compliant(law.force, rtol=rtol)
-    assert isinstance(law, LZB)
-    return LZB(law.restitution, law.stiffness, law.exponent, rtol=rtol)
 
 
 def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
@@ -488,11 +460,8 @@ def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
             f"{STATUS[int(reference.status[0])].message}."
         )
     lost = failed[:, None]
-    return Outcomes(
-        np.where(lost, np.nan, reference.velocity),
-        np.where(lost, np.nan, reference.impulse),
-        reference.status,
-    )
+    v, p = (np.where(lost, np.nan, x) for x in (reference.velocity, reference.impulse))
+    return reference._replace(velocity=v, impulse=p)
 
 
 def _blocks(
@@ -502,20 +471,20 @@ def _blocks(
     reference: Outcomes,
     tolerance: float,
 ) -> tuple[Block, ...]:
-    """The blocks, each with the simplest law that is within tolerance there."""
-    errors = {
-        name: block_errors(at, outcome, reference)
-        for name, outcome in own.items()
-        if evidence[name].status != "order_dependent"
-    }
+    """The blocks, each with the simplest law whose impulses there move v+ within tolerance."""
+    of_impulse = jax.vmap(partial(velocity_change, at.scene))
+    change = np.asarray(of_impulse(jnp.eye(len(at.gap_velocity), dtype=at.velocity.dtype)))
 
-    def simplest(i: int) -> str | None:
-        return next((name for name, error in errors.items() if error[i] <= tolerance), None)
+    def error(name: str, block: Block) -> float:
+        here = list(block.contacts)
+        wrong = own[name].impulse[:1, here] - reference.impulse[:, here]
+        return float(np.nanmax(np.abs(wrong @ change[here]))) / at.scale
 
-    return tuple(
-        block._replace(law=simplest(i)) if block.approaches else block
-        for i, block in enumerate(at.blocks)
-    )
+    def simplest(block: Block) -> str | None:
+        known = (name for name, c in evidence.items() if c.status != "order_dependent")
+        return next((name for name in known if error(name, block) <= tolerance), None)
+
+    return tuple(b._replace(law=simplest(b)) if b.approaches else b for b in at.blocks)
 
 
 def _effects(
