@@ -23,6 +23,7 @@ _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 _FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
 _DATA_KEYS = ("file", "momentum_corrected")
 _SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
+_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
 _DISTRIBUTIONS: dict[tuple[str, ...], Any] = {("high", "low"): Uniform, ("mean", "std"): Normal}
 
 
@@ -174,21 +175,16 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
     chunk, bins.
     """
     check_keys("[monte_carlo]", table, _SAMPLING_KEYS, required=("velocity_m_per_s",))
-    found: dict[str, Any] = {"scene": scene}
-    found["velocity"] = _source("velocity_m_per_s", table["velocity_m_per_s"])
-    if "gaps_m" in table:
-        found["gaps"] = _source("gaps_m", table["gaps_m"])
     random = table.get("law", {})
     if not isinstance(random, dict):
         raise ValueError(f"[monte_carlo.law] must be a table, but is {random!r}.")
     drawn = {name: _distribution(f"law.{name}", value) for name, value in random.items()}
-    found["law"] = RandomLaw(law, **drawn) if drawn else law
-    found |= {name: table[name] for name in ("samples", "chunk", "bins") if name in table}
-    return found | ({"key": table["seed"]} if "seed" in table else {})
-
-
-def _source(name: str, value: Any) -> Any:
-    return _distribution(name, value) if isinstance(value, dict) else value
+    given = {
+        _ARGUMENTS.get(key, key): _distribution(key, value) if isinstance(value, dict) else value
+        for key, value in table.items()
+        if key != "law"
+    }
+    return {"scene": scene, "law": RandomLaw(law, **drawn) if drawn else law} | given
 
 
 def _distribution(name: str, value: Any) -> Distribution:
