@@ -175,8 +175,6 @@ Source = Distribution | Rows | Callable[[jax.Array], Any] | jax.Array | None
 
 def as_source(name: str, value: Any, size: int, non_negative: bool) -> Source:
     """A distribution, a function of a key, rows, or a constant (size,); checked on the host."""
-    if value is None:
-        return None
     if isinstance(value, Distribution):
         value.check(name, size, non_negative)
         return value

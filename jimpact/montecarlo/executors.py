@@ -4,6 +4,7 @@ An executor is any object with this `run`; which one is used never changes a res
 """
 
 import functools
+import itertools
 import pickle
 import queue
 from collections import deque
@@ -47,14 +48,10 @@ class Serial:
 
     def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """Chunks in order."""
-        before = None
-        for task in tasks:
-            started = plan.start(task)
-            if before is not None:
-                yield before()
-            before = started
-        if before is not None:
-            yield before()
+        end: list[Any] = [None]
+        under_way = itertools.chain(map(plan.start, tasks), end)
+        for finish, _ in itertools.pairwise(under_way):  # the next one has been started
+            yield finish()
 
 
 @dataclass(frozen=True)

@@ -294,8 +294,10 @@ def _sources(given: Sources, scene: Scene) -> Sources:
     if not isinstance(law, Law) and not callable(law):
         raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
     velocity = as_source("velocity", given.velocity, scene.size, non_negative=False)
-    gaps = as_source("gaps", given.gaps, scene.contacts, non_negative=True)
-    if gaps is None and not (is_random(law) or is_random(velocity)):
+    gaps = given.gaps
+    if gaps is not None:
+        gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
+    elif not (is_random(law) or is_random(velocity)):
         raise ValueError(
             "Argument `gaps` must be given where neither the velocity nor the law is random: all "
             "samples would be the same."
