@@ -25,10 +25,8 @@ def in_turns(
     runs: Sequence[Callable[[], Any]], repeats: int, advance: Callable[[], Any] = lambda: None
 ) -> list[np.ndarray]:
     """Times [s] of each of `runs`, as many as `repeats`, fewer of slow ones; `advance` at each."""
-    counts = []
-    for run in runs:
-        run()  # compiled, if it was not
-        counts.append(int(np.clip(SHORT / max(seconds(run), 1e-9), 1, MOST_RUNS)))
+    warm = [min(seconds(run), seconds(run)) for run in runs]  # the first call may compile
+    counts = [int(np.clip(SHORT / max(t, 1e-9), 1, MOST_RUNS)) for t in warm]
     taken: list[list[float]] = [[] for _ in runs]
     for _ in range(repeats):
         for run, count, kept in zip(runs, counts, taken):
