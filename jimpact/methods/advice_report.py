@@ -2,10 +2,9 @@
 
 import math
 import textwrap
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jimpact.law import Law
@@ -26,6 +25,7 @@ _TOLD = 4  # stiffness ratios named one by one
 _PERCENT_FROM = 1e-4
 _ROUNDING = 1e-12
 _NONE = 1e-6  # a change of v+ below, relative to max |v-|, is told as none
+_PARAMETERS = ("restitution", "stiffness", "exponent")  # that an advice tells
 NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
 
 
@@ -215,20 +215,16 @@ def as_code(law: Law) -> str:
             return f"{array.flat[0]:.6g}"
         return f"[{', '.join(f'{z:.6g}' for z in array)}]"
 
-    if isinstance(law, LZB):
-        given = f"{value(law.restitution)}, {value(law.stiffness)}, {value(law.exponent)}"
-        return f"LZB({given}{_rtol(law.rtol)})"
-    if isinstance(law, Compliant):
-        force = ", ".join(
-            value(getattr(law.force, key)) for key in ("stiffness", "exponent", "restitution")
-        )
-        return f"Compliant(Bistiffness({force}){_rtol(law.rtol)})"
-    order = f", {law.order!r}" if isinstance(law, Binary) and law.order != "fastest" else ""
-    return f"{type(law).__name__}({value(jax.tree.leaves(law)[0])}{order})"
-
-
-def _rtol(rtol: float | None) -> str:
-    return "" if rtol is None else f", rtol={rtol:g}"
+    holder = law.force if isinstance(law, Compliant) else law
+    names = [field.name for field in fields(holder) if field.name in _PARAMETERS]
+    words = [value(getattr(holder, name)) for name in names]
+    if holder is not law:
+        words = [f"{type(holder).__name__}({', '.join(words)})"]
+    if isinstance(law, Binary) and law.order != "fastest":
+        words.append(repr(law.order))
+    if isinstance(law, LZB | Compliant) and law.rtol is not None:
+        words.append(f"rtol={law.rtol:g}")
+    return f"{type(law).__name__}({', '.join(words)})"
 
 
 def structure(found: Advice) -> str:
