@@ -25,7 +25,7 @@ def _name(kind: type) -> str:
 
 @dataclasses.dataclass(frozen=True)
 class Command:
-    """Options of every command; `jimpact.commands.<name>` runs it, and imports what it needs."""
+    """Options of every command; `jimpact.commands` runs it."""
 
     json: bool = False
     """Print JSON instead of text."""
@@ -37,7 +37,7 @@ class Command:
 
     def run(self) -> int:
         """The exit code."""
-        return import_module("jimpact.commands.output").run(self)
+        return import_module("jimpact.commands").run(self)
 
 
 @dataclasses.dataclass(frozen=True)
