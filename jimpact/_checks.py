@@ -110,5 +110,7 @@ def check_per_contact(name: str, value: Any, contacts: int) -> None:
 def in_common_dtype(*trees: Any) -> Any:
     """All of them in the widest floating type among them (Python numbers follow the arrays)."""
     leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
+    if len({x.dtype for x in leaves}) == 1:
+        return trees
     dtype = jnp.result_type(*leaves)
     return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees)

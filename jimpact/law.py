@@ -312,6 +312,11 @@ class Law(Declared):
         """To override: raise where the law does not fit the scene, or the precision."""
 
     @property
+    def fills_up(self) -> bool:
+        """Whether open contacts cost it little beside compiling for another number of contacts."""
+        return False
+
+    @property
     def stored(self) -> jax.Array:
         """Energy stored in the contacts before the impact, () or (m,) [J]."""
         stored = getattr(self, "initial_energy", None)

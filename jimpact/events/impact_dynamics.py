@@ -16,7 +16,7 @@ import numpy as np
 
 from jimpact.contact import Contact
 from jimpact.events import impulse_form, stepper
-from jimpact.events.batches import in_columns
+from jimpact.events.batches import in_columns, tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -87,8 +87,9 @@ def dimensionless(
     stored: jax.Array,
     rtol: float,
     gaps: jax.Array | None = None,
+    count: Any = None,
 ) -> tuple[Problem, Units]:
-    """The dimensionless problem and the units to return from it."""
+    """The dimensionless problem and the units to return from it; `count` contacts take part."""
     m, dtype = gamma.shape[0], gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
     root = jnp.sqrt(diagonal(delassus))
@@ -107,7 +108,8 @@ def dimensionless(
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
-    step = jax.lax.stop_gradient(rtol * min(1.0, 2 / m) / jnp.max(weight))
+    share = jnp.minimum(1.0, 2 / jnp.maximum(m if count is None else count, 1))
+    step = jax.lax.stop_gradient(rtol * share / jnp.max(weight))
     problem = Problem(
         beside=beside,
         omega=omega,
@@ -190,26 +192,37 @@ class Outcome:
     most: int
     sides: int = 0  # tangential rows
     whole: bool = False
+    finely: bool = False  # at the tolerance of derivatives
     repeats: bool = False  # walk the steps once more, for derivatives
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
         return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
+    def shapes(self, *leaves: Any) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """Of the results, from those of the leaves."""
+        contacts, batch = jax.tree.unflatten(self.tree, leaves).omega.shape
+        smooth = (leaves[0].dtype,) * 3
+        kinds = smooth if self.repeats else (*smooth, jnp.int32, jnp.int32)
+        rows = contacts, self.sides, 1, 1, 1
+        return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
+
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         problem = jax.tree.unflatten(self.tree, leaves)
         still = jax.lax.stop_gradient(problem)
-        tighten = GRADIENT_TIGHTENING if self.repeats else 1.0
+        tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         flow, modes, y = self.flow(still, tighten)
-        end = to_the_end(flow, still.gamma, modes, y, self.most, keeps=self.repeats)
-        state, dp = end.state, end.impulse
+        end = to_the_end(flow, still.gamma, modes, y, self.most, keeps=self.finely)
+        state, dp = end.carry.y, end.impulse
         if self.repeats:
             moving, _, y = self.flow(problem, tighten)
             state = stepper.repeat(moving, modes, y, end.plan)
             state = jnp.where(end.finishes, moving.finish(end.carry.step.modes, state)[1], state)
-            dp = remainder(moving, problem.gamma, state, end.rest.carries)
+            dp = remainder(moving, problem.gamma, state, end.carries)
         m = flow.contacts
         p = state[2 * m : 3 * m] + dp
+        if self.finely:
+            p = stepper.with_plan(p, end.plan)
         side, time = state[3 * m + self.sides : -1][: self.sides], state[-1:]
         if self.repeats:
             return p, side, time
@@ -267,12 +280,14 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
     def value(*leaves: jax.Array) -> tuple[jax.Array, ...]:
         return in_columns(function, *leaves)
 
-    @value.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        again = dataclasses.replace(function, repeats=True)
-        rates = jax.jvp(lambda *x: in_columns(again, *x), primals, tangents)[1]
-        outs = value(*primals)
+    def rule(primals: Any, tangents: Any) -> Any:
+        # the same steps give both: one loop where they are one program
+        fine = dataclasses.replace(function, finely=True)
+        outs = outcome(fine, primals)
+        again = dataclasses.replace(fine, repeats=True)
+        rates = tangents_in_columns(again, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 
+    value.defjvp(rule, symbolic_zeros=True)
     return value(*leaves)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from jimpact.events import stepper
 from jimpact.events.contact_flow import ContactFlow
-from jimpact.events.stepper import OVER, PAUSED, any_of, total
+from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
 from jimpact.status import CODE
 
 QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
@@ -42,18 +42,22 @@ class Rest(NamedTuple):
 
 
 class End(NamedTuple):
-    """An impact at its end; `state` once finished, but for the impulse of the contacts at rest."""
+    """An impact at its end, finished but for the impulse of the contacts at rest."""
 
     carry: stepper.Carry
     pen: stepper.Recorder | None
     rest: Rest
-    state: jax.Array
     begun: jax.Array  # ()
+
+    @property
+    def carries(self) -> jax.Array:
+        """Contacts at rest that carry an impulse (m, B); asks for both, see `with_plan`."""
+        return self.rest.carries & self.rest.contacts
 
     @property
     def impulse(self) -> jax.Array:
         """Of the contacts at rest (m, B)."""
-        return jnp.where(self.rest.carries, self.rest.rows[2], 0.0)
+        return jnp.where(self.carries, self.rest.rows[2], 0.0)
 
     @property
     def plan(self) -> stepper.Plan:
@@ -86,27 +90,27 @@ def to_the_end(
     no = jnp.zeros(gamma.shape, bool)
     rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
     rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
-    start = End(carry, stepper.recorder(carry) if keeps else None, rest, y, jnp.asarray(False))
+    start = End(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
 
     def on(end: End) -> End:
+        finished = (end.carry.plan[2:3] == OVER) & end.begun
         if end.pen is None:
             carry, pen = stepper.run(flow, end.carry, most), None
         else:
             carry, pen = stepper.record(flow, end.carry, end.pen, most)
-        rest = end.rest
-        over = (carry.plan[2:3] == OVER) & ~rest.ended
-        state = jnp.where(over, flow.finish(carry.step.modes, carry.y)[1], carry.y)
-        paused = carry.plan[2:3] == PAUSED
+        over, paused = (carry.plan[2:3] == OVER) & ~finished, carry.plan[2:3] == PAUSED
         quiet = over & at_rest(flow, carry)
+        carry = carry._replace(
+            y=jnp.where(over, flow.finish(carry.step.modes, carry.y)[1], carry.y)
+        )
         rest = jax.lax.cond(
             jnp.any(paused | quiet),
-            lambda: looked(flow, gamma, carry, state, rest, quiet),
-            lambda: rest,
+            lambda: looked(flow, gamma, carry, end.rest, quiet),
+            lambda: end.rest,
         )
-        plan = carry.plan.at[2:3].set(
-            jnp.where(paused, jnp.where(rest.ended, OVER, 0.0), carry.plan[2:3])
-        )
-        return End(carry._replace(plan=plan), pen, rest, state, jnp.asarray(True))
+        settled = jnp.where(rest.ended, OVER, GOES_ON)
+        plan = carry.plan.at[2:3].set(jnp.where(paused, settled, carry.plan[2:3]))
+        return End(carry._replace(plan=plan), pen, rest, jnp.asarray(True))
 
     return jax.lax.while_loop(
         lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start
@@ -123,19 +127,14 @@ def at_rest(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
 
 
 def looked(
-    flow: ContactFlow,
-    gamma: jax.Array,
-    carry: stepper.Carry,
-    state: jax.Array,
-    seen: Rest,
-    quiet: jax.Array,
+    flow: ContactFlow, gamma: jax.Array, carry: stepper.Carry, seen: Rest, quiet: jax.Array
 ) -> Rest:
     """Who is at rest at the end, or would come to rest from a pause.
 
     Contacts at rest carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, on
     the gamma+ that their impulses give: errors of many closings add up.
     """
-    m, modes = flow.contacts, carry.step.modes
+    m, modes, state = flow.contacts, carry.step.modes, carry.y
     paused = carry.plan[2:3] == PAUSED
     count = modes[m : 2 * m]
     since = count - seen.closings
