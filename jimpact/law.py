@@ -116,7 +116,7 @@ class Domain:
 class Option:
     """What `option` declares of a static field; called by equinox to check a value."""
 
-    choices: tuple[str, ...] | None = None
+    choices: tuple[Any, ...] | None = None
     low: float | None = None
     high: float = np.inf
     open_low: bool = False
@@ -180,7 +180,7 @@ def parameter(
 
 def option(
     default: Any,
-    choices: tuple[str, ...] | None = None,
+    choices: tuple[Any, ...] | None = None,
     *,
     low: float | None = None,
     high: float = np.inf,
