@@ -1,6 +1,7 @@
 """Host-side argument checks with one error template; tracers pass unchecked."""
 
 import operator
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -68,6 +69,13 @@ def as_whole(name: str, value: Any, low: int) -> int:
     return operator.index(value)
 
 
+def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
+    """Raise a ValueError unless `value` is one of `choices`."""
+    if value not in choices:
+        known = ", ".join(map(str, choices))
+        raise ValueError(f"Argument `{name}` must be one of {known}, but has value {value!r}.")
+
+
 def check_kind(name: str, value: Any, kind: type) -> None:
     """Raise a TypeError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
@@ -102,5 +110,7 @@ def check_per_contact(name: str, value: Any, contacts: int) -> None:
 def in_common_dtype(*trees: Any) -> Any:
     """All of them in the widest floating type among them (Python numbers follow the arrays)."""
     leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
+    if len({x.dtype for x in leaves}) == 1:
+        return trees
     dtype = jnp.result_type(*leaves)
     return jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, trees)

@@ -8,8 +8,6 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jimpact._checks import is_traced
-
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
 # take twice as long to compile a program of many small loops.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
@@ -27,16 +25,27 @@ def known_options() -> dict[str, Any]:
     return QUICK
 
 
-def staged() -> bool:
-    """Whether a program of somebody else's is being traced: it is compiled with their options."""
-    return isinstance(jax.lax.add(np.float32(0), np.float32(0)), jax.core.Tracer)
+@functools.cache
+def _asks() -> Callable[..., Any]:
+    return jax.jit(lambda *x: x, compiler_options=known_options())
+
+
+def is_own(args: Any) -> bool:
+    """Whether what is called with these is a program of its own, now: JAX itself is asked.
+
+    JAX refuses options of a program that becomes part of another one: under jit, in loops, and in
+    reverse mode. Forward mode and vmap run it at once.
+    """
+    traced = [x for x in jax.tree.leaves(args) if isinstance(x, jax.core.Tracer)]
+    try:
+        _asks()(*traced)
+    except ValueError:
+        return False
+    return True
 
 
 def quick_jit(function: Function) -> Function:
-    """`eqx.filter_jit(function)`, compiled quickly where it is a program of its own.
-
-    JAX refuses options of a function that is traced: under jit, and where it is differentiated.
-    """
+    """`eqx.filter_jit(function)`, compiled quickly where it is a program of its own."""
     inside = eqx.filter_jit(function)
 
     @functools.cache
@@ -46,7 +55,6 @@ def quick_jit(function: Function) -> Function:
 
     @functools.wraps(function)
     def call(*args: Any, **given: Any) -> Any:
-        free = not is_traced((args, given)) and not staged()
-        return (own() if free else inside)(*args, **given)
+        return (own() if is_own((args, given)) else inside)(*args, **given)
 
     return call  # type: ignore[return-value]

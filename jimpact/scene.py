@@ -11,9 +11,10 @@
 #   T = v^T M v / 2  kinetic energy                              [J]
 """
 
+import dataclasses
 import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -197,30 +198,75 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
     most = max(s.contacts for s in scenes)
     extra = (most - min(s.contacts for s in scenes)) * (1 + sides)
     dense = any(s.mass.ndim == 2 for s in scenes)
+    return [_with_open_contacts(s, most, s.size + extra, dense) for s in scenes], extra
 
-    def alike(scene: Scene) -> Scene:
-        n, missing = scene.size, most - scene.contacts
-        mass = jnp.pad(scene.mass, [(0, extra)] * scene.mass.ndim)
-        own = jnp.arange(n + extra) >= n
-        mass = mass + (own if mass.ndim == 1 else jnp.diag(own)).astype(mass.dtype)
-        columns = jnp.eye(n + extra, dtype=scene.normals.dtype)[:, n:]
 
-        def grown(matrix: jax.Array, first: int, count: int) -> jax.Array:
-            below = jnp.pad(matrix, ((0, extra), (0, 0)))
-            return jnp.concatenate([below, columns[:, first : first + count]], axis=1)
+def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool) -> Scene:
+    """The scene with so many contacts and coordinates, on the host.
 
-        gaps = jnp.zeros(scene.contacts, mass.dtype) if scene.gaps is None else scene.gaps
-        tangents = scene.tangents
-        held = scene.constraints
-        return Scene(
-            jnp.diag(mass) if dense and mass.ndim == 1 else mass,
-            grown(scene.normals, 0, missing),
-            None if tangents is None else grown(tangents, missing, missing * sides),
-            jnp.concatenate([gaps, jnp.ones(missing, gaps.dtype)]),
-            None if held is None else jnp.pad(held, ((0, extra), (0, 0))),
+    What is added comes last: open contacts as heavy as the last one, between coordinates of their
+    own; units and tolerances are not moved by them.
+    """
+    n, m, missing = scene.size, scene.contacts, contacts - scene.contacts
+    mass, normals = np.asarray(scene.mass), np.asarray(scene.normals)
+    last = normals[:, -1]
+    moved = last / mass if mass.ndim == 1 else np.linalg.solve(mass, last)
+    columns = np.sqrt(last @ moved) * np.eye(size, dtype=mass.dtype)[:, n:]
+    if dense_mass or mass.ndim == 2:
+        whole = np.eye(size, dtype=mass.dtype)
+        whole[:n, :n] = np.diag(mass) if mass.ndim == 1 else mass
+    else:
+        whole = np.pad(mass, (0, size - n), constant_values=1)
+
+    def grown(matrix: Any, first: int, count: int) -> np.ndarray:
+        below = np.pad(np.asarray(matrix), ((0, size - n), (0, 0)))
+        return np.concatenate([below, columns[:, first : first + count]], axis=1)
+
+    tangents, held = scene.tangents, scene.constraints
+    sides = 0 if tangents is None else missing * (tangents.shape[1] // m)
+    return _unchecked(
+        mass=whole,
+        _normals=grown(scene.normals, 0, missing),
+        tangents=None if tangents is None else grown(tangents, missing, sides),
+        gaps=_open_behind(scene, missing),
+        constraints=None if held is None else grown(held, 0, 0),
+    )
+
+
+def _open_behind(scene: Scene, missing: int) -> Any:
+    """Gaps of the scene, and of so many open contacts."""
+    gaps = np.zeros(scene.contacts) if scene.gaps is None else np.asarray(scene.gaps)
+    return np.pad(gaps, (0, missing), constant_values=1).astype(scene.mass.dtype)
+
+
+class Filled(NamedTuple):
+    """A scene with open contacts added, where it is in it, and which contact each is like."""
+
+    scene: Scene
+    coordinates: slice
+    contacts: slice
+    copied: Any
+
+
+def filled_up(scene: Scene, contacts: int) -> Filled:
+    """The scene with so many contacts, on the host: scenes of other sizes share its programs."""
+    n, m = scene.size, scene.contacts
+    missing = contacts - m
+    copied = np.minimum(np.arange(contacts), m - 1)
+    if scene.walls is None:
+        size = -(-(n + missing) // contacts) * contacts
+        grown = _with_open_contacts(scene, contacts, size, False)
+        return Filled(grown, slice(n), slice(m), copied)
+    mass: Any = np.asarray(scene.mass)
+    gaps = _open_behind(scene, missing)
+    if scene.walls[1]:  # what is added comes before it, in mirror image
+        mass = np.concatenate([np.resize(mass[1::-1], missing)[::-1], mass])
+        gaps, copied = np.roll(gaps, missing), m - 1 - copied[::-1]
+        return Filled(
+            chain_scene(mass, scene.walls, gaps), slice(missing, None), slice(missing, None), copied
         )
-
-    return [alike(scene) for scene in scenes], extra
+    mass = np.concatenate([mass, np.resize(mass[-2:], missing)])
+    return Filled(chain_scene(mass, scene.walls, gaps), slice(n), slice(m), copied)
 
 
 def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
@@ -334,17 +380,14 @@ def without_constraints(scene: Scene) -> Scene:
 
 def chain_scene(masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | None) -> Scene:
     """A chain: its normals stay implicit, its Delassus matrix tridiagonal (see `ji.chain`)."""
+    return _unchecked(mass=masses, walls=walls, gaps=gaps)
+
+
+def _unchecked(**fields: Any) -> Scene:
+    """A scene of these fields as they are; None: those that are not given."""
     scene = object.__new__(Scene)
-    fields = {
-        "mass": masses,
-        "tangents": None,
-        "gaps": gaps,
-        "constraints": None,
-        "_normals": None,
-        "walls": walls,
-    }
-    for name, value in fields.items():
-        object.__setattr__(scene, name, value)
+    for field in dataclasses.fields(Scene):
+        object.__setattr__(scene, field.name, fields.get(field.name))
     return scene
 
 

@@ -16,8 +16,6 @@ from programs import chain, failed, names
 
 import jimpact as ji
 
-pytestmark = pytest.mark.xdist_group("lzb")
-
 V = [1.0, 0.4, 0.1, -0.6]
 E, K = [0.9, 0.7, 0.8], [1.0, 2.5, 0.7]
 
@@ -71,14 +69,56 @@ def test_exponents_and_chains(path):
 
 
 def test_a_single_impact_is_one_of_a_batch():
-    """Not batched, not padded, eager; and on the dense scene of the chain."""
-    given = states(1.5)[:2]
+    """Not batched, eager, filled up with open contacts; chains and their dense scenes."""
+    given = [
+        *states(1.5)[:2],
+        chain([1.0, 3.0], [1.0, -0.5], wall="right", e=E[:2], k=K[:2]),
+        chain([3.0, 1.0], [-1.0, -2.5], wall="left", e=E[:2], k=K[:2]),
+        chain([1.0, 2.0, 0.5], [1.0, 0.2, 0.3], e=E[:2], k=K[:2], gaps=[0.0, 0.1]),
+    ]
+    walls = [False, False, "right", "left", False]
     (same, _) = programs.values("lzb")(given)
-    for i, s in enumerate(given):
-        law = ji.LZB(*(jnp.broadcast_to(jnp.asarray(x, float), 3) for x in (s.e, s.k)))
-        out = ji.impact(law, ji.chain(np.diag(s.mass)), jnp.asarray(s.velocity, float))
-        np.testing.assert_allclose(out.velocity, same.velocity[i], atol=2e-7)
-        assert int(out.status) == same.status[i]
+    for i, (s, wall) in enumerate(zip(given, walls)):
+        n, m = s.size
+        law = ji.LZB(*(jnp.broadcast_to(jnp.asarray(x, float), m) for x in (s.e, s.k)))
+        gaps = np.broadcast_to(s.gaps, m)
+        for scene in (
+            ji.chain(np.diag(s.mass), wall, gaps=gaps),
+            ji.Scene(s.mass, s.normals),
+        ):
+            if scene.gaps is None and gaps.any():
+                continue  # open contacts of a dense scene are left out before
+            out = ji.impact(law, scene, jnp.asarray(s.velocity, float))
+            np.testing.assert_allclose(out.velocity, same.velocity[i, :n], atol=2e-7)
+            np.testing.assert_allclose(out.impulse, same.impulse[i, :m], atol=4e-7)
+            assert int(out.status) == same.status[i]
+
+
+def test_numbers_of_contacts_share_one_program(caplog):
+    law = ji.LZB(0.9)
+    ji.impact(law, ji.chain([1.0, 1.0]), [1.0, 0.0])
+    with jax.log_compiles():
+        for balls in range(3, 10):
+            out = ji.impact(law, ji.chain(np.ones(balls)), np.eye(balls)[0])
+            assert out.velocity.shape == (balls,)
+            assert out.impulse.shape == (balls - 1,)
+    assert "impact" not in caplog.text
+
+
+def test_directions_at_one_point():
+    """Their steps are found once: as one direction alone, and in reverse."""
+    given, way = jnp.array([0.9, 0.7, 1.0, 2.5]), jnp.array([0.3, -1.0, 0.5, 2.0])
+
+    def after(x):
+        return ji.impact(ji.LZB(x[:2], x[2:]), ji.chain(jnp.ones(3)), jnp.eye(3)[0]).velocity
+
+    @jax.jit
+    def all_ways(x):
+        return jax.jacfwd(after)(x), jax.jacrev(after)(x), jax.jvp(after, (x,), (way,))[1]
+
+    forward, reverse, alone = all_ways(given)
+    np.testing.assert_allclose(forward @ way, alone, atol=1e-12)
+    np.testing.assert_allclose(reverse, forward, atol=1e-9)
 
 
 def test_impulse_form():
@@ -89,27 +129,6 @@ def test_impulse_form():
     assert names(out.status) == ["ok"] * 2
     np.testing.assert_allclose(out.velocity, same.velocity, atol=1e-3)
     assert np.abs(out.velocity - same.velocity).max() > 1e-7  # it is not the same code
-
-
-@pytest.mark.parametrize(
-    ("eta", "force"), [(1.5, lambda k: ji.Hertz(k)), (1.0, lambda k: ji.LinearSpring(k))]
-)
-def test_forces_without_losses(eta, force):
-    given = [*states(eta)[1:2], chain([1.0, 2.0, 1.5, 0.7], V, k=K, eta=eta, gaps=[0.0, 0.3, 0.0])]
-
-    @jax.jit
-    @jax.vmap
-    def run(masses, v, k, gaps):
-        return ji.impact(ji.Compliant(force(k)), ji.chain(masses, gaps=gaps), v)
-
-    rows = [
-        (np.diag(s.mass), s.velocity, *(np.broadcast_to(x, 3) for x in (s.k, s.gaps)))
-        for s in given
-    ]
-    out = run(*(np.array(x, float) for x in zip(*rows)))
-    same, _ = programs.values("compliant")(given)
-    np.testing.assert_allclose(out.velocity, same.velocity, atol=2e-7)
-    np.testing.assert_array_equal(out.status, same.status)
 
 
 @functools.cache

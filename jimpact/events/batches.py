@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -30,7 +31,8 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
 
     Where it is differentiated all its results are floating-point numbers.
     `function` is hashable and compares equal where it does the same (a function of a module, or a
-    frozen dataclass with `__call__`): its derivatives are made and compiled once.
+    frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
+    `shapes`, if it has one, tells the shapes of its results from those of its arguments.
     """
     return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
 
@@ -50,15 +52,23 @@ def _smooth(
 
 @dataclasses.dataclass(frozen=True)
 class Tangent:
-    """Tangents of `function` from its arguments and the tangents of those marked."""
+    """Tangents of `function` from its arguments and the tangents of those marked.
+
+    `many`: these have a leading axis, along which the arguments are the same.
+    """
 
     function: Callable[..., Arrays]
     marked: tuple[bool, ...]
+    many: bool = False
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
         smooth, values = _smooth(self.function, self.marked, arrays[:count])
-        return jax.jvp(smooth, values, arrays[count:])[1]
+
+        def push(*given: jax.Array) -> Arrays:
+            return jax.jvp(smooth, values, given)[1]
+
+        return (jax.vmap(push) if self.many else push)(*arrays[count:])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,11 +77,26 @@ class Cotangent:
 
     function: Callable[..., Arrays]
     marked: tuple[bool, ...]
+    many: bool = False
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
         smooth, values = _smooth(self.function, self.marked, arrays[:count])
-        return jax.vjp(smooth, *values)[1](arrays[count:])
+        _, back = jax.vjp(smooth, *values)
+
+        def pull(*given: jax.Array) -> Arrays:
+            return back(given)
+
+        return (jax.vmap(pull) if self.many else pull)(*arrays[count:])
+
+
+def tangents_in_columns(
+    function: Callable[..., Arrays], arrays: Arrays, tangents: tuple[Any, ...]
+) -> Arrays:
+    """Tangents of `in_columns(function, *arrays)`, without its value."""
+    marked = tuple(not isinstance(t, SymbolicZero) for t in tangents)
+    moving = (t for t, mark in zip(tangents, marked) if mark)
+    return in_columns(Tangent(function, marked), *arrays, *moving)
 
 
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
@@ -111,15 +136,21 @@ def _run(*arrays: jax.Array, function: Callable[..., Arrays]) -> Arrays:
 
 @columns_p.def_abstract_eval
 def _shapes(*shapes: Any, function: Callable[..., Arrays]) -> list[Any]:
-    outs = jax.eval_shape(function, *(jax.ShapeDtypeStruct(s.shape, s.dtype) for s in shapes))
-    return [jax.core.ShapedArray(out.shape, out.dtype) for out in outs]
+    """Tracing takes as long as lowering: nothing is traced whose shapes are known without."""
+    known = [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
+    if isinstance(function, Tangent | Cotangent):
+        given, along = known[: len(function.marked)], shapes[len(function.marked) :]
+        if isinstance(function, Tangent):
+            outs = _shapes(*given, function=function.function)
+        else:
+            outs = [x for x, mark in zip(given, function.marked) if mark]
+        many = along[0].shape[:1] if function.many else ()
+        return [jax.core.ShapedArray((*many, *x.shape), x.dtype) for x in outs]
+    told = getattr(function, "shapes", None) or functools.partial(jax.eval_shape, function)
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in told(*known)]
 
 
-def _lowered(*arrays: jax.Array, function: Callable[..., Arrays]) -> Arrays:
-    return _in_chunks(function, *arrays)
-
-
-mlir.register_lowering(columns_p, mlir.lower_fun(_lowered, multiple_results=True))
+mlir.register_lowering(columns_p, mlir.lower_fun(_run, multiple_results=True))
 
 
 def _wider(
@@ -127,6 +158,16 @@ def _wider(
 ) -> tuple[list[jax.Array], list[int]]:
     """The batch of `vmap` becomes part of the last axis."""
     size = next(x.shape[axis] for x, axis in zip(arrays, axes) if axis is not None)
+    if isinstance(function, Tangent | Cotangent) and not function.many:
+        count = len(function.marked)
+        if all(axis is None for axis in axes[:count]):
+            # many directions at one point: its steps are found once
+            along = [
+                jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+                for x, axis in zip(arrays[count:], axes[count:])
+            ]
+            outs = in_columns(dataclasses.replace(function, many=True), *arrays[:count], *along)
+            return list(outs), [0] * len(outs)
 
     def wide(x: jax.Array, axis: int | None) -> jax.Array:
         if axis is None:
@@ -167,7 +208,7 @@ def _transpose(cotangents: Any, *arrays: Any, function: Callable[..., Arrays]) -
     ):
         # the transpose of a tangent map is the pull back of its function
         given = list(arrays[: len(function.marked)])
-        back = Cotangent(function.function, function.marked)
+        back = Cotangent(function.function, function.marked, function.many)
     else:
         # linear in what is undefined: its derivative at 0 is the map itself
         given = [zeros(x) if undefined else x for x, undefined in zip(arrays, linear)]

@@ -36,6 +36,8 @@ SNAP = 1e-2  # of the tolerance: margins closer to 0 than that are 0
 NEGLIGIBLE = 0.1  # of the tolerance: an approach or a load below it does nothing more
 PATIENCE = 2000  # passes per contact after which an impact may end at WIDENED tolerances
 WIDENED = 100.0
+DRAGGING = 100  # passes per contact, which few impacts need
+OFTEN = 8  # closings of a contact, from which on they may be endless
 UNROLLED = 8  # products with a matrix of this size are written out, without a reduction
 LARGE = 6.0  # exponents below it that are whole or half are products
 
@@ -357,7 +359,20 @@ class ContactFlow:
         force = self.force(const, x, g)
         return Measured(force, x, p, const.scale * g, none, none, none, const.unit)
 
+    def change(self, y: jax.Array) -> jax.Array:
+        """What the impulses of a state change of the gap velocities (m, B)."""
+        return self.coupling.times(self.rows(y)[2])
+
     # ---- the end
+
+    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
+        """Where the most closings of a contact become 8, 16, 32, ...: see `plastic_limit.py`."""
+        if self.gapped or self.viscous is not None:
+            return None  # nothing is self-similar there
+        m = self.contacts
+        count, old = (jnp.max(x[m : 2 * m], axis=0, keepdims=True) for x in (after, before))
+        doubled = (count > old) & (count >= OFTEN) & (count & (count - 1) == 0)
+        return doubled & (passes > DRAGGING * m)
 
     def patience(self, passes: jax.Array) -> jax.Array:
         """Widens what counts as nothing left once an impact drags on."""

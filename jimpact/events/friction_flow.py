@@ -188,7 +188,15 @@ class FrictionFlow(ContactFlow):
             ._replace(tangential_force=side, tangential_impulse=y[4 * m : 5 * m], slip=self.slip(y))
         )
 
-    # ---- the end: a contact with friction is never alone
+    def change(self, y: jax.Array) -> jax.Array:
+        """What the impulses of a state change of the gap velocities, tangential ones, too."""
+        side = y[-1 - self.across.shape[1] : -1]
+        return super().change(y) + times(self.across, side)
+
+    # ---- the end: a contact with friction is never alone, and no multiple of another state
+
+    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
+        return None
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))

@@ -16,7 +16,7 @@ import numpy as np
 
 from jimpact.contact import Contact
 from jimpact.events import impulse_form, stepper
-from jimpact.events.batches import in_columns
+from jimpact.events.batches import in_columns, tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -27,20 +27,17 @@ from jimpact.events.contact_flow import (
     unit,
 )
 from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
-from jimpact.events.stepper import any_of, total
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
 # Derivatives are one or two digits worse than values at the same tolerance; at order 8 two digits
 # more cost a third more steps.
 GRADIENT_TIGHTENING = 0.01
-QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
 # Contacts so many times slower than the fastest see as many of its periods, whose errors add up.
 WIDE_SPREAD = 5.0
 METHODS = ("time", "impulse")
-ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
-CHOICES = 8  # rounds of the search for the contacts that carry the remainder of a plastic limit
 # The tolerance of a second run that shows how well an outcome is conditioned, as a multiple of that
 # of the first one: coarser where the precision can hold none that is APART finer.
 FINER, APART, COARSER = 0.01, 3.0, 10.0
@@ -97,8 +94,9 @@ def dimensionless(
     stored: jax.Array,
     rtol: float,
     gaps: jax.Array | None = None,
+    count: Any = None,
 ) -> tuple[Problem, Units]:
-    """The dimensionless problem and the units to return from it."""
+    """The dimensionless problem and the units to return from it; `count` contacts take part."""
     m, dtype = gamma.shape[0], gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
     root = jnp.sqrt(diagonal(delassus))
@@ -117,7 +115,8 @@ def dimensionless(
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
-    step = jax.lax.stop_gradient(rtol * min(1.0, 2 / m) / jnp.max(weight))
+    share = jnp.minimum(1.0, 2 / jnp.maximum(m if count is None else count, 1))
+    step = jax.lax.stop_gradient(rtol * share / jnp.max(weight))
     problem = Problem(
         beside=beside,
         omega=omega,
@@ -200,35 +199,41 @@ class Outcome:
     most: int
     sides: int = 0  # tangential rows
     whole: bool = False
+    finely: bool = False  # at the tolerance of derivatives
     repeats: bool = False  # walk the steps once more, for derivatives
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
         return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
+    def shapes(self, *leaves: Any) -> tuple[jax.ShapeDtypeStruct, ...]:
+        """Of the results, from those of the leaves."""
+        contacts, batch = jax.tree.unflatten(self.tree, leaves).omega.shape
+        smooth = (leaves[0].dtype,) * 3
+        kinds = smooth if self.repeats else (*smooth, jnp.int32, jnp.int32)
+        rows = contacts, self.sides, 1, 1, 1
+        return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
+
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         problem = jax.tree.unflatten(self.tree, leaves)
         still = jax.lax.stop_gradient(problem)
-        tighten = GRADIENT_TIGHTENING if self.repeats else 1.0
+        tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         flow, modes, y = self.flow(still, tighten)
-        if self.repeats:
-            end, plan = stepper.record(flow, modes, y, self.most)
-        else:
-            end = stepper.run(flow, modes, y, self.most)
-        over, last = end.plan[2:3] > 0, end.step.modes
-        m = flow.contacts
+        end = to_the_end(flow, still.gamma, modes, y, self.most, keeps=self.finely)
+        state, dp = end.carry.y, end.impulse
         if self.repeats:
             moving, _, y = self.flow(problem, tighten)
-            state = stepper.repeat(moving, modes, y, plan, last, over)
-        else:
-            moving, state = flow, jnp.where(over, flow.finish(last, end.y)[1], end.y)
-        p = state[2 * m : 3 * m]
-        rest = at_rest(flow, end)
-        p = settled(moving, problem.gamma, p, rest, exactly=self.repeats)
+            state = stepper.repeat(moving, modes, y, end.plan)
+            state = jnp.where(end.finishes, moving.finish(end.carry.step.modes, state)[1], state)
+            dp = remainder(moving, problem.gamma, state, end.carries)
+        m = flow.contacts
+        p = state[2 * m : 3 * m] + dp
+        if self.finely:
+            p = stepper.with_plan(p, end.plan)
         side, time = state[3 * m + self.sides : -1][: self.sides], state[-1:]
         if self.repeats:
             return p, side, time
-        return p, side, time, status_of(end, rest), end.plan[3:4].astype(jnp.int32)
+        return p, side, time, end.status, end.carry.plan[3:4].astype(jnp.int32)
 
 
 class Dynamics(NamedTuple):
@@ -319,73 +324,14 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
     def value(*leaves: jax.Array) -> tuple[jax.Array, ...]:
         return in_columns(function, *leaves)
 
-    @value.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
-        again = dataclasses.replace(function, repeats=True)
-        rates = jax.jvp(lambda *x: in_columns(again, *x), primals, tangents)[1]
-        outs = value(*primals)
+    def rule(primals: Any, tangents: Any) -> Any:
+        # the same steps give both: one loop where they are one program
+        fine = dataclasses.replace(function, finely=True)
+        outs = outcome(fine, primals)
+        again = dataclasses.replace(fine, repeats=True)
+        rates = tangents_in_columns(again, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 
+    value.defjvp(rule, symbolic_zeros=True)
     return value(*leaves)
-
-
-def at_rest(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
-    """Contacts (m, B) as good as at rest where some of them re-closed again and again."""
-    m, modes, over = flow.contacts, end.step.modes, end.plan[2:3] > 0
-    gamma = flow.scales(modes) * flow.rows(end.y)[1]
-    # no wider than what ended the impact: a ball of a long chain may be slower
-    quiet = jnp.abs(gamma) <= QUIET * flow.patience(end.plan[3:4])
-    return over & quiet & any_of(quiet & (modes[m : 2 * m] >= ENDLESS))
-
-
-def status_of(end: stepper.Carry, rest: jax.Array) -> jax.Array:
-    """Status (1, B) of a run with contacts left at rest."""
-    code = jnp.where(any_of(rest), CODE["plastic_limit"], CODE["ok"])
-    return jnp.where(end.plan[2:3] > 0, code, CODE["max_steps"]).astype(jnp.int32)
-
-
-def settled(
-    flow: ContactFlow, gamma: jax.Array, p: jax.Array, rest: jax.Array, exactly: bool
-) -> jax.Array:
-    """Impulses once endless re-closing has come to its limit.
-
-    Contacts at rest carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, on
-    the gamma+ that their impulses give: errors of many closings add up. Who carries is a decision;
-    `exactly`: dp is a smooth function of the rest.
-    """
-
-    def come_to_rest(p: jax.Array) -> jax.Array:
-        still, frozen = jax.lax.stop_gradient((gamma + flow.coupling.times(p), flow.coupling))
-
-        def choose(_: Any, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-            """Those that would pull leave, those that still approach carry, too."""
-            carries, _ = both
-            dp = remainder(frozen, carries, still)
-            return rest & jnp.where(carries, dp > 0, still + frozen.times(dp) < 0), dp
-
-        start = (rest & (still < 0), jnp.zeros_like(still))
-        carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
-        if exactly:
-            dp = remainder(flow.coupling, carries, gamma + flow.coupling.times(p))
-        return p + dp
-
-    return jax.lax.cond(jnp.any(rest), come_to_rest, lambda p: p, p)
-
-
-def remainder(coupling: Chain | Dense, carries: jax.Array, after: jax.Array) -> jax.Array:
-    """dp (m, B) of the contacts that carry, with which their gamma+ is 0: conjugate gradients."""
-    right = jnp.where(carries, -after, 0.0)
-
-    def step(carry: Any, _: None) -> tuple[Any, None]:
-        z, residual, direction, size = carry
-        image = jnp.where(carries, coupling.times(direction), 0.0)
-        curvature = total(direction * image)
-        length = jnp.where(curvature > 0, size / jnp.where(curvature > 0, curvature, 1.0), 0.0)
-        z, residual = z + length * direction, residual - length * image
-        new = total(residual * residual)
-        kept = jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0)
-        return (z, residual, residual + kept * direction, new), None
-
-    start = (jnp.zeros_like(right), right, right, total(right * right))
-    return jax.lax.scan(step, start, None, length=2 * right.shape[0])[0][0]

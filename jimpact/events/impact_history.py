@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from jimpact.events import stepper
 from jimpact.events.contact_flow import Measured
-from jimpact.events.impact_dynamics import Outcome, at_rest, status_of
+from jimpact.events.impact_dynamics import Outcome
+from jimpact.events.plastic_limit import to_the_end
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,8 +24,10 @@ class Samples:
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
-        flow, modes, y = self.outcome.flow(jax.lax.stop_gradient(problem), 1.0)
-        end, plan = stepper.record(flow, modes, y, self.outcome.most)
+        still = jax.lax.stop_gradient(problem)
+        flow, modes, y = self.outcome.flow(still, 1.0)
+        ended = to_the_end(flow, still.gamma, modes, y, self.outcome.most, keeps=True)
+        end, plan = ended.carry, ended.plan
         moving, _, y = self.outcome.flow(problem, 1.0)
         states = stepper.path(moving, modes, y, plan)
         marks = jnp.where(plan.marks[:, -1:] > 0, plan.marks, 0)
@@ -55,5 +58,5 @@ class Samples:
         parts = jnp.linspace(0.0, 1.0, self.samples, dtype=y.dtype)
         time, energy, seen = jax.lax.map(at, parts)
         force = jax.lax.map(lambda both: moving.measured(*both).force, (phases, states))
-        code = status_of(end, at_rest(flow, end)).astype(y.dtype)
+        code = ended.status.astype(y.dtype)
         return time, energy, *seen, jnp.max(force, axis=0), code

@@ -13,6 +13,7 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     begins(before, after)      -> (1, B): forces set in like powers of t, so steps begin in its root
     coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
     over(modes, y, passes)     -> (1, B): nothing is left to integrate
+    pauses(before, after, passes)  -> (1, B): the caller wants to look now; None: never
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
     longest                    the longest step in the flow's own time that is stable
@@ -52,7 +53,6 @@ GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
 RESTART = 0.1  # first rooted step after a contact has closed, as a part of the step before it
 CUT = 0.7  # part of the way to an event that a step is shortened to where it cannot land
-DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
 SHORTEST = 1e-13  # step: a shorter one cannot be told from none
 TIE = 1e-13  # of a step: events of one moment are taken in the order of their rows
 # Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
@@ -64,7 +64,7 @@ COARSE = 0.3  # the error is no less than this part of the third-order estimate 
 COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
 
 # Accepted steps kept for derivatives: blocks of steps, where nothing is kept a block is skipped.
-# An impact of more steps has no derivative (NaN): its status says max_steps.
+# An impact of more steps has no derivative: NaN, whatever its status.
 BLOCKS, BLOCK = 64, 16
 
 STAGES = len(DOP853.c)
@@ -96,6 +96,9 @@ class Flow(Protocol):
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array: ...
     def coasts(self, modes: jax.Array) -> jax.Array | None: ...
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array: ...
+    def pauses(
+        self, before: jax.Array, after: jax.Array, passes: jax.Array
+    ) -> jax.Array | None: ...
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]: ...
 
 
@@ -171,12 +174,16 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
     return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates
 
 
+GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
+
+
 class Carry(NamedTuple):
     """What one pass hands to the next."""
 
     y: jax.Array
     step: Step  # the one to try
-    plan: jax.Array  # (4, B): time it is expected to take, landing aimed at twice, over, passes
+    # (4, B): time it is expected to take, landing aimed at twice, GOES_ON | OVER | PAUSED, passes
+    plan: jax.Array
 
 
 def begin(flow: Flow, modes: jax.Array, y: jax.Array) -> Carry:
@@ -185,20 +192,26 @@ def begin(flow: Flow, modes: jax.Array, y: jax.Array) -> Carry:
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
     targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
-    over = flow.over(modes, y, 0 * one).astype(y.dtype)
-    return Carry(y, step, jnp.concatenate([FIRST * one, 0 * one, over, 0 * one]))
+    over = flow.over(modes, y, 0 * one)
+    state = jnp.where(over, OVER, GOES_ON).astype(y.dtype)
+    return Carry(y, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
 
 
 def goes_on(carry: Carry, most: int) -> jax.Array:
-    """Impacts (1, B) that are neither over nor given up."""
-    return (carry.plan[2:3] == 0) & (carry.plan[3:4] < most)
+    """Impacts (1, B) that are neither over nor given up nor looked at."""
+    return (carry.plan[2:3] == GOES_ON) & (carry.plan[3:4] < most)
+
+
+def unwatched(carry: Carry, most: int) -> jax.Array:
+    """Whether () some impact goes on and none wants to be looked at."""
+    return jnp.any(goes_on(carry, most)) & ~jnp.any(carry.plan[2:3] == PAUSED)
 
 
 def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     """One pass: try a step; accept it, or aim at what lies in its middle, or shorten it.
 
     Every margin gets one number, in units of the step tried, and the least one decides:
-        -2 .. -1   it dips, or cannot be landed on from here: shorten the step to CUT * (at + 2)
+        -2 .. -1   it cannot be landed on from here: shorten the step to CUT * (at + 2)
          0 ..  1   it vanishes inside the step: repeat the step as a landing on it
          1 .. inf  it is expected to vanish so far ahead: land on it if the next step reaches it
     """
@@ -229,28 +242,24 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     d0, d1 = d0 * span, d1 * span
     snap = flow.snap
     free = ~s.target
-    crossed, turns = free & (c1 < -snap), free & (d0 < 0) & (d1 > 0) & (c0 > snap)
-    top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
-    bottom = jnp.where(crossed, c0 - c1, jnp.where(turns, d1 - d0, -d1))
-    u = top / jnp.where(bottom > 0, bottom, jnp.inf)
+    crossed = free & (c1 < -snap)
+    fall = c0 - c1
+    u = jnp.maximum(c0, 0.0) / jnp.where(fall > 0, fall, jnp.inf)
     # what rises from 0 and falls back: as in a parabola
     u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
     if flow.near:
         # steps in time go before: exact in a parabola, where dt/dxi has a singularity at the top
         u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
-    v = 1 - u
-    low = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
-    dipped = turns & (low < DOUBT * (d1 - d0) - snap)
     at_once = (c0 <= snap) & (d0 <= 0)
     direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > snap))
     # ahead by a parabola: a margin that only creeps towards 0 is not about to reach it
     left = d1 * d1 - 2 * (d1 - d0) * c1
-    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
+    ahead = free & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
     soon = 2 * c1 / (jnp.sqrt(jnp.where(ahead, left, 1.0)) - jnp.where(ahead, d1, 0.0))
     at = jnp.where(
         crossed,
         jnp.where(direct & (again == 0), jnp.where(at_once, 0.0, u), u - 2),
-        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + soon, jnp.inf)),
+        jnp.where(ahead, 1 + soon, jnp.inf),
     )
     at = at + TIE * jnp.arange(c0.shape[0], dtype=dtype)[:, None]
     first = jnp.min(at, axis=0, keepdims=True)
@@ -288,12 +297,14 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     due = jnp.where(event, first, first - 1) * span
     clock = jnp.concatenate([xi, h, in_root.astype(dtype), aim.astype(dtype)])
     passes = passes + active.astype(dtype)
-    over = flow.over(modes, y, passes)
+    pauses = flow.pauses(s.modes, modes, passes)
+    done = done if pauses is None else jnp.where(landed & pauses, PAUSED, done)
+    over = flow.over(modes, y, passes) | broken
     plan = jnp.concatenate(
         [
             jnp.where(aim, due, new_span),
             (aim & lands & event).astype(dtype),
-            jnp.where(over | broken, 1.0, done),
+            jnp.where(over, OVER, done),
             passes,
         ]
     )
@@ -315,12 +326,10 @@ def _root_of_cubic(
     return u
 
 
-def run(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> Carry:
-    """From the beginning to the end, or to the limit of passes; `finish` is not yet applied."""
+def run(flow: Flow, carry: Carry, most: int) -> Carry:
+    """On to the end, the first pause, or the limit of passes; `finish` is not yet applied."""
     return jax.lax.while_loop(
-        lambda c: jnp.any(goes_on(c, most)),
-        lambda c: advance(flow, c, most)[0],
-        begin(flow, modes, y),
+        lambda c: unwatched(c, most), lambda c: advance(flow, c, most)[0], carry
     )
 
 
@@ -334,19 +343,35 @@ class Plan(NamedTuple):
     clock: jax.Array  # (steps, 4, B)
 
 
-def record(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> tuple[Carry, Plan]:
+class Recorder(NamedTuple):
+    """A plan while it is written: rows used, and whether (1, B) there were too few."""
+
+    plan: Plan
+    used: jax.Array
+    lost: jax.Array
+
+    def closed(self) -> Plan:
+        """The plan. An impact of more steps than rows has no derivative: NaN, no wrong number."""
+        return Plan(self.plan.marks, jnp.where(self.lost[None], jnp.nan, self.plan.clock))
+
+
+def recorder(carry: Carry) -> Recorder:
+    """A plan without a step."""
+    modes, target, clock = carry.step
+    size, rows = BLOCKS * BLOCK, len(modes) + len(target) + 1
+    plan = Plan(
+        jnp.zeros((size, rows, *clock.shape[1:]), jnp.int8),
+        jnp.zeros((size, *clock.shape), clock.dtype),
+    )
+    return Recorder(plan, jnp.zeros((), jnp.uint32), jnp.zeros(clock[:1].shape, bool))
+
+
+def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, Recorder]:
     """As `run`, and the plan of its steps."""
     size = BLOCKS * BLOCK
-    start = begin(flow, modes, y)
-    rows = modes.shape[0] + start.step.target.shape[0] + 1
-    plan = Plan(
-        jnp.zeros((size, rows, *y.shape[1:]), jnp.int8), jnp.zeros((size, 4, *y.shape[1:]), y.dtype)
-    )
 
-    Loop = tuple[Carry, Plan, jax.Array, jax.Array]
-
-    def body(state: Loop) -> Loop:
-        carry, plan, count, lost = state
+    def body(state: tuple[Carry, Recorder]) -> tuple[Carry, Recorder]:
+        carry, (plan, count, lost) = state
         after, accept = advance(flow, carry, most)
         s = carry.step
         marks = jnp.concatenate(
@@ -359,23 +384,24 @@ def record(flow: Flow, modes: jax.Array, y: jax.Array, most: int) -> tuple[Carry
             _put(plan.clock, jnp.where(accept, s.clock, 0.0), index),
         )
         count = count + jnp.any(accept).astype(count.dtype)
-        return after, plan, count, lost | (accept & (count > size))
+        return after, Recorder(plan, count, lost | (accept & (count > size)))
 
-    end, plan, _, lost = jax.lax.while_loop(
-        lambda state: jnp.any(goes_on(state[0], most)),
-        body,
-        (start, plan, jnp.zeros((), jnp.uint32), jnp.zeros(y[:1].shape, bool)),
-    )
-    # an impact of more steps than there are rows has no derivative: NaN, not a wrong number
-    return end, Plan(plan.marks, jnp.where(lost[None], jnp.nan, plan.clock))
+    return jax.lax.while_loop(lambda state: unwatched(state[0], most), body, (carry, pen))
 
 
-def repeat(
-    flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, last: jax.Array, over: jax.Array
-) -> jax.Array:
-    """The state that `run` and `finish` end with, as a smooth function of `flow` and `y`."""
-    y, _ = _walk(flow, modes, y, plan, states=False)
-    return jnp.where(over, flow.finish(last, y)[1], y)
+def with_plan(x: jax.Array, plan: Plan) -> jax.Array:
+    """x, of a program that has to keep the plan although nothing else is asked of it.
+
+    Values and their derivatives record the same steps. The compiler makes one loop of two that are
+    the same; it would strip one of them of the plan first.
+    """
+    marks, clock = plan.marks[0, -1:], plan.clock[0, 2:3]  # each is 0 or 1
+    return jnp.where((marks < 0) | (clock < 0), jnp.nan, x)
+
+
+def repeat(flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan) -> jax.Array:
+    """The state that `run` ends with, as a smooth function of `flow` and `y`."""
+    return _walk(flow, modes, y, plan, states=False)[0]
 
 
 def path(flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan) -> jax.Array:

@@ -143,6 +143,11 @@ class LZB(Law):
         """A tolerance finer than the precision can hold is an error."""
         check_rtol(self.rtol, dtype)
 
+    @property
+    def fills_up(self) -> bool:
+        """Without friction, by the stepper."""
+        return self.method == "time" and self.friction is None
+
     def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
         """The impact dynamics in units of their own; `rtol` in place of the law's."""
         problem, units = dimensionless(
@@ -155,6 +160,7 @@ class LZB(Law):
             self.rtol or default_rtol(self.method, contact.gap_velocity.dtype)
             if rtol is None
             else rtol,
+            count=jnp.sum(contact.closed, dtype=contact.gap_velocity.dtype),
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))

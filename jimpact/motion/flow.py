@@ -165,6 +165,9 @@ class MotionFlow(eqx.Module):
         """Never: it is seen from outside."""
         return jnp.zeros((1, 1), bool)
 
+    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> None:
+        """Never, as well."""
+
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Nothing."""
         return modes, y

@@ -1,0 +1,197 @@
+"""Contacts that close again and again, and the plastic limit that this comes to.
+
+Each closing takes part of the velocities away, so that endless closings end with `gamma+ = 0` of
+those contacts. What is left of a contact below the tolerance is such an end. But contacts beside a
+light body lose about its part of the mass at each closing: thousands of closings, all alike. The
+law is homogeneous: a state multiplied by s takes the same course, multiplied by s. Once a state
+returns as a multiple s < 1 of itself, it will return so for ever, and the limit is known.
+
+Whether it does is looked at when the number of closings becomes 8, 16, 32, ... Two states one
+such number apart are compared by `gamma`, by the energy in each contact, and by the impulses that
+would bring the contacts to rest now. These see, as `gamma` alone does not, how fast heavy bodies
+on both sides of a light one still approach. A light body that does not lose its energy may push
+them apart in the end; meanwhile its states are no multiples of each other.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.events import stepper
+from jimpact.events.contact_flow import ContactFlow
+from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
+from jimpact.status import CODE
+
+QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
+ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
+CHOICES = 8  # rounds of the search for the contacts that carry the remainder of a plastic limit
+# Of what the size of a state falls by its shape may change: at 1, anything that shrinks would do.
+SHAPE = 0.02
+
+
+class Rest(NamedTuple):
+    """Who comes to rest (m, B), and what was seen when it was looked at last."""
+
+    contacts: jax.Array  # whose closings have no end
+    carries: jax.Array  # of these, who carries an impulse
+    # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of the approach
+    rows: jax.Array
+    closings: jax.Array
+    ended: jax.Array  # (1, B): by a state that returned as a part of itself
+
+
+class End(NamedTuple):
+    """An impact at its end, finished but for the impulse of the contacts at rest."""
+
+    carry: stepper.Carry
+    pen: stepper.Recorder | None
+    rest: Rest
+    begun: jax.Array  # ()
+
+    @property
+    def carries(self) -> jax.Array:
+        """Contacts at rest that carry an impulse (m, B); asks for both, see `with_plan`."""
+        return self.rest.carries & self.rest.contacts
+
+    @property
+    def impulse(self) -> jax.Array:
+        """Of the contacts at rest (m, B)."""
+        return jnp.where(self.carries, self.rest.rows[2], 0.0)
+
+    @property
+    def plan(self) -> stepper.Plan:
+        """The steps that were kept."""
+        assert self.pen is not None
+        return self.pen.closed()
+
+    @property
+    def over(self) -> jax.Array:
+        """Not given up (1, B)."""
+        return self.carry.plan[2:3] == OVER
+
+    @property
+    def finishes(self) -> jax.Array:
+        """Ended by the flow itself (1, B)."""
+        return self.over & ~self.rest.ended
+
+    @property
+    def status(self) -> jax.Array:
+        """Status (1, B) of the run."""
+        code = jnp.where(any_of(self.rest.contacts), CODE["plastic_limit"], CODE["ok"])
+        return jnp.where(self.over, code, CODE["max_steps"]).astype(jnp.int32)
+
+
+def to_the_end(
+    flow: ContactFlow, gamma: jax.Array, modes: jax.Array, y: jax.Array, most: int, keeps: bool
+) -> End:
+    """From gap velocities gamma (m, B) to the end; `keeps` the plan of the steps."""
+    carry = stepper.begin(flow, modes, y)
+    no = jnp.zeros(gamma.shape, bool)
+    rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
+    rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
+    start = End(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
+
+    def on(end: End) -> End:
+        finished = (end.carry.plan[2:3] == OVER) & end.begun
+        if end.pen is None:
+            carry, pen = stepper.run(flow, end.carry, most), None
+        else:
+            carry, pen = stepper.record(flow, end.carry, end.pen, most)
+        over, paused = (carry.plan[2:3] == OVER) & ~finished, carry.plan[2:3] == PAUSED
+        quiet = over & at_rest(flow, carry)
+        carry = carry._replace(
+            y=jnp.where(over, flow.finish(carry.step.modes, carry.y)[1], carry.y)
+        )
+        rest = jax.lax.cond(
+            jnp.any(paused | quiet),
+            lambda: looked(flow, gamma, carry, end.rest, quiet),
+            lambda: end.rest,
+        )
+        settled = jnp.where(rest.ended, OVER, GOES_ON)
+        plan = carry.plan.at[2:3].set(jnp.where(paused, settled, carry.plan[2:3]))
+        return End(carry._replace(plan=plan), pen, rest, jnp.asarray(True))
+
+    return jax.lax.while_loop(
+        lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start
+    )
+
+
+def at_rest(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
+    """Contacts (m, B) as good as at rest where some of them re-closed again and again."""
+    m, modes = flow.contacts, end.step.modes
+    gamma = flow.scales(modes) * flow.rows(end.y)[1]
+    # no wider than what ended the impact: a ball of a long chain may be slower
+    quiet = jnp.abs(gamma) <= QUIET * flow.patience(end.plan[3:4])
+    return quiet & any_of(quiet & (modes[m : 2 * m] >= ENDLESS))
+
+
+def looked(
+    flow: ContactFlow, gamma: jax.Array, carry: stepper.Carry, seen: Rest, quiet: jax.Array
+) -> Rest:
+    """Who is at rest at the end, or would come to rest from a pause.
+
+    Contacts at rest carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, on
+    the gamma+ that their impulses give: errors of many closings add up.
+    """
+    m, modes, state = flow.contacts, carry.step.modes, carry.y
+    paused = carry.plan[2:3] == PAUSED
+    count = modes[m : 2 * m]
+    since = count - seen.closings
+    often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
+    rest = quiet | often
+    now = gamma + flow.change(state)
+
+    def choose(_: Any, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Those that would pull leave, those that still approach carry, too."""
+        carries, _ = both
+        dp = impulse_of_rest(flow, carries, now)
+        after = now + flow.coupling.times(dp)
+        return rest & jnp.where(carries, dp > 0, after < 0), dp
+
+    start = (often | (rest & (now < 0)), jnp.zeros_like(now))
+    carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
+
+    # is it a part of the state seen before?
+    root = jnp.sqrt(flow.energy(state[:m], jnp.zeros_like(now)))
+    rows = jnp.where(often, jnp.stack([now, root, dp]), 0.0)
+    size, before = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, seen.rows))
+    ratio = size[:1] / jnp.where(before[:1] > 0, before[:1], size[:1])
+    returns = jnp.abs(rows - ratio * seen.rows) <= SHAPE * (1 - ratio) * size
+    after = now + flow.coupling.times(dp)
+    stays = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
+    meets = jnp.where(often, carries, stays) & jnp.all(returns, axis=0)
+    ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
+    rest = quiet | (often & ends)
+    new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends)
+    fresh = paused | any_of(quiet)
+    return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, seen)
+
+
+def remainder(
+    flow: ContactFlow, gamma: jax.Array, state: jax.Array, carries: jax.Array
+) -> jax.Array:
+    """The impulses of the contacts that carry at the end, as a smooth function of the rest."""
+
+    def some() -> jax.Array:
+        return impulse_of_rest(flow, carries, gamma + flow.change(state))
+
+    return jax.lax.cond(jnp.any(carries), some, lambda: jnp.zeros_like(gamma))
+
+
+def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> jax.Array:
+    """dp (m, B) of the contacts that carry, with which their gamma+ is 0: conjugate gradients."""
+    right = jnp.where(carries, -after, 0.0)
+
+    def step(carry: Any, _: None) -> tuple[Any, None]:
+        z, residual, direction, size = carry
+        image = jnp.where(carries, flow.coupling.times(direction), 0.0)
+        curvature = total(direction * image)
+        length = jnp.where(curvature > 0, size / jnp.where(curvature > 0, curvature, 1.0), 0.0)
+        z, residual = z + length * direction, residual - length * image
+        new = total(residual * residual)
+        kept = jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0)
+        return (z, residual, residual + kept * direction, new), None
+
+    start = (jnp.zeros_like(right), right, right, total(right * right))
+    return jax.lax.scan(step, start, None, length=2 * right.shape[0])[0][0]
