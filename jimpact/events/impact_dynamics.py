@@ -39,8 +39,8 @@ GRADIENT_TIGHTENING = 0.01
 WIDE_SPREAD = 5.0
 METHODS = ("time", "impulse")
 # The tolerance of a second run that shows how well an outcome is conditioned, as a multiple of that
-# of the first one: coarser where the precision can hold none that is APART finer.
-FINER, APART, COARSER = 0.01, 3.0, 10.0
+# of the first one: APART coarser where the precision can hold none that is so much finer.
+FINER, APART = 0.01, 3.0
 ILL = 10.0  # rtol that two runs may differ by
 
 
@@ -291,18 +291,19 @@ def solve(
 
 
 def otherwise(problem: Problem) -> Problem:
-    """The same at another tolerance, gamma- changed in the last digits that the precision can hold.
+    """The same at another tolerance, gamma- and omega changed in the last digits that can be held.
 
     That tells what errors grow to also where it is rounding, not the tolerance, that limits them.
     """
     still = jax.lax.stop_gradient(problem)
     gamma, tolerance = still.gamma, still.tolerance
-    last = stepper.FINEST * float(jnp.finfo(gamma.dtype).eps)
-    finer = jnp.maximum(FINER * tolerance, last)
-    coarser = COARSER * jnp.maximum(tolerance, last)
-    signs = 1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2)
+    held = stepper.FINEST * float(jnp.finfo(gamma.dtype).eps)
+    finer = jnp.maximum(FINER * tolerance, held)
+    coarser = APART * jnp.maximum(tolerance, held)
+    last = held * (1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2))
     return still._replace(
-        gamma=gamma + last * signs,
+        gamma=gamma * (1 + last),
+        omega=still.omega * (1 - last),
         tolerance=jnp.where(APART * finer <= tolerance, finer, coarser),
     )
 
