@@ -36,7 +36,8 @@ class Compliant(Law):
         max_steps: passes of the integrator before it gives up.
         check_conditioning: a second run tells `ill_conditioned`, as in `LZB`.
 
-    Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`.
+    Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`
+    where that is checked.
 
     Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-; one-sided
     where a gap is 0 and at grazing events. Where two orders of collision meet the outcome changes

@@ -93,14 +93,13 @@ class LZB(Law):
         max_steps: passes of the integrator (or steps, method 'impulse') before it gives up.
         method: 'time' (default), event-aligned, order 8; 'impulse', the published scheme in the
             impulse of a primary contact, order 1.
-        check_conditioning: a second run beside the first, at rtol / 100 (10 rtol where the
-            precision cannot hold that) and with v- changed in its last digits, tells
-            `ill_conditioned` where gap velocities differ by more than 10 rtol of the fastest
-            approach. In a batch two to three times the time; method 'time'.
+        check_conditioning: a second run beside the first, at rtol / 100 and from data changed in
+            their last digits, tells `ill_conditioned` where gap velocities or slips differ by more
+            than 10 rtol of the fastest approach (`docs/speed_accuracy.md`: what that finds, and
+            float32). In a batch two to three times the time; method 'time'.
 
     Status: `plastic_limit` where contacts re-close without end; `max_steps`, also where large
-    friction wedges contacts that then vibrate for long; `ill_conditioned` (see
-    `docs/speed_accuracy.md`).
+    friction wedges contacts that then vibrate for long; `ill_conditioned` where that is checked.
 
     Derivatives, forward and reverse, in all parameters, W and gamma-; one-sided at e = 0 and
     e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three equal
