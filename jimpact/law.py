@@ -139,7 +139,7 @@ class Option:
 
     def __init__(
         self,
-        choices: tuple[str, ...] | None = None,
+        choices: tuple[Any, ...] | None = None,
         low: float | None = None,
         high: float = np.inf,
         *,
@@ -218,7 +218,7 @@ def parameter(
 
 def option(
     default: Any,
-    choices: tuple[str, ...] | None = None,
+    choices: tuple[Any, ...] | None = None,
     *,
     low: float | None = None,
     high: float = np.inf,

@@ -37,6 +37,10 @@ GRADIENT_TIGHTENING = 0.01
 # Contacts so many times slower than the fastest see as many of its periods, whose errors add up.
 WIDE_SPREAD = 5.0
 METHODS = ("time", "impulse")
+# The tolerance of a second run that shows how well an outcome is conditioned, as a multiple of that
+# of the first one: coarser where the precision can hold none that is APART finer.
+FINER, APART, COARSER = 0.01, 3.0, 10.0
+ILL = 10.0  # rtol that two runs may differ by
 
 
 class Problem(NamedTuple):
@@ -66,12 +70,14 @@ class Sides(NamedTuple):
 
 
 class Units(NamedTuple):
-    """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m]."""
+    """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m], the error [m/s] that
+    `rtol` allows."""
 
     velocity: jax.Array
     time: jax.Array
     root: jax.Array
     indentation: jax.Array
+    error: jax.Array
 
     @property
     def momentum(self) -> jax.Array:
@@ -124,7 +130,7 @@ def dimensionless(
         taking_part=count[None],
         step=step[None],
     )
-    return problem, Units(q, time, root, x_ref)
+    return problem, Units(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
 
 
 def sides_of(contact: Contact, friction: jax.Array, units: Units) -> Sides:
@@ -258,10 +264,11 @@ class Dynamics(NamedTuple):
 
 
 def solve(
-    given: Dynamics, max_steps: int, method: str = "time"
+    given: Dynamics, max_steps: int, method: str = "time", doubted: Contact | None = None
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
     """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
+    `doubted`: a second run beside the first one says whether the outcome is `ill_conditioned`.
     Differentiable in both modes; method 'time' in all orders.
     """
     units, static = given.units, given.static_exponent
@@ -269,12 +276,48 @@ def solve(
         p, code = impulse_form.solve(given.problem, static, given.chain, max_steps)
         return p * units.momentum, None, code
     leaves, tree = given.columns()
+    if doubted is not None:
+        second = given._replace(problem=otherwise(given.problem)).columns()[0]
+        leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
     found = outcome(Outcome(tree, static, given.chain, max_steps, given.tangents), leaves)
     p, side, _, code, _ = found
-    if given.tangents == 0:
-        return p[:, 0] * units.momentum, None, code[0, 0]
-    momentum = jnp.repeat(units.momentum, given.tangents // len(units.root))
-    return p[:, 0] * units.momentum, side[:, 0] * momentum, code[0, 0]
+    p, code = p * units.momentum[:, None], code[0]
+    sides = None
+    if given.tangents > 0:
+        sides = side * jnp.repeat(units.momentum, given.tangents // len(units.root))[:, None]
+    if doubted is not None:
+        apart = None if sides is None else sides[:, 1] - sides[:, 0]
+        change = velocity_changes(doubted, p[:, 1] - p[:, 0], apart)
+        same = jnp.all(jnp.abs(change) <= ILL * units.error) & (code[1] <= CODE["plastic_limit"])
+        code = jnp.maximum(code, jnp.where(same, CODE["ok"], CODE["ill_conditioned"]))
+    return p[:, 0], None if sides is None else sides[:, 0], code[0]
+
+
+def otherwise(problem: Problem) -> Problem:
+    """The same at another tolerance, gamma- changed in the last digits that the precision can hold.
+
+    That tells what errors grow to also where it is rounding, not the tolerance, that limits them.
+    """
+    still = jax.lax.stop_gradient(problem)
+    gamma, tolerance = still.gamma, still.tolerance
+    last = stepper.FINEST * float(jnp.finfo(gamma.dtype).eps)
+    finer = jnp.maximum(FINER * tolerance, last)
+    coarser = COARSER * jnp.maximum(tolerance, last)
+    signs = 1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2)
+    return still._replace(
+        gamma=gamma * (1 + last * signs),
+        tolerance=jnp.where(APART * finer <= tolerance, finer, coarser),
+    )
+
+
+def velocity_changes(contact: Contact, p: jax.Array, sides: jax.Array | None) -> jax.Array:
+    """Changes (m,) or (m + t,) of gap velocities and slip [m/s] that impulses make."""
+    if sides is None:
+        return contact.delassus @ p
+    assert contact.cross is not None
+    assert contact.tangential is not None
+    normal = contact.delassus @ p + contact.cross @ sides
+    return jnp.concatenate([normal, contact.cross.T @ p + contact.tangential @ sides])
 
 
 def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

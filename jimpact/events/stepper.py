@@ -62,6 +62,7 @@ TIE = 1e-13  # of a step: events of one moment are taken in the order of their r
 FULL = 30
 POLISH = 2  # Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3
 FINEST = 16  # roundings: an error estimate below them is noise
+COARSE = 0.3  # the error is no less than this part of the third-order estimate squared
 COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
 
 # Accepted steps kept for derivatives: blocks of steps, where nothing is kept a block is skipped.
@@ -231,6 +232,8 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
+    # small by chance where the fifth order is: a landing from a maximum, a step of half a period
+    error2 = jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
     ok = error2 <= 1
     factor = jnp.clip(
         SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20)))), SHRINK, GROWTH
