@@ -4,38 +4,67 @@ Heavy imports wait until a command runs.
 """
 
 import dataclasses
-import json as json_module
+import functools
+import operator
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from jimpact import __version__
 
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
+StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
 
 
-class _Command:
-    """Options of a command; `jimpact.commands.<name>` runs it, and imports what it needs."""
-
-    name: ClassVar[str]
-
-    def run(self) -> int:
-        """The exit code."""
-        return import_module(f"jimpact.commands.{self.name}").run(**vars(self))
+def _name(kind: type) -> str:
+    return kind.__name__.removesuffix("Command").lower()
 
 
 @dataclasses.dataclass(frozen=True)
-class FitCommand(_Command):
+class Command:
+    """Options of every command; `jimpact.commands` runs it."""
+
+    json: bool = False
+    """Print JSON instead of text."""
+
+    @property
+    def name(self) -> str:
+        """The command's name."""
+        return _name(type(self))
+
+    def run(self) -> int:
+        """The exit code."""
+        return import_module("jimpact.commands").run(self)
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawingCommand(Command):
+    """Options of a command that draws a picture."""
+
+    out: Path = Path()
+    """Picture (.png, .pdf, .svg), or a directory for it; default: ./jimpact-<command>.png."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShotCommand(DrawingCommand):
+    """Options of a command about one impact."""
+
+    study: StudyFile = Path("three_balls.toml")
+    """Study file, or the name of a bundled one; its [data] may be missing."""
+    velocity: tuple[float, ...] | None = None
+    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
+    shot: int = 1
+    """Which measured shot, counted from 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FitCommand(DrawingCommand):
     """Fit a law to measured velocities; without a file: the bundled three balls."""
 
-    name: ClassVar[str] = "fit"
-
-    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
-        "three_balls.toml"
-    )
+    study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one (three_balls.toml, air_track.toml)."""
     law: str | None = None
     """Law in the place of the study's (see `jimpact laws`)."""
@@ -45,43 +74,21 @@ class FitCommand(_Command):
     """Number of starts; default: the study's, or 8."""
     seed: int | None = None
     """Seed of the random starts."""
-    out: Path = Path("jimpact-fit.png")
-    """Picture (.png, .pdf, .svg), or a directory for it."""
-    json: bool = False
-    """Print JSON instead of tables."""
 
 
 @dataclasses.dataclass(frozen=True)
-class CompareCommand(_Command):
+class CompareCommand(ShotCommand):
     """Every law on one scene, side by side: velocities, energy, dispersion, audit, time."""
 
-    name: ClassVar[str] = "compare"
-
-    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
-        "three_balls.toml"
-    )
-    """Study file, or the name of a bundled one; its [data] may be missing."""
-    velocity: tuple[float, ...] | None = None
-    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
-    shot: int = 1
-    """Which measured shot, counted from 1."""
     fit: bool = False
     """Fit every law to the data too, with one coefficient and with one per contact."""
-    out: Path = Path("jimpact-compare.png")
-    """Picture (.png, .pdf, .svg), or a directory for it."""
-    json: bool = False
-    """Print JSON instead of tables."""
 
 
 @dataclasses.dataclass(frozen=True)
-class MonteCarloCommand(_Command):
+class MonteCarloCommand(DrawingCommand):
     """Velocities after an impact whose gaps are random: statistics, histograms, outcome map."""
 
-    name: ClassVar[str] = "montecarlo"
-
-    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
-        "three_balls_gaps.toml"
-    )
+    study: StudyFile = Path("three_balls_gaps.toml")
     """Study file with a [monte_carlo] table, or the name of a bundled one."""
     samples: int | None = None
     """Number of samples; default: the study's, or 100000."""
@@ -95,26 +102,12 @@ class MonteCarloCommand(_Command):
     """Where finished chunks are kept; the same command again continues there."""
     keep_samples: bool = False
     """Keep the raw samples in the folder, too."""
-    out: Path = Path("jimpact-montecarlo.png")
-    """Picture (.png, .pdf, .svg), or a directory for it."""
-    json: bool = False
-    """Print JSON instead of a report."""
 
 
 @dataclasses.dataclass(frozen=True)
-class ChartCommand(_Command):
+class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
-    name: ClassVar[str] = "chart"
-
-    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
-        "three_balls.toml"
-    )
-    """Study file, or the name of a bundled one; its [data] may be missing."""
-    velocity: tuple[float, ...] | None = None
-    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
-    shot: int = 1
-    """Which measured shot, counted from 1."""
     methods: tuple[str, ...] | None = None
     """Methods by name; default: those that the scene allows and that compile fast."""
     full: bool = False
@@ -125,42 +118,22 @@ class ChartCommand(_Command):
     """Impacts solved side by side."""
     repeats: int = 5
     """Timings of each entry, taken in turn."""
-    out: Path = Path("jimpact-chart.png")
-    """Picture (.png, .pdf, .svg), or a directory for it."""
-    json: bool = False
-    """Print JSON instead of tables."""
 
 
 @dataclasses.dataclass(frozen=True)
-class StabilityCommand(_Command):
+class StabilityCommand(DrawingCommand):
     """Where methods of integration are right, wrong, gain energy or do not end."""
 
-    name: ClassVar[str] = "stability"
-
     methods: tuple[str, ...] | None = None
-    """Methods by name; default: all that run in batches."""
+    """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: bool = False
-    """All pairs of axes and 300 points over all of them besides."""
-    out: Path = Path("jimpact-stability.png")
-    """Picture (.png, .pdf, .svg), or a directory for it; pairs go beside it."""
-    json: bool = False
-    """Print JSON instead of tables."""
+    """All pairs of axes, each method its own picture, and 300 points over all of them besides."""
 
 
 @dataclasses.dataclass(frozen=True)
-class AdviseCommand(_Command):
+class AdviseCommand(ShotCommand):
     """The simplest law and method that a scene needs, with the evidence."""
 
-    name: ClassVar[str] = "advise"
-
-    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
-        "three_balls.toml"
-    )
-    """Study file, or the name of a bundled one; its [data] may be missing."""
-    velocity: tuple[float, ...] | None = None
-    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
-    shot: int = 1
-    """Which measured shot, counted from 1."""
     tolerance: float = 1e-2
     """Model error that is allowed, over the largest velocity before."""
     stiffness_range: tuple[float, float] | None = None
@@ -169,21 +142,13 @@ class AdviseCommand(_Command):
     """Draws of the unknown stiffnesses."""
     seed: int = 0
     """Seed of the draws."""
-    out: Path = Path("jimpact-advise.png")
-    """Picture (.png, .pdf, .svg), or a directory for it."""
-    json: bool = False
-    """Print JSON instead of text."""
 
 
 @dataclasses.dataclass(frozen=True)
-class SimulateCommand(_Command):
+class SimulateCommand(DrawingCommand):
     """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
 
-    name: ClassVar[str] = "simulate"
-
-    study: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")] = Path(
-        "cradle_motion.toml"
-    )
+    study: StudyFile = Path("cradle_motion.toml")
     """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml)."""
     t_end: float | None = None
     """End of the motion [s]; default: the study's."""
@@ -195,63 +160,27 @@ class SimulateCommand(_Command):
     """Phase portrait (.png, .pdf, .svg)."""
     coordinate: int = 1
     """Coordinate of the phase portrait, counted from 1."""
-    out: Path = Path("jimpact-simulate.png")
-    """Picture (.png, .pdf, .svg), or a directory for it."""
-    json: bool = False
-    """Print JSON instead of a report."""
 
 
 @dataclasses.dataclass(frozen=True)
-class LawsCommand:
+class LawsCommand(Command):
     """List the laws: what they say, when they are right and when they fail."""
 
     module: str | None = None
     """File (.py) or module that registers further laws, see `ji.register`."""
     bibtex: bool = False
     """Print the references as BibTeX."""
-    json: bool = False
-    """Print JSON instead of a table."""
-
-    def run(self) -> int:
-        """Print the registry."""
-        from rich.console import Console
-        from rich.table import Table
-
-        from jimpact.laws import REGISTRY
-        from jimpact.study import import_laws
-
-        if self.module is not None:
-            try:
-                import_laws(self.module, Path())
-            except (ValueError, ImportError) as error:
-                print(f"jimpact laws: {error}", file=sys.stderr)
-                return 2
-        if self.bibtex:
-            print("\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values())))
-        elif self.json:
-            columns = ("parameters", "summary", "right_when", "fails_when", "source")
-            rows = {name: {k: getattr(row, k) for k in columns} for name, row in REGISTRY.items()}
-            print(json_module.dumps(rows, indent=2))
-        else:
-            table = Table()
-            for title in ("law", "parameters", "says", "right when", "fails when"):
-                table.add_column(title, overflow="fold")
-            for name, row in REGISTRY.items():
-                parameters = ", ".join(row.parameters)
-                table.add_row(name, parameters, row.summary, row.right_when, row.fails_when)
-            Console().print(table)
-        return 0
 
 
-Command = (
-    Annotated[FitCommand, tyro.conf.subcommand(FitCommand.name)]
-    | Annotated[CompareCommand, tyro.conf.subcommand(CompareCommand.name)]
-    | Annotated[MonteCarloCommand, tyro.conf.subcommand(MonteCarloCommand.name)]
-    | Annotated[ChartCommand, tyro.conf.subcommand(ChartCommand.name)]
-    | Annotated[StabilityCommand, tyro.conf.subcommand(StabilityCommand.name)]
-    | Annotated[AdviseCommand, tyro.conf.subcommand(AdviseCommand.name)]
-    | Annotated[SimulateCommand, tyro.conf.subcommand(SimulateCommand.name)]
-    | Annotated[LawsCommand, tyro.conf.subcommand("laws")]
+COMMANDS: tuple[type[Command], ...] = (
+    FitCommand,
+    CompareCommand,
+    MonteCarloCommand,
+    ChartCommand,
+    StabilityCommand,
+    AdviseCommand,
+    SimulateCommand,
+    LawsCommand,
 )
 
 
@@ -261,8 +190,9 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments == ["--version"]:
         print(f"jimpact {__version__}")
         return 0
+    commands: list[Any] = [Annotated[x, tyro.conf.subcommand(_name(x))] for x in COMMANDS]
     command = tyro.cli(
-        Command,
+        functools.reduce(operator.or_, commands),
         prog="jimpact",
         config=(tyro.conf.FlagCreatePairsOff,),
         description="Differentiable impact laws for several simultaneous contacts. "

@@ -1,12 +1,15 @@
 """Strict JAX flags for every test, and the count of the programs that the tests compile.
 
-Compiling is what the suite's time goes into: a session tells the tests that compile most, and a
-session of the whole default suite fails beyond BUDGET programs.
+Compiling is what the suite's time goes into. So the default suite compiles with little
+optimization, in half the time (`programs.values`, the held values, and the slow tests with all of
+it). A session tells the tests that compile most; one of the whole default suite fails beyond
+BUDGET programs.
 """
 
 import os
 import random
 import tempfile
+import time
 from collections import Counter
 from pathlib import Path
 
@@ -29,25 +32,50 @@ MANY_MAPS = 30_000
 WORTH_SHARING = "0.2"  # seconds
 
 # A program counts if its compilation took longer; single operations, run eagerly, take less.
-COUNTS_FROM = 0.2  # seconds
+COUNTS_FROM = 0.2  # CPU seconds, which a busy machine does not change
 # Programs of the default suite, over all processes. 250 are aimed at; a busy machine, on which more
 # of them take so long, has counted 595.
 BUDGET = 700
+LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # just before
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
+BY_LAW = ("test_contract", "test_systems")  # a law's tests share its programs
+OF_LAW = {
+    "test_compliant": "compliant",
+    "test_complementarity": "moreau",
+    "test_fast_paths": "lzb",
+    "test_values": "lzb",  # most of it
+}
+DEAR = (  # groups that take longest begin first, so that no process is left alone at the end
+    "test_documents",
+    "test_friction",
+    "lzb",
+    "test_methods",
+    "test_motion",
+    "test_commands",
+    "test_fit",
+)
+
 programs, seconds = Counter(), Counter()  # of each test, in this process
-running = ["imports"]
+running, begun = ["imports"], [0.0]
 
 
 def compiled(event, duration, **_):
-    if event == COMPILED and duration > COUNTS_FROM:
-        programs[running[0]] += 1
-        seconds[running[0]] += duration
+    if event == LOWERED:
+        begun[0] = time.process_time()
+    elif event == COMPILED:
+        took = time.process_time() - begun[0]
+        if took > COUNTS_FROM:
+            programs[running[0]] += 1
+            seconds[running[0]] += took
 
 
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
     jax.monitoring.register_event_duration_secs_listener(compiled)
+    quick = config.option.markexpr == "not slow"
+    jax.config.update("jax_disable_most_optimizations", quick)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(quick)  # for what tests run as commands
     if hasattr(config, "workerinput"):
         return
     config.pluginmanager.register(Workers())
@@ -97,13 +125,28 @@ def pytest_terminal_summary(terminalreporter, config):
         write(f"FAILED: {total} programs are more than the budget of {BUDGET}")
 
 
+def group(nodeid):
+    """Tests that share programs run in one process: those of a law, else those of a file."""
+    stem = Path(nodeid.split("::")[0]).stem
+    laws = sorted(programs_of_laws.LAWS, key=len, reverse=True) if stem in BY_LAW else ()
+    return next((law for law in laws if law in nodeid), OF_LAW.get(stem, stem))
+
+
 def pytest_collection_modifyitems(items):
-    """Tests that share a program run in one process: those that name a law, those of a file."""
-    laws = sorted(programs_of_laws.LAWS, key=len, reverse=True)
-    for item in items:
-        if not item.get_closest_marker("xdist_group"):
-            shared = next((law for law in laws if law in item.nodeid), Path(item.path).stem)
-            item.add_marker(pytest.mark.xdist_group(shared))
+    """The dearest groups first, so that no process is left alone with one at the end."""
+    items.sort(key=lambda item: [*DEAR, group(item.nodeid)].index(group(item.nodeid)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    """Groups of our own: with pytest 9.2 the marks of `--dist loadgroup` have no effect."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Groups(LoadScopeScheduling):
+        def _split_scope(self, nodeid):
+            return group(nodeid)
+
+    return Groups(config, log)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -31,6 +31,7 @@ class Mutation:
     put: str
     tests: tuple[str, ...]
     within: str = "*.py"  # files it may be in
+    marks: str = "not slow"  # of these tests
 
 
 VALUES = ("test_values.py", "test_systems.py::test_outcomes")
@@ -65,15 +66,19 @@ MUTATIONS = [
     Mutation("gaps forgotten", r"apart = 0\.0 if problem\.gap is None else -problem\.gap", "apart = 0.0 if problem.gap is None else -0.5 * problem.gap", (*FLOW, "test_compliant.py::test_gapped_chains_against_scipy"), "impact_dynamics.py"),
     Mutation("a touching contact at rest is open", r"\(gamma <= 0\) \| \(x > 0\), COMPRESSION", "(gamma < 0) | (x > 0), COMPRESSION", FLOW, "contact_flow.py"),
     # --- the stepper
-    Mutation("dips switched off", r"dipped = turns & .*", "dipped = turns & False", (*FLOW, "test_methods.py::test_right_or_flagged", "test_compliant.py::test_gapped_chains_against_scipy"), "stepper.py"),
-    Mutation("events in the wrong order", r"first = jnp\.min\(at, axis=0, keepdims=True\)", "first = jnp.max(jnp.where(at <= 1, at, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(at, axis=0, keepdims=True))", FLOW, "stepper.py"),
-    Mutation("crossings not seen", r"crossed, turns = free & \(c1 < -snap\)", "crossed, turns = free & (c1 < -1e3 * snap)", FLOW, "stepper.py"),
-    Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", (*FLOW, "test_methods.py::test_right_or_flagged"), "stepper.py"),
+    Mutation(  # the last one first, and no other seen on the way to it; either alone mends itself
+        "events in the wrong order",
+        r"(?s)free = ~s\.target\n(.*)    first = jnp\.min\(at, axis=0, keepdims=True\)",
+        r"free = ~s.target & ~lands\n\1    first = jnp.max(jnp.where(at <= 1, at, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(at, axis=0, keepdims=True))",
+        FLOW,
+        "stepper.py",
+    ),
+    Mutation("crossings not seen", r"crossed = free & \(c1 < -snap\)", "crossed = free & (c1 < -1e3 * snap)", FLOW, "stepper.py"),
+    Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", ("test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]",), "stepper.py", "slow"),
     Mutation("every step accepted", r"ok = error2 <= 1\n", "ok = error2 <= 1e6\n", FLOW, "stepper.py"),
     # --- complementarity
-    Mutation("LCP: tie rules removed", r"own = kept & \(state\.basis == artificial\)", "own = kept & False", KINEMATIC, "lcp.py"),
-    Mutation("LCP: no lexicographic order", r"least = jax\.lax\.fori_loop\(0, m \+ 1, keep_least, candidates\)", "least = jax.lax.fori_loop(0, 1, keep_least, candidates)", KINEMATIC, "lcp.py"),
-    Mutation("LCP: the least ratio becomes the first", r"ratio <= jnp\.min\(ratio\) \+ tolerance", "ratio < jnp.inf", KINEMATIC, "lcp.py"),
+    Mutation("LCP: tie rules removed", r"own = candidates & ", "own = (candidates & False) & ", KINEMATIC, "lcp.py"),
+    Mutation("LCP: the least ratio becomes the first", r"jnp\.argmin\(jnp\.where\(own, -jnp\.inf, ratio\)\)", "jnp.argmax(candidates)", KINEMATIC, "lcp.py"),
     Mutation("LCP: no solution is not told", r"CODE\[\"infeasible\"\], CODE\[\"max_steps\"\]\), CODE\[\"ok\"\]\)", 'CODE["ok"], CODE["max_steps"]), CODE["ok"])', KINEMATIC, "lcp.py"),
     Mutation("LCP: least norm forgotten", r"return jnp\.where\(singular, rest \+ projector @ y, z\), singular", "return z, singular", KINEMATIC, "lcp.py"),
     # --- laws
@@ -84,10 +89,10 @@ MUTATIONS = [
     Mutation("friction along the slip", r"-modes\[2 \* m :\]\.astype\(most\.dtype\) \* most", "modes[2 * m :].astype(most.dtype) * most", ("test_friction.py",), "friction_flow.py"),
     Mutation("friction of the other contact", r"most = self\.friction \* f\n", "most = self.friction[::-1] * f\n", ("test_friction.py",), "friction_flow.py"),
     # --- impact
-    Mutation("energy gain is not told", r"change > total \+ tolerance", "change > total + 1e6 * tolerance", ("test_contract.py", "test_values.py", "test_complementarity.py"), "impacts.py"),
+    Mutation("energy gain is not told", r"change > total \+ tolerance", "change > total + jnp.inf", ("test_contract.py", "test_values.py", "test_complementarity.py"), "impacts.py"),
     Mutation("pulling is not told", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", ("test_contract.py", "test_values.py"), "impacts.py"),
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_contract.py", "test_values.py", "test_friction.py"), "impacts.py"),
-    Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_contract.py",), "impacts.py"),
+    Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py", "test_contract.py"), "impacts.py"),
     # --- fits
     Mutation("freedom counted with parameters, not rank", r"freedom = values - rank\n", "freedom = values - len(names)\n", ("test_fit.py",), "uncertainty.py"),
     Mutation("rank tolerance too coarse", r"\"float64\": 1e-6", '"float64": 1e-1', ("test_fit.py",), "uncertainty.py"),
@@ -128,7 +133,7 @@ def tried(mutation, tests=None):
         path.write_text(text, encoding="utf-8")
         files = [f"tests/{x}" for x in tests or mutation.tests]
         command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-x", "-q", "--no-header"]
-        command += ["-o", "addopts=-m 'not slow'", "--tb=no", *files]
+        command += ["-o", f"addopts=-m '{mutation.marks}'", "--tb=no", *files]
         environment = os.environ | {"PYTHONPATH": str(folder), "JAX_PLATFORMS": "cpu"}
         begin = time.monotonic()
         try:
@@ -141,6 +146,8 @@ def tried(mutation, tests=None):
         noticed = re.findall(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.M)
         if done.returncode == 0:
             return "MISSED", seconds, ""
+        if done.returncode == 5:  # of pytest
+            return "NO TEST", seconds, ""
         return "caught", seconds, noticed[0] if noticed else done.stdout.splitlines()[-1]
 
 

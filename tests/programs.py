@@ -63,6 +63,7 @@ LAWS = {
     ),
 }
 SEQUENTIAL = ("binary", "binary-earliest", "binary-left")
+SLOW_SLOPES = ("compliant", "binary-earliest", "binary-left")  # LZB's and Binary's code again
 
 
 # ----------------------------------------------------------------------------------- states
@@ -153,10 +154,13 @@ def one(make):
     return run
 
 
+OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
+
+
 @functools.cache
 def values(name):
     """`run(states) -> (Impact, Audit)` of a law, numpy arrays, in batches of one compiled shape."""
-    program = jax.jit(jax.vmap(one(LAWS[name].make)))
+    program = jax.jit(jax.vmap(one(LAWS[name].make)), compiler_options=OPTIMIZED)
 
     def run(states):
         columns = [np.stack(column) for column in zip(*map(padded, states))]

@@ -61,6 +61,32 @@ def test_energy_is_what_the_restitution_leaves():
     assert set(names(out.status)) <= {"ok", "plastic_limit"}
 
 
+@pytest.mark.parametrize(
+    ("eta", "force"), [(1.5, lambda k: ji.Hertz(k)), (1.0, lambda k: ji.LinearSpring(k))]
+)
+def test_forces_without_losses(eta, force):
+    """Forces without an e, and chains, are faster paths of the canonical program."""
+    k = [1.0, 2.5, 0.7]
+    given = [
+        chain([1.0, 1.0, 1.0, 1.0], [1, 0, 0, 0], e=1.0, k=k, eta=eta),
+        chain([1.0, 2.0, 1.5, 0.7], [1.0, 0.4, 0.1, -0.6], k=k, eta=eta, gaps=[0.0, 0.3, 0.0]),
+    ]
+
+    @jax.jit
+    @jax.vmap
+    def run(masses, v, k, gaps):
+        return ji.impact(ji.Compliant(force(k)), ji.chain(masses, gaps=gaps), v)
+
+    rows = [
+        (np.diag(s.mass), s.velocity, *(np.broadcast_to(x, 3) for x in (s.k, s.gaps)))
+        for s in given
+    ]
+    out = run(*(np.array(x, float) for x in zip(*rows)))
+    same, _ = programs.values("compliant")(given)
+    np.testing.assert_allclose(out.velocity, same.velocity, atol=2e-7)
+    np.testing.assert_array_equal(out.status, same.status)
+
+
 def test_lzb_against_an_oracle_of_another_formulation():
     """Chains with walls, mixed exponents, precompression, by scipy with events."""
     rows = [

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import programs
 import pytest
-from programs import LAWS, SEQUENTIAL, State, chain, failed
+from programs import LAWS, SEQUENTIAL, SLOW_SLOPES, State, chain, failed
 
 import jimpact as ji
 
@@ -113,11 +113,15 @@ def test_promises(name):
     "name",
     [
         *SEQUENTIAL,
-        pytest.param(
-            "lzb", marks=pytest.mark.xfail(reason="ends with an approach of 1e-7", strict=True)
-        ),
-        pytest.param(
-            "compliant", marks=pytest.mark.xfail(reason="ends with an approach", strict=True)
+        *(
+            pytest.param(
+                name,
+                marks=[
+                    pytest.mark.slow,
+                    pytest.mark.xfail(reason="ends with an approach", strict=True),
+                ],
+            )
+            for name in ("lzb", "compliant")
         ),
     ],
 )
@@ -247,10 +251,7 @@ STEP = 4e-3  # of differences of fourth order, relative
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(x, marks=[pytest.mark.slow] if x in ("compliant", "binary-left") else [])
-        for x in LAWS
-    ],
+    [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW_SLOPES else []) for x in LAWS],
 )
 def test_derivatives(name):
     """Forward equals reverse, and both are the slope of the values."""

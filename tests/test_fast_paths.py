@@ -16,8 +16,6 @@ from programs import chain, failed, names
 
 import jimpact as ji
 
-pytestmark = pytest.mark.xdist_group("lzb")
-
 V = [1.0, 0.4, 0.1, -0.6]
 E, K = [0.9, 0.7, 0.8], [1.0, 2.5, 0.7]
 
@@ -131,27 +129,6 @@ def test_impulse_form():
     assert names(out.status) == ["ok"] * 2
     np.testing.assert_allclose(out.velocity, same.velocity, atol=1e-3)
     assert np.abs(out.velocity - same.velocity).max() > 1e-7  # it is not the same code
-
-
-@pytest.mark.parametrize(
-    ("eta", "force"), [(1.5, lambda k: ji.Hertz(k)), (1.0, lambda k: ji.LinearSpring(k))]
-)
-def test_forces_without_losses(eta, force):
-    given = [*states(eta)[1:2], chain([1.0, 2.0, 1.5, 0.7], V, k=K, eta=eta, gaps=[0.0, 0.3, 0.0])]
-
-    @jax.jit
-    @jax.vmap
-    def run(masses, v, k, gaps):
-        return ji.impact(ji.Compliant(force(k)), ji.chain(masses, gaps=gaps), v)
-
-    rows = [
-        (np.diag(s.mass), s.velocity, *(np.broadcast_to(x, 3) for x in (s.k, s.gaps)))
-        for s in given
-    ]
-    out = run(*(np.array(x, float) for x in zip(*rows)))
-    same, _ = programs.values("compliant")(given)
-    np.testing.assert_allclose(out.velocity, same.velocity, atol=2e-7)
-    np.testing.assert_array_equal(out.status, same.status)
 
 
 @functools.cache

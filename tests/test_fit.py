@@ -221,6 +221,15 @@ def test_known_parameters_are_recovered_from_varied_shots():
     )
 
 
+def test_what_is_seen_weakly_is_seen():
+    """The second contact approaches at 1 % of the first's speed: two parameters of two."""
+    pre = np.outer([1.0, 2.0, 1.5, 3.0], [1.0, 0.0, -0.01])
+    data = ji.Experiments(pre, simulated(ji.Newton([0.6, 0.3]), BALLS, pre))
+    found = ji.fit(ji.Newton([0.9, 0.9]), BALLS, data, starts=1)
+    assert found.rank == 2
+    np.testing.assert_allclose(found.value, [0.6, 0.3], atol=1e-7)
+
+
 def test_masks_groups_and_held_contacts():
     truth = ji.LZB([0.9, 0.9], [3.0, 6.0])
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from friction_reference import routh, small_steps
-from programs import failed, names
+from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
 
@@ -43,7 +43,9 @@ def program(name):
         out = ji.impact(LAWS[name](e, mu, e_t, k), scene, v)
         return out, ji.audit(scene, v, out)
 
-    return jax.jit(jax.vmap(one))
+    # long runs: what compiling well takes is saved
+    options = OPTIMIZED if name in ("lzb", "compliant") else None
+    return jax.jit(jax.vmap(one), compiler_options=options)
 
 
 LANES = 64
@@ -139,13 +141,8 @@ RODS = [
 ]
 
 
-def one_contact(mass, normals, tangents, v, e, mu, stored):
-    law = ji.LZB(e, friction=mu, initial_energy=stored)
-    return ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v)
-
-
 def test_rods_are_rouths():
-    """One contact with friction: alone (in closed form) and by steps, beside an open contact."""
+    """One contact with friction: slip, slip and stick, reversal, jam."""
     mass, normals, tangents, v, e, mu = (np.stack(x) for x in zip(*RODS))
     expected = np.array(
         [
@@ -153,12 +150,10 @@ def test_rods_are_rouths():
             for m, n, h, *x in zip(mass, normals, tangents, v, mu, e)
         ]
     )
-    alone = jax.jit(jax.vmap(one_contact))(mass, normals, tangents, v, e, mu, 0 * mu)
-    steps, _ = run("lzb", mass, normals, tangents, v, e, mu)
-    for out, allowed in ((alone, 1e-13), (steps, 1e-7)):
-        assert not np.asarray(out.status).any()
-        close(out.impulse[:, 0], expected[:, 0], atol=allowed)
-        close(out.tangential_impulse[:, 0], expected[:, 1], atol=allowed)
+    out, _ = run("lzb", mass, normals, tangents, v, e, mu)
+    assert not out.status.any()
+    close(out.impulse[:, 0], expected[:, 0], atol=1e-7)
+    close(out.tangential_impulse[:, 0], expected[:, 1], atol=1e-7)
     kinds = np.abs(expected[:, 1]) < mu * expected[:, 0] - 1e-6
     assert kinds.any()
     assert not kinds.all()
@@ -346,25 +341,31 @@ def test_none_and_several_outcomes_are_told():
 # ---------------------------------------------------------------------------------- LZB
 
 
-def check_random(name_rows, most_failed):
-    rows, count = name_rows, 64
+def check_random(rows, most_failed):
+    """Random scenes, with the contacts in the other order, and faster: three lanes each."""
+    count = 32
     scenes, e, mu, k = random_scenes(count, rows, n=3 * rows)
-    _, normals, tangents, v = scenes
-    out, found = run("lzb", *scenes, e, mu, k=k)
+    mass, normals, tangents, v = scenes
+    swapped = tangents.reshape(count, -1, 2, rows)[:, :, ::-1].reshape(tangents.shape)
+    lanes = [
+        (*scenes, e, mu, k),
+        (mass, normals[:, :, ::-1], swapped, v, e[:, ::-1], mu[:, ::-1], k[:, ::-1]),
+        (mass, normals, tangents, 1e3 * v, e, mu, k),
+    ]
+    *given, stiff = (np.concatenate(x) for x in zip(*lanes))
+    out, found = run("lzb", *given, k=stiff)
+    out, turned, faster = (
+        jax.tree.map(lambda x, i=i: x[i : i + count], out) for i in (0, count, 2 * count)
+    )
     good = ~failed(out.status)
     assert (~good).mean() <= most_failed
     p, side = out.impulse, np.linalg.norm(out.tangential_impulse.reshape(count, 2, rows), axis=2)
-    assert found.consistent[good].all()
+    assert found.consistent[:count][good].all()
     assert (p >= 0)[good].all()
     assert (side <= mu * p + 1e-6)[good].all()
     assert (out.energy_change <= 0)[good].all()
-    swapped = tangents.reshape(count, -1, 2, rows)[:, :, ::-1].reshape(tangents.shape)
-    turned, _ = run(
-        "lzb", scenes[0], normals[:, :, ::-1], swapped, v, e[:, ::-1], mu[:, ::-1], k=k[:, ::-1]
-    )
     both = good & ~failed(turned.status)
     close(turned.velocity[both], out.velocity[both], atol=5e-7)
-    faster, _ = run("lzb", scenes[0], normals, tangents, 1e3 * v, e, mu, k=k)
     both = good & ~failed(faster.status)
     close(faster.velocity[both] / 1e3, out.velocity[both], atol=1e-8)
     return scenes, e, mu, k, out, good
@@ -372,7 +373,7 @@ def check_random(name_rows, most_failed):
 
 def test_lzb_in_the_plane():
     scenes, e, mu, k, out, good = check_random(1, 0.02)
-    for i in np.flatnonzero(good)[:6]:
+    for i in np.flatnonzero(good)[:3]:
         mass, normals, tangents, v = (x[i] for x in scenes)
         scene = ji.Scene(mass, normals, tangents=tangents)
         found = small_steps(scene, v, k[i], 1.5, e[i], mu[i], steps=2000)
@@ -391,7 +392,7 @@ def test_lzb_of_a_flat_block():
     v, e, mu = (np.array(x) for x in zip(*rows))
     out, _ = run("lzb", *(np.tile(x, (4, 1, 1)) for x in block), v, e, mu)
     assert not failed(out.status).any()
-    for i, (v, e, mu) in enumerate(rows):
+    for i, (v, e, mu) in enumerate(rows[:2]):
         scene = ji.Scene(block[0], block[1], tangents=block[2])
         found = small_steps(scene, v, np.ones(2), 1.5, e, mu, steps=2000)
         close(out.velocity[i], found, atol=1e-3)
@@ -410,19 +411,18 @@ def test_lzb_in_space():
     both = good & ~failed(again.status)
     close(again.velocity[both], out.velocity[both], atol=5e-7)
     # x, y, z and the spins of a rolling ball: along (.6, .8) it is the disk
-    ball = np.diag([1.0, 1.0, 1.0, 0.4, 0.4, 1.0])[None]
-    up = np.array([0, 0, 1.0, 0, 0, 0])[None, :, None]
-    both = np.zeros((1, 6, 2))
-    both[0, [0, 3], 0] = both[0, [1, 4], 1] = 1.0
-    v = np.array([[0.6, 0.8, -1, 0.18, 0.24, 0.5]])
-    for mu in (0.1, 5.0):
-        space, _ = run("lzb", ball, up, both, v, np.full(1, 0.8), np.full(1, mu))
-        p = 1.8
-        side = -min(mu * p, 1.3 / 3.5)
-        expected = [1 + side, p - 1, 0.3 + side / 0.4]
-        along = [0.6, 0.8] @ space.velocity[0, :2], space.velocity[0, 2]
-        close([*along, [0.6, 0.8] @ space.velocity[0, 3:5]], expected, atol=1e-7)
-        assert space.velocity[0, 5] == 0.5
+    ball = np.diag([1.0, 1.0, 1.0, 0.4, 0.4, 1.0])
+    up = np.array([0, 0, 1.0, 0, 0, 0])[:, None]
+    both = np.zeros((6, 2))
+    both[[0, 3], 0] = both[[1, 4], 1] = 1.0
+    mu, p = np.array([0.1, 5.0]), 1.8
+    twice = (np.stack([x, x]) for x in (ball, up, both, [0.6, 0.8, -1, 0.18, 0.24, 0.5]))
+    space, _ = run("lzb", *twice, np.full(2, 0.8), mu)
+    side = -np.minimum(mu * p, 1.3 / 3.5)
+    close(space.velocity[:, :2] @ [0.6, 0.8], 1 + side, atol=1e-7)
+    close(space.velocity[:, 2], p - 1, atol=1e-7)
+    close(space.velocity[:, 3:5] @ [0.6, 0.8], 0.3 + side / 0.4, atol=1e-7)
+    assert (space.velocity[:, 5] == 0.5).all()
 
 
 def test_lzb_without_friction():
@@ -454,39 +454,38 @@ SLOPES = {"planar": (1, 4), "space": (2, 6)}
     ],
 )
 def test_derivatives(name, kind):
-    """In v, e, mu and k: the slope of the values; reverse, where it is compiled, is forward."""
+    """Along a direction of v, e, mu and k: the slope of the values; reverse, where compiled."""
     rows, n = SLOPES[kind]
     scenes, e, mu, k = random_scenes(8, rows, n, most=-0.5)
-    e = np.minimum(e, 0.95)
-
-    def after(x, mass, normals, tangents):
-        v, e, mu, k = x
-        scene = ji.Scene(mass, normals, tangents=tangents, gaps=jnp.zeros(2))
-        return ji.impact(LAWS[name](e, mu, jnp.zeros(2), k), scene, v).velocity
-
-    modes = (jax.jacfwd, jax.jacrev) if (name, kind) == ("moreau", "planar") else (jax.jacfwd,)
-
-    def each(*given):
-        return [mode(after)(*given) for mode in modes]
-
-    x = (scenes[3], e, mu, k)
-    slopes = jax.jit(jax.vmap(each))(x, *scenes[:3])
-    forward, reverse = slopes[0], slopes[-1]
+    x = (scenes[3], np.minimum(e, 0.95), mu, k)
     rng = np.random.default_rng(1)
-    way = [0.3 * rng.normal(size=np.shape(y)) for y in x]
-    step = 1e-3
-    v, *moved, stiff = (
-        np.concatenate([y + s * step * d for s in (2, 1, -1, -2)]) for y, d in zip(x, way)
-    )
-    four = [np.concatenate([y] * 4) for y in scenes[:3]]
-    out, _ = run(name, *four, v, *moved, k=stiff)
-    f, fine = out.velocity.reshape(4, 8, n), ~failed(out.status).reshape(4, 8).any(axis=0)
-    slope = (-f[0] + 8 * f[1] - 8 * f[2] + f[3]) / (12 * step)
-    found = sum(np.einsum("cij,cj->ci", a, d) for a, d in zip(forward, way))
+    way = tuple(0.3 * rng.normal(size=np.shape(y)) for y in x)
+    weight = rng.normal(size=n)
+    both_modes = (name, kind) == ("moreau", "planar")
+
+    def along(x, way, mass, normals, tangents):
+        def after(x):
+            v, e, mu, k = x
+            scene = ji.Scene(mass, normals, tangents=tangents, gaps=jnp.zeros(2))
+            out = ji.impact(LAWS[name](e, mu, jnp.zeros(2), k), scene, v)
+            return out.velocity, out.status
+
+        out, (rate, _) = jax.jvp(after, (x,), (way,))
+        if both_modes:
+            (back,) = jax.vjp(lambda x: after(x)[0], x)[1](weight)
+            return *out, rate, sum(jnp.vdot(a, b) for a, b in zip(back, way))
+        return *out, rate, rate @ weight
+
+    step, shifts = 1e-3, np.array([0, -2, -1, 1, 2])
+    lanes = [np.concatenate([y + s * step * d for s in shifts]) for y, d in zip(x, way)]
+    given = (np.concatenate([y] * 5) for y in (*way, *scenes[:3]))
+    ways = tuple(next(given) for _ in way)
+    v, status, rate, back = map(np.asarray, jax.jit(jax.vmap(along))(tuple(lanes), ways, *given))
+    f, fine = v.reshape(5, 8, n), ~failed(status).reshape(5, 8).any(axis=0)
+    slope, rate, back = (f[1] - 8 * f[2] + 8 * f[3] - f[4]) / (12 * step), rate[:8], back[:8]
     assert fine.sum() >= (3 if name == "newton" else 6)
-    for a, b in zip(forward, reverse):
-        close(np.asarray(a)[fine], np.asarray(b)[fine], atol=1e-9)
-    error = np.abs(found - slope)[fine].max(axis=1)
+    close(back[fine], (rate @ weight)[fine], atol=1e-9)
+    error = np.abs(rate - slope)[fine].max(axis=1)
     assert np.sort(error)[-2] < 2e-5, error  # one of them may cross a change of stick and slip
 
 
@@ -611,24 +610,27 @@ def test_lzb_of_a_real_cube(contacts):
     close(out.velocity, after, atol=5e-7)
 
 
+@pytest.mark.slow
 def test_slopes_where_a_real_cube_comes_to_stick():
     """Derivatives in mu and e: once up to 1e223."""
     rows = cube_impacts()[cube_impacts()["contacts"] == 1]
     scenes = [np.stack(x) for x in zip(*map(cube, rows))]
     given = np.stack([rows["mu"], np.full(len(rows), 0.27)], axis=1)
 
-    def after(given, mass, normals, tangents, v):
-        law = ji.LZB(given[1], friction=given[0])
-        return ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v).velocity
+    @jax.jit
+    @jax.vmap
+    def along(given, way, mass, normals, tangents, v):
+        def after(given):
+            law = ji.LZB(given[1], friction=given[0])
+            return ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v).velocity
 
-    slopes = jax.jit(jax.vmap(jax.jacfwd(after)))(given, *scenes)
-    for i in range(2):
+        return jax.jvp(after, (given,), (way,))
 
-        def difference(h, i=i):
-            ends = (given + s * h * np.eye(2)[i] for s in (1, -1))
-            plus, minus = (run("lzb", *scenes, x[:, 1], x[:, 0])[0].velocity for x in ends)
-            return (plus - minus) / (2 * h)
-
-        close(slopes[:, :, i], (4 * difference(1e-4) - difference(2e-4)) / 3, atol=2e-2)
+    step, shifts = 1e-4, (0, 1, -1)
+    lanes = [(given + s * step * way, way + 0 * given) for way in np.eye(2) for s in shifts]
+    x, ways = (np.concatenate(part) for part in zip(*lanes))
+    v, slope = along(x, ways, *(np.concatenate([y] * len(lanes)) for y in scenes))
+    v, slope = (np.asarray(y).reshape(2, 3, len(rows), 6) for y in (v, slope))
+    close(slope[:, 0], (v[:, 1] - v[:, 2]) / (2 * step), atol=2e-2)
     sticks = rows["toss"] == 46
-    assert np.abs(slopes[sticks, :, 0]).max() < 0.01
+    assert np.abs(slope[0, 0, sticks]).max() < 0.01

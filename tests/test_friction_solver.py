@@ -231,7 +231,7 @@ def along(rows):
     return jax.jit(jax.vmap(one))
 
 
-@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("rows", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_derivatives(rows):
     rng = np.random.default_rng(7)
     lanes = random_scenes(rows, seed=8)

@@ -24,6 +24,13 @@ class Blended(ji.Law):
         return ji.Impulses(p)
 
 
+class Push(ji.Law):
+    """It pushes at every contact, whatever it is told of them."""
+
+    def impulses(self, contact):
+        return ji.Impulses(jnp.ones_like(contact.gap_velocity))
+
+
 @pytest.fixture
 def registered():
     before = dict(ji.REGISTRY)
@@ -43,9 +50,11 @@ def test_one_method_is_enough():
 def test_what_every_law_gets_for_nothing():
     """Open contacts, nothing happening, NaN, batches, gradients, domains."""
     law = Blended(0.8, 0.25)
-    gapped = ji.impact(law, ji.chain([1.0] * 3, gaps=[0.0, 1e-3]), [1.0, 0.0, -0.5])
-    assert float(gapped.impulse[1]) == 0.0
-    assert float(gapped.velocity[2]) == -0.5
+    scene = ji.chain([1.0] * 3, gaps=[0.0, 1e-3])
+    for any_law in (law, Push()):
+        gapped = ji.impact(any_law, scene, [1.0, 0.0, -0.5])
+        assert float(gapped.impulse[1]) == 0.0
+        assert float(gapped.velocity[2]) == -0.5
     away = ji.impact(law, BALLS, [0.0, 0.0, 1.0])
     np.testing.assert_array_equal(away.velocity, [0.0, 0.0, 1.0])
     slope = jax.jit(jax.grad(lambda law: ji.impact(law, BALLS, V).velocity[0]))(law)

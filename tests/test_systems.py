@@ -3,7 +3,7 @@
 import numpy as np
 import programs
 import pytest
-from programs import LAWS
+from programs import LAWS, SLOW_SLOPES
 from systems.closed_forms import SYSTEMS
 
 
@@ -31,10 +31,7 @@ def test_outcomes(name):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        pytest.param(x, marks=[pytest.mark.slow] if x in ("compliant", "binary-left") else [])
-        for x in LAWS
-    ],
+    [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW_SLOPES else []) for x in LAWS],
 )
 def test_slopes(name):
     """dv+ by velocities, restitution, stiffness, exponent: forward and reverse, exact slopes."""

@@ -70,6 +70,7 @@ def test_unknown_names_are_attribute_errors():
         _ = ji.no_such_name
 
 
+@pytest.mark.slow
 def test_mypy_sees_names_signatures_and_fields():
     command = [sys.executable, "-m", "mypy", "--config-file", "pyproject.toml", str(SCRIPT)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -30,6 +30,7 @@ from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.status import CODE
 
 # Derivatives are one or two digits worse than values at the same tolerance; at order 8 two digits
 # more cost a third more steps.

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import check_values
+from jimpact._checks import check_choice, check_values
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
 from jimpact.events.impact_dynamics import Dynamics, dimensionless, sides_of, solve
@@ -123,10 +123,7 @@ def make_compliant(
         "hunt-crossley": partial(HuntCrossley, exponent=exponent),
         "kuwabara-kono": KuwabaraKono,
     }
-    if rheology not in RHEOLOGIES:
-        raise ValueError(
-            f"Argument `rheology` must be one of {RHEOLOGIES}, but has value {rheology!r}."
-        )
+    check_choice("rheology", rheology, RHEOLOGIES)
     if (rheology == "bistiffness") != (damping is None):
         raise ValueError(
             "Argument `damping` must be given for a viscous rheology and only there, but "

@@ -116,10 +116,12 @@ def solve(
 
     Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247 (planar existence).
 
+    >>> import jax
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.friction import solve
-    >>> found = solve(jnp.diag(jnp.array([1.0, 2.0])), jnp.array([-1.0]), jnp.array([3.0]),
-    ...               jnp.array([0.5]), complementary=True)
+    >>> matrix, mu = jnp.diag(jnp.array([1.0, 2.0])), jnp.array([0.5])
+    >>> given = (matrix, jnp.array([-1.0]), jnp.array([3.0]), mu)
+    >>> found = jax.jit(lambda *given: solve(*given, complementary=True))(*given)
     >>> [round(float(x), 6) for x in (found.normal[0], found.tangential[0])]
     [1.0, -0.5]
     """
@@ -589,10 +591,12 @@ def distribute(
         force. Contacts are relaxed in turn, 200 times at most: of strongly coupled ones near the
         rim (of random pairs with nearly equal tangents 3 %) the last to settle may be wrong.
 
+    >>> import jax
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.friction import distribute
     >>> k, asked = jnp.ones((2, 2, 1)), jnp.ones((2, 1), bool)  # both corners of a block
-    >>> stick, slip = distribute(k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), asked)
+    >>> given = (k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), asked)
+    >>> stick, slip = jax.jit(distribute)(*given)
     >>> stick[:, 0].tolist(), jnp.sign(slip[:, 0]).tolist()
     ([False, False], [1.0, 1.0])
     """

@@ -9,7 +9,20 @@ from rows import CASES
 TEXT = page.PAGE.read_text(encoding="utf-8") if page.PAGE.exists() else ""
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.rows.__name__)
+SLOW = ("vibrating_plate",)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(
+            case,
+            id=case.rows.__name__,
+            marks=[pytest.mark.slow] if case.rows.__name__ in SLOW else [],
+        )
+        for case in CASES
+    ],
+)
 def test_numbers_by_others(case):
     rows = case.rows()
     assert rows
