@@ -55,6 +55,7 @@ class Problem(NamedTuple):
     energy: jax.Array  # x^(eta + 1) of contacts loaded beforehand
     gap: jax.Array | None  # in units of the indentation
     tolerance: jax.Array  # (1,)
+    taking_part: jax.Array  # (1,) contacts that are not open for good
     step: jax.Array  # (1,) of the impulse form: the tolerance itself, whatever the stiffnesses
     viscous: Viscous | None = None
     sides: "Sides | None" = None
@@ -94,9 +95,9 @@ def dimensionless(
     stored: jax.Array,
     rtol: float,
     gaps: jax.Array | None = None,
-    count: Any = None,
+    closed: jax.Array | None = None,
 ) -> tuple[Problem, Units]:
-    """The dimensionless problem and the units to return from it; `count` contacts take part."""
+    """The dimensionless problem and the units to return from it; `closed`: those that take part."""
     m, dtype = gamma.shape[0], gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
     root = jnp.sqrt(diagonal(delassus))
@@ -115,8 +116,9 @@ def dimensionless(
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
-    share = jnp.minimum(1.0, 2 / jnp.maximum(m if count is None else count, 1))
-    step = jax.lax.stop_gradient(rtol * share / jnp.max(weight))
+    count = jnp.full((), m, dtype) if closed is None else jnp.sum(closed, dtype=dtype)
+    count = jnp.maximum(count, 1)
+    step = jax.lax.stop_gradient(rtol * jnp.minimum(1.0, 2 / count) / jnp.max(weight))
     problem = Problem(
         beside=beside,
         omega=omega,
@@ -126,6 +128,7 @@ def dimensionless(
         energy=2 * stored / q**2,
         gap=None if gaps is None else gaps / x_ref,
         tolerance=(step * closeness)[None],
+        taking_part=count[None],
         step=step[None],
     )
     return problem, Units(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
@@ -166,6 +169,7 @@ def flow_of(
         restitution=problem.restitution,
         exponent_array=problem.exponent,
         tolerance=tighten * problem.tolerance,
+        taking_part=problem.taking_part,
         viscous=viscous,
         exponent_static=None if problem.exponent is not None else exponent,
         gapped=problem.gap is not None,

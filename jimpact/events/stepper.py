@@ -17,7 +17,8 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
     longest                    the longest step in the flow's own time that is stable
-    tolerance (1, B), snap (1, B), contacts
+    tolerance (1, B), snap (1, B)
+    taking_part (1, B)             contacts, of which some may be open for good
     near                       share of a step from which landings start, 0: from anywhere
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
@@ -82,7 +83,7 @@ class Flow(Protocol):
     @property
     def tolerance(self) -> jax.Array: ...
     @property
-    def contacts(self) -> int: ...
+    def taking_part(self) -> jax.Array | int: ...
     @property
     def snap(self) -> jax.Array: ...
     def constants(self, modes: jax.Array) -> Any: ...
@@ -224,7 +225,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     c1, d0, d1 = values[-1], rates[0], rates[-1]
     end = y + sums[0, :n]
     eps = float(jnp.finfo(dtype).eps)
-    full = FULL * flow.contacts
+    full = FULL * flow.taking_part
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)

@@ -159,7 +159,7 @@ class LZB(Law):
             self.rtol or default_rtol(self.method, contact.gap_velocity.dtype)
             if rtol is None
             else rtol,
-            count=jnp.sum(contact.closed, dtype=contact.gap_velocity.dtype),
+            closed=contact.closed,
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
