@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 import jimpact as ji
-from jimpact import cli
+from jimpact import options
 from jimpact.comparison import registered_laws
 from jimpact.fits.fitting import Fit
 from jimpact.records import as_data, table
@@ -42,11 +42,11 @@ class Answer(NamedTuple):
     failure: str = ""
 
 
-def run(given: cli.Command) -> int:
+def run(given: options.Command) -> int:
     """The exit code of a command: 0; wrong input 2, a method or law that fails 1, ctrl-C 130."""
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
     try:
-        answer = _COMMANDS[given.name](given)
+        answer = _COMMANDS[given.name()](given)
         for path, figure in answer.pictures.items():
             path.parent.mkdir(parents=True, exist_ok=True)
             figure.savefig(path, dpi=DPI)
@@ -66,14 +66,14 @@ def run(given: cli.Command) -> int:
     return _refuse(given, answer.failure, FAILURE) if answer.failure else 0
 
 
-def _refuse(given: cli.Command, reason: str, code: int) -> int:
-    print(f"jimpact {given.name}: {reason}", file=sys.stderr)
+def _refuse(given: options.Command, reason: str, code: int) -> int:
+    print(f"jimpact {given.name()}: {reason}", file=sys.stderr)
     return code
 
 
-def _picture(given: cli.DrawingCommand) -> Path:
+def _picture(given: options.DrawingCommand) -> Path:
     """The file --out, or the command's own in the directory --out."""
-    return _checked(given.out if given.out.suffix else given.out / f"jimpact-{given.name}.png")
+    return _checked(given.out if given.out.suffix else given.out / f"jimpact-{given.name()}.png")
 
 
 def _checked(path: Path, option: str = "--out") -> Path:
@@ -85,7 +85,7 @@ def _checked(path: Path, option: str = "--out") -> Path:
     return path
 
 
-def _velocities(study: Study, given: cli.ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
+def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
     """Velocities before the impact, and after it where they were measured."""
     if given.velocity is not None:
         return np.asarray(given.velocity, float), None
@@ -107,7 +107,7 @@ def _titled(study: Study, before: np.ndarray) -> str:
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
-def fit(given: cli.FitCommand) -> Answer:
+def fit(given: options.FitCommand) -> Answer:
     """The study's fit and its yardsticks."""
     path = _picture(given)
     study = read_study(given.study, given.law)
@@ -188,7 +188,7 @@ def _value(found: Fit, i: int) -> str:
 # ---------------------------------------------------------------------------------------- compare
 
 
-def compare(given: cli.CompareCommand) -> Answer:
+def compare(given: options.CompareCommand) -> Answer:
     """Every law on one scene."""
     path = _picture(given)
     study = read_study(given.study)
@@ -234,7 +234,7 @@ def _fit_table(fits: dict[str, Fit]) -> list[str]:
 # ------------------------------------------------------------------------------------- montecarlo
 
 
-def montecarlo(given: cli.MonteCarloCommand) -> Answer:
+def montecarlo(given: options.MonteCarloCommand) -> Answer:
     """Random gaps, velocities, parameters."""
     path = _picture(given)
     study = read_study(given.study)
@@ -247,7 +247,7 @@ def montecarlo(given: cli.MonteCarloCommand) -> Answer:
     return Answer(study.title, found.to_dict(), str(found), {path: picture})
 
 
-def _sampling(study: Study, given: cli.MonteCarloCommand) -> dict[str, Any]:
+def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
     """Of `monte_carlo`: those of the study, or in their place those of the command line."""
     if not study.monte_carlo:
         raise ValueError(f"the study '{given.study}' must have a [monte_carlo] table.")
@@ -268,7 +268,7 @@ def _sampling(study: Study, given: cli.MonteCarloCommand) -> dict[str, Any]:
 SLOW_TO_COMPILE = ("tsit5", "kvaerno5")  # left to --full
 
 
-def chart(given: cli.ChartCommand) -> Answer:
+def chart(given: options.ChartCommand) -> Answer:
     """Speed against accuracy on one scene."""
     path = _picture(given)
     study = read_study(given.study)
@@ -314,7 +314,7 @@ QUICK_RESOLUTION, FULL_RESOLUTION, FULL_SAMPLES = 7, 9, 300
 TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
 
 
-def stability(given: cli.StabilityCommand) -> Answer:
+def stability(given: options.StabilityCommand) -> Answer:
     """Maps of methods; the picture of single axes, and of pairs, one more beside it a method."""
     path = _picture(given)
     size: dict[str, Any] = {"resolution": QUICK_RESOLUTION}
@@ -333,7 +333,7 @@ def stability(given: cli.StabilityCommand) -> Answer:
 _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 
 
-def advise(given: cli.AdviseCommand) -> Answer:
+def advise(given: options.AdviseCommand) -> Answer:
     """The simplest law that a scene needs."""
     path = _picture(given)
     study = read_study(given.study)
@@ -365,7 +365,7 @@ def _lzb_parameters(study: Study) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------- simulate
 
 
-def simulate(given: cli.SimulateCommand) -> Answer:
+def simulate(given: options.SimulateCommand) -> Answer:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
     from jimpact.motion.study_motion import read_motion_study
 
@@ -402,7 +402,7 @@ def _failure(motion: "ji.Motion") -> str:
 COLUMNS = ("parameters", "summary", "right_when", "fails_when", "source")
 
 
-def laws(given: cli.LawsCommand) -> Answer:
+def laws(given: options.LawsCommand) -> Answer:
     """The registry as a table, as JSON or as references."""
     if given.module is not None:
         import_laws(given.module, Path())

@@ -306,7 +306,7 @@ def otherwise(problem: Problem) -> Problem:
     coarser = COARSER * jnp.maximum(tolerance, last)
     signs = 1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2)
     return still._replace(
-        gamma=gamma * (1 + last * signs),
+        gamma=gamma + last * signs,
         tolerance=jnp.where(APART * finer <= tolerance, finer, coarser),
     )
 
