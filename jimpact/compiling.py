@@ -50,11 +50,22 @@ def quick_jit(function: Function) -> Function:
 
     @functools.cache
     def own() -> Callable[..., Any]:
-        jit: Any = eqx.filter_jit  # its types do not name what it hands on to jax.jit
-        return jit(function, compiler_options=known_options())
+        def of_arrays(rest: Any, arrays: list[Any]) -> Any:
+            tree, fixed = rest
+            values = iter(arrays)
+            leaves = [next(values) if x is None else x[0] for x in fixed]
+            args, given = jax.tree.unflatten(tree, leaves)
+            return function(*args, **given)
+
+        of_arrays.__name__ = function.__name__
+        return jax.jit(of_arrays, static_argnums=0, compiler_options=known_options())
 
     @functools.wraps(function)
     def call(*args: Any, **given: Any) -> Any:
-        return (own() if is_own((args, given)) else inside)(*args, **given)
+        if not is_own((args, given)):
+            return inside(*args, **given)
+        leaves, tree = jax.tree.flatten((args, given))
+        fixed = tuple(None if eqx.is_array(x) else (x,) for x in leaves)
+        return own()((tree, fixed), [x for x in leaves if eqx.is_array(x)])
 
     return call  # type: ignore[return-value]

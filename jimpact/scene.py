@@ -235,8 +235,9 @@ def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool
 
 def _open_behind(scene: Scene, missing: int) -> Any:
     """Gaps of the scene, and of so many open contacts."""
-    gaps = np.zeros(scene.contacts) if scene.gaps is None else np.asarray(scene.gaps)
-    return np.pad(gaps, (0, missing), constant_values=1).astype(scene.mass.dtype)
+    gaps = np.ones(scene.contacts + missing, scene.mass.dtype)
+    gaps[: scene.contacts] = 0.0 if scene.gaps is None else scene.gaps
+    return gaps
 
 
 class Filled(NamedTuple):
