@@ -1,6 +1,7 @@
 """Host-side argument checks with one error template; tracers pass unchecked."""
 
 import operator
+from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -66,6 +67,13 @@ def as_whole(name: str, value: Any, low: int) -> int:
     if isinstance(value, bool) or not hasattr(value, "__index__") or operator.index(value) < low:
         raise ValueError(f"Argument `{name}` must be an int >= {low}, but has value {value!r}.")
     return operator.index(value)
+
+
+def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
+    """Raise a ValueError unless `value` is one of `choices`."""
+    if value not in choices:
+        known = ", ".join(map(str, choices))
+        raise ValueError(f"Argument `{name}` must be one of {known}, but has value {value!r}.")
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:

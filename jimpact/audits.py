@@ -13,6 +13,8 @@ from jimpact.scene import Scene, as_velocity, gap_velocity, kinetic_energy, mome
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS, sign_tolerance
 
+CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
+
 
 class Audit(eqx.Module):
     """Four answers and the numbers behind them (`worst_*`: scaled by the impact's own size)."""
@@ -30,6 +32,11 @@ class Audit(eqx.Module):
     def consistent(self) -> jax.Array:
         """All four hold."""
         return self.kinematic & self.kinetic & self.energetic & self.momentum
+
+    @property
+    def broken(self) -> list[str]:
+        """Names of those that do not."""
+        return [name for name in CONSISTENCIES if not bool(getattr(self, name))]
 
 
 def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
@@ -114,11 +121,8 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     row = STATUS[int(codes)]
     before = float(kinetic_energy(scene, velocity))
     kept = (before + float(out.energy_change)) / before if before else float("nan")
-    checks = audit(scene, velocity, out)
-    words = [
-        f"{name} {'ok' if bool(getattr(checks, name)) else 'VIOLATED'}"
-        for name in ("kinematic", "kinetic", "energetic", "momentum")
-    ]
+    broken = audit(scene, velocity, out).broken
+    words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
     nothing = nothing_approaches(scene, velocity)
     quiet = nothing is not None and not np.asarray(out.impulse).any()
     lines = [

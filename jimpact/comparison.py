@@ -1,8 +1,8 @@
 """Every law on one scene, side by side."""
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
@@ -14,8 +14,10 @@ from jimpact.audits import Audit, audit, nothing_approaches
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
 from jimpact.laws import REGISTRY
+from jimpact.records import as_data, fields_as_data, number, table
 from jimpact.scene import Scene, as_velocity, kinetic_energy, momentum
 from jimpact.status import STATUS
+from jimpact.timing import in_turns, seconds
 
 _REPEATS = 20  # of the timing; its median is told
 
@@ -67,51 +69,56 @@ class Entry:
         """Name of the status."""
         return STATUS[int(self.outcome.status)].name
 
+    @property
+    def verdict(self) -> str:
+        """'ok', or what is violated, and a status that is not ok."""
+        broken = [f"{name} violated" for name in self.audit.broken]
+        return ", ".join(broken + [self.status] * (self.status != "ok")) or "ok"
+
+    def to_dict(self) -> dict[str, Any]:
+        """The row, as a JSON file can hold it."""
+        out, checked = self.outcome, {"status": self.status, "consistent": self.audit.consistent}
+        rest = fields_as_data(self, "law", "outcome", "audit")
+        return as_data({"velocity": out.velocity, "impulse": out.impulse, **checked}) | rest
+
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found: `entries[name]`; `left_out[name]` says why; `print` gives a table."""
+    """What `compare` found: `entries[name]`; `left_out[name]` says why; `print` gives a table.
+
+    `measured` (n,), where it is known, is v+ beside which the laws are put.
+    """
 
     scene: Scene
     velocity: np.ndarray
     entries: dict[str, Entry]
     left_out: dict[str, str] = field(default_factory=dict)
+    measured: np.ndarray | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything, as a JSON file can hold it."""
-        return {
-            name: {
-                "velocity": np.asarray(entry.outcome.velocity).tolist(),
-                "impulse": np.asarray(entry.outcome.impulse).tolist(),
-                "energy_ratio": entry.energy_ratio,
-                "dispersion_index": entry.dispersion_index,
-                "status": entry.status,
-                "consistent": bool(entry.audit.consistent),
-                "time_us": 1e6 * entry.time,
-                "compile_time_s": entry.compile_time,
-            }
-            for name, entry in self.entries.items()
-        }
+        """The laws' rows, as a JSON file can hold them."""
+        return as_data(self.entries)
 
     def __str__(self) -> str:
-        head = f"{'law':22s}{'v+ [m/s]':{11 * self.scene.size}s}{'T+/T-':>8s}{'disp.':>7s}"
-        lines = [head + f"{'us':>8s}  audit"]
-        for name, entry in self.entries.items():
-            v = "".join(f"{x:11.5f}" for x in np.asarray(entry.outcome.velocity))
-            numbers = f"{entry.energy_ratio:8.4f}{entry.dispersion_index:7.3f}"
-            lines.append(f"{name:22s}{v}{numbers}{1e6 * entry.time:8.0f}  {verdict(entry)}")
+        bodies = [f"v{i + 1}+" for i in range(self.scene.size)]
+        heads = ["law", *bodies, "T+/T-", "dispersion", "us", "audit"]
+        rows = [
+            [name, *self._cells(entry.outcome.velocity), f"{1e6 * entry.time:.0f}", entry.verdict]
+            for name, entry in self.entries.items()
+        ]
+        if self.measured is not None:
+            rows.append(["measured", *self._cells(self.measured), "", ""])
+        lines = table(heads, rows, left=["audit"])
         lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         quiet = nothing_approaches(self.scene, self.velocity)
-        lines += [] if quiet is None else [quiet]
-        return "\n".join(lines)
+        return "\n".join(lines + ([] if quiet is None else [f"no impact: {quiet}"]))
 
-
-def verdict(entry: Entry) -> str:
-    """'ok', or what is violated, and a status that is not ok."""
-    names = ("kinematic", "kinetic", "energetic", "momentum")
-    broken = [f"{n} violated" for n in names if not bool(getattr(entry.audit, n))]
-    words = [] if entry.status == "ok" else [entry.status]
-    return ", ".join(broken + words) or "ok"
+    def _cells(self, after: Any) -> list[str]:
+        """Velocities [m/s], energy ratio and dispersion, as far as they are known."""
+        ratio = energy_ratio(self.scene, self.velocity, after)
+        spread = dispersion_index(self.scene, after)
+        v = [number(x, ".5f") for x in np.asarray(after)]
+        return [*v, number(float(ratio), ".4f"), number(float(spread), ".3f")]
 
 
 def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str, str]]:
@@ -160,26 +167,19 @@ def compare(
             f"Argument `laws` must be None where parameters are given, but {', '.join(values)} "
             "came with it."
         )
-    entries = {name: _entry(law, scene, v) for name, law in laws.items()}
+    runs = {name: partial(impact, law, scene, v) for name, law in laws.items()}
+    first = [seconds(run) for run in runs.values()]
+    each = [float(np.median(x)) for x in in_turns(list(runs.values()), _REPEATS)]
+    entries = {
+        name: Entry(
+            law=laws[name],
+            outcome=(out := run()),
+            audit=audit(scene, v, out),
+            energy_ratio=float(energy_ratio(scene, v, out.velocity)),
+            dispersion_index=float(dispersion_index(scene, out.velocity)),
+            time=each[i],
+            compile_time=max(first[i] - each[i], 0.0),
+        )
+        for i, (name, run) in enumerate(runs.items())
+    }
     return Comparison(scene, np.asarray(v), entries, left_out)
-
-
-def _entry(law: Law, scene: Scene, v: jax.Array) -> Entry:
-    begin = time.perf_counter()
-    out = jax.block_until_ready(impact(law, scene, v))
-    first = time.perf_counter() - begin
-    times = []
-    for _ in range(_REPEATS):
-        begin = time.perf_counter()
-        jax.block_until_ready(impact(law, scene, v))
-        times.append(time.perf_counter() - begin)
-    each = float(np.median(times))
-    return Entry(
-        law=law,
-        outcome=out,
-        audit=audit(scene, v, out),
-        energy_ratio=float(energy_ratio(scene, v, out.velocity)),
-        dispersion_index=float(dispersion_index(scene, out.velocity)),
-        time=each,
-        compile_time=max(first - each, 0.0),
-    )

@@ -129,8 +129,7 @@ class Experiments(eqx.Module):
         >>> round(float(data.momentum_excess(ji.chain([1.0, 1.0]))[0, 0]), 6)
         0.1
         """
-        rows = [m @ (post - pre) for m, pre, post in self.balances(scene)]
-        return _filled(rows)
+        return _filled([m @ (post - pre) for m, pre, post in self.balances(scene)])
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """Conserved momentum after over before, (K, c); inf or NaN where there was none before."""
@@ -260,30 +259,6 @@ def read_experiments(path: str | Path) -> Experiments:
     >>> [round(float(v), 4) for v in balls.post[0]]
     [-0.0605, 0.1049, 0.9978]
     """
-    table = read_table(path)
-    return Experiments(table.pre, table.post, table.sigma, shots=table.shots)
-
-
-class Column(NamedTuple):
-    """One column: what it holds, of which body (from 1), and its unit in m/s."""
-
-    header: str
-    kind: str
-    body: int
-    factor: float
-
-
-class Table(NamedTuple):
-    """Velocities in m/s, NaN where not measured; sigma is None where the file has none."""
-
-    pre: np.ndarray
-    post: np.ndarray
-    sigma: np.ndarray | None
-    shots: list[str] | None
-
-
-def read_table(path: str | Path) -> Table:
-    """Parse the file; every error names file, line, column, the value and what is allowed."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"Data file '{path}' does not exist or is no file.")
@@ -293,32 +268,42 @@ def read_table(path: str | Path) -> Table:
         raise ValueError(f"{path}: the file must be UTF-8 text, but is not ({error}).") from None
     reader = csv.reader(text.splitlines())
     lines = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    rows = [(number, row) for number, row in lines if any(row)]
+    rows = [(f"{path}, line {number}", row) for number, row in lines if any(row)]
     if not rows:
         raise ValueError(f"{path}: the file is empty; its first line must name the columns.")
-    header_line, headers = rows[0]
-    columns = [_column(f"{path}, line {header_line}", i, h) for i, h in enumerate(headers)]
-    bodies = _check_columns(f"{path}, line {header_line}", columns)
+    where, headers = rows[0]
+    columns = [_column(where, i, header) for i, header in enumerate(headers)]
+    bodies = _check_columns(where, columns)
     if len(rows) == 1:
         raise ValueError(f"{path}: the file has no shots; each line below the header is one.")
     values = {kind: np.full((len(rows) - 1, bodies), np.nan) for kind in _KINDS}
     shots = []
-    for k, (line, row) in enumerate(rows[1:]):
+    for k, (where, row) in enumerate(rows[1:]):
         if len(row) != len(columns):
             raise ValueError(
-                f"{path}, line {line}: a shot must have {len(columns)} values, one per column, "
+                f"{where}: a shot must have {len(columns)} values, one per column, "
                 f"but has {len(row)}."
             )
         for column, cell in zip(columns, row):
             if column.kind == "shot":
                 shots.append(cell or str(k + 1))
             else:
-                number = _number(f"{path}, line {line}, column `{column.header}`", column, cell)
+                number = _number(f"{where}, column `{column.header}`", column, cell)
                 values[column.kind][k, column.body - 1] = number
-        _check_sigma(f"{path}, line {line}", columns, values, k)
-    has_sigma = any(c.kind == "sigma" for c in columns)
-    sigma = values["sigma"] if has_sigma else None
-    return Table(values["pre"], values["post"], sigma, shots or None)
+        for column in columns:
+            if column.kind == "sigma":
+                _check_sigma(where, column, *(values[x][k, column.body - 1] for x in _KINDS[1:]))
+    sigma = values["sigma"] if any(column.kind == "sigma" for column in columns) else None
+    return Experiments(values["pre"], values["post"], sigma, shots=shots or None)
+
+
+class Column(NamedTuple):
+    """One column: what it holds, of which body (from 1), and its unit in m/s."""
+
+    header: str
+    kind: str
+    body: int
+    factor: float
 
 
 def _column(where: str, index: int, header: str) -> Column:
@@ -350,15 +335,14 @@ def _check_columns(where: str, columns: list[Column]) -> int:
     for column, key in zip(columns, found):
         if found.count(key) > 1:
             raise ValueError(f"{where}: column `{column.header}` must occur once, but is repeated.")
-    bodies = max((body for _, body in found), default=0)
-    kinds = [k for k in _KINDS if k != "sigma" or any(kind == k for kind, _ in found)]
-    for body in range(1, max(bodies, 1) + 1):
-        for kind in kinds:
-            if (kind, body) not in found:
-                raise ValueError(
-                    f"{where}: column `{kind}_{body}[unit]` is missing; every body from 1 to "
-                    f"{max(bodies, 1)} needs {', '.join(f'`{k}`' for k in kinds)}."
-                )
+    bodies = max(1, *(body for _, body in found))
+    kinds = [kind for kind in _KINDS if kind != "sigma" or any(x == kind for x, _ in found)]
+    missing = [f"{k}_{i + 1}" for i in range(bodies) for k in kinds if (k, i + 1) not in found]
+    if missing:
+        raise ValueError(
+            f"{where}: column `{missing[0]}[unit]` is missing; every body from 1 to {bodies} needs "
+            f"{', '.join(f'`{kind}`' for kind in kinds)}."
+        )
     return bodies
 
 
@@ -379,19 +363,13 @@ def _number(where: str, column: Column, cell: str) -> float:
     return number * column.factor
 
 
-def _check_sigma(
-    where: str, columns: list[Column], values: dict[str, np.ndarray], shot: int
-) -> None:
-    for column in columns:
-        if column.kind != "sigma":
-            continue
-        post, sigma = values["post"][shot, column.body - 1], values["sigma"][shot, column.body - 1]
-        if not np.isnan(post) and not sigma > 0:
-            given = "is empty" if np.isnan(sigma) else f"is {sigma / column.factor:g}"
-            raise ValueError(
-                f"{where}, column `{column.header}`: the error of a measured value must be > 0, "
-                f"but {given}."
-            )
+def _check_sigma(where: str, column: Column, post: float, sigma: float) -> None:
+    if not np.isnan(post) and not sigma > 0:
+        given = "is empty" if np.isnan(sigma) else f"is {sigma / column.factor:g}"
+        raise ValueError(
+            f"{where}, column `{column.header}`: the error of a measured value must be > 0, "
+            f"but {given}."
+        )
 
 
 def data_defects(

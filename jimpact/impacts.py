@@ -232,7 +232,7 @@ def _signs(contact: Contact, p: jax.Array, tangential: jax.Array) -> jax.Array:
 def raise_on_failure(out: Impact) -> Impact:
     """Raise a RuntimeError naming every failed impact of `out` (batched or not); else return it.
 
-    Codes that only inform (`plastic_limit`, `impulse_not_unique`, `order_dependent`) pass.
+    Codes that only inform (`plastic_limit`, `ill_conditioned`, `order_dependent`, ..) pass.
 
     >>> import jimpact as ji
     >>> apart = ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 1.0])

@@ -1,18 +1,23 @@
-"""What a law is: one method from `Contact` to impulses, declared parameters, an open registry."""
+"""What a law is: one method from `Contact` to impulses, declared parameters."""
 
 import abc
-import copy
 import dataclasses
-import inspect
-from collections.abc import Callable, Iterable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar, overload
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_square, check_values, is_traced
+from jimpact._checks import (
+    as_float_array,
+    check_choice,
+    check_shape,
+    check_square,
+    check_values,
+    is_traced,
+)
 from jimpact.contact import Contact, contact_of
 from jimpact.scene import Scene
 from jimpact.status import CODE
@@ -33,68 +38,43 @@ class StaticNumbers(tuple[float, ...]):
 if TYPE_CHECKING:
     # What a parameter takes and what it is read as; type checkers see both in such a descriptor.
     Numbers = jax.typing.ArrayLike | Sequence[Any]
+    Taken = TypeVar("Taken", contravariant=True)
+    Read = TypeVar("Read", covariant=True)
 
-    class Values:
-        """Takes numbers or an array, is read as an array."""
+    class Declaration(Generic[Taken, Read]):
+        """Takes one thing, is read as another."""
 
         @overload
-        def __get__(self, module: None, owner: type) -> "Values": ...
+        def __get__(self, module: None, owner: type) -> "Declaration[Taken, Read]": ...
         @overload
-        def __get__(self, module: object, owner: type) -> jax.Array: ...
+        def __get__(self, module: object, owner: type) -> Read: ...
         def __get__(self, module: object | None, owner: type) -> Any:
-            """An array."""
+            """What it is read as."""
 
-        def __set__(self, module: object, value: Numbers) -> None: ...
+        def __set__(self, module: object, value: Taken) -> None: ...
 
-    class OptionalValues:
-        """Takes numbers, an array or None, is read as an array or None."""
-
-        @overload
-        def __get__(self, module: None, owner: type) -> "OptionalValues": ...
-        @overload
-        def __get__(self, module: object, owner: type) -> jax.Array | None: ...
-        def __get__(self, module: object | None, owner: type) -> Any:
-            """An array or None."""
-
-        def __set__(self, module: object, value: Numbers | None) -> None: ...
-
-    class StaticOrValues:
-        """Takes numbers or an array, is read as static numbers or an array."""
-
-        @overload
-        def __get__(self, module: None, owner: type) -> "StaticOrValues": ...
-        @overload
-        def __get__(self, module: object, owner: type) -> float | tuple[float, ...] | jax.Array: ...
-        def __get__(self, module: object | None, owner: type) -> Any:
-            """Static numbers or an array."""
-
-        def __set__(self, module: object, value: Numbers) -> None: ...
-
+    Values = Declaration[Numbers, jax.Array]
+    OptionalValues = Declaration[Numbers | None, jax.Array | None]
+    StaticOrValues = Declaration[Numbers, float | tuple[float, ...] | jax.Array]
 else:
     Values = jax.Array
     OptionalValues = jax.Array | None
     StaticOrValues = float | tuple[float, ...] | jax.Array
 
 
+@dataclasses.dataclass(eq=False)
 class Domain:
     """What `parameter` declares of a field; called by equinox to convert and check a value."""
 
-    def __init__(
-        self,
-        low: float = -np.inf,
-        high: float = np.inf,
-        *,
-        open_low: bool = False,
-        log: bool = False,
-        static_numbers: bool = False,
-        matrix: bool = False,
-        per_contact: bool = True,
-        high_unless: str | None = None,
-    ):
-        self.name = "parameter"  # until the class that holds it is made
-        self.low, self.high, self.open_low, self.log = low, high, open_low, log
-        self.static_numbers, self.matrix, self.per_contact = static_numbers, matrix, per_contact
-        self.high_unless = high_unless
+    low: float = -np.inf
+    high: float = np.inf
+    open_low: bool = False
+    log: bool = False
+    static_numbers: bool = False
+    matrix: bool = False
+    per_contact: bool = True
+    high_unless: str | None = None
+    name: str = "parameter"  # until the class that holds it is made
 
     def __call__(self, value: Any) -> Any:
         """The value as a float array (or static numbers); None stays None."""
@@ -110,9 +90,7 @@ class Domain:
         """The domain in this module, whose option may have lifted the upper end."""
         if self.high_unless is None or not getattr(module, self.high_unless):
             return self
-        lifted = copy.copy(self)
-        lifted.high = np.inf
-        return lifted
+        return dataclasses.replace(self, high=np.inf)
 
     def check(self, value: Any) -> None:
         """Raise a ValueError for a value outside."""
@@ -134,30 +112,23 @@ class Domain:
         return self.low, self.high
 
 
+@dataclasses.dataclass(eq=False)
 class Option:
     """What `option` declares of a static field; called by equinox to check a value."""
 
-    def __init__(
-        self,
-        choices: tuple[str, ...] | None = None,
-        low: float | None = None,
-        high: float = np.inf,
-        *,
-        open_low: bool = False,
-        converter: Callable[[Any], Any] | None = None,
-    ):
-        self.name = "option"
-        self.choices, self.low, self.high, self.open_low = choices, low, high, open_low
-        self.converter = converter
+    choices: tuple[Any, ...] | None = None
+    low: float | None = None
+    high: float = np.inf
+    open_low: bool = False
+    converter: Callable[[Any], Any] | None = None
+    name: str = "option"
 
     def __call__(self, value: Any) -> Any:
         """The value, checked; None stays None."""
         if self.converter is not None:
             return self.converter(value)
-        if self.choices is not None and value not in self.choices:
-            raise ValueError(
-                f"Argument `{self.name}` must be one of {self.choices}, but has value {value!r}."
-            )
+        if self.choices is not None:
+            check_choice(self.name, value, self.choices)
         if self.low is not None and value is not None:
             check_values(self.name, value, low=self.low, high=self.high, open_low=self.open_low)
         return value
@@ -203,22 +174,13 @@ def parameter(
         ...
     ValueError: Argument `loss` must lie in [0, 1], but has value 1.5.
     """
-    declared = Domain(
-        low,
-        high,
-        open_low=open_low,
-        log=log,
-        static_numbers=static_numbers,
-        matrix=matrix,
-        per_contact=per_contact,
-        high_unless=high_unless,
-    )
+    declared = Domain(low, high, open_low, log, static_numbers, matrix, per_contact, high_unless)
     return _field(declared, default, kw_only, False)
 
 
 def option(
     default: Any,
-    choices: tuple[str, ...] | None = None,
+    choices: tuple[Any, ...] | None = None,
     *,
     low: float | None = None,
     high: float = np.inf,
@@ -234,9 +196,9 @@ def option(
     >>> ji.LZB(0.9, method="euler")
     Traceback (most recent call last):
         ...
-    ValueError: Argument `method` must be one of ('time', 'impulse'), but has value 'euler'.
+    ValueError: Argument `method` must be one of time, impulse, but has value 'euler'.
     """
-    declared = Option(choices, low, high, open_low=open_low, converter=converter)
+    declared = Option(choices, low, high, open_low, converter)
     return _field(declared, default, kw_only, True)
 
 
@@ -292,6 +254,12 @@ def parameters_of(module: eqx.Module) -> dict[str, Parameter]:
 def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
     """Those that are arrays, not None or static numbers: they can be fitted and drawn."""
     return {k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)}
+
+
+def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
+    """Names of the fields that say how a law is solved."""
+    fields = dataclasses.fields(kind)
+    return tuple(f.name for f in fields if isinstance(f.metadata.get(_KEY), Option))
 
 
 class Impulses(NamedTuple):
@@ -382,131 +350,3 @@ def is_separable(law: Law) -> bool:
 def of_contacts(law: Law, index: jax.Array) -> Law:
     """The law of some contacts only: their entries of what it has one of per contact."""
     return jax.tree.map(lambda x: x[index] if eqx.is_array(x) and x.ndim == 1 else x, law)
-
-
-# ------------------------------------------------------------------------------- the registry
-
-L = TypeVar("L", bound=type[Law])
-EVERY_PROPERTY = frozenset(
-    {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
-)
-
-
-class Row(NamedTuple):
-    """A registered law, what it promises on every scene, and where it comes from.
-
-    `promises` names the properties the contract suite holds it to; where the law breaks another
-    one of them, its status must say so.
-    """
-
-    law: type[Law]
-    summary: str
-    right_when: str
-    fails_when: str
-    promises: frozenset[str]
-    source: str
-    bibtex: str
-    make: Callable[..., Law] | None = None  # from plain numbers, where the class takes others
-
-    @property
-    def arguments(self) -> dict[str, inspect.Parameter]:
-        """What `build` takes, by name."""
-        return dict(inspect.signature(self.make or self.law).parameters)
-
-    @property
-    def options(self) -> tuple[str, ...]:
-        """Names of what says how the law is solved."""
-        fields = dataclasses.fields(self.law)
-        return tuple(f.name for f in fields if isinstance(f.metadata.get(_KEY), Option))
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
-        return tuple(name for name in self.arguments if name not in self.options)
-
-    @property
-    def required(self) -> tuple[str, ...]:
-        """Parameters without a default."""
-        empty = inspect.Parameter.empty
-        return tuple(name for name, x in self.arguments.items() if x.default is empty)
-
-    def build(self, **parameters: Any) -> Law:
-        """The law with these parameters."""
-        return (self.make or self.law)(**parameters)
-
-
-REGISTRY: dict[str, Row] = {}
-
-
-def register(
-    name: str,
-    law: Any = None,
-    *,
-    summary: str = "",
-    right_when: str = "",
-    fails_when: str = "",
-    promises: Iterable[str] = (),
-    source: str = "",
-    bibtex: str = "",
-    make: Callable[..., Law] | None = None,
-) -> Any:
-    """Enter a law in `ji.REGISTRY`: then `compare`, studies and the command line know it by name.
-
-    Args:
-        name: in small letters; what a study calls it.
-        law: the class; None: `register` is used as a decorator of it.
-        summary, right_when, fails_when: a line each, for `jimpact laws`.
-        promises: properties it keeps on every scene, of 'impulse_sign', 'gap_velocity_sign',
-            'energy', 'velocity_scaling', 'mass_scaling'.
-        source, bibtex: where it comes from.
-        make: builds it from plain numbers, where the class takes other things.
-
-    Returns:
-        The class, or the decorator.
-
-    Raises:
-        TypeError: no Law. ValueError: a name that another law has, an unknown promise.
-
-    >>> import jimpact as ji
-    >>> @ji.register("gentle", summary="half of Newton's impulse")
-    ... class Gentle(ji.Newton):
-    ...     def impulses(self, contact):
-    ...         p, side, status = super().impulses(contact)
-    ...         return ji.Impulses(0.5 * p, side, status)
-    >>> ji.REGISTRY["gentle"].parameters
-    ('restitution', 'friction', 'tangential_restitution')
-    >>> del ji.REGISTRY["gentle"]
-    """
-    if law is None:
-        given = dict(summary=summary, right_when=right_when, fails_when=fails_when)
-        given |= dict(source=source, bibtex=bibtex)
-        return lambda own: register(name, own, promises=promises, make=make, **given)
-    if not (isinstance(law, type) and issubclass(law, Law)):
-        raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
-    if name != name.lower() or not name:
-        raise ValueError(f"Argument `name` must be in small letters, but has value {name!r}.")
-    unknown = set(promises) - EVERY_PROPERTY
-    if unknown:
-        raise ValueError(
-            f"Argument `promises` must be among {', '.join(sorted(EVERY_PROPERTY))}, but has "
-            f"{sorted(unknown)[0]!r}."
-        )
-    other = REGISTRY.get(name)
-    if other is not None and _place(other.law) != _place(law):  # a module read again is the same
-        raise ValueError(
-            f"Argument `name` must be new, but {name!r} is {other.law.__qualname__} of "
-            f"{other.law.__module__}."
-        )
-    REGISTRY[name] = Row(
-        law, summary, right_when, fails_when, frozenset(promises), source, bibtex, make
-    )
-    return law
-
-
-def _place(law: type[Law]) -> tuple[str, str]:
-    return law.__module__, law.__qualname__
-
-
-def registered_name(law: Law) -> str | None:
-    """The name of this law's class in the registry; None if it has none."""
-    return next((name for name, row in REGISTRY.items() if row.law is type(law)), None)

@@ -18,6 +18,7 @@ STATUS = (
     Status("order_dependent", "the outcome depends on the order of adjacent collisions", False),
     Status("several_outcomes", "the law allows several velocities, these are one of them", False),
     Status("plastic_limit", "contacts re-close without end; finished in the plastic limit", False),
+    Status("ill_conditioned", "the outcome depends on the tolerance by more than 10 rtol", False),
     Status("energy_gain", "the outcome holds more energy than was there before", True),
     Status("inadmissible_velocity", "a contact still approaches after the impact", True),
     Status("negative_impulse", "a contact would have to pull (p < 0)", True),

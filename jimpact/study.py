@@ -3,27 +3,31 @@
 import importlib.util
 import sys
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.law import Law
-from jimpact.laws import REGISTRY, Row
+from jimpact.laws import REGISTRY
 from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
+from jimpact.registry import Row
 from jimpact.scene import Scene, chain
 
-_TABLES = ("title", "scene", "law", "fit", "data", "monte_carlo")
 _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 _FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
 _DATA_KEYS = ("file", "momentum_corrected")
 _SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
+_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
 _DISTRIBUTIONS: dict[tuple[str, ...], Any] = {("high", "low"): Uniform, ("mean", "std"): Normal}
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -77,19 +81,24 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     >>> read_study("three_balls.toml").title
     'Three equal hard balls, one shot'
     """
-    path = locate(Path(path))
+    return from_file(path, "[scene]", lambda tables, file: _study(tables, file, law))
+
+
+def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Path], T]) -> T:
+    """What `build` makes of a study file's tables; studies of a kind have this `table`."""
+    path = _located(Path(path), table)
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: the study must be a TOML file, but {error}.") from None
     try:
-        return _study(tables, path, law)
+        return build(tables, path)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
 
 
-def locate(path: Path, table: str = "[scene]") -> Path:
-    """The file, or the bundled study of this name; studies of a kind have this `table`."""
+def _located(path: Path, table: str) -> Path:
+    """The file, or the bundled study of this name."""
     if path.is_file():
         return path
     bundled = Path(str(files("jimpact") / "data" / path.name))
@@ -101,10 +110,7 @@ def locate(path: Path, table: str = "[scene]") -> Path:
 
 
 def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Study:
-    check_keys("the study", tables, _TABLES, required=("scene", "law"))
-    for name in ("scene", "law", "fit", "data", "monte_carlo"):
-        if not isinstance(tables.get(name, {}), dict):
-            raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
+    check_tables(tables, ("scene", "law"), ("fit", "data", "monte_carlo"))
     scene = _scene(tables["scene"])
     options = dict(tables.get("fit", {}))
     check_keys("[fit]", options, _FIT_KEYS)
@@ -169,21 +175,16 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
     chunk, bins.
     """
     check_keys("[monte_carlo]", table, _SAMPLING_KEYS, required=("velocity_m_per_s",))
-    found: dict[str, Any] = {"scene": scene}
-    found["velocity"] = _source("velocity_m_per_s", table["velocity_m_per_s"])
-    if "gaps_m" in table:
-        found["gaps"] = _source("gaps_m", table["gaps_m"])
     random = table.get("law", {})
     if not isinstance(random, dict):
         raise ValueError(f"[monte_carlo.law] must be a table, but is {random!r}.")
     drawn = {name: _distribution(f"law.{name}", value) for name, value in random.items()}
-    found["law"] = RandomLaw(law, **drawn) if drawn else law
-    found |= {name: table[name] for name in ("samples", "chunk", "bins") if name in table}
-    return found | ({"key": table["seed"]} if "seed" in table else {})
-
-
-def _source(name: str, value: Any) -> Any:
-    return _distribution(name, value) if isinstance(value, dict) else value
+    given = {
+        _ARGUMENTS.get(key, key): _distribution(key, value) if isinstance(value, dict) else value
+        for key, value in table.items()
+        if key != "law"
+    }
+    return {"scene": scene, "law": RandomLaw(law, **drawn) if drawn else law} | given
 
 
 def _distribution(name: str, value: Any) -> Distribution:
@@ -238,3 +239,13 @@ def check_keys(
     for key in table:
         if key not in allowed:
             raise ValueError(f"{where} may have the keys {', '.join(allowed)}, but has `{key}`.")
+
+
+def check_tables(
+    study: Mapping[str, Any], required: tuple[str, ...], others: tuple[str, ...]
+) -> None:
+    """Raise a ValueError unless a study has these tables, and besides them a title at most."""
+    check_keys("the study", study, ("title", *required, *others), required)
+    for name in (*required, *others):
+        if not isinstance(study.get(name, {}), dict):
+            raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")

@@ -299,5 +299,5 @@ def test_statuses_go_from_mild_to_grave():
     failures = [row.failure for row in ji.STATUS]
     assert failures == sorted(failures)
     wanted = "max_steps not_finite infeasible inadmissible_velocity negative_impulse energy_gain"
-    wanted += " impulse_not_unique order_dependent plastic_limit several_outcomes"
+    wanted += " impulse_not_unique order_dependent plastic_limit several_outcomes ill_conditioned"
     assert set(wanted.split()) <= set(told)

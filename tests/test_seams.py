@@ -198,3 +198,71 @@ def test_poisson_of_one_contact_in_space():
         np.testing.assert_allclose(outcome(ji.Poisson(0.6, mu)), expected, atol=1e-14)
     back = outcome(ji.Poisson(0.6, 5.0, 0.5))
     np.testing.assert_allclose(back, [-1.0, -0.25, 0.6], atol=1e-14)
+
+
+# ---------------------------------------------------------------- outcomes that are badly conditioned
+
+# a chain whose v+ changes by 2 800 times as much as v-: its errors grow on the way
+TOUCHY = (  # masses, e, k
+    np.array([3.16708679, 2.57808882, 0.23471182, 4.50260497]),
+    np.array([0.52428569, 0.10617625, 0.36288352]),
+    np.array([0.028467902, 97.0572957, 37.9132260]),
+)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_ill_conditioned_is_told_and_nothing_else_is(dtype):
+    @jax.jit
+    @jax.vmap
+    def told(masses, e, k, v):
+        return ji.impact(ji.LZB(e, k, check_conditioning=True), ji.chain(masses), v).status
+
+    plain = [np.ones(4), np.full(3, 0.9), np.ones(3)]
+    v = np.array([1.0, 0.0, 0.0, 0.0])
+    args = [jnp.asarray(pair, dtype) for pair in zip((*TOUCHY, v), (*plain, v))]
+    status = told(*args)
+    assert list(status) == [CODE["ill_conditioned"], CODE["ok"]]
+
+
+def test_light_balls_with_gaps_and_knife_edges_are_right_or_told():
+    """Masses and stiffnesses over three decades behind gaps; gaps of 1e-8 that open and close."""
+    rng, half = np.random.default_rng(0), 48
+    masses = np.concatenate(
+        [30.0 ** rng.uniform(-1, 1, (half, 4)), 3.0 ** rng.uniform(-1, 1, (half, 4))]
+    )
+    k = np.concatenate(
+        [1e3 ** rng.uniform(-1, 1, (half, 3)), 10.0 ** rng.uniform(-1, 1, (half, 3))]
+    )
+    gaps = rng.choice([0.0, 1.0], (2 * half, 3)) * rng.uniform(0, 1, (2 * half, 3))
+    gaps[:half] *= 0.5
+    gaps[half:] *= 2e-8
+    v = rng.normal(size=(2 * half, 4))
+
+    def outcome(rtol, check):
+        def one(masses, k, gaps, v):
+            given = dict(rtol=rtol, max_steps=2000, check_conditioning=check)
+            law = ji.Compliant(ji.LinearSpring(k), **given)
+            return ji.impact(law, ji.chain(masses, gaps=gaps), v)
+
+        return jax.jit(jax.vmap(one))(masses, k, gaps, v)
+
+    got, exact = outcome(1e-8, True), outcome(1e-11, False)
+    known = (got.status <= CODE["ill_conditioned"]) & (exact.status == 0)
+    assert known.mean() > 0.9
+    error = np.abs(got.velocity - exact.velocity).max(1) / np.abs(v).max(1)
+    told = got.status == CODE["ill_conditioned"]
+    assert error[known & ~told].max() < 10e-8
+    assert told.mean() < 0.05
+
+
+def test_derivatives_of_a_checked_outcome_are_those_of_the_plain_one():
+    balls, v = ji.chain(np.ones(3)), jnp.array([1.0, 0.0, 0.0])
+
+    def last(e, check):
+        return ji.impact(ji.LZB(e, check_conditioning=check), balls, v).velocity[2]
+
+    slopes = [jax.jit(jax.grad(lambda e, c=check: last(e, c))) for check in (False, True)]
+    plain, checked = (slope(jnp.array([0.9, 0.8])) for slope in slopes)
+    np.testing.assert_allclose(plain, checked, rtol=1e-9)
+    with pytest.raises(ValueError, match="must be 'time' with check_conditioning"):
+        ji.LZB(0.5, method="impulse", check_conditioning=True)

@@ -134,7 +134,7 @@ def test_register_refuses():
         ji.register("newton", ji.Moreau)
     with pytest.raises(TypeError, match="`law` must be a class of Law"):
         ji.register("nothing", int)
-    with pytest.raises(ValueError, match="`promises` must be among"):
+    with pytest.raises(ValueError, match="`promises` must be one of"):
         ji.register("mine", ji.Newton, promises={"beauty"})
     with pytest.raises(ValueError, match="small letters"):
         ji.register("Mine", ji.Newton)

@@ -195,6 +195,7 @@ class ContactFlow:
     restitution: jax.Array  # (m, B)
     exponent_array: jax.Array | None  # (m, B)
     tolerance: jax.Array  # (1, B)
+    taking_part: jax.Array  # (1, B) contacts that are not open for good
     viscous: Viscous | None = None
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
@@ -376,7 +377,7 @@ class ContactFlow:
 
     def patience(self, passes: jax.Array) -> jax.Array:
         """Widens what counts as nothing left once an impact drags on."""
-        return jnp.where(passes > PATIENCE * self.contacts, WIDENED, 1.0) * self.tolerance
+        return jnp.where(passes > PATIENCE * self.taking_part, WIDENED, 1.0) * self.tolerance
 
     def energy(self, x: jax.Array, g: jax.Array) -> jax.Array:
         """Twice the energy of each contact by itself."""

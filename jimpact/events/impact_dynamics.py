@@ -30,6 +30,7 @@ from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.status import CODE
 
 # Derivatives are one or two digits worse than values at the same tolerance; at order 8 two digits
 # more cost a third more steps.
@@ -37,6 +38,10 @@ GRADIENT_TIGHTENING = 0.01
 # Contacts so many times slower than the fastest see as many of its periods, whose errors add up.
 WIDE_SPREAD = 5.0
 METHODS = ("time", "impulse")
+# The tolerance of a second run that shows how well an outcome is conditioned, as a multiple of that
+# of the first one: coarser where the precision can hold none that is APART finer.
+FINER, APART, COARSER = 0.01, 3.0, 10.0
+ILL = 10.0  # rtol that two runs may differ by
 
 
 class Problem(NamedTuple):
@@ -50,6 +55,7 @@ class Problem(NamedTuple):
     energy: jax.Array  # x^(eta + 1) of contacts loaded beforehand
     gap: jax.Array | None  # in units of the indentation
     tolerance: jax.Array  # (1,)
+    taking_part: jax.Array  # (1,) contacts that are not open for good
     step: jax.Array  # (1,) of the impulse form: the tolerance itself, whatever the stiffnesses
     viscous: Viscous | None = None
     sides: "Sides | None" = None
@@ -65,12 +71,14 @@ class Sides(NamedTuple):
 
 
 class Units(NamedTuple):
-    """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m]."""
+    """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m], the error [m/s] that
+    `rtol` allows."""
 
     velocity: jax.Array
     time: jax.Array
     root: jax.Array
     indentation: jax.Array
+    error: jax.Array
 
     @property
     def momentum(self) -> jax.Array:
@@ -87,9 +95,9 @@ def dimensionless(
     stored: jax.Array,
     rtol: float,
     gaps: jax.Array | None = None,
-    count: Any = None,
+    closed: jax.Array | None = None,
 ) -> tuple[Problem, Units]:
-    """The dimensionless problem and the units to return from it; `count` contacts take part."""
+    """The dimensionless problem and the units to return from it; `closed`: those that take part."""
     m, dtype = gamma.shape[0], gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
     root = jnp.sqrt(diagonal(delassus))
@@ -108,8 +116,9 @@ def dimensionless(
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
-    share = jnp.minimum(1.0, 2 / jnp.maximum(m if count is None else count, 1))
-    step = jax.lax.stop_gradient(rtol * share / jnp.max(weight))
+    count = jnp.full((), m, dtype) if closed is None else jnp.sum(closed, dtype=dtype)
+    count = jnp.maximum(count, 1)
+    step = jax.lax.stop_gradient(rtol * jnp.minimum(1.0, 2 / count) / jnp.max(weight))
     problem = Problem(
         beside=beside,
         omega=omega,
@@ -119,9 +128,10 @@ def dimensionless(
         energy=2 * stored / q**2,
         gap=None if gaps is None else gaps / x_ref,
         tolerance=(step * closeness)[None],
+        taking_part=count[None],
         step=step[None],
     )
-    return problem, Units(q, time, root, x_ref)
+    return problem, Units(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
 
 
 def sides_of(contact: Contact, friction: jax.Array, units: Units) -> Sides:
@@ -159,6 +169,7 @@ def flow_of(
         restitution=problem.restitution,
         exponent_array=problem.exponent,
         tolerance=tighten * problem.tolerance,
+        taking_part=problem.taking_part,
         viscous=viscous,
         exponent_static=None if problem.exponent is not None else exponent,
         gapped=problem.gap is not None,
@@ -254,10 +265,11 @@ class Dynamics(NamedTuple):
 
 
 def solve(
-    given: Dynamics, max_steps: int, method: str = "time"
+    given: Dynamics, max_steps: int, method: str = "time", doubted: Contact | None = None
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
     """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
+    `doubted`: a second run beside the first one says whether the outcome is `ill_conditioned`.
     Differentiable in both modes; method 'time' in all orders.
     """
     units, static = given.units, given.static_exponent
@@ -265,12 +277,48 @@ def solve(
         p, code = impulse_form.solve(given.problem, static, given.chain, max_steps)
         return p * units.momentum, None, code
     leaves, tree = given.columns()
+    if doubted is not None:
+        second = given._replace(problem=otherwise(given.problem)).columns()[0]
+        leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
     found = outcome(Outcome(tree, static, given.chain, max_steps, given.tangents), leaves)
     p, side, _, code, _ = found
-    if given.tangents == 0:
-        return p[:, 0] * units.momentum, None, code[0, 0]
-    momentum = jnp.repeat(units.momentum, given.tangents // len(units.root))
-    return p[:, 0] * units.momentum, side[:, 0] * momentum, code[0, 0]
+    p, code = p * units.momentum[:, None], code[0]
+    sides = None
+    if given.tangents > 0:
+        sides = side * jnp.repeat(units.momentum, given.tangents // len(units.root))[:, None]
+    if doubted is not None:
+        apart = None if sides is None else sides[:, 1] - sides[:, 0]
+        change = velocity_changes(doubted, p[:, 1] - p[:, 0], apart)
+        same = jnp.all(jnp.abs(change) <= ILL * units.error) & (code[1] <= CODE["plastic_limit"])
+        code = jnp.maximum(code, jnp.where(same, CODE["ok"], CODE["ill_conditioned"]))
+    return p[:, 0], None if sides is None else sides[:, 0], code[0]
+
+
+def otherwise(problem: Problem) -> Problem:
+    """The same at another tolerance, gamma- changed in the last digits that the precision can hold.
+
+    That tells what errors grow to also where it is rounding, not the tolerance, that limits them.
+    """
+    still = jax.lax.stop_gradient(problem)
+    gamma, tolerance = still.gamma, still.tolerance
+    last = stepper.FINEST * float(jnp.finfo(gamma.dtype).eps)
+    finer = jnp.maximum(FINER * tolerance, last)
+    coarser = COARSER * jnp.maximum(tolerance, last)
+    signs = 1 - 2 * (jnp.arange(len(gamma), dtype=gamma.dtype) % 2)
+    return still._replace(
+        gamma=gamma + last * signs,
+        tolerance=jnp.where(APART * finer <= tolerance, finer, coarser),
+    )
+
+
+def velocity_changes(contact: Contact, p: jax.Array, sides: jax.Array | None) -> jax.Array:
+    """Changes (m,) or (m + t,) of gap velocities and slip [m/s] that impulses make."""
+    if sides is None:
+        return contact.delassus @ p
+    assert contact.cross is not None
+    assert contact.tangential is not None
+    normal = contact.delassus @ p + contact.cross @ sides
+    return jnp.concatenate([normal, contact.cross.T @ p + contact.tangential @ sides])
 
 
 def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

@@ -17,7 +17,8 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
     longest                    the longest step in the flow's own time that is stable
-    tolerance (1, B), snap (1, B), contacts
+    tolerance (1, B), snap (1, B)
+    taking_part (1, B)             contacts, of which some may be open for good
     near                       share of a step from which landings start, 0: from anywhere
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
@@ -60,6 +61,7 @@ TIE = 1e-13  # of a step: events of one moment are taken in the order of their r
 FULL = 30
 POLISH = 2  # Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3
 FINEST = 16  # roundings: an error estimate below them is noise
+COARSE = 0.3  # the error is no less than this part of the third-order estimate squared
 COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
 
 # Accepted steps kept for derivatives: blocks of steps, where nothing is kept a block is skipped.
@@ -81,7 +83,7 @@ class Flow(Protocol):
     @property
     def tolerance(self) -> jax.Array: ...
     @property
-    def contacts(self) -> int: ...
+    def taking_part(self) -> jax.Array | int: ...
     @property
     def snap(self) -> jax.Array: ...
     def constants(self, modes: jax.Array) -> Any: ...
@@ -223,12 +225,14 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     c1, d0, d1 = values[-1], rates[0], rates[-1]
     end = y + sums[0, :n]
     eps = float(jnp.finfo(dtype).eps)
-    full = FULL * flow.contacts
+    full = FULL * flow.taking_part
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
+    # small by chance where the fifth order is: a landing from a maximum, a step of half a period
+    error2 = jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
     ok = error2 <= 1
     factor = jnp.clip(
         SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20)))), SHRINK, GROWTH

@@ -76,7 +76,7 @@ def search(
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)
     points = _start_points(problem, parameters, starts, rng)
-    with progress_bar(starts, max_steps, progress) as show:
+    with progress_bar(progress) as show:
         states = _run(problem, points, method, max_steps, show)
         for _ in range(ROUNDS if starts > 1 else 0):
             best = int(np.nanargmin(states.cost))
@@ -96,7 +96,7 @@ def _run(
     points: np.ndarray,
     method: Method,
     max_steps: int,
-    show: Callable[[int, int], None],
+    show: Callable[[str, float, float], None],
 ) -> SolverState:
     """Solve from points (S, Q), a few at a time; the states come back to the host."""
     starts = jnp.asarray(points, problem.pre.dtype)
@@ -109,7 +109,9 @@ def _run(
             some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], states)
             some = jax.device_get(advance_all(problem, some, method, max_steps, PASSES))
             states = jax.tree.map(partial(_with_rows, rows), states, some)
-            show(len(points) - len(active), int(states.steps.max()))
+            ready, steps = len(points) - len(active), int(states.steps.max())
+            counts = f"{ready} of {len(points)} starts done, step {steps} of at most {max_steps}"
+            show(f"fit: {counts}", steps, max_steps)
         ended = states.done | (states.steps >= max_steps)
         if method == "levenberg-marquardt":
             share = np.where(states.cost > BEHIND * np.nanmin(states.cost), SLOW_BEHIND, SLOW)

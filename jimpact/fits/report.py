@@ -13,6 +13,7 @@ from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
+from jimpact.records import as_data
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
@@ -120,16 +121,16 @@ def to_json(fit: Any) -> dict[str, Any]:
     parameters = [
         {
             "name": name,
-            "value": _plain(fit.value[i]),
-            "standard_error": _plain(fit.standard_error[i]),
-            "confidence_interval_95": _plain(interval[i]),
+            "value": as_data(fit.value[i]),
+            "standard_error": as_data(fit.standard_error[i]),
+            "confidence_interval_95": as_data(interval[i]),
             "at_bound": bool(fit.at_bound[i]),
             "seen": bool(not np.isinf(fit.standard_error[i])),
         }
         for i, name in enumerate(fit.names)
     ]
     starts = [
-        {"sum_of_squares": s.sum_of_squares, "value": _plain(s.value), "count": s.count}
+        {"sum_of_squares": s.sum_of_squares, "value": as_data(s.value), "count": s.count}
         for s in fit.starts
     ]
     return {
@@ -137,28 +138,20 @@ def to_json(fit: Any) -> dict[str, Any]:
         "method": fit.method,
         "parameters": parameters,
         "rms": fit.rms,
-        "noise": _plain(fit.noise),
+        "noise": as_data(fit.noise),
         "degrees_of_freedom": fit.degrees_of_freedom,
         "rank": fit.rank,
         "identifiability": list(fit.identifiability),
         "warnings": list(fit.warnings),
         "converged": fit.converged,
-        "covariance": _plain(fit.covariance),
-        "correlation": _plain(fit.correlation),
+        "covariance": as_data(fit.covariance),
+        "correlation": as_data(fit.correlation),
         "starts": starts,
         "shots": list(fit.experiments.shots),
-        "predicted": _plain(fit.predicted),
-        "residual": _plain(fit.residual),
+        "predicted": as_data(fit.predicted),
+        "residual": as_data(fit.residual),
         "status": [STATUS[code].name for code in fit.status],
     }
-
-
-def _plain(value: Any) -> Any:
-    """Nested lists of floats, None where not finite."""
-    array = np.asarray(value, dtype=float)
-    if array.ndim:
-        return [_plain(entry) for entry in array]
-    return float(array) if np.isfinite(array) else None
 
 
 def fit_warnings(

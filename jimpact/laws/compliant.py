@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import check_values
+from jimpact._checks import check_choice, check_values
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
 from jimpact.events.impact_dynamics import Dynamics, dimensionless, sides_of, solve
@@ -34,8 +34,9 @@ class Compliant(Law):
             a viscous force.
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
         max_steps: passes of the integrator before it gives up.
+        check_conditioning: a second run tells `ill_conditioned`, as in `LZB`.
 
-    Status: `max_steps`; `plastic_limit` where contacts re-close without end.
+    Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`.
 
     Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-; one-sided
     where a gap is 0 and at grazing events. Where two orders of collision meet the outcome changes
@@ -57,6 +58,7 @@ class Compliant(Law):
     initial_energy: Values = parameter(low=0.0, default=0.0, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
+    check_conditioning: bool = option(False, (False, True))
 
     def __check_init__(self) -> None:
         if not isinstance(self.force, Force):
@@ -101,7 +103,8 @@ class Compliant(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
-        return Impulses(*solve(self.dynamics(contact), self.max_steps))
+        doubted = contact if self.check_conditioning else None
+        return Impulses(*solve(self.dynamics(contact), self.max_steps, doubted=doubted))
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")
@@ -120,10 +123,7 @@ def make_compliant(
         "hunt-crossley": partial(HuntCrossley, exponent=exponent),
         "kuwabara-kono": KuwabaraKono,
     }
-    if rheology not in RHEOLOGIES:
-        raise ValueError(
-            f"Argument `rheology` must be one of {RHEOLOGIES}, but has value {rheology!r}."
-        )
+    check_choice("rheology", rheology, RHEOLOGIES)
     if (rheology == "bistiffness") != (damping is None):
         raise ValueError(
             "Argument `damping` must be given for a viscous rheology and only there, but "

@@ -2,9 +2,9 @@
 
 import math
 import textwrap
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from jimpact.law import Law
@@ -13,8 +13,10 @@ from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.kinematic import Newton
 from jimpact.laws.lzb import LZB
-from jimpact.methods.advice_evidence import Findings
 from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
+from jimpact.records import as_data, fields_as_data, number, table
+from jimpact.scene import Scene
+from jimpact.status import CODE, STATUS
 
 _WIDTH = 92  # of the printed lines
 _BODIES = 5  # in the printed table
@@ -23,15 +25,109 @@ _TOLD = 4  # stiffness ratios named one by one
 _PERCENT_FROM = 1e-4
 _ROUNDING = 1e-12
 _NONE = 1e-6  # a change of v+ below, relative to max |v-|, is told as none
+_PARAMETERS = ("restitution", "stiffness", "exponent")  # that an advice tells
 NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
 
 
-class Advice(Findings):
+class Block(NamedTuple):
+    """Contacts that feel each other, 0-based; the kinetic angles [deg] between coupled ones."""
+
+    contacts: tuple[int, ...]
+    approaches: bool
+    angles: tuple[float, float] | None
+    law: str | None = None  # the simplest one that is within tolerance in this block
+
+    @property
+    def name(self) -> str:
+        """Contacts counted from 1."""
+        return ", ".join(str(j + 1) for j in self.contacts)
+
+
+class Unknown(NamedTuple):
+    """A stiffness known within a range only: of `contact`, over that of `base` (None: SI).
+
+    What it does to v+ by itself, relative to max |v-|: `alone`: largest change over its range;
+    `slope`: |d v+ / d ln k|; `needed`: relative accuracy of k at which it moves v+ by the
+    tolerance (inf: it does not).
+    """
+
+    contact: int
+    base: int | None
+    nominal: float
+    low: float
+    high: float
+    alone: float = math.nan
+    slope: float = math.nan
+    needed: float = math.nan
+
+    @property
+    def name(self) -> str:
+        """`k2/k1`, contacts counted from 1."""
+        return f"k{self.contact + 1}" + ("" if self.base is None else f"/k{self.base + 1}")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A law, the scene to use it on (contacts taken as closed or not), and how it fares.
+
+    `velocity` (n,) at the nominal stiffness; `low`, `high` (n,) over the unknown ratios; `median`
+    and `worst` error of v+ against the reference over them, relative to max |v-|; `cost` per
+    impact in a batch, in units of the cheapest law's (None: not timed).
+    """
+
+    law: Law
+    scene: Scene
+    velocity: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    median: float
+    worst: float
+    status: str
+    cost: float | None = None
+
+    @property
+    def usable(self) -> bool:
+        """Whether the status allows to use the outcome, whatever order contacts are numbered in."""
+        code = CODE[self.status]
+        return not STATUS[code].failure and self.status != "order_dependent"
+
+
+@dataclass(frozen=True)
+class Advice:
     """What `advise` found; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
 
     `within`: the law keeps the tolerance; `reason` in words; `candidates[name]` the evidence, from
-    the simplest law to the `reference`; `unknown` and `effects` of the stiffnesses not known.
+    the simplest law to the `reference`; `unknown`: the stiffnesses not known and what they do;
+    `rows`: how many stiffnesses were tried; `gap_ratio`: gaps at work in units of delta_c.
     """
+
+    name: str
+    tolerance: float
+    within: bool
+    reference: str
+    velocity: np.ndarray
+    gap_velocity: np.ndarray
+    candidates: dict[str, Candidate]
+    blocks: tuple[Block, ...]
+    stiffness: np.ndarray
+    unknown: tuple[Unknown, ...]
+    rows: int
+    gap_ratio: np.ndarray | None
+
+    @property
+    def law(self) -> Law:
+        """The law to use."""
+        return self.candidates[self.name].law
+
+    @property
+    def scene(self) -> Scene:
+        """The scene to use it on: contacts taken as closed or not."""
+        return self.candidates[self.name].scene
+
+    @property
+    def at_work(self) -> list[Block]:
+        """Blocks in which a contact approaches."""
+        return [block for block in self.blocks if block.approaches]
 
     @property
     def reason(self) -> str:
@@ -41,45 +137,16 @@ class Advice(Findings):
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it; contacts counted from 1."""
         laws = {
-            name: {
-                "law": as_code(c.law),
-                "velocity": c.velocity.tolist(),
-                "low": c.low.tolist(),
-                "high": c.high.tolist(),
-                "median_error": c.median,
-                "worst_error": c.worst,
-                "status": c.status,
-                "usable": c.usable,
-                "cost": c.cost,
-            }
+            name: fields_as_data(c, "law", "scene") | {"law": as_code(c.law), "usable": c.usable}
             for name, c in self.candidates.items()
         }
-        return {
-            "advice": self.name,
-            "law": as_code(self.law),
-            "within": self.within,
-            "tolerance": self.tolerance,
-            "reason": self.reason,
-            "reference": self.reference,
-            "laws": laws,
-            "blocks": [
-                {
-                    "contacts": [j + 1 for j in block.contacts],
-                    "approaches": block.approaches,
-                    "kinetic_angles_deg": block.angles,
-                    "law": block.law,
-                }
-                for block in self.blocks
-            ],
-            "unknown": [
-                {"name": u.name, "nominal": u.nominal, "low": u.low, "high": u.high}
-                | {"alone": e.alone, "slope": e.slope}
-                | {"needed": e.needed if math.isfinite(e.needed) else None}
-                for u, e in zip(self.unknown, self.effects)
-            ],
-            "rows": self.rows,
-            "gaps_in_delta_c": None if self.gap_ratio is None else self.gap_ratio.tolist(),
-        }
+        words = {"advice": self.name, "law": as_code(self.law), "reason": self.reason}
+        blocks = [as_data(b) | {"contacts": [j + 1 for j in b.contacts]} for b in self.blocks]
+        unknown = [{"name": u.name} | as_data(u._asdict()) for u in self.unknown]
+        for each in unknown:
+            del each["contact"], each["base"]
+        parts = {"laws": laws, "blocks": blocks, "unknown": unknown}
+        return words | fields_as_data(self, "name", "candidates", *parts) | parts
 
     def __str__(self) -> str:
         verdict = "within" if self.within else "NOT within"
@@ -96,16 +163,14 @@ class Advice(Findings):
 
     def _table(self) -> list[str]:
         shown = min(len(self.velocity), _BODIES)
-        title_v = "v+" if shown == len(self.velocity) else f"v+ (first {shown})"
-        head = f" {'law':10s}{'median':>9s}{'worst':>9s}{'cost':>7s}"
-        lines = [f"{head}  {title_v:>8s}{'':{9 * shown - 8}s}  status"]
+        heads = ["law", "median", "worst", "cost", *(f"v{i + 1}+" for i in range(shown)), "status"]
+        rows = []
         for name, c in self.candidates.items():
-            v = "".join(f"{x:9.4f}" for x in c.velocity[:shown])
-            cost = "" if c.cost is None else f"{c.cost:.{0 if c.cost >= 10 else 1}f}"
+            v = [f"{x:.4f}" for x in c.velocity[:shown]]
+            cost = number(c.cost, ".1f" if (c.cost or 0) < 10 else ".0f")
             mark = "*" if name == self.name else " "
-            error = f"{share(c.median):>9s}{share(c.worst):>9s}"
-            lines.append(f"{mark}{name:10s}{error}{cost:>7s} {v}  {c.status}")
-        return lines
+            rows.append([mark + name, share(c.median), share(c.worst), cost, *v, c.status])
+        return table(heads, rows, left=["status"])
 
     def _footnote(self) -> str:
         over = f"; median and worst over {self.rows} stiffnesses" if self.rows > 1 else ""
@@ -150,29 +215,24 @@ def as_code(law: Law) -> str:
             return f"{array.flat[0]:.6g}"
         return f"[{', '.join(f'{z:.6g}' for z in array)}]"
 
-    if isinstance(law, LZB):
-        given = f"{value(law.restitution)}, {value(law.stiffness)}, {value(law.exponent)}"
-        return f"LZB({given}{_rtol(law.rtol)})"
-    if isinstance(law, Compliant):
-        force = ", ".join(
-            value(getattr(law.force, key)) for key in ("stiffness", "exponent", "restitution")
-        )
-        return f"Compliant(Bistiffness({force}){_rtol(law.rtol)})"
-    order = f", {law.order!r}" if isinstance(law, Binary) and law.order != "fastest" else ""
-    return f"{type(law).__name__}({value(jax.tree.leaves(law)[0])}{order})"
+    holder = law.force if isinstance(law, Compliant) else law
+    names = [field.name for field in fields(holder) if field.name in _PARAMETERS]
+    words = [value(getattr(holder, name)) for name in names]
+    if holder is not law:
+        words = [f"{type(holder).__name__}({', '.join(words)})"]
+    if isinstance(law, Binary) and law.order != "fastest":
+        words.append(repr(law.order))
+    if isinstance(law, LZB | Compliant) and law.rtol is not None:
+        words.append(f"rtol={law.rtol:g}")
+    return f"{type(law).__name__}({', '.join(words)})"
 
 
-def _rtol(rtol: float | None) -> str:
-    return "" if rtol is None else f", rtol={rtol:g}"
-
-
-def structure(found: Findings) -> str:
+def structure(found: Advice) -> str:
     """Which contacts are coupled: one sentence a block of several, one for all others."""
     words = []
-    for block in found.blocks:
-        if len(block.contacts) == 1 or not block.approaches:
+    for block in found.at_work:
+        if block.angles is None:
             continue
-        assert block.angles is not None
         low, high = block.angles
         angle = f"angle {low:.4g}" if high - low < 0.05 else f"angles {low:.4g} to {high:.4g}"
         law = f"{title(block.law)} is enough" if block.law else "no law is within tolerance"
@@ -192,9 +252,9 @@ def structure(found: Findings) -> str:
     return "; ".join(words)
 
 
-def effects(found: Findings) -> str:
+def effects(found: Advice) -> str:
     """What each unknown stiffness does by itself, the strongest first."""
-    strongest = sorted(found.effects, key=lambda effect: -effect.alone)[:_TOLD]
+    strongest = sorted(found.unknown, key=lambda u: -u.alone)[:_TOLD]
     words = [
         f"{e.name} {share(e.alone)}"
         + (f" (know it within {100 * e.needed:.2g} %)" if e.needed < 1 else "")
@@ -203,7 +263,7 @@ def effects(found: Findings) -> str:
     return f"alone they move v+ by: {', '.join(words)}"
 
 
-def agreeing(found: Findings) -> str:
+def agreeing(found: Advice) -> str:
     """Other laws, not more complex than the reference, that keep the tolerance too."""
     others = [
         title(name)
@@ -216,9 +276,8 @@ def agreeing(found: Findings) -> str:
     return f"within {share(found.tolerance)}: {', '.join(others)}" if others else ""
 
 
-def ratios(found: Findings) -> str:
+def ratios(found: Advice) -> str:
     """The stiffness ratios this advice is about."""
-    coupled = [b for b in found.blocks if b.approaches and len(b.contacts) > 1]
     if found.unknown:
         names = [u.name for u in found.unknown[:_TOLD]]
         more = ", ..." if len(found.unknown) > _TOLD else ""
@@ -228,16 +287,16 @@ def ratios(found: Findings) -> str:
         many = len(found.unknown) > 1
         kind = "stiffness" + (" ratio" + "s" * many if first.base is not None else "es" * many)
         return f"{kind} {', '.join(names)}{more} {where}"
-    pairs = [(b.contacts[0], j) for b in coupled for j in b.contacts[1:]]
+    pairs = [(b.contacts[0], j) for b in found.at_work for j in b.contacts[1:]]
     names = [f"k{j + 1}/k{i + 1}" for i, j in pairs[:_TOLD]]
     values = [f"{found.stiffness[j] / found.stiffness[i]:.3g}" for i, j in pairs[:_TOLD]]
     more = ", ..." if len(pairs) > _TOLD else ""
     return f"stiffness ratio{'s' * (len(pairs) > 1)} {', '.join(names)} = {', '.join(values)}{more}"
 
 
-def reason(found: Findings) -> str:
+def reason(found: Advice) -> str:
     """Why this law, in one sentence or two."""
-    if not any(block.approaches for block in found.blocks):
+    if not found.at_work:
         slowest = float(found.gap_velocity.min())
         return f"no approach: nothing happens (smallest gap velocity {slowest:.3g} m/s)"
     head = _head(found)
@@ -245,14 +304,13 @@ def reason(found: Findings) -> str:
     return f"{head}; {closest}" if closest else head
 
 
-def _head(found: Findings) -> str:
+def _head(found: Advice) -> str:
     name, worst = found.name, share(found.candidates[found.name].worst)
-    at_work = [block for block in found.blocks if block.approaches]
-    if all(len(block.contacts) == 1 for block in at_work):
-        if found.contacts == 1:
+    if all(len(block.contacts) == 1 for block in found.at_work):
+        if len(found.gap_velocity) == 1:
             return "single contact: every law is Newton's"
-        if len(at_work) == 1:
-            only = f"only contact {at_work[0].name} takes part: a single contact"
+        if len(found.at_work) == 1:
+            only = f"only contact {found.at_work[0].name} takes part: a single contact"
         else:
             only = "contacts decoupled: kinetic angle 90 degrees"
         if name == "newton":
@@ -271,18 +329,18 @@ def _head(found: Findings) -> str:
     return f"{ratios(found)}{_idle(found)}: {title(name)} is within {worst}"
 
 
-def _idle(found: Findings) -> str:
+def _idle(found: Advice) -> str:
     """Where unknown ratios make no difference, and where angles above 90 degrees explain it."""
-    if not found.effects or max(effect.alone for effect in found.effects) > _NONE:
+    if not found.unknown or max(u.alone for u in found.unknown) > _NONE:
         return ""
-    wide = [b.angles[1] for b in found.blocks if b.approaches and b.angles is not None]
+    wide = [b.angles[1] for b in found.at_work if b.angles is not None]
     why = ""
     if max(wide) > 90 + _NONE:
         why = f" (kinetic angle {max(wide):.4g} degrees: pushing one contact opens the other)"
-    return f" make{'s' * (len(found.effects) == 1)} no difference{why}"
+    return f" make{'s' * (len(found.unknown) == 1)} no difference{why}"
 
 
-def _gaps(found: Findings, worst: str) -> str:
+def _gaps(found: Advice, worst: str) -> str:
     """Where gaps matter: how wide they are, and what that allows."""
     assert found.gap_ratio is not None
     low, high = (float(f(found.gap_ratio)) for f in (np.min, np.max))
@@ -297,15 +355,15 @@ def _gaps(found: Findings, worst: str) -> str:
     return f"gaps of {both} delta_c: {verb}"
 
 
-def _undecided(found: Findings) -> str:
+def _undecided(found: Advice) -> str:
     """Nothing is within tolerance, because the stiffnesses are not known."""
     moved, bound = share(found.candidates[found.name].worst), share(found.tolerance)
-    many = len(found.effects) > 1
+    many = len(found.unknown) > 1
     words = (
         f"{ratios(found)} decide{'' if many else 's'}: no law is within {bound}, because "
         f"{'they move' if many else 'it moves'} v+ by up to {moved}"
     )
-    most = max(found.effects, key=lambda effect: effect.alone)
+    most = max(found.unknown, key=lambda u: u.alone)
     if many:
         return f"{words}; measure {most.name} first (alone {share(most.alone)})"
     if most.needed < 1:
@@ -313,7 +371,7 @@ def _undecided(found: Findings) -> str:
     return words
 
 
-def _closest_simpler(found: Findings) -> str:
+def _closest_simpler(found: Advice) -> str:
     """How far off the best of the simpler laws is, or what it breaks."""
     names = list(found.candidates)
     simpler = names[: names.index(found.name)]

@@ -1,40 +1,133 @@
 """Speed against accuracy: every way to compute an impact, on one chart."""
 
+import functools
+import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_shape, check_values, in_common_dtype
+from jimpact._checks import as_whole, check_choice, check_values, in_common_dtype
 from jimpact.comparison import registered_laws
+from jimpact.fits.parameters import with_entries
+from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
-from jimpact.methods.chart_programs import (
-    FINEST,
-    SECOND,
-    Case,
-    Moment,
-    Programs,
-    errors_of,
-    in_turns,
-    law_programs,
-    method_programs,
-    moment_of,
-    reference_of,
-)
-from jimpact.methods.chart_record import Point, Timing, WorkPrecision
-from jimpact.methods.contenders import METHODS, Method, checked
-from jimpact.progress import stage_bar
-from jimpact.scene import Scene, as_velocity
+from jimpact.methods.contenders import METHODS, UNCOUNTED, Method, outcome
+from jimpact.progress import counting_bar
+from jimpact.records import fields_as_data, number, table
+from jimpact.scene import Scene, as_velocity, kinetic_energy
 from jimpact.status import STATUS
+from jimpact.timing import in_turns
 
-Row = tuple[str, float | None]  # a method and its setting, or a law
+QUANTITIES = ("velocity", "impulse", "energy", "duration", "gradient")
 ALGEBRAIC = ("newton", "moreau", "poisson", "binary")
 
 SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
 SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right
+HOST_BATCH = 4  # impacts that a method without vmap does for its time in a batch: a plain loop
+FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the other one it is compared with
+
+
+class Timing(NamedTuple):
+    """Median and quartiles of the time per impact [s]."""
+
+    median: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method at one of its settings, or a law (`setting` None).
+
+    `error[quantity]` is relative, the largest over the sample (of a law: its model error); NaN
+    where there is none. `evaluations`: mean number of field evaluations an impact, NaN where there
+    are none or nothing counts them. `gradient` is None where there is none. `status`: the gravest.
+    """
+
+    label: str
+    setting: float | None
+    error: dict[str, float]
+    evaluations: float
+    status: str
+    single: Timing
+    batched: Timing
+    gradient: Timing | None = None
+
+    def cells(self) -> list[str]:
+        """What a table tells of it."""
+        times = [_us(t and t.median) for t in (self.single, self.batched, self.gradient)]
+        times[1] += f" ({_us(self.batched.low)}-{_us(self.batched.high)})"
+        setting = "law" if self.setting is None else f"{self.setting:g}"
+        errors = [number(self.error[q], ".1e") for q in QUANTITIES]
+        return [setting, *errors, number(self.evaluations, ".0f"), *times]
+
+
+def _us(seconds: float | None) -> str:
+    return "" if seconds is None else f"{1e6 * seconds:.3g}"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Where the errors are measured from: how it came about, how uncertain it is (relative)."""
+
+    how: str
+    uncertainty: dict[str, float]
+    velocity: np.ndarray
+    impulse: np.ndarray
+    duration: float
+
+
+@dataclass(frozen=True)
+class WorkPrecision:
+    """Error against time and work; `print` gives a table, `ji.plot.work_precision` a picture.
+
+    `points[name]` from coarse to fine; `compile_time[name]` [s] by program ('single', 'batched',
+    'gradient'), traced and compiled; `left_out[name]`: why a method is missing.
+    """
+
+    velocity: np.ndarray
+    points: dict[str, tuple[Point, ...]]
+    reference: Reference
+    compile_time: dict[str, dict[str, float]]
+    left_out: dict[str, str]
+    without_gradient: dict[str, str]
+    batch: int
+    sample: int
+    spread: float
+    repeats: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, as a JSON file can hold it (NaN: null)."""
+        return fields_as_data(self)
+
+    def __str__(self) -> str:
+        heads = ["method", "setting", "v+", "impulse", "energy", "time", "gradient", "evals"]
+        heads += ["alone [us]", "batch", "with J", "compile [s]", "status"]
+        rows = []
+        for name, points in self.points.items():
+            compiled = sum(self.compile_time[name].values())
+            first = [name, f"{compiled:.1f}" if compiled else ""]
+            for point in points:
+                rows.append([first[0], *point.cells(), first[1], point.status])
+                first = ["", ""]
+        uncertain = ", ".join(f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items())
+        lines = [
+            *table(heads, rows, left=["status"]),
+            f"Reference: {self.reference.how}; uncertain by {uncertain}.",
+            f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
+            f"factor {self.spread:g}; of a law its model error.",
+            f"Times: medians of {self.repeats} in turns, µs per impact: alone, in a batch of "
+            f"{self.batch} (quartiles), with gradient.",
+        ]
+        lines += [f"left out: {name}: {why}." for name, why in self.left_out.items()]
+        lines += [f"no gradient: {name}: {why}." for name, why in self.without_gradient.items()]
+        return "\n".join(lines)
 
 
 def work_precision(
@@ -84,115 +177,72 @@ def work_precision(
     >>> [f"{point.error['velocity']:.0e}" for point in found.points["verlet"]]
     ['2e-04', '4e-06']
     """
-    case = case_of(scene, velocity, law, batch, repeats)
-    chosen, left_out = chosen_methods(methods, case)
-    ladders = ladders_of(chosen, settings or {})
-    exact, second = reference_method(reference, case), METHODS["dop853"]
+    repeats = as_whole("repeats", repeats, 1)
+    case = _case(scene, velocity, law, as_whole("batch", batch, 1))
+    chosen, left_out = _chosen(methods, case)
+    ladders = _ladders(chosen, settings or {})
+    exact, second = _reference(reference, case), METHODS["dop853"]
     if laws is None:
         known = registered_laws({"restitution": law.restitution})[0]
         laws = {name: known[name] for name in ALGEBRAIC}
-    rows: list[Row] = [(name, value) for name, ladder in ladders.items() for value in ladder]
+    needed = {m.name: m for m in (*chosen, exact, second)}
+    programs = {name: _of_method(m, case, gradients) for name, m in needed.items()}
+    programs |= {name: _of_law(other, case) for name, other in laws.items()}
+    rows: list[tuple[str, float | None]] = [(n, x) for n, row in ladders.items() for x in row]
     rows += [(name, None) for name in laws]
-    with stage_bar(progress) as (stage, advance):
-        needed = {m.name: m for m in (*chosen, exact, second)}
-        stage("compiling", len(needed) + len(laws))
-        programs: dict[str, Programs] = {}
-        for name, method in needed.items():
-            wanted = gradients and not method.no_gradient
-            programs[name] = method_programs(method, case, wanted, timed=name in ladders)
-            advance()
-        for name, other in laws.items():
-            programs[name] = law_programs(in_common_dtype(other, case.velocity)[0], case)
-            advance()
-        truth, other_truth = (
-            moment_of(programs[m.name], rtol) for m, rtol in ((exact, FINEST), (second, SECOND))
-        )
-        stage("measuring errors", len(rows))
-        moments = []
+    truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
+    found = []
+    with counting_bar(len(rows), "errors", progress) as advance:
         for name, value in rows:
-            moments.append(moment_of(programs[name], value))
-            advance()
-        times = _times(rows, programs, repeats, stage, advance)
+            found.append(programs[name].at(value))
+            advance(1)
+    times = _times([(programs[name], value) for name, value in rows], repeats, progress)
     labels = {m.name: m.label for m in chosen} | {name: f"law: {name}" for name in laws}
     points: dict[str, list[Point]] = {name: [] for name, _ in rows}
-    for row, moment, timing in zip(rows, moments, times):
-        error = errors_of(case, moment, truth)
-        points[row[0]].append(_point(row, labels[row[0]], error, moment, timing))
+    for (name, value), each, timed in zip(rows, found, times):
+        answer, error = each[0], _errors(case, each, truth)
+        status = STATUS[int(np.max(answer.out.status))].name
+        work = float(np.mean(answer.evaluations))
+        points[name].append(Point(labels[name], value, error, work, status, *timed))
     return WorkPrecision(
         velocity=np.asarray(case.velocity),
         points={name: tuple(row) for name, row in points.items()},
-        reference=reference_of(case, exact, second, truth, other_truth),
+        reference=Reference(
+            how=f"{exact.name} at rtol {FINEST:g} against {second.name} at {SECOND:g}",
+            uncertainty=_errors(case, other_truth, truth),
+            velocity=np.asarray(truth[0].out.velocity[0]),
+            impulse=np.asarray(truth[0].out.impulse[0]),
+            duration=float(truth[0].duration[0]),
+        ),
         compile_time={name: programs[name].compile_time for name in points},
         left_out=left_out,
+        without_gradient={m.name: m.no_gradient for m in chosen if m.no_gradient and gradients},
         batch=batch,
         sample=case.sample,
         spread=SPREAD,
         repeats=repeats,
-        without_gradient={m.name: m.no_gradient for m in chosen if m.no_gradient and gradients},
     )
 
 
-def _point(
-    row: Row,
-    label: str,
-    error: dict[str, float],
-    moment: Moment,
-    timing: tuple[Timing, Timing, Timing | None],
-) -> Point:
-    answer = moment[0]
-    return Point(
-        name=row[0],
-        label=label,
-        setting=row[1],
-        error=error,
-        evaluations=float(np.mean(np.asarray(answer.evaluations))),
-        single=timing[0],
-        batched=timing[1],
-        gradient=timing[2],
-        status=STATUS[int(np.max(np.asarray(answer.status)))].name,
-    )
+# --------------------------------------------------------------- what is asked, and by whom
 
 
-def _times(
-    rows: list[Row],
-    programs: dict[str, Programs],
-    repeats: int,
-    stage: Callable[[str, int], None],
-    advance: Callable[[], None],
-) -> list[tuple[Timing, Timing, Timing | None]]:
-    """Single, batched and gradient time of every row, all in turns."""
-    tasks: list[tuple[Callable[[], Any], int]] = []
-    places: list[list[int]] = []
-    for name, value in rows:
-        timed = programs[name]
-        own: list[tuple[Callable[[Any], Any] | None, int]] = [
-            (timed.single, 1),
-            (timed.batched, timed.batch),
-            (timed.gradient, min(SAMPLE, timed.batch)),
-        ]
-        places.append([])
-        for run, impacts in own:
-            if run is not None:
-                places[-1].append(len(tasks))
-                tasks.append((lambda run=run, value=value: run(value), impacts))  # type: ignore[misc]
-    stage("timing", len(tasks) * repeats)
-    taken = in_turns(tasks, repeats, advance)
-    of_rows = []
-    for place in places:
-        single, batched, *gradient = (taken[i] for i in place)
-        of_rows.append((single, batched, gradient[0] if gradient else None))
-    return of_rows
+class Case(NamedTuple):
+    """The impact, and stiffnesses (batch, m) around its own; row 0 is its own."""
+
+    law: LZB
+    scene: Scene
+    velocity: jax.Array
+    stiffness: jax.Array
+    sample: int  # rows on which errors are measured
 
 
-def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> Case:
+def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
     """The impact in double precision, one parameter per contact, with a batch around it."""
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
     if not isinstance(law, LZB):
         raise TypeError(f"Argument `law` must be an LZB law, but is {type(law).__name__}.")
-    for name, value in (("batch", batch), ("repeats", repeats)):
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"Argument `{name}` must be a whole number >= 1, but is {value!r}.")
     law, scene, v = in_common_dtype(law, scene, v)
     if v.dtype != jnp.float64:
         raise ValueError(
@@ -203,10 +253,6 @@ def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> 
     if not bool(law.contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
     m = scene.contacts
-    for name in ("restitution", "stiffness"):
-        value = getattr(law, name)
-        if value.shape not in ((), (m,)):
-            check_shape(name, value, (m,), "one entry per contact, or a scalar")
     law = eqx.tree_at(
         lambda old: (old.restitution, old.stiffness),
         law,
@@ -218,41 +264,260 @@ def case_of(scene: Scene, velocity: Any, law: LZB, batch: int, repeats: int) -> 
     return Case(law, scene, v, stiffness, min(SAMPLE, batch))
 
 
-def chosen_methods(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict[str, str]]:
+def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict[str, str]]:
     """Methods asked for; without names all that can, and why the others cannot."""
     if names is None:
         why = {n: m.supports(case.law, case.scene) for n, m in METHODS.items()}
         left_out = {name: reason for name, reason in why.items() if reason is not None}
         return [m for n, m in METHODS.items() if n not in left_out], left_out
-    chosen = [_method("methods", name) for name in names]
-    for method in chosen:
-        checked(case.law, case.scene, method)
-    return chosen, {}
+    return [_able("methods", name, case) for name in names], {}
 
 
-def _method(argument: str, name: str) -> Method:
-    if name not in METHODS:
+def _able(argument: str, name: str, case: Case) -> Method:
+    check_choice(argument, name, METHODS)
+    reason = METHODS[name].supports(case.law, case.scene)
+    if reason is not None:
         raise ValueError(
-            f"Argument `{argument}` must be among {', '.join(METHODS)}, but has {name!r}."
+            f"Argument `{argument}` must be able to solve the impact, but has {name!r}: {reason}."
         )
     return METHODS[name]
 
 
-def ladders_of(
+def _ladders(
     chosen: list[Method], settings: Mapping[str, Sequence[float]]
 ) -> dict[str, tuple[float, ...]]:
     """Settings by method."""
     for name, values in settings.items():
-        if name not in [method.name for method in chosen]:
-            raise ValueError(f"Argument `settings` must be of chosen methods, but has {name!r}.")
+        check_choice("settings", name, [method.name for method in chosen])
         check_values(f"settings[{name!r}]", values, low=0.0, open_low=True)
     return {m.name: tuple(settings.get(m.name, m.ladder)) for m in chosen}
 
 
-def reference_method(name: str | None, case: Case) -> Method:
+def _reference(name: str | None, case: Case) -> Method:
     """The method that errors are measured from."""
-    method = _method("reference", name or "dop853")
-    checked(case.law, case.scene, method)
+    method = _able("reference", name or "dop853", case)
     if method.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
     return method
+
+
+# ------------------------------------------------------------------------------- programs
+
+
+class Answer(NamedTuple):
+    """An outcome or a batch of them, duration [s] and field evaluations; JAX or numpy."""
+
+    out: Impact
+    duration: Any
+    evaluations: Any
+
+
+Moment = tuple[Answer, np.ndarray | None]  # answers of a sample, and their gradients
+
+
+@dataclass(frozen=True)
+class Programs:
+    """What can be run at a setting; `batched` gives whole batches, `account` the sample.
+
+    `compile_time` fills up as programs are called first.
+    """
+
+    single: Callable[[Any], Any]
+    batched: Callable[[Any], Any]
+    batch: int
+    account: Callable[[Any], Answer]
+    gradient: Callable[[Any], Any] | None
+    compile_time: dict[str, float]
+
+    def at(self, setting: float | None) -> Moment:
+        """Answer and gradient of the sample, as numpy; evaluations NaN where not counted."""
+        answer = jax.tree.map(np.asarray, self.account(setting))
+        work = np.where(answer.evaluations == UNCOUNTED, np.nan, answer.evaluations)
+        slopes = None if self.gradient is None else np.asarray(self.gradient(setting))
+        return answer._replace(evaluations=work), slopes
+
+
+def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
+    if not method.jax:
+        return _on_host(method, case)
+
+    def whole(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Answer:
+        law = with_entries(law, ("stiffness",), k)
+        found = method.solve(law, scene, v, setting)
+        return Answer(outcome(law, scene, v, found), found.duration, found.evaluations)
+
+    def fast(*given: Any) -> Answer:
+        answer = whole(*given)
+        return answer._replace(duration=jnp.nan) if method.duration_apart else answer
+
+    def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
+        def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
+            moved = with_entries(law, ("restitution",), e)
+            return fast(k * jnp.exp(stretch), moved, scene, v, setting).out.velocity
+
+        both = jax.jacfwd(velocity, argnums=(0, 1))(jnp.zeros_like(k), law.restitution)
+        return jnp.concatenate(both, axis=-1)
+
+    seconds: dict[str, float] = {}
+    constant = (case.law, case.scene, case.velocity)
+
+    def program(name: str, function: Callable[..., Any], rows: int | None) -> Callable[[Any], Any]:
+        k = case.stiffness[0] if rows is None else case.stiffness[:rows]
+        each = function if rows is None else jax.vmap(function, in_axes=(0, *[None] * 4))
+        return _compiled(seconds, name, each, k, *constant)
+
+    batched = program("batched", fast, len(case.stiffness))
+    account = program("errors", whole, case.sample) if method.duration_apart else batched
+    count = _counter(method, program) if method.counting else None
+
+    def accounted(setting: Any) -> Answer:
+        answer = jax.tree.map(lambda a: a[: case.sample], account(setting))
+        if count is None:
+            return answer
+        return answer._replace(evaluations=np.full(case.sample, count(setting)))
+
+    wanted = gradients and not method.no_gradient
+    return Programs(
+        single=program("single", fast, None),
+        batched=batched,
+        batch=len(case.stiffness),
+        account=accounted,
+        gradient=program("gradient", slopes, case.sample) if wanted else None,
+        compile_time=seconds,
+    )
+
+
+def _compiled(
+    seconds: dict[str, float], name: str, function: Callable[..., Any], *given: Any
+) -> Callable[[Any], Any]:
+    """The function of a setting; its first call enters in `seconds` how long compiling took."""
+
+    @functools.cache
+    def ready() -> Callable[..., Any]:
+        begin = time.perf_counter()
+        program = jax.jit(function).lower(*given, jnp.ones((), float)).compile()
+        seconds[name] = time.perf_counter() - begin
+        return program
+
+    return lambda setting: ready()(
+        *given, jnp.asarray(np.nan if setting is None else setting, float)
+    )
+
+
+def _counter(method: Method, program: Callable[..., Callable[[Any], Any]]) -> Callable[[Any], int]:
+    """Field evaluations of the impact itself, counted one by one."""
+    evaluations = 0
+
+    def tally() -> None:
+        nonlocal evaluations
+        evaluations += 1
+
+    def counted(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
+        assert method.counting is not None
+        return method.counting(tally)(with_entries(law, ("stiffness",), k), scene, v, setting).code
+
+    run = program("count", counted, None)
+
+    def count(setting: Any) -> int:
+        nonlocal evaluations
+        evaluations = 0
+        jax.block_until_ready(run(setting))
+        jax.effects_barrier()
+        return evaluations
+
+    return count
+
+
+def _on_host(method: Method, case: Case) -> Programs:
+    rows = min(HOST_BATCH, len(case.stiffness))
+    laws = [
+        with_entries(case.law, ("stiffness",), k)
+        for k in case.stiffness[: max(HOST_BATCH, case.sample)]
+    ]
+
+    def one(law: LZB, setting: Any) -> Any:
+        return method.solve(law, case.scene, case.velocity, setting)
+
+    def account(setting: Any) -> Answer:
+        answers = []
+        for law in laws[: case.sample]:
+            found = one(law, setting)
+            out = outcome(law, case.scene, case.velocity, found)
+            answers.append(Answer(out, found.duration, found.evaluations))
+        return jax.tree.map(lambda *a: jnp.stack(a), *answers)
+
+    return Programs(
+        single=lambda setting: one(laws[0], setting),
+        batched=lambda setting: [one(law, setting) for law in laws[:rows]],
+        batch=rows,
+        account=account,
+        gradient=None,
+        compile_time={},
+    )
+
+
+def _of_law(law: Law, case: Case) -> Programs:
+    """Programs of another law; it has no setting, and is accounted for at the impact itself."""
+    law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
+    seconds: dict[str, float] = {}
+
+    def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Answer:
+        return Answer(impact(law, scene, v), jnp.nan, UNCOUNTED)
+
+    many = jax.vmap(run, in_axes=(0, None, None, None))
+    velocities = jnp.tile(case.velocity[None, :], (batch, 1))
+    one = _compiled(seconds, "single", run, case.velocity, law, case.scene)
+    return Programs(
+        single=one,
+        batched=_compiled(seconds, "batched", many, velocities, law, case.scene),
+        batch=batch,
+        account=lambda _: jax.tree.map(lambda a: a[None], one(None)),
+        gradient=None,
+        compile_time=seconds,
+    )
+
+
+# ------------------------------------------------------------------------- errors and times
+
+
+def _errors(case: Case, moment: Moment, truth: Moment) -> dict[str, float]:
+    """Relative errors, the largest over as many impacts as `moment` has."""
+    (answer, slopes), (true_answer, true_slopes) = moment, truth
+    found, exact = answer.out, true_answer.out
+    fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(exact.velocity).max()
+    before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(exact.energy_change).max()
+
+    def largest(a: Any, b: Any, scale: Any = None) -> float:
+        scale = np.abs(b).max() if scale is None else scale
+        return float(np.abs(a - b[: len(found.velocity)]).max() / scale)
+
+    known = slopes is not None and true_slopes is not None
+    return {
+        "velocity": largest(found.velocity, exact.velocity, fastest),
+        "impulse": largest(found.impulse, exact.impulse),
+        "energy": largest(found.energy_change, exact.energy_change, before),
+        "duration": largest(answer.duration, true_answer.duration),
+        "gradient": largest(slopes, true_slopes, fastest) if known else float("nan"),
+    }
+
+
+def _times(
+    rows: list[tuple[Programs, float | None]], repeats: int, progress: bool | None
+) -> list[list[Timing]]:
+    """Single and batched time of every row, and with its gradient if it has one; all in turns."""
+    tasks = []
+    for row, (timed, value) in enumerate(rows):
+        for run, impacts in (
+            (timed.single, 1),
+            (timed.batched, timed.batch),
+            (timed.gradient, min(SAMPLE, timed.batch)),
+        ):
+            if run is not None:
+                tasks.append((row, impacts, functools.partial(run, value)))
+    with counting_bar(len(tasks) * repeats, "timings", progress) as advance:
+        taken = in_turns([run for *_, run in tasks], repeats, lambda: advance(1))
+    times: list[list[Timing]] = [[] for _ in rows]
+    for (row, impacts, _), seconds in zip(tasks, taken):
+        quartiles = np.quantile(seconds / impacts, (0.5, 0.25, 0.75))
+        times[row].append(Timing(*quartiles.tolist()))
+    return times

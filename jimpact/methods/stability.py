@@ -1,52 +1,101 @@
-"""`stability_map`: where a method of integration is right, flagged, wrong, or worse."""
+"""`stability_map`: where a method of integration is right, flagged, wrong, or worse.
 
-from collections.abc import Mapping, Sequence
+# notation: a point is a row (6,) of AXES
+#   setting           0 coarse .. 1 fine, log-linear in what the method takes (`setting_of`)
+#   stiffness_ratio   kappa: stiffness of the right half of the contacts; the left half has 1
+#   exponent          eta of all contacts
+#   restitution       e of all contacts
+#   mass_ratio        mu: mass of the middle ball; all others have 1
+#   balls             N, a touching chain without walls; v- = (1, 0, .., 0)
+
+A batch is one compiled function a method and number of balls, over lanes of points; lanes of
+one chunk wait for the slowest, so the number of steps is bounded.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from itertools import combinations
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_values
+from jimpact._checks import as_whole, check_choice, check_values
+from jimpact.audits import audit
+from jimpact.events.impact_dynamics import solve
+from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import METHODS
-from jimpact.methods.contenders.base import Method
-from jimpact.methods.stability_points import (
-    AXES,
-    CLASSES,
-    DEFAULT,
-    FALLS,
-    FINER,
-    FIXED_STEP_RIGHT,
-    FLAGGED,
-    HONEST,
-    STALLS,
-    WRONG,
-    checked_axes,
-    checked_base,
-    classify,
-    error_of,
-    refused,
-    sample_points,
-    setting_of,
-    slice_points,
-    threshold,
-)
-from jimpact.methods.stability_references import (
-    CAUSES,
-    CONFIRMED,
-    REFERENCE_RTOL,
-    Confirmation,
-    Runners,
-    cause_of,
-    groups,
-    references,
-)
-from jimpact.progress import sample_bar
+from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
+from jimpact.progress import counting_bar
+from jimpact.records import as_data, fields_as_data, table
+from jimpact.scene import Scene, chain
 from jimpact.status import CODE
 
+
+class Axis(NamedTuple):
+    """Value of an axis at the base point of the slices, and the ends of its range."""
+
+    base: float
+    low: float
+    high: float
+
+
+_AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse step 1e-3
+    "setting": Axis(0.6, 0.0, 1.0),
+    "stiffness_ratio": Axis(1.0, 1e-8, 1e8),
+    "exponent": Axis(1.5, 1.0, 5.0),
+    "restitution": Axis(0.9, 0.0, 1.0),
+    "mass_ratio": Axis(1.0, 1e-6, 1e6),
+    "balls": Axis(3.0, 2.0, 1000.0),
+}
+AXES = tuple(_AXES)
+# kind of setting (see `jimpact.methods.contenders.Method`): value at level 0 and at level 1
+SETTINGS = {"rtol": (1e-2, 1e-12), "step": (3.0, 3e-3), "impulse step": (0.3, 3e-5)}
+
+CLASSES = (
+    "right",
+    "flagged",
+    "wrong",
+    "gains energy",
+    "stalls",
+    "does not end",
+    "not finite",
+    "unchecked",
+)
+(RIGHT, FLAGGED, WRONG, GAINS_ENERGY, STALLS, ENDLESS, NOT_FINITE, UNCHECKED) = range(8)
+HONEST = 10.0  # error over tolerance up to which a result counts as right
+FIXED_STEP_RIGHT = 1e-3  # the same of methods with a step: error in v+ over the largest |v-|
+FINER = 0.1  # setting at which a wrong result is tried again: it stalls if the error does
+FALLS = 0.5  # not fall below this part
+LANES = 32
+
+REFERENCE_RTOL = 1e-12
+CHECK_RTOL = 1e-11  # of the run by scipy
+CONFIRMED = 1e-7  # difference from it up to which the reference counts as confirmed
+CHECKED = 12  # points
+QUICK_UP_TO, QUICK_BALLS = 1e3, 10  # frequencies over the slowest contact's, size of a chain
+
+CAUSES = (  # limits, formulas and remedies: docs/stability.md
+    "refused beforehand",
+    "step beyond the linear stability limit",
+    "a contact's whole stroke lies within one step",
+    "contacts re-close without end",
+    "time scales far apart",
+    "many contacts at once",
+    "first order at E = 0",
+    "steps straddle changes of phase",
+)
+(_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
+STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # step sqrt(lambda_max)
+RECLOSING = 0.1  # e below which three balls re-close (nearly) without end
+_LONG, _CLUSTERED = 10, 0.9  # chains this long stay clustered up to about this e
+_FAR = 100.0  # times between the frequencies of contacts
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 SLICES = ("one", "pairs")
+BALLS = (2, 3, 5, 10, 30, 100)
+_FEW_BALLS, _FEW = (2, 3, 10), 8  # every number of balls is compiled apart: few where it is coarse
 
 
 class Slice(NamedTuple):
@@ -58,6 +107,15 @@ class Slice(NamedTuple):
     cause: np.ndarray
 
 
+class Confirmation(NamedTuple):
+    """How many references another integrator could confirm, and the largest difference there."""
+
+    points: int
+    tried: int
+    confirmed: int
+    difference: float
+
+
 @dataclass(frozen=True, eq=False)
 class StabilityMap:
     """What `stability_map` found; `print` gives shares and causes.
@@ -66,7 +124,7 @@ class StabilityMap:
         methods: the names.
         axes, base: values along every axis; the base point of the slices.
         slices: by method, first those over one axis, then pairs.
-        samples: Latin-hypercube points (S, 6), columns `jimpact.methods.stability_points.AXES`.
+        samples: Latin-hypercube points (S, 6), columns `jimpact.methods.stability.AXES`.
         sampled: by method, a `Slice` over the samples.
         confirmation: of the reference, by an integrator that shares no code with it.
         max_steps: of every run.
@@ -86,54 +144,34 @@ class StabilityMap:
         codes = np.concatenate([s.codes.ravel() for s in self._all_slices(method)])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
-    def silent(self, method: str) -> int:
-        """Points that are not right without a word: wrong or stalled."""
-        found = self.counts(method)
-        return found["wrong"] + found["stalls"]
-
     def causes(self, method: str) -> dict[str, int]:
         """Points that are not right, by cause."""
         found = np.concatenate([s.cause.ravel() for s in self._all_slices(method)])
         counts = np.bincount(found[found >= 0], minlength=len(CAUSES)).tolist()
-        return {cause.name: count for cause, count in zip(CAUSES, counts) if count}
+        return {cause: count for cause, count in zip(CAUSES, counts) if count}
 
     def _all_slices(self, method: str) -> tuple[Slice, ...]:
         return (*self.slices[method], self.sampled[method])
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it."""
-
-        def as_data(found: Slice) -> dict[str, Any]:
-            error = np.where(np.isfinite(found.error), found.error, -1.0)  # JSON has no NaN
-            return {
-                "axes": list(found.axes),
-                "codes": found.codes.tolist(),
-                "error": error.tolist(),
-                "cause": found.cause.tolist(),
+        by_method = {
+            name: {
+                "counts": self.counts(name),
+                "causes": self.causes(name),
+                "slices": self.slices[name],
+                "sampled": self.sampled[name],
             }
-
-        return {
-            "classes": list(CLASSES),
-            "causes": [cause.name for cause in CAUSES],
-            "axes": {name: values.tolist() for name, values in self.axes.items()},
-            "base": self.base,
-            "max_steps": self.max_steps,
-            "confirmation": self.confirmation._asdict(),
-            "samples": self.samples.tolist(),
-            "methods": {
-                name: {
-                    "counts": self.counts(name),
-                    "causes": self.causes(name),
-                    "slices": [as_data(each) for each in self.slices[name]],
-                    "sampled": as_data(self.sampled[name]),
-                }
-                for name in self.methods
-            },
+            for name in self.methods
         }
+        known = {"classes": CLASSES, "causes": CAUSES, "methods": by_method}
+        return fields_as_data(self, "slices", "sampled") | as_data(known)
 
     def __str__(self) -> str:
         base = ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items())
         found = self.confirmation
+        counts = [[m, *(str(x or "") for x in self.counts(m).values())] for m in self.methods]
+        causes = [[m, str(x), cause] for m in self.methods for cause, x in self.causes(m).items()]
         lines = [
             f"base: {base}; at most {self.max_steps:,} steps",
             f"reference: {found.points} points at rtol {REFERENCE_RTOL:g}; of {found.tried} "
@@ -142,15 +180,14 @@ class StabilityMap:
             f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for fixed steps, "
             "of the largest |v-|",
             "",
-            f"{'points':14s}" + "".join(f"{name:>15s}" for name in CLASSES),
+            *table(["method", *CLASSES], counts),
+            "",
+            *table(
+                ["method", "points", "cause where not right"],
+                causes,
+                left=["cause where not right"],
+            ),
         ]
-        for name in self.methods:
-            row = "".join(f"{count or '':>15}" for count in self.counts(name).values())
-            lines.append(f"{name:14s}{row}")
-        lines += ["", "causes where not right"]
-        for name in self.methods:
-            for cause, count in self.causes(name).items():
-                lines.append(f"{name:14s}{count:6d}  {cause}")
         return "\n".join(lines)
 
 
@@ -201,43 +238,40 @@ def stability_map(
     >>> found.counts("verlet")["right"]
     1
     """
-    if slices not in SLICES:
-        raise ValueError(f"Argument `slices` must be one of {SLICES}, but has value {slices!r}.")
-    check_values("samples", samples, low=0)
-    check_values("max_steps", max_steps, low=1)
+    check_choice("slices", slices, SLICES)
+    samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    chosen, lines = _methods(methods), checked_axes(axes, int(resolution))
-    start = checked_base(base)
+    chosen, lines = _methods(methods), _axes(axes, as_whole("resolution", resolution, 2))
+    start = {name: axis.base for name, axis in _AXES.items()}
+    start |= {name: float(x) for name, x in _known("base", base or {}).items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
     if slices == "pairs":
         axis_sets += list(combinations(lines, 2))
-    parts = [slice_points(start, lines, names) for names in axis_sets]
-    sampled = sample_points(start, lines, int(samples), seed)
+    parts = [_slice_points(start, lines, names) for names in axis_sets]
+    sampled = _sample_points(start, lines, samples, seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
+    runners = cache(partial(runner, max_steps))
     total = len(points) * (len(chosen) + 1)
-    with sample_bar(total, 0, progress) as advance:
-        runners = Runners(int(max_steps), advance)
-        exact, confirmation = references(points, runners)
-        found = {method.name: classes_of(method, points, exact, runners) for method in chosen}
-    cut = np.cumsum([len(part.reshape(-1, len(AXES))) for part in parts])
-
-    def split(name: str) -> tuple[tuple[Slice, ...], Slice]:
-        columns = [np.split(column, cut) for column in found[name]]
-        cuts = [
+    with counting_bar(total, "impacts", progress) as advance:
+        exact, confirmation = references(points, runners, advance)
+        found = {m.name: classes_of(m, points, exact, runners, advance) for m in chosen}
+    cut = np.cumsum([part[..., 0].size for part in parts])
+    own, last = {}, {}
+    for name, results in found.items():
+        columns = [np.split(column, cut) for column in results]
+        own[name] = tuple(
             Slice(names, *(column[i].reshape(part.shape[:-1]) for column in columns))
             for i, (names, part) in enumerate(zip(axis_sets, parts))
-        ]
-        return tuple(cuts), Slice(("samples",), *(column[-1] for column in columns))
-
-    both = {name: split(name) for name in found}
+        )
+        last[name] = Slice(("samples",), *(column[-1] for column in columns))
     return StabilityMap(
         methods=tuple(found),
         axes=lines,
         base=start,
-        slices={name: first for name, (first, _) in both.items()},
+        slices=own,
         samples=sampled,
-        sampled={name: last for name, (_, last) in both.items()},
+        sampled=last,
         confirmation=confirmation,
         max_steps=max_steps,
     )
@@ -246,31 +280,308 @@ def stability_map(
 def _methods(names: Sequence[str] | None) -> list[Method]:
     known = {"default": DEFAULT} | {name: m for name, m in METHODS.items() if m.jax}
     names = NAMES if names is None else tuple(names)
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        raise ValueError(f"Argument `methods` must name some of {tuple(known)}, but has {unknown}.")
+    for name in names or ("",):
+        check_choice("methods", name, known)
     return [known[name] for name in names]
 
 
+def _known(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Values by axis, checked."""
+    for name, value in values.items():
+        check_choice(argument, name, AXES)
+        axis = _AXES[name]
+        check_values(f"{argument}[{name!r}]", value, low=axis.low, high=axis.high)
+    return values
+
+
+def _axes(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str, np.ndarray]:
+    """The axes to map: those given, or r values of each (number of balls: at most six)."""
+    if axes is None:
+        return {
+            "setting": np.linspace(0, 1, r),
+            "stiffness_ratio": np.logspace(-8, 8, r),
+            "exponent": np.linspace(1, 5, r),
+            "restitution": np.append(0.0, np.logspace(-3, 0, r - 1)),
+            "mass_ratio": np.logspace(-6, 6, r),
+            "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
+        }
+    axes = _known("axes", axes or {"": ()})
+    found = {name: np.unique(np.asarray(x, float)) for name, x in axes.items()}
+    balls = found.get("balls", np.zeros(0))
+    if (balls != np.round(balls)).any():
+        raise ValueError(f"Argument `axes['balls']` must hold whole numbers, but has {balls}.")
+    return {name: found[name] for name in AXES if name in found}
+
+
+def _slice_points(
+    base: Mapping[str, float], axes: Mapping[str, np.ndarray], varied: tuple[str, ...]
+) -> np.ndarray:
+    """Points (K_1 .. K_d, 6) in which the axes `varied` run over their values."""
+    columns = [axes[name] if name in varied else np.array([base[name]]) for name in AXES]
+    grid = np.stack(np.meshgrid(*columns, indexing="ij"), axis=-1)
+    return grid.reshape(*(len(axes[name]) for name in varied), len(AXES))
+
+
+def _sample_points(
+    base: Mapping[str, float], axes: Mapping[str, np.ndarray], samples: int, seed: int
+) -> np.ndarray:
+    """Latin-hypercube points (samples, 6), between the values of `axes`; others from `base`."""
+    from scipy.stats import qmc  # late: slow to import
+
+    found = np.tile([base[name] for name in AXES], (samples, 1))
+    unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(samples)
+    for column, (name, values) in zip(unit.T, axes.items()):
+        place = column * (len(values) - 1)
+        if name == "balls":
+            found[:, AXES.index(name)] = values[np.round(place).astype(int)]
+            continue
+        powers = bool((values > 0).all()) and name != "exponent"
+        scaled = np.log(values) if powers else values
+        between = np.interp(place, np.arange(len(values)), scaled)
+        found[:, AXES.index(name)] = np.exp(between) if powers else between
+    return found
+
+
+# --------------------------------------------------------------------------- running methods
+
+
+def setting_of(kind: str, level: Any) -> Any:
+    """The number a method takes at `level` in [0, 1].
+
+    >>> from jimpact.methods.stability import setting_of
+    >>> round(float(setting_of("rtol", 0.6)), 12)
+    1e-08
+    """
+    coarse, fine = SETTINGS[kind]
+    return coarse * (fine / coarse) ** level
+
+
+def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
+    """Masses (N,) [kg] and stiffnesses (N - 1,) of a point.
+
+    Contact j = 1..N-1 belongs to the right half where j > N // 2; ball N // 2 + 1 is the middle.
+
+    >>> from jimpact.methods.stability import chain_of
+    >>> [values.tolist() for values in chain_of(10.0, 0.5, 4)]
+    [[1.0, 1.0, 0.5, 1.0], [1.0, 1.0, 10.0]]
+    """
+    kappa, mu = jnp.asarray(kappa, float), jnp.asarray(mu, float)
+    middle = balls // 2
+    mass = jnp.where(jnp.arange(balls) == middle, mu, jnp.ones_like(mu))
+    stiffness = jnp.where(jnp.arange(balls - 1) >= middle, kappa, jnp.ones_like(kappa))
+    return mass, stiffness
+
+
+def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+    """What `ji.impact(ji.LZB(..., rtol=setting), ...)` does."""
+    given = problem(law, scene, velocity, setting)
+    p, _, code = solve(given.dynamics, given.max_steps, law.method)
+    unknown = jnp.full((), jnp.nan, p.dtype)
+    return in_si(given, p / given.units.momentum, unknown, jnp.asarray(-1), code)
+
+
+DEFAULT = Method(
+    "default", "jimpact's default", "rtol", (1e-4, 1e-8, 1e-12), _solve_default, lzb_only
+)
+
+
+class Found(NamedTuple):
+    """Velocities after (L, n), status of the method and of the impact, energy gained over T-."""
+
+    velocity: np.ndarray
+    code: np.ndarray
+    status: np.ndarray
+    gain: np.ndarray
+
+
+Runner = Callable[[np.ndarray, Any], Found]  # of points (L, 6) and settings () or (L,)
+Runners = Callable[[Method, int, bool], Runner]
+
+
+def runner(max_steps: int, method: Method, balls: int, linear: bool) -> Runner:
+    """One method on chains of so many balls.
+
+    `linear`: the exponent is the static 1.0, which some methods ask for.
+    """
+
+    def one(point: jax.Array, setting: jax.Array) -> tuple[jax.Array, ...]:
+        _, kappa, eta, e, mu, _ = point
+        mass, stiffness = chain_of(kappa, mu, balls)
+        scene, v = chain(mass), jnp.zeros_like(mass).at[0].set(1.0)
+        law = LZB(e, stiffness, 1.0 if linear else eta, max_steps=max_steps)
+        found = method.solve(law, scene, v, setting)
+        out = outcome(law, scene, v, found)
+        return out.velocity, found.code, out.status, audit(scene, v, out).energy_gain
+
+    batch = jax.jit(jax.vmap(one))
+
+    def run(points: np.ndarray, settings: Any) -> Found:
+        settings, rows = np.broadcast_to(settings, len(points)), []
+        for begin in range(0, len(points), LANES):
+            lanes = np.arange(begin, begin + LANES).clip(max=len(points) - 1)  # the last repeats
+            out = batch(jnp.asarray(points[lanes]), jnp.asarray(settings[lanes]))
+            rows.append([np.asarray(x)[: len(points) - begin] for x in out])
+        return Found(*(np.concatenate(column) for column in zip(*rows)))
+
+    return run
+
+
+def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int, bool]]:
+    """Points (indices) of equal shapes, their number of balls, whether they are linear."""
+    balls, linear = points[:, AXES.index("balls")], points[:, AXES.index("exponent")] == 1.0
+    for n, kind in np.unique(np.stack([balls, linear], axis=1), axis=0):
+        yield np.flatnonzero((balls == n) & (linear == kind)), int(n), bool(kind)
+
+
+# --------------------------------------------------------------------------- the references
+
+
+def references(
+    points: np.ndarray, runners: Runners, advance: Callable[[int], None]
+) -> tuple[np.ndarray, Confirmation]:
+    """v+ of every point (P, most balls), NaN where no run ends; how many scipy confirms."""
+    exact = np.full((len(points), int(points[:, AXES.index("balls")].max())), np.nan)
+    for at, balls, linear in _groups(points):
+        unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
+        rows = np.column_stack([np.zeros(len(unique)), unique])
+        found = runners(DEFAULT, balls, linear)(rows, REFERENCE_RTOL)
+        ended = (found.code == CODE["ok"]) | (found.code == CODE["plastic_limit"])
+        exact[at, :balls] = np.where(ended[:, None], found.velocity, np.nan)[np.ravel(back)]
+        advance(len(at))
+    return exact, _confirm(points, exact)
+
+
+def _confirm(points: np.ndarray, exact: np.ndarray) -> Confirmation:
+    """Differences from scipy's integrator at points spread over those that it solves quickly."""
+    quick = np.array([_is_quick(point) for point in points])
+    candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
+    _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
+    candidates = candidates[np.sort(first)]
+    every = max(1, -(-len(candidates) // CHECKED))
+    apart = np.array([_by_scipy(points[i], exact[i]) for i in candidates[::every]])
+    largest = float(apart.max(initial=0.0)) if len(apart) else float("nan")
+    return Confirmation(len(points), len(apart), int((apart <= CONFIRMED).sum()), largest)
+
+
+def _is_quick(point: np.ndarray) -> bool:
+    highest, apart = frequencies(point)
+    parts = point[AXES.index("restitution")] >= RECLOSING  # else scipy may end it too early
+    few = point[AXES.index("balls")] <= QUICK_BALLS
+    return bool(parts and few and highest * apart < QUICK_UP_TO)
+
+
+def _by_scipy(point: np.ndarray, exact: np.ndarray) -> float:
+    _, kappa, eta, e, mu, balls = map(float, point)
+    mass, stiffness = chain_of(kappa, mu, int(balls))
+    scene, v = chain(mass), np.eye(int(balls))[0]
+    law = LZB(e, stiffness, eta)
+    found = METHODS["scipy_dop853"].solve(law, scene, v, CHECK_RTOL)
+    return float(np.abs(outcome(law, scene, v, found).velocity - exact[: len(v)]).max())
+
+
+# ------------------------------------------------------------------------ classes and causes
+
+
 def classes_of(
-    method: Method, points: np.ndarray, exact: list[np.ndarray], runners: Runners
+    method: Method,
+    points: np.ndarray,
+    exact: np.ndarray,
+    runners: Runners,
+    advance: Callable[[int], None],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Class, error and cause of every point."""
-    codes = np.full(len(points), FLAGGED)
-    errors, level = np.full(len(points), np.nan), points[:, AXES.index("setting")]
+    """Class, error (over the largest |v-|, which is 1) and cause of every point."""
+    codes, errors = np.full(len(points), FLAGGED), np.full(len(points), np.nan)
+    level = points[:, AXES.index("setting")]
     setting = setting_of(method.setting, level)
-    for group, balls, linear in groups(points):
-        at = group[~refused(method, points[group], linear)]
+    allowed = np.full(len(points), FIXED_STEP_RIGHT)
+    if method.setting == "rtol":
+        allowed = HONEST * setting
+    for group, balls, linear in _groups(points):
+        run = runners(method, balls, linear)
+
+        def off(found: Found, at: np.ndarray, balls: int = balls) -> np.ndarray:
+            return np.abs(found.velocity - exact[at, :balls]).max(axis=1)
+
+        at = group[~_refused(method, points[group], linear)]
         if len(at):
-            truth, allowed = np.stack([exact[i] for i in at]), threshold(method, level[at])
-            found = runners.run(method, balls, linear, points[at], setting[at])
-            errors[at] = error_of(found, truth)
-            codes[at] = classify(found, errors[at], allowed)
+            found = run(points[at], setting[at])
+            errors[at] = off(found, at)
+            codes[at] = _classified(found, errors[at], allowed[at])
         wrong = at[codes[at] == WRONG]
         if len(wrong):
-            finer = runners.run(method, balls, linear, points[wrong], FINER * setting[wrong])
-            error = error_of(finer, np.stack([exact[i] for i in wrong]))
-            stalls = (finer.code == CODE["ok"]) & ~(error < FALLS * errors[wrong])
-            codes[wrong[stalls]] = STALLS
-        runners.advance(len(group))
-    return codes, errors, cause_of(method, points, codes, setting)
+            finer = run(points[wrong], FINER * setting[wrong])
+            falls = off(finer, wrong) < FALLS * errors[wrong]
+            codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
+        advance(len(group))
+    causes = np.full(len(points), -1)
+    for i in np.flatnonzero(codes != RIGHT):
+        causes[i] = _cause(method, points[i], CLASSES[codes[i]], float(setting[i]))
+    return codes, errors, causes
+
+
+def _refused(method: Method, points: np.ndarray, linear: bool) -> np.ndarray:
+    """Points (L,) on which the method says beforehand that it cannot work."""
+    pair, exponent = chain(jnp.ones(2)), 1.0 if linear else jnp.asarray(1.5)
+    at_0, at_1 = (method.supports(LZB(e, exponent=exponent), pair) for e in (0.0, 1.0))
+    e = points[:, AXES.index("restitution")]
+    return np.where(e == 0, at_0 is not None, at_1 is not None)
+
+
+def _classified(found: Found, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Classes (L,) before a finer setting is tried; `error` NaN where there is no reference."""
+    status = np.where(found.code == CODE["ok"], found.status, found.code)
+    cases = {
+        NOT_FINITE: status == CODE["not_finite"],
+        ENDLESS: status == CODE["max_steps"],
+        RIGHT: error <= allowed,
+        GAINS_ENERGY: (status == CODE["energy_gain"]) | (found.gain > allowed),
+        FLAGGED: status != CODE["ok"],
+        WRONG: np.isfinite(error),
+    }
+    return np.select(list(cases.values()), list(cases), UNCHECKED)
+
+
+def frequencies(point: np.ndarray) -> tuple[float, float]:
+    """`sqrt(lambda_max)` of the linearized flow in units of the fastest contact, and the ratio of
+    the fastest contact's frequency to the slowest's.
+
+    lambda: eigenvalues of `omega G omega eta (eta + 1) / (2 e^2)`, the slope of the force at x = 1.
+
+    >>> import numpy as np
+    >>> from jimpact.methods.stability import frequencies
+    >>> [round(x, 3) for x in frequencies(np.array([0.5, 1.0, 1.0, 1.0, 1.0, 2]))]
+    [1.0, 1.0]
+    """
+    _, kappa, eta, e, mu, balls = map(float, point)
+    mass, k = (np.asarray(x, float) for x in chain_of(kappa, mu, int(balls)))
+    w = 1 / mass[:-1] + 1 / mass[1:]
+    # 1 / t_ref at the largest normalized speed, up to a common factor
+    omega = k ** (1 / (eta + 1)) * np.sqrt(w)
+    slowest = omega.max() / omega.min()
+    omega = omega / omega.max()
+    beside = -1 / mass[1:-1] / np.sqrt(w[:-1] * w[1:])
+    g = np.eye(len(w)) + np.diag(beside, 1) + np.diag(beside, -1)
+    largest = np.linalg.eigvalsh(omega[:, None] * g * omega[None, :])[-1]
+    with np.errstate(divide="ignore"):
+        return float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf, float(slowest)
+
+
+def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
+    """Index of CAUSES."""
+    e, balls = point[AXES.index("restitution")], point[AXES.index("balls")]
+    highest, apart = frequencies(point)
+    reach = setting * highest
+    if name == "flagged" and e == 0:
+        return _REFUSED
+    if method.setting == "step" and reach > 1:
+        return _UNSTABLE if reach > STABLE.get(method.name, np.inf) else _COARSE
+    if name in ("does not end", "flagged", "unchecked"):
+        if e < RECLOSING:
+            return _RECLOSES
+        if apart > _FAR or point[AXES.index("mass_ratio")] < 1 / _FAR:
+            return _APART
+        if balls >= _LONG and e < _CLUSTERED:
+            return _CLUSTER
+    if method.setting == "impulse step":
+        return _FIRST_ORDER
+    return _STRADDLES if name in ("wrong", "stalls", "gains energy") else _APART

@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_values
+from jimpact._checks import as_float_array, check_choice, check_per_contact, check_values
 from jimpact.comparison import dispersion_index
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
+from jimpact.records import fields_as_data, table
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 
@@ -41,10 +42,7 @@ class ValidityMap:
 
     def error(self, law: str) -> np.ndarray:
         """Error of v+ of 'moreau' or 'binary' against LZB (x, r), relative to max |v-|."""
-        if law not in self.laws:
-            raise ValueError(
-                f"Argument `law` must be one of {', '.join(self.laws)}, but has value {law!r}."
-            )
+        check_choice("law", law, self.laws)
         scale = np.abs(self.before).max()
         return np.abs(self.velocity - self.laws[law]).max(axis=-1) / scale
 
@@ -62,27 +60,17 @@ class ValidityMap:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything, as a JSON file can hold it."""
-        return {
-            "velocity_before": self.before.tolist(),
-            "ratios": self.ratios.tolist(),
-            "exponents": self.exponents.tolist(),
-            "velocity": self.velocity.tolist(),
-            "dispersion": self.dispersion.tolist(),
-            "status": [[STATUS[code].name for code in row] for row in self.status],
-            "laws": {
-                name: {"velocity": v.tolist(), "dispersion": self.law_dispersion[name]}
-                for name, v in self.laws.items()
-            },
-        }
+        status = [[STATUS[code].name for code in row] for row in self.status]
+        return fields_as_data(self, "scene") | {"status": status}
 
     def __str__(self) -> str:
-        lines = ["exponent   binary within 1 %     Moreau within 1 %"]
-        low, high = self.limit("binary"), self.limit("moreau")
-        for i, eta in enumerate(self.exponents):
-            below = "nowhere" if np.isnan(low[i]) else f"ratio <= {low[i]:.3g}"
-            above = "nowhere" if np.isnan(high[i]) else f"ratio >= {high[i]:.3g}"
-            lines.append(f"{eta:8.3g}   {below:21s} {above}")
-        return "\n".join(lines)
+        def ends(law: str, sign: str) -> list[str]:
+            return ["nowhere" if np.isnan(x) else f"ratio {sign} {x:.3g}" for x in self.limit(law)]
+
+        exponents = [f"{eta:.3g}" for eta in self.exponents]
+        heads = ["exponent", "binary within 1 %", "Moreau within 1 %"]
+        rows = zip(exponents, ends("binary", "<="), ends("moreau", ">="))
+        return "\n".join(table(heads, rows, left=heads))
 
 
 def validity_map(

@@ -22,13 +22,22 @@ OVERLAP = (
 class Distribution(eqx.Module):
     """Independent entries, each with its own parameters, or the same for all."""
 
+    def __repr__(self) -> str:
+        given = ", ".join(f"{name}={_short(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({given})"
+
     @abc.abstractmethod
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
         """One draw (size,); with `non_negative` truncated at 0."""
 
-    @abc.abstractmethod
     def check(self, name: str, size: int, non_negative: bool) -> None:
         """Raise where the parameters do not fit."""
+        for field, value in vars(self).items():
+            if np.shape(value) not in ((), (size,)):
+                raise ValueError(
+                    f"Argument `{name}` must have scalars or {size} values in `{field}`, but is "
+                    f"{self!r}."
+                )
 
 
 class Uniform(Distribution):
@@ -49,9 +58,6 @@ class Uniform(Distribution):
         if np.any(np.asarray(self.low) > np.asarray(self.high)):
             raise ValueError(f"Argument `high` must be at least `low`, but has {self!r}.")
 
-    def __repr__(self) -> str:
-        return f"Uniform(low={_short(self.low)}, high={_short(self.high)})"
-
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
         """One draw (size,)."""
         low, high = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.low, self.high))
@@ -59,7 +65,7 @@ class Uniform(Distribution):
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
         """Raise where `low` is negative and must not be, or the shapes do not fit."""
-        _check_sizes(self, name, size, ("low", "high"))
+        super().check(name, size, non_negative)
         if non_negative and np.any(np.asarray(self.low) < 0):
             raise ValueError(
                 f"Argument `{name}` must not yield negative values, but {self!r} does; {OVERLAP}"
@@ -85,9 +91,6 @@ class Normal(Distribution):
         check_values("mean", self.mean)
         check_values("std", self.std, low=0.0, open_low=True)
 
-    def __repr__(self) -> str:
-        return f"Normal(mean={_short(self.mean)}, std={_short(self.std)})"
-
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
         """One draw (size,)."""
         mean, std = (jnp.broadcast_to(x, (size,)).astype(dtype) for x in (self.mean, self.std))
@@ -98,7 +101,7 @@ class Normal(Distribution):
 
     def check(self, name: str, size: int, non_negative: bool) -> None:
         """Raise where a truncated distribution has a negative mean, or the shapes do not fit."""
-        _check_sizes(self, name, size, ("mean", "std"))
+        super().check(name, size, non_negative)
         if non_negative and np.any(np.asarray(self.mean) < 0):
             raise ValueError(
                 f"Argument `{name}` is truncated at 0 and must have a mean of at least 0, but is "
@@ -194,24 +197,12 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Source:
     return Rows(np.asarray(array)) if array.ndim == 2 else array
 
 
-def _check_sizes(value: Any, name: str, size: int, fields: tuple[str, ...]) -> None:
-    for field in fields:
-        if np.shape(getattr(value, field)) not in ((), (size,)):
-            raise ValueError(
-                f"Argument `{name}` must have scalars or {size} values in `{field}`, but is "
-                f"{value!r}."
-            )
-
-
-def _check_domain(name: str, distribution: Distribution, domain: Domain) -> None:
+def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
     low, high = domain.bounds
-    if isinstance(distribution, Uniform):
-        least, most = np.min(np.asarray(distribution.low)), np.max(np.asarray(distribution.high))
-    else:
-        least, most = -np.inf, np.inf
-    if least < low or most > high:
+    least, most = (drawn.low, drawn.high) if isinstance(drawn, Uniform) else (-np.inf, np.inf)
+    if np.min(least) < low or np.max(most) > high:
         raise ValueError(
-            f"Argument `{name}` must lie in [{low:g}, {high:g}], but {distribution!r} can leave it."
+            f"Argument `{name}` must lie in [{low:g}, {high:g}], but {drawn!r} can leave it."
         )
 
 

@@ -4,6 +4,7 @@ An executor is any object with this `run`; which one is used never changes a res
 """
 
 import functools
+import itertools
 import pickle
 import queue
 from collections import deque
@@ -47,14 +48,10 @@ class Serial:
 
     def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """Chunks in order."""
-        before = None
-        for task in tasks:
-            started = plan.start(task)
-            if before is not None:
-                yield plan.finish(before)
-            before = started
-        if before is not None:
-            yield plan.finish(before)
+        end: list[Any] = [None]
+        under_way = itertools.chain(map(plan.start, tasks), end)
+        for finish, _ in itertools.pairwise(under_way):  # the next one has been started
+            yield finish()
 
 
 @dataclass(frozen=True)
@@ -132,19 +129,12 @@ class DaskExecutor:
             for task in tasks:
                 running.add(client.submit(_compute, shipped, plan.x64, task, pure=False))
                 if running.count() >= window:
-                    yield _result(running)
-            while running.count():
-                yield _result(running)
+                    yield next(running).result()
+            for future in running:
+                yield future.result()
         finally:
             if own:
                 client.close()  # and with it the cluster that it started
-
-
-def _result(running: Any) -> Chunk:
-    future = next(running)
-    chunk = future.result()
-    future.release()
-    return chunk
 
 
 def _compute(shipped: bytes, x64: bool, task: Task) -> Chunk:

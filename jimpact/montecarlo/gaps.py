@@ -153,19 +153,9 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
     delta = jnp.max(scale.delta)
     mean = jnp.maximum(jnp.mean(scale.gaps), 0.5 * delta * jnp.max(jnp.abs(s)))
     gaps = mean + 0.5 * delta * s[:, None] * jnp.array([1.0, -1.0], s.dtype)[None, :]
-    return _crossover(law, scene, as_float_array("velocity", velocity), s, jnp.maximum(gaps, 0.0))
-
-
-@eqx.filter_jit
-def _crossover(
-    law: Compliant, scene: Scene, v: jax.Array, offset: jax.Array, gaps: jax.Array
-) -> Crossover:
-    def at(g: jax.Array) -> tuple[jax.Array, jax.Array]:
-        out = impact(law, with_gaps(scene, g), v)
-        return out.velocity, out.status
-
-    velocity, status = jax.vmap(at)(gaps)
-    return Crossover(offset, velocity, status)
+    v, gaps = as_float_array("velocity", velocity), jnp.maximum(gaps, 0.0)
+    out = jax.vmap(lambda each: impact(law, with_gaps(scene, each), v))(gaps)
+    return Crossover(s, out.velocity, out.status)
 
 
 @dataclass(frozen=True, eq=False)

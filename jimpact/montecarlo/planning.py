@@ -3,11 +3,13 @@
 A chunk is always computed at its full size, on one device, by the same program; the statistics are
 numpy's, in float64. So they depend neither on the executor nor on the number of devices. (A program
 that `shard_map` spreads over two devices has other last bits than that for one.)
+
+Sample i is lane i % C of chunk i // C; its key is `fold_in(fold_in(key, chunk), lane)`. Draws and
+impacts are two compiled programs, so that draws made again give the same bits.
 """
 
 import contextlib
-import operator
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,28 +19,95 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact
-from jimpact._checks import check_kind, in_common_dtype
-from jimpact.law import Law
-from jimpact.montecarlo.distributions import Rows, as_source
-from jimpact.montecarlo.drawing import Drawn, Sources, draw, impacts, is_random
-from jimpact.montecarlo.statistics import Chunk, Task, reduced
+from jimpact._checks import as_whole, check_kind, in_common_dtype
+from jimpact.impacts import impact
+from jimpact.law import Law, free_parameters_of
+from jimpact.montecarlo.distributions import Distribution, Rows, Source, as_source
+from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk, Task, reduced
 from jimpact.montecarlo.store import fingerprint
 from jimpact.scene import Scene, with_gaps
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
-LARGEST_CHUNK = 2**31  # lanes are numbered in uint32
 SAMPLES = 100_000
 BINS = 1000
 
 
-@dataclass(frozen=True)
-class Started:
-    """A chunk under way on a device."""
+class Sources(eqx.Module):
+    """Where law, velocity and gaps come from; an array, a `Law` or None is a constant."""
 
-    task: Task
-    drawn: Drawn
+    law: Any
+    velocity: Source
+    gaps: Source
+
+
+class Drawn(eqx.Module):
+    """Law, velocities and gaps of a chunk; what is random (`varies`) has a leading axis (C,)."""
+
+    law: Law
     velocity: jax.Array
-    status: jax.Array
+    gaps: jax.Array | None
+    varies: tuple[bool, bool, bool] = eqx.field(static=True)
+
+
+def is_random(source: Any) -> bool:
+    """Whether it differs from sample to sample."""
+    return not (source is None or isinstance(source, jax.Array | Law))
+
+
+@eqx.filter_jit
+def draw(
+    sources: Sources,
+    sizes: tuple[int, int],
+    key: jax.Array,
+    lanes: jax.Array,
+    rows: dict[str, jax.Array],
+) -> Drawn:
+    """The chunk's law, velocities and gaps.
+
+    `sizes` are (n, m), `key` is the chunk's, `rows` are those of given samples (C, n), (C, m).
+    """
+    keys = jax.vmap(lambda lane: jax.random.split(jax.random.fold_in(key, lane), 3))(lanes)
+    varies = (is_random(sources.law), is_random(sources.velocity), is_random(sources.gaps))
+    law = eqx.filter_vmap(sources.law)(keys[:, 0]) if varies[0] else sources.law
+    velocity = _entries(sources.velocity, sizes[0], keys[:, 1], False)
+    gaps = _entries(sources.gaps, sizes[1], keys[:, 2], True)
+    return Drawn(law, rows.get("velocity", velocity), rows.get("gaps", gaps), varies)
+
+
+def _entries(source: Source, size: int, keys: jax.Array, non_negative: bool) -> Any:
+    if isinstance(source, Distribution):
+        dtype = jnp.result_type(*jax.tree.leaves(source))
+        return jax.vmap(lambda key: source.sample(key, size, dtype, non_negative))(keys)
+    return jax.vmap(source)(keys) if callable(source) else source
+
+
+@eqx.filter_jit
+def impacts(drawn: Drawn, scene: Scene, lanes: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Velocities (C, n) and statuses (C,) of a chunk, those of bad draws included."""
+    law_axis = eqx.if_array(0) if drawn.varies[0] else None
+    axes = (law_axis, *(0 if each else None for each in drawn.varies[1:]), None)
+    run = eqx.filter_vmap(_outcome, in_axes=axes, axis_size=len(lanes))
+    return run(drawn.law, drawn.velocity, drawn.gaps, scene)
+
+
+def _outcome(
+    law: Law, velocity: jax.Array, gaps: jax.Array | None, scene: Scene
+) -> tuple[jax.Array, jax.Array]:
+    code = jnp.where(_in_domain(law), 0, BAD_LAW)
+    code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
+    if gaps is not None:
+        fine = jnp.isfinite(gaps) & (gaps >= 0)
+        code = jnp.where(jnp.all(fine), code, BAD_GAP)
+        scene = with_gaps(scene, jnp.where(fine, gaps, 0))
+    out = impact(law, scene, jnp.where(code == 0, velocity, 0))  # at rest: over at once
+    return out.velocity, jnp.where(code == 0, out.status, code.astype(jnp.int32))
+
+
+def _in_domain(law: Law) -> jax.Array:
+    fine = jnp.asarray(True)
+    for value, _, domain in free_parameters_of(law).values():
+        fine = fine & domain.holds(value)
+    return fine
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,46 +126,42 @@ class Plan:
 
     def __call__(self, task: Task, device: jax.Device | None = None) -> Chunk:
         """Compute one chunk on a device (None: the default one)."""
-        return self.finish(self.start(task, device))
+        return self.start(task, device)()
 
-    def start(self, task: Task, device: jax.Device | None = None) -> Started:
-        """Enqueue a chunk on a device."""
+    def start(self, task: Task, device: jax.Device | None = None) -> Callable[[], Chunk]:
+        """Enqueue a chunk on a device; call the result to wait for it and reduce it."""
         with self._flags():
             drawn, lanes, scene = self._drawn(task, device)
-            return Started(task, drawn, *impacts(drawn, scene, lanes))
+            velocity, status = impacts(drawn, scene, lanes)
 
-    def finish(self, started: Started) -> Chunk:
-        """Wait for a chunk and reduce it."""
-        drawn, empty = started.drawn, np.zeros((self.size, 0))
-        samples = {
-            "velocity": np.asarray(started.velocity),
-            "status": np.asarray(started.status),
-            "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
-            "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
-        }
-        return reduced(started.task, samples, self.bins, self.keep_samples)
+        def finish() -> Chunk:
+            empty = np.zeros((self.size, 0))
+            samples = {
+                "velocity": np.asarray(velocity),
+                "status": np.asarray(status),
+                "velocity_before": np.asarray(drawn.velocity) if drawn.varies[1] else empty,
+                "gaps": np.asarray(drawn.gaps) if drawn.varies[2] else empty,
+            }
+            return reduced(task, samples, self.bins, self.keep_samples)
+
+        return finish
 
     def sample(self, task: Task, lane: int) -> tuple[Law, jax.Array, jax.Array | None]:
         """Law, velocity and gaps of one sample, the same bits as in the run."""
         with self._flags():
             drawn, _, _ = self._drawn(task, None)
 
-        def own(part: Any) -> Any:
-            return jax.tree.map(lambda leaf: leaf[lane] if eqx.is_array(leaf) else leaf, part)
+        def own(part: Any, varies: bool) -> Any:
+            return jax.tree.map(lambda x: x[lane] if varies and eqx.is_array(x) else x, part)
 
-        law, velocity, gaps = drawn.law, drawn.velocity, drawn.gaps
-        one, two, three = drawn.varies
-        return (
-            own(law) if one else law,
-            own(velocity) if two else velocity,
-            own(gaps) if three else gaps,
-        )
+        parts = (drawn.law, drawn.velocity, drawn.gaps)
+        law, velocity, gaps = map(own, parts, drawn.varies)
+        return law, velocity, gaps
 
     @contextlib.contextmanager
     def _flags(self) -> Iterator[None]:
         """What precision and draws depend on, in this thread only: workers have their own."""
-        partitionable = jax.threefry_partitionable(self.threefry_partitionable)
-        with jax.enable_x64(self.x64), partitionable:
+        with jax.enable_x64(self.x64), jax.threefry_partitionable(self.threefry_partitionable):
             yield
 
     def _drawn(self, task: Task, device: jax.Device | None) -> tuple[Drawn, jax.Array, Scene]:
@@ -141,6 +206,39 @@ class Run:
         scene = self.plan.scene
         return law, scene if gaps is None else with_gaps(scene, gaps), velocity
 
+    @property
+    def identity(self) -> dict[str, str]:
+        """A hash of each thing that determines the chunks; the number of samples does not."""
+        plan = self.plan
+        versions = {"jimpact": jimpact.__version__, "jax": jax.__version__}
+        parts = {
+            "law": plan.sources.law,
+            "scene": plan.scene,
+            "velocity": (plan.sources.velocity, self.rows.get("velocity")),
+            "gaps": (plan.sources.gaps, self.rows.get("gaps")),
+            "key": (plan.key, plan.key_kind, plan.threefry_partitionable),
+            "chunk": plan.size,
+            "bins": plan.bins,
+            "precision": plan.x64,
+        }
+        hashes = {name: fingerprint(value) for name, value in parts.items()}
+        return hashes | {f"version of {name}": value for name, value in versions.items()}
+
+    @property
+    def description(self) -> str:
+        """The run in one line."""
+        sources, scene = self.plan.sources, self.plan.scene
+        law = sources.law
+        name = type(law).__name__ if isinstance(law, Law) else _source(law)
+        text = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
+        for what in ("gaps", "velocity"):
+            source = getattr(sources, what)
+            if is_random(source):
+                rows = self.rows.get(what)
+                drawn = _source(source) if rows is None else f"{len(rows)} given rows"
+                text += f"; {what}: {drawn}"
+        return text
+
 
 def planned_run(
     given: Sources,
@@ -154,8 +252,8 @@ def planned_run(
     """The run of these arguments; raises where one of them is bad."""
     check_kind("scene", scene, Scene)
     sources = _sources(given, scene)
-    chunk = _positive_int("chunk", chunk, LARGEST_CHUNK)
-    bins = _positive_int("bins", bins)
+    chunk = as_whole("chunk", chunk, 1)
+    bins = as_whole("bins", bins, 1)
     rows = {
         name: np.asarray(source.values)
         for name in ("velocity", "gaps")
@@ -164,7 +262,7 @@ def planned_run(
     fewest = min((len(values) for values in rows.values()), default=None)
     if samples is None:
         samples = SAMPLES if fewest is None else fewest
-    samples = _positive_int("samples", samples)
+    samples = as_whole("samples", samples, 1)
     for name, values in rows.items():
         if len(values) < samples:
             raise ValueError(
@@ -195,60 +293,19 @@ def _sources(given: Sources, scene: Scene) -> Sources:
     law = given.law
     if not isinstance(law, Law) and not callable(law):
         raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
-    if given.gaps is None and not (is_random(given.law) or _varies(given.velocity)):
-        raise ValueError(
-            "Argument `gaps` must be given where neither the velocity nor the law is random: all "
-            "samples would be the same."
-        )
     velocity = as_source("velocity", given.velocity, scene.size, non_negative=False)
     gaps = given.gaps
     if gaps is not None:
         gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
-    sources = Sources(law, velocity, gaps)
+    elif not (is_random(law) or is_random(velocity)):
+        raise ValueError(
+            "Argument `gaps` must be given where neither the velocity nor the law is random: all "
+            "samples would be the same."
+        )
     drawn = law if isinstance(law, Law) else law(jax.random.key(0, impl="threefry2x32"))
     if not isinstance(drawn, Law):
         raise TypeError(f"Argument `law` must give a Law for a key, but gives {drawn!r}.")
-    return in_common_dtype(sources, scene, drawn)[0]
-
-
-def _varies(value: Any) -> bool:
-    return (
-        callable(value)
-        or not isinstance(value, list | tuple | np.ndarray | jax.Array)
-        or (np.ndim(value) == 2)
-    )
-
-
-def identity(run: Run) -> dict[str, str]:
-    """A hash of each thing that determines the chunks; the number of samples does not."""
-    plan = run.plan
-    versions = {"jimpact": jimpact.__version__, "jax": jax.__version__}
-    parts = {
-        "law": plan.sources.law,
-        "scene": plan.scene,
-        "velocity": (plan.sources.velocity, run.rows.get("velocity")),
-        "gaps": (plan.sources.gaps, run.rows.get("gaps")),
-        "key": (plan.key, plan.key_kind, plan.threefry_partitionable),
-        "chunk": plan.size,
-        "bins": plan.bins,
-        "precision": plan.x64,
-    }
-    hashes = {name: fingerprint(value) for name, value in parts.items()}
-    return hashes | {f"version of {name}": value for name, value in versions.items()}
-
-
-def description(run: Run) -> str:
-    """The run in one line."""
-    sources, scene = run.plan.sources, run.plan.scene
-    law = sources.law
-    name = type(law).__name__ if isinstance(law, Law) else _source(law)
-    text = f"{name}, {scene.size} coordinates, {scene.contacts} contacts"
-    for what in ("gaps", "velocity"):
-        source = getattr(sources, what)
-        if is_random(source):
-            rows = run.rows.get(what)
-            text += f"; {what}: " + (_source(source) if rows is None else f"{len(rows)} given rows")
-    return text
+    return in_common_dtype(Sources(law, velocity, gaps), scene, drawn)[0]
 
 
 def _source(source: Any) -> str:
@@ -272,14 +329,3 @@ def _key(key: Any) -> tuple[np.ndarray, str]:
 
 def _flag(name: str) -> bool:
     return bool(getattr(jax.config, name))
-
-
-def _positive_int(name: str, value: Any, most: int | None = None) -> int:
-    try:
-        number = -1 if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        raise TypeError(f"Argument `{name}` must be an integer, but has value {value!r}.") from None
-    if number < 1 or (most is not None and number > most):
-        upper = "" if most is None else f" and at most {most}"
-        raise ValueError(f"Argument `{name}` must be at least 1{upper}, but has value {value!r}.")
-    return number

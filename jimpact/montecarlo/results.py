@@ -1,4 +1,4 @@
-"""What `monte_carlo` returns, its report in words, and how chunks add up to it, always in order."""
+"""What `monte_carlo` returns, and its report in words."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -10,20 +10,17 @@ from jimpact._checks import check_values
 from jimpact.law import Law
 from jimpact.montecarlo.planning import Run
 from jimpact.montecarlo.statistics import (
-    LISTED,
     OUTCOMES,
     Chunk,
-    Moments,
     bin_edges,
-    binned_quantile,
-    merged,
+    binned_quantiles,
     named,
 )
+from jimpact.records import as_data, fields_as_data, table
 from jimpact.scene import Scene
 
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report
-_FAILED = {name for name, _, failure in OUTCOMES if failure}
-_MESSAGE = {name: message for name, message, _ in OUTCOMES}
+_OUTCOMES = {row.name: row for row in OUTCOMES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +94,7 @@ class MonteCarlo:
         """Quantiles (..., n) [m/s] of the velocities after, from the histograms; q in [0, 1]."""
         check_values("q", q, low=0.0, high=1.0)
         ends = self.edges[:, [0, -1]]
-        found = [
-            binned_quantile(float(each), ends, self.counts, self.minimum, self.maximum)
-            for each in np.ravel(q)
-        ]
-        return np.reshape(found, (*np.shape(q), len(self.mean)))
+        return binned_quantiles(q, ends, self.counts, self.minimum, self.maximum)
 
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
         """Law, scene and velocity of sample `index`: `ji.impact(*found.replay(index))`."""
@@ -113,43 +106,29 @@ class MonteCarlo:
 
     def to_dict(self) -> dict[str, Any]:
         """Everything but samples and run, as a JSON file can hold it."""
-        arrays = "mean covariance minimum maximum gap_mean gap_covariance cross_covariance"
-        data: dict[str, Any] = {"samples": self.samples, "count": self.count}
-        data |= {name: getattr(self, name).tolist() for name in arrays.split()}
-        data["standard_error"] = self.standard_error.tolist()
-        data["quantiles"] = {f"{q:g}": self.quantile(q).tolist() for q in REPORTED}
-        data["quantile_resolution"] = self.quantile_resolution.tolist()
-        data["histogram"] = {"edges": self.edges.tolist(), "counts": self.counts.tolist()}
-        data["statuses"] = self.statuses
-        data["bad"] = [
-            {
-                "index": bad.index,
-                "status": bad.status,
-                "gaps": [_json_number(x) for x in bad.gaps],
-                "velocity": [_json_number(x) for x in bad.velocity],
-            }
-            for bad in self.bad
-        ]
-        data["gap_scale"] = None if self.gap_scale is None else self.gap_scale.tolist()
-        return data | {"rate": self.rate, "resumed": self.resumed}
+        quantiles = {f"{q:g}": self.quantile(q) for q in REPORTED}
+        derived = {"standard_error": self.standard_error, "quantiles": quantiles}
+        derived |= {"quantile_resolution": self.quantile_resolution}
+        return fields_as_data(self, "first", "run", "description") | as_data(derived)
 
     def __str__(self) -> str:
-        lines = [f"{self.samples:,} samples of {self.description}", self._rate(), ""]
-        lines += [
-            f"{'[m/s]':8s}{'mean':>12s}{'± error':>10s}{'std':>11s}"
-            + "".join(f"{f'{100 * q:g} %':>11s}" for q in REPORTED)
-            + f"{'least':>11s}{'largest':>11s}"
+        heads = ["[m/s]", "mean", "± error", "std", *(f"{100 * q:g} %" for q in REPORTED)]
+        columns = [self.std, *self.quantile(REPORTED), self.minimum, self.maximum]
+        rows = [
+            [f"v{i + 1}+", f"{mean:.6f}", f"{error:.1g}", *(f"{x[i]:.5f}" for x in columns)]
+            for i, (mean, error) in enumerate(zip(self.mean, self.standard_error))
         ]
-        quantiles = self.quantile(REPORTED)
-        for i in range(len(self.mean)):
-            row = [self.std[i], *quantiles[:, i], self.minimum[i], self.maximum[i]]
-            lines.append(
-                f"v{i + 1}+".ljust(8)
-                + f"{self.mean[i]:12.6f}{self.standard_error[i]:10.1g}"
-                + "".join(f"{x:11.5f}" for x in row)
-            )
-        lines += [f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.", ""]
-        return "\n".join([*lines, *self._gap_lines(), *self._status_lines()])
+        lines = [
+            f"{self.samples:,} samples of {self.description}",
+            self._rate(),
+            "",
+            *table([*heads, "least", "largest"], rows),
+            f"Quantiles are right to {self.quantile_resolution.max():.2g} m/s.",
+            "",
+            *self._gap_lines(),
+            *self._status_lines(),
+        ]
+        return "\n".join(lines)
 
     def _rate(self) -> str:
         if self.resumed == self.samples:
@@ -173,81 +152,43 @@ class MonteCarlo:
     def _status_lines(self) -> list[str]:
         lines = []
         for name, count in self.statuses.items():
-            left_out = ", left out" if name in _FAILED else ""
-            lines.append(f"{name}: {count:,}{left_out} ({_MESSAGE[name]})")
+            left_out = ", left out" if _OUTCOMES[name].failure else ""
+            lines.append(f"{name}: {count:,}{left_out} ({_OUTCOMES[name].message})")
         for bad in self.bad[:5]:
             gaps = f", gaps {np.array2string(bad.gaps, precision=6)} m" if bad.gaps.size else ""
             lines.append(f"  sample {bad.index}: {bad.status}{gaps}; replay({bad.index})")
         return lines
 
 
-def _json_number(value: float) -> float | str:
-    """JSON has no NaN."""
-    return float(value) if np.isfinite(value) else str(float(value))
-
-
-class Totals:
-    """Sums over the chunks 0 .. `chunks` - 1."""
-
-    def __init__(self, run: Run):
-        self.run = run
-        self.chunks = 0
-        self.resumed = 0
-        self.moments: Moments | None = None
-        self.statuses = np.zeros(len(OUTCOMES), np.int64)
-        self.bad: list[BadSample] = []
-
-    def add(self, chunk: Chunk, resumed: bool) -> None:
-        """The next chunk."""
-        assert chunk.number == self.chunks  # floating-point sums depend on the order
-        if self.moments is None:
-            self.moments, self.ends = chunk.moments, chunk.ends
-            self.low, self.high, self.counts = chunk.low, chunk.high, chunk.counts
-            self.first = chunk.without_samples().samples
-        else:
-            self.moments = merged(self.moments, chunk.moments)
-            self.low, self.high = np.minimum(self.low, chunk.low), np.maximum(self.high, chunk.high)
-            self.counts = self.counts + chunk.counts
-        self.statuses = self.statuses + chunk.statuses
-        self.resumed += chunk.count if resumed else 0
-        self._list_bad(chunk)
-        self.chunks += 1
-
-    def _list_bad(self, chunk: Chunk) -> None:
-        room = max(LISTED - len(self.bad), 0)
-        for i, lane in enumerate(chunk.bad["lane"][:room]):
-            self.bad.append(
-                BadSample(
-                    index=chunk.number * self.run.plan.size + int(lane),
-                    status=OUTCOMES[int(chunk.bad["status"][i])].name,
-                    gaps=chunk.bad["gaps"][i],
-                    velocity=chunk.bad["velocity_before"][i],
-                )
+def result(
+    run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
+) -> MonteCarlo:
+    """What is known of a run from the statistics of all its chunks."""
+    n, bad = len(total.ends), total.bad
+    mean, covariance = total.moments.mean, total.moments.covariance
+    return MonteCarlo(
+        samples=run.samples,
+        count=total.moments.count,
+        mean=mean[:n],
+        covariance=covariance[:n, :n],
+        minimum=total.low,
+        maximum=total.high,
+        gap_mean=mean[n:],
+        gap_covariance=covariance[n:, n:],
+        cross_covariance=covariance[:n, n:],
+        edges=bin_edges(total.ends, run.plan.bins),
+        counts=total.counts,
+        statuses=named(total.statuses),
+        bad=tuple(
+            BadSample(int(index), OUTCOMES[code].name, gaps, velocity)
+            for index, code, gaps, velocity in zip(
+                bad["index"], bad["status"], bad["gaps"], bad["velocity_before"]
             )
-
-    def result(self, rate: float, description: str, gap_scale: np.ndarray | None) -> MonteCarlo:
-        """What is known of the run."""
-        assert self.moments is not None
-        n = len(self.ends)
-        covariance = self.moments.covariance
-        return MonteCarlo(
-            samples=self.run.samples,
-            count=self.moments.count,
-            mean=self.moments.mean[:n],
-            covariance=covariance[:n, :n],
-            minimum=self.low,
-            maximum=self.high,
-            gap_mean=self.moments.mean[n:],
-            gap_covariance=covariance[n:, n:],
-            cross_covariance=covariance[:n, n:],
-            edges=bin_edges(self.ends, self.run.plan.bins),
-            counts=self.counts,
-            statuses=named(self.statuses),
-            bad=tuple(self.bad),
-            first=self.first,
-            gap_scale=gap_scale,
-            rate=rate,
-            resumed=self.resumed,
-            description=description,
-            run=self.run,
-        )
+        ),
+        first=total.samples,
+        gap_scale=gap_scale,
+        rate=rate,
+        resumed=resumed,
+        description=run.description,
+        run=run,
+    )

@@ -13,14 +13,13 @@ import numpy as np
 from jimpact._checks import in_common_dtype
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
-from jimpact.montecarlo.drawing import Sources
 from jimpact.montecarlo.executors import Executor, as_executor
 from jimpact.montecarlo.gaps import gap_scale
-from jimpact.montecarlo.planning import BINS, CHUNK, Run, description, identity, planned_run
-from jimpact.montecarlo.results import MonteCarlo, Totals
-from jimpact.montecarlo.statistics import Chunk
+from jimpact.montecarlo.planning import BINS, CHUNK, Run, Sources, planned_run
+from jimpact.montecarlo.results import MonteCarlo, result
+from jimpact.montecarlo.statistics import Chunk, joined
 from jimpact.montecarlo.store import Store
-from jimpact.progress import sample_bar
+from jimpact.progress import counting_bar
 from jimpact.scene import Scene
 
 
@@ -85,15 +84,11 @@ def monte_carlo(
     chosen = as_executor(executor)
     if keep_samples and folder is None:
         raise ValueError("Argument `folder` must be given to keep samples, but is None.")
-    store = None if folder is None else Store(folder, identity(run))
+    store = None if folder is None else Store(folder, run.identity)
     begin = time.perf_counter()
-    totals = _totals(run, chosen, store, progress)
-    seconds = time.perf_counter() - begin
-    found = totals.result(
-        rate=(run.samples - totals.resumed) / seconds,
-        description=description(run),
-        gap_scale=_gap_scale(run.plan.sources, scene),
-    )
+    total, resumed = _total(run, chosen, store, progress)
+    rate = (run.samples - resumed) / (time.perf_counter() - begin)
+    found = result(run, total, resumed, rate, _gap_scale(run.plan.sources, scene))
     failed = found.samples - found.count
     if failed:
         text = ", ".join(f"{count} {name}" for name, count in found.statuses.items())
@@ -105,8 +100,10 @@ def monte_carlo(
     return found
 
 
-def _totals(run: Run, executor: Executor, store: Store | None, progress: bool | None) -> Totals:
-    """All chunks, read or computed, merged in the order of their numbers."""
+def _total(
+    run: Run, executor: Executor, store: Store | None, progress: bool | None
+) -> tuple[Chunk, int]:
+    """All chunks, read or computed, joined in their order; how many samples were read."""
     keep = run.plan.keep_samples
 
     def read(number: int) -> Chunk | None:
@@ -114,41 +111,36 @@ def _totals(run: Run, executor: Executor, store: Store | None, progress: bool | 
 
     missing = [number for number in range(run.chunks) if read(number) is None]
     known = set(range(run.chunks)).difference(missing)
-    totals = Totals(run)
-    done = sum(run.task(number).count for number in known)
+    resumed = finished = sum(run.task(number).count for number in known)
     waiting: dict[int, Chunk] = {}
-    finished = done
+    total: Chunk | None = None
+
+    def join_ready() -> None:
+        nonlocal total
+        number = 0 if total is None else total.number + 1
+        while number in waiting or number in known:
+            chunk = waiting.pop(number) if number in waiting else read(number)
+            if chunk is None:
+                raise OSError(f"Chunk {number} of the folder changed during the run: run again.")
+            total = chunk.without_samples() if total is None else joined(total, chunk)
+            number += 1
+
     try:
         computing = closing(_computed(run, executor, missing, read))
-        with sample_bar(run.samples, done, progress) as advance, computing as chunks:
+        bar = counting_bar(run.samples, "samples", progress, resumed)
+        with bar as advance, computing as chunks:
             for computed in chunks:
                 if store is not None:
                     store.write(computed)
                 waiting[computed.number] = computed.without_samples()
                 finished += computed.count
                 advance(computed.count)
-                _merge_ready(totals, waiting, known, read)
-            _merge_ready(totals, waiting, known, read)
+                join_ready()
+            join_ready()
     except KeyboardInterrupt:
         raise KeyboardInterrupt(_interrupted(run, store, finished)) from None
-    return totals
-
-
-def _merge_ready(
-    totals: Totals,
-    waiting: dict[int, Chunk],
-    known: set[int],
-    read: Callable[[int], Chunk | None],
-) -> None:
-    while totals.chunks in waiting or totals.chunks in known:
-        number = totals.chunks
-        if number in waiting:
-            totals.add(waiting.pop(number), resumed=False)
-            continue
-        chunk = read(number)
-        if chunk is None:
-            raise OSError(f"Chunk {number} of the folder changed during the run: run again.")
-        totals.add(chunk, resumed=True)
+    assert total is not None  # there is a chunk
+    return total, resumed
 
 
 def _computed(

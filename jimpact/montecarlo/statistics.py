@@ -6,15 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.montecarlo.drawing import BAD_INPUTS
 from jimpact.status import STATUS, Status
 
 MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
 FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
 LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
 SHOWN = 4096  # first samples of a run that are kept in memory for pictures
-# name, message and whether it is a failure, of every code
-OUTCOMES = [*STATUS, *(Status(*row, True) for row in BAD_INPUTS.values())]
+# Outcomes of a sample: those of an impact, and further ones where it never reached the law.
+OUTCOMES = (
+    *STATUS,
+    Status("bad_gap", "a drawn gap is not finite or an overlap: see LZB's `initial_energy`", True),
+    Status("bad_velocity", "a drawn velocity is not finite", True),
+    Status("bad_law", "a drawn parameter is not finite or outside its domain", True),
+)
+BAD_GAP, BAD_VELOCITY, BAD_LAW = range(len(STATUS), len(OUTCOMES))
 FAILURE = np.array([row.failure for row in OUTCOMES])
 _SAMPLE_FIELDS = ("gaps", "velocity_before", "velocity", "status")
 _PLAIN = ("number", "count", "statuses", "low", "high", "ends", "counts")
@@ -107,32 +112,29 @@ def bin_edges(ends: np.ndarray, bins: int) -> np.ndarray:
     return np.linspace(ends[:, 0], ends[:, 1], bins + 1, axis=1)
 
 
-def binned_quantile(
-    q: float, ends: np.ndarray, counts: np.ndarray, low: np.ndarray, high: np.ndarray
+def binned_quantiles(
+    q: Any, ends: np.ndarray, counts: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """The q-quantiles (d,), right to one bin width where they lie inside the bins.
+    """The q-quantiles (..., d), right to one bin width where they lie inside the bins.
 
     Linear inside the bin; `low` and `high` (d,), the smallest and largest values, bound what lies
     outside the bins.
 
     >>> import numpy as np
-    >>> from jimpact.montecarlo.statistics import binned_quantile
+    >>> from jimpact.montecarlo.statistics import binned_quantiles
     >>> counts, ends = np.array([[0, 1, 1, 0]]), np.array([[0.0, 1.0]])
-    >>> binned_quantile(0.75, ends, counts, np.array([0.1]), np.array([0.9])).tolist()
+    >>> binned_quantiles(0.75, ends, counts, np.array([0.1]), np.array([0.9])).tolist()
     [0.75]
     """
     inner = bin_edges(ends, counts.shape[1] - 2)
-    left = np.concatenate([np.minimum(low, inner[:, 0])[:, None], inner], axis=1)
-    right = np.concatenate([inner, np.maximum(high, inner[:, -1])[:, None]], axis=1)
-    found = np.empty(len(counts))
-    for i, count in enumerate(counts):
-        after = np.cumsum(count)
-        wanted = q * after[-1]
-        k = int(np.searchsorted(after, wanted))
-        k = k if count[k] else int(np.flatnonzero(count)[0])  # q = 0: the first bin in use
-        part = (wanted - (after[k] - count[k])) / count[k]
-        found[i] = left[i, k] + part * (right[i, k] - left[i, k])
-    return np.clip(found, low, high)
+    first, last = np.minimum(low, inner[:, 0]), np.maximum(high, inner[:, -1])
+    edges = np.column_stack([first, inner, last])
+    below = np.cumsum(np.column_stack([np.zeros(len(counts)), counts]), axis=1)
+    # from above: of an empty stretch between two bins the lower end is taken
+    found = [
+        np.interp(-np.asarray(q) * b[-1], -b[::-1], edge[::-1]) for b, edge in zip(below, edges)
+    ]
+    return np.clip(np.stack(found, axis=-1), low, high)
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class Chunk:
         moments: of the samples that did not fail.
         low, high: smallest and largest velocities (n,); inf, -inf without any.
         ends, counts: histogram ranges (n, 2) and counts (n, bins + 2).
-        bad: lanes, codes, gaps and velocities before of the first failed samples.
+        bad: numbers, codes, gaps and velocities before of the first failed samples.
         samples: all samples, or the first few (`SHOWN`), or none.
     """
 
@@ -196,6 +198,24 @@ def chunk_from(arrays: dict[str, np.ndarray]) -> Chunk:
     return Chunk(**own, moments=whole, bad=part("bad"), samples=part("samples"))
 
 
+def joined(before: Chunk, chunk: Chunk) -> Chunk:
+    """The statistics of all chunks before and of the next one, with the first ones' samples."""
+    assert chunk.number == before.number + 1  # floating-point sums depend on the order
+    bad = {k: np.concatenate([v, chunk.bad[k]])[:LISTED] for k, v in before.bad.items()}
+    return Chunk(
+        number=chunk.number,
+        count=before.count + chunk.count,
+        statuses=before.statuses + chunk.statuses,
+        moments=merged(before.moments, chunk.moments),
+        low=np.minimum(before.low, chunk.low),
+        high=np.maximum(before.high, chunk.high),
+        ends=before.ends,
+        counts=before.counts + chunk.counts,
+        bad=bad,
+        samples=before.samples,
+    )
+
+
 def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples: bool) -> Chunk:
     """The statistics of the first `task.count` samples of a chunk."""
     failed = FAILURE[samples["status"]]
@@ -209,7 +229,8 @@ def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples:
     used = whole[:, :count] if not failed.any() else whole[:, :count][:, ~failed]
     velocity = used[:n]
     lanes = np.flatnonzero(failed)[:LISTED]
-    bad = {"lane": lanes} | {name: samples[name][lanes] for name in _SAMPLE_FIELDS}
+    bad = {"index": task.number * len(samples["status"]) + lanes}
+    bad |= {name: samples[name][lanes] for name in _SAMPLE_FIELDS}
     kept = count if keep_samples else (min(count, SHOWN) if task.number == 0 else 0)
     return Chunk(
         number=task.number,

@@ -13,11 +13,8 @@ import io
 import json
 import os
 import pickle
-import tokenize
 import warnings
-import zipfile
-import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,18 +25,6 @@ from jimpact.montecarlo.statistics import Chunk, chunk_from
 
 FORMAT = 1
 MANIFEST = "manifest.json"
-# what reading a damaged file raises: zip's and numpy's complaints, numpy's about its text headers
-UNUSABLE = (
-    ValueError,
-    KeyError,
-    OSError,
-    EOFError,
-    NotImplementedError,
-    zipfile.BadZipFile,
-    zlib.error,
-    SyntaxError,
-    tokenize.TokenError,
-)
 
 
 def fingerprint(value: Any) -> str:
@@ -60,50 +45,51 @@ def fingerprint(value: Any) -> str:
 
 def _parts(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
     """The value as byte strings; `inside` are the ids of what holds it (functions may recur)."""
+    yield _name(type(value)).encode()
     if id(value) in inside:
         yield b"itself"
-        return
-    inside = (*inside, id(value))
-    yield _name(type(value)).encode()
-    if isinstance(value, jax.Array | np.ndarray | np.generic):
+    elif isinstance(value, jax.Array | np.ndarray | np.generic):
         array = np.asarray(value)
         yield f"{array.dtype} {array.shape}".encode()
         yield np.ascontiguousarray(array).tobytes()
     elif value is None or isinstance(value, str | bytes | int | float | complex):
         yield repr(value).encode()
-    elif isinstance(value, type):
-        yield _name(value).encode()
-    elif isinstance(value, Mapping):
-        for key in sorted(value, key=repr):
-            yield from _parts(key, inside)
-            yield from _parts(value[key], inside)
-    elif isinstance(value, list | tuple | set | frozenset):
-        for item in sorted(value, key=repr) if isinstance(value, set | frozenset) else value:
-            yield from _parts(item, inside)
-    elif isinstance(value, functools.partial):
-        yield from _parts((value.func, value.args, value.keywords), inside)
-    elif dataclasses.is_dataclass(value):
-        for field in dataclasses.fields(value):
-            yield field.name.encode()
-            yield from _parts(getattr(value, field.name, None), inside)
-    elif inspect.ismethod(value):
-        yield from _parts((value.__func__, value.__self__), inside)
-    elif inspect.isfunction(value):
-        yield from _function(value, inside)
+    elif (held := _held(value)) is not None:
+        for part in held:
+            yield from _parts(part, (*inside, id(value)))
     else:
         yield _pickled(value)
 
 
-def _function(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
-    yield _name(value).encode()
+def _held(value: Any) -> Iterable[Any] | None:
+    """What the value consists of; None where it has no parts that are known."""
+    if isinstance(value, Mapping):
+        return sorted(value.items(), key=repr)
+    if isinstance(value, set | frozenset):
+        return sorted(value, key=repr)
+    if isinstance(value, list | tuple):
+        return value
+    if isinstance(value, functools.partial):
+        return value.func, value.args, value.keywords
+    if isinstance(value, type):
+        return (_name(value),)
+    if dataclasses.is_dataclass(value):
+        return [(f.name, getattr(value, f.name, None)) for f in dataclasses.fields(value)]
+    if inspect.ismethod(value):
+        return value.__func__, value.__self__
+    if inspect.isfunction(value):
+        held = [cell.cell_contents for cell in value.__closure__ or ()]
+        return _name(value), _source(value), value.__defaults__, value.__kwdefaults__, held
+    return None
+
+
+def _source(function: Any) -> Any:
     try:
-        yield inspect.getsource(value).encode()
+        return inspect.getsource(function)
     except (OSError, TypeError):
-        yield value.__code__.co_code + repr(value.__code__.co_names).encode()
-        yield from _parts([c for c in value.__code__.co_consts if not inspect.iscode(c)], inside)
-    yield from _parts((value.__defaults__, value.__kwdefaults__), inside)
-    for cell in value.__closure__ or ():
-        yield from _parts(cell.cell_contents, inside)
+        code = function.__code__
+        constants = [c for c in code.co_consts if not inspect.iscode(c)]
+        return code.co_code, code.co_names, constants
 
 
 def _pickled(value: Any) -> bytes:
@@ -163,7 +149,7 @@ class Store:
             arrays = _checked(path, self.run)
             if int(arrays["number"]) != number:
                 raise ValueError(f"it is chunk {int(arrays['number'])} of this run")
-        except UNUSABLE as error:
+        except Exception as error:  # zip, zlib, numpy: a damaged file makes all of them complain
             text = str(error) or type(error).__name__
             warnings.warn(
                 f"'{path}' is not used, its samples are computed again: {text}.", stacklevel=2
@@ -200,7 +186,7 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
     for path in sorted(folder.glob("chunk-*.npz")):
         try:
             chunk = chunk_from(_checked(path, run))
-        except UNUSABLE as error:
+        except Exception as error:
             raise ValueError(f"'{path}' cannot be used: {error}.") from None
         if len(chunk.samples.get("status", ())) != chunk.count:
             raise ValueError(f"'{path}' has no raw samples: run with keep_samples=True.")

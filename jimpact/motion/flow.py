@@ -105,7 +105,7 @@ class MotionFlow(eqx.Module):
     longest = math.inf  # no rate is large beside the others
 
     @property
-    def contacts(self) -> int:
+    def taking_part(self) -> int:
         """One: the number of passes does not matter here."""
         return 1
 

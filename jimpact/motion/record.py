@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.records import as_data, fields_as_data
 from jimpact.status import Status
 
 # of these rows `failure` marks motions that end before t_end; the code is the row number
@@ -123,15 +124,10 @@ class Motion(eqx.Module):
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON (NaN: None)."""
         n = int(self.events.count)
-        rows = {
-            name: _plain(np.asarray(value)[:n])
-            for name, value in vars(self.events).items()
-            if name not in ("count", "kind")
-        }
-        kinds = [EVENT_KINDS[k] for k in np.asarray(self.events.kind)[:n]]
-        told = {k: _plain(np.asarray(v)) for k, v in vars(self).items() if k != "events"}
-        told["status"] = MOTION_STATUS[int(self.status)].name
-        return told | {"events": rows | {"kind": kinds}}
+        rows = {k: np.asarray(v)[:n] for k, v in vars(self.events).items() if k != "count"}
+        events = rows | {"kind": [EVENT_KINDS[k] for k in rows["kind"]]}
+        status = MOTION_STATUS[int(self.status)].name
+        return fields_as_data(self, "events") | as_data({"status": status, "events": events})
 
     def __str__(self) -> str:
         if np.ndim(self.status):
@@ -154,14 +150,6 @@ class Motion(eqx.Module):
             f"  ledger closes to {np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J",
         ]
         return "\n".join(lines)
-
-
-def _plain(value: np.ndarray) -> Any:
-    if value.dtype.kind == "f":
-        plain = value.astype(object)
-        plain[~np.isfinite(value)] = None
-        return plain.tolist()
-    return value.tolist()
 
 
 def _batch_report(motion: Motion) -> str:

@@ -1,6 +1,5 @@
 """A motion from a TOML study: system, base, law, initial state."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from jimpact.motion.system import (
     cradle_system,
     dimer_system,
 )
-from jimpact.study import check_keys, law_table, locate
+from jimpact.study import check_keys, check_tables, from_file, law_table
 
 # kind -> builder, {key of the study: its argument}
 _SYSTEMS: dict[str, tuple[Any, dict[str, str]]] = {
@@ -58,7 +57,6 @@ _BASE = {
     "phase_rad": "phase",
     "direction": "direction",
 }
-_TABLES = ("title", "system", "base", "law", "motion")
 
 
 @dataclass(frozen=True)
@@ -91,22 +89,11 @@ def read_motion_study(path: str | Path) -> MotionStudy:
     >>> read_motion_study("cradle_motion.toml").title
     "Newton's cradle, three balls"
     """
-    path = locate(Path(path), "[system]")
-    try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: the study must be a TOML file, but {error}.") from None
-    try:
-        return _study(tables, path)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: {error}") from None
+    return from_file(path, "[system]", _study)
 
 
 def _study(tables: Mapping[str, Any], path: Path) -> MotionStudy:
-    check_keys("the study", tables, _TABLES, required=("system", "law", "motion"))
-    for name in ("system", "base", "law", "motion"):
-        if not isinstance(tables.get(name, {}), dict):
-            raise ValueError(f"`{name}` must be a table, but is {tables[name]!r}.")
+    check_tables(tables, ("system", "law", "motion"), ("base",))
     row, values, _ = law_table(tables["law"], None, path.parent)
     if isinstance(values.get("exponent"), list):
         values["exponent"] = tuple(values["exponent"])

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from jimpact.methods.advice_report import Advice, as_code, share
-from jimpact.methods.chart_record import Point, Timing, WorkPrecision
-from jimpact.methods.stability import Slice, StabilityMap
-from jimpact.methods.stability_points import CLASSES
+from jimpact.methods.chart import Point, Timing, WorkPrecision
+from jimpact.methods.stability import CLASSES, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
 from jimpact.plot.style import COLOURS, GREY, SPREAD
 from jimpact.status import CODE, STATUS

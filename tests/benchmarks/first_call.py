@@ -14,7 +14,7 @@ from pathlib import Path
 TARGETS = {  # times diffrax
     "diffrax": None,
     "impact": 1.5,
-    "another number of balls": None,
+    "another number of balls": 0.1,
     "Jacobian": 2.5,
     "friction": 4.0,
     "fit": 4.0,

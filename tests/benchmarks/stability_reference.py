@@ -3,7 +3,7 @@ outcomes of `lzb_oracle.cpp` there (80-bit precision, another formulation, no sh
 
     python tests/benchmarks/stability_reference.py        (needs g++; half an hour)
 
-The point of axes (kappa, mu, e, eta, N) is the chain of `jimpact.methods.stability_points.chain_of`: N balls,
+The point of axes (kappa, mu, e, eta, N) is the chain of `jimpact.methods.stability.chain_of`: N balls,
 the first strikes the others with v = 1; contacts of the right half have stiffness kappa, the others
 1; the middle ball has mass mu, the others 1. `uncertainty` is the difference between runs at local
 tolerances 1e-12 and 1e-14; NaN where the oracle gave up after SECONDS.

@@ -8,38 +8,13 @@
 (1.0, 316)
 """
 
-from jimpact.methods.contenders import (
-    libraries,
-    schemes,
-)
 from jimpact.methods.contenders.base import (
-    UNCOUNTED,
-    Method,
-    MethodResult,
-    checked,
-    outcome,
-    time_scale,
+    UNCOUNTED as UNCOUNTED,
+    Method as Method,
+    outcome as outcome,
+    time_scale as time_scale,
 )
+from jimpact.methods.contenders.libraries import DIFFRAX, SCIPY
+from jimpact.methods.contenders.schemes import SCHEMES
 
-METHODS: dict[str, Method] = {
-    method.name: method
-    for method in (
-        schemes.IMPULSE_EULER,
-        schemes.IMPULSE_RK4,
-        schemes.TIME_RK4,
-        schemes.VERLET,
-        schemes.DOP853_ALIGNED,
-        *libraries.DIFFRAX,
-        *libraries.SCIPY,
-    )
-}
-
-__all__ = [
-    "METHODS",
-    "UNCOUNTED",
-    "Method",
-    "MethodResult",
-    "checked",
-    "outcome",
-    "time_scale",
-]
+METHODS: dict[str, Method] = {method.name: method for method in (*SCHEMES, *DIFFRAX, *SCIPY)}

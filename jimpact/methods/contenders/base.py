@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, in_common_dtype, is_traced
+from jimpact._checks import as_float_array, in_common_dtype
 from jimpact.contact import Contact
 from jimpact.events import impact_dynamics
 from jimpact.events.contact_flow import power
@@ -38,28 +38,51 @@ class MethodResult(NamedTuple):
     code: jax.Array
 
 
+def lzb_only(law: Law, scene: Scene) -> str | None:
+    """Whether the law has LZB's dynamics, and fits the scene."""
+    if not isinstance(law, LZB):
+        return f"it integrates the LZB law, and the law is {type(law).__name__}"
+    for name in ("restitution", "stiffness"):
+        shape = np.shape(getattr(law, name))[-1:]
+        if shape not in ((), (scene.contacts,)):
+            return f"`{name}` has {shape[0]} entries for {scene.contacts} contacts"
+    return None
+
+
+def finite_rate(law: Law, scene: Scene) -> str | None:
+    """As `lzb_only`; and the plain time form divides by e."""
+    reason = lzb_only(law, scene)
+    if reason is None and isinstance(law, LZB) and np.any(law.restitution == 0):
+        return "it divides by e^2, and a restitution is 0"
+    return reason
+
+
+Solve = Callable[[LZB, Scene, Any, Any], MethodResult]
+
+
 class Method(NamedTuple):
     """A way to integrate an LZB impact.
 
     `setting` says what the number handed to `solve` is: 'rtol', a tolerance on velocities relative
     to the largest |v-|; 'step', the time step in units of `time_scale`; or 'impulse step', the
     step in the primary impulse, in units of the impact's own. `ladder`: settings from coarse to
-    fine. `jax`: `solve(law, scene, velocity, setting)` can be jitted, vmapped and differentiated
-    forward, over the setting too; otherwise it takes concrete values. `supports(law, scene)` is
-    None or says why not. `duration_apart`: the duration takes a run of its own. `counting(tally)`:
-    where `solve` gives no evaluations, one that calls `tally()` at each (one impact at a time).
+    fine. `supports(law, scene)` is None or says why not. `jax`: `solve(law, scene, velocity,
+    setting)` can be jitted, vmapped and differentiated forward, over the setting too; otherwise it
+    takes concrete values. `duration_apart`: the duration takes a run of its own.
+    `counting(tally)`: where `solve` gives no evaluations, one that calls `tally()` at each (one
+    impact at a time).
     """
 
     name: str
     label: str
     setting: str
     ladder: tuple[float, ...]
-    jax: bool
-    supports: Callable[[Law, Scene], str | None]
-    solve: Callable[[LZB, Scene, Any, Any], MethodResult]
+    solve: Solve
+    supports: Callable[[Law, Scene], str | None] = finite_rate
+    jax: bool = True
     no_gradient: str | None = None  # why there is none that is meaningful
     duration_apart: bool = False
-    counting: Callable[[Callable[[], None]], Callable[..., MethodResult]] | None = None
+    counting: Callable[[Callable[[], None]], Solve] | None = None
 
 
 class GivenImpact(NamedTuple):
@@ -164,35 +187,6 @@ def time_form(
 def held_open(x: jax.Array, closing: jax.Array) -> jax.Array:
     """`x'` of a code that cannot clamp: an open contact keeps its x <= 0."""
     return jnp.where((x <= 0) & (closing < 0), 0.0, closing)
-
-
-def lzb_only(law: Law, scene: Scene) -> str | None:
-    """Whether the law has LZB's dynamics, and fits the scene."""
-    if not isinstance(law, LZB):
-        return f"it integrates the LZB law, and the law is {type(law).__name__}"
-    for name in ("restitution", "stiffness"):
-        shape = np.shape(getattr(law, name))[-1:]
-        if shape not in ((), (scene.contacts,)) and not is_traced(law):
-            return f"`{name}` has {shape[0]} entries for {scene.contacts} contacts"
-    return None
-
-
-def finite_rate(law: Law, scene: Scene) -> str | None:
-    """As `lzb_only`; and the plain time form divides by e."""
-    reason = lzb_only(law, scene)
-    if not isinstance(law, LZB) or reason is not None or is_traced(law):
-        return reason
-    return "it divides by e^2, and a restitution is 0" if jnp.any(law.restitution == 0) else None
-
-
-def checked(law: Law, scene: Scene, method: Method) -> None:
-    """Raise where the method does not support the law on this scene."""
-    reason = method.supports(law, scene)
-    if reason is not None:
-        raise ValueError(
-            f"Argument `methods` must be able to solve the impact, but has "
-            f"{method.name!r}: {reason}."
-        )
 
 
 setup = eqx.filter_jit(problem)

@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from jimpact.events.impulse_form import Rule
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import (
     UNCOUNTED,
     Method,
     MethodResult,
-    finite_rate,
+    Solve,
     held_open,
     in_si,
     problem,
@@ -43,29 +42,24 @@ def _diffrax_solver(
     solver: diffrax.AbstractSolver,
     stages: int | None,
     tally: Callable[[], None] | None = None,
-) -> Callable[[LZB, Scene, Any, Any], MethodResult]:
+) -> Solve:
     """`solve` by a diffrax solver of so many new stages a step (None: not known beforehand)."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
         given = problem(law, scene, velocity)
-        inputs, flow = given.inputs, given.flow
+        inputs = given.inputs
         rtol = jnp.asarray(setting, inputs.gamma.dtype)
-        static = None if isinstance(flow.exponent, jax.Array) else flow.exponent
-        eta = flow.exponent if static is None else None
 
         def rates(t: Any, y: Any, args: Any) -> tuple[jax.Array, jax.Array]:
             if tally is not None:
                 jax.debug.callback(tally)
-            gamma, coupling, omega, restitution, eta, _ = args
-            exponent = eta if static is None else static
-            flow = Rule(coupling, omega, restitution, exponent)
+            flow, gamma, _ = args
             closing, force = time_form(flow, gamma, *y)
             return held_open(y[0], closing), force
 
         def at_work(t: Any, y: Any, args: Any, **_: Any) -> jax.Array:
-            x, p = y
-            gamma, coupling, rtol = args[0], args[1], args[-1]
-            return jnp.maximum(jnp.max(x), jnp.max(-(gamma + coupling @ p))) - rtol
+            (flow, gamma, rtol), (x, p) = args, y
+            return jnp.maximum(jnp.max(x), jnp.max(-(gamma + flow.coupling @ p))) - rtol
 
         found = diffrax.diffeqsolve(
             diffrax.ODETerm(rates),
@@ -74,7 +68,7 @@ def _diffrax_solver(
             t1=jnp.full_like(rtol, jnp.inf),
             dt0=None,
             y0=(given.x, jnp.zeros_like(inputs.gamma)),
-            args=(inputs.gamma, flow.coupling, flow.omega, flow.restitution, eta, rtol),
+            args=(given.flow, inputs.gamma, rtol),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
             event=diffrax.Event(
                 at_work,
@@ -101,8 +95,7 @@ def _diffrax_method(
 ) -> Method:
     label = f"diffrax {type(solver).__name__} with Event"
     counting = None if stages is not None else functools.partial(_diffrax_solver, solver, None)
-    solve = _diffrax_solver(solver, stages)
-    return Method(name, label, "rtol", ladder, True, finite_rate, solve, counting=counting)
+    return Method(name, label, "rtol", ladder, _diffrax_solver(solver, stages), counting=counting)
 
 
 DIFFRAX = (
@@ -116,7 +109,7 @@ class _GaveUpError(Exception):
     """More evaluations than the law allows steps."""
 
 
-def _scipy_solver(name: str) -> Callable[[LZB, Scene, Any, Any], MethodResult]:
+def _scipy_solver(name: str) -> Solve:
     """`solve` by one of the solvers of `scipy.integrate.solve_ivp`."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
@@ -125,12 +118,7 @@ def _scipy_solver(name: str) -> Callable[[LZB, Scene, Any, Any], MethodResult]:
         given = setup(law, scene, velocity)
         inputs, flow = given.inputs, given.flow
         gamma, omega, e = (
-            np.asarray(a, float)
-            for a in (
-                inputs.gamma,
-                flow.omega,
-                jnp.broadcast_to(inputs.restitution, inputs.gamma.shape),
-            )
+            np.asarray(a, float) for a in (inputs.gamma, flow.omega, flow.restitution)
         )
         coupling = np.asarray(as_matrix(flow.coupling), float)
         eta = np.asarray(flow.exponent, float)
@@ -162,30 +150,16 @@ def _scipy_solver(name: str) -> Callable[[LZB, Scene, Any, Any], MethodResult]:
         else:
             code = CODE["ok"] if found.status == 1 else CODE["max_steps"]
             p, t = found.y[m:, -1], found.t[-1]
-        dtype = inputs.gamma.dtype
         # `nfev`, and what LSODA's own differences take
-        return in_si(
-            given,
-            jnp.asarray(p, dtype),
-            jnp.asarray(t, dtype),
-            jnp.asarray(count),
-            jnp.asarray(code),
-        )
+        impulse, duration = (jnp.asarray(x, inputs.gamma.dtype) for x in (p, t))
+        return in_si(given, impulse, duration, jnp.asarray(count), jnp.asarray(code))
 
     return solve
 
 
 def _scipy_method(name: str, solver: str, ladder: tuple[float, ...]) -> Method:
-    return Method(
-        name,
-        f"scipy {solver} with event",
-        "rtol",
-        ladder,
-        False,
-        finite_rate,
-        _scipy_solver(solver),
-        no_gradient="host code: finite differences only",
-    )
+    label, why = f"scipy {solver} with event", "host code: finite differences only"
+    return Method(name, label, "rtol", ladder, _scipy_solver(solver), jax=False, no_gradient=why)
 
 
 SCIPY = (

@@ -25,6 +25,7 @@ The impulse form has no time, so the duration is NaN.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -37,10 +38,9 @@ from jimpact.events.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import (
-    GivenImpact,
     Method,
     MethodResult,
-    finite_rate,
+    Solve,
     in_si,
     lzb_only,
     problem,
@@ -48,9 +48,6 @@ from jimpact.methods.contenders.base import (
 )
 from jimpact.scene import Scene
 from jimpact.status import CODE
-
-_NODES = (0.0, 0.5, 0.5, 1.0)  # of the classical Runge-Kutta formula
-_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
 
 def _solve_aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
@@ -62,16 +59,20 @@ def _solve_aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> Metho
     return in_si(given, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0])
 
 
-DOP853_ALIGNED = Method(
-    name="dop853",
-    label="event-aligned Dormand-Prince 8 (default)",
-    setting="rtol",
-    ladder=(1e-3, 1e-5, 1e-7, 1e-9, 1e-11),
-    jax=True,
-    supports=lzb_only,
-    solve=_solve_aligned,
-    duration_apart=True,
-)
+Pair = tuple[jax.Array, jax.Array]
+
+
+def _runge_kutta(rates: Callable[[Pair], Pair], h: jax.Array, zero: jax.Array) -> Pair:
+    """The change over a step by the classical formula; `rates` at a change of the state."""
+    change, total = (zero, zero), (zero, zero)
+    for node, weight in ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)):
+        slope = rates((node * h * change[0], node * h * change[1]))
+        total = total[0] + weight * h * slope[0], total[1] + weight * h * slope[1]
+        change = slope
+    return total
+
+
+# ----------------------------------------------------------------------------- steps in time
 
 
 class _TimeWalk(NamedTuple):
@@ -84,119 +85,80 @@ class _TimeWalk(NamedTuple):
     steps: jax.Array
 
 
-def _solve_time_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-    given = problem(law, scene, velocity)
-    flow, before = given.flow, given.inputs.gamma
-    h = jnp.asarray(setting, before.dtype)
+# (flow, gamma-, h, walk) -> x (to be clamped), p, force
+TimeStep = Callable[[Rule, jax.Array, jax.Array, _TimeWalk], tuple[jax.Array, jax.Array, jax.Array]]
 
-    def advance(walk: _TimeWalk) -> _TimeWalk:
-        def at(part: jax.Array, dx: jax.Array, dp: jax.Array) -> tuple[jax.Array, jax.Array]:
-            return time_form(flow, before, walk.x + part * dx, walk.p + part * dp)
 
-        a = time_form(flow, before, walk.x, walk.p)
-        b = at(0.5 * h, *a)
-        c = at(0.5 * h, *b)
-        d = at(h, *c)
-        dx, dp = (
-            (h / 6) * (first + 2 * (second + third) + last)
-            for first, second, third, last in zip(a, b, c, d)
+def _in_time(step: TimeStep, stages: int, first: int) -> Solve:
+    """`solve` by fixed steps of so many evaluations each, and so many before the first."""
+
+    def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+        given = problem(law, scene, velocity)
+        flow, before, start = given.flow, given.inputs.gamma, given.x
+        h, zero = jnp.asarray(setting, before.dtype), jnp.zeros_like(before)
+
+        def at_work(walk: _TimeWalk) -> jax.Array:
+            return jnp.any((walk.x > 0) | (walk.gamma < 0))
+
+        def advance(walk: _TimeWalk) -> _TimeWalk:
+            x, p, force = step(flow, before, h, walk)
+            gamma = before + flow.coupling @ p
+            return _TimeWalk(jnp.maximum(x, 0.0), p, gamma, force, walk.steps + 1)
+
+        _, force = time_form(flow, before, start, zero)
+        end = jax.lax.while_loop(
+            lambda walk: at_work(walk) & (walk.steps < given.max_steps),
+            advance,
+            _TimeWalk(start, zero, before, force, jnp.zeros((), jnp.int32)),
         )
-        p = walk.p + dp
-        x = jnp.maximum(walk.x + dx, 0.0)
-        return _TimeWalk(x, p, before + flow.coupling @ p, walk.force, walk.steps + 1)
+        code = jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
+        return in_si(given, end.p, h * end.steps.astype(h.dtype), stages * end.steps + first, code)
 
-    end = _run(given, advance)
-    return in_si(given, end.p, h * end.steps.astype(h.dtype), 4 * end.steps, _code(end))
+    return solve
 
 
-def _solve_verlet(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-    given = problem(law, scene, velocity)
-    flow, before = given.flow, given.inputs.gamma
-    h = jnp.asarray(setting, before.dtype)
+def _rk4(
+    flow: Rule, before: jax.Array, h: jax.Array, walk: _TimeWalk
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def rates(change: Pair) -> Pair:
+        return time_form(flow, before, walk.x + change[0], walk.p + change[1])
 
-    def advance(walk: _TimeWalk) -> _TimeWalk:
-        p = walk.p + 0.5 * h * walk.force
-        closing, _ = time_form(flow, before, walk.x, p)  # compression or expansion: at mid-step
-        x = jnp.maximum(walk.x + h * closing, 0.0)
-        _, force = time_form(flow, before, x, p)
-        p = p + 0.5 * h * force
-        return _TimeWalk(x, p, before + flow.coupling @ p, force, walk.steps + 1)
-
-    end = _run(given, advance)
-    return in_si(
-        given, end.p, h * end.steps.astype(h.dtype), end.steps + 1, _code(end)
-    )  # one force a step
+    dx, dp = _runge_kutta(rates, h, jnp.zeros_like(before))
+    return walk.x + dx, walk.p + dp, walk.force
 
 
-def _run(given: GivenImpact, advance: Any) -> _TimeWalk:
-    x, gamma, zero = given.x, given.inputs.gamma, jnp.zeros_like(given.inputs.gamma)
-    _, force = time_form(given.flow, gamma, x, zero)
-    return jax.lax.while_loop(
-        lambda w: _at_work(w) & (w.steps < given.max_steps),
-        advance,
-        _TimeWalk(x, zero, gamma, force, jnp.zeros((), jnp.int32)),
-    )
+def _verlet(
+    flow: Rule, before: jax.Array, h: jax.Array, walk: _TimeWalk
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    p = walk.p + 0.5 * h * walk.force
+    closing, _ = time_form(flow, before, walk.x, p)  # compression or expansion: at mid-step
+    x = jnp.maximum(walk.x + h * closing, 0.0)
+    _, force = time_form(flow, before, x, p)
+    return x, p + 0.5 * h * force, force
 
 
-def _at_work(walk: _TimeWalk) -> jax.Array:
-    return jnp.any((walk.x > 0) | (walk.gamma < 0))
+# -------------------------------------------------------------------------- steps in impulse
 
 
-def _code(end: _TimeWalk) -> jax.Array:
-    return jnp.where(_at_work(end), CODE["max_steps"], CODE["ok"])
+def _in_impulse(step: Callable[[Rule, jax.Array, Walk], Walk], stages: int) -> Solve:
+    """`solve` by steps in the primary impulse, of so many evaluations each."""
+
+    def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+        given = problem(law, scene, velocity, setting)
+        inputs, flow = given.inputs, given.flow
+        none, gamma = jnp.zeros_like(inputs.gamma), inputs.gamma
+        end = jax.lax.while_loop(
+            lambda walk: impulse_form.at_work(walk) & (walk.steps < given.max_steps),
+            lambda walk: step(flow, inputs.step[0], walk),
+            Walk(gamma, 0.5 * inputs.energy, none, jnp.zeros((), jnp.int32)),
+        )
+        code = jnp.where(impulse_form.at_work(end), CODE["max_steps"], CODE["ok"])
+        return in_si(given, end.p, jnp.full_like(end.p[0], jnp.nan), stages * end.steps, code)
+
+    return solve
 
 
-TIME_RK4 = Method(
-    name="rk4",
-    label="time, fixed Runge-Kutta 4",
-    setting="step",
-    ladder=(0.2, 0.1, 0.03, 0.01, 0.003),
-    jax=True,
-    supports=finite_rate,
-    solve=_solve_time_rk4,
-)
-VERLET = Method(
-    name="verlet",
-    label="time, velocity Verlet",
-    setting="step",
-    ladder=(0.2, 0.1, 0.03, 0.01, 0.003),
-    jax=True,
-    supports=finite_rate,
-    solve=_solve_verlet,
-)
-
-
-def _solve_euler(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-    given = problem(law, scene, velocity, setting)
-    gamma, energy, dp = _start(given)
-    end = impulse_form.walk(given.flow, dp, given.max_steps, gamma, energy)
-    return _result(given, end, 1)
-
-
-def _solve_impulse_rk4(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-    given = problem(law, scene, velocity, setting)
-    gamma, energy, dp = _start(given)
-    end = jax.lax.while_loop(
-        lambda w: impulse_form.at_work(w) & (w.steps < given.max_steps),
-        lambda w: _advance(given.flow, dp, w),
-        Walk(gamma, energy, jnp.zeros_like(gamma), jnp.zeros((), jnp.int32)),
-    )
-    return _result(given, end, len(_NODES))
-
-
-def _start(given: GivenImpact) -> tuple[jax.Array, jax.Array, jax.Array]:
-    x = given.x
-    eta = jnp.asarray(given.flow.exponent, x.dtype)
-    energy = 0.5 * jnp.where(x > 0, jnp.where(x > 0, x, 1.0) ** (eta + 1), 0.0)
-    return given.inputs.gamma, energy, given.inputs.step[0]
-
-
-def _result(given: GivenImpact, end: Walk, stages: int) -> MethodResult:
-    code = jnp.where(impulse_form.at_work(end), CODE["max_steps"], CODE["ok"])
-    return in_si(given, end.p, jnp.full_like(end.p[0], jnp.nan), stages * end.steps, code)
-
-
-def _advance(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
+def _impulse_rk4(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
     """One Runge-Kutta step of `dp` in the primary impulse."""
     gamma, energy = walk.gamma, walk.energy
     eta = jnp.asarray(flow.exponent, gamma.dtype)
@@ -211,21 +173,17 @@ def _advance(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
     dp = dp * impulse_form.emptying(flow, walk, primary, begun)
     fresh = begun / jnp.max(jnp.where(primary, begun, 0.0))
 
-    def rates(de: jax.Array, push: jax.Array) -> tuple[jax.Array, jax.Array]:
-        at = force(flow, energy + de)
+    def rates(change: Pair) -> Pair:
+        at = force(flow, energy + change[0])
         leading = jnp.sum(jnp.where(primary, at, 0.0))
         # as the primary contact is unloaded the rule has a pole; a force that outgrows its own
         # is primary from the next step on
         slope = jnp.minimum(at / jnp.where(leading > 0, leading, 1.0), 1.0)
         slope = jnp.where(primary, 1.0, jnp.where(loaded & (leading > 0), slope, fresh))
-        now = gamma + flow.coupling @ push
+        now = gamma + flow.coupling @ change[1]
         return -jnp.where(now > 0, 1 / flow.restitution**2, 1.0) * now * slope, slope
 
-    de, push = jnp.zeros_like(energy), jnp.zeros_like(energy)
-    change, increment = de, push
-    for node, weight in zip(_NODES, _WEIGHTS):
-        de, push = rates(node * dp * de, node * dp * push)
-        change, increment = change + weight * dp * de, increment + weight * dp * push
+    change, increment = _runge_kutta(rates, dp, jnp.zeros_like(energy))
     left = jnp.maximum(energy + change, 0.0)
     return Walk(
         gamma + flow.coupling @ increment,
@@ -235,21 +193,33 @@ def _advance(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
     )
 
 
-IMPULSE_EULER = Method(
-    name="impulse_euler",
-    label="impulse, Euler (published)",
-    setting="impulse step",
-    ladder=(1e-2, 3e-3, 1e-3, 3e-4),
-    jax=True,
-    supports=lzb_only,
-    solve=_solve_euler,
+_TIME_STEPS = (0.2, 0.1, 0.03, 0.01, 0.003)
+DOP853_ALIGNED = Method(
+    "dop853",
+    "event-aligned Dormand-Prince 8 (default)",
+    "rtol",
+    (1e-3, 1e-5, 1e-7, 1e-9, 1e-11),
+    _solve_aligned,
+    lzb_only,
+    duration_apart=True,
 )
-IMPULSE_RK4 = Method(
-    name="impulse_rk4",
-    label="impulse, Runge-Kutta 4",
-    setting="impulse step",
-    ladder=(3e-2, 1e-2, 3e-3, 1e-3),
-    jax=True,
-    supports=finite_rate,
-    solve=_solve_impulse_rk4,
+SCHEMES = (
+    Method(
+        "impulse_euler",
+        "impulse, Euler (published)",
+        "impulse step",
+        (1e-2, 3e-3, 1e-3, 3e-4),
+        _in_impulse(impulse_form.advance, 1),
+        lzb_only,
+    ),
+    Method(
+        "impulse_rk4",
+        "impulse, Runge-Kutta 4",
+        "impulse step",
+        (3e-2, 1e-2, 3e-3, 1e-3),
+        _in_impulse(_impulse_rk4, 4),
+    ),
+    Method("rk4", "time, fixed Runge-Kutta 4", "step", _TIME_STEPS, _in_time(_rk4, 4, 0)),
+    Method("verlet", "time, velocity Verlet", "step", _TIME_STEPS, _in_time(_verlet, 1, 1)),
+    DOP853_ALIGNED,
 )

@@ -1,0 +1,167 @@
+"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, a class a command."""
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
+StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """Options of every command."""
+
+    json: bool = False
+    """Print JSON instead of text."""
+
+    @classmethod
+    def name(cls) -> str:
+        """The command's name."""
+        return cls.__name__.removesuffix("Command").lower()
+
+
+@dataclasses.dataclass(frozen=True)
+class DrawingCommand(Command):
+    """Options of a command that draws a picture."""
+
+    out: Path = Path()
+    """Picture (.png, .pdf, .svg), or a directory for it; default: ./jimpact-<command>.png."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ShotCommand(DrawingCommand):
+    """Options of a command about one impact."""
+
+    study: StudyFile = Path("three_balls.toml")
+    """Study file, or the name of a bundled one; its [data] may be missing."""
+    velocity: tuple[float, ...] | None = None
+    """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
+    shot: int = 1
+    """Which measured shot, counted from 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FitCommand(DrawingCommand):
+    """Fit a law to measured velocities; without a file: the bundled three balls."""
+
+    study: StudyFile = Path("three_balls.toml")
+    """Study file, or the name of a bundled one (three_balls.toml, air_track.toml)."""
+    law: str | None = None
+    """Law in the place of the study's (see `jimpact laws`)."""
+    method: Method | None = None
+    """Solver; default: the study's, or levenberg-marquardt."""
+    starts: int | None = None
+    """Number of starts; default: the study's, or 8."""
+    seed: int | None = None
+    """Seed of the random starts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CompareCommand(ShotCommand):
+    """Every law on one scene, side by side: velocities, energy, dispersion, audit, time."""
+
+    fit: bool = False
+    """Fit every law to the data too, with one coefficient and with one per contact."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MonteCarloCommand(DrawingCommand):
+    """Velocities after an impact whose gaps are random: statistics, histograms, outcome map."""
+
+    study: StudyFile = Path("three_balls_gaps.toml")
+    """Study file with a [monte_carlo] table, or the name of a bundled one."""
+    samples: int | None = None
+    """Number of samples; default: the study's, or 100000."""
+    seed: int | None = None
+    """Seed; default: the study's, or 0."""
+    executor: Literal["serial", "devices", "dask"] = "serial"
+    """Where: one chunk after another, all devices of the process, or Dask workers."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler; default: workers on this machine."""
+    folder: Path | None = None
+    """Where finished chunks are kept; the same command again continues there."""
+    keep_samples: bool = False
+    """Keep the raw samples in the folder, too."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ChartCommand(ShotCommand):
+    """Speed against accuracy: methods of integration and laws on one scene."""
+
+    methods: tuple[str, ...] | None = None
+    """Methods by name; default: those that the scene allows and that compile fast."""
+    full: bool = False
+    """The methods that compile slowly, too."""
+    no_gradients: bool = False
+    """Leave out the errors of the derivatives."""
+    batch: int = 256
+    """Impacts solved side by side."""
+    repeats: int = 5
+    """Timings of each entry, taken in turn."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StabilityCommand(DrawingCommand):
+    """Where methods of integration are right, wrong, gain energy or do not end."""
+
+    methods: tuple[str, ...] | None = None
+    """Methods by name; default: default, rk4, verlet and impulse_euler."""
+    full: bool = False
+    """All pairs of axes, each method its own picture, and 300 points over all of them besides."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AdviseCommand(ShotCommand):
+    """The simplest law and method that a scene needs, with the evidence."""
+
+    tolerance: float = 1e-2
+    """Model error that is allowed, over the largest velocity before."""
+    stiffness_range: tuple[float, float] | None = None
+    """Factors by which each stiffness may be off; default 0.1 10."""
+    samples: int = 128
+    """Draws of the unknown stiffnesses."""
+    seed: int = 0
+    """Seed of the draws."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulateCommand(DrawingCommand):
+    """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
+
+    study: StudyFile = Path("cradle_motion.toml")
+    """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml)."""
+    t_end: float | None = None
+    """End of the motion [s]; default: the study's."""
+    samples: int | None = None
+    """Instants in the record; default: the study's, or 201."""
+    gif: Path | None = None
+    """Animation (.gif), one frame a sample."""
+    portrait: Path | None = None
+    """Phase portrait (.png, .pdf, .svg)."""
+    coordinate: int = 1
+    """Coordinate of the phase portrait, counted from 1."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LawsCommand(Command):
+    """List the laws: what they say, when they are right and when they fail."""
+
+    module: str | None = None
+    """File (.py) or module that registers further laws, see `ji.register`."""
+    bibtex: bool = False
+    """Print the references as BibTeX."""
+
+
+COMMANDS: tuple[type[Command], ...] = (
+    FitCommand,
+    CompareCommand,
+    MonteCarloCommand,
+    ChartCommand,
+    StabilityCommand,
+    AdviseCommand,
+    SimulateCommand,
+    LawsCommand,
+)

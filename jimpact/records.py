@@ -1,0 +1,67 @@
+"""What results have in common: as data for a JSON file, as a table in text."""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+
+def as_data(value: Any) -> Any:
+    """Records, arrays and mappings as what a JSON file can hold; numbers not finite are None.
+
+    >>> import numpy as np
+    >>> from jimpact.records import as_data
+    >>> as_data({"velocity": np.array([1.0, np.nan]), "bodies": (1, 2)})
+    {'velocity': [1.0, None], 'bodies': [1, 2]}
+    """
+    if hasattr(value, "to_dict"):
+        return value.to_dict()
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    elif dataclasses.is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    elif isinstance(value, jax.Array | np.ndarray | np.generic):
+        value = np.asarray(value).tolist()
+    if isinstance(value, Mapping):
+        return {key: as_data(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [as_data(each) for each in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def fields_as_data(record: Any, *left_out: str) -> dict[str, Any]:
+    """The fields of a record but for those left out, see `as_data`."""
+    return {name: as_data(x) for name, x in vars(record).items() if name not in left_out}
+
+
+def number(value: float | None, form: str) -> str:
+    """The number in this format, nothing where there is none.
+
+    >>> from jimpact.records import number
+    >>> number(0.25, ".1f"), number(float("nan"), ".1f"), number(None, ".1f")
+    ('0.2', '', '')
+    """
+    return "" if value is None or np.isnan(value) else format(value, form)
+
+
+def table(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = ()
+) -> list[str]:
+    """Lines of a table; the first column and those with a head in `left` are text, others numbers.
+
+    >>> from jimpact.records import table
+    >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
+    ['law       e  status', 'newton  0.5  ok']
+    """
+    whole = [list(heads), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*whole)]
+    is_text = [i == 0 or head in left for i, head in enumerate(heads)]
+    return [
+        "  ".join(
+            cell.ljust(width) if text else cell.rjust(width)
+            for cell, width, text in zip(row, widths, is_text)
+        ).rstrip()
+        for row in whole
+    ]

@@ -1,0 +1,121 @@
+"""The registry of laws: what studies, comparisons and the command line know by name."""
+
+import inspect
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from jimpact._checks import check_choice
+from jimpact.law import Law, options_of
+
+EVERY_PROPERTY = frozenset(
+    {"impulse_sign", "gap_velocity_sign", "energy", "velocity_scaling", "mass_scaling"}
+)
+
+
+class Row(NamedTuple):
+    """A registered law, what it promises on every scene, and where it comes from.
+
+    `promises` names the properties the contract suite holds it to; where the law breaks another
+    one of them, its status must say so.
+    """
+
+    law: type[Law]
+    summary: str
+    right_when: str
+    fails_when: str
+    promises: frozenset[str]
+    source: str
+    bibtex: str
+    make: Callable[..., Law] | None = None  # from plain numbers, where the class takes others
+
+    @property
+    def arguments(self) -> dict[str, inspect.Parameter]:
+        """What `build` takes, by name."""
+        return dict(inspect.signature(self.make or self.law).parameters)
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """Names of what says how the law is solved."""
+        return options_of(self.law)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(name for name in self.arguments if name not in self.options)
+
+    @property
+    def required(self) -> tuple[str, ...]:
+        """Parameters without a default."""
+        empty = inspect.Parameter.empty
+        return tuple(name for name, x in self.arguments.items() if x.default is empty)
+
+    def build(self, **parameters: Any) -> Law:
+        """The law with these parameters."""
+        return (self.make or self.law)(**parameters)
+
+
+REGISTRY: dict[str, Row] = {}
+
+
+def register(
+    name: str,
+    law: Any = None,
+    *,
+    summary: str = "",
+    right_when: str = "",
+    fails_when: str = "",
+    promises: Iterable[str] = (),
+    source: str = "",
+    bibtex: str = "",
+    make: Callable[..., Law] | None = None,
+) -> Any:
+    """Enter a law in `ji.REGISTRY`: then `compare`, studies and the command line know it by name.
+
+    Args:
+        name: in small letters; what a study calls it.
+        law: the class; None: `register` is used as a decorator of it.
+        summary, right_when, fails_when: a line each, for `jimpact laws`.
+        promises: properties it keeps on every scene, of 'impulse_sign', 'gap_velocity_sign',
+            'energy', 'velocity_scaling', 'mass_scaling'.
+        source, bibtex: where it comes from.
+        make: builds it from plain numbers, where the class takes other things.
+
+    Returns:
+        The class, or the decorator.
+
+    Raises:
+        TypeError: no Law. ValueError: a name that another law has, an unknown promise.
+
+    >>> import jimpact as ji
+    >>> @ji.register("gentle", summary="half of Newton's impulse")
+    ... class Gentle(ji.Newton):
+    ...     def impulses(self, contact):
+    ...         p, side, status = super().impulses(contact)
+    ...         return ji.Impulses(0.5 * p, side, status)
+    >>> ji.REGISTRY["gentle"].parameters
+    ('restitution', 'friction', 'tangential_restitution')
+    >>> del ji.REGISTRY["gentle"]
+    """
+
+    def enter(law: Any) -> Any:
+        if not (isinstance(law, type) and issubclass(law, Law)):
+            raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
+        if name != name.lower() or not name:
+            raise ValueError(f"Argument `name` must be in small letters, but has value {name!r}.")
+        for promise in promises:
+            check_choice("promises", promise, sorted(EVERY_PROPERTY))
+        other = REGISTRY.get(name)  # of the same place: a module that is read again
+        if other is not None and _place(other.law) != _place(law):
+            raise ValueError(
+                f"Argument `name` must be new, but {name!r} is {other.law.__qualname__} of "
+                f"{other.law.__module__}."
+            )
+        row = (law, summary, right_when, fails_when, frozenset(promises), source, bibtex, make)
+        REGISTRY[name] = Row(*row)
+        return law
+
+    return enter if law is None else enter(law)
+
+
+def _place(law: type[Law]) -> tuple[str, str]:
+    return law.__module__, law.__qualname__
