@@ -27,11 +27,14 @@ LAWS = {
     "matrix": lambda e, mu, e_t, k: ji.RestitutionMatrix(
         jnp.diag(e), friction=mu, tangential_restitution=e_t
     ),
+    "binary": lambda e, mu, e_t, k: ji.Binary(
+        e, "earliest", friction=mu, tangential_restitution=e_t
+    ),
     "poisson": lambda e, mu, e_t, k: ji.Poisson(e, friction=mu, tangential_restitution=e_t),
     "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu),
     "compliant": lambda e, mu, e_t, k: ji.Compliant(ji.Bistiffness(k, 1.5, e), friction=mu),
 }
-KINEMATIC = ("newton", "moreau", "matrix")
+KINEMATIC = ("newton", "moreau", "matrix", "binary")
 
 
 @functools.cache
@@ -120,6 +123,22 @@ def test_disk_in_closed_form(name):
     stuck = np.abs(side) < mu * p  # v_t+ = -e_t v_t-
     close((out.velocity @ DISK[2][:, 0])[stuck], (-e_t * slip)[stuck], atol=off)
     assert 0 < stuck.sum() < len(stuck)
+
+
+@pytest.mark.parametrize("v", [(0.1, -1.0, 0.3), (0.5, -1.0, -1.0), (-0.4, -1.0, 0.0)])
+def test_binary_is_newton_at_one_contact_after_another(v):
+    block, e, rubs = ji.rocking_block(1.0, 2.0), 0.5, dict(friction=0.2, tangential_restitution=0.1)
+    out = ji.impact(ji.Binary(e, **rubs), block, v)
+    normals, tangents, after = np.asarray(block.normals), np.asarray(block.tangents), np.array(v)
+    for _ in range(20):
+        rate = normals.T @ after
+        j = int(np.argmin(rate))
+        if rate[j] > -1e-12:
+            break
+        alone = ji.Scene(block.mass, normals[:, [j]], tangents=tangents[:, [j]])
+        after = np.asarray(ji.impact(ji.Newton(e, **rubs), alone, after).velocity)
+    close(out.velocity, after, atol=1e-12)
+    assert ji.STATUS[int(out.status)].name in ("ok", "order_dependent")
 
 
 def rod(angle, length=1.0):
@@ -448,6 +467,7 @@ SLOPES = {"planar": (1, 4), "space": (2, 6)}
     [
         ("moreau", "planar"),
         pytest.param("newton", "planar", marks=pytest.mark.slow),
+        pytest.param("binary", "planar", marks=pytest.mark.slow),
         ("lzb", "planar"),
         pytest.param("moreau", "space", marks=pytest.mark.slow),
         pytest.param("lzb", "space", marks=pytest.mark.slow),

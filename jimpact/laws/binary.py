@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_values, in_common_dtype
-from jimpact.contact import Contact, delassus_matrix
-from jimpact.law import Impulses, Law, Values, check_law, option, parameter
-from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
+from jimpact.contact import Contact
+from jimpact.law import Impulses, Law, OptionalValues, Values, check_law, option, parameter
+from jimpact.laws.friction import friction_fields
+from jimpact.scene import Scene, as_velocity, velocity_change
 from jimpact.solvers import collisions
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
+from jimpact.solvers.tridiagonal import Tridiagonal
 
 ORDERS = ("fastest", "earliest", "left_to_right")
 
@@ -50,9 +51,12 @@ class Binary(Law):
             a tuple of all contact indices (0-based, repeats allowed): in turn, likewise. Contacts
             that do not approach are skipped.
         max_collisions: the law gives up after so many.
+        friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
+        tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `u+ = -e_t u-`.
 
-    There is no friction: tangential velocities stay. In every order but 'earliest' gap sizes do
-    not matter: open contacts that approach collide too.
+    With friction each collision is one contact's: `p_t in -mu p Sgn(u+ + e_t u-)`, u its slip
+    velocity; it may set its neighbours in motion, along and across. In every order but 'earliest'
+    gap sizes do not matter: open contacts that approach collide too.
 
     Status: `order_dependent` where two coupled contacts were equally fast (early) within rounding
     (the lower index went first); `plastic_limit` where collisions go on forever: for two contacts
@@ -77,6 +81,22 @@ class Binary(Law):
     restitution: Values = parameter(low=0.0, high=1.0)
     order: str | tuple[int, ...] = option("fastest", converter=_checked_order, kw_only=False)
     max_collisions: int = option(10_000, converter=lambda n: as_whole("max_collisions", n, 1))
+    friction: OptionalValues = parameter(low=0.0)
+    tangential_restitution: OptionalValues = parameter(low=-1.0, high=1.0)
+
+    def __init__(
+        self,
+        restitution: Any,
+        order: Any = "fastest",
+        *,
+        max_collisions: int = 10_000,
+        friction: Any = None,
+        tangential_restitution: Any = 0.0,
+    ):
+        self.restitution, self.order, self.max_collisions = restitution, order, max_collisions
+        self.friction, self.tangential_restitution = friction_fields(
+            friction, tangential_restitution
+        )
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """An order that names no such contact, or leaves one out, is an error."""
@@ -102,8 +122,8 @@ class Binary(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Sum of the impulses of all collisions; gaps matter in the order 'earliest'."""
-        p, end = self._solve(contact.delassus, contact.gap_velocity, contact.gaps)
-        return Impulses(p, None, end.code)
+        p, side, end = self._solve(contact)
+        return Impulses(p, side, end.code)
 
     def _cycle(self, m: int) -> tuple[int, ...] | None:
         if isinstance(self.order, tuple):
@@ -115,16 +135,28 @@ class Binary(Law):
             return None
         return jnp.zeros_like(gamma) if gaps is None else gaps
 
-    def _solve(
-        self, delassus: Symmetric, gamma: jax.Array, gaps: jax.Array | None
-    ) -> tuple[jax.Array, collisions.End]:
+    def _sides(self, contact: Contact) -> collisions.Sides | None:
+        mu, e_t, cross, along = (
+            self.friction,
+            self.tangential_restitution,
+            contact.cross,
+            contact.tangential,
+        )
+        if mu is None or e_t is None or cross is None or along is None or contact.slip is None:
+            return None
+        ones = jnp.ones_like(contact.gap_velocity)
+        return collisions.Sides(cross, along, contact.slip, mu * ones, e_t * ones)
+
+    def _solve(self, contact: Contact) -> tuple[jax.Array, jax.Array | None, collisions.End]:
+        gamma = contact.gap_velocity
         return collisions.solve(
-            delassus,
+            contact.delassus,
             gamma,
             self.restitution,
-            self._gaps(gaps, gamma),
+            self._gaps(contact.gaps, gamma),
             self._cycle(gamma.shape[0]),
             self.max_collisions,
+            self._sides(contact),
         )
 
     def collisions(self, scene: Scene, velocity: Any) -> jax.Array:
@@ -158,19 +190,20 @@ class Binary(Law):
         0 [0.203125 0.234375 0.5625  ]
         """
         law, scene, v = self._prepared(scene, velocity)
-        w, gamma = delassus_matrix(scene), gap_velocity(scene, v)
-        inputs = collisions.to_inputs(w, gamma, law.restitution, law._gaps(scene.gaps, gamma))
+        contact = law.contact(scene, v)
+        w, gamma = contact.delassus, contact.gap_velocity
+        gaps = law._gaps(contact.gaps, gamma)
+        inputs = collisions.to_inputs(w, gamma, law.restitution, gaps, law._sides(contact))
         cycle = law._cycle(scene.contacts)
         options = collisions.Options(cycle, self.max_collisions, isinstance(w, Tridiagonal))
         g, at = collisions.coupling_matrix(inputs, options), collisions.begin(inputs)
         steps: list[tuple[int, float | None, np.ndarray]] = []
         while len(steps) < min(limit, self.max_collisions) and collisions.approaches(inputs, at):
             before, at = at, _collide(inputs, options, g, at)
-            contact = int(jnp.argmax(at.p - before.p))
+            j = int(jnp.argmax(at.p - before.p))
             time = float(at.time) if law.order == "earliest" else None
-            steps.append(
-                (contact, time, np.asarray(v + velocity_change(scene, at.p / inputs.root)))
-            )
+            p, side = collisions.impulses_of(at, inputs.root)
+            steps.append((j, time, np.asarray(v + velocity_change(scene, p, side))))
         return steps
 
     def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
@@ -184,8 +217,7 @@ class Binary(Law):
 
 @eqx.filter_jit
 def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
-    gamma = gap_velocity(scene, velocity)
-    return law._solve(delassus_matrix(scene), gamma, scene.gaps)[1].number
+    return law._solve(law.contact(scene, velocity))[2].number
 
 
 _collide = eqx.filter_jit(collisions.collide)

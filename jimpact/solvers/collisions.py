@@ -2,7 +2,8 @@
 
 Everything is in normalized quantities: `qn = gamma / sqrt(W_jj)`, `pbar = sqrt(W_jj) p` and G with
 unit diagonal. A collision at contact j adds `pbar_j += s_j` and `qn += G_j s_j`, with
-`s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`.
+`s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`. With friction it adds a
+tangential impulse, too: each collision is one contact's Coulomb problem (`friction.py`).
 """
 
 from typing import NamedTuple
@@ -10,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.solvers.friction import solve as solve_friction
 from jimpact.solvers.sensitivity import both_modes
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -28,6 +30,16 @@ BOUNDARY = 8.0  # eps: a state on the edge of the endless cone (body between two
 SINGULAR = 16.0  # eps: two contacts with 1 - cos^2 below this are redundant
 
 
+class Sides(NamedTuple):
+    """Tangential directions (t,), contact by contact, normalized by the `sqrt(W_jj)` of theirs."""
+
+    cross: jax.Array  # (m, t)
+    along: jax.Array  # (t, t)
+    slip: jax.Array  # (t,)
+    friction: jax.Array  # mu (m,)
+    restitution: jax.Array  # e_t (m,)
+
+
 class Inputs(NamedTuple):
     """A problem; `coupling` holds the entries of G beside its unit diagonal."""
 
@@ -36,6 +48,7 @@ class Inputs(NamedTuple):
     qn: jax.Array
     root: jax.Array  # sqrt(W_jj), only compared
     gaps: jax.Array | None  # None: no free flight
+    sides: Sides | None = None  # None: no friction
 
 
 class Options(NamedTuple):
@@ -57,6 +70,9 @@ class Carry(NamedTuple):
     tied: jax.Array
     gaps: jax.Array | None
     time: jax.Array
+    slip: jax.Array | None  # (t,) with friction
+    side: jax.Array | None  # its impulses (t,)
+    code: jax.Array  # the worst status of a collision with friction
 
 
 class Choice(NamedTuple):
@@ -82,16 +98,38 @@ def solve(
     gaps: jax.Array | None,
     cycle: tuple[int, ...] | None,
     max_collisions: int,
-) -> tuple[jax.Array, End]:
-    """Impulses p (m,) [N s] and how it ended, differentiable in both modes."""
-    inputs = to_inputs(delassus, gamma, restitution, gaps)
+    sides: Sides | None = None,
+) -> tuple[jax.Array, jax.Array | None, End]:
+    """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
+    inputs = to_inputs(delassus, gamma, restitution, gaps, sides)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
-    pbar, end = both_modes(lambda given, _: run(given, options))(inputs)
-    return pbar / jnp.sqrt(diagonal(delassus)), end
+    at, end = both_modes(lambda given, _: run(given, options))(inputs)
+    (p, side), root = at, jnp.sqrt(diagonal(delassus))
+    return *_impulses(p, side, root), end
+
+
+def impulses_of(at: Carry, root: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+    """p (m,) and p_t (t,) [N s] up to here."""
+    return _impulses(at.p, at.side, root)
+
+
+def _impulses(
+    p: jax.Array, side: jax.Array | None, root: jax.Array
+) -> tuple[jax.Array, jax.Array | None]:
+    return p / root, None if side is None else side / per_tangent(root, side)
+
+
+def per_tangent(values: jax.Array, like: jax.Array) -> jax.Array:
+    """Values (m,) of contacts for each of their tangents (t,)."""
+    return jnp.repeat(values, len(like) // len(values))
 
 
 def to_inputs(
-    delassus: Symmetric, gamma: jax.Array, restitution: jax.Array, gaps: jax.Array | None
+    delassus: Symmetric,
+    gamma: jax.Array,
+    restitution: jax.Array,
+    gaps: jax.Array | None,
+    sides: Sides | None = None,
 ) -> Inputs:
     """The normalized problem. Gaps and `sqrt(W_jj)` only order the collisions: no derivatives."""
     root = jnp.sqrt(diagonal(delassus))
@@ -99,20 +137,28 @@ def to_inputs(
     m = gamma.shape[0]
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     fixed = jax.lax.stop_gradient
+    if sides is not None:
+        each = per_tangent(root, sides.slip)
+        sides = sides._replace(
+            cross=sides.cross / (root[:, None] * each[None]),
+            along=sides.along / (each[:, None] * each[None]),
+            slip=sides.slip / each,
+        )
     return Inputs(
         beside,
         restitution,
         gamma / root,
         fixed(root),
         None if gaps is None else fixed(gaps),
+        sides,
     )
 
 
-def run(inputs: Inputs, options: Options) -> tuple[jax.Array, End]:
+def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | None], End]:
     """Normalized impulses and the end of the sequence."""
     g = coupling_matrix(inputs, options)
     start = begin(inputs)
-    pair = inputs.qn.shape[0] == 2
+    pair = inputs.qn.shape[0] == 2 and inputs.sides is None
     endless, limit = jnp.array(False), start.p
     if pair:
         first = choose(inputs, options, g, start).contact
@@ -128,10 +174,11 @@ def run(inputs: Inputs, options: Options) -> tuple[jax.Array, End]:
         slow = end.speed < DECAYED.get(str(end.qn.dtype), 3e-4) * scale_of(inputs)
         endless = slow & jnp.any(end.qn < 0) & ~stopped
     code = jnp.where(end.tied, CODE["order_dependent"], CODE["ok"])
+    code = jnp.maximum(code, end.code)
     code = jnp.where(endless, CODE["plastic_limit"], code)
     code = jnp.where(stopped, CODE["max_steps"], code)
     p = jnp.where(endless, limit, end.p) if pair else end.p
-    return p, End(code, jnp.where(endless, -1, end.number))
+    return (p, end.side), End(code, jnp.where(endless, -1, end.number))
 
 
 def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
@@ -172,6 +219,9 @@ def begin(inputs: Inputs) -> Carry:
         tied=jnp.array(False),
         gaps=inputs.gaps,
         time=jnp.array(0, dtype),
+        slip=None if inputs.sides is None else inputs.sides.slip,
+        side=None if inputs.sides is None else jnp.zeros_like(inputs.sides.slip),
+        code=jnp.array(CODE["ok"], jnp.int32),
     )
 
 
@@ -225,14 +275,23 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Carry:
     """One collision, after the free flight that leads to it."""
     choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
     chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
-    jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
-    after = at.qn + times(g, jump)
+    slip, side, code = at.slip, at.side, at.code
+    if inputs.sides is None:
+        jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+        after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, jump))
+    else:
+        assert slip is not None
+        assert side is not None
+        jump, push, status = _with_friction(inputs, inputs.sides, at, choice.contact)
+        after = at.qn + times(g, jump) + inputs.sides.cross @ push
+        slip = slip + inputs.sides.cross.T @ jump + inputs.sides.along @ push
+        side, code = side + push, jnp.maximum(code, status)
     gaps = at.gaps
     if gaps is not None:
         flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
         gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
     return Carry(
-        qn=jnp.where(chosen, -inputs.restitution * at.qn, after),
+        qn=after,
         p=at.p + jump,
         number=at.number + jnp.array(1, jnp.int32),
         place=choice.place,
@@ -240,7 +299,34 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Carry:
         tied=at.tied | choice.tied,
         gaps=gaps,
         time=at.time + choice.wait,
+        slip=slip,
+        side=side,
+        code=code,
     )
+
+
+def _with_friction(
+    inputs: Inputs, sides: Sides, at: Carry, contact: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Impulses (m,) and (t,) of a collision at one contact, and its status."""
+    m, t = sides.cross.shape
+    each = t // m
+    rows = contact * each + jnp.arange(each, dtype=contact.dtype)
+    cross = sides.cross[contact, rows][None]
+    corner = jnp.ones((1, 1), cross.dtype)
+    matrix = jnp.block([[corner, cross], [cross.T, sides.along[rows[:, None], rows[None]]]])
+    e = jnp.broadcast_to(inputs.restitution, (m,))[contact]
+    assert at.slip is not None
+    found = solve_friction(
+        matrix,
+        ((1 + e) * at.qn[contact])[None],
+        (1 + sides.restitution[contact]) * at.slip[rows],
+        sides.friction[contact][None],
+        complementary=True,
+    )
+    jump = jnp.zeros_like(at.qn).at[contact].set(found.normal[0])
+    push = jnp.zeros_like(at.slip).at[rows].set(found.tangential)
+    return jump, push, found.status
 
 
 def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array]:
