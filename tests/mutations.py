@@ -73,7 +73,8 @@ MUTATIONS = [
         FLOW,
         "stepper.py",
     ),
-    Mutation("crossings not seen", r"crossed = free & \(c1 < -snap\)", "crossed = free & (c1 < -1e3 * snap)", FLOW, "stepper.py"),
+    Mutation("dips switched off", r"dipped = turns & .*", "dipped = turns & False", ("test_methods.py::test_right_or_flagged[20-0.1]",), "stepper.py", "slow"),
+    Mutation("crossings not seen", r"crossed, turns = free & \(c1 < -snap\)", "crossed, turns = free & (c1 < -1e3 * snap)", FLOW, "stepper.py"),
     Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", ("test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]",), "stepper.py", "slow"),
     Mutation("every step accepted", r"ok = error2 <= 1\n", "ok = error2 <= 1e6\n", FLOW, "stepper.py"),
     # --- complementarity

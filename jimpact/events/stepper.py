@@ -54,6 +54,7 @@ GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
 RESTART = 0.1  # first rooted step after a contact has closed, as a part of the step before it
 CUT = 0.7  # part of the way to an event that a step is shortened to where it cannot land
+DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
 SHORTEST = 1e-13  # step: a shorter one cannot be told from none
 TIE = 1e-13  # of a step: events of one moment are taken in the order of their rows
 # Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
@@ -212,7 +213,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     """One pass: try a step; accept it, or aim at what lies in its middle, or shorten it.
 
     Every margin gets one number, in units of the step tried, and the least one decides:
-        -2 .. -1   it cannot be landed on from here: shorten the step to CUT * (at + 2)
+        -2 .. -1   it dips, or cannot be landed on from here: shorten the step to CUT * (at + 2)
          0 ..  1   it vanishes inside the step: repeat the step as a landing on it
          1 .. inf  it is expected to vanish so far ahead: land on it if the next step reaches it
     """
@@ -243,24 +244,28 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     d0, d1 = d0 * span, d1 * span
     snap = flow.snap
     free = ~s.target
-    crossed = free & (c1 < -snap)
-    fall = c0 - c1
-    u = jnp.maximum(c0, 0.0) / jnp.where(fall > 0, fall, jnp.inf)
+    crossed, turns = free & (c1 < -snap), free & (d0 < 0) & (d1 > 0) & (c0 > snap)
+    top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
+    bottom = jnp.where(crossed, c0 - c1, jnp.where(turns, d1 - d0, -d1))
+    u = top / jnp.where(bottom > 0, bottom, jnp.inf)
     # what rises from 0 and falls back: as in a parabola
     u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
     if flow.near:
         # steps in time go before: exact in a parabola, where dt/dxi has a singularity at the top
         u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
+    v = 1 - u
+    low = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
+    dipped = turns & (low < DOUBT * (d1 - d0) - snap)
     at_once = (c0 <= snap) & (d0 <= 0)
     direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > snap))
     # ahead by a parabola: a margin that only creeps towards 0 is not about to reach it
     left = d1 * d1 - 2 * (d1 - d0) * c1
-    ahead = free & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
+    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
     soon = 2 * c1 / (jnp.sqrt(jnp.where(ahead, left, 1.0)) - jnp.where(ahead, d1, 0.0))
     at = jnp.where(
         crossed,
         jnp.where(direct & (again == 0), jnp.where(at_once, 0.0, u), u - 2),
-        jnp.where(ahead, 1 + soon, jnp.inf),
+        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + soon, jnp.inf)),
     )
     at = at + TIE * jnp.arange(c0.shape[0], dtype=dtype)[:, None]
     first = jnp.min(at, axis=0, keepdims=True)
