@@ -41,15 +41,28 @@ REFINEMENTS = 2
 LEFT = 0.1  # of the tolerance: a loaded contact with less energy ends the impact all the same
 
 
-def inverse(matrix: jax.Array) -> jax.Array:
-    """Inverse (t, t, B) of what is similar to a positive definite matrix: needs no pivots."""
+def solve(matrix: jax.Array, *right: jax.Array) -> list[jax.Array]:
+    """`matrix^-1 right` of (n, n, B) and right sides (n, B), entry by entry.
+
+    Gauss-Jordan without pivots, which what is similar to a positive definite matrix does not need.
+    """
     n = len(matrix)
-    eye = jnp.broadcast_to(unit(matrix), matrix.shape)
-    rows = [jnp.concatenate([matrix[i], eye[i]]) for i in range(n)]
+    rows = [[*matrix[i], *(b[i] for b in right)] for i in range(n)]
     for k in range(n):
-        rows[k] = rows[k] / rows[k][k][None]
-        rows = [row if i == k else row - row[k][None] * rows[k] for i, row in enumerate(rows)]
-    return jnp.stack([row[n:] for row in rows])
+        pivot = 1 / rows[k][k]
+        rows[k] = [x * pivot if j > k else x for j, x in enumerate(rows[k])]
+        for i in range(n):
+            if i != k:
+                pairs = zip(rows[i], rows[k])
+                factor = rows[i][k]
+                rows[i] = [x - factor * y if j > k else x for j, (x, y) in enumerate(pairs)]
+    return [jnp.stack([row[n + c] for row in rows]) for c in range(len(right))]
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """The inverse (n, n, B)."""
+    eye = jnp.broadcast_to(unit(matrix), matrix.shape)
+    return jnp.stack(solve(matrix, *(eye[:, j] for j in range(len(matrix)))), axis=1)
 
 
 @as_pytree

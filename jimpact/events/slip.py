@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, as_pytree, times, unit
-from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse
+from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse, solve
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.friction import distribute
 
@@ -119,16 +119,6 @@ def dot(a: jax.Array, b: jax.Array) -> jax.Array:
 def product(a: jax.Array, b: jax.Array) -> jax.Array:
     """Matrices (n, k, B) times (k, l, B)."""
     return jnp.stack([times(a, b[:, j]) for j in range(b.shape[1])], axis=1)
-
-
-def solve(matrix: jax.Array, *right: jax.Array) -> list[jax.Array]:
-    """Gauss-Jordan without pivots for right sides (n, B)."""
-    n = len(matrix)
-    rows = [jnp.concatenate([matrix[i], *(b[i : i + 1] for b in right)]) for i in range(n)]
-    for k in range(n):
-        rows[k] = rows[k] / rows[k][k][None]
-        rows = [row if i == k else row - row[k][None] * rows[k] for i, row in enumerate(rows)]
-    return list(jnp.stack([row[n:] for row in rows], axis=1))
 
 
 def pseudoinverse(k: jax.Array, held: jax.Array) -> jax.Array:
