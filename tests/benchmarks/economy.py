@@ -184,9 +184,7 @@ def not_asked_for(batch):
         return jax.jit(jax.vmap(lambda k: ji.impact(ji.Compliant(force(k)), scene, v).velocity))
 
     spring, damper = forced(ji.Hertz), forced(lambda k: ji.HuntCrossley(k, 0.0))
-    sampled = jax.jit(
-        jax.vmap(lambda k: ji.history(ji.LZB(E, k, 1.5), scene, v, records=128).force)
-    )
+    sampled = jax.jit(jax.vmap(lambda k: ji.history(ji.LZB(E, k, 1.5), scene, v).force))
     return [
         ("gaps: none / all zero", lambda: plain(k), lambda: touching(k), "1"),
         ("tangents: none / there, no friction", lambda: smooth(k), lambda: tangents(k), "1"),
