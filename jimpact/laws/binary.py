@@ -136,14 +136,13 @@ class Binary(Law):
         return jnp.zeros_like(gamma) if gaps is None else gaps
 
     def _sides(self, contact: Contact) -> collisions.Sides | None:
-        mu, e_t, cross, along = (
-            self.friction,
-            self.tangential_restitution,
-            contact.cross,
-            contact.tangential,
-        )
-        if mu is None or e_t is None or cross is None or along is None or contact.slip is None:
+        mu, e_t = self.friction, self.tangential_restitution
+        if mu is None or e_t is None:
             return None
+        cross, along = contact.cross, contact.tangential
+        assert cross is not None  # see `check_law`
+        assert along is not None
+        assert contact.slip is not None
         ones = jnp.ones_like(contact.gap_velocity)
         return collisions.Sides(cross, along, contact.slip, mu * ones, e_t * ones)
 
@@ -202,7 +201,7 @@ class Binary(Law):
             before, at = at, _collide(inputs, options, g, at)
             j = int(jnp.argmax(at.p - before.p))
             time = float(at.time) if law.order == "earliest" else None
-            p, side = collisions.impulses_of(at, inputs.root)
+            p, side = collisions.impulses_of(at.p, at.side, inputs.root)
             steps.append((j, time, np.asarray(v + velocity_change(scene, p, side))))
         return steps
 

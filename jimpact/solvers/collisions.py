@@ -103,19 +103,14 @@ def solve(
     """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
     inputs = to_inputs(delassus, gamma, restitution, gaps, sides)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
-    at, end = both_modes(lambda given, _: run(given, options))(inputs)
-    (p, side), root = at, jnp.sqrt(diagonal(delassus))
-    return *_impulses(p, side, root), end
+    (p, side), end = both_modes(lambda given, _: run(given, options))(inputs)
+    return *impulses_of(p, side, jnp.sqrt(diagonal(delassus))), end
 
 
-def impulses_of(at: Carry, root: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-    """p (m,) and p_t (t,) [N s] up to here."""
-    return _impulses(at.p, at.side, root)
-
-
-def _impulses(
+def impulses_of(
     p: jax.Array, side: jax.Array | None, root: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
+    """p (m,) and p_t (t,) [N s] of normalized ones."""
     return p / root, None if side is None else side / per_tangent(root, side)
 
 

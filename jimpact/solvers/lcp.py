@@ -140,7 +140,7 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _leaving(state: _Tableau, artificial: int, tolerance: float) -> tuple[jax.Array, jax.Array]:
     """Row of the least ratio, in a tie that of the artificial variable; whether there is none.
 
-    An order among further ties (lexicographic) changed none of 100 000 degenerate problems; a
+    An order among further ties (lexicographic) changed none of over 80 000 degenerate problems; a
     cycle would end as `max_steps`.
     """
     m = state.basis.shape[0]
