@@ -64,15 +64,16 @@ class Dimer(OnGround):
         """M = diag(m, m, I)."""
         return jnp.stack([self.total_mass, self.total_mass, self.inertia])
 
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Heights of the right and the left sphere over the ground."""
-        lift = self.arm * jnp.sin(q[2])
-        return jnp.stack([q[1] + lift, q[1] - lift]) - self.radius
+    @property
+    def rim(self) -> jax.Array:
+        """The radius of the spheres."""
+        return self.radius
 
-    def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Ways that the lowest points of the spheres slide."""
-        rolled, side = q[0] + self.radius * q[2], self.arm * jnp.cos(q[2])
-        return jnp.stack([rolled + side, rolled - side])
+    @property
+    def points(self) -> jax.Array:
+        """Centres of the spheres (2, 2)."""
+        none = jnp.zeros_like(self.arm)
+        return jnp.stack([jnp.stack([self.arm, none]), jnp.stack([-self.arm, none])])
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """The rod between the centres, and the spheres."""
