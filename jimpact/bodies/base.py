@@ -337,3 +337,21 @@ def turned(points: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Points (k, 2) of a planar body, in its own frame, at q = (x, y, theta)."""
     c, s = np.cos(q[2]), np.sin(q[2])
     return q[:2] + points @ np.array([[c, s], [-s, c]])
+
+
+_AZIMUTH, _ELEVATION = np.deg2rad(30.0), np.deg2rad(20.0)  # from where bodies in space are seen
+_SCREEN = np.array(
+    [
+        [np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0],
+        [
+            -np.sin(_AZIMUTH) * np.sin(_ELEVATION),
+            np.cos(_AZIMUTH) * np.sin(_ELEVATION),
+            np.cos(_ELEVATION),
+        ],
+    ]
+)
+
+
+def projected(points: np.ndarray) -> np.ndarray:
+    """Points (.., 3) of space on the screen (.., 2): parallel projection, from above the plane."""
+    return points @ _SCREEN.T
