@@ -2,6 +2,7 @@
 
 from . import plot as plot, theory as theory
 from .audits import audit as audit, summary as summary
+from .bodies.assemblies import PlanarBodies as PlanarBodies
 from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
 from .bodies.blocks import Block as Block, rocking_block as rocking_block
 from .bodies.dimers import (
