@@ -50,7 +50,8 @@ def motion(motion: Motion, title: str = "", names: Sequence[str] = ()) -> Figure
         colour = COLOURS[i % len(COLOURS)]
         label = names[i] if i < len(names) else f"q{i + 1}"
         top.plot(time, q[:, i], color=colour, label=label if i < _LEGEND else None)
-        middle.plot(time, v[:, i], color=colour)
+    for i in range(v.shape[1]):
+        middle.plot(time, v[:, i], color=COLOURS[i % len(COLOURS)])
     top.set_ylabel("coordinates [m, rad]")
     middle.set_ylabel("velocities [m/s, rad/s]")
     for axes in (top, middle):
@@ -107,6 +108,7 @@ def phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") -> Figu
     """
     one_motion(motion)
     n = motion.q.shape[-1]
+    n = n if n == motion.velocity.shape[-1] else 3  # in space: of the position only
     if not 0 <= coordinate < n:
         raise ValueError(f"Argument `coordinate` must lie in [0, {n - 1}], but is {coordinate}.")
     figure = Figure(figsize=(6.0, 5.0), layout="constrained")
