@@ -13,6 +13,7 @@ from .bodies.dimers import (
 from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
+from .bodies.piles import Discs as Discs
 from .comparison import (
     compare as compare,
     dispersion_index as dispersion_index,
