@@ -1,5 +1,6 @@
 """`simulate`: whole motions."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -22,7 +23,7 @@ from jimpact.laws.forces import Force
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
-from jimpact.motion.event_driven import event_driven
+from jimpact.motion.event_driven import Given, event_driven
 from jimpact.motion.flow import Course, Settings
 from jimpact.motion.record import Motion
 from jimpact.motion.stepping import is_pile, joins_step, recorded_gaps, time_stepping
@@ -163,9 +164,9 @@ def _events(
     max_events: int,
 ) -> Motion:
     times = _equal_times(start, end, samples)
-    return _recorded(
-        system, times, event_driven(system, law, mu, settings, q, v, times, max_events)
-    )
+    contacts = jax.eval_shape(system.body.gap_function, q).shape[0]
+    given = Given(system, law, mu, settings, q, v, times, contacts)
+    return _recorded(system, times, event_driven(given, max_events))
 
 
 @quick_jit
@@ -208,16 +209,24 @@ def _stepped(
 def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
     """The record of a course, with its energies and gaps."""
     at = course.samples
+    there = jnp.isfinite(at.t)
+
+    def seen(function: Callable[..., jax.Array], *args: jax.Array) -> jax.Array:
+        """A function of the samples; where one is NaN, that is no derivative of the others."""
+        rows = (jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, x[:1]) for x in args)
+        found = jax.vmap(function)(*rows)
+        return jnp.where(there.reshape(-1, *[1] * (found.ndim - 1)), found, jnp.nan)
+
     return Motion(
         time=times,
         q=at.q,
         velocity=at.v,
-        kinetic_energy=jax.vmap(lambda q, v: kinetic(system, q, v))(at.q, at.v),
-        potential_energy=jax.vmap(lambda q: potential(system, q))(at.q),
+        kinetic_energy=seen(lambda q, v: kinetic(system, q, v), at.q, at.v),
+        potential_energy=seen(lambda q: potential(system, q), at.q),
         force_work=at.work,
         base_work=at.base_work,
         contact_work=at.contact_work,
-        gaps=jax.vmap(lambda q, t: recorded_gaps(system, q, t))(at.q, times),
+        gaps=seen(lambda q, t: recorded_gaps(system, q, t), at.q, times),
         events=course.events,
         steps=course.steps,
         status=course.status,
