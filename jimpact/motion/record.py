@@ -20,6 +20,7 @@ MOTION_STATUS = (
     Status("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
     Status("penetration", "a gap is negative at the start", True),
     Status("singular_mass", "the mass matrix is not positive definite on the way", True),
+    Status("out_of_range", "a gap function does not hold any more (`valid` of the body)", True),
     Status("not_finite", "the motion or its input is NaN or infinite", True),
     Status(
         "coarse_step", "a contact is struck again within 3 steps: they are too long for it", False
