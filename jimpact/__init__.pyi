@@ -14,6 +14,7 @@ from .bodies.dimers import (
 from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
+from .bodies.piles import Discs as Discs
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
 from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
 from .comparison import (
