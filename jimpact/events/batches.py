@@ -17,6 +17,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jimpact.events.tangents import BESIDE, Moving, moving_with
+
 # Impacts side by side on a CPU. A piece of a batch ends with its slowest member, and its stages
 # should stay in a core's cache: 64 are no faster, 1024 take half as long again.
 CHUNK = 256
@@ -55,6 +57,7 @@ class Tangent:
     """Tangents of `function` from its arguments and the tangents of those marked.
 
     `many`: these have a leading axis, along which the arguments are the same.
+    A `function` that is `beside` takes arguments that are `Moving`, and gives such results.
     """
 
     function: Callable[..., Arrays]
@@ -63,12 +66,20 @@ class Tangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
-        smooth, values = _smooth(self.function, self.marked, arrays[:count])
+        given, along = arrays[:count], arrays[count:]
+        if getattr(self.function, "beside", False):
+            along = along if self.many else tuple(x[None] for x in along)
+            beside = iter(jnp.moveaxis(x, 0, BESIDE) for x in along)
+            mixed = [Moving(x, next(beside)) if m else x for x, m in zip(given, self.marked)]
+            outs = [moving_with(mixed, x) for x in self.function(*mixed)]
+            rates = [jnp.moveaxis(x.along, BESIDE, 0) for x in outs]
+            return tuple(rates if self.many else (x[0] for x in rates))
+        smooth, values = _smooth(self.function, self.marked, given)
 
         def push(*given: jax.Array) -> Arrays:
             return jax.jvp(smooth, values, given)[1]
 
-        return (jax.vmap(push) if self.many else push)(*arrays[count:])
+        return (jax.vmap(push) if self.many else push)(*along)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,6 +29,7 @@ from jimpact.events.contact_flow import (
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
+from jimpact.events.tangents import through, value_of
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
@@ -218,26 +219,42 @@ class Outcome:
         rows = contacts, self.sides, 1, 1, 1
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
 
-    def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
+    @property
+    def beside(self) -> bool:
+        """Whether its arguments may have tangents (see `tangents.py`)."""
+        return self.repeats
+
+    def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         problem = jax.tree.unflatten(self.tree, leaves)
-        still = jax.lax.stop_gradient(problem)
+        still = jax.lax.stop_gradient(value_of(problem))
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         flow, modes, y = self.flow(still, tighten)
         end = to_the_end(flow, still.gamma, modes, y, self.most, keeps=self.finely)
-        state, dp = end.carry.y, end.impulse
-        if self.repeats:
-            moving, _, y = self.flow(problem, tighten)
-            state = stepper.repeat(moving, modes, y, end.plan)
-            state = jnp.where(end.finishes, moving.finish(end.carry.step.modes, state)[1], state)
-            dp = remainder(moving, problem.gamma, state, end.carries)
         m = flow.contacts
-        p = state[2 * m : 3 * m] + dp
-        if self.finely:
-            p = stepper.with_plan(p, end.plan)
-        side, time = state[3 * m + self.sides : -1][: self.sides], state[-1:]
         if self.repeats:
-            return p, side, time
-        return p, side, time, end.status, end.carry.plan[3:4].astype(jnp.int32)
+            moving, _, y = through(lambda problem: self.flow(problem, tighten), problem)
+            state = stepper.repeat(moving, modes, y, end.plan)
+            carries, last = end.carries, end.carry.step.modes
+
+            def finished(
+                flow: ContactFlow, gamma: jax.Array, y: jax.Array
+            ) -> tuple[jax.Array, jax.Array]:
+                y = jnp.where(end.finishes, flow.finish(last, y)[1], y)
+                return y, remainder(flow, gamma, y, carries)
+
+            state, dp = through(finished, moving, problem.gamma, state)
+        else:
+            state, dp = end.carry.y, end.impulse
+
+        def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
+            p = state[2 * m : 3 * m] + dp
+            p = stepper.with_plan(p, end.plan) if self.finely else p
+            return p, state[3 * m + self.sides : -1][: self.sides], state[-1:]
+
+        outs = through(parts, state, dp)
+        if self.repeats:
+            return outs
+        return *outs, end.status, end.carry.plan[3:4].astype(jnp.int32)
 
 
 class Dynamics(NamedTuple):

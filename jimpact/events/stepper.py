@@ -16,6 +16,7 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     pauses(before, after, passes)  -> (1, B): the caller wants to look now; None: never
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
+    driving, adding            blocks of rows; those that only add up come last
     longest                    the longest step in the flow's own time that is stable
     tolerance (1, B), snap (1, B)
     taking_part (1, B)             contacts, of which some may be open for good
@@ -49,6 +50,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.tableaux import DOP853
+from jimpact.events.tangents import Moving, moving_with, through, value_of
 
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
@@ -80,6 +82,11 @@ class Flow(Protocol):
 
     longest: float
     near: float
+
+    @property
+    def driving(self) -> tuple[int, ...]: ...
+    @property
+    def adding(self) -> tuple[int, ...]: ...
 
     @property
     def tolerance(self) -> jax.Array: ...
@@ -131,30 +138,44 @@ class Step(NamedTuple):
     clock: jax.Array  # (4, B): xi at the beginning, length, whether xi is a root, whether it lands
 
 
-def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
+def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     """Sums (3, n + 1, B) of the slopes of y and of time (weights b and both error estimates);
-    margins at the beginning; their rates (stages, k, B); the constants of the field."""
-    dtype = y.dtype
-    const = flow.constants(s.modes)
-    c0 = flow.margins(const, s.modes, y)
+    margins and their rates (k, B) at the beginning and at the end.
+
+    What of `flow` and y has tangents (see `tangents.py`) gives sums with tangents.
+    """
+    plain, state = value_of((flow, y))
+    n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
-    # from a margin that is 0 already a landing has length 0, and no root
-    root = flow.rooted(s.modes) & (c0 > flow.snap)
-    xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
-    xi0 = total(jnp.where(s.target, xi0, 0.0))
-    rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
-    start = jnp.where(lands > 0, xi0, begun)
-    # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
-    nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
-    length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
+
+    def frame(flow: Flow, y: jax.Array) -> tuple[Any, ...]:
+        const = flow.constants(s.modes)
+        c0 = flow.margins(const, s.modes, y)
+        # from a margin that is 0 already a landing has length 0, and no root
+        root = flow.rooted(s.modes) & (c0 > flow.snap)
+        xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
+        xi0 = total(jnp.where(s.target, xi0, 0.0))
+        rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
+        start = jnp.where(lands > 0, xi0, begun)
+        # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
+        nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
+        length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
+        return const, c0, start, length, rooted, nowhere
+
+    const, c0, start, length, rooted, nowhere = through(frame, flow, y)
     count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
+    adds = sum(plain.adding)
+    drives = n - adds
 
-    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, Any]:
-        i, a, c = at
+    def evaluated(
+        flow: Flow, const: Any, start: Any, length: Any, y: jax.Array, change: jax.Array, at: Any
+    ) -> tuple[jax.Array, ...]:
+        i, c = at
         xi = start + c * length
-        now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
+        now = y[:drives] + length * change
+        now = jnp.concatenate([now, y[drives:]]) if adds else now
         dy = flow.field(const, s.modes, now)
 
         def seen() -> tuple[jax.Array, jax.Array]:
@@ -162,18 +183,52 @@ def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
 
         if flow.near:  # of costly margins: steps in time need them at their ends only
             needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
-            value, dc = jax.lax.cond(needed, seen, lambda: (c0, jnp.zeros_like(c0)))
+            none = jnp.zeros_like(s.target, dtype)
+            value, dc = jax.lax.cond(needed, seen, lambda: (none, none))
         else:
             value, dc = seen()
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (2 * xi - 1)) / rate
-        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), (value, dc) if ends else None
+        return dy[:drives] * dt, jnp.concatenate([dy[drives:] * dt, dt]), value, dc
 
-    none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
+    def stage(carry: Any, at: Any) -> tuple[Any, None]:
+        slopes, added, *margins = carry
+        i, a, c = at
+        change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
+        inner, outer, value, dc = through(evaluated, flow, const, start, length, y, change, (i, c))
+        slopes = _kept(slopes, inner, i, plain.driving)
+        added = _kept(added, outer, i, (*plain.adding, 1))
+        if ends:
+            margins = [jnp.where(i == 0, dc, margins[0]), value, dc]
+        return (slopes, added, *margins), None
+
+    none = [jnp.zeros((count, k, *batch), dtype) for k in (drives, adds + 1)]
+    carry = [moving_with((flow, y), k) for k in none]
+    margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
-    slopes, rates = jax.lax.scan(stage, none, rows)
-    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates
+    (slopes, added, *margins), _ = jax.lax.scan(stage, (*carry, *margins), rows)
+    sums = [jax.tree.map(lambda k: jnp.tensordot(weights, k, axes=1), k) for k in (slopes, added)]
+    scaled = through(lambda h, *k: h[None] * jnp.concatenate(k, axis=1), length, *sums)
+    return (scaled, c0, *margins)
+
+
+def _kept(table: Any, new: Any, i: jax.Array, blocks: tuple[int, ...]) -> Any:
+    """The table with a new row of slopes. Tangents of each block of it are a kernel: in one they
+    would be computed entry by entry."""
+    if not isinstance(table, Moving):
+        return _put(table, new, i)
+    value, along = table
+    if not isinstance(new, Moving):
+        return Moving(_put(value, new, i), along)  # tangents of 0
+    none = jnp.zeros((), i.dtype)
+    ends = np.cumsum([0, *blocks])
+    for first, last in zip(ends[:-1], ends[1:]):
+        at = (i, jnp.asarray(first, i.dtype), none, none)
+        along = jax.lax.dynamic_update_slice(
+            along, new.along[None, first:last], at, allow_negative_indices=False
+        )
+    return Moving(_put(value, new.value, i), along)
 
 
 GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
@@ -222,8 +277,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
-    sums, c0, (values, rates) = _stages(flow, s, y, ends=True)
-    c1, d0, d1 = values[-1], rates[0], rates[-1]
+    sums, c0, d0, c1, d1 = _stages(flow, s, y, ends=True)
     end = y + sums[0, :n]
     eps = float(jnp.finfo(dtype).eps)
     full = FULL * flow.taking_part
@@ -440,15 +494,20 @@ def _walk(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
 ) -> tuple[jax.Array, jax.Array | None]:
     """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
-    n = y.shape[0]
+    y = moving_with((flow, y), y)
+    n = value_of(y).shape[0]
 
     def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
             sums, *_ = _stages(flow, s, y, ends=False)
-            end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
-            return jnp.where(accept, end, y)
+
+            def after(flow: Flow, y: jax.Array, sums: jax.Array) -> jax.Array:
+                end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
+                return jnp.where(accept, end, y)
+
+            return moving_with(y, through(after, flow, y, sums))
 
         y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
         return y, y if states else None

@@ -103,6 +103,12 @@ class MotionFlow(eqx.Module):
 
     near = 0.0
     longest = math.inf  # no rate is large beside the others
+    adding = ()
+
+    @property
+    def driving(self) -> tuple[int, ...]:
+        """All rows in one block."""
+        return (self.errors.shape[0],)
 
     @property
     def taking_part(self) -> int:
