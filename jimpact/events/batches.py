@@ -82,6 +82,14 @@ class Tangent:
         return (jax.vmap(push) if self.many else push)(*along)
 
 
+def reversible(function: Any) -> Any:
+    """The function in a form that the reverse mode goes through, too."""
+    if isinstance(function, Tangent | Cotangent):
+        return dataclasses.replace(function, function=reversible(function.function))
+    form = getattr(function, "reversible", None)
+    return function if form is None else form()
+
+
 @dataclasses.dataclass(frozen=True)
 class Cotangent:
     """Cotangents of the marked arguments of `function`, from its arguments and cotangents."""
@@ -92,7 +100,7 @@ class Cotangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
-        smooth, values = _smooth(self.function, self.marked, arrays[:count])
+        smooth, values = _smooth(reversible(self.function), self.marked, arrays[:count])
         _, back = jax.vjp(smooth, *values)
 
         def pull(*given: jax.Array) -> Arrays:

@@ -145,15 +145,6 @@ class SlipFlow(FrictionFlow):
 
     # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
 
-    @property
-    def driving(self) -> tuple[int, ...]:
-        m = self.contacts
-        return m, m, m, self.across.shape[1]
-
-    @property
-    def adding(self) -> tuple[int, ...]:
-        return self.across.shape[1], 1
-
     def slip(self, y: jax.Array) -> jax.Array:
         m = self.contacts
         return pairs(y[3 * m : 5 * m])

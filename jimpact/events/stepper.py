@@ -160,7 +160,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
         nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
         length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
-        return const, c0, start, length, rooted, nowhere
+        return const, jax.lax.stop_gradient(c0), start, length, rooted, nowhere
 
     const, c0, start, length, rooted, nowhere = through(frame, flow, y)
     count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
@@ -190,7 +190,8 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (2 * xi - 1)) / rate
-        return dy[:drives] * dt, jnp.concatenate([dy[drives:] * dt, dt]), value, dc
+        decide = jax.lax.stop_gradient((value, dc))
+        return dy[:drives] * dt, jnp.concatenate([dy[drives:] * dt, dt]), *decide
 
     def stage(carry: Any, at: Any) -> tuple[Any, None]:
         slopes, added, *margins = carry
@@ -237,21 +238,23 @@ GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
 class Carry(NamedTuple):
     """What one pass hands to the next."""
 
-    y: jax.Array
+    y: Any  # (n, B), which may be `Moving`
     step: Step  # the one to try
     # (4, B): time it is expected to take, landing aimed at twice, GOES_ON | OVER | PAUSED, passes
     plan: jax.Array
 
 
-def begin(flow: Flow, modes: jax.Array, y: jax.Array) -> Carry:
+def begin(flow: Any, modes: jax.Array, start: Any) -> Carry:
     """The first step: short, in the root of time, for forces set in like a power of it."""
+    start = moving_with((flow, start), start)
+    flow, y = value_of((flow, start))
     one = jnp.ones_like(y[:1])
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
     targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
     state = jnp.where(over, OVER, GOES_ON).astype(y.dtype)
-    return Carry(y, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
+    return Carry(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
 
 
 def goes_on(carry: Carry, most: int) -> jax.Array:
@@ -272,13 +275,14 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
          0 ..  1   it vanishes inside the step: repeat the step as a landing on it
          1 .. inf  it is expected to vanish so far ahead: land on it if the next step reaches it
     """
-    y, s = carry.y, carry.step
+    moving, start, s = flow, carry.y, carry.step
+    flow, y = value_of((flow, start))
     n, dtype = y.shape[0], y.dtype
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
-    sums, c0, d0, c1, d1 = _stages(flow, s, y, ends=True)
-    end = y + sums[0, :n]
+    changes, c0, d0, c1, d1 = _stages(moving, s, start, ends=True)
+    sums = value_of(changes)
     eps = float(jnp.finfo(dtype).eps)
     full = FULL * flow.taking_part
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
@@ -328,10 +332,16 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     accept = ok & ~event & active
     landed = accept & lands
     which = s.target & landed
-    modes, end = flow.switch(s.modes, end, which)
     # however short the step, the field has no value: given up, for the status to say
     broken = active & ~lands & ~(error2 < jnp.inf) & (h < SHORTEST)
-    y = jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
+
+    def after(flow: Flow, y: jax.Array, changes: jax.Array) -> tuple[jax.Array, jax.Array]:
+        modes, end = flow.switch(s.modes, y + changes[0, :n], which)
+        return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
+
+    modes, end = through(after, moving, start, changes)
+    end = moving_with(start, end)
+    y = value_of(end)
     # the next step
     in_root = in_root & ~lands
     xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
@@ -368,7 +378,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
             passes,
         ]
     )
-    return Carry(y, Step(modes, target, clock), plan), accept
+    return Carry(end, *jax.lax.stop_gradient((Step(modes, target, clock), plan))), accept
 
 
 def _root_of_cubic(
@@ -401,18 +411,15 @@ class Plan(NamedTuple):
 
     marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 where a step is kept
     clock: jax.Array  # (steps, 4, B)
+    # (1, B): there were too few rows. Such an impact has no derivative: NaN, no wrong number
+    lost: jax.Array | None
 
 
 class Recorder(NamedTuple):
-    """A plan while it is written: rows used, and whether (1, B) there were too few."""
+    """A plan while it is written, and rows used."""
 
     plan: Plan
     used: jax.Array
-    lost: jax.Array
-
-    def closed(self) -> Plan:
-        """The plan. An impact of more steps than rows has no derivative: NaN, no wrong number."""
-        return Plan(self.plan.marks, jnp.where(self.lost[None], jnp.nan, self.plan.clock))
 
 
 def recorder(carry: Carry) -> Recorder:
@@ -422,8 +429,9 @@ def recorder(carry: Carry) -> Recorder:
     plan = Plan(
         jnp.zeros((size, rows, *clock.shape[1:]), jnp.int8),
         jnp.zeros((size, *clock.shape), clock.dtype),
+        jnp.zeros(clock[:1].shape, bool),
     )
-    return Recorder(plan, jnp.zeros((), jnp.uint32), jnp.zeros(clock[:1].shape, bool))
+    return Recorder(plan, jnp.zeros((), jnp.uint32))
 
 
 def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, Recorder]:
@@ -431,7 +439,7 @@ def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, R
     size = BLOCKS * BLOCK
 
     def body(state: tuple[Carry, Recorder]) -> tuple[Carry, Recorder]:
-        carry, (plan, count, lost) = state
+        carry, (plan, count) = state
         after, accept = advance(flow, carry, most)
         s = carry.step
         marks = jnp.concatenate(
@@ -442,9 +450,10 @@ def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, R
         plan = Plan(
             _put(plan.marks, jnp.where(accept, marks, 0), index),
             _put(plan.clock, jnp.where(accept, s.clock, 0.0), index),
+            plan.lost | (accept & (count >= size)),
         )
         count = count + jnp.any(accept).astype(count.dtype)
-        return after, Recorder(plan, count, lost | (accept & (count > size)))
+        return after, Recorder(plan, count)
 
     return jax.lax.while_loop(lambda state: unwatched(state[0], most), body, (carry, pen))
 
@@ -494,20 +503,16 @@ def _walk(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
 ) -> tuple[jax.Array, jax.Array | None]:
     """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
-    y = moving_with((flow, y), y)
-    n = value_of(y).shape[0]
+    n = y.shape[0]
+    y = jnp.where(plan.lost, jnp.nan, 1.0) * y
 
     def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
             sums, *_ = _stages(flow, s, y, ends=False)
-
-            def after(flow: Flow, y: jax.Array, sums: jax.Array) -> jax.Array:
-                end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
-                return jnp.where(accept, end, y)
-
-            return moving_with(y, through(after, flow, y, sums))
+            end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
+            return jnp.where(accept, end, y)
 
         y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
         return y, y if states else None
@@ -521,5 +526,6 @@ def _walk(
 
         return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, stay, y)
 
-    rows = jax.tree.map(lambda x: x.reshape(BLOCKS, BLOCK, *x.shape[1:]), plan)
+    rows = plan._replace(lost=None)
+    rows = jax.tree.map(lambda x: x.reshape(BLOCKS, BLOCK, *x.shape[1:]), rows)
     return jax.lax.scan(jax.checkpoint(block), y, rows)
