@@ -139,10 +139,10 @@ class Step(NamedTuple):
 
 
 def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
-    """Sums (3, n + 1, B) of the slopes of y and of time (weights b and both error estimates);
-    margins and their rates (k, B) at the beginning and at the end.
+    """Change of y and of time (n + 1, B); both estimates of its error (2, n, B); margins (k, B) at
+    the beginning, and where it `ends`: rates at the beginning, margins and rates at the end.
 
-    What of `flow` and y has tangents (see `tangents.py`) gives sums with tangents.
+    What of `flow` and y has tangents (see `tangents.py`) gives a change with tangents.
     """
     plain, state = value_of((flow, y))
     n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
@@ -168,18 +168,18 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
     adds = sum(plain.adding)
     drives = n - adds
+    ends_of = np.cumsum([0, *plain.driving, *plain.adding])
 
     def evaluated(
         flow: Flow, const: Any, start: Any, length: Any, y: jax.Array, change: jax.Array, at: Any
-    ) -> tuple[jax.Array, ...]:
+    ) -> tuple[list[jax.Array], tuple[jax.Array, jax.Array]]:
         i, c = at
         xi = start + c * length
         now = y[:drives] + length * change
-        now = jnp.concatenate([now, y[drives:]]) if adds else now
         dy = flow.field(const, s.modes, now)
 
         def seen() -> tuple[jax.Array, jax.Array]:
-            return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))
+            return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy[:drives],))
 
         if flow.near:  # of costly margins: steps in time need them at their ends only
             needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
@@ -190,16 +190,16 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (2 * xi - 1)) / rate
-        decide = jax.lax.stop_gradient((value, dc))
-        return dy[:drives] * dt, jnp.concatenate([dy[drives:] * dt, dt]), *decide
+        rows = [dy[first:last] * dt for first, last in zip(ends_of[:-1], ends_of[1:])]
+        return [*rows, dt], jax.lax.stop_gradient((value, dc))
 
     def stage(carry: Any, at: Any) -> tuple[Any, None]:
         slopes, added, *margins = carry
         i, a, c = at
         change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
-        inner, outer, value, dc = through(evaluated, flow, const, start, length, y, change, (i, c))
-        slopes = _kept(slopes, inner, i, plain.driving)
-        added = _kept(added, outer, i, (*plain.adding, 1))
+        new, (value, dc) = through(evaluated, flow, const, start, length, y, change, (i, c))
+        slopes = _kept(slopes, new[: len(plain.driving)], i)
+        added = _kept(added, new[len(plain.driving) :], i)
         if ends:
             margins = [jnp.where(i == 0, dc, margins[0]), value, dc]
         return (slopes, added, *margins), None
@@ -209,27 +209,34 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     (slopes, added, *margins), _ = jax.lax.scan(stage, (*carry, *margins), rows)
-    sums = [jax.tree.map(lambda k: jnp.tensordot(weights, k, axes=1), k) for k in (slopes, added)]
-    scaled = through(lambda h, *k: h[None] * jnp.concatenate(k, axis=1), length, *sums)
-    return (scaled, c0, *margins)
+    sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in (slopes, added)]
+    inner, outer = (
+        Moving(x[0], jnp.tensordot(weights[0], k.along, axes=1)) if isinstance(k, Moving) else x[0]
+        for x, k in zip(sums, (slopes, added))
+    )
+    change = through(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
+    errors = value_of(length) * jnp.concatenate([x[1:] for x in sums], axis=1)[:, :n]
+    return change, errors, c0, margins
 
 
-def _kept(table: Any, new: Any, i: jax.Array, blocks: tuple[int, ...]) -> Any:
-    """The table with a new row of slopes. Tangents of each block of it are a kernel: in one they
-    would be computed entry by entry."""
+def _kept(table: Any, new: list[Any], i: jax.Array) -> Any:
+    """The table with a new row of slopes, in blocks.
+
+    Each block of tangents is a kernel: one for all would compute them entry by entry.
+    """
+    value = value_of(table)
+    value = _put(value, jnp.concatenate(value_of(new)), i)
     if not isinstance(table, Moving):
-        return _put(table, new, i)
-    value, along = table
-    if not isinstance(new, Moving):
-        return Moving(_put(value, new, i), along)  # tangents of 0
-    none = jnp.zeros((), i.dtype)
-    ends = np.cumsum([0, *blocks])
-    for first, last in zip(ends[:-1], ends[1:]):
-        at = (i, jnp.asarray(first, i.dtype), none, none)
-        along = jax.lax.dynamic_update_slice(
-            along, new.along[None, first:last], at, allow_negative_indices=False
-        )
-    return Moving(_put(value, new.value, i), along)
+        return value
+    along, first, none = table.along, 0, jnp.zeros((), i.dtype)
+    for block in new:
+        if isinstance(block, Moving):  # else its tangents are 0
+            at = (i, jnp.asarray(first, i.dtype), none, none)
+            along = jax.lax.dynamic_update_slice(
+                along, block.along[None], at, allow_negative_indices=False
+            )
+        first += len(value_of(block))
+    return Moving(value, along)
 
 
 GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
@@ -281,14 +288,14 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
-    changes, c0, d0, c1, d1 = _stages(moving, s, start, ends=True)
-    sums = value_of(changes)
+    change, errors, c0, (d0, c1, d1) = _stages(moving, s, start, ends=True)
+    taken = value_of(change)[n:]
     eps = float(jnp.finfo(dtype).eps)
     full = FULL * flow.taking_part
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
-    fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
+    fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
     # small by chance where the fifth order is: a landing from a maximum, a step of half a period
     error2 = jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
@@ -297,7 +304,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
         SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20)))), SHRINK, GROWTH
     )
     factor = jnp.where(error2 < jnp.inf, factor, SHRINK)
-    span = jnp.where(ok & (sums[0, n:] > 0), sums[0, n:], expected)
+    span = jnp.where(ok & (taken > 0), taken, expected)
     # what each margin does in this step, and after it
     d0, d1 = d0 * span, d1 * span
     snap = flow.snap
@@ -335,11 +342,11 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     # however short the step, the field has no value: given up, for the status to say
     broken = active & ~lands & ~(error2 < jnp.inf) & (h < SHORTEST)
 
-    def after(flow: Flow, y: jax.Array, changes: jax.Array) -> tuple[jax.Array, jax.Array]:
-        modes, end = flow.switch(s.modes, y + changes[0, :n], which)
+    def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+        modes, end = flow.switch(s.modes, y + change[:n], which)
         return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
-    modes, end = through(after, moving, start, changes)
+    modes, end = through(after, moving, start, change)
     end = moving_with(start, end)
     y = value_of(end)
     # the next step
@@ -489,8 +496,8 @@ def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
     h = jnp.where(in_root > 0, root - begun, ahead)
     clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
-    sums, *_ = _stages(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y, ends=False)
-    return y + sums[0, :-1]
+    change, *_ = _stages(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y, ends=False)
+    return y + change[:-1]
 
 
 def step_of(row: Plan, modes: int) -> tuple[Step, jax.Array]:
@@ -503,15 +510,14 @@ def _walk(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
 ) -> tuple[jax.Array, jax.Array | None]:
     """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
-    n = y.shape[0]
     y = jnp.where(plan.lost, jnp.nan, 1.0) * y
 
     def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
-            sums, *_ = _stages(flow, s, y, ends=False)
-            end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
+            change, *_ = _stages(flow, s, y, ends=False)
+            end = flow.switch(s.modes, y + change[:-1], s.target)[1]
             return jnp.where(accept, end, y)
 
         y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
