@@ -242,10 +242,8 @@ class Outcome:
             state = stepper.repeat(flow, modes, y, end.plan)
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
         if self.smooth:
-            carries = end.carries
-            dp = through(
-                lambda *of: remainder(*of, carries=carries), flow, problem.gamma, state
-            )
+            last = flow, problem.gamma, state
+            dp = through(lambda f, g, y: remainder(f, g, y, end.carries), *last)
         rows = 3 * gamma.shape[0]
 
         def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:

@@ -108,10 +108,10 @@ def to_the_end(
         seen = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
         quiet = over & at_rest(still, seen)
 
-        def finished(flow: ContactFlow, y: jax.Array) -> jax.Array:
+        def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
             return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
 
-        carry = carry._replace(y=moving_with(carry.y, through(finished, flow, carry.y)))
+        carry = carry._replace(y=moving_with(carry.y, through(at_end, flow, carry.y)))
         seen = seen._replace(y=jax.lax.stop_gradient(value_of(carry.y)))
         rest = jax.lax.cond(
             jnp.any(paused | quiet),

@@ -43,6 +43,7 @@ b gives margins and their rates at the end of a step), and what is one number an
 two arrays.
 """
 
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -190,7 +191,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (2 * xi - 1)) / rate
-        rows = [dy[first:last] * dt for first, last in zip(ends_of[:-1], ends_of[1:])]
+        rows = [dy[first:last] * dt for first, last in pairwise(ends_of)]
         return [*rows, dt], jax.lax.stop_gradient((value, dc))
 
     def stage(carry: Any, at: Any) -> tuple[Any, None]:
@@ -215,7 +216,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         for x, k in zip(sums, (slopes, added))
     )
     change = through(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
-    errors = value_of(length) * jnp.concatenate([x[1:] for x in sums], axis=1)[:, :n]
+    errors = value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)[:, :n]
     return change, errors, c0, margins
 
 
@@ -419,7 +420,7 @@ class Plan(NamedTuple):
     marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 where a step is kept
     clock: jax.Array  # (steps, 4, B)
     # (1, B): there were too few rows. Such an impact has no derivative: NaN, no wrong number
-    lost: jax.Array | None
+    lost: jax.Array
 
 
 class Recorder(NamedTuple):
@@ -500,10 +501,13 @@ def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     return y + change[:-1]
 
 
-def step_of(row: Plan, modes: int) -> tuple[Step, jax.Array]:
+Row = tuple[jax.Array, jax.Array]  # marks and clock of a step of the plan
+
+
+def step_of(row: Row, modes: int) -> tuple[Step, jax.Array]:
     """A step of the plan, and whether (1, B) there is one."""
-    marks = row.marks
-    return Step(marks[:modes].astype(jnp.int32), marks[modes:-1] > 0, row.clock), marks[-1:] > 0
+    marks, clock = row
+    return Step(marks[:modes].astype(jnp.int32), marks[modes:-1] > 0, clock), marks[-1:] > 0
 
 
 def _walk(
@@ -512,7 +516,7 @@ def _walk(
     """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
     y = jnp.where(plan.lost, jnp.nan, 1.0) * y
 
-    def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
+    def step(y: jax.Array, row: Row) -> tuple[jax.Array, jax.Array | None]:
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
@@ -523,15 +527,14 @@ def _walk(
         y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
         return y, y if states else None
 
-    def block(y: jax.Array, rows: Plan) -> tuple[jax.Array, jax.Array | None]:
+    def block(y: jax.Array, rows: Row) -> tuple[jax.Array, jax.Array | None]:
         def walk(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
             return jax.lax.scan(jax.checkpoint(step), y, rows)
 
         def stay(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
             return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
 
-        return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, stay, y)
+        return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, stay, y)
 
-    rows = plan._replace(lost=None)
-    rows = jax.tree.map(lambda x: x.reshape(BLOCKS, BLOCK, *x.shape[1:]), rows)
+    rows = tuple(x.reshape(BLOCKS, BLOCK, *x.shape[1:]) for x in (plan.marks, plan.clock))
     return jax.lax.scan(jax.checkpoint(block), y, rows)
