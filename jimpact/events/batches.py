@@ -22,6 +22,7 @@ from jimpact.events.tangents import BESIDE, Moving, moving_with
 # Impacts side by side on a CPU. A piece of a batch ends with its slowest member, and its stages
 # should stay in a core's cache: 64 are no faster, 1024 take half as long again.
 CHUNK = 256
+WITH_TANGENTS = 128  # of those with tangents side by side, which take more room
 
 Arrays = tuple[jax.Array, ...]
 columns_p = Primitive("columns")
@@ -121,7 +122,7 @@ def tangents_in_columns(
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
-    count = -(-size // CHUNK)
+    count = -(-size // (WITH_TANGENTS if isinstance(function, Tangent) else CHUNK))
     if count == 1:
         return tuple(function(*arrays))
     width = -(-size // count)
