@@ -65,6 +65,21 @@ def inverse(matrix: jax.Array) -> jax.Array:
     return jnp.stack(solve(matrix, *(eye[:, j] for j in range(len(matrix)))), axis=1)
 
 
+def regularized(
+    matrix: jax.Array, right: jax.Array, ridge: jax.Array, refinements: int
+) -> jax.Array:
+    """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) beside it.
+
+    Each refinement takes out what the ridge changes where the matrix is regular, and makes the
+    derivatives right in one order more: the inverse has none.
+    """
+    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
+    z = times(inverted, right)
+    for _ in range(refinements):
+        z = z + times(inverted, right - times(matrix, z))
+    return z
+
+
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class FrictionFlow(ContactFlow):
@@ -125,11 +140,7 @@ class FrictionFlow(ContactFlow):
         largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
         weight = most / jnp.where(largest > 0, largest, 1.0)
         k = jnp.where(stick[:, None] & stick[None], self.along, 0.0) * weight[None]
-        inverted = inverse(k + unit(k) * jnp.where(stick, SHARING, 1.0)[:, None])
-        z = times(inverted, right)
-        for _ in range(REFINEMENTS):
-            z = z + times(inverted, right - times(k, z))
-        return weight * z
+        return weight * regularized(k, right, jnp.where(stick, SHARING, 1.0), REFINEMENTS)
 
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         _, g, _ = self.rows(y)

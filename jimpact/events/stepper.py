@@ -16,7 +16,7 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     pauses(before, after, passes)  -> (1, B): the caller wants to look now; None: never
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
-    driving, adding            blocks of rows; those that only add up come last
+    driving, adding            blocks of rows (none: one block); those that only add up come last
     longest                    the longest step in the flow's own time that is stable
     tolerance (1, B), snap (1, B)
     taking_part (1, B)             contacts, of which some may be open for good
@@ -169,7 +169,8 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
     adds = sum(plain.adding)
     drives = n - adds
-    ends_of = np.cumsum([0, *plain.driving, *plain.adding])
+    blocks = plain.driving or (drives,)
+    ends_of = np.cumsum([0, *blocks, *plain.adding])
 
     def evaluated(
         flow: Flow, const: Any, start: Any, length: Any, y: jax.Array, change: jax.Array, at: Any
@@ -199,8 +200,8 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         i, a, c = at
         change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
         new, (value, dc) = through(evaluated, flow, const, start, length, y, change, (i, c))
-        slopes = _kept(slopes, new[: len(plain.driving)], i)
-        added = _kept(added, new[len(plain.driving) :], i)
+        slopes = _kept(slopes, new[: len(blocks)], i)
+        added = _kept(added, new[len(blocks) :], i)
         if ends:
             margins = [jnp.where(i == 0, dc, margins[0]), value, dc]
         return (slopes, added, *margins), None
@@ -497,7 +498,12 @@ def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
     h = jnp.where(in_root > 0, root - begun, ahead)
     clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
-    change, *_ = _stages(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y, ends=False)
+    return step_again(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y)
+
+
+def step_again(flow: Flow, s: Step, y: jax.Array) -> jax.Array:
+    """The state after an accepted step, as a smooth function of `flow` and `y`."""
+    change, *_ = _stages(flow, s, y, ends=False)
     return y + change[:-1]
 
 
@@ -520,8 +526,7 @@ def _walk(
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
-            change, *_ = _stages(flow, s, y, ends=False)
-            end = flow.switch(s.modes, y + change[:-1], s.target)[1]
+            end = flow.switch(s.modes, step_again(flow, s, y), s.target)[1]
             return jnp.where(accept, end, y)
 
         y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
