@@ -34,8 +34,9 @@ jump rules, also where events coincide.
 WHAT COMES NEXT   Every margin gets one number, in units of the step just tried, and the least of
 them decides (`advance`).
 
-DERIVATIVES   The run records its accepted steps; `repeat` walks through them once more as a scan
-in which nothing is decided. JAX differentiates that: both modes, any order.
+DERIVATIVES   Forward ones go along with the steps: the state carries tangents (`tangents.py`) while
+values alone decide. For the reverse mode the run records its accepted steps, and `repeat` walks
+through them once more as a scan in which nothing is decided. JAX differentiates both: any order.
 
 COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
 reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
@@ -68,8 +69,8 @@ FINEST = 16  # roundings: an error estimate below them is noise
 COARSE = 0.3  # the error is no less than this part of the third-order estimate squared
 COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
 
-# Accepted steps kept for derivatives: blocks of steps, where nothing is kept a block is skipped.
-# An impact of more steps has no derivative: NaN, whatever its status.
+# Accepted steps kept for the reverse mode: blocks of steps, where nothing is kept a block is skipped.
+# An impact of more steps has no derivative there: NaN, whatever its status.
 BLOCKS, BLOCK = 64, 16
 
 STAGES = len(DOP853.c)
