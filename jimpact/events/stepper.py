@@ -69,7 +69,7 @@ FINEST = 16  # roundings: an error estimate below them is noise
 COARSE = 0.3  # the error is no less than this part of the third-order estimate squared
 COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
 
-# Accepted steps kept for the reverse mode: blocks of steps, where nothing is kept a block is skipped.
+# Accepted steps kept for the reverse mode: blocks of steps; where nothing is kept one is skipped.
 # An impact of more steps has no derivative there: NaN, whatever its status.
 BLOCKS, BLOCK = 64, 16
 
