@@ -91,6 +91,15 @@ class FrictionFlow(ContactFlow):
 
     # ---- the state: x, g, p, slip u, its impulse, time
 
+    @property
+    def driving(self) -> tuple[int, ...]:
+        m = self.contacts
+        return m, m, m, self.across.shape[1]
+
+    @property
+    def adding(self) -> tuple[int, ...]:
+        return self.across.shape[1], 1
+
     def slip(self, y: jax.Array) -> jax.Array:
         m = self.contacts
         return y[3 * m : 4 * m]

@@ -112,6 +112,7 @@ class MotionFlow(eqx.Module):
     longest: jax.Array  # step ()
 
     near = 0.0
+    driving = adding = ()
     spare = 0  # rows beside those of the state, which only say how long steps may be
 
     @property
