@@ -146,9 +146,18 @@ class FrictionFlow(ContactFlow):
             [
                 super().margins(const, modes, y),
                 jnp.where(slides, modes[2 * m :].astype(y.dtype) * self.slip(y), 1.0),
-                jnp.where(stick, most - jnp.abs(side), 1.0),
+                self.room(stick, most, jnp.abs(side)),
             ]
         )
+
+    def room(self, stick: jax.Array, most: jax.Array, held: jax.Array) -> jax.Array:
+        """Inside the friction cone: 1 nothing is held, 0 on the cone; of a part of the force.
+
+        Forces of a contact that opens vanish together: their difference would vanish with them.
+        """
+        both = most + held
+        some = stick & (both > 0)
+        return jnp.where(some, (most - held) / jnp.where(some, both, 1.0), 1.0)
 
     def rooted(self, modes: jax.Array) -> jax.Array:
         rooted = super().rooted(modes)
