@@ -100,7 +100,7 @@ class FrictionFlow(ContactFlow):
     def forces(
         self, const: Frozen, modes: jax.Array, y: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """F, mu F, lambda, and who sticks."""
+        """F, lambda, who sticks, and the room of those in their cone."""
         m = self.contacts
         x, g, _ = self.rows(y)
         f = self.force(const, x, g)
@@ -108,23 +108,33 @@ class FrictionFlow(ContactFlow):
         stick = (modes[2 * m :] == 0) & self.loaded(modes)
         sliding = jnp.where(stick, 0.0, -modes[2 * m :].astype(most.dtype) * most)
         missing = times(jnp.swapaxes(self.across, 0, 1), f) + times(self.along, sliding)
-        holding = self.holding(jnp.where(stick, -missing, 0.0), stick, most)
-        return f, most, jnp.where(stick, holding, sliding), stick
+        holding, room = self.holding(jnp.where(stick, -missing, 0.0), stick, most)
+        return f, jnp.where(stick, holding, sliding), stick, room
 
-    def holding(self, right: jax.Array, stick: jax.Array, most: jax.Array) -> jax.Array:
-        """`K_tt lambda = right` on the rows that stick, shared in proportion to `most`."""
+    def holding(
+        self, right: jax.Array, stick: jax.Array, most: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """`K_tt lambda = right` on the rows that stick, shared in proportion to `most`.
+
+        And the room in the cone: 1 where nothing is held, 0 on the cone, as parts of the forces:
+        those of a contact that opens vanish, and so would the difference of theirs.
+        """
         largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
         weight = most / jnp.where(largest > 0, largest, 1.0)
+        # z = lambda / weight has a limit where weight is 0
         k = jnp.where(stick[:, None] & stick[None], self.along, 0.0) * weight[None]
         inverted = inverse(k + unit(k) * jnp.where(stick, SHARING, 1.0)[:, None])
         z = times(inverted, right)
         for _ in range(REFINEMENTS):
             z = z + times(inverted, right - times(k, z))
-        return weight * z
+        held = jnp.abs(z)
+        some = stick & (largest + held > 0)
+        room = jnp.where(some, (largest - held) / jnp.where(some, largest + held, 1.0), 1.0)
+        return weight * z, room
 
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         _, g, _ = self.rows(y)
-        f, _, side, stick = self.forces(const, modes, y)
+        f, side, stick, _ = self.forces(const, modes, y)
         pull = self.coupling.times(f) + times(self.across, side)
         slip = times(jnp.swapaxes(self.across, 0, 1), f) + times(self.along, side)
         return jnp.concatenate(
@@ -140,24 +150,15 @@ class FrictionFlow(ContactFlow):
 
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         m = self.contacts
-        _, most, side, stick = self.forces(const, modes, y)
+        _, _, stick, room = self.forces(const, modes, y)
         slides = ~stick & self.loaded(modes)
         return jnp.concatenate(
             [
                 super().margins(const, modes, y),
                 jnp.where(slides, modes[2 * m :].astype(y.dtype) * self.slip(y), 1.0),
-                self.room(stick, most, jnp.abs(side)),
+                room,
             ]
         )
-
-    def room(self, stick: jax.Array, most: jax.Array, held: jax.Array) -> jax.Array:
-        """Inside the friction cone: 1 nothing is held, 0 on the cone; of a part of the force.
-
-        Forces of a contact that opens vanish together: their difference would vanish with them.
-        """
-        both = most + held
-        some = stick & (both > 0)
-        return jnp.where(some, (most - held) / jnp.where(some, both, 1.0), 1.0)
 
     def rooted(self, modes: jax.Array) -> jax.Array:
         rooted = super().rooted(modes)
@@ -168,7 +169,7 @@ class FrictionFlow(ContactFlow):
     ) -> tuple[jax.Array, jax.Array]:
         m = self.contacts
         stopped, broke = which[2 * m : 3 * m], which[3 * m :]
-        _, _, side, _ = self.forces(self.constants(modes), modes, y)
+        _, side, *_ = self.forces(self.constants(modes), modes, y)
         turned = jnp.where(broke, -jnp.sign(side).astype(modes.dtype), modes[2 * m :])
         after, y = super().switch(modes, y, which[: 2 * m])
         after = jnp.concatenate([after[: 2 * m], turned])
@@ -203,7 +204,7 @@ class FrictionFlow(ContactFlow):
         return jnp.concatenate([modes[: 2 * m], slip]), jnp.concatenate([y[: 3 * m], u, y[4 * m :]])
 
     def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
-        m, side = self.contacts, self.forces(self.constants(modes), modes, y)[2]
+        m, side = self.contacts, self.forces(self.constants(modes), modes, y)[1]
         return (
             super()
             .measured(modes, y)
