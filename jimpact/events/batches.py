@@ -218,3 +218,22 @@ def _transpose(cotangents: Any, *arrays: Any, function: Callable[..., Arrays]) -
 
 
 ad.primitive_transposes[columns_p] = _transpose
+
+
+@jax.custom_batching.custom_vmap
+def over_lanes(count: jax.Array) -> jax.Array:
+    """The sum of whole numbers over all lanes that `vmap` makes of this program.
+
+    It is the same in all lanes: a condition or a loop on it is not turned into a selection.
+    """
+    return count
+
+
+@over_lanes.def_vmap
+def _over_lanes(size: int, batched: Any, count: jax.Array) -> tuple[jax.Array, bool]:
+    return over_lanes(jnp.sum(count, axis=0, dtype=count.dtype)), False
+
+
+def any_lane(happens: jax.Array) -> jax.Array:
+    """Whether it happens in any lane."""
+    return over_lanes(happens.astype(jnp.int32)) > 0

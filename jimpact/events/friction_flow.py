@@ -39,6 +39,7 @@ AHEAD = 1e-6  # of the unit of time: at the first touch there are no forces yet 
 # rounding: it decides where K_tt is singular only, and a refinement removes what it changes
 # elsewhere.
 SHARING = 1.0
+REFINEMENTS = 1
 LEFT = 0.1  # of the tolerance: a loaded contact with less energy ends the impact all the same
 
 
@@ -66,15 +67,25 @@ def inverse(matrix: jax.Array) -> jax.Array:
     return jnp.stack(solve(matrix, *(eye[:, j] for j in range(len(matrix)))), axis=1)
 
 
+def regularized(
+    matrix: jax.Array, right: jax.Array, ridge: jax.Array, refinements: int
+) -> jax.Array:
+    """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) beside it.
+
+    Each refinement takes out what the ridge changes where the matrix is regular, and makes the
+    derivatives right in one order more: the inverse has none.
+    """
+    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
+    z = times(inverted, right)
+    for _ in range(refinements):
+        z = z + times(inverted, right - times(matrix, z))
+    return z
+
+
 @jax.custom_jvp
 def refined(k: jax.Array, share: jax.Array, right: jax.Array) -> jax.Array:
-    """z (n, B) with `(k + share) z = right`, to which `k z = right` brings nearer once more.
-
-    The tangent is one of the same equations: one inverse does for both.
-    """
-    inverted = inverse(k + share)
-    z = times(inverted, right)
-    return z + times(inverted, right - times(k, z))
+    """As `regularized`, with tangents by the same equations: one inverse does for both."""
+    return regularized(k, right, share, REFINEMENTS)
 
 
 @refined.defjvp
@@ -92,7 +103,7 @@ class Modes(NamedTuple):
     drag: jax.Array  # lambda / F of those that slide (m, B)
     pull: jax.Array  # u' = pull F, but for what is held (m, m, B)
     along: jax.Array  # K_tt of those that stick (m, m, B)
-    share: jax.Array  # beside it (m, m, B)
+    share: jax.Array  # beside its diagonal (m, B)
 
 
 class Forces(NamedTuple):
@@ -149,7 +160,7 @@ class FrictionFlow(ContactFlow):
             drag=drag,
             pull=jnp.swapaxes(self.across, 0, 1) + self.along * drag[None],
             along=k,
-            share=unit(k) * jnp.where(stick, share, 1.0)[:, None],
+            share=jnp.where(stick, share, 1.0),
         )
 
     def forces(self, const: Modes, y: jax.Array) -> Forces:

@@ -426,7 +426,12 @@ def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     root = jnp.where(positive, jnp.sqrt(jnp.where(positive, reached, 1.0)), 0.0)
     h = jnp.where(in_root > 0, root - begun, ahead)
     clock = jnp.concatenate([begun, h, in_root, jnp.zeros_like(h)])
-    sums, *_ = _stages(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y, ends=False)
+    return step_again(flow, Step(s.modes, jnp.zeros_like(s.target), clock), y)
+
+
+def step_again(flow: Flow, s: Step, y: jax.Array) -> jax.Array:
+    """The state after an accepted step, as a smooth function of `flow` and `y`."""
+    sums, *_ = _stages(flow, s, y, ends=False)
     return y + sums[0, :-1]
 
 
@@ -440,14 +445,12 @@ def _walk(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
 ) -> tuple[jax.Array, jax.Array | None]:
     """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
-    n = y.shape[0]
 
     def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
-            sums, *_ = _stages(flow, s, y, ends=False)
-            end = flow.switch(s.modes, y + sums[0, :n], s.target)[1]
+            end = flow.switch(s.modes, step_again(flow, s, y), s.target)[1]
             return jnp.where(accept, end, y)
 
         y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)

@@ -24,9 +24,13 @@ from jimpact.motion.flow import (
     State,
     allowed_errors,
     first_flight,
+    longest_step,
+    no_samples,
     one_pass,
     packed,
+    put,
     roundings,
+    sampled_states,
     toward_sample,
     unpacked,
 )
@@ -91,7 +95,7 @@ class CompliantFlow(MotionFlow):
         if carried is not None:
             base = (given.normal.gradient @ push) @ carried
         rates = State(
-            q=at.v,
+            q=self.system.body.rates(at.q, at.v),
             v=given.free + given.moved @ push,
             t=jnp.ones_like(at.t),
             work=user_force(self.system, at.q, at.v, at.t) @ at.v,
@@ -153,6 +157,7 @@ class CompliantFlow(MotionFlow):
 
 class _Run(NamedTuple):
     flight: Flight
+    samples: jax.Array
     fastest: jax.Array  # (m,) approach so far [m/s]
     events: Events
     status: jax.Array
@@ -186,10 +191,11 @@ def compliant_motion(
         phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
     status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"]).astype(jnp.int32)
-    begin = first_flight(state, phase[:, None].astype(jnp.int32), 2 * m, times)
-    events = no_events(max_events, q0.shape[0], m, dtype)
+    begin = first_flight(system, state, phase[:, None].astype(jnp.int32), 2 * m, times)
+    events = no_events(max_events, q0, v0, m)
     start = _Run(
         toward_sample(begin, times, begin.free),
+        no_samples(state, times),
         jax.lax.stop_gradient(jnp.maximum(-gamma, 0.0)),
         events,
         status,
@@ -206,13 +212,14 @@ def compliant_motion(
         given = contacts_at(system, flight.state.q, flight.state.v, flight.state.t, False)
         units = _units(force, given, run.fastest)
         share = jnp.full(2 * m, SNAP * settings.rtol, dtype)
+        rounded, longest = roundings(settings, share, times), longest_step(system, times)
         flow = CompliantFlow(
-            system, roundings(settings, share, times), times[0], blank, state, force, units
+            system, rounded, times[0], settings.rtol, blank, state, longest, force, units
         )
         ledger = allowed_errors(system, settings, flight.state, 1.0)[: -2 * m]
         rows = jnp.concatenate([ledger, settings.rtol * units.depth, settings.rtol * units.impulse])
-        flown = one_pass(flow, settings, rows, times, flight)
-        before, after = (f.plan.step.modes[:, 0] for f in (flight, flown))
+        flown, _ = one_pass(flow, settings, rows, times, flight)
+        before, after = (f.aim.modes[:, 0] for f in (flight, flown))
         closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
         at = flown.state
         gamma = kinematics(system, at.q, at.v, at.t).rate
@@ -229,10 +236,11 @@ def compliant_motion(
         happened = jnp.any(closed | opened)
         full = happened & (run.events.count >= max_events)
         status = jnp.where(full, MOTION_CODE["max_events"], run.status)
-        status = jnp.where(flown.stuck, why_stuck(system, flown, times), status)
+        status = jnp.where(flown.stuck, why_stuck(system, flown, q0, times), status)
         fastest = jnp.maximum(run.fastest, jnp.maximum(-gamma, 0.0))
         return _Run(
             flown,
+            put(run.samples, packed(at)[:, 0], flight.sample),
             jax.lax.stop_gradient(fastest),
             with_row(run.events, happened, row),
             status.astype(jnp.int32),
@@ -240,7 +248,8 @@ def compliant_motion(
         )
 
     end = jax.lax.while_loop(going, one, start)
-    course = Course(end.flight.samples, end.events, end.flight.steps, end.status)
+    samples = sampled_states(end.samples, state, end.flight.sample)
+    course = Course(samples, end.events, end.flight.steps, end.status)
     return course, end.flight.state, end.apart
 
 

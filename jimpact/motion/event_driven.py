@@ -1,116 +1,349 @@
-"""Event by event: resolve what happens, write it down, fly on."""
+"""Event by event: resolve what happens, write it down, fly on; and the same once more, smoothly.
 
-from typing import NamedTuple
+One loop, one pass: where an event waits it is resolved, then a step is tried. Lanes of a batch
+advance independently; an event waits until as many lanes wait as fly.
 
+DERIVATIVES   The run writes down its accepted steps and what was decided at its events (`Plan`). A
+second walk through them, in which nothing is decided, is a scan: JAX differentiates it in both modes
+and any order. Its blocks of rows are checkpoints, and blocks without a step are skipped.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.custom_derivatives import SymbolicZero
+from jax.flatten_util import ravel_pytree
 
+from jimpact.bodies.base import GivenBody
+from jimpact.events import stepper
+from jimpact.events.batches import any_lane, over_lanes
 from jimpact.law import Law
 from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
-from jimpact.motion.flow import Course, Flight, Scales, Settings, State, encoded, first_flight, fly
+from jimpact.motion.flow import (
+    Course,
+    Flight,
+    Scales,
+    Settings,
+    State,
+    allowed_errors,
+    encoded,
+    first_flight,
+    flow_of,
+    no_samples,
+    one_pass,
+    packed,
+    put,
+    sampled_states,
+    selected,
+    step_again,
+    toward_sample,
+)
 from jimpact.motion.persistent_contact import Modes, no_modes
-from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
+from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events
 from jimpact.motion.system import System
-from jimpact.motion.transitions import Outcome, resolve
+from jimpact.motion.transitions import After, Decision, resolve, resolved_again
 
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6
 AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
+# Rows of a plan beside one a sample: accepted steps of a motion that has derivatives. A motion of
+# more steps has none: NaN.
+ROWS_PER_EVENT, ROWS_MORE = 16, 1024
+BLOCK = 16  # rows between two checkpoints
+
+
+class Given(NamedTuple):
+    """What a motion follows from."""
+
+    system: System
+    law: Law
+    mu: jax.Array | None
+    settings: Settings
+    q0: jax.Array
+    v0: jax.Array
+    times: jax.Array  # (S,)
+    contacts: int  # m
+
+    @property
+    def start(self) -> State:
+        """The state at the beginning."""
+        zero = jnp.zeros((), self.q0.dtype)
+        rest = jnp.zeros((2, self.contacts), self.q0.dtype)
+        return State(self.q0, self.v0, self.times[0], zero, zero, rest, rest[:0])
+
+
+class Row(NamedTuple):
+    """Of a plan: an event perhaps, a step after it perhaps."""
+
+    happens: jax.Array  # ()
+    written: jax.Array  # () whether the event has a row in the record
+    decision: Decision
+    accepted: jax.Array  # ()
+    aim: stepper.Step
+
+
+class Plan(NamedTuple):
+    """Rows of a run; those beyond `used` are not to be read."""
+
+    rows: Row  # (R, ..)
+    used: jax.Array
+    lost: jax.Array  # whether there were too few
+
+
+class Table(NamedTuple):
+    """What a motion writes down; rows beyond those reached hold anything."""
+
+    samples: jax.Array  # (S + 1, rows of the state)
+    events: jax.Array  # (E + 1, w)
+    marks: jax.Array  # (E + 1, 2 + m) kind, status of the law, contacts
 
 
 class _Run(NamedTuple):
     flight: Flight
     modes: Modes
-    scales: Scales
     struck: jax.Array
-    events: Events
+    allowed: jax.Array  # errors of the ledger
+    waits: jax.Array  # whether an event is to be resolved
+    last: Row  # the event before the next step
+    table: Table
+    count: jax.Array  # events
     status: jax.Array
+    plan: Plan | None
 
 
-def event_driven(
-    system: System,
-    law: Law,
-    mu: jax.Array | None,
-    settings: Settings,
-    q0: jax.Array,
-    v0: jax.Array,
-    times: jax.Array,
-    max_events: int,
-) -> Course:
-    """The motion from `times[0]` to `times[-1]`, sampled at `times` (S,)."""
-    n = q0.shape[0]
-    m = gaps(system, q0, times[0]).shape[0]
-    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
-    rest = jnp.zeros((2, m), dtype)
-    state = State(q0, v0, times[0], zero, zero, rest, rest[:0])
+class _End(NamedTuple):
+    table: Table
+    reached: jax.Array  # samples
+    count: jax.Array  # events
+    steps: jax.Array
+    status: jax.Array
+    plan: Plan | None
+
+
+def event_driven(given: Given, max_events: int) -> Course:
+    """The motion from `times[0]` to `times[-1]`, sampled at `times`. Both derivatives, any order."""
+    leaves, tree = jax.tree.flatten(_without_closures(given))
+    fixed = [None if eqx.is_array(x) else x for x in leaves]
+
+    def rebuilt(arrays: tuple[jax.Array, ...]) -> Given:
+        every = iter(arrays)
+        return jax.tree.unflatten(tree, [next(every) if x is None else x for x in fixed])
+
+    @jax.custom_jvp
+    def value(*arrays: jax.Array) -> _End:
+        return _run(rebuilt(arrays), max_events, records=False)
+
+    def rule(arrays: Any, tangents: Any) -> Any:
+        marked = [not isinstance(t, SymbolicZero) for t in tangents]
+        end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
+        assert end.plan is not None
+        plan = end.plan
+
+        def smooth(*moved: jax.Array) -> tuple[jax.Array, jax.Array]:
+            some = iter(moved)
+            every = [next(some) if mark else x for x, mark in zip(arrays, marked)]
+            return _again(rebuilt(tuple(every)), plan, max_events)
+
+        values = tuple(x for x, mark in zip(arrays, marked) if mark)
+        rates = tuple(t for t, mark in zip(tangents, marked) if mark)
+        found, slopes = jax.jvp(smooth, values, rates)
+        recorded = end.table.samples, end.table.events
+        samples, events = selected(plan.lost, recorded, found)
+        end = end._replace(table=Table(samples, events, end.table.marks), plan=None)
+        none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)
+        return end, none._replace(table=Table(*slopes, none.table.marks))
+
+    value.defjvp(rule, symbolic_zeros=True)
+    end = value(*(x for x, y in zip(leaves, fixed) if y is None))
+    samples = sampled_states(end.table.samples, given.start, end.reached)
+    events = _events(end.table, end.count, given)
+    return Course(samples, events, end.steps, end.status)
+
+
+def _without_closures(given: Given) -> Given:
+    """Functions of the system that close over traced arrays have these as arguments instead."""
+
+    def closed(function: Any, *args: jax.Array) -> Any:
+        if function is None or isinstance(function, eqx.Module) or not callable(function):
+            return function
+        opened = eqx.filter_closure_convert(function, *args)
+        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(opened))
+        return opened if traced else function
+
+    q, v, t, system = given.q0, given.v0, given.times[0], given.system
+    parts = [
+        closed(system.force, q, v, t), closed(system.potential, q), closed(system.base, t)
+    ]  # fmt: skip
+    new = eqx.tree_at(
+        lambda s: (s.force, s.potential, s.base), system, parts, is_leaf=lambda x: x is None
+    )
+    if isinstance(new.body, GivenBody):
+        body = new.body
+        parts = [closed(body.gaps, q), closed(body.sliding, q), closed(body.mass_given, q)]
+        new = eqx.tree_at(
+            lambda s: (s.body.gaps, s.body.sliding, s.body.mass_given), new, parts,
+            is_leaf=lambda x: x is None,
+        )  # fmt: skip
+    return given._replace(system=new)
+
+
+# ------------------------------------------------------------------------------ the run
+
+
+def _run(given: Given, max_events: int, records: bool) -> _End:
+    """From event to event; with its plan, if it `records`."""
+    start = _begin(given, max_events, records)
+
+    def goes_on(run: _Run) -> jax.Array:
+        flight = run.flight
+        there = flight.sample >= given.times.shape[0]
+        return (run.status == MOTION_CODE["ok"]) & ~flight.stuck & ~there
+
+    def one(run: _Run) -> _Run:
+        on = goes_on(run)
+        waiting, flying = on & run.waits, on & ~run.waits
+        due = over_lanes(waiting.astype(jnp.int32)) >= over_lanes(flying.astype(jnp.int32))
+        run = _resolved(given, max_events, run, waiting, due)
+        return _flown(given, run, goes_on(run) & ~run.waits)
+
+    end = jax.lax.while_loop(lambda run: any_lane(goes_on(run)), one, start)
+    stuck = end.flight.stuck & (end.status == MOTION_CODE["ok"])
+    status = jnp.where(
+        stuck, why_stuck(given.system, end.flight, given.q0, given.times), end.status
+    ).astype(jnp.int32)
+    flight = end.flight
+    return _End(end.table, flight.sample, end.count, flight.steps, status, end.plan)
+
+
+def _begin(given: Given, max_events: int, records: bool) -> _Run:
+    system, _, _, settings, q0, v0, times, _ = given
+    m, dtype = given.contacts, q0.dtype
+    state = given.start
     watched = 2 * m if settings.friction else m
-    begin = first_flight(state, encoded(no_modes(m, dtype)), watched, times)
-    events = no_events(max_events, n, m, q0.dtype)
+    flight = first_flight(system, state, encoded(no_modes(m, dtype)), watched, times)
+    table = Table(
+        no_samples(state, times),
+        jnp.zeros((max_events + 1, _width(given)), dtype),
+        jnp.zeros((max_events + 1, 2 + m), jnp.int32),
+    )
     penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
-    start = _Run(
-        begin,
-        no_modes(m, q0.dtype),
-        Scales(zero, zero, zero),
-        jnp.full((2, m), -jnp.inf, q0.dtype),
-        events,
+    zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
+    decision = Decision(no, none, none, none, none, none, Scales(zero, zero, zero))
+    last = Row(no, no, decision, no, flight.aim)
+    plan = None
+    if records:
+        size = min(times.shape[0] + ROWS_PER_EVENT * max_events + ROWS_MORE, settings.max_steps)
+        size = -(-size // BLOCK) * BLOCK + 1  # one more to write what is not kept
+        rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), last)
+        plan = Plan(rows, jnp.int32(0), no)
+    return _Run(
+        flight,
+        no_modes(m, dtype),
+        jnp.full((2, m), -jnp.inf, dtype),
+        packed(state)[q0.size + v0.size :, 0],
+        jnp.asarray(True),
+        last,
+        table,
+        jnp.int32(0),
         status,
+        plan,
     )
 
-    def going(run: _Run) -> jax.Array:
-        return (run.status == MOTION_CODE["ok"]) & (run.flight.sample < times.shape[0])
 
-    def one(run: _Run) -> _Run:
-        return _next_event(system, law, mu, settings, times, max_events, run)
-
-    end = jax.lax.while_loop(going, one, start)
-    return Course(end.flight.samples, end.events, end.flight.steps, end.status)
+def _short(x: jax.Array) -> Any:
+    """Modes are small numbers."""
+    return jnp.int8 if jnp.issubdtype(x.dtype, jnp.integer) else x.dtype
 
 
-def _next_event(
-    system: System,
-    law: Law,
-    mu: jax.Array | None,
-    settings: Settings,
-    times: jax.Array,
-    max_events: int,
-    run: _Run,
-) -> _Run:
-    """Resolve the event that ended the last flight (or the beginning), then fly to the next."""
-    flight = run.flight
-    found = resolve(
-        system,
-        law,
-        mu,
-        settings,
-        flight.state,
-        run.modes,
-        flight.event,
-        run.scales,
-        run.struck,
+def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: jax.Array) -> _Run:
+    """The event resolved and written down in lanes where it is `mine`, if it is `due`."""
+    system, law, mu, settings, *_, times, _ = given
+    flight, old = run.flight, run.flight.state
+
+    def now(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
+        scales = run.last.decision.scales
+        found = resolve(
+            system, law, mu, settings, old, run.modes, flight.event & mine, scales, run.struck
+        )
+        happened = found.kind != KIND_CODE["none"]
+        full = (run.count >= max_events) & happened
+        status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
+        kept = mine & happened & ~full
+        row = Row(jnp.asarray(True), kept, found.decision, jnp.asarray(False), flight.aim)
+        state = found.after.state
+        ready = flight._replace(
+            state=state,
+            aim=flight.aim._replace(modes=encoded(found.modes)),
+            event=jnp.zeros_like(flight.event),
+        )
+        new = run._replace(
+            flight=toward_sample(ready, times, flight.free),
+            modes=found.modes,
+            struck=found.after.struck,
+            allowed=allowed_errors(system, settings, state),
+            waits=jnp.asarray(False),
+            last=row,
+            count=run.count + kept.astype(jnp.int32),
+            status=status,
+        )
+        codes = jnp.stack([found.kind, found.after.jump.code])
+        marks = jnp.concatenate([codes.astype(jnp.int32), found.contacts.astype(jnp.int32)])
+        numbers = _numbers(old, found.after)
+        return selected(mine, new, run), numbers, marks
+
+    def later(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
+        events, marks = (jnp.zeros_like(x[0]) for x in run.table[1:])
+        return run, events, marks
+
+    table, plan = run.table, run.plan
+    light = run._replace(table=Table(table.samples[:1], *(x[:1] for x in table[1:])), plan=None)
+    new, numbers, marks = jax.lax.cond(due, now, later, light)
+    index = jnp.where(new.count > run.count, run.count, max_events)
+    table = table._replace(events=put(table.events, numbers, index))
+    table = table._replace(marks=put(table.marks, marks, index))
+    return new._replace(table=table, plan=plan)
+
+
+def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
+    """One pass of the stepper in lanes that fly."""
+    system, _, mu, settings, *_, times, _ = given
+    begin, last = run.flight, times.shape[0]
+    scales = run.last.decision.scales
+    flow = flow_of(system, mu, settings, run.modes, scales, times, begin.state)
+    after, accept = one_pass(flow, settings, run.allowed, times, begin)
+    accept = accept & flies
+    flight = selected(flies, after, begin)
+    samples = put(
+        run.table.samples, packed(flight.state)[:, 0], jnp.where(flies, begin.sample, last)
     )
-    full = (run.events.count >= max_events) & (found.kind != KIND_CODE["none"])
-    events = _written(run.events, flight, found)
-    status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
-    # after a failure the flight is over at once
-    over = status != MOTION_CODE["ok"]
-    ready = flight._replace(state=found.state, event=jnp.zeros_like(flight.event), stuck=over)
-    flown = fly(system, mu, settings, found.modes, found.scales, times, ready)
-    stuck = flown.stuck & ~over
-    status = jnp.where(
-        stuck, why_stuck(system, flown, jax.lax.stop_gradient(times)), status
-    ).astype(jnp.int32)
-    return _Run(flown, found.modes, found.scales, found.struck, events, status)
+    plan, still = run.plan, jnp.asarray(False)
+    if plan is not None:
+        size = plan.rows.happens.shape[0] - 1
+        row = run.last._replace(accepted=accept, aim=begin.aim)
+        rows = jax.tree.map(lambda all_, x: put(all_, x, plan.used), plan.rows, row)
+        used = plan.used + accept.astype(jnp.int32)
+        plan = Plan(rows, jnp.minimum(used, size), plan.lost | (used > size))
+    return run._replace(
+        flight=flight,
+        waits=run.waits | (flies & jnp.any(flight.event)),
+        last=run.last._replace(happens=jnp.where(accept, still, run.last.happens)),
+        table=run.table._replace(samples=samples),
+        plan=plan,
+    )
 
 
-def why_stuck(system: System, flight: Flight, times: jax.Array) -> jax.Array:
+def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -> jax.Array:
     """The status of a motion whose steps vanish or are too many."""
-    state = jax.lax.stop_gradient(flight.state)
+    state, q0, times = jax.lax.stop_gradient((flight.state, q0, times))
     # where steps vanish before something that is not a number, it is a few roundings ahead
     ahead = AHEAD * (times[-1] - times[0])
-    q, t = state.q + ahead * state.v, state.t + ahead
+    q, t = system.body.moved(state.q, ahead * state.v), state.t + ahead
     force = user_force(system, q, state.v, t)
     rates = free_acceleration(system, q, state.v, force, mass_at(system, q))
     parts = (state.q, state.v, rates, gaps(system, q, t))
@@ -118,7 +351,7 @@ def why_stuck(system: System, flight: Flight, times: jax.Array) -> jax.Array:
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
     if not callable(system.mass):
         return code
-    begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (flight.samples.q[0], state.q))
+    begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))
     if begin.ndim == 1:
         least = jnp.min(now / begin)
     else:
@@ -127,18 +360,111 @@ def why_stuck(system: System, flight: Flight, times: jax.Array) -> jax.Array:
     return jnp.where(~(least > _SINGULAR), MOTION_CODE["singular_mass"], code)
 
 
-def _written(events: Events, flight: Flight, found: Outcome) -> Events:
-    values = {
-        "time": flight.state.t,
-        "kind": found.kind,
-        "contacts": found.contacts,
-        "q": flight.state.q,
-        "velocity_before": flight.state.v,
-        "velocity_after": found.jump.v,
-        "impulse": found.jump.impulse,
-        "tangential_impulse": found.jump.tangential,
-        "energy": found.jump.energy,
-        "status": found.jump.code,
-        "accumulation_end": found.accumulation_end,
-    }
-    return with_row(events, found.kind != KIND_CODE["none"], values)
+# ------------------------------------------------------------------------------ the record
+
+
+def _width(given: Given) -> int:
+    """Numbers of an event."""
+    return 2 + given.q0.size + 2 * given.v0.size + 4 * given.contacts
+
+
+def _numbers(before: State, after: After) -> jax.Array:
+    """Those of one event, in a row."""
+    jump = after.jump
+    parts = (before.t, before.q, before.v, jump.v, jump.impulse, jump.tangential, jump.energy)
+    return ravel_pytree((parts, after.accumulation_end))[0]
+
+
+def _events(table: Table, count: jax.Array, given: Given) -> Events:
+    """The record of events; NaN or 0 in rows that are not used."""
+    there = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
+    marks = jnp.where(there[:, None], table.marks[:-1], 0)
+    rows = jnp.where(there[:, None], table.events[:-1], jnp.nan)
+    n, m = given.v0.size, given.contacts
+    sizes = np.cumsum([1, given.q0.size, n, n, m, m, 2 * m])
+    time, q, before, after, impulse, side, energy, end = jnp.split(rows, sizes, axis=1)
+    return Events(
+        count=count,
+        time=time[:, 0],
+        kind=marks[:, 0],
+        contacts=marks[:, 2:] > 0,
+        q=q,
+        velocity_before=before,
+        velocity_after=after,
+        impulse=impulse,
+        tangential_impulse=side,
+        energy=energy.reshape(-1, 2, m),
+        status=marks[:, 1],
+        accumulation_end=end[:, 0],
+    )
+
+
+# ------------------------------------------------------------------------------ once more
+
+
+def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Array]:
+    """Samples and events of a run, as a smooth function of `given`."""
+    system, law, mu, settings, *_, times, _ = given
+    start, m = given.start, given.contacts
+    width = _width(given)
+    size = plan.rows.happens.shape[0] - 1
+    rows = jax.tree.map(lambda x: x[:size], plan.rows)
+    index = jnp.arange(size, dtype=jnp.int32)
+    # what an event without a step leaves is in the row after the last step
+    there = index <= plan.used
+    happens, accepted = rows.happens & there, rows.accepted & (index < plan.used)
+    sampled = accepted & rows.aim.target[:, -1, 0]
+    written = rows.written & happens
+    reached = jnp.cumsum(sampled, dtype=jnp.int32) + (~sampled).astype(jnp.int32)  # before the step
+
+    def event(y: Any, row: Row) -> tuple[Any, jax.Array]:
+        state, struck = y
+        after = resolved_again(system, law, mu, settings, state, struck, row.decision)
+        new = selected(row.happens, (after.state, after.struck), y)
+        return new, jnp.where(row.happens, _numbers(state, after), 0.0)
+
+    def step(state: State, row: Row, sample: jax.Array) -> State:
+        aim = row.aim._replace(modes=row.aim.modes.astype(jnp.int32))
+        active, stick, sign = aim.modes[:, 0].reshape(3, m)
+        modes = Modes(active > 0, stick > 0, sign.astype(state.q.dtype))
+        flow = flow_of(system, mu, settings, modes, row.decision.scales, times, state)
+        flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
+        return selected(row.accepted, step_again(flow, aim, state), state)
+
+    def one(y: Any, x: Any) -> tuple[Any, Any]:
+        row, sample = x
+        nothing = jnp.zeros(width, start.q.dtype)
+        y, numbers = jax.lax.cond(any_lane(row.happens), event, lambda y, row: (y, nothing), y, row)
+        state = jax.lax.cond(
+            any_lane(row.accepted), step, lambda state, *_: state, y[0], row, sample
+        )
+        return (state, y[1]), (packed(state)[:, 0], numbers)
+
+    def block(y: Any, xs: Any) -> tuple[Any, Any]:
+        def walk(y: Any) -> tuple[Any, Any]:
+            return jax.lax.scan(jax.checkpoint(one), y, xs)
+
+        def stay(y: Any) -> tuple[Any, Any]:
+            nothing = jnp.zeros((BLOCK, len(packed(start)) + width), start.q.dtype)
+            return y, (nothing[:, width:], nothing[:, :width])
+
+        some = xs[0].happens | xs[0].accepted
+        return jax.lax.cond(any_lane(jnp.any(some)), walk, stay, y)
+
+    xs = rows._replace(happens=happens, accepted=accepted), reached
+    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
+    # rows beyond those that there was room for: no number at all
+    lost = jnp.where(plan.lost, jnp.nan, 1.0)
+    begin = jax.tree.map(lambda x: x * lost, start), jnp.full((2, m), -jnp.inf, start.q.dtype)
+    states, numbers = jax.lax.scan(jax.checkpoint(block), begin, blocks)[1]
+
+    def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
+        """The values in the first rows with a flag."""
+        seen, wanted = jnp.cumsum(flags, dtype=jnp.int32), jnp.arange(count, dtype=jnp.int32)
+        row = jnp.minimum(jnp.searchsorted(seen, wanted + 1), size - 1)
+        found = values.reshape(size, -1)[row]
+        return jnp.where((wanted < seen[-1])[:, None], found, 0.0)
+
+    samples = at(sampled, states, times.shape[0])
+    first = packed(begin[0])[:, 0][None]
+    return jnp.concatenate([first, samples]), at(written, numbers, max_events + 1)

@@ -2,7 +2,6 @@
 
 import abc
 import dataclasses
-import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +10,13 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jimpact.events import stepper
-from jimpact.motion.dynamics import definite, free_acceleration, mass_at, user_force
+from jimpact.motion.dynamics import (
+    definite,
+    free_acceleration,
+    kinematics,
+    mass_at,
+    user_force,
+)
 from jimpact.motion.persistent_contact import (
     REST_ACCELERATION,
     Contacts,
@@ -30,6 +35,9 @@ ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is round
 # the steps of a body that rests on a moving base are those of the base's motion only.
 LEDGER = 0.01
 FORGET = 0.5  # of the last free step, that shorter ones leave of it each
+# Steps at least that the duration is cut into where loads or a base may depend on time, each seen
+# at 12 instants: a pulse shorter than about a 200th of the duration may be missed.
+LOOKS = 64
 
 
 class State(NamedTuple):
@@ -65,7 +73,7 @@ class Scales(NamedTuple):
 
 
 class Course(NamedTuple):
-    """A whole motion: states at the sampled times, events, number of steps, status."""
+    """A whole motion: states at the sampled times (NaN: not reached), events, steps, status."""
 
     samples: State
     events: Events
@@ -98,11 +106,13 @@ class MotionFlow(eqx.Module):
     system: System
     rounding: jax.Array  # (k,)
     sample: jax.Array  # time of the next sample ()
-    errors: jax.Array  # (rows, 1) that a step may make
+    rtol: float
+    sizes: jax.Array  # (rows, 1): a step may make errors of `rtol` of them
     like: State  # of its shapes
+    longest: jax.Array  # step ()
 
     near = 0.0
-    longest = math.inf  # no rate is large beside the others
+    spare = 0  # rows beside those of the state, which only say how long steps may be
 
     @property
     def taking_part(self) -> int:
@@ -111,17 +121,17 @@ class MotionFlow(eqx.Module):
 
     @property
     def tolerance(self) -> jax.Array:
-        """One `allowance`."""
-        return jnp.ones((1, 1), self.errors.dtype)
+        """`rtol`."""
+        return jnp.full((1, 1), self.rtol, self.sizes.dtype)
 
     def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Errors that a step may make in each row (rows, 1)."""
-        return self.errors
+        """Errors that a step may make in each row (rows, 1), in tolerances."""
+        return self.sizes
 
     @property
     def snap(self) -> jax.Array:
         """Margins are in units of their rounding."""
-        return jnp.ones((1, 1), self.errors.dtype)
+        return jnp.ones((1, 1), self.sizes.dtype)
 
     @abc.abstractmethod
     def constants(self, modes: jax.Array) -> Any:
@@ -192,10 +202,15 @@ class MechanicalFlow(MotionFlow):
 
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
+    @property
+    def spare(self) -> int:  # type: ignore[override]
+        """The gaps by integration: steps follow them where the base moves faster than the body."""
+        return self.like.contact_work.shape[1]
+
     def constants(self, modes: jax.Array) -> Modes:
         """The modes, of each contact."""
         active, stick, sign = modes[:, 0].reshape(3, -1)
-        return Modes(active > 0, stick > 0, sign.astype(self.errors.dtype))
+        return Modes(active > 0, stick > 0, sign.astype(self.sizes.dtype))
 
     def _contacts(self, at: State) -> Contacts:
         return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
@@ -210,9 +225,10 @@ class MechanicalFlow(MotionFlow):
         per_contact = jnp.stack([jnp.zeros_like(friction), friction])
         still = jnp.zeros_like(at.contact)
         one = jnp.ones_like(at.t)
-        return self.regular(
-            State(at.v, found.acceleration, one, power, base, per_contact, still), at
-        )
+        moves = self.system.body.rates(at.q, at.v)
+        rates = State(moves, found.acceleration, one, power, base, per_contact, still)
+        parting = jnp.where(const.active, 0.0, given.normal.rate)
+        return jnp.concatenate([self.regular(rates, at), parting[:, None]])
 
     def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """What must stay positive."""
@@ -229,7 +245,7 @@ class MechanicalFlow(MotionFlow):
             rate = jnp.concatenate([rate, given.tangent.rate])
         p = constraint_impulse(given, self.mu, const, jnp.stack([value, rate], axis=1))
         move = given.moved @ p
-        return at._replace(q=at.q + move[:, 0], v=at.v + move[:, 1])
+        return at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
 
 
 def packed(state: State) -> jax.Array:
@@ -238,8 +254,9 @@ def packed(state: State) -> jax.Array:
 
 
 def unpacked(like: State, y: jax.Array) -> State:
-    """The state of rows (.., 1)."""
-    return ravel_pytree(like)[1](y[:, 0])
+    """The state of rows (.., 1); `spare` ones come last."""
+    flat, back = ravel_pytree(like)
+    return back(y[: len(flat), 0])
 
 
 def encoded(modes: Modes) -> jax.Array:
@@ -252,96 +269,153 @@ class Flight(NamedTuple):
     """A flight under way."""
 
     state: State
-    plan: stepper.Carry  # the step to try
+    aim: stepper.Step  # the step to try
+    plan: jax.Array  # and what the stepper expects of it
     free: jax.Array  # length of steps that nothing shortens [s]
     event: jax.Array  # (k,) one-hot: what has happened
     sample: jax.Array  # number of samples reached
-    samples: State
     steps: jax.Array
     stuck: jax.Array
 
 
-def first_flight(state: State, rows: jax.Array, events: int, times: jax.Array) -> Flight:
-    """A flight at the beginning: `rows` of modes, so many `events`, the first sample written."""
-    dtype, samples = state.q.dtype, times.shape[0]
-    unknown = jax.tree.map(lambda x: jnp.full((samples, *x.shape), jnp.nan, x.dtype), state)
-    first = jax.tree.map(lambda all_, x: all_.at[0].set(x), unknown, state)
-    step = jax.lax.stop_gradient(times[1] - times[0])
+def put(rows: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
+    """The table with a row written."""
+    return jax.lax.dynamic_update_index_in_dim(rows, value.astype(rows.dtype), index, 0)
+
+
+def no_samples(start: State, targets: jax.Array) -> jax.Array:
+    """A table of the states at the samples, and a last row for what is not kept."""
+    row = packed(start)[:, 0]
+    return jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype).at[0].set(row)
+
+
+def sampled_states(samples: jax.Array, start: State, reached: jax.Array) -> State:
+    """States of a table, NaN where they were not reached."""
+    there = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
+    rows = jnp.where(there[:, None], samples[:-1], jnp.nan)
+    return jax.vmap(lambda row: unpacked(start, row[:, None]))(rows)
+
+
+def longest_step(system: System, targets: jax.Array) -> jax.Array:
+    """How long a step may be () [s]: a bound only where something may depend on time."""
+    if system.base is None and system.force is None:
+        return jnp.full((), jnp.inf, targets.dtype)
+    return jax.lax.stop_gradient(targets[-1] - targets[0]) / LOOKS
+
+
+def first_flight(
+    system: System, state: State, rows: jax.Array, events: int, targets: jax.Array
+) -> Flight:
+    """A flight at the beginning: `rows` of modes, so many `events`; one sample is reached."""
+    step = jnp.minimum(
+        jax.lax.stop_gradient(targets[1] - targets[0]), longest_step(system, targets)
+    )
     clock = jnp.stack([0 * step, step, 0 * step, 0 * step])[:, None]
     aim = stepper.Step(rows, jnp.zeros((events + 1, 1), bool), clock)
-    plan = stepper.Carry(packed(state), aim, jnp.zeros((4, 1), dtype))
     one, none, no = jnp.int32(1), jnp.int32(0), jnp.asarray(False)
-    return Flight(state, plan, step, jnp.zeros(events, bool), one, first, none, no)
+    event = jnp.zeros(events, bool)
+    return Flight(state, aim, jnp.zeros((4, 1), step.dtype), step, event, one, none, no)
+
+
+def next_sample(targets: jax.Array, reached: jax.Array) -> jax.Array:
+    """The time of the sample after so many."""
+    return targets[jnp.minimum(reached, targets.shape[0] - 1)]
 
 
 def toward_sample(flight: Flight, targets: jax.Array, h: jax.Array) -> Flight:
     """The next step, of length h, lands on the sample if it reaches it."""
-    _, step, plan = flight.plan
-    left = targets[jnp.minimum(flight.sample, targets.shape[0] - 1)] - flight.state.t
+    left = next_sample(targets, flight.sample) - flight.state.t
     lands = left <= h
-    target = jnp.zeros_like(step.target).at[-1].set(lands)
+    target = jnp.zeros_like(flight.aim.target).at[-1].set(lands)
     clock = jnp.stack([0 * h, h, 0 * h, lands.astype(h.dtype)])[:, None]
-    plan = plan.at[0, 0].set(jnp.where(lands, left, h)).at[1].set(0.0)
-    new = stepper.Carry(packed(flight.state), step._replace(target=target, clock=clock), plan)
-    return flight._replace(plan=jax.lax.stop_gradient(new))
+    plan = flight.plan.at[0, 0].set(jnp.where(lands, left, h)).at[1].set(0.0)
+    aim = flight.aim._replace(target=target, clock=clock)
+    aim, plan = jax.lax.stop_gradient((aim, plan))
+    return flight._replace(aim=aim, plan=plan)
+
+
+def selected(which: jax.Array, new: Any, old: Any) -> Any:
+    """Leaf by leaf, `new` where `which`."""
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
 
 
 def one_pass(
     flow: MotionFlow, settings: Settings, allowed: jax.Array, targets: jax.Array, flight: Flight
-) -> Flight:
-    """One pass of the stepper; `allowed` are the errors of all rows but q and v."""
-    state, before, last = flight.state, flight.plan, targets.shape[0] - 1
-    # sizes of q and v within the step, for those that cross 0
-    push = user_force(flow.system, state.q, state.v, state.t)
-    mass = mass_at(flow.system, state.q)
-    rates = free_acceleration(flow.system, state.q, state.v, push, mass)
-    change = before.plan[0, 0] * jnp.abs(jnp.concatenate([state.v, rates]))
-    size = jnp.abs(jnp.concatenate([state.q, state.v])) + change
-    errors = jnp.concatenate([settings.atol + settings.rtol * size, allowed])
+) -> tuple[Flight, jax.Array]:
+    """One pass of the stepper, and whether its step is accepted.
+
+    `allowed` are the errors of all rows of the state but q and v.
+    """
+    state = flight.state
     flow = dataclasses.replace(
         flow,
-        sample=targets[jnp.minimum(flight.sample, last)],
-        errors=jax.lax.stop_gradient(errors)[:, None],
+        sample=next_sample(targets, flight.sample),
+        sizes=jax.lax.stop_gradient(_errors(flow, settings, allowed, flight) / flow.rtol)[:, None],
     )
     # passes are counted here: their number does not lower the tolerance
-    carry = before._replace(y=packed(state), plan=before.plan.at[2:].set(0.0))
+    carry = stepper.Carry(_rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0))
     after, accept = stepper.advance(flow, carry, 2)
     accept = accept[0, 0]
-    new = unpacked(flow.like, after.y)
-    new = flow.projected(flow.constants(after.step.modes), new)
-    landed = before.step.target[:, 0] & accept
+    landed = flight.aim.target[:, 0] & accept
     sampled = landed[-1]
-    new = new._replace(t=jnp.where(sampled, flow.sample, new.t))
-    state = jax.tree.map(lambda a, b: jnp.where(accept, a, b), new, state)
-    row = (jnp.arange(last + 1, dtype=flight.sample.dtype) == flight.sample) & sampled
-    samples = jax.tree.map(
-        lambda all_, x: jnp.where(row.reshape((-1,) + (1,) * x.ndim), x[None], all_),
-        flight.samples,
-        state,
-    )
+    state = selected(accept, _reached(flow, flight.aim, after.y), state)
     steps = flight.steps + 1
-    span = jnp.abs(targets[0]) + jnp.abs(targets[-1])
-    vanishes = ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * span)
+    vanishes = ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * _span(targets))
     # what an event or a sample shortens says nothing of the steps after it
-    tried, lands = before.step.clock[1, 0], before.step.clock[3, 0] > 0
+    tried, lands = flight.aim.clock[1, 0], flight.aim.clock[3, 0] > 0
     proposed = after.step.clock[1, 0]
     longer = jnp.where(tried < flight.free, jnp.maximum(proposed, FORGET * flight.free), proposed)
     free = jnp.where(accept & ~lands, jax.lax.stop_gradient(longer), flight.free)
     moved = flight._replace(
         state=state,
         free=free,
-        plan=jax.lax.stop_gradient(after)._replace(y=before.y),
+        aim=jax.lax.stop_gradient(after.step),
+        plan=jax.lax.stop_gradient(after.plan),
         event=landed[:-1],
         sample=flight.sample + sampled.astype(flight.sample.dtype),
-        samples=samples,
         steps=steps,
         stuck=vanishes | (steps >= settings.max_steps),
     )
     aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
     plain = sampled | (accept & in_time)
-    plan = jax.tree.map(lambda a, b: jnp.where(plain, a, b), aimed.plan, moved.plan)
-    return moved._replace(plan=plan)
+    aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
+    return moved._replace(aim=aim, plan=plan), accept
+
+
+def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:
+    """The state after an accepted step, as a smooth function of the flow and the state."""
+    return _reached(flow, aim, stepper.step_again(flow, aim, _rows(flow, state)))
+
+
+def _rows(flow: MotionFlow, state: State) -> jax.Array:
+    return jnp.pad(packed(state), ((0, flow.spare), (0, 0)))
+
+
+def _reached(flow: MotionFlow, aim: stepper.Step, y: jax.Array) -> State:
+    """The state of rows at the end of a step; at a sample with its time, to the last digit."""
+    new = flow.projected(flow.constants(aim.modes), unpacked(flow.like, y))
+    return new._replace(t=jnp.where(aim.target[-1, 0], flow.sample, new.t))
+
+
+def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Flight) -> jax.Array:
+    """Errors (rows,) that a step may make, by the sizes within it of q and v (they cross 0)."""
+    system, state, h = flow.system, flight.state, flight.plan[0, 0]
+    push = user_force(system, state.q, state.v, state.t)
+    rates = free_acceleration(system, state.q, state.v, push, mass_at(system, state.q))
+    of_q = jnp.abs(state.q) + h * jnp.abs(system.body.rates(state.q, state.v))
+    of_v = jnp.abs(state.v) + h * jnp.abs(rates)
+    errors = [settings.atol + settings.rtol * jnp.concatenate([of_q, of_v]), allowed]
+    if flow.spare:
+        of_u = of_q if system.body.coordinates is None else h * jnp.abs(state.v)
+        seen = kinematics(system, state.q, state.v, state.t)
+        of_gap = jnp.abs(seen.value) + h * jnp.abs(seen.rate) + jnp.abs(seen.gradient).T @ of_u
+        errors.append(settings.atol + settings.rtol * of_gap)
+    return jnp.concatenate(errors)
+
+
+def _span(targets: jax.Array) -> jax.Array:
+    return jnp.abs(targets[0]) + jnp.abs(targets[-1])
 
 
 def allowed_errors(
@@ -353,48 +427,38 @@ def allowed_errors(
     both = jnp.stack([free, at.v], axis=1)
     pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)
     of_q, of_v = (settings.atol + settings.rtol * jnp.abs(x) for x in (at.q, at.v))
+    if system.body.coordinates is not None:  # of displacements
+        of_q = jnp.broadcast_to(jnp.max(of_q), at.v.shape)
     ledger = share * (of_q @ pushed[:, 0] + of_v @ pushed[:, 1])
-    rows = packed(at).shape[0] - 2 * at.q.shape[0]
+    rows = packed(at).shape[0] - at.q.shape[0] - at.v.shape[0]
     # at least a number: nothing moves and nothing is pulled
     return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)  # time: none
 
 
 def roundings(settings: Settings, margins: jax.Array, targets: jax.Array) -> jax.Array:
     """Roundings of these margins and of the time to the next sample (k,)."""
-    span = jnp.abs(targets[0]) + jnp.abs(targets[-1])
+    span = _span(targets)
     least = float(jnp.finfo(span.dtype).tiny) ** 0.5
     every = jnp.append(margins, SMALLEST_STEP * span)
     return jax.lax.stop_gradient(jnp.maximum(every, least))
 
 
-def fly(
+def flow_of(
     system: System,
     mu: jax.Array | None,
     settings: Settings,
     modes: Modes,
     scales: Scales,
     targets: jax.Array,
-    begin: Flight,
-) -> Flight:
-    """Integrate until something watched crosses zero, or to the last of `targets` (S,)."""
+    state: State,
+) -> MechanicalFlow:
+    """The flow with these modes; `one_pass` sets the time of the next sample, and the errors."""
     slack = REST_ACCELERATION * scales.acceleration
     normal = jnp.where(modes.active, slack, ROUNDING_GAP * settings.closed_below)
     side = jnp.where(modes.stick, slack, REST_ACCELERATION * scales.speed)
     margins = jnp.concatenate([normal, side]) if settings.friction else normal
-    state = begin.state
-    allowed = jax.lax.stop_gradient(allowed_errors(system, settings, state))
-    blank = jnp.zeros((packed(state).shape[0], 1), state.q.dtype)
-    flow = MechanicalFlow(
-        system, roundings(settings, margins, targets), state.t, blank, state, mu, scales
-    )
-
-    def going(flight: Flight) -> jax.Array:
-        return ~jnp.any(flight.event) & (flight.sample < targets.shape[0]) & ~flight.stuck
-
-    plan = begin.plan
-    modes_now = begin._replace(plan=plan._replace(step=plan.step._replace(modes=encoded(modes))))
-    return jax.lax.while_loop(
-        going,
-        lambda flight: one_pass(flow, settings, allowed, targets, flight),
-        toward_sample(modes_now, targets, begin.free),
+    rounded, longest = roundings(settings, margins, targets), longest_step(system, targets)
+    blank = jnp.zeros((1, 1), state.q.dtype)
+    return MechanicalFlow(
+        system, rounded, state.t, settings.rtol, blank, state, longest, mu, scales
     )

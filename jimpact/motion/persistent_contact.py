@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.events.friction_flow import regularized
 from jimpact.motion.dynamics import (
     Kinematics,
     base_velocity,
@@ -25,9 +26,10 @@ from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.linear import solve_definite
 from jimpact.status import CODE
 
-# singular values below this share of the largest are rounding: redundant sticking contacts
-_REDUNDANT = 1e-12
-_LEAST_SHARE = 1e-6  # of the pressing force: keeps the weights of contacts without load regular
+# Beside a matrix with unit diagonal: it decides where that is singular (redundant sticking contacts)
+# and refinements remove what it changes elsewhere. Ten times less, and rounding decides, too.
+_RIDGE, _REFINEMENTS = 1e-7, 3
+_LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
 REST_ACCELERATION = 1e-11
@@ -94,21 +96,40 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
         normal = solve_definite(k, jnp.where(modes.active, -given.approach, 0.0))
         return Forces(normal, None, given.free + given.moved @ normal)
     held = jnp.concatenate([modes.active, modes.active & modes.stick])
-    eye = jnp.eye(2 * m, dtype=given.free.dtype)
     sliding = modes.active & ~modes.stick
     drag = jnp.where(sliding, modes.sign * mu, 0.0)
-    coupled = eye.at[jnp.arange(m) + m, jnp.arange(m)].set(drag)
-    k = jnp.where(held[:, None], given.delassus, coupled)
-    # columns of open contacts multiply forces that are 0
-    right = jnp.where(held, -given.approach, 0.0)
-    first = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right
-    # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
-    # `solvers.friction`: they break loose together
-    press = mu * jnp.maximum(first[:m], 0.0)
-    share = jnp.maximum(press / jnp.maximum(jnp.max(press), jnp.finfo(k.dtype).tiny), _LEAST_SHARE)
-    weight = jax.lax.stop_gradient(jnp.concatenate([jnp.ones(m, k.dtype), jnp.sqrt(share)]))
-    both = weight * (jnp.linalg.pinv(k * weight[None, :], rtol=_REDUNDANT) @ right)
+    # what slides goes with its normal force
+    w = given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag)
+    right = -given.approach
+    none = jnp.zeros(m, w.dtype)
+
+    def shared(_: int, known: jax.Array) -> jax.Array:
+        # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
+        # `solvers.friction`: they break loose together
+        press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
+        top = jnp.max(press)
+        share = jnp.where(top > 0, press / jnp.where(top > 0, top, 1.0), 1.0)
+        weight = jnp.concatenate([none + 1, jnp.maximum(share, _LEAST_SHARE)])
+        return _least(w, right[:, None], held, weight)[:, 0]
+
+    both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
+    both = both.at[m:].add(-drag * both[:m])
     return Forces(both[:m], both[m:], given.free + given.moved @ both)
+
+
+def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -> jax.Array:
+    """`w x = right` (k, columns) on the rows that are held; 0 elsewhere.
+
+    Where that has many solutions, the one of least `sum w_jj x_j^2 / weight_j`.
+    """
+    scale = jnp.where(held, 1 / jnp.sqrt(jnp.diagonal(w)), 1.0)
+    scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
+    both = held[:, None] & held[None, :]
+    k = jnp.where(both, w * scale[:, None] * scale * weight, jnp.eye(len(held), dtype=w.dtype))
+    right = jnp.where(held[:, None], right * scale[:, None], 0.0)
+    ridge = jnp.where(held, _RIDGE, 0.0)
+    z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)
+    return (scale * weight)[:, None] * z
 
 
 def constraint_impulse(
@@ -124,13 +145,15 @@ def constraint_impulse(
     if friction:
         held = jnp.concatenate([modes.active, modes.active & modes.stick])
     held = held[: rates.shape[0]]
-    both = held[:, None] & held[None, :]
     size = held.shape[0]
-    k = jnp.where(both, given.delassus[:size, :size], jnp.eye(size, dtype=rates.dtype))
-    right = jnp.where(held if rates.ndim == 1 else held[:, None], -rates, 0.0)
-    p = jnp.linalg.pinv(k, rtol=_REDUNDANT) @ right if friction else solve_definite(k, right)
+    w, columns = given.delassus[:size, :size], rates.reshape(size, -1)
+    if friction:
+        p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
+    else:
+        k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(size, dtype=rates.dtype))
+        p = solve_definite(k, jnp.where(held[:, None], -columns, 0.0))
     rest = given.delassus.shape[0] - size
-    return jnp.pad(p, ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
+    return jnp.pad(p.reshape(rates.shape), ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
 
 
 def powers(

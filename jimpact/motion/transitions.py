@@ -74,15 +74,14 @@ def impact_jump(
     """
     m = closed.shape[0]
     scene = scene_at(system, state.q, state.v, t, closed)
-    carried = base_velocity(system, t)
-    carried = jnp.zeros_like(state.v) if carried is None else carried
+    carried = _carried(system, state.v, t)
     relative = state.v - carried
     out = impact(law, scene, relative, noise)
     mean = 0.5 * (out.velocity + relative)
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
     tangential, side = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
-    if scene.tangents is not None:
+    if scene.tangents is not None and scene.tangents.shape[1] == m:  # in space: no friction here
         tangential = out.tangential_impulse
         side = (scene.tangents.T @ mean) * tangential
         push = push + scene.tangents @ tangential
@@ -90,17 +89,35 @@ def impact_jump(
     return Jump(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
 
 
-class Outcome(NamedTuple):
-    """State, modes and what is to be written down after an event."""
+class Decision(NamedTuple):
+    """What is decided at an event: with it the state after it is a smooth function."""
+
+    strikes: jax.Array  # () whether there is an impact
+    closed: jax.Array  # (m,) contacts that take part in it
+    took: jax.Array  # (m,) those that it gave an impulse
+    held: jax.Array  # (m,) those brought to rest
+    stick: jax.Array  # (m,) tangentially, too
+    ends: jax.Array  # (m,) accumulations that are passed
+    scales: Scales
+
+
+class After(NamedTuple):
+    """The smooth part of an event."""
 
     state: State
-    modes: Modes
-    scales: Scales
     struck: jax.Array  # (2, m) times of the last two impacts of each contact
     jump: Jump
+    accumulation_end: jax.Array
+
+
+class Outcome(NamedTuple):
+    """What happens at an event, and how it goes on."""
+
+    after: After
+    decision: Decision
+    modes: Modes
     kind: jax.Array
     contacts: jax.Array  # (m,)
-    accumulation_end: jax.Array
     status: jax.Array
 
 
@@ -124,15 +141,10 @@ def resolve(
     m, t = before.active.shape[0], state.t
     given = contacts_at(system, state.q, state.v, t, settings.friction)
     closed = given.normal.value <= settings.closed_below
-    scales = jax.lax.stop_gradient(_grown(system, scales, given, t, state))
-    rounding = ROUNDINGS * float(jnp.finfo(t.dtype).eps) * jnp.abs(settings.duration)
-    rest = jax.lax.stop_gradient(REST_SPEED * scales.speed + rounding * scales.acceleration)
+    scales = _grown(system, scales, given, t, state)
+    rest = _rest(settings, scales)
     strikes = jnp.any(closed & (given.normal.rate < -rest))
-    jump = jax.lax.cond(
-        strikes,
-        lambda: impact_jump(system, law, t, state, closed, rest),
-        lambda: no_jump(state, m),
-    )
+    jump = _struck(system, law, settings, state, strikes, closed, scales)
     given = contacts_at(system, state.q, jump.v, t, settings.friction)
     gamma = given.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
@@ -143,39 +155,85 @@ def resolve(
     tight = closed & (jnp.abs(gamma) <= rest)
     slack = REST_ACCELERATION * scales.acceleration
     pressed, resting = pressed_together(given, slow, slack)
-    held = tight | (slow & pressed)
-    carried = base_velocity(system, t)
-    carried = jnp.zeros_like(jump.v) if carried is None else carried
-    jump = _brought_to_rest(given, mu, held, slowly, carried, jump)
+    held, stick = tight | (slow & pressed), jnp.zeros(m, bool)
+    if given.tangent is not None:
+        stick = jnp.abs(given.tangent.rate) <= slowly
+    jump = _brought_to_rest(system, given, mu, held, stick, t, jump)
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strikes
     if mu is None:
         active = pressed | (tight & resting & ~released)
         choice = Choice(no_modes(m, gamma.dtype)._replace(active=active), jnp.asarray(True))
     else:
-        choice = _with_friction(given, mu, before, held, released, jump.v - carried, rest, slack)
+        relative = jump.v - _carried(system, state.v, t)
+        choice = _with_friction(given, mu, before, held, released, relative, rest, slack)
     # a contact accumulates if it was brought to rest from more than rounding
     ends = held & ~tight & strikes
     fails = jnp.asarray(FAILS)[jump.code]
     status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
     status = jnp.where(fails, MOTION_CODE["law_failed"], status)
     took = jnp.where(strikes, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
+    decision = Decision(strikes, closed, took & strikes, held, stick, ends, scales)
+    after = _after(decision, state, struck, jump)
+    kind = _kind(strikes, jnp.any(ends), released, fired, m)
+    return Outcome(after, decision, choice.modes, kind, took, status)
+
+
+def resolved_again(
+    system: System,
+    law: Law,
+    mu: jax.Array | None,
+    settings: Settings,
+    state: State,
+    struck: jax.Array,
+    decision: Decision,
+) -> After:
+    """What `resolve` does to the state, as a smooth function: all is decided already."""
+    t, (strikes, closed, _, held, stick, _, scales) = state.t, decision
+    jump = _struck(system, law, settings, state, strikes, closed, scales)
+    given = contacts_at(system, state.q, jump.v, t, settings.friction)
+    jump = _brought_to_rest(system, given, mu, held, stick, t, jump)
+    return _after(decision, state, struck, jump)
+
+
+def _rest(settings: Settings, scales: Scales) -> jax.Array:
+    """Gap velocities () that are rounding."""
+    duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
+    rounding = ROUNDINGS * float(jnp.finfo(duration.dtype).eps) * duration
+    return REST_SPEED * scales.speed + rounding * scales.acceleration
+
+
+def _struck(
+    system: System,
+    law: Law,
+    settings: Settings,
+    state: State,
+    strikes: jax.Array,
+    closed: jax.Array,
+    scales: Scales,
+) -> Jump:
+    return jax.lax.cond(
+        strikes,
+        lambda: impact_jump(system, law, state.t, state, closed, _rest(settings, scales)),
+        lambda: no_jump(state, closed.shape[0]),
+    )
+
+
+def _after(decision: Decision, state: State, struck: jax.Array, jump: Jump) -> After:
     work = state._replace(
         v=jump.v,
         base_work=state.base_work + jump.base_work,
         contact_work=state.contact_work + jump.energy,
     )
-    return Outcome(
-        work,
-        choice.modes,
-        scales,
-        jnp.where(took & strikes, jnp.stack([jnp.full(m, t), struck[0]]), struck),
-        jump,
-        _kind(strikes, jnp.any(ends), released, fired, m),
-        took,
-        _accumulation_end(t, struck, ends),
-        status,
-    )
+    end = _accumulation_end(state.t, struck, decision.ends)
+    now = jnp.stack([jnp.full_like(struck[0], state.t), struck[0]])
+    return After(work, jnp.where(decision.took, now, struck), jump, end)
+
+
+def _carried(system: System, v: jax.Array, t: jax.Array) -> jax.Array:
+    """Velocity of the base (n,)."""
+    carried = base_velocity(system, t)
+    return jnp.zeros_like(v) if carried is None else carried
 
 
 def _with_friction(
@@ -196,8 +254,7 @@ def _with_friction(
 
 def _grown(system: System, scales: Scales, given: Contacts, t: jax.Array, state: State) -> Scales:
     m = given.normal.rate.shape[0]
-    carried = base_velocity(system, t)
-    seen = state.v if carried is None else state.v - carried
+    seen = state.v - _carried(system, state.v, t)
     energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, seen))
     now = Scales(
         jnp.abs(given.normal.rate).max(),
@@ -208,23 +265,24 @@ def _grown(system: System, scales: Scales, given: Contacts, t: jax.Array, state:
 
 
 def _brought_to_rest(
+    system: System,
     given: Contacts,
     mu: jax.Array | None,
     held: jax.Array,
-    slowly: jax.Array,
-    carried: jax.Array,
+    stick: jax.Array,
+    t: jax.Array,
     jump: Jump,
 ) -> Jump:
-    """Gap velocities of `held` contacts set to 0, and with friction what slides as slowly."""
+    """Gap velocities of `held` contacts set to 0, tangential ones of those that `stick`, too."""
     m = held.shape[0]
-    modes, rates = no_modes(m, jump.v.dtype)._replace(active=held), given.normal.rate
+    modes, rates = no_modes(m, jump.v.dtype)._replace(active=held, stick=stick), given.normal.rate
     if given.tangent is not None:
-        modes = modes._replace(stick=jnp.abs(given.tangent.rate) <= slowly)
         rates = jnp.concatenate([rates, given.tangent.rate])
     p = constraint_impulse(given, mu, modes, rates)
     # work at the mean velocity: half of that before, 0 after
     energy = jnp.pad(0.5 * p * rates, (0, 2 * m - p.shape[0])).reshape(2, m)
     side = jnp.pad(p, (0, 2 * m - p.shape[0]))[m:]
+    carried = _carried(system, jump.v, t)
     return jump._replace(
         v=jump.v + given.moved @ p,
         impulse=jump.impulse + p[:m],

@@ -5,6 +5,7 @@ are not counted. `python tests/benchmarks/first_call.py [repeats]` prints median
 to one impact of three balls by diffrax (Dopri8, an Event at the end).
 """
 
+import math
 import resource
 import statistics
 import subprocess
@@ -18,6 +19,8 @@ TARGETS = {  # times diffrax
     "Jacobian": 2.5,
     "friction": 4.0,
     "fit": 4.0,
+    "motion": 8.0,
+    "motion with friction": 8.0,
 }
 
 
@@ -44,6 +47,9 @@ def measure(row):
     shots = ji.Experiments(pre=[[1.0, 0, 0]], post=[[-0.0605, 0.1049, 0.9978]])
     if row == "another number of balls":
         ji.impact(ji.LZB(0.9), balls, v)
+    ball, rocks = ji.ball_system(), ji.block_system(0.2, 0.6)
+    matrix = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))
+    tilted = [0.0, 0.1 * math.sin(0.15) + 0.3 * math.cos(0.15), 0.15]
     run = diffrax_event.dopri8()
     first = {
         "diffrax": lambda: run(jnp.ones((1, 2)), e[None], 1e-8),
@@ -52,6 +58,10 @@ def measure(row):
         "Jacobian": lambda: jax.jacfwd(lambda e: ji.impact(ji.LZB(e), balls, v).velocity)(e),
         "friction": lambda: ji.impact(ji.LZB(0.9, friction=0.3), block, v).velocity,
         "fit": lambda: ji.fit(ji.LZB(0.9), balls, shots, free=("restitution",)).law.restitution,
+        "motion": lambda: ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0).q,
+        "motion with friction": lambda: (
+            ji.simulate(rocks, matrix, tilted, [0.0] * 3, 4.0, friction=5.0).q
+        ),
     }[row]
     begun = cpu()
     jax.block_until_ready(first())
