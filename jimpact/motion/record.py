@@ -56,8 +56,9 @@ class Events(eqx.Module):
     accumulation_end: jax.Array  # (E,)
 
 
-def no_events(size: int, n: int, m: int, dtype: Any, sides: int | None = None) -> Events:
-    """An empty table of events; so many tangential impulses, m where not said."""
+def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None = None) -> Events:
+    """An empty table of events of m contacts; so many tangential impulses, m where not said."""
+    dtype, n = q.dtype, v.shape[0]
 
     def blank(*shape: int) -> jax.Array:
         return jnp.full((size, *shape), jnp.nan, dtype)
@@ -67,7 +68,7 @@ def no_events(size: int, n: int, m: int, dtype: Any, sides: int | None = None) -
         time=blank(),
         kind=jnp.zeros(size, jnp.int32),
         contacts=jnp.zeros((size, m), bool),
-        q=blank(n),
+        q=blank(q.shape[0]),
         velocity_before=blank(n),
         velocity_after=blank(n),
         impulse=blank(m),

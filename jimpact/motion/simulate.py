@@ -22,7 +22,7 @@ from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.compliant_contact import compliant_motion
-from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
+from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential, seen_from_base
 from jimpact.motion.event_driven import Given, event_driven
 from jimpact.motion.flow import Course, Settings
 from jimpact.motion.record import Motion
@@ -66,7 +66,7 @@ def simulate(
         system: gaps, mass, forces, base.
         law: any impact law.
         q0: (n,) at the start, without penetration.
-        v0: (n,).
+        v0: (n,); of bodies in space `(x', omega)`.
         t_end: [s] > t_start.
         t_start: [s].
         samples: number of equally spaced instants in the record, both ends included.
@@ -250,7 +250,11 @@ def _check_motion(
     """Raise a ValueError for a bad start, end or system."""
     if q.ndim != 1:
         raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
-    check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    many = system.body.coordinates
+    if many is None:
+        check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    else:
+        check_shape("q0", q, (many,), "the coordinates of the body")
     for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
         check_values(name, value)
     check_shape("t_start", start, (), "a time")
@@ -271,12 +275,12 @@ def _check_system(
     end: jax.Array,
     closed_below: float,
 ) -> None:
-    n = q.shape[0]
+    n = v.shape[0]
     mass = jax.eval_shape(partial(mass_at, system), q)
     if mass.shape not in ((n,), (n, n)):
         raise ValueError(
-            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `q0` has {n} "
-            f"coordinates, but has one of shape {mass.shape}."
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
+            f"velocities, but has one of shape {mass.shape}."
         )
     if is_traced((system, q, v, start, end)):
         return
@@ -292,6 +296,12 @@ def _check_system(
                 "Argument `system` must have a finite base motion, but base(t) has value "
                 f"{np.asarray(base)[bad][0]} at t = {looks[bad][0]:g} s."
             )
+    margin = float(system.body.valid(seen_from_base(system, q, start)))
+    if not margin >= 0:
+        raise ValueError(
+            "Argument `q0` must be in the range of the gap function "
+            f"({system.body.range_in_words}), but its margin has value {margin:g}."
+        )
     f = np.asarray(gaps(system, q, start))
     if not (f >= -closed_below).all():
         worst = int(np.argmin(f))

@@ -29,6 +29,7 @@ from jimpact.motion.dynamics import (
     base_velocity,
     free_acceleration,
     gaps,
+    kinematics,
     mass_at,
     seen_from_base,
     solve_mass,
@@ -39,7 +40,7 @@ from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, wit
 from jimpact.motion.system import System
 from jimpact.motion.transitions import FAILS, scene_at
 from jimpact.scene import Scene
-from jimpact.solvers.many_contacts import solve_many
+from jimpact.solvers.many_contacts import Many, solve_many
 from jimpact.solvers.sensitivity import without_derivatives
 from jimpact.status import CODE
 
@@ -52,6 +53,7 @@ SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an im
 # so many roundings at least. A step that misses by more than OFF is told.
 FEW, PILE, ROUNDINGS, OFF = 1e-9, 1e-6, 32, 1e-2
 ITERATIONS = 1000
+MEAN = 4  # tries for the mean velocity that forces depend on; each gains h omega, of spin omega
 APART = 3  # steps: a contact that is struck again before is told
 
 WHY = (
@@ -148,6 +150,15 @@ class _Heap(NamedTuple):
         return jnp.sum(values, axis=-1, keepdims=True)
 
 
+class _Tried(NamedTuple):
+    """One try of a step: velocity at its end, mean velocity, forces taken, impulses."""
+
+    v: jax.Array
+    mean: jax.Array
+    force: jax.Array
+    found: Many
+
+
 class _Progress(NamedTuple):
     state: State
     speed: jax.Array  # the largest that velocities could give a gap so far
@@ -189,18 +200,18 @@ def time_stepping(
     system, law, mu, q0, v0, times = without_derivatives(
         (system, law, mu, q0, v0, times), NotImplementedError(WHY)
     )
-    n, zero, dtype = q0.shape[0], jnp.zeros((), q0.dtype), q0.dtype
+    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
     m = recorded_gaps(system, q0, times[0]).shape[0]
 
     def rates_at(q: jax.Array) -> jax.Array:
-        return _contacts(system, q, times[0], closed_below, mu is not None).rates(q)
+        return _contacts(system, q, times[0], closed_below, mu is not None).rates(v0)
 
     contacts, b = jax.eval_shape(rates_at, q0).shape
     kept = _numbers(system.body) if isinstance(system.body, Discs) else contacts
     rest = jnp.zeros((2, m), dtype)
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     rows = 1 if is_pile(system) else max_events
-    events = no_events(rows, n, m, dtype, sides=m * max(b - 1, 1))
+    events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0))
     status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"])
     penetrates = jnp.any(recorded_gaps(system, q0, times[0]) < -closed_below)
@@ -249,7 +260,8 @@ def _contacts(
         near = system.body.near(at, closed_below)
         near = near if friction else near._replace(directions=near.directions[:, :1])
         return _Heap(near, jnp.pad(1 / mass.reshape(-1, 3), ((0, 1), (0, 0))))
-    gap, normals = gaps(system, q, t), jax.jacfwd(system.body.gap_function)(at).T
+    given = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
+    gap, normals = given.value, given.gradient
     n, m = normals.shape
     directions = normals[:, :, None]
     if friction:
@@ -272,19 +284,24 @@ def _one_step(
     course: _Progress,
     t: jax.Array,
 ) -> _Progress:
-    state, dtype = course.state, course.state.q.dtype
+    state, dtype, body = course.state, course.state.q.dtype, system.body
     middle = t + 0.5 * h
-    q = state.q + 0.5 * h * state.v
+    q = body.moved(state.q, 0.5 * h * state.v)
     close = _contacts(system, q, middle, closed_below, mu is not None)
     carried = base_velocity(system, middle)
-    carried = jnp.zeros_like(q) if carried is None else carried
-    force = user_force(system, q, state.v, middle)
-    free = free_acceleration(system, q, state.v, force, mass_at(system, q))
+    carried = jnp.zeros_like(state.v) if carried is None else carried
+    mass = mass_at(system, q)
+
+    def pushed(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Forces, and the acceleration without contacts, at the velocity v."""
+        force = user_force(system, q, v, middle)
+        return force, free_acceleration(system, q, v, force, mass)
+
     before = close.rates(state.v - carried)
     eps = float(jnp.finfo(dtype).eps)
     speed = jnp.maximum(course.speed, close.fastest(state.v))
     noise = max(_ROUNDING, _ROUNDINGS * eps) * speed
-    slow = noise + SLOW * h * jnp.abs(close.rates(free)[:, 0])
+    slow = noise + SLOW * h * jnp.abs(close.rates(pushed(state.v)[1])[:, 0])
     strikes = close.there & (before[:, 0] < -slow)
     wanted = jnp.zeros_like(before)
     given, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
@@ -301,33 +318,45 @@ def _one_step(
             lambda: _struck(law, scene, state.v - carried, noise, before.shape),
             lambda: (given, code),
         )
-    mu_now = jnp.zeros((), dtype) if mu is None else mu
-    free_rates = close.rates(state.v + h * free - carried) + close.product(given)
-    found = solve_many(
-        close.product,
-        close.diagonal,
-        jnp.where(close.there[:, None], free_rates + wanted, 0.0),
-        mu_now,
-        close.recall(course.memory),
-        course.steepness,
-        max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps),
-        ITERATIONS,
-    )
+    wanted = wanted + close.product(given)
+
+    def solved(_: Any, tried: _Tried) -> _Tried:
+        """The step with the forces at its mean velocity, as far as that is known."""
+        force, free = pushed(tried.mean)
+        rates = close.rates(state.v + h * free - carried) + wanted
+        found = solve_many(
+            close.product,
+            close.diagonal,
+            jnp.where(close.there[:, None], rates, 0.0),
+            jnp.zeros((), dtype) if mu is None else mu,
+            tried.found.impulse,
+            tried.found.steepness,
+            max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps),
+            ITERATIONS,
+        )
+        v = state.v + h * free + close.push(given + found.impulse)
+        return _Tried(v, 0.5 * (state.v + v), force, found)
+
+    begun = Many(close.recall(course.memory), 0 * speed, jnp.int32(0), course.steepness)
+    start = _Tried(state.v, state.v, jnp.zeros_like(state.v), begun)
+    constant = system.force is None and not callable(system.mass) and body.coordinates is None
+    end = jax.lax.fori_loop(0, 1 if constant else MEAN, solved, start)
+    found, v, mean = end.found, end.v, end.mean
     x = given + found.impulse
-    v = state.v + h * free + close.push(x)
-    mean = 0.5 * (state.v + v)
     energy = x * close.rates(mean - carried)
     sides = jnp.sum(energy[:, 1:], axis=1)
     moved = state._replace(
-        q=q + 0.5 * h * v,
+        q=body.moved(q, 0.5 * h * v),
         v=v,
         t=t + h,
-        work=state.work + h * force @ mean,
+        work=state.work + h * end.force @ mean,
         base_work=state.base_work + close.pull(x) @ carried,
         contact_work=state.contact_work + close.seen(jnp.stack([energy[:, 0], sides])),
     )
     fails = jnp.asarray(FAILS)[code]
     status = jnp.where(fails, MOTION_CODE["law_failed"], course.status)
+    inside = body.valid(seen_from_base(system, moved.q, t + h)) >= 0
+    status = jnp.where(inside, status, MOTION_CODE["out_of_range"])
     if isinstance(close, _Heap):
         status = jnp.where(close.near.lost, MOTION_CODE["room"], status)
     finite = jnp.all(jnp.isfinite(v))
