@@ -26,8 +26,8 @@ from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.linear import solve_definite
 from jimpact.status import CODE
 
-# Beside a matrix with unit diagonal: it decides where that is singular (redundant sticking contacts)
-# and refinements remove what it changes elsewhere. Ten times less, and rounding decides, too.
+# Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
+# stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the

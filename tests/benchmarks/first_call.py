@@ -59,9 +59,9 @@ def measure(row):
         "friction": lambda: ji.impact(ji.LZB(0.9, friction=0.3), block, v).velocity,
         "fit": lambda: ji.fit(ji.LZB(0.9), balls, shots, free=("restitution",)).law.restitution,
         "motion": lambda: ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 5.0).q,
-        "motion with friction": lambda: ji.simulate(
-            rocks, matrix, tilted, [0.0] * 3, 4.0, friction=5.0
-        ).q,
+        "motion with friction": lambda: (
+            ji.simulate(rocks, matrix, tilted, [0.0] * 3, 4.0, friction=5.0).q
+        ),
     }[row]
     begun = cpu()
     jax.block_until_ready(first())
