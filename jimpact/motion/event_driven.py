@@ -4,8 +4,8 @@ One loop, one pass: where an event waits it is resolved, then a step is tried. L
 advance independently; an event waits until as many lanes wait as fly.
 
 DERIVATIVES   The run writes down its accepted steps and what was decided at its events (`Plan`). A
-second walk through them, in which nothing is decided, is a scan: JAX differentiates it in both modes
-and any order. Its blocks of rows are checkpoints, and blocks without a step are skipped.
+second walk through them, in which nothing is decided, is a scan: JAX differentiates it in both
+modes and any order. Its blocks of rows are checkpoints, and blocks without a step are skipped.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,6 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 
-from jimpact.bodies.base import GivenBody
 from jimpact.events import stepper
 from jimpact.events.batches import any_lane, over_lanes
 from jimpact.law import Law
@@ -109,7 +108,7 @@ class _Run(NamedTuple):
     waits: jax.Array  # whether an event is to be resolved
     last: Row  # the event before the next step
     table: Table
-    count: jax.Array  # events
+    seen: jax.Array  # events
     status: jax.Array
     plan: Plan | None
 
@@ -117,15 +116,15 @@ class _Run(NamedTuple):
 class _End(NamedTuple):
     table: Table
     reached: jax.Array  # samples
-    count: jax.Array  # events
+    seen: jax.Array  # events
     steps: jax.Array
     status: jax.Array
     plan: Plan | None
 
 
 def event_driven(given: Given, max_events: int) -> Course:
-    """The motion from `times[0]` to `times[-1]`, sampled at `times`. Both derivatives, any order."""
-    leaves, tree = jax.tree.flatten(_without_closures(given))
+    """The motion from `times[0]` to `times[-1]`, sampled at `times`; it has both derivatives."""
+    leaves, tree = jax.tree.flatten(given)
     fixed = [None if eqx.is_array(x) else x for x in leaves]
 
     def rebuilt(arrays: tuple[jax.Array, ...]) -> Given:
@@ -140,7 +139,7 @@ def event_driven(given: Given, max_events: int) -> Course:
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
         end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
         assert end.plan is not None
-        plan = end.plan
+        plan: Plan = end.plan
 
         def smooth(*moved: jax.Array) -> tuple[jax.Array, jax.Array]:
             some = iter(moved)
@@ -154,40 +153,13 @@ def event_driven(given: Given, max_events: int) -> Course:
         samples, events = selected(plan.lost, recorded, found)
         end = end._replace(table=Table(samples, events, end.table.marks), plan=None)
         none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)
-        return end, none._replace(table=Table(*slopes, none.table.marks))
+        return end, none._replace(table=Table(slopes[0], slopes[1], none.table.marks))
 
     value.defjvp(rule, symbolic_zeros=True)
     end = value(*(x for x, y in zip(leaves, fixed) if y is None))
     samples = sampled_states(end.table.samples, given.start, end.reached)
-    events = _events(end.table, end.count, given)
+    events = _events(end.table, end.seen, given)
     return Course(samples, events, end.steps, end.status)
-
-
-def _without_closures(given: Given) -> Given:
-    """Functions of the system that close over traced arrays have these as arguments instead."""
-
-    def closed(function: Any, *args: jax.Array) -> Any:
-        if function is None or isinstance(function, eqx.Module) or not callable(function):
-            return function
-        opened = eqx.filter_closure_convert(function, *args)
-        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(opened))
-        return opened if traced else function
-
-    q, v, t, system = given.q0, given.v0, given.times[0], given.system
-    parts = [
-        closed(system.force, q, v, t), closed(system.potential, q), closed(system.base, t)
-    ]  # fmt: skip
-    new = eqx.tree_at(
-        lambda s: (s.force, s.potential, s.base), system, parts, is_leaf=lambda x: x is None
-    )
-    if isinstance(new.body, GivenBody):
-        body = new.body
-        parts = [closed(body.gaps, q), closed(body.sliding, q), closed(body.mass_given, q)]
-        new = eqx.tree_at(
-            lambda s: (s.body.gaps, s.body.sliding, s.body.mass_given), new, parts,
-            is_leaf=lambda x: x is None,
-        )  # fmt: skip
-    return given._replace(system=new)
 
 
 # ------------------------------------------------------------------------------ the run
@@ -215,7 +187,7 @@ def _run(given: Given, max_events: int, records: bool) -> _End:
         stuck, why_stuck(given.system, end.flight, given.q0, given.times), end.status
     ).astype(jnp.int32)
     flight = end.flight
-    return _End(end.table, flight.sample, end.count, flight.steps, status, end.plan)
+    return _End(end.table, flight.sample, end.seen, flight.steps, status, end.plan)
 
 
 def _begin(given: Given, max_events: int, records: bool) -> _Run:
@@ -272,7 +244,7 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
             system, law, mu, settings, old, run.modes, flight.event & mine, scales, run.struck
         )
         happened = found.kind != KIND_CODE["none"]
-        full = (run.count >= max_events) & happened
+        full = (run.seen >= max_events) & happened
         status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
         kept = mine & happened & ~full
         row = Row(jnp.asarray(True), kept, found.decision, jnp.asarray(False), flight.aim)
@@ -289,7 +261,7 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
             allowed=allowed_errors(system, settings, state),
             waits=jnp.asarray(False),
             last=row,
-            count=run.count + kept.astype(jnp.int32),
+            seen=run.seen + kept.astype(jnp.int32),
             status=status,
         )
         codes = jnp.stack([found.kind, found.after.jump.code])
@@ -304,7 +276,7 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
     table, plan = run.table, run.plan
     light = run._replace(table=Table(table.samples[:1], *(x[:1] for x in table[1:])), plan=None)
     new, numbers, marks = jax.lax.cond(due, now, later, light)
-    index = jnp.where(new.count > run.count, run.count, max_events)
+    index = jnp.where(new.seen > run.seen, run.seen, max_events)
     table = table._replace(events=put(table.events, numbers, index))
     table = table._replace(marks=put(table.marks, marks, index))
     return new._replace(table=table, plan=plan)
@@ -326,9 +298,10 @@ def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
     if plan is not None:
         size = plan.rows.happens.shape[0] - 1
         row = run.last._replace(accepted=accept, aim=begin.aim)
-        rows = jax.tree.map(lambda all_, x: put(all_, x, plan.used), plan.rows, row)
-        used = plan.used + accept.astype(jnp.int32)
-        plan = Plan(rows, jnp.minimum(used, size), plan.lost | (used > size))
+        index = plan.used
+        rows = jax.tree.map(lambda all_, x: put(all_, x, index), plan.rows, row)
+        used = jnp.minimum(index + accept.astype(jnp.int32), size)
+        plan = Plan(rows, used, plan.lost | (used == size))
     return run._replace(
         flight=flight,
         waits=run.waits | (flies & jnp.any(flight.event)),
