@@ -33,6 +33,7 @@ from jimpact.motion.flow import (
     flow_of,
     no_samples,
     one_pass,
+    out_of_range,
     packed,
     put,
     sampled_states,
@@ -322,6 +323,7 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
     parts = (state.q, state.v, rates, gaps(system, q, t))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
+    code = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], code)
     if not callable(system.mass):
         return code
     begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))

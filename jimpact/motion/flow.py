@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jimpact.bodies.base import Body
 from jimpact.events import stepper
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
     kinematics,
     mass_at,
+    seen_from_base,
     user_force,
 )
 from jimpact.motion.persistent_contact import (
@@ -375,13 +377,20 @@ def one_pass(
         event=landed[:-1],
         sample=flight.sample + sampled.astype(flight.sample.dtype),
         steps=steps,
-        stuck=vanishes | (steps >= settings.max_steps),
+        stuck=vanishes | (steps >= settings.max_steps) | out_of_range(flow.system, state),
     )
     aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
     plain = sampled | (accept & in_time)
     aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
     return moved._replace(aim=aim, plan=plan), accept
+
+
+def out_of_range(system: System, at: State) -> jax.Array:
+    """Whether () the gap function does not hold here any more."""
+    if type(system.body).valid is Body.valid:
+        return jnp.asarray(False)
+    return ~(system.body.valid(seen_from_base(system, at.q, at.t)) >= 0)
 
 
 def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:
