@@ -2,6 +2,7 @@
 
 from . import plot as plot, theory as theory
 from .audits import audit as audit, summary as summary
+from .bodies.assemblies import PlanarBodies as PlanarBodies
 from .bodies.base import Body as Body, scene_from_gaps as scene_from_gaps
 from .bodies.blocks import Block as Block, rocking_block as rocking_block
 from .bodies.dimers import (
@@ -13,6 +14,9 @@ from .bodies.dimers import (
 from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
+from .bodies.piles import Discs as Discs
+from .bodies.polygons import Disc as Disc, Polygon as Polygon
+from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
 from .comparison import (
     compare as compare,
     dispersion_index as dispersion_index,

@@ -115,6 +115,17 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
     np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-12)
 
 
+def test_an_overturned_block_lies_on_its_side():
+    motion = ji.simulate(
+        ji.block_system(0.2, 0.6), ji.LZB(0.3), upright(0.5), [0.0] * 3, 3.0, samples=31
+    )
+    assert ended(motion) == ["ok"]
+    np.testing.assert_allclose(motion.q[-1], [0, 0.1, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(motion.gaps[-1], [0.2, 0, 0, 0.2], atol=1e-12)
+    assert np.asarray(motion.gaps).min() > -1e-12
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_overturning_on_a_harmonic_base():
     """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""

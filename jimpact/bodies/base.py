@@ -1,7 +1,7 @@
 """The description of a body: gaps, tangents and mass matrix as functions of its configuration."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -22,25 +22,46 @@ Potential = Callable[[jax.Array], jax.Array]  # q (n,) -> V () [J]
 
 
 class Body(eqx.Module):
-    """One or several bodies with contacts, as functions of their configuration q (n,).
+    """One or several bodies with contacts, as functions of their configuration q.
 
-    Equation: gaps `f(q)`, normals `N = grad f`, tangents `H_t`, mass matrix `M(q)`.
+    Equation: gaps `f(q)`, normals `N = grad f`, tangents `H_t`, mass matrix `M(q)`; the velocities
+    v (n,) are the rates of q (n,), or what `moved` makes of them: `q' = rates(q, v)`.
 
     At one instant a body is a `Scene` (`scene(q)`), under loads it is a `System` that moves. A body
     of your own gives `gap_function(q) -> (m,)`, `mass`, and for friction `tangent_function(q) ->
     (m,)` (or `tangents(q)` itself); where it shall stand under gravity or on a moving base,
-    `gravity(acceleration)` and `base_directions`. It is a pytree: its numbers may be traced,
-    batched and differentiated.
+    `gravity(acceleration)` and `base_directions`; where its gap function has a range, `valid`. Only
+    a body whose velocities are not the rates of q gives `coordinates`, `moved` and
+    `inertial_force`, too. It is a pytree: its numbers may be traced, batched and differentiated.
 
     >>> import jimpact as ji
     >>> block = ji.Block(width=1.0, height=2.0)
     >>> block.gap_function(block.touching(0.0)).tolist()
-    [0.0, 0.0]
+    [0.0, 0.0, 2.0, 2.0]
     """
+
+    @property
+    def coordinates(self) -> int | None:
+        """How many numbers q has; None: as many as there are velocities."""
+        return None
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f(q) (m,) [m]; negative in penetration."""
         raise NotImplementedError(f"{type(self).__name__} must define `gap_function`.")
+
+    range_in_words: ClassVar[str] = "see its `valid`"
+
+    def valid(self, q: jax.Array) -> jax.Array:
+        """Margin () that is >= 0 where the gap function holds; here it always does."""
+        return jnp.ones((), q.dtype)
+
+    def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
+        """q after the displacement u (n,), a constant velocity times its time: `q + u`."""
+        return q + u
+
+    def rates(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """q' at velocities v (n,)."""
+        return jax.jvp(lambda u: self.moved(q, u), (jnp.zeros_like(v),), (v,))[1]
 
     @property
     def mass(self) -> Any:
@@ -55,12 +76,39 @@ class Body(eqx.Module):
         """H_t (n, m), planar, or (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
         if self.tangent_function(q) is None:
             return None
-        return jax.jacobian(self.tangent_function)(q).T
+        return self._gradient(self.tangent_function, q)
 
     def mass_matrix(self, q: jax.Array) -> jax.Array:
         """M(q) (n, n), or (n,) its diagonal."""
         mass = self.mass
         return jnp.asarray(mass(q) if callable(mass) else mass)
+
+    def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """What constant velocities take (n,): `M v' = F + inertial_force`, Coriolis and gyroscopic.
+
+        Equation: `grad(v^T M v) / 2 - M' v`, 0 for a constant M.
+        """
+        if not callable(self.mass):
+            return jnp.zeros_like(v)
+
+        def momentum(x: jax.Array) -> jax.Array:
+            mass = self.mass_matrix(x)
+            return mass * v if mass.ndim == 1 else mass @ v
+
+        change = jax.jvp(momentum, (q,), (v,))[1]
+        return 0.5 * jax.grad(lambda x: v @ momentum(x))(q) - change
+
+    def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
+        """Gradient in q as one in the displacements (n,): `(dq'/dv)^T gradient`."""
+        still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
+        return jax.vjp(lambda u: self.moved(q, u), still)[1](gradient)[0]
+
+    def _gradient(self, function: Callable[[jax.Array], Any], q: jax.Array) -> jax.Array:
+        """(n, k) of a function q -> (k,), in the displacements."""
+        if self.coordinates is None:
+            return jax.jacobian(function)(q).T
+        still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
+        return jax.jacfwd(lambda u: function(self.moved(q, u)))(still).T
 
     def gravity(self, acceleration: Any) -> Potential:
         """Potential `q -> V ()` [J] of its weight at this acceleration g [m/s^2]."""
@@ -68,28 +116,41 @@ class Body(eqx.Module):
 
     @property
     def base_directions(self) -> jax.Array | None:
-        """B (n, d): how q changes when everything moves with the base; None: it has no base."""
+        """B (n, d): velocities when everything moves with the base; None: it has no base."""
         return None
 
     def outlines(self, q: np.ndarray, point: float) -> Sequence[np.ndarray]:
         """Curves (k, 2) of points (x, y) [m] that show it; mass points get the radius `point`."""
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
 
+    @property
+    def floors(self) -> Sequence[Any]:
+        """Planes to draw, (angle, offset) each; in space and where all hang none."""
+        return ((0.0, 0.0),)
+
     def scene(self, q: Any, closed_below: float = CLOSED_BELOW) -> Scene:
-        """The scene at configuration q (n,).
+        """The scene at configuration q, its normals and tangents in the velocities (n,).
 
         Gaps up to `closed_below` [m] (or a few roundings of q) count as closed.
 
         Raises:
-            ValueError: q of another size or not finite; penetration; a mass that is not positive.
+            ValueError: q of another size, not finite, or out of the range of the gap function
+                (inside jit: normals that are NaN, so that `impact` says `not_finite`);
+                penetration; a mass that is not positive.
         """
         q = as_float_array("q", q)
         mass = self.mass
         if callable(mass):
             mass = jax.eval_shape(mass, q)
-        check_shape("q", q, mass.shape[:1], "one per coordinate of the body")
+        size = mass.shape[:1] if self.coordinates is None else (self.coordinates,)
+        check_shape("q", q, size, "one per coordinate of the body")
         check_values("q", q)
-        mass, normals, tangents, f = self._parts(q)
+        mass, normals, tangents, f, margin = self._parts(q)
+        if not is_traced(margin) and not float(margin) >= 0:
+            raise ValueError(
+                f"Argument `q` must be in the range of the gap function ({self.range_in_words}), "
+                f"but its margin `valid(q)` has value {float(margin):g}."
+            )
         eps = float(jnp.finfo(f.dtype).eps)
         none = jnp.maximum(closed_below, _ROUNDINGS * eps * jnp.maximum(1.0, jnp.abs(q).max()))
         if not is_traced((f, none)) and bool(jnp.any(f < -none)):
@@ -102,13 +163,18 @@ class Body(eqx.Module):
         parts = (mass, normals, tangents, gaps)
         return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), parts))
 
-    def _parts(self, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
+    def _parts(self, q: jax.Array) -> "_Parts":
         return _compiled_parts(self, q)
 
 
-def _parts(body: Body, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
-    normals = jax.jacobian(body.gap_function)(q).T
-    return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q)
+# mass, normals, tangents, gaps, margin of their range
+_Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
+
+
+def _parts(body: Body, q: jax.Array) -> _Parts:
+    margin = body.valid(q)
+    normals = jnp.where(margin >= 0, body._gradient(body.gap_function, q), jnp.nan)
+    return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q), margin
 
 
 _compiled_parts = eqx.filter_jit(_parts)
@@ -149,7 +215,7 @@ class GivenBody(Body):
         found = None if self.sliding is None else self.sliding(q)
         return None if found is None else jnp.atleast_1d(found)
 
-    def _parts(self, q: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array | None, jax.Array]:
+    def _parts(self, q: jax.Array) -> _Parts:
         return _parts(self, q)  # each new lambda would be compiled anew
 
 
@@ -221,7 +287,34 @@ def positives(
 
 
 class OnGround(Body):
-    """A planar body above the ground y = 0; q = (x, y, theta) of its middle."""
+    """A rigid planar body above the ground y = 0; q = (x, y, theta) of its centre of mass.
+
+    Equation: contact i is a circle of radius r about the point c_i of the body,
+    `f_i = y + (R(theta) c_i)_y - r`, its lowest point slides at the rate of
+    `x + (R(theta) c_i)_x + r theta`. A body of this kind gives `points` (m, 2), `mass` and, unless
+    it is 0, `rim`.
+    """
+
+    @property
+    def points(self) -> jax.Array:
+        """c_i (m, 2) from the centre of mass [m]."""
+        raise NotImplementedError(f"{type(self).__name__} must define `points`.")
+
+    @property
+    def rim(self) -> Any:
+        """r () of the circles about them [m]."""
+        return 0.0
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Heights of the contact points over the ground."""
+        c = self.points
+        return q[1] + (jnp.sin(q[2]) * c[:, 0] + jnp.cos(q[2]) * c[:, 1]) - self.rim
+
+    def tangent_function(self, q: jax.Array) -> jax.Array:
+        """Ways that the contact points slide along the ground."""
+        c = self.points
+        rolled = q[0] + self.rim * q[2]
+        return rolled + (jnp.cos(q[2]) * c[:, 0] - jnp.sin(q[2]) * c[:, 1])
 
     @property
     def base_directions(self) -> jax.Array:
@@ -234,7 +327,7 @@ class OnGround(Body):
         return LinearPotential(self.mass * up * acceleration)
 
     def touching(self, angle: Any = 0.0) -> jax.Array:
-        """q (3,) with x = 0 at which the lower contact (at angle 0: both) touches the ground."""
+        """q (3,) with x = 0, turned by `angle`, at which its lowest contacts touch the ground."""
         turn = number("angle", angle)
         zero = jnp.zeros_like(turn)
         return jnp.stack([zero, -jnp.min(self.gap_function(jnp.stack([zero, zero, turn]))), turn])
@@ -244,3 +337,21 @@ def turned(points: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Points (k, 2) of a planar body, in its own frame, at q = (x, y, theta)."""
     c, s = np.cos(q[2]), np.sin(q[2])
     return q[:2] + points @ np.array([[c, s], [-s, c]])
+
+
+_AZIMUTH, _ELEVATION = np.deg2rad(30.0), np.deg2rad(20.0)  # from where bodies in space are seen
+_SCREEN = np.array(
+    [
+        [np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0],
+        [
+            -np.sin(_AZIMUTH) * np.sin(_ELEVATION),
+            np.cos(_AZIMUTH) * np.sin(_ELEVATION),
+            np.cos(_ELEVATION),
+        ],
+    ]
+)
+
+
+def projected(points: np.ndarray) -> np.ndarray:
+    """Points (.., 3) of space on the screen (.., 2): parallel projection, from above the plane."""
+    return points @ _SCREEN.T

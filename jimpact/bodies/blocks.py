@@ -2,67 +2,84 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jimpact.bodies.base import OnGround, positive, turned
+from jimpact._checks import check_choice
+from jimpact.bodies.base import positive
+from jimpact.bodies.polygons import Cornered
 from jimpact.scene import Scene
 
 
-class Block(OnGround):
+class Block(Cornered):
     """A rigid rectangle over the ground; q = (x, y, theta) of its centre, counter-clockwise.
 
     Equation: `f_{1,2} = y - (l/2) cos(theta) +/- (L/2) sin(theta)`, width L, height l; contact 1
     is the right lower corner B, contact 2 the left one A. Tangents are the corners' positions
-    along the ground, `x + (l/2) sin(theta) +/- (L/2) cos(theta)`.
+    along the ground, `x + (l/2) sin(theta) +/- (L/2) cos(theta)`. Contacts 3 and 4 are the left
+    and the right upper corner: overturned, the block lies on another side.
 
     Args:
         width: L > 0 [m].
         height: l > 0 [m].
         mass: m > 0 [kg].
         inertia: I about the centre [kg m^2]; None: homogeneous, `m (l^2 + L^2) / 12`.
+        corners: 'all' four; or 'base', the lower two of the literature on rocking: then the gap
+            function holds while no upper corner is below the ground, see `valid`.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.74).
 
     >>> import jimpact as ji
-    >>> ji.Block(width=1.0, height=2.0, mass=3.0).scene([0.0, 1.5, 0.0]).gaps.tolist()
-    [0.5, 0.5]
+    >>> block = ji.Block(width=1.0, height=2.0, mass=3.0)
+    >>> block.scene([0.0, 1.5, 0.0]).gaps.tolist()
+    [0.5, 0.5, 2.5, 2.5]
+    >>> ji.Block(1.0, 2.0, corners="base").gap_function(block.touching()).tolist()
+    [0.0, 0.0]
     """
+
+    range_in_words = "no upper corner below the ground: or give corners='all'"
 
     width: jax.Array
     height: jax.Array
     total_mass: jax.Array
     inertia: jax.Array
+    contacts: str = eqx.field(static=True)
+    ring: tuple[int, ...] = eqx.field(static=True)
 
-    def __init__(self, width: Any, height: Any, mass: Any = 1.0, inertia: Any = None):
+    def __init__(
+        self,
+        width: Any,
+        height: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        corners: str = "all",
+    ):
         self.width, self.height = positive("width", width), positive("height", height)
         self.total_mass = positive("mass", mass)
         if inertia is None:
             inertia = self.total_mass * (self.height**2 + self.width**2) / 12
         self.inertia = positive("inertia", inertia)
+        check_choice("corners", corners, ("all", "base"))
+        self.contacts, self.ring = corners, (1, 0, 3, 2)
 
     @property
-    def mass(self) -> jax.Array:
-        """M = diag(m, m, I)."""
-        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
+    def corners(self) -> jax.Array:
+        """All four (4, 2) [m], right lower, left lower, left upper, right upper."""
+        w, h = 0.5 * self.width, 0.5 * self.height
+        return jnp.stack([jnp.stack([w, -w, -w, w]), jnp.stack([-h, -h, h, h])], axis=1)
 
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Heights of the right and the left lower corner."""
-        middle = q[1] - 0.5 * self.height * jnp.cos(q[2])
-        lift = 0.5 * self.width * jnp.sin(q[2])
-        return jnp.stack([middle + lift, middle - lift])
+    @property
+    def points(self) -> jax.Array:
+        """The corners that make contact."""
+        return self.corners if self.contacts == "all" else self.corners[:2]
 
-    def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Positions of the right and the left lower corner along the ground."""
-        middle = q[0] + 0.5 * self.height * jnp.sin(q[2])
-        side = 0.5 * self.width * jnp.cos(q[2])
-        return jnp.stack([middle + side, middle - side])
-
-    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
-        """The rectangle."""
-        w, h = float(self.width) / 2, float(self.height) / 2
-        return [turned(np.array([[w, -h], [-w, -h], [-w, h], [w, h], [w, -h]]), q)]
+    def valid(self, q: jax.Array) -> jax.Array:
+        """With the lower corners only: height () of the lower one of the upper corners [m]."""
+        if self.contacts == "all":
+            return super().valid(q)
+        up = self.corners[2:]
+        return q[1] + jnp.min(jnp.sin(q[2]) * up[:, 0] + jnp.cos(q[2]) * up[:, 1])
 
 
 def rocking_block(
@@ -91,5 +108,5 @@ def rocking_block(
     >>> round(float(ji.kinetic_angles(scene)[0, 1]), 6)
     1.823477
     """
-    block = Block(width, height, mass, inertia)
+    block = Block(width, height, mass, inertia, corners="base")
     return block.scene(block.touching(angle))

@@ -8,7 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_values
-from jimpact.bodies.base import CIRCLE, Body, LinearPotential, OnGround, number, positive, turned
+from jimpact.bodies.base import (
+    CIRCLE,
+    Body,
+    LinearPotential,
+    OnGround,
+    number,
+    positive,
+    projected,
+    turned,
+)
 from jimpact.scene import Scene
 
 
@@ -64,15 +73,16 @@ class Dimer(OnGround):
         """M = diag(m, m, I)."""
         return jnp.stack([self.total_mass, self.total_mass, self.inertia])
 
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Heights of the right and the left sphere over the ground."""
-        lift = self.arm * jnp.sin(q[2])
-        return jnp.stack([q[1] + lift, q[1] - lift]) - self.radius
+    @property
+    def rim(self) -> jax.Array:
+        """The radius of the spheres."""
+        return self.radius
 
-    def tangent_function(self, q: jax.Array) -> jax.Array:
-        """Ways that the lowest points of the spheres slide."""
-        rolled, side = q[0] + self.radius * q[2], self.arm * jnp.cos(q[2])
-        return jnp.stack([rolled + side, rolled - side])
+    @property
+    def points(self) -> jax.Array:
+        """Centres of the spheres (2, 2)."""
+        none = jnp.zeros_like(self.arm)
+        return jnp.stack([jnp.stack([self.arm, none]), jnp.stack([-self.arm, none])])
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """The rod between the centres, and the spheres."""
@@ -89,7 +99,7 @@ class SpatialDimer(Body):
     part of `c_i' - R omega x e_z`. The spin about the axis belongs to q: friction across the rod
     changes it. Mass matrix: `m`, and `I |a'|^2 + I_a (omega . a)^2` with `I_a = (4/5) m_s R^2`.
 
-    These angles do not serve an upright rod (pitch pi/2): there M is singular.
+    These angles do not serve an upright rod (pitch pi/2): there M is singular (`valid`: cos p).
 
     Args:
         radius: R > 0 of the spheres [m].
@@ -104,6 +114,8 @@ class SpatialDimer(Body):
     >>> body.scene(body.touching()).tangents.shape
     (6, 4)
     """
+
+    range_in_words = "a rod that is not upright"
 
     planar: Dimer
 
@@ -145,6 +157,10 @@ class SpatialDimer(Body):
         lift = self.planar.arm * jnp.sin(q[4])
         return jnp.stack([q[2] + lift, q[2] - lift]) - self.planar.radius
 
+    def valid(self, q: jax.Array) -> jax.Array:
+        """cos(pitch) ()."""
+        return jnp.cos(q[4])
+
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (6, 4): x and y of sphere 1, x and y of sphere 2."""
 
@@ -168,6 +184,19 @@ class SpatialDimer(Body):
         zero = jnp.zeros_like(pitch)
         low = self.planar.touching(pitch)[1]
         return jnp.stack([zero, zero, low, turn.astype(zero.dtype), pitch, zero])
+
+    @property
+    def floors(self) -> tuple[()]:
+        """None: outlines have a shadow on the plane instead."""
+        return ()
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """The rod between the centres, its shadow, and the spheres, in projection."""
+        level = np.array([np.cos(q[3]), np.sin(q[3])]) * np.cos(q[4])
+        way = float(self.planar.arm) * np.append(level, np.sin(q[4]))
+        ends = np.stack([q[:3] + way, q[:3] - way])
+        spheres = (x + float(self.planar.radius) * CIRCLE for x in projected(ends))
+        return [projected(ends), projected(ends * [1, 1, 0]), *spheres]
 
 
 def dimer(

@@ -74,6 +74,11 @@ class DiskBalls(Body):
         balls = jnp.stack([far * jnp.cos(phi), far * jnp.sin(phi), jnp.zeros_like(phi)], axis=1)
         return jnp.concatenate([jnp.zeros(3, balls.dtype), balls.reshape(-1)])
 
+    @property
+    def floors(self) -> tuple[()]:
+        """None."""
+        return ()
+
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles, each with the radius that shows how far it has turned."""
         radii = [self.disk_radius, *self.ball_radius]

@@ -64,6 +64,11 @@ class Corner(Body):
         """q (2,) in the corner."""
         return jnp.zeros(2, self.angle.dtype)
 
+    @property
+    def floors(self) -> list[tuple[float, float]]:
+        """The walls."""
+        return [(0.0, 0.0), (float(self.angle), 0.0)]
+
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """The particle."""
         return [q + point * CIRCLE]

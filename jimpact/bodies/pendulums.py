@@ -32,6 +32,8 @@ class PendulumCradle(Body):
     [False, True]
     """
 
+    range_in_words = "no ball in another one but its neighbours"
+
     masses: jax.Array
     length: jax.Array
     radius: jax.Array
@@ -66,6 +68,22 @@ class PendulumCradle(Body):
         # |c| - d as (|c|^2 - d^2) / (|c| + d): exactly 0 at rest
         across = (right - touching) * (right + touching) + up**2
         return across / (jnp.sqrt(right**2 + up**2) + touching)
+
+    def valid(self, q: jax.Array) -> jax.Array:
+        """The least distance () of balls that are no neighbours, which have no contact [m]."""
+        i, j = np.triu_indices(self.masses.shape[0], 2)
+        if not len(i):
+            return super().valid(q)
+        between = self.radius[:-1] + self.radius[1:] + self.gaps
+        at = jnp.concatenate([jnp.zeros_like(between[:1]), jnp.cumsum(between)])
+        right, up = at + self.length * jnp.sin(q), self.length * jnp.cos(q)
+        apart = jnp.sqrt((right[i] - right[j]) ** 2 + (up[i] - up[j]) ** 2)
+        return jnp.min(apart - self.radius[i] - self.radius[j])
+
+    @property
+    def floors(self) -> tuple[()]:
+        """None: the balls hang."""
+        return ()
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Strings and balls."""

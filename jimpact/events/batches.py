@@ -17,9 +17,12 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jimpact.events.tangents import BESIDE, Moving, moving_with
+
 # Impacts side by side on a CPU. A piece of a batch ends with its slowest member, and its stages
 # should stay in a core's cache: 64 are no faster, 1024 take half as long again.
 CHUNK = 256
+WITH_TANGENTS = 128  # of those with tangents side by side, which take more room
 
 Arrays = tuple[jax.Array, ...]
 columns_p = Primitive("columns")
@@ -55,6 +58,7 @@ class Tangent:
     """Tangents of `function` from its arguments and the tangents of those marked.
 
     `many`: these have a leading axis, along which the arguments are the same.
+    A `function` that is `beside` takes arguments that are `Moving`, and gives such results.
     """
 
     function: Callable[..., Arrays]
@@ -63,12 +67,28 @@ class Tangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
-        smooth, values = _smooth(self.function, self.marked, arrays[:count])
+        given, along = arrays[:count], arrays[count:]
+        if getattr(self.function, "beside", False):
+            along = along if self.many else tuple(x[None] for x in along)
+            beside = iter(jnp.moveaxis(x, 0, BESIDE) for x in along)
+            mixed = [Moving(x, next(beside)) if m else x for x, m in zip(given, self.marked)]
+            outs = [moving_with(mixed, x) for x in self.function(*mixed)]
+            rates = [jnp.moveaxis(x.along, BESIDE, 0) for x in outs]
+            return tuple(rates if self.many else (x[0] for x in rates))
+        smooth, values = _smooth(self.function, self.marked, given)
 
         def push(*given: jax.Array) -> Arrays:
             return jax.jvp(smooth, values, given)[1]
 
-        return (jax.vmap(push) if self.many else push)(*arrays[count:])
+        return (jax.vmap(push) if self.many else push)(*along)
+
+
+def reversible(function: Any) -> Any:
+    """The function in a form that the reverse mode goes through, too."""
+    if isinstance(function, Tangent | Cotangent):
+        return dataclasses.replace(function, function=reversible(function.function))
+    form = getattr(function, "reversible", None)
+    return function if form is None else form()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,7 +101,7 @@ class Cotangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
-        smooth, values = _smooth(self.function, self.marked, arrays[:count])
+        smooth, values = _smooth(reversible(self.function), self.marked, arrays[:count])
         _, back = jax.vjp(smooth, *values)
 
         def pull(*given: jax.Array) -> Arrays:
@@ -102,7 +122,7 @@ def tangents_in_columns(
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
-    count = -(-size // CHUNK)
+    count = -(-size // (WITH_TANGENTS if isinstance(function, Tangent) else CHUNK))
     if count == 1:
         return tuple(function(*arrays))
     width = -(-size // count)

@@ -224,6 +224,16 @@ class ContactFlow:
 
     # ---- the state
 
+    @property
+    def driving(self) -> tuple[int, ...]:
+        """Blocks of rows that the field depends on."""
+        return self.contacts, self.contacts
+
+    @property
+    def adding(self) -> tuple[int, ...]:
+        """Blocks of rows, behind those, that only add up."""
+        return self.contacts, 1
+
     def rows(self, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """x, g and p."""
         m = self.contacts

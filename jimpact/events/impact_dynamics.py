@@ -29,6 +29,7 @@ from jimpact.events.contact_flow import (
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
+from jimpact.events.tangents import through, value_of
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
@@ -204,7 +205,8 @@ class Outcome:
     sides: int = 0  # tangential rows
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    repeats: bool = False  # walk the steps once more, for derivatives
+    smooth: bool = False  # what has derivatives alone: tangents go along with the steps
+    repeats: bool = False  # walk the steps once more, for both modes
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
@@ -214,30 +216,45 @@ class Outcome:
         """Of the results, from those of the leaves."""
         contacts, batch = jax.tree.unflatten(self.tree, leaves).omega.shape
         smooth = (leaves[0].dtype,) * 3
-        kinds = smooth if self.repeats else (*smooth, jnp.int32, jnp.int32)
+        kinds = smooth if self.smooth else (*smooth, jnp.int32, jnp.int32)
         rows = contacts, self.sides, 1, 1, 1
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
 
-    def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
+    @property
+    def beside(self) -> bool:
+        """Whether its arguments may have tangents (see `tangents.py`)."""
+        return self.smooth and not self.repeats
+
+    def reversible(self) -> "Outcome":
+        """The same in a form that both modes go through."""
+        return dataclasses.replace(self, repeats=self.smooth)
+
+    def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         problem = jax.tree.unflatten(self.tree, leaves)
-        still = jax.lax.stop_gradient(problem)
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
-        flow, modes, y = self.flow(still, tighten)
-        end = to_the_end(flow, still.gamma, modes, y, self.most, keeps=self.finely)
+        given = jax.lax.stop_gradient(problem) if self.repeats else problem
+        flow, modes, y = through(lambda problem: self.flow(problem, tighten), given)
+        gamma = value_of(problem.gamma)
+        end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not self.beside)
         state, dp = end.carry.y, end.impulse
         if self.repeats:
-            moving, _, y = self.flow(problem, tighten)
-            state = stepper.repeat(moving, modes, y, end.plan)
-            state = jnp.where(end.finishes, moving.finish(end.carry.step.modes, state)[1], state)
-            dp = remainder(moving, problem.gamma, state, end.carries)
-        m = flow.contacts
-        p = state[2 * m : 3 * m] + dp
-        if self.finely:
-            p = stepper.with_plan(p, end.plan)
-        side, time = state[3 * m + self.sides : -1][: self.sides], state[-1:]
-        if self.repeats:
-            return p, side, time
-        return p, side, time, end.status, end.carry.plan[3:4].astype(jnp.int32)
+            flow, _, y = self.flow(problem, tighten)
+            state = stepper.repeat(flow, modes, y, end.plan)
+            state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
+        if self.smooth:
+            last = flow, problem.gamma, state
+            dp = through(lambda f, g, y: remainder(f, g, y, end.carries), *last)
+        rows = 3 * gamma.shape[0]
+
+        def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
+            p = state[rows - len(gamma) : rows] + dp
+            return p, state[rows + self.sides : -1][: self.sides], state[-1:]
+
+        p, *rest = through(parts, state, dp)
+        if self.smooth:
+            return p, *rest
+        p = stepper.with_plan(p, end.plan) if self.finely else p
+        return p, *rest, end.status, end.carry.plan[3:4].astype(jnp.int32)
 
 
 class Dynamics(NamedTuple):
@@ -330,11 +347,11 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
         return in_columns(function, *leaves)
 
     def rule(primals: Any, tangents: Any) -> Any:
-        # the same steps give both: one loop where they are one program
+        # values keep the steps for the reverse mode: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
         outs = outcome(fine, primals)
-        again = dataclasses.replace(fine, repeats=True)
-        rates = tangents_in_columns(again, primals, tangents)
+        along = dataclasses.replace(fine, smooth=True)
+        rates = tangents_in_columns(along, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 

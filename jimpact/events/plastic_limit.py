@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jimpact.events import stepper
 from jimpact.events.contact_flow import ContactFlow
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
+from jimpact.events.tangents import moving_with, through, value_of
 from jimpact.status import CODE
 
 QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
@@ -63,7 +64,7 @@ class End(NamedTuple):
     def plan(self) -> stepper.Plan:
         """The steps that were kept."""
         assert self.pen is not None
-        return self.pen.closed()
+        return self.pen.plan
 
     @property
     def over(self) -> jax.Array:
@@ -83,10 +84,15 @@ class End(NamedTuple):
 
 
 def to_the_end(
-    flow: ContactFlow, gamma: jax.Array, modes: jax.Array, y: jax.Array, most: int, keeps: bool
+    flow: Any, gamma: jax.Array, modes: jax.Array, y: Any, most: int, keeps: bool
 ) -> End:
-    """From gap velocities gamma (m, B) to the end; `keeps` the plan of the steps."""
+    """From gap velocities gamma (m, B) to the end; `keeps` the plan of the steps.
+
+    What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents.
+    """
     carry = stepper.begin(flow, modes, y)
+    still = jax.lax.stop_gradient(value_of(flow))
+    gamma = jax.lax.stop_gradient(gamma)
     no = jnp.zeros(gamma.shape, bool)
     rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
     rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
@@ -99,13 +105,17 @@ def to_the_end(
         else:
             carry, pen = stepper.record(flow, end.carry, end.pen, most)
         over, paused = (carry.plan[2:3] == OVER) & ~finished, carry.plan[2:3] == PAUSED
-        quiet = over & at_rest(flow, carry)
-        carry = carry._replace(
-            y=jnp.where(over, flow.finish(carry.step.modes, carry.y)[1], carry.y)
-        )
+        seen = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
+        quiet = over & at_rest(still, seen)
+
+        def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
+            return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
+
+        carry = carry._replace(y=moving_with(carry.y, through(at_end, flow, carry.y)))
+        seen = seen._replace(y=jax.lax.stop_gradient(value_of(carry.y)))
         rest = jax.lax.cond(
             jnp.any(paused | quiet),
-            lambda: looked(flow, gamma, carry, end.rest, quiet),
+            lambda: looked(still, gamma, seen, end.rest, quiet),
             lambda: end.rest,
         )
         settled = jnp.where(rest.ended, OVER, GOES_ON)

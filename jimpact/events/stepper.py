@@ -16,6 +16,7 @@ PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
     pauses(before, after, passes)  -> (1, B): the caller wants to look now; None: never
     finish(modes, y)           -> (modes, y) where it is over
     allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
+    driving, adding            blocks of rows (none: one block); those that only add up come last
     longest                    the longest step in the flow's own time that is stable
     tolerance (1, B), snap (1, B)
     taking_part (1, B)             contacts, of which some may be open for good
@@ -33,8 +34,9 @@ jump rules, also where events coincide.
 WHAT COMES NEXT   Every margin gets one number, in units of the step just tried, and the least of
 them decides (`advance`).
 
-DERIVATIVES   The run records its accepted steps; `repeat` walks through them once more as a scan
-in which nothing is decided. JAX differentiates that: both modes, any order.
+DERIVATIVES   Forward ones go along with the steps: the state carries tangents (`tangents.py`) while
+values alone decide. For the reverse mode the run records its accepted steps, and `repeat` walks
+through them once more as a scan in which nothing is decided. JAX differentiates both: any order.
 
 COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
 reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
@@ -42,6 +44,7 @@ b gives margins and their rates at the end of a step), and what is one number an
 two arrays.
 """
 
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import jax
@@ -49,6 +52,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.tableaux import DOP853
+from jimpact.events.tangents import Moving, moving_with, through, value_of
 
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
@@ -65,8 +69,8 @@ FINEST = 16  # roundings: an error estimate below them is noise
 COARSE = 0.3  # the error is no less than this part of the third-order estimate squared
 COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
 
-# Accepted steps kept for derivatives: blocks of steps, where nothing is kept a block is skipped.
-# An impact of more steps has no derivative: NaN, whatever its status.
+# Accepted steps kept for the reverse mode: blocks of steps; where nothing is kept one is skipped.
+# An impact of more steps has no derivative there: NaN, whatever its status.
 BLOCKS, BLOCK = 64, 16
 
 STAGES = len(DOP853.c)
@@ -80,6 +84,11 @@ class Flow(Protocol):
 
     longest: Any  # a number, or ()
     near: float
+
+    @property
+    def driving(self) -> tuple[int, ...]: ...
+    @property
+    def adding(self) -> tuple[int, ...]: ...
 
     @property
     def tolerance(self) -> jax.Array: ...
@@ -131,49 +140,106 @@ class Step(NamedTuple):
     clock: jax.Array  # (4, B): xi at the beginning, length, whether xi is a root, whether it lands
 
 
-def _stages(flow: Flow, s: Step, y: jax.Array, ends: bool) -> tuple[Any, ...]:
-    """Sums (3, n + 1, B) of the slopes of y and of time (weights b and both error estimates);
-    margins at the beginning; their rates (stages, k, B); the constants of the field."""
-    dtype = y.dtype
-    const = flow.constants(s.modes)
-    c0 = flow.margins(const, s.modes, y)
+def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
+    """Change of y and of time (n + 1, B); both estimates of its error (2, n, B); margins (k, B) at
+    the beginning, and where it `ends`: rates at the beginning, margins and rates at the end.
+
+    What of `flow` and y has tangents (see `tangents.py`) gives a change with tangents.
+    """
+    plain, state = value_of((flow, y))
+    n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
-    # from a margin that is 0 already a landing has length 0, and no root
-    root = flow.rooted(s.modes) & (c0 > flow.snap)
-    xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
-    xi0 = total(jnp.where(s.target, xi0, 0.0))
-    rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
-    start = jnp.where(lands > 0, xi0, begun)
-    # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
-    nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
-    length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
+
+    def frame(flow: Flow, y: jax.Array) -> tuple[Any, ...]:
+        const = flow.constants(s.modes)
+        c0 = flow.margins(const, s.modes, y)
+        # from a margin that is 0 already a landing has length 0, and no root
+        root = flow.rooted(s.modes) & (c0 > flow.snap)
+        xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
+        xi0 = total(jnp.where(s.target, xi0, 0.0))
+        rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
+        start = jnp.where(lands > 0, xi0, begun)
+        # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
+        nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
+        length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
+        return const, jax.lax.stop_gradient(c0), start, length, rooted, nowhere
+
+    const, c0, start, length, rooted, nowhere = through(frame, flow, y)
     count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
+    adds = sum(plain.adding)
+    drives = n - adds
+    blocks = plain.driving or (drives,)
+    ends_of = np.cumsum([0, *blocks, *plain.adding])
 
-    def stage(slopes: jax.Array, at: Any) -> tuple[jax.Array, Any]:
-        i, a, c = at
+    def evaluated(
+        flow: Flow, const: Any, start: Any, length: Any, y: jax.Array, change: jax.Array, at: Any
+    ) -> tuple[list[jax.Array], tuple[jax.Array, jax.Array]]:
+        i, c = at
         xi = start + c * length
-        now = y + length * jnp.tensordot(a, slopes, axes=1)[: y.shape[0]]
+        now = y[:drives] + length * change
         dy = flow.field(const, s.modes, now)
 
         def seen() -> tuple[jax.Array, jax.Array]:
-            return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy,))
+            return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy[:drives],))
 
         if flow.near:  # of costly margins: steps in time need them at their ends only
             needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
-            value, dc = jax.lax.cond(needed, seen, lambda: (c0, jnp.zeros_like(c0)))
+            none = jnp.zeros_like(s.target, dtype)
+            value, dc = jax.lax.cond(needed, seen, lambda: (none, none))
         else:
             value, dc = seen()
         rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
         rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
         dt = (1 + rooted * (2 * xi - 1)) / rate
-        return _put(slopes, jnp.concatenate([dy * dt, dt]), i), (value, dc) if ends else None
+        rows = [dy[first:last] * dt for first, last in pairwise(ends_of)]
+        return [*rows, dt], jax.lax.stop_gradient((value, dc))
 
-    none = jnp.zeros((count, y.shape[0] + 1, *y.shape[1:]), dtype)
+    def stage(carry: Any, at: Any) -> tuple[Any, None]:
+        slopes, added, *margins = carry
+        i, a, c = at
+        change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
+        new, (value, dc) = through(evaluated, flow, const, start, length, y, change, (i, c))
+        slopes = _kept(slopes, new[: len(blocks)], i)
+        added = _kept(added, new[len(blocks) :], i)
+        if ends:
+            margins = [jnp.where(i == 0, dc, margins[0]), value, dc]
+        return (slopes, added, *margins), None
+
+    none = [jnp.zeros((count, k, *batch), dtype) for k in (drives, adds + 1)]
+    carry = [moving_with((flow, y), k) for k in none]
+    margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
-    slopes, rates = jax.lax.scan(stage, none, rows)
-    return length[None] * jnp.tensordot(weights, slopes, axes=1), c0, rates
+    (slopes, added, *margins), _ = jax.lax.scan(stage, (*carry, *margins), rows)
+    sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in (slopes, added)]
+    inner, outer = (
+        Moving(x[0], jnp.tensordot(weights[0], k.along, axes=1)) if isinstance(k, Moving) else x[0]
+        for x, k in zip(sums, (slopes, added))
+    )
+    change = through(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
+    errors = value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)[:, :n]
+    return change, errors, c0, margins
+
+
+def _kept(table: Any, new: list[Any], i: jax.Array) -> Any:
+    """The table with a new row of slopes, in blocks.
+
+    Each block of tangents is a kernel: one for all would compute them entry by entry.
+    """
+    value = value_of(table)
+    value = _put(value, jnp.concatenate(value_of(new)), i)
+    if not isinstance(table, Moving):
+        return value
+    along, first, none = table.along, 0, jnp.zeros((), i.dtype)
+    for block in new:
+        if isinstance(block, Moving):  # else its tangents are 0
+            at = (i, jnp.asarray(first, i.dtype), none, none)
+            along = jax.lax.dynamic_update_slice(
+                along, block.along[None], at, allow_negative_indices=False
+            )
+        first += len(value_of(block))
+    return Moving(value, along)
 
 
 GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
@@ -182,21 +248,23 @@ GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
 class Carry(NamedTuple):
     """What one pass hands to the next."""
 
-    y: jax.Array
+    y: Any  # (n, B), which may be `Moving`
     step: Step  # the one to try
     # (4, B): time it is expected to take, landing aimed at twice, GOES_ON | OVER | PAUSED, passes
     plan: jax.Array
 
 
-def begin(flow: Flow, modes: jax.Array, y: jax.Array) -> Carry:
+def begin(flow: Any, modes: jax.Array, start: Any) -> Carry:
     """The first step: short, in the root of time, for forces set in like a power of it."""
+    start = moving_with((flow, start), start)
+    flow, y = value_of((flow, start))
     one = jnp.ones_like(y[:1])
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
     targets = jax.eval_shape(lambda: flow.margins(flow.constants(modes), modes, y)).shape
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
     state = jnp.where(over, OVER, GOES_ON).astype(y.dtype)
-    return Carry(y, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
+    return Carry(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
 
 
 def goes_on(carry: Carry, most: int) -> jax.Array:
@@ -217,20 +285,20 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
          0 ..  1   it vanishes inside the step: repeat the step as a landing on it
          1 .. inf  it is expected to vanish so far ahead: land on it if the next step reaches it
     """
-    y, s = carry.y, carry.step
+    moving, start, s = flow, carry.y, carry.step
+    flow, y = value_of((flow, start))
     n, dtype = y.shape[0], y.dtype
     expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
     begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
     in_root, lands = in_root > 0, lands > 0
-    sums, c0, (values, rates) = _stages(flow, s, y, ends=True)
-    c1, d0, d1 = values[-1], rates[0], rates[-1]
-    end = y + sums[0, :n]
+    change, errors, c0, (d0, c1, d1) = _stages(moving, s, start, ends=True)
+    taken = value_of(change)[n:]
     eps = float(jnp.finfo(dtype).eps)
     full = FULL * flow.taking_part
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     # Hairer's error, squared, in tolerances
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
-    fifth, third = (x[None] for x in jnp.max(jnp.abs(sums[1:, :n]) / scale[None], axis=1))
+    fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + 1e-60)
     # small by chance where the fifth order is: a landing from a maximum, a step of half a period
     error2 = jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
@@ -239,7 +307,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
         SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20)))), SHRINK, GROWTH
     )
     factor = jnp.where(error2 < jnp.inf, factor, SHRINK)
-    span = jnp.where(ok & (sums[0, n:] > 0), sums[0, n:], expected)
+    span = jnp.where(ok & (taken > 0), taken, expected)
     # what each margin does in this step, and after it
     d0, d1 = d0 * span, d1 * span
     snap = flow.snap
@@ -274,10 +342,16 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
     accept = ok & ~event & active
     landed = accept & lands
     which = s.target & landed
-    modes, end = flow.switch(s.modes, end, which)
     # however short the step, the field has no value: given up, for the status to say
     broken = active & ~lands & ~(error2 < jnp.inf) & (h < SHORTEST)
-    y = jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
+
+    def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+        modes, end = flow.switch(s.modes, y + change[:n], which)
+        return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
+
+    modes, end = through(after, moving, start, change)
+    end = moving_with(start, end)
+    y = value_of(end)
     # the next step
     in_root = in_root & ~lands
     xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
@@ -314,7 +388,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
             passes,
         ]
     )
-    return Carry(y, Step(modes, target, clock), plan), accept
+    return Carry(end, *jax.lax.stop_gradient((Step(modes, target, clock), plan))), accept
 
 
 def _root_of_cubic(
@@ -347,18 +421,15 @@ class Plan(NamedTuple):
 
     marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 where a step is kept
     clock: jax.Array  # (steps, 4, B)
+    # (1, B): there were too few rows. Such an impact has no derivative: NaN, no wrong number
+    lost: jax.Array
 
 
 class Recorder(NamedTuple):
-    """A plan while it is written: rows used, and whether (1, B) there were too few."""
+    """A plan while it is written, and rows used."""
 
     plan: Plan
     used: jax.Array
-    lost: jax.Array
-
-    def closed(self) -> Plan:
-        """The plan. An impact of more steps than rows has no derivative: NaN, no wrong number."""
-        return Plan(self.plan.marks, jnp.where(self.lost[None], jnp.nan, self.plan.clock))
 
 
 def recorder(carry: Carry) -> Recorder:
@@ -368,8 +439,9 @@ def recorder(carry: Carry) -> Recorder:
     plan = Plan(
         jnp.zeros((size, rows, *clock.shape[1:]), jnp.int8),
         jnp.zeros((size, *clock.shape), clock.dtype),
+        jnp.zeros(clock[:1].shape, bool),
     )
-    return Recorder(plan, jnp.zeros((), jnp.uint32), jnp.zeros(clock[:1].shape, bool))
+    return Recorder(plan, jnp.zeros((), jnp.uint32))
 
 
 def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, Recorder]:
@@ -377,7 +449,7 @@ def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, R
     size = BLOCKS * BLOCK
 
     def body(state: tuple[Carry, Recorder]) -> tuple[Carry, Recorder]:
-        carry, (plan, count, lost) = state
+        carry, (plan, count) = state
         after, accept = advance(flow, carry, most)
         s = carry.step
         marks = jnp.concatenate(
@@ -388,9 +460,10 @@ def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, R
         plan = Plan(
             _put(plan.marks, jnp.where(accept, marks, 0), index),
             _put(plan.clock, jnp.where(accept, s.clock, 0.0), index),
+            plan.lost | (accept & (count >= size)),
         )
         count = count + jnp.any(accept).astype(count.dtype)
-        return after, Recorder(plan, count, lost | (accept & (count > size)))
+        return after, Recorder(plan, count)
 
     return jax.lax.while_loop(lambda state: unwatched(state[0], most), body, (carry, pen))
 
@@ -431,22 +504,26 @@ def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
 
 def step_again(flow: Flow, s: Step, y: jax.Array) -> jax.Array:
     """The state after an accepted step, as a smooth function of `flow` and `y`."""
-    sums, *_ = _stages(flow, s, y, ends=False)
-    return y + sums[0, :-1]
+    change, *_ = _stages(flow, s, y, ends=False)
+    return y + change[:-1]
 
 
-def step_of(row: Plan, modes: int) -> tuple[Step, jax.Array]:
+Row = tuple[jax.Array, jax.Array]  # marks and clock of a step of the plan
+
+
+def step_of(row: Row, modes: int) -> tuple[Step, jax.Array]:
     """A step of the plan, and whether (1, B) there is one."""
-    marks = row.marks
-    return Step(marks[:modes].astype(jnp.int32), marks[modes:-1] > 0, row.clock), marks[-1:] > 0
+    marks, clock = row
+    return Step(marks[:modes].astype(jnp.int32), marks[modes:-1] > 0, clock), marks[-1:] > 0
 
 
 def _walk(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
 ) -> tuple[jax.Array, jax.Array | None]:
     """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
+    y = jnp.where(plan.lost, jnp.nan, 1.0) * y
 
-    def step(y: jax.Array, row: Plan) -> tuple[jax.Array, jax.Array | None]:
+    def step(y: jax.Array, row: Row) -> tuple[jax.Array, jax.Array | None]:
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
@@ -456,14 +533,14 @@ def _walk(
         y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
         return y, y if states else None
 
-    def block(y: jax.Array, rows: Plan) -> tuple[jax.Array, jax.Array | None]:
+    def block(y: jax.Array, rows: Row) -> tuple[jax.Array, jax.Array | None]:
         def walk(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
             return jax.lax.scan(jax.checkpoint(step), y, rows)
 
         def stay(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
             return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
 
-        return jax.lax.cond(jnp.any(rows.marks[:, -1] > 0), walk, stay, y)
+        return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, stay, y)
 
-    rows = jax.tree.map(lambda x: x.reshape(BLOCKS, BLOCK, *x.shape[1:]), plan)
+    rows = tuple(x.reshape(BLOCKS, BLOCK, *x.shape[1:]) for x in (plan.marks, plan.clock))
     return jax.lax.scan(jax.checkpoint(block), y, rows)

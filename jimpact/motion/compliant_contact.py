@@ -95,7 +95,7 @@ class CompliantFlow(MotionFlow):
         if carried is not None:
             base = (given.normal.gradient @ push) @ carried
         rates = State(
-            q=at.v,
+            q=self.system.body.rates(at.q, at.v),
             v=given.free + given.moved @ push,
             t=jnp.ones_like(at.t),
             work=user_force(self.system, at.q, at.v, at.t) @ at.v,
@@ -192,7 +192,7 @@ def compliant_motion(
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
     status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"]).astype(jnp.int32)
     begin = first_flight(system, state, phase[:, None].astype(jnp.int32), 2 * m, times)
-    events = no_events(max_events, q0.shape[0], m, dtype)
+    events = no_events(max_events, q0, v0, m)
     start = _Run(
         toward_sample(begin, times, begin.free),
         no_samples(state, times),

@@ -31,8 +31,8 @@ def _carried(system: System, t: jax.Array) -> jax.Array:
 
 
 def seen_from_base(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """`q - B y_b(t)`."""
-    return q if system.base is None else q - _carried(system, t)
+    """The configuration, displaced by `-B y_b(t)`."""
+    return q if system.base is None else system.body.moved(q, -_carried(system, t))
 
 
 def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
@@ -54,14 +54,15 @@ def kinematics(
     function = tangential if of_tangents else gaps
 
     def moved(s: jax.Array) -> jax.Array:
-        return function(system, q + s * v, t + s)
+        return function(system, system.body.moved(q, s * v), t + s)
 
     def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jax.jvp(moved, (s,), (jnp.ones_like(s),))
 
     zero, one = jnp.zeros_like(t), jnp.ones_like(t)
     (value, rate), (_, drift) = jax.jvp(rates, (zero,), (one,))
-    return Kinematics(value, rate, drift, jax.jacfwd(function, argnums=1)(system, q, t).T)
+    gradient = jax.jacfwd(lambda u: function(system, system.body.moved(q, u), t))(0 * v).T
+    return Kinematics(value, rate, drift, gradient)
 
 
 def mass_at(system: System, q: jax.Array) -> jax.Array:
@@ -96,22 +97,14 @@ def potential(system: System, q: jax.Array) -> jax.Array:
 
 def user_force(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> jax.Array:
     """F (n,) without the forces of the potential."""
-    return jnp.zeros_like(q) if system.force is None else jnp.asarray(system.force(q, v, t))
+    return jnp.zeros_like(v) if system.force is None else jnp.asarray(system.force(q, v, t))
 
 
 def free_acceleration(
     system: System, q: jax.Array, v: jax.Array, force: jax.Array, mass: jax.Array
 ) -> jax.Array:
-    """q'' (n,) without contact forces: `M q'' = F - grad V - M' v + grad(v^T M v) / 2`."""
+    """v' (n,) without contact forces: `M v' = F - grad V + inertial forces`."""
     total = force
     if system.potential is not None:
-        total = total - jax.grad(system.potential)(q)
-    if callable(system.mass):
-        total = total + jax.grad(lambda x: kinetic(system, x, v))(q)
-
-        def momentum(x: jax.Array) -> jax.Array:
-            m = mass_at(system, x)
-            return m * v if m.ndim == 1 else m @ v
-
-        total = total - jax.jvp(momentum, (q,), (v,))[1]
-    return solve_mass(mass, total)
+        total = total - system.body.pulled(q, jax.grad(system.potential)(q))
+    return solve_mass(mass, total + system.body.inertial_force(q, v))

@@ -34,6 +34,7 @@ from jimpact.motion.flow import (
     flow_of,
     no_samples,
     one_pass,
+    out_of_range,
     packed,
     put,
     sampled_states,
@@ -164,7 +165,7 @@ def event_driven(given: Given, max_events: int) -> Course:
     value.defjvp(rule, symbolic_zeros=True)
     end = value(*(x for x, y in zip(leaves, fixed) if y is None))
     samples = sampled_states(end.table.samples, given.start, end.reached)
-    events = _events(end.table, end.seen, given.q0.shape[0], given.contacts)
+    events = _events(end.table, end.seen, given)
     return Course(samples, events, end.steps, end.status)
 
 
@@ -198,13 +199,13 @@ def _run(given: Given, max_events: int, records: bool) -> _End:
 
 def _begin(given: Given, max_events: int, records: bool) -> _Run:
     system, _, _, settings, q0, v0, times, _ = given
-    n, m, dtype = q0.shape[0], given.contacts, q0.dtype
+    m, dtype = given.contacts, q0.dtype
     state = given.start
     watched = 2 * m if settings.friction else m
     flight = first_flight(system, state, encoded(no_modes(m, dtype)), watched, times)
     table = Table(
         no_samples(state, times),
-        jnp.zeros((max_events + 1, _width(n, m)), dtype),
+        jnp.zeros((max_events + 1, _width(given)), dtype),
         jnp.zeros((max_events + 1, 2 + m), jnp.int32),
     )
     penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
@@ -224,7 +225,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
     return _Run(
         flight,
         jnp.full((2, m), -jnp.inf, dtype),
-        packed(state)[2 * n :, 0],
+        packed(state)[q0.size + v0.size :, 0],
         jnp.asarray(True),
         last,
         table,
@@ -319,12 +320,13 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
     state, q0, times = jax.lax.stop_gradient((flight.state, q0, times))
     # where steps vanish before something that is not a number, it is a few roundings ahead
     ahead = AHEAD * (times[-1] - times[0])
-    q, t = state.q + ahead * state.v, state.t + ahead
+    q, t = system.body.moved(state.q, ahead * state.v), state.t + ahead
     force = user_force(system, q, state.v, t)
     rates = free_acceleration(system, q, state.v, force, mass_at(system, q))
     parts = (state.q, state.v, rates, gaps(system, q, t))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
+    code = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], code)
     if not callable(system.mass):
         return code
     begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))
@@ -339,9 +341,9 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
 # ------------------------------------------------------------------------------ the record
 
 
-def _width(n: int, m: int) -> int:
+def _width(given: Given) -> int:
     """Numbers of an event."""
-    return 2 + 3 * n + 4 * m
+    return 2 + given.q0.size + 2 * given.v0.size + 4 * given.contacts
 
 
 def _numbers(before: State, after: After) -> jax.Array:
@@ -351,12 +353,13 @@ def _numbers(before: State, after: After) -> jax.Array:
     return ravel_pytree((parts, after.accumulation_end))[0]
 
 
-def _events(table: Table, count: jax.Array, n: int, m: int) -> Events:
+def _events(table: Table, count: jax.Array, given: Given) -> Events:
     """The record of events; NaN or 0 in rows that are not used."""
     there = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
     marks = jnp.where(there[:, None], table.marks[:-1], 0)
     rows = jnp.where(there[:, None], table.events[:-1], jnp.nan)
-    sizes = np.cumsum([1, n, n, n, m, m, 2 * m])
+    n, m = given.v0.size, given.contacts
+    sizes = np.cumsum([1, given.q0.size, n, n, m, m, 2 * m])
     time, q, before, after, impulse, side, energy, end = jnp.split(rows, sizes, axis=1)
     return Events(
         count=count,
@@ -381,7 +384,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
     """Samples and events of a run, as a smooth function of `given`."""
     system, law, mu, settings, *_, times, _ = given
     start, m = given.start, given.contacts
-    width = _width(given.q0.shape[0], m)
+    width = _width(given)
     size = plan.rows.accepted.shape[0] - 1
     rows = jax.tree.map(lambda x: x[:size], plan.rows)
     index = jnp.arange(size, dtype=jnp.int32)

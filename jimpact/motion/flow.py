@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jimpact.bodies.base import Body
 from jimpact.events import stepper
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
     kinematics,
     mass_at,
+    seen_from_base,
     user_force,
 )
 from jimpact.motion.persistent_contact import (
@@ -112,6 +114,7 @@ class MotionFlow(eqx.Module):
     longest: jax.Array  # step ()
 
     near = 0.0
+    driving = adding = ()
     spare = 0  # rows beside those of the state, which only say how long steps may be
 
     @property
@@ -224,7 +227,8 @@ class MechanicalFlow(MotionFlow):
         per_contact = jnp.stack([jnp.zeros_like(friction), friction])
         still = jnp.zeros_like(at.contact)
         one = jnp.ones_like(at.t)
-        rates = State(at.v, found.acceleration, one, power, base, per_contact, still)
+        moves = self.system.body.rates(at.q, at.v)
+        rates = State(moves, found.acceleration, one, power, base, per_contact, still)
         parting = jnp.where(const.active, 0.0, given.normal.rate)
         return jnp.concatenate([self.regular(rates, at), parting[:, None]])
 
@@ -243,7 +247,7 @@ class MechanicalFlow(MotionFlow):
             rate = jnp.concatenate([rate, given.tangent.rate])
         p = constraint_impulse(given, self.mu, const, jnp.stack([value, rate], axis=1))
         move = given.moved @ p
-        return at._replace(q=at.q + move[:, 0], v=at.v + move[:, 1])
+        return at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
 
 
 def packed(state: State) -> jax.Array:
@@ -384,13 +388,23 @@ def one_pass(
         event=jnp.where(flies, landed[:-1], flight.event),
         sample=flight.sample + sampled.astype(flight.sample.dtype),
         steps=steps,
-        stuck=flight.stuck | vanishes | (steps >= settings.max_steps),
+        stuck=flight.stuck
+        | vanishes
+        | (steps >= settings.max_steps)
+        | out_of_range(flow.system, state),
     )
     aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
     plain = sampled | (accept & in_time)
     aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
     return moved._replace(aim=aim, plan=plan), accept
+
+
+def out_of_range(system: System, at: State) -> jax.Array:
+    """Whether () the gap function does not hold here any more."""
+    if type(system.body).valid is Body.valid:
+        return jnp.asarray(False)
+    return ~(system.body.valid(seen_from_base(system, at.q, at.t)) >= 0)
 
 
 def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:
@@ -413,12 +427,13 @@ def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Fl
     system, state, h = flow.system, flight.state, flight.plan[0, 0]
     push = user_force(system, state.q, state.v, state.t)
     rates = free_acceleration(system, state.q, state.v, push, mass_at(system, state.q))
-    of_q = jnp.abs(state.q) + h * jnp.abs(state.v)
+    of_q = jnp.abs(state.q) + h * jnp.abs(system.body.rates(state.q, state.v))
     of_v = jnp.abs(state.v) + h * jnp.abs(rates)
     errors = [settings.atol + settings.rtol * jnp.concatenate([of_q, of_v]), allowed]
     if flow.spare:
+        of_u = of_q if system.body.coordinates is None else h * jnp.abs(state.v)
         seen = kinematics(system, state.q, state.v, state.t)
-        of_gap = jnp.abs(seen.value) + h * jnp.abs(seen.rate) + jnp.abs(seen.gradient).T @ of_q
+        of_gap = jnp.abs(seen.value) + h * jnp.abs(seen.rate) + jnp.abs(seen.gradient).T @ of_u
         errors.append(settings.atol + settings.rtol * of_gap)
     return jnp.concatenate(errors)
 
@@ -436,8 +451,10 @@ def allowed_errors(
     both = jnp.stack([free, at.v], axis=1)
     pushed = jnp.abs(mass[:, None] * both if mass.ndim == 1 else mass @ both)
     of_q, of_v = (settings.atol + settings.rtol * jnp.abs(x) for x in (at.q, at.v))
+    if system.body.coordinates is not None:  # of displacements
+        of_q = jnp.broadcast_to(jnp.max(of_q), at.v.shape)
     ledger = share * (of_q @ pushed[:, 0] + of_v @ pushed[:, 1])
-    rows = packed(at).shape[0] - 2 * at.q.shape[0]
+    rows = packed(at).shape[0] - at.q.shape[0] - at.v.shape[0]
     # at least a number: nothing moves and nothing is pulled
     return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)  # time: none
 

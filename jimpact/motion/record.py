@@ -20,7 +20,13 @@ MOTION_STATUS = (
     Status("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
     Status("penetration", "a gap is negative at the start", True),
     Status("singular_mass", "the mass matrix is not positive definite on the way", True),
+    Status("out_of_range", "a gap function does not hold any more (`valid` of the body)", True),
     Status("not_finite", "the motion or its input is NaN or infinite", True),
+    Status(
+        "coarse_step", "a contact is struck again within 3 steps: they are too long for it", False
+    ),
+    Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
+    Status("room", "more contacts are closed than the body has `room` for", True),
 )
 MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 
@@ -44,14 +50,15 @@ class Events(eqx.Module):
     velocity_before: jax.Array
     velocity_after: jax.Array
     impulse: jax.Array  # (E, m)
-    tangential_impulse: jax.Array  # (E, m), 0 without tangents
+    tangential_impulse: jax.Array  # (E, m), in space (E, 2 m)
     energy: jax.Array  # (E, 2, m)
     status: jax.Array  # (E,) of the law, see `jimpact.STATUS`
     accumulation_end: jax.Array  # (E,)
 
 
-def no_events(size: int, n: int, m: int, dtype: Any) -> Events:
-    """An empty table of events."""
+def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None = None) -> Events:
+    """An empty table of events of m contacts; so many tangential impulses, m where not said."""
+    dtype, n = q.dtype, v.shape[0]
 
     def blank(*shape: int) -> jax.Array:
         return jnp.full((size, *shape), jnp.nan, dtype)
@@ -61,11 +68,11 @@ def no_events(size: int, n: int, m: int, dtype: Any) -> Events:
         time=blank(),
         kind=jnp.zeros(size, jnp.int32),
         contacts=jnp.zeros((size, m), bool),
-        q=blank(n),
+        q=blank(q.shape[0]),
         velocity_before=blank(n),
         velocity_after=blank(n),
         impulse=blank(m),
-        tangential_impulse=blank(m),
+        tangential_impulse=blank(m if sides is None else sides),
         energy=blank(2, m),
         status=jnp.zeros(size, jnp.int32),
         accumulation_end=blank(),

@@ -24,11 +24,11 @@ from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.compliant_contact import compliant_motion
-from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential
+from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential, seen_from_base
 from jimpact.motion.event_driven import Given, event_driven
 from jimpact.motion.flow import Course, Settings
 from jimpact.motion.record import Motion
-from jimpact.motion.stepping import time_stepping
+from jimpact.motion.stepping import is_pile, joins_step, recorded_gaps, time_stepping
 from jimpact.motion.system import System
 from jimpact.scene import check_mass
 
@@ -68,7 +68,7 @@ def simulate(
         system: gaps, mass, forces, base.
         law: any impact law.
         q0: (n,) at the start, without penetration.
-        v0: (n,).
+        v0: (n,); of bodies in space `(x', omega)`.
         t_end: [s] > t_start.
         t_start: [s].
         samples: number of equally spaced instants in the record, both ends included.
@@ -77,9 +77,10 @@ def simulate(
             a `Compliant` law act throughout: contacts take time, and may start in penetration).
         step: of the time stepping [s].
         friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
-            `tangent_function`; None: that of the law, if it has a field `friction`. Not in time
-            stepping.
-        max_events: rows for events; one more ends the motion with the status `max_events`.
+            `tangent_function`, in time stepping with any tangents; None: that of the law, if it
+            has a field `friction`.
+        max_events: rows for events; one more ends the motion with the status `max_events` (in
+            time stepping it is not written).
         rtol, atol: tolerances of the flights.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
@@ -95,6 +96,7 @@ def simulate(
         samples + 16 `max_events` + 1024. Method 'contact_forces' has forward ones (jvp, jacfwd).
 
     Raises:
+        NotImplementedError: derivatives of time stepping, which do not converge with the step.
         ValueError: shapes, t_end <= t_start, penetration, a base or a mass that is not a number, on
             the host; inside jit only the status speaks (`raise_on_failed_motion`).
 
@@ -127,7 +129,7 @@ def simulate(
             f"Argument `rtol` must be at least {FINEST_RTOL_IN_EPS} roundings of {dtype}, but has "
             f"value {rtol:g}: enable jax_enable_x64, or give a coarser one."
         )
-    mu = _friction_of(system, law, friction, q)
+    mu = _friction_of(system, law, friction, q, in_space=method == "time_stepping")
     system = _opened(system, q, v, start)
     q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     settings = Settings(
@@ -141,8 +143,14 @@ def simulate(
     )
     if method == "time_stepping":
         substeps = _substeps_of(step, t_start, t_end, count)
-        closed = settings.closed_below
-        return _stepped(system, law, q, v, start, end, count, substeps, closed, max_events)
+        joint = joins_step(law) and friction is None
+        if is_pile(system) and not joint:
+            raise ValueError(
+                "Argument `law` must be Moreau's, with its own `friction` and one `restitution`, "
+                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
+            )
+        sizes = count, substeps, joint, max_events
+        return _stepped(system, law, mu, q, v, start, end, settings.closed_below, *sizes)
     if method == "contact_forces":
         force = _force_of(law, mu)
         return _forced(system, force, settings, q, v, start, end, count, max_events)
@@ -189,19 +197,20 @@ def _forced(
 def _stepped(
     system: System,
     law: Law,
+    mu: jax.Array | None,
     q: jax.Array,
     v: jax.Array,
     start: jax.Array,
     end: jax.Array,
+    closed_below: jax.Array,
     samples: int,
     substeps: int,
-    closed_below: jax.Array,
+    joint: bool,
     max_events: int,
 ) -> Motion:
     times = _equal_times(start, end, samples)
-    return _recorded(
-        system, times, time_stepping(system, law, q, v, times, substeps, closed_below, max_events)
-    )
+    course = time_stepping(system, law, mu, q, v, times, closed_below, substeps, joint, max_events)
+    return _recorded(system, times, course)
 
 
 def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
@@ -224,7 +233,7 @@ def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
         force_work=at.work,
         base_work=at.base_work,
         contact_work=at.contact_work,
-        gaps=seen(lambda q, t: gaps(system, q, t), at.q, times),
+        gaps=seen(lambda q, t: recorded_gaps(system, q, t), at.q, times),
         events=course.events,
         steps=course.steps,
         status=course.status,
@@ -248,7 +257,11 @@ def _check_motion(
     """Raise a ValueError for a bad start, end or system."""
     if q.ndim != 1:
         raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
-    check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    many = system.body.coordinates
+    if many is None:
+        check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    else:
+        check_shape("q0", q, (many,), "the coordinates of the body")
     for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
         check_values(name, value)
     check_shape("t_start", start, (), "a time")
@@ -269,12 +282,12 @@ def _check_system(
     end: jax.Array,
     closed_below: float,
 ) -> None:
-    n = q.shape[0]
+    n = v.shape[0]
     mass = jax.eval_shape(partial(mass_at, system), q)
     if mass.shape not in ((n,), (n, n)):
         raise ValueError(
-            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `q0` has {n} "
-            f"coordinates, but has one of shape {mass.shape}."
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
+            f"velocities, but has one of shape {mass.shape}."
         )
     # functions of a system may close over traced numbers
     mass, f = mass_at(system, q), gaps(system, q, start)
@@ -294,6 +307,12 @@ def _check_system(
                 "Argument `system` must have a finite base motion, but base(t) has value "
                 f"{np.asarray(base)[bad][0]} at t = {looks[bad][0]:g} s."
             )
+    margin = float(system.body.valid(seen_from_base(system, q, start)))
+    if not margin >= 0:
+        raise ValueError(
+            "Argument `q0` must be in the range of the gap function "
+            f"({system.body.range_in_words}), but its margin has value {margin:g}."
+        )
     if not (f >= -closed_below).all():
         worst = int(jnp.argmin(f))
         raise ValueError(
@@ -326,8 +345,10 @@ def _opened(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> System:
     return eqx.tree_at(parts, system, new, is_leaf=lambda x: x is None)
 
 
-def _friction_of(system: System, law: Law, given: Any, q: jax.Array) -> jax.Array | None:
-    """mu (m,), given or of the law; None without friction."""
+def _friction_of(
+    system: System, law: Law, given: Any, q: jax.Array, in_space: bool
+) -> jax.Array | None:
+    """mu (m,), () of a pile, given or of the law; None without friction."""
     mu = getattr(law, "friction", None) if given is None else given
     tangents = jax.eval_shape(system.body.tangents, q)
     if mu is None or (tangents is None and given is None):
@@ -339,11 +360,15 @@ def _friction_of(system: System, law: Law, given: Any, q: jax.Array) -> jax.Arra
     if not is_traced(mu) and not np.any(mu):
         return None  # frictionless systems pay nothing
     m = jax.eval_shape(system.body.gap_function, q).shape[0]
-    if tangents.shape[1] != m or jax.eval_shape(system.body.tangent_function, q) is None:
+    planar = jax.eval_shape(system.body.tangent_function, q) is not None
+    if not (in_space or planar):
         raise ValueError(
-            "Argument `friction` must be 0 for a body with tangents in space: motions know planar "
-            "friction only, by a `tangent_function`."
+            "Argument `friction` must be 0 for a body with tangents in space: with "
+            "method='time_stepping' alone motions know friction in space."
         )
+    if is_pile(system):
+        check_shape("friction", mu, (), "one for all contacts of a pile")
+        return mu.astype(q.dtype)
     if mu.shape not in ((), (m,)):
         raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)

@@ -4,160 +4,407 @@ One step of length h (Remark 6.9 of Brogliato, with the forces of contact at res
 
     q_m = q + h/2 v                            the midpoint says which contacts are closed
     v+  = impact(law, scene(q_m), v)           if a closed contact approaches
-    v*  = v+ + h M^-1 F(q_m, v+, t + h/2)
-    v'  = v* + M^-1 N p,  0 <= p _|_ gamma(v') >= 0   over closed contacts: no rebound
+    v'  = v+ + h M^-1 F + M^-1 (N p + H p_t)   0 <= p _|_ gamma' >= 0,  p_t in -mu p Sgn(u')
     q'  = q_m + h/2 v'
 
-The last line but one keeps resting contacts at rest; with the law in its place they would hop with
-e h g. Order 1: impacts are late by up to h, gaps negative by up to h times the approach.
+The complementarity keeps resting contacts at rest, sticking or sliding; with the law in its place
+they would hop with e h g. Approach within what forces give in two steps is rest. Moreau's law needs
+no impact of its own: its `gamma' + e gamma >= 0` is put into the same problem. Order 1: impacts are
+late by up to h, gaps negative by up to h times the approach.
+
+DERIVATIVES of such a step do not converge: with h the time of an impact is constant, while its
+derivative is not. They are refused.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from jimpact.bodies.piles import Discs, Near
+from jimpact.impacts import impact
 from jimpact.law import Law
-from jimpact.motion.dynamics import base_velocity, gaps, user_force
+from jimpact.laws.kinematic import Moreau
+from jimpact.motion.dynamics import (
+    base_velocity,
+    free_acceleration,
+    gaps,
+    kinematics,
+    mass_at,
+    seen_from_base,
+    solve_mass,
+    user_force,
+)
 from jimpact.motion.flow import Course, State
-from jimpact.motion.persistent_contact import contacts_at
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
-from jimpact.motion.transitions import FAILS, impact_jump, no_jump
-from jimpact.solvers.lcp import solve_lcp
+from jimpact.motion.transitions import FAILS, scene_at
+from jimpact.scene import Scene
+from jimpact.solvers.many_contacts import Many, solve_many
+from jimpact.solvers.sensitivity import without_derivatives
+from jimpact.status import CODE
 
 # Gap velocities below this share of the largest speed of the motion, or below so many roundings of
 # it, are what solving for contacts at rest leaves. Ten times less, and resting beads strike in
 # every step; ten times more, and slow impacts come a step later.
 _ROUNDING, _ROUNDINGS = 1e-12, 64
+SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an impact
+# Misfit of a step's impulses, of its velocities: wanted of a few contacts, of a pile; in float32
+# so many roundings at least. A step that misses by more than OFF is told.
+FEW, PILE, ROUNDINGS, OFF = 1e-9, 1e-6, 32, 1e-2
+ITERATIONS = 1000
+MEAN = 4  # tries for the mean velocity that forces depend on; each gains h omega, of spin omega
+APART = 3  # steps: a contact that is struck again before is told
+
+WHY = (
+    "Argument `method` must not be 'time_stepping' where derivatives are taken: with the step the "
+    "times of impacts are fixed, so that derivatives do not converge. method='events' has them."
+)
+
+
+class _Few(NamedTuple):
+    """The contacts of a body, all of them, in one step."""
+
+    there: jax.Array  # (m,) closed
+    directions: jax.Array  # (n, m, b): normals, tangents
+    moved: jax.Array  # M^-1 of them
+    matrix: jax.Array  # (m, b, m, b); 0 where open
+
+    def rates(self, v: jax.Array) -> jax.Array:
+        """Gap velocities and slips (m, b) of v (n,)."""
+        return jnp.tensordot(v, self.directions, axes=1)
+
+    def fastest(self, v: jax.Array) -> jax.Array:
+        """Gap velocity () that the speeds of v could give."""
+        return jnp.max(jnp.abs(v) @ jnp.abs(self.directions[:, :, 0]))
+
+    def push(self, x: jax.Array) -> jax.Array:
+        """Change of velocity (n,) by impulses x (m, b)."""
+        return jnp.tensordot(self.moved, x, axes=2)
+
+    def pull(self, x: jax.Array) -> jax.Array:
+        """Generalized impulse (n,)."""
+        return jnp.tensordot(self.directions, x, axes=2)
+
+    def product(self, x: jax.Array) -> jax.Array:
+        """Rates (m, b) that impulses give."""
+        return jnp.tensordot(self.matrix, x, axes=2)
+
+    @property
+    def diagonal(self) -> jax.Array:
+        """Of the matrix (m, b)."""
+        m, b = self.matrix.shape[:2]
+        return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
+
+    def recall(self, memory: jax.Array) -> jax.Array:
+        """Impulses (m, b) of the last step."""
+        return jnp.where(self.there[:, None], memory, 0.0)
+
+    def keep(self, memory: jax.Array, x: jax.Array) -> jax.Array:
+        """The memory, for the next step."""
+        return x
+
+    def seen(self, values: jax.Array) -> jax.Array:
+        """What of contacts (.., m) is recorded."""
+        return values
+
+
+class _Heap(NamedTuple):
+    """The closed contacts of a pile in one step; as `_Few`."""
+
+    near: Near
+    inverse: jax.Array  # 1 / M (k + 1, 3), 0 of walls
+
+    @property
+    def there(self) -> jax.Array:
+        return self.near.there
+
+    def rates(self, v: jax.Array) -> jax.Array:
+        at = jnp.pad(v.reshape(-1, 3), ((0, 1), (0, 0)))[self.near.bodies]
+        return jnp.sum(self.near.directions * at[:, None], axis=(2, 3))
+
+    def fastest(self, v: jax.Array) -> jax.Array:
+        return 2 * jnp.max(jnp.abs(v))
+
+    def push(self, x: jax.Array) -> jax.Array:
+        return self.pull(x) * self.inverse[:-1].reshape(-1)
+
+    def pull(self, x: jax.Array) -> jax.Array:
+        each = jnp.sum(self.near.directions * x[:, :, None, None], axis=1)
+        return jnp.zeros_like(self.inverse).at[self.near.bodies].add(each)[:-1].reshape(-1)
+
+    def product(self, x: jax.Array) -> jax.Array:
+        return self.rates(self.push(x))
+
+    @property
+    def diagonal(self) -> jax.Array:
+        return jnp.sum(self.near.directions**2 * self.inverse[self.near.bodies][:, None], (2, 3))
+
+    def recall(self, memory: jax.Array) -> jax.Array:
+        return memory.at[self.near.number].get(mode="fill", fill_value=0.0)
+
+    def keep(self, memory: jax.Array, x: jax.Array) -> jax.Array:
+        return jnp.zeros_like(memory).at[self.near.number].set(x, mode="drop")
+
+    def seen(self, values: jax.Array) -> jax.Array:
+        return jnp.sum(values, axis=-1, keepdims=True)
+
+
+class _Tried(NamedTuple):
+    """One try of a step: velocity at its end, mean velocity, forces taken, impulses."""
+
+    v: jax.Array
+    mean: jax.Array
+    force: jax.Array
+    found: Many
 
 
 class _Progress(NamedTuple):
     state: State
     speed: jax.Array  # the largest that velocities could give a gap so far
+    memory: jax.Array  # impulses of the last step
+    steepness: jax.Array
+    since: jax.Array  # (m,) steps since each was struck
     events: Events
     status: jax.Array
+    told: jax.Array  # what is no failure
+
+
+def is_pile(system: System) -> bool:
+    """Whether only closed contacts are looked at."""
+    return isinstance(system.body, Discs)
+
+
+def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
+    """Gaps (m,), of a pile the least one (1,)."""
+    found = gaps(system, q, t)
+    return jnp.min(found, keepdims=True) if is_pile(system) else found
 
 
 def time_stepping(
     system: System,
     law: Law,
+    mu: jax.Array | None,
     q0: jax.Array,
     v0: jax.Array,
     times: jax.Array,
-    substeps: int,
     closed_below: jax.Array,
+    substeps: int,
+    joint: bool,
     max_events: int,
 ) -> Course:
-    """The motion with `substeps` steps between neighbours of `times` (S,)."""
-    m = gaps(system, q0, times[0]).shape[0]
-    zero = jnp.zeros((), q0.dtype)
-    rest = jnp.zeros((2, m), q0.dtype)
-    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
-    events = no_events(max_events, q0.shape[0], m, q0.dtype)
-    status = jnp.where(
-        jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)),
-        MOTION_CODE["ok"],
-        MOTION_CODE["not_finite"],
+    """The motion with `substeps` steps between neighbours of `times` (S,).
+
+    `joint`: the law is a condition on v' that joins the problem of the step (`joins_step`).
+    """
+    system, law, mu, q0, v0, times = without_derivatives(
+        (system, law, mu, q0, v0, times), NotImplementedError(WHY)
     )
-    penetrates = jnp.any(gaps(system, q0, times[0]) < -closed_below)
+    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
+    m = recorded_gaps(system, q0, times[0]).shape[0]
+
+    def rates_at(q: jax.Array) -> jax.Array:
+        return _contacts(system, q, times[0], closed_below, mu is not None).rates(v0)
+
+    contacts, b = jax.eval_shape(rates_at, q0).shape
+    kept = _numbers(system.body) if isinstance(system.body, Discs) else contacts
+    rest = jnp.zeros((2, m), dtype)
+    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
+    rows = 1 if is_pile(system) else max_events
+    events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
+    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0))
+    status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"])
+    penetrates = jnp.any(recorded_gaps(system, q0, times[0]) < -closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], status).astype(jnp.int32)
     h = (times[1] - times[0]) / substeps
+    start = _Progress(
+        begin,
+        zero,
+        jnp.zeros((kept, b), dtype),
+        jnp.ones((), dtype),
+        jnp.full(contacts, substeps * len(times)),
+        events,
+        status,
+        jnp.int32(MOTION_CODE["ok"]),
+    )
 
     def one(course: _Progress, t: jax.Array) -> tuple[_Progress, None]:
-        moved = _one_step(system, law, h, closed_below, course, t)
-        going = course.status == MOTION_CODE["ok"]
-        return jax.tree.map(lambda a, b: jnp.where(going, a, b), moved, course), None
+        def go() -> _Progress:
+            return _one_step(system, law, mu, h, closed_below, joint, course, t)
+
+        return jax.lax.cond(course.status == MOTION_CODE["ok"], go, lambda: course), None
 
     def to_sample(course: _Progress, t: jax.Array) -> tuple[_Progress, State]:
-        steps = t + h * jnp.arange(substeps, dtype=t.dtype)
-        course, _ = jax.lax.scan(one, course, steps)
+        course, _ = jax.lax.scan(one, course, t + h * jnp.arange(substeps, dtype=t.dtype))
         fine = course.status == MOTION_CODE["ok"]
         return course, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), course.state)
 
-    end, rows = jax.lax.scan(to_sample, _Progress(begin, zero, events, status), times[:-1])
-    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, rows)
+    end, later = jax.lax.scan(to_sample, start, times[:-1])
+    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, later)
     steps = jnp.int32(substeps * (times.shape[0] - 1))
-    return Course(samples, end.events, steps, end.status)
+    status = jnp.where(end.status == MOTION_CODE["ok"], end.told, end.status)
+    return Course(samples, end.events, steps, status)
+
+
+def _numbers(pile: Discs) -> int:
+    return pile.count * (pile.count + len(pile.walls))
+
+
+def _contacts(
+    system: System, q: jax.Array, t: jax.Array, closed_below: jax.Array, friction: bool
+) -> _Few | _Heap:
+    """The contacts of a step whose middle is at (q, t)."""
+    at = seen_from_base(system, q, t)
+    mass = mass_at(system, q)
+    if isinstance(system.body, Discs):
+        near = system.body.near(at, closed_below)
+        near = near if friction else near._replace(directions=near.directions[:, :1])
+        return _Heap(near, jnp.pad(1 / mass.reshape(-1, 3), ((0, 1), (0, 0))))
+    given = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
+    gap, normals = given.value, given.gradient
+    n, m = normals.shape
+    directions = normals[:, :, None]
+    if friction:
+        sides = system.body.tangents(at)
+        assert sides is not None
+        directions = jnp.concatenate([directions, sides.reshape(n, m, -1)], axis=2)
+    there = gap <= closed_below
+    directions = jnp.where(there[:, None], directions, 0.0)
+    moved = solve_mass(mass, directions.reshape(n, -1)).reshape(directions.shape)
+    return _Few(there, directions, moved, jnp.tensordot(directions, moved, axes=([0], [0])))
 
 
 def _one_step(
     system: System,
     law: Law,
+    mu: jax.Array | None,
     h: jax.Array,
     closed_below: jax.Array,
+    joint: bool,
     course: _Progress,
     t: jax.Array,
 ) -> _Progress:
-    state = course.state
+    state, dtype, body = course.state, course.state.q.dtype, system.body
     middle = t + 0.5 * h
-    q = state.q + 0.5 * h * state.v
-    f = gaps(system, q, middle)
-    m = f.shape[0]
-    closed = f <= closed_below
-    given = contacts_at(system, q, state.v, middle, False)
-    possible = jnp.max(jnp.abs(given.normal.gradient).T @ jnp.abs(state.v))
-    speed = jax.lax.stop_gradient(jnp.maximum(course.speed, possible))
-    share = max(_ROUNDING, _ROUNDINGS * float(jnp.finfo(q.dtype).eps))
-    noise = share * speed
-    strikes = jnp.any(closed & (given.normal.rate < -noise))
-    at_middle = state._replace(q=q)
-    jump = jax.lax.cond(
-        strikes,
-        lambda: impact_jump(system, law, middle, at_middle, closed, noise),
-        lambda: no_jump(at_middle, m),
-    )
-    force = user_force(system, q, jump.v, middle)
-    v, push, energy = _pressed(system, q, jump.v, middle, h, closed)
+    q = body.moved(state.q, 0.5 * h * state.v)
+    close = _contacts(system, q, middle, closed_below, mu is not None)
     carried = base_velocity(system, middle)
-    base = jump.base_work + (0.0 if carried is None else push @ carried)
-    work = state._replace(
-        q=q + 0.5 * h * v,
+    carried = jnp.zeros_like(state.v) if carried is None else carried
+    mass = mass_at(system, q)
+
+    def pushed(v: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Forces, and the acceleration without contacts, at the velocity v."""
+        force = user_force(system, q, v, middle)
+        return force, free_acceleration(system, q, v, force, mass)
+
+    before = close.rates(state.v - carried)
+    eps = float(jnp.finfo(dtype).eps)
+    speed = jnp.maximum(course.speed, close.fastest(state.v))
+    noise = max(_ROUNDING, _ROUNDINGS * eps) * speed
+    slow = noise + SLOW * h * jnp.abs(close.rates(pushed(state.v)[1])[:, 0])
+    strikes = close.there & (before[:, 0] < -slow)
+    wanted = jnp.zeros_like(before)
+    given, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
+    if joint:
+        assert isinstance(law, Moreau)
+        wanted = wanted.at[:, 0].set(law.restitution * jnp.minimum(before[:, 0], 0.0))
+        if law.tangential_restitution is not None and before.shape[1] > 1:
+            turned = jnp.where(strikes, law.tangential_restitution, 0.0)
+            wanted = wanted.at[:, 1:].set(turned[:, None] * before[:, 1:])
+    else:
+        scene = scene_at(system, q, state.v, middle, close.there)
+        given, code = jax.lax.cond(
+            jnp.any(strikes),
+            lambda: _struck(law, scene, state.v - carried, noise, before.shape),
+            lambda: (given, code),
+        )
+    wanted = wanted + close.product(given)
+
+    def solved(_: Any, tried: _Tried) -> _Tried:
+        """The step with the forces at its mean velocity, as far as that is known."""
+        force, free = pushed(tried.mean)
+        rates = close.rates(state.v + h * free - carried) + wanted
+        found = solve_many(
+            close.product,
+            close.diagonal,
+            jnp.where(close.there[:, None], rates, 0.0),
+            jnp.zeros((), dtype) if mu is None else mu,
+            tried.found.impulse,
+            tried.found.steepness,
+            max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps),
+            ITERATIONS,
+        )
+        v = state.v + h * free + close.push(given + found.impulse)
+        return _Tried(v, 0.5 * (state.v + v), force, found)
+
+    begun = Many(close.recall(course.memory), 0 * speed, jnp.int32(0), course.steepness)
+    start = _Tried(state.v, state.v, jnp.zeros_like(state.v), begun)
+    constant = system.force is None and not callable(system.mass) and body.coordinates is None
+    end = jax.lax.fori_loop(0, 1 if constant else MEAN, solved, start)
+    found, v, mean = end.found, end.v, end.mean
+    x = given + found.impulse
+    energy = x * close.rates(mean - carried)
+    sides = jnp.sum(energy[:, 1:], axis=1)
+    moved = state._replace(
+        q=body.moved(q, 0.5 * h * v),
         v=v,
         t=t + h,
-        work=state.work + h * force @ (0.5 * (jump.v + v)),
-        base_work=state.base_work + base,
-        contact_work=state.contact_work + jump.energy + energy,
+        work=state.work + h * end.force @ mean,
+        base_work=state.base_work + close.pull(x) @ carried,
+        contact_work=state.contact_work + close.seen(jnp.stack([energy[:, 0], sides])),
     )
-    finite = jnp.all(jnp.isfinite(v))
-    fails = jnp.asarray(FAILS)[jump.code]
+    fails = jnp.asarray(FAILS)[code]
     status = jnp.where(fails, MOTION_CODE["law_failed"], course.status)
+    inside = body.valid(seen_from_base(system, moved.q, t + h)) >= 0
+    status = jnp.where(inside, status, MOTION_CODE["out_of_range"])
+    if isinstance(close, _Heap):
+        status = jnp.where(close.near.lost, MOTION_CODE["room"], status)
+    finite = jnp.all(jnp.isfinite(v))
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
-    row = {
-        "time": middle,
-        "kind": jnp.int32(KIND_CODE["impact"]),
-        "contacts": jump.impulse != 0,
-        "q": q,
-        "velocity_before": state.v,
-        "velocity_after": jump.v,
-        "impulse": jump.impulse,
-        "tangential_impulse": jump.tangential,
-        "energy": jump.energy,
-        "status": jump.code,
-    }
-    return _Progress(work, speed, with_row(course.events, strikes, row), status)
-
-
-def _pressed(
-    system: System,
-    q: jax.Array,
-    v: jax.Array,
-    t: jax.Array,
-    h: jax.Array,
-    closed: jax.Array,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Velocity after the forces of the step and of contacts at rest; their push and energy."""
-    given = contacts_at(system, q, v, t, False)
-    free = v + h * given.free
-    carried = base_velocity(system, t)
-    gamma = given.normal.gradient.T @ (free if carried is None else free - carried)
-    both = closed[:, None] & closed[None, :]
-    w = jnp.where(both, given.delassus, jnp.eye(closed.shape[0], dtype=v.dtype))
-    p = jnp.where(closed, solve_lcp(w, jnp.where(closed, gamma, 0.0), regular=True).z, 0.0)
-    after = gamma + given.delassus @ p
-    energy = 0.5 * (gamma + after) * p
-    return (
-        free + given.moved @ p,
-        given.normal.gradient @ p,
-        jnp.stack([energy, jnp.zeros_like(energy)]),
+    again = isinstance(close, _Few) & jnp.any(strikes & (course.since < APART))
+    coarse = jnp.where(again, MOTION_CODE["coarse_step"], 0)
+    missed = jnp.where(found.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
+    told = jnp.maximum(course.told, jnp.maximum(coarse, missed)).astype(jnp.int32)
+    events = course.events
+    if isinstance(close, _Few):
+        struck = x if joint else given
+        row = {
+            "time": middle,
+            "kind": jnp.int32(KIND_CODE["impact"]),
+            "contacts": strikes,
+            "q": q,
+            "velocity_before": state.v,
+            "velocity_after": v if joint else state.v + close.push(given),
+            "impulse": struck[:, 0],
+            "energy": jnp.stack([energy[:, 0], sides]),
+            "status": code,
+        }
+        if before.shape[1] > 1:
+            row["tangential_impulse"] = struck[:, 1:].reshape(-1)
+        events = with_row(events, jnp.any(strikes), row)
+    return _Progress(
+        moved,
+        speed,
+        close.keep(course.memory, found.impulse),
+        found.steepness,
+        jnp.where(strikes, 1, course.since + 1),
+        events,
+        status,
+        told,
     )
+
+
+def joins_step(law: Law) -> bool:
+    """Whether the law is a condition on v' of each contact: Moreau's."""
+    return isinstance(law, Moreau) and law.restitution.ndim < 2
+
+
+def _struck(
+    law: Law, scene: Scene, v: jax.Array, noise: jax.Array, shape: tuple[int, ...]
+) -> tuple[jax.Array, jax.Array]:
+    """Impulses (m, b) of the law, and its status."""
+    out: Any = impact(law, scene, v, noise)
+    x = out.impulse[:, None]
+    if shape[1] > 1:
+        x = jnp.concatenate([x, out.tangential_impulse.reshape(shape[0], -1)], axis=1)
+    return x, out.status

@@ -253,6 +253,7 @@ def block_system(
     mass: Any = 1.0,
     acceleration: Any = STANDARD_GRAVITY,
     base: Base | None = None,
+    corners: str = "all",
 ) -> System:
     """A homogeneous planar block on a plane: `Block` in gravity; q = (x, y, theta).
 
@@ -262,12 +263,13 @@ def block_system(
         mass: [kg].
         acceleration: of gravity [m/s^2].
         base: t -> (x_b, y_b) [m], how the plane moves.
+        corners: 'all' four make contact; 'base': the lower two, as long as it does not overturn.
 
     >>> import jimpact as ji, jax.numpy as jnp
     >>> ji.block_system(1.0, 2.0).gap_function(jnp.array([0.0, 1.0, 0.0])).tolist()
-    [0.0, 0.0]
+    [0.0, 0.0, 2.0, 2.0]
     """
-    return _under_gravity(Block(width, height, mass), acceleration, base)
+    return _under_gravity(Block(width, height, mass, corners=corners), acceleration, base)
 
 
 def dimer_system(

@@ -81,7 +81,7 @@ def impact_jump(
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
     tangential, side = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
-    if scene.tangents is not None:
+    if scene.tangents is not None and scene.tangents.shape[1] == m:  # in space: no friction here
         tangential = out.tangential_impulse
         side = (scene.tangents.T @ mean) * tangential
         push = push + scene.tangents @ tangential

@@ -11,8 +11,6 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact.bodies.pendulums import PendulumCradle
-from jimpact.motion.dynamics import seen_from_base
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.plot.style import COLOURS, GREY
@@ -52,7 +50,8 @@ def motion(motion: Motion, title: str = "", names: Sequence[str] = ()) -> Figure
         colour = COLOURS[i % len(COLOURS)]
         label = names[i] if i < len(names) else f"q{i + 1}"
         top.plot(time, q[:, i], color=colour, label=label if i < _LEGEND else None)
-        middle.plot(time, v[:, i], color=colour)
+    for i in range(v.shape[1]):
+        middle.plot(time, v[:, i], color=COLOURS[i % len(COLOURS)])
     top.set_ylabel("coordinates [m, rad]")
     middle.set_ylabel("velocities [m/s, rad/s]")
     for axes in (top, middle):
@@ -109,6 +108,7 @@ def phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") -> Figu
     """
     one_motion(motion)
     n = motion.q.shape[-1]
+    n = n if n == motion.velocity.shape[-1] else 3  # in space: of the position only
     if not 0 <= coordinate < n:
         raise ValueError(f"Argument `coordinate` must lie in [0, {n - 1}], but is {coordinate}.")
     figure = Figure(figsize=(6.0, 5.0), layout="constrained")
@@ -176,24 +176,26 @@ def animation(
     q, time = q[reached], np.asarray(motion.time)[reached]
     point = _POINT * (np.nanmax(q) - np.nanmin(q) or 1.0)
     curves = [system.body.outlines(x, point) if outlines is None else outlines(x) for x in q]
-    ground = _grounds(system, q, time)
+    ground = _grounds(system, time)
     figure = Figure(figsize=(4.8, 4.8), layout="constrained", dpi=80)
     axes = figure.subplots()
-    _limits(axes, curves, ground)
+    _limits(axes, curves, ground, bool(system.body.floors))
     lines = [
         axes.plot([], [], color=COLOURS[i // 2 % len(COLOURS)])[0] for i in range(len(curves[0]))
     ]
-    floor = axes.plot([], [], color=GREY, lw=2)[0]
+    floors = [axes.plot([], [], color=GREY, lw=2)[0] for _ in system.body.floors]
+    view = np.array([axes.get_xlim(), axes.get_ylim()])
 
     def draw(k: int) -> list[Any]:
         for line, points in zip(lines, curves[k], strict=True):
             line.set_data(points[:, 0], points[:, 1])
-        if ground is not None:
-            x, y = ground[k]
-            low, high = axes.get_xlim()
-            floor.set_data([low + x, high + x], [y, y])
+        for floor, (angle, offset) in zip(floors, system.body.floors, strict=True):
+            n, along = np.array([[-np.sin(angle), np.cos(angle)], [np.cos(angle), np.sin(angle)]])
+            middle, half = view.mean(axis=1), 0.5 * np.ptp(view[0])
+            middle = (n @ ground[k] + offset) * n + along @ (middle + ground[k]) * along
+            floor.set_data(*(middle[:, None] + half * np.array([-1, 1]) * along[:, None]))
         axes.set_title(f"{title}\n{time[k]:.2f} s" if title else f"{time[k]:.2f} s", loc="left")
-        return [*lines, floor]
+        return [*lines, *floors]
 
     path.parent.mkdir(parents=True, exist_ok=True)
     shown = FuncAnimation(figure, draw, frames=len(q))
@@ -201,19 +203,18 @@ def animation(
     return path
 
 
-def _grounds(system: System, q: np.ndarray, time: np.ndarray) -> np.ndarray | None:
-    """Where the base is (S, 2); None for a system that hangs."""
-    if isinstance(system.body, PendulumCradle):
-        return None
-    moved = q - np.asarray(
-        jax.vmap(lambda x, t: seen_from_base(system, x, t))(jnp.asarray(q), jnp.asarray(time))
-    )
-    return moved[:, :2] if moved.shape[1] == 3 else np.stack([0 * moved[:, 0], moved[:, 0]], axis=1)
+def _grounds(system: System, time: np.ndarray) -> np.ndarray:
+    """Where the base is (S, 2)."""
+    base = system.base
+    if base is None:
+        return np.zeros((len(time), 2))
+    moved = np.asarray(jax.vmap(lambda t: jnp.atleast_1d(base(t)))(jnp.asarray(time)))
+    return np.insert(moved, 0, 0.0, axis=1) if moved.shape[1] == 1 else moved[:, :2]
 
 
-def _limits(axes: Axes, curves: list[Any], ground: np.ndarray | None) -> None:
+def _limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: bool) -> None:
     every = np.concatenate([points for frame in curves for points in frame])
-    if ground is not None:
+    if floors:
         every = np.concatenate([every, np.stack([every[:1, 0], ground[:1, 1]], axis=1)])
     low, high = every.min(axis=0), every.max(axis=0)
     half = 0.55 * float((high - low).max()) or 1.0

@@ -495,7 +495,10 @@ def _search(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
         room = jnp.where(skip, problem.tolerance, room)
         modes, better = _newton(problem, _at_rest(problem, swept, room))
         good = _misfit(problem, better)[0] <= problem.tolerance
-        return _Searched(jnp.where(good, better[..., 0], swept), modes, good, state.level + 1)
+        # redundant contacts near their cones: x is allowed, the least impulses are not
+        kept = _misfit(problem, swept[..., None])[0] <= problem.tolerance
+        chosen = jnp.where(good, better[..., 0], swept)
+        return _Searched(chosen, modes, good | kept, state.level + 1)
 
     first = jnp.asarray(-1 if started else 0)
     blank = _at_rest(problem, x, jnp.zeros((), x.dtype))

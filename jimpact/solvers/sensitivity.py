@@ -8,6 +8,7 @@ and so can be transposed: forward and reverse mode agree to rounding.
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
@@ -52,6 +53,26 @@ def both_modes(
 
     differentiable.defjvp(rule, symbolic_zeros=True)
     return differentiable
+
+
+def without_derivatives(values: Any, why: Exception) -> Any:
+    """`values` as they are; `why` is raised where one of them is differentiated."""
+
+    @jax.custom_jvp
+    def same(numbers: list[Any]) -> list[Any]:
+        return numbers
+
+    def rule(primals: Any, tangents: Any) -> Any:
+        rates = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
+        if any(not isinstance(rate, SymbolicZero) for rate in rates):
+            raise why
+        return primals[0], tangents[0]
+
+    same.defjvp(rule, symbolic_zeros=True)
+    leaves, tree = jax.tree.flatten(values)
+    moving = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
+    kept = dict(zip(moving, same([leaves[i] for i in moving])))
+    return jax.tree.unflatten(tree, [kept.get(i, x) for i, x in enumerate(leaves)])
 
 
 def _directions(values: list[jax.Array]) -> list[jax.Array]:

@@ -1,0 +1,416 @@
+"""Several planar bodies: on planes of any slope, and on each other."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.bodies.base import Body, LinearPotential, OnGround, number
+from jimpact.bodies.polygons import Cornered, Disc
+
+_PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
+
+
+class Contacts(NamedTuple):
+    """Of the m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
+
+    gap: jax.Array  # (m,)
+    point: jax.Array  # (m, 2)
+    normal: jax.Array  # (m, 2)
+
+
+class PlanarBodies(Body):
+    """Planar bodies on planes and on each other; q = (x, y, theta) of each centre of mass.
+
+    Equation: on a plane with normal n = (-sin a, cos a), at offset d from the origin, each contact
+    point of a body has `f = n . (x + R c_i) - r - d`. Two discs have `f = |x_1 - x_2| - r_1 - r_2`,
+    a disc and a polygon `f = dist(x_1, polygon) - r_1`. Two polygons have the two contacts of two
+    sides that face each other: at each end of the first side, the distance of its corner from the
+    second side, or, where it overhangs, that of the second side's end from the first side, or, in
+    between, that of the two corners. Normals are unit vectors n from the second body to the first,
+    tangents (n_y, -n_x); both as rates of q.
+
+    Contacts, in order: for each plane and body, its contact points; then the pairs of discs; discs
+    on polygons, polygon by polygon; polygons, two contacts a pair. `between` names their bodies.
+
+    The gap functions hold (`valid`, [m]) while the centre of a disc is outside the other body, and
+    while two sides overlap or the line of one of them keeps them apart, turned by less than 90
+    degrees against each other, with no other corner of the first body beyond the second side: a
+    body that falls beside another or rolls on it to its next side leaves this range. Bodies that
+    are no pair do not feel each other.
+
+    Args:
+        bodies: `Polygon`, `Block`, `Disc`; `Dimer` on planes only.
+        planes: angle a [rad] of each, or (a, d); 0: the ground, pi/2: a wall on the right.
+        pairs: (i, j) of bodies, counted from 0, in contact with each other; None: all. Two
+            polygons may be given as ((i, side), (j, side)), sides counted counter-clockwise: of a
+            `Block` 0 is the base, of a `Polygon` it begins at the first corner.
+        at: q (3 b,) at which the sides of two polygons are chosen that face each other, and which
+            is the first body; not needed where sides are given.
+
+    Raises:
+        ValueError: no bodies or contacts, planes that are not finite, pairs that do not exist or
+            without a gap function, two polygons without sides.
+
+    Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7 (distances, separating axes).
+
+    >>> import jimpact as ji
+    >>> slope = ji.PlanarBodies([ji.Block(0.2, 0.1)], planes=[0.3])
+    >>> slope.scene(slope.touching()).closed.tolist()
+    [True, True, False, False]
+    >>> q = [0.0, 0.5, 0.0, 0.3, 1.5, 0.0]
+    >>> stack = ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)], pairs=[(1, 0)], at=q)
+    >>> stack.scene(q).gaps[-2:].tolist()
+    [0.0, 0.0]
+    """
+
+    range_in_words = "see `PlanarBodies`: no centre in another body, sides that face each other"
+
+    bodies: tuple[OnGround, ...]
+    planes: jax.Array  # (k, 2) angle, offset
+    between: tuple[tuple[int, int], ...] = eqx.field(static=True)  # bodies of contacts; plane: -1
+    pairs: "_Pairs" = eqx.field(static=True)
+
+    def __init__(
+        self,
+        bodies: Sequence[OnGround],
+        planes: Any = (0.0,),
+        pairs: Sequence[Any] | None = None,
+        at: Any = None,
+    ):
+        self.bodies = tuple(bodies)
+        for body in self.bodies:
+            if not isinstance(body, OnGround):
+                raise TypeError(f"Argument `bodies` must hold planar bodies, but holds {body!r}.")
+        every = [_plane(plane) for plane in planes]
+        self.planes = jnp.stack(every) if every else jnp.zeros((0, 2))
+        counts = [body.points.shape[0] for body in self.bodies]
+        ground = [(b, -1) for _ in every for b, count in enumerate(counts) for _ in range(count)]
+        self.pairs = _sorted_pairs(self.bodies, pairs, at)
+        self.between = (*ground, *self.pairs.between)
+        if not self.between:
+            raise ValueError("Arguments `bodies`, `planes` and `pairs` must give a contact.")
+
+    @property
+    def mass(self) -> jax.Array:
+        """M, its diagonal (3 b,)."""
+        return jnp.concatenate([body.mass for body in self.bodies])
+
+    @property
+    def base_directions(self) -> jax.Array:
+        """All planes move in x and y (3 b, 2)."""
+        return jnp.tile(jnp.eye(3, 2, dtype=self.mass.dtype), (len(self.bodies), 1))
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = g sum m_i y_i`."""
+        up = jnp.tile(jnp.array([0.0, 1.0, 0.0], self.mass.dtype), len(self.bodies))
+        return LinearPotential(self.mass * up * acceleration)
+
+    def contacts(self, q: jax.Array) -> Contacts:
+        """Gaps, points and normals at q (3 b,); `between` says of which bodies."""
+        places, found = self._places(q), []
+        if self.planes.shape[0]:
+            found.append(self._on_planes(places))
+        if self.pairs.discs:
+            found.append(_discs(places, np.array(self.pairs.discs)))
+        for polygon, discs in self.pairs.rolling:
+            found.append(_disc_on_polygon(places, np.array(discs), polygon))
+        if self.pairs.sides:
+            found.append(_facing_sides(places, self.pairs.sides))
+        return Contacts(*(jnp.concatenate(parts) for parts in zip(*found)))
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Gaps f(q) (m,) [m]."""
+        return self.contacts(q).gap
+
+    def tangents(self, q: jax.Array) -> jax.Array:
+        """H_t (3 b, m): how fast body 1 slides along body 2, to the right of the normal."""
+        found, middle = self.contacts(q), q.reshape(-1, 3)[:, :2]
+        along = jnp.stack([found.normal[:, 1], -found.normal[:, 0]], axis=1)
+        first, second = np.array(self.between).T
+        columns = np.arange(len(first))
+        out = jnp.zeros((len(self.bodies), 3, len(first)), q.dtype)
+        for body, sign in ((first, 1.0), (second, -1.0)):
+            there = body >= 0
+            lever = found.point - middle[body]
+            turn = lever[:, :1] * along[:, 1:] - lever[:, 1:] * along[:, :1]
+            rows = sign * jnp.concatenate([along, turn], axis=1)[there]
+            out = out.at[body[there], :, columns[there]].add(rows)
+        return out.reshape(-1, len(first))
+
+    def valid(self, q: jax.Array) -> jax.Array:
+        """The least of the margins () [m], see the class."""
+        places, room = self._places(q), [super().valid(q)[None]]
+        if self.pairs.discs:
+            i, j = np.array(self.pairs.discs).T
+            room.append(_length(places.middle[i] - places.middle[j])[0])
+        for polygon, discs in self.pairs.rolling:
+            found = _disc_on_polygon(places, np.array(discs), polygon)
+            room.append(found.gap + places.rim[np.array(discs)])
+        room += [_overlap(places, *pair)[None] for pair in self.pairs.sides]
+        return jnp.min(jnp.concatenate(room))
+
+    def touching(
+        self, angle: Any = 0.0, along: Any = 0.0, body: int = 0, plane: int = 0
+    ) -> jax.Array:
+        """(x, y, theta) of one body on one plane, turned by `angle` from it, `along` it [m]."""
+        turn, way = number("angle", angle), number("along", along)
+        a, offset = self.planes[plane]
+        x, y, _ = self.bodies[body].touching(turn)
+        c, s = jnp.cos(a), jnp.sin(a)
+        right, up = x + way, y + offset
+        return jnp.stack([c * right - s * up, s * right + c * up, turn + a])
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Those of all bodies."""
+        each = zip(self.bodies, np.reshape(q, (-1, 3)))
+        return [curve for body, x in each for curve in body.outlines(x, point)]
+
+    @property
+    def floors(self) -> list[Any]:
+        """The planes."""
+        return np.asarray(self.planes).tolist()
+
+    def _places(self, q: jax.Array) -> "_Places":
+        at = q.reshape(-1, 3)
+        counts = np.array([body.points.shape[0] for body in self.bodies])
+        owner = np.repeat(np.arange(len(counts)), counts)
+        points = _placed(jnp.concatenate([body.points for body in self.bodies]), at[owner])
+        rim = jnp.stack([jnp.asarray(body.rim, q.dtype) for body in self.bodies])
+        polygons = {
+            b: _placed(body.corners[np.array(body.ring)], at[b][None])
+            for b, body in enumerate(self.bodies)
+            if isinstance(body, Cornered)
+        }
+        return _Places(owner, points, points[np.cumsum(counts) - counts], rim, polygons)
+
+    def _on_planes(self, places: "_Places") -> Contacts:
+        a, offset = self.planes.T
+        n = jnp.stack([-jnp.sin(a), jnp.cos(a)], axis=1)[:, None]
+        height = jnp.sum(n * places.points[None], axis=2) - offset[:, None]
+        point = places.points[None] - height[..., None] * n
+        gap, normal = height - places.rim[places.owner][None], jnp.broadcast_to(n, point.shape)
+        return Contacts(gap.reshape(-1), point.reshape(-1, 2), normal.reshape(-1, 2))
+
+
+Side = tuple[int, int]  # of which body, and which
+
+
+class _Pairs(NamedTuple):
+    """Pairs by what they are."""
+
+    discs: tuple[tuple[int, int], ...]
+    rolling: tuple[tuple[int, tuple[int, ...]], ...]  # a polygon and its discs
+    sides: tuple[tuple[Side, Side], ...]
+
+    @property
+    def between(self) -> list[tuple[int, int]]:
+        """Bodies of each contact."""
+        discs = [*self.discs, *((i, polygon) for polygon, some in self.rolling for i in some)]
+        return discs + [(first[0], second[0]) for first, second in self.sides for _ in (0, 1)]
+
+
+class _Places(NamedTuple):
+    owner: np.ndarray  # (p,) body of each contact point
+    points: jax.Array  # (p, 2)
+    middle: jax.Array  # (b, 2) first contact point: the middle of a disc
+    rim: jax.Array  # (b,)
+    polygons: dict[int, jax.Array]  # corners (k, 2), counter-clockwise
+
+
+def _placed(points: jax.Array, at: jax.Array) -> jax.Array:
+    """Points (p, 2) of bodies at (p or 1, 3)."""
+    c, s = jnp.cos(at[:, 2]), jnp.sin(at[:, 2])
+    x, y = points.T
+    return at[:, :2] + jnp.stack([c * x - s * y, s * x + c * y], axis=1)
+
+
+def _length(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lengths (g,) and unit vectors (g, 2); one of length 0 has no direction."""
+    square = jnp.sum(vectors**2, axis=1)
+    length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    return jnp.where(square > 0, length, 0.0), vectors / length[:, None]
+
+
+def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.sum(a * b, axis=-1)
+
+
+def _outward(side: jax.Array) -> jax.Array:
+    """Unit normals (.., 2) of counter-clockwise sides (.., 2)."""
+    return jnp.stack([side[..., 1], -side[..., 0]], axis=-1) / jnp.sqrt(_dot(side, side))[..., None]
+
+
+def _discs(places: _Places, pairs: np.ndarray) -> Contacts:
+    i, j = pairs.T
+    length, n = _length(places.middle[i] - places.middle[j])
+    gap = length - places.rim[i] - places.rim[j]
+    return Contacts(gap, places.middle[j] + (places.rim[j] + 0.5 * gap)[:, None] * n, n)
+
+
+def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> Contacts:
+    """Distances of discs from a polygon: from a side, or, beyond its ends, from a corner."""
+    begin, middle = places.polygons[polygon], places.middle[discs]
+    side = jnp.roll(begin, -1, axis=0) - begin
+    normals = _outward(side)
+    heights = jnp.sum((middle[:, None] - begin[None]) * normals[None], axis=2)
+    nearest = jnp.argmax(heights, axis=1)  # outside, its side or one of its ends is the nearest
+    a, along, n = begin[nearest], side[nearest], normals[nearest]
+    share = _dot(middle - a, along) / _dot(along, along)
+    beyond = (share < 0) | (share > 1)
+    corner = a + jnp.where(share > 1, 1.0, 0.0)[:, None] * along
+    length, toward = _length(middle - corner)
+    n = jnp.where(beyond[:, None], toward, n)
+    away = jnp.where(beyond, length, jnp.max(heights, axis=1))
+    return Contacts(away - places.rim[discs], middle - away[:, None] * n, n)
+
+
+def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> Contacts:
+    """Two contacts a pair, at the begin and at the end of the first body's side."""
+
+    def ends(which: int) -> tuple[jax.Array, jax.Array]:
+        found = [_side(places, pair[which]) for pair in pairs]
+        return jnp.stack([x for x, _ in found]), jnp.stack([x for _, x in found])
+
+    (a_begin, a_end), (b_begin, b_end) = ends(0), ends(1)
+    n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)
+
+    def at_end(a: jax.Array, other_a: jax.Array, b: jax.Array, other_b: jax.Array) -> Contacts:
+        side = other_a - a
+        share = _dot(side, b - a) / _dot(side, side)
+        over = _dot(b - other_b, a - b) > 0  # a overhangs: b is under the side, or beyond it
+        past = _dot(other_b - b, a - other_b) > 0  # the sides do not overlap
+        by_side = over & (share >= 0) & (share <= 1)
+        by_end = past | (over & ~by_side)
+        end = jnp.where((over & (share > 1))[:, None], other_a, a)
+        b = jnp.where(past[:, None], other_b, b)
+        apart, toward = _length(end - b)
+        gap = jnp.where(by_end, apart, jnp.where(by_side, _dot(n_a, b - a), _dot(n_b, a - b)))
+        n = jnp.where(by_end[:, None], toward, jnp.where(by_side[:, None], -n_a, n_b))
+        point = jnp.where(by_end[:, None], 0.5 * (end + b), jnp.where(by_side[:, None], b, a))
+        return Contacts(gap, point, n)
+
+    both = (at_end(a_begin, a_end, b_end, b_begin), at_end(a_end, a_begin, b_begin, b_end))
+    gap, point, n = (jnp.stack(parts, axis=1) for parts in zip(*both))
+    return Contacts(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
+
+
+def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
+    corners, begin = places.polygons[side[0]], side[1]
+    return corners[begin], corners[(begin + 1) % corners.shape[0]]
+
+
+def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
+    """Margin () [m] of the gaps of two sides, see `PlanarBodies`."""
+    (a_begin, a_end), (b_begin, b_end) = _side(places, first), _side(places, second)
+    n = _outward(b_end - b_begin)
+    along = jnp.stack([-n[1], n[0]])  # from begin to end
+    corners = places.polygons[first[0]]
+    others = [
+        c for c in range(corners.shape[0]) if c not in (first[1], (first[1] + 1) % len(corners))
+    ]
+    beyond = jnp.min((corners[np.array(others)] - b_begin[None]) @ n)
+    facing = along @ (a_begin - a_end)
+    shared = jnp.minimum(along @ (a_begin - b_end), 0.0) + along @ (b_end - b_begin)
+    shared = shared - jnp.maximum(along @ (a_end - b_begin), 0.0)
+    above = jnp.minimum((a_begin - b_begin) @ n, (a_end - b_begin) @ n)
+    n_a = _outward(a_end - a_begin)
+    apart = jnp.maximum(above, jnp.minimum((b_begin - a_begin) @ n_a, (b_end - a_begin) @ n_a))
+    return jnp.minimum(jnp.minimum(beyond, facing), jnp.maximum(shared, apart))
+
+
+# ------------------------------------------------------------------------------ construction
+
+
+def _plane(plane: Any) -> jax.Array:
+    """(angle, offset) of an angle, or of both."""
+    found = as_float_array("planes", plane)
+    found = jnp.stack([found, jnp.zeros_like(found)]) if found.ndim == 0 else found
+    check_shape("planes", found, (2,), "an angle, or an angle and an offset, of each")
+    check_values("planes", found)
+    return found
+
+
+def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at: Any) -> _Pairs:
+    if pairs is None:
+        shapes = [b for b, body in enumerate(bodies) if isinstance(body, Cornered | Disc)]
+        pairs = [(i, j) for i in shapes for j in shapes if i > j]
+    discs: list[tuple[int, int]] = []
+    rolling: dict[int, list[int]] = {}
+    sides: list[tuple[Side, Side]] = []
+    for pair in pairs:
+        i, j = (_body_of(x, bodies) for x in pair)
+        if i == j:
+            raise ValueError(f"Argument `pairs` must join different bodies, but holds {pair!r}.")
+        if isinstance(bodies[i], Disc) and isinstance(bodies[j], Disc):
+            discs.append((i, j))
+        elif isinstance(bodies[i], Disc):
+            rolling.setdefault(j, []).append(i)
+        elif isinstance(bodies[j], Disc):
+            rolling.setdefault(i, []).append(j)
+        else:
+            sides.append(_sides_of(pair, i, j, bodies, at))
+    grouped = tuple((polygon, tuple(some)) for polygon, some in rolling.items())
+    return _Pairs(tuple(discs), grouped, tuple(sides))
+
+
+def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:
+    body = entry if np.ndim(entry) == 0 else entry[0]
+    if not 0 <= body < len(bodies):
+        raise ValueError(
+            f"Argument `pairs` must hold bodies 0 to {len(bodies) - 1}, but holds {body!r}."
+        )
+    if not isinstance(bodies[body], Cornered | Disc):
+        raise ValueError(
+            f"Argument `pairs` must join polygons and discs, but body {body} is a "
+            f"{type(bodies[body]).__name__}."
+        )
+    return int(body)
+
+
+def _polygon(bodies: tuple[OnGround, ...], which: int) -> Cornered:
+    body = bodies[which]
+    assert isinstance(body, Cornered)
+    return body
+
+
+def _sides_of(
+    pair: Any, i: int, j: int, bodies: tuple[OnGround, ...], at: Any
+) -> tuple[Side, Side]:
+    """The sides in contact of two polygons: as given, or those that face each other."""
+    if all(np.ndim(x) for x in pair):
+        for body, side in pair:
+            count = len(_polygon(bodies, body).ring)
+            if not 0 <= side < count:
+                raise ValueError(
+                    f"Argument `pairs` must hold sides 0 to {count - 1} of body {body}, but holds "
+                    f"{side!r}."
+                )
+        return (i, int(pair[0][1])), (j, int(pair[1][1]))
+    if at is None or is_traced((at, bodies)):
+        raise ValueError(
+            f"Argument `at` must be given, a configuration that is not traced, for the polygons "
+            f"{i} and {j}: or give their sides."
+        )
+    q = as_float_array("at", at)
+    check_shape("at", q, (3 * len(bodies),), "x, y, theta of each body")
+    check_values("at", q)
+
+    def shape(which: int) -> tuple[np.ndarray, np.ndarray]:
+        body = _polygon(bodies, which)
+        corners = _placed(body.corners[np.array(body.ring)], q.reshape(-1, 3)[which][None])
+        return np.asarray(corners), np.asarray(_outward(jnp.roll(corners, -1, axis=0) - corners))
+
+    best = []
+    for first, second in ((i, j), (j, i)):
+        (a, normals_a), (b, normals_b) = shape(first), shape(second)
+        away = np.min(np.sum((a[:, None] - b[None]) * normals_b, axis=2), axis=0)
+        widest = int(np.argmax(away))
+        facing = int(np.argmin(normals_a @ normals_b[widest]))
+        best.append((away[widest], (first, facing), (second, widest)))
+    _, first_side, second_side = best[int(best[1][0] > best[0][0] + _PARALLEL)]
+    return first_side, second_side

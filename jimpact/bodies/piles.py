@@ -1,0 +1,162 @@
+"""Piles: many discs between walls, each contact between two of them or with a wall."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, as_whole, check_values
+from jimpact.bodies.base import CIRCLE, Body, LinearPotential, positives, turned
+
+ROOM = 4  # contacts per disc: equal discs have 3, and walls
+
+
+class Near(NamedTuple):
+    """Contacts of a pile that are closed, at most `room` of them; rows beyond are 0."""
+
+    number: jax.Array  # (K,) of the contact among all (i, j), count * (count + walls) for none
+    there: jax.Array  # (K,)
+    bodies: jax.Array  # (K, 2); the number of discs stands for a wall
+    directions: jax.Array  # (K, 2, 2, 3): normal and tangent, of both discs, in x, y, turn
+    lost: jax.Array  # whether there are more
+
+
+class Discs(Body):
+    """Discs in a plane between straight walls; q = (x, y, turn) of each in turn.
+
+    Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
+    `(v_i - v_j) . t - R_i omega_i - R_j omega_j`, t = n turned by a quarter counter-clockwise.
+    Inertia `m R^2 / 2`. As a `Scene` it has a contact for every pair, those of disc 1 first, and
+    for each disc and wall, disc by disc. Motions of many discs are those of
+    `simulate(method="time_stepping")`, which looks at closed contacts only.
+
+    Args:
+        masses: > 0, scalar or (k,) [kg].
+        radii: > 0 (k,) [m].
+        walls: rows (n_x, n_y, d): the half plane `n . x >= d` is free; n is made a unit vector.
+        room: contacts that may be closed at once in time stepping; None: 4 a disc.
+
+    >>> import jimpact as ji
+    >>> discs = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])
+    >>> [round(float(f), 6) for f in discs.gap_function(discs.at([[0.0, 0.1], [0.5, 0.1]]))]
+    [0.3, 0.0, 0.0]
+    """
+
+    masses: jax.Array
+    radii: jax.Array
+    walls: jax.Array
+    room: int = eqx.field(static=True)
+
+    def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
+        self.radii = positives("radii", radii)
+        self.masses = positives("masses", masses, self.radii.shape[0])
+        rows = as_float_array("walls", np.reshape(walls, (-1, 3)) if len(walls) == 0 else walls)
+        if rows.ndim != 2 or rows.shape[1] != 3:
+            raise ValueError(f"Argument `walls` must have shape (w, 3), but has {rows.shape}.")
+        check_values("walls", rows)
+        length = jnp.sqrt(jnp.sum(rows[:, :2] ** 2, axis=1))
+        check_values("walls", length, low=0.0, open_low=True)
+        scale = jnp.stack([length, length, jnp.ones_like(length)], axis=1)
+        self.walls = (rows / scale).astype(self.radii.dtype)
+        self.room = ROOM * len(self.radii) if room is None else as_whole("room", room, 1)
+
+    @property
+    def count(self) -> int:
+        """Number of discs."""
+        return self.radii.shape[0]
+
+    @property
+    def mass(self) -> jax.Array:
+        """M, its diagonal (n,)."""
+        turning = 0.5 * self.masses * self.radii**2
+        return jnp.stack([self.masses, self.masses, turning], axis=1).reshape(-1)
+
+    def at(self, centres: Any) -> jax.Array:
+        """q (n,) with the discs, not turned, at these centres (k, 2) [m]."""
+        places = as_float_array("centres", centres)
+        if places.shape != (self.count, 2):
+            raise ValueError(
+                f"Argument `centres` must have shape ({self.count}, 2), but has {places.shape}."
+            )
+        return jnp.pad(places, ((0, 0), (0, 1))).reshape(-1)
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = g sum m_i y_i`."""
+        none = jnp.zeros_like(self.masses)
+        up = jnp.stack([none, self.masses, none], axis=1).reshape(-1)
+        return LinearPotential(up * acceleration)
+
+    @property
+    def base_directions(self) -> jax.Array:
+        """The walls move in x and y (n, 2)."""
+        return jnp.tile(jnp.eye(3, 2, dtype=self.radii.dtype), (self.count, 1))
+
+    # ---- all contacts
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Gaps of all pairs, then of each disc with every wall."""
+        first, second, gaps = *self._pairs(), self._all_gaps(q)
+        return jnp.concatenate([gaps[first, second], gaps[:, self.count :].reshape(-1)])
+
+    def tangent_function(self, q: jax.Array) -> jax.Array:
+        """Ways that the discs slide on each other and along the walls."""
+        at = q.reshape(-1, 3)
+        first, second = self._pairs()
+        way = at[first, :2] - at[second, :2]
+        rolled = self.radii * at[:, 2]
+        both = self.radii[first] + self.radii[second]
+        around = both * jnp.arctan2(way[:, 1], way[:, 0]) - rolled[first] - rolled[second]
+        along = at[:, :2] @ jnp.stack([-self.walls[:, 1], self.walls[:, 0]]) - rolled[:, None]
+        return jnp.concatenate([around, along.reshape(-1)])
+
+    def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        return np.triu_indices(self.count, 1)
+
+    def _all_gaps(self, q: jax.Array) -> jax.Array:
+        """(k, k + w), of which pairs count once, above the diagonal; elsewhere inf."""
+        centres = q.reshape(-1, 3)[:, :2]
+        once = np.triu(np.ones((self.count, self.count), bool), 1)
+        squares = jnp.sum((centres[:, None] - centres[None]) ** 2, axis=2)
+        apart = jnp.sqrt(jnp.where(once, squares, 1.0)) - self.radii[:, None] - self.radii[None]
+        to_walls = centres @ self.walls[:, :2].T - self.walls[None, :, 2] - self.radii[:, None]
+        return jnp.concatenate([jnp.where(once, apart, jnp.inf), to_walls], axis=1)
+
+    # ---- closed contacts only
+
+    def near(self, q: jax.Array, below: jax.Array) -> Near:
+        """The contacts with gaps up to `below`."""
+        gaps = self._all_gaps(q)
+        none, across = gaps.size, gaps.shape[1]
+        closed = gaps.reshape(-1) <= below
+        number = jnp.nonzero(closed, size=self.room, fill_value=none)[0]
+        there = number < none
+        i, j = jnp.where(there, number, 0) // across, jnp.where(there, number, 0) % across
+        wall = j >= self.count
+        at, radius = q.reshape(-1, 3), self.radii
+        other = jnp.minimum(j, self.count - 1)
+        way = at[i, :2] - at[other, :2]
+        length = jnp.sqrt(jnp.sum(way**2, axis=1, keepdims=True))
+        normal = way / jnp.where(length > 0, length, 1.0)
+        if len(self.walls):
+            row = self.walls[jnp.maximum(j - self.count, 0)]
+            normal = jnp.where(wall[:, None], row[:, :2], normal)
+        zero = jnp.zeros_like(normal[:, 0])
+        x, y = normal.T
+        arms = -radius[i], -jnp.where(wall, 0.0, radius[other])
+        own = jnp.stack([jnp.stack([x, y, zero], 1), jnp.stack([-y, x, arms[0]], 1)], axis=1)
+        opposite = jnp.stack([jnp.stack([-x, -y, zero], 1), jnp.stack([y, -x, arms[1]], 1)], 1)
+        directions = jnp.stack([own, opposite], axis=2)
+        return Near(
+            number,
+            there,
+            jnp.stack([i, jnp.where(wall, self.count, other)], axis=1),
+            jnp.where(there[:, None, None, None], directions, 0.0),
+            jnp.sum(closed) > self.room,
+        )
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Circles, each with the radius that shows how far it has turned."""
+        spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
+        return [turned(float(r) * spoke, at) for r, at in zip(self.radii, q.reshape(-1, 3))]

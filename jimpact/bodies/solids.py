@@ -1,0 +1,348 @@
+"""Bodies in space over a plane: boxes and spheres, their orientation a unit quaternion."""
+
+import itertools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.bodies.base import (
+    CIRCLE,
+    Body,
+    LinearPotential,
+    number,
+    positive,
+    positives,
+    projected,
+)
+from jimpact.scene import check_mass
+
+# How far a quaternion may be from length 1. Numbers written with six digits are within; ten times
+# more, and a motion could turn a body by a visible angle before it says so.
+UNIT_WITHIN = 1e-6
+_SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
+_SERIES = 1e-2  # squares of angles below it go through the series: there the formula is 0/0
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+_LEVEL = (0.0, 0.0, 1.0)
+
+
+class Solid(Body):
+    """A rigid body in space over a plane through the origin; q = (x, y, z, e_0, e_1, e_2, e_3).
+
+    Equation: x is the centre of mass, e a unit quaternion (scalar first), R(e) turns the body's
+    axes into those of space. Velocities are v = (x', omega), omega in the body's axes:
+    `e' = e (0, omega) / 2`, `M = diag(m, m, m) + I`,
+    `M v' = F - (0, omega x I omega)`. Contact i is
+    a sphere of radius r about the point c_i of the body: `f_i = n . (x + R c_i) - r`, its lowest
+    point slides at `t . (x' + R (omega x d_i))`, `d_i = c_i - r R^T n`, along two directions t,
+    the first one that of x, both in the plane. Turning is exact: `moved` keeps the length of e.
+    A body of this kind gives `points` (m, 3) and, unless it is 0, `rim`.
+
+    Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2 and 4.
+    """
+
+    range_in_words = "a quaternion of length 1"
+
+    total_mass: jax.Array
+    inertia: jax.Array  # (3,) its diagonal, or (3, 3)
+    middle: jax.Array  # (3,) of the body's shape, from the centre of mass
+    normal: jax.Array  # (3,)
+
+    def _weigh(self, mass: Any, inertia: Any, homogeneous: Any, centre: Any, normal: Any) -> None:
+        """Set what all bodies have; `homogeneous` are the moments of inertia over the mass."""
+        self.total_mass = positive("mass", mass)
+        self.middle = -_vector("centre", (0.0,) * 3 if centre is None else centre)
+        if inertia is None:
+            if centre is not None:
+                raise ValueError("Argument `inertia` must be given with `centre`.")
+            inertia = self.total_mass * homogeneous
+        self.inertia = _inertia(inertia)
+        n = _vector("normal", normal)
+        if not is_traced(n) and not float(n[2]) > 0:
+            raise ValueError(
+                f"Argument `normal` must point up (its z > 0), but has value {n.tolist()}."
+            )
+        self.normal = n / jnp.sqrt(jnp.sum(n**2))
+
+    @property
+    def points(self) -> jax.Array:
+        """c_i (m, 3) from the centre of mass [m]."""
+        raise NotImplementedError(f"{type(self).__name__} must define `points`.")
+
+    @property
+    def rim(self) -> Any:
+        """r () of the spheres about them [m]."""
+        return 0.0
+
+    @property
+    def coordinates(self) -> int:
+        """Seven, with six velocities."""
+        return 7
+
+    @property
+    def mass(self) -> jax.Array:
+        """M (6,), its diagonal, or (6, 6)."""
+        still = jnp.stack([self.total_mass] * 3)
+        if self.inertia.ndim == 1:
+            return jnp.concatenate([still, self.inertia])
+        return jax.scipy.linalg.block_diag(jnp.diag(still), self.inertia)
+
+    def valid(self, q: jax.Array) -> jax.Array:
+        """How much farther from 1 the quaternion's length may be ()."""
+        return UNIT_WITHIN - jnp.abs(jnp.sqrt(jnp.sum(q[3:] ** 2)) - 1)
+
+    def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
+        """q displaced by u[:3] and turned by the vector u[3:] of the body's axes; |e| = 1."""
+        e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
+        half = 0.5 * u[3:]
+        cosine, ratio = _cosine_and_sine_ratio(half @ half)
+        return jnp.concatenate([q[:3] + u[:3], _product(e, cosine, ratio * half)])
+
+    def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
+        """`-(0, omega x I omega)` (6,)."""
+        omega = v[3:]
+        spin = self.inertia * omega if self.inertia.ndim == 1 else self.inertia @ omega
+        return jnp.concatenate([jnp.zeros_like(omega), -jnp.cross(omega, spin)])
+
+    @property
+    def base_directions(self) -> jax.Array:
+        """The plane moves in x, y and z (6, 3)."""
+        return jnp.eye(6, 3, dtype=self.mass.dtype)
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = m g z`."""
+        up = jnp.zeros(7, self.mass.dtype).at[2].set(1.0)
+        return LinearPotential(self.total_mass * up * acceleration)
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Heights of the contact points over the plane (m,)."""
+        return self.normal @ q[:3] + self.points @ (rotation(q).T @ self.normal) - self.rim
+
+    def tangents(self, q: jax.Array) -> jax.Array:
+        """H_t (6, 2 m): two directions in the plane for each contact."""
+        n = self.normal
+        none = jnp.zeros_like(n[0])
+        first = jnp.stack([n[2], none, none - n[0]]) / jnp.sqrt(n[2] ** 2 + n[0] ** 2)
+        both = jnp.stack([first, jnp.cross(n, first)])
+        back = rotation(q).T
+        lever = self.points - (self.rim * (back @ n))[None, :]
+        turn = jnp.cross(lever[:, None, :], (both @ back.T)[None, :, :])
+        still = jnp.broadcast_to(both[None], turn.shape)
+        return jnp.concatenate([still, turn], axis=2).reshape(-1, 6).T
+
+    def at(self, position: Any, quaternion: Any = _UPRIGHT) -> jax.Array:
+        """q (7,) with the middle of its shape, not its centre of mass, at `position` (3,) [m]."""
+        place, e = _vector("position", position), _unit(quaternion)
+        away = jnp.concatenate([place, e])
+        return away.at[:3].add(-rotation(away) @ self.middle)
+
+    def touching(self, quaternion: Any = _UPRIGHT) -> jax.Array:
+        """q (7,), turned like this, at which its lowest contacts touch the plane at the origin."""
+        q = jnp.concatenate([jnp.zeros(3, self.mass.dtype), _unit(quaternion)])
+        return q.at[:3].set(-jnp.min(self.gap_function(q)) * self.normal)
+
+    @property
+    def floors(self) -> tuple[()]:
+        """None: outlines have a shadow on the plane instead."""
+        return ()
+
+    def _drawn(self, q: np.ndarray, curve: np.ndarray) -> list[np.ndarray]:
+        """A curve (k, 3) of the body in projection, and its shadow."""
+        seen = q[:3] + curve @ np.asarray(rotation(jnp.asarray(q))).T
+        n = np.asarray(self.normal)
+        return [projected(seen), projected(seen - np.outer(seen @ n, n))]
+
+
+class Box(Solid):
+    """A box in space over a plane, see `Solid`; one contact a corner, eight in all.
+
+    Equation: c_i = middle + (+/- a/2, +/- b/2, +/- c/2), contacts in the order (-,-,-), (-,-,+),
+    (-,+,-), ... (+,+,+) of the body's axes; with `rounding` r, spheres that touch the sides.
+
+    Args:
+        sizes: (a, b, c) > 0 [m].
+        mass: m > 0 [kg].
+        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg m^2]; None:
+            homogeneous, `m (b^2 + c^2) / 12`, ...
+        centre: (3,) of mass, from the middle of the box and inside it [m]; with it goes an
+            `inertia`. None: the middle.
+        rounding: r >= 0 of the corners, at most half the shortest size [m].
+        normal: of the plane (3,), z > 0: (0, 0, 1) is level.
+
+    Raises:
+        ValueError: sizes, mass or inertia not positive, moments of inertia that no body has, a
+            centre of mass outside or without inertia, a rounding that does not fit.
+
+    Source: own derivation; see `Solid`.
+
+    >>> import jimpact as ji
+    >>> box = ji.Box([0.2, 0.1, 0.3], mass=2.0)
+    >>> scene = box.scene(box.touching())
+    >>> scene.closed.tolist()[:4], scene.tangents.shape
+    ([True, False, True, False], (6, 16))
+    """
+
+    sizes: jax.Array
+    rounding: jax.Array
+
+    def __init__(
+        self,
+        sizes: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        centre: Any = None,
+        rounding: Any = 0.0,
+        normal: Any = _LEVEL,
+    ):
+        self.sizes = positives("sizes", as_float_array("sizes", sizes), 3)
+        square = self.sizes**2
+        self._weigh(mass, inertia, (jnp.sum(square) - square) / 12, centre, normal)
+        self.rounding = positive("rounding", rounding, low_allowed=True)
+        if not is_traced((self.sizes, self.rounding, self.middle)):
+            half = 0.5 * np.asarray(self.sizes)
+            check_values("rounding", self.rounding, high=float(half.min()))
+            if not (np.abs(self.middle) < half).all():
+                raise ValueError(
+                    "Argument `centre` must lie inside the box, but has value "
+                    f"{(-np.asarray(self.middle)).tolist()}."
+                )
+
+    @property
+    def points(self) -> jax.Array:
+        """Middles of the corners' spheres (8, 3)."""
+        signs = jnp.array([*itertools.product((-1.0, 1.0), repeat=3)], self.sizes.dtype)
+        return self.middle[None, :] + signs * (0.5 * self.sizes - self.rounding)[None, :]
+
+    @property
+    def rim(self) -> jax.Array:
+        """The rounding."""
+        return self.rounding
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Its edges and their shadow, in projection."""
+        signs = np.array([*itertools.product((-0.5, 0.5), repeat=3)])
+        every = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]  # a way along all edges
+        return self._drawn(q, (np.asarray(self.middle) + signs * np.asarray(self.sizes))[every])
+
+
+class Sphere(Solid):
+    """A sphere in space over a plane, see `Solid`; one contact.
+
+    Equation: `f = n . (x + R c) - r`, c its middle from the centre of mass.
+
+    Args:
+        radius: r > 0 [m].
+        mass: m > 0 [kg].
+        inertia: about the centre of mass, scalar, (3,) along the body's axes or (3, 3) [kg m^2];
+            None: homogeneous, `2 m r^2 / 5`.
+        centre: (3,) of mass, from the middle and inside [m]; with it goes an `inertia`.
+        normal: of the plane (3,), z > 0: (0, 0, 1) is level.
+
+    Raises:
+        ValueError: as for `Box`.
+
+    >>> import jimpact as ji
+    >>> ball = ji.Sphere(0.1, mass=2.0)
+    >>> [round(float(x), 6) for x in ball.scene(ball.touching()).tangents[:, 0]]
+    [1.0, 0.0, 0.0, 0.0, -0.1, 0.0]
+    """
+
+    radius: jax.Array
+
+    def __init__(
+        self,
+        radius: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        centre: Any = None,
+        normal: Any = _LEVEL,
+    ):
+        self.radius = positive("radius", radius)
+        if inertia is not None and np.ndim(inertia) == 0:
+            inertia = jnp.stack([number("inertia", inertia)] * 3)
+        self._weigh(mass, inertia, jnp.stack([0.4 * self.radius**2] * 3), centre, normal)
+        if not is_traced((self.radius, self.middle)):
+            far = np.linalg.norm(np.asarray(self.middle))
+            check_values("centre", far, high=float(self.radius))
+
+    @property
+    def points(self) -> jax.Array:
+        """The middle (1, 3)."""
+        return self.middle[None, :]
+
+    @property
+    def rim(self) -> jax.Array:
+        """The radius."""
+        return self.radius
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Its silhouette, and two great circles of the body with their shadow, in projection."""
+        flat = np.insert(CIRCLE, 2, 0.0, axis=1)
+        rings = np.concatenate([flat, np.roll(flat, 1, axis=1)])
+        turning = self._drawn(q, np.asarray(self.middle) + float(self.radius) * rings)
+        middle = q[:3] + np.asarray(rotation(jnp.asarray(q)) @ self.middle)
+        return [*turning, projected(middle) + float(self.radius) * CIRCLE]
+
+
+def rotation(q: jax.Array) -> jax.Array:
+    """R (3, 3) of q (7,), from the body's axes to those of space, whatever the length of e."""
+    w, e = q[3], q[4:]
+    zero = jnp.zeros_like(w)
+    cross = jnp.stack([zero, -e[2], e[1], e[2], zero, -e[0], -e[1], e[0], zero]).reshape(3, 3)
+    turn = 2 * (w * cross + cross @ cross) / jnp.sum(q[3:] ** 2)
+    return jnp.eye(3, dtype=q.dtype) + turn
+
+
+def _product(e: jax.Array, w: jax.Array, u: jax.Array) -> jax.Array:
+    """Quaternion product e (w, u)."""
+    scalar = e[0] * w - e[1:] @ u
+    return jnp.append(scalar, e[0] * u + w * e[1:] + jnp.cross(e[1:], u))
+
+
+def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """`cos(a)` and `sin(a) / a` of `a^2`, with all derivatives at 0."""
+    small = square < _SERIES
+    a = jnp.sqrt(jnp.where(small, 1.0, square))
+    x = jnp.where(small, square, 0.0)
+    cosine = 1 - x / 2 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
+    ratio = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110))))
+    return jnp.where(small, cosine, jnp.cos(a)), jnp.where(small, ratio, jnp.sin(a) / a)
+
+
+def _vector(name: str, value: Any) -> jax.Array:
+    found = as_float_array(name, value)
+    check_shape(name, found, (3,), "a vector in space")
+    check_values(name, found)
+    return found
+
+
+def _unit(quaternion: Any) -> jax.Array:
+    e = as_float_array("quaternion", quaternion)
+    check_shape("quaternion", e, (4,), "scalar first")
+    check_values("quaternion", e)
+    if not is_traced(e) and abs(float(np.linalg.norm(e)) - 1) > UNIT_WITHIN:
+        raise ValueError(
+            f"Argument `quaternion` must have length 1, but has length {np.linalg.norm(e):g}."
+        )
+    return e
+
+
+def _inertia(value: Any) -> jax.Array:
+    found = as_float_array("inertia", value)
+    if found.shape not in ((3,), (3, 3)):
+        raise ValueError(f"Argument `inertia` must have shape (3,) or (3, 3), not {found.shape}.")
+    if is_traced(found):
+        return found
+    try:
+        check_mass(found)
+    except ValueError as error:
+        raise ValueError(str(error).replace("`mass`", "`inertia`").replace("M ", "I ")) from None
+    least = np.sort(found if found.ndim == 1 else np.linalg.eigvalsh(found))
+    if least[2] > (1 + _SLACK) * (least[0] + least[1]):
+        raise ValueError(
+            "Argument `inertia` must have principal moments none of which is more than the sum of "
+            f"the others, but has {least.tolist()}."
+        )
+    return found

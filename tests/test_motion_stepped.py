@@ -1,0 +1,207 @@
+"""Worked motions by time stepping: blocks that overturn, bricks and cubes in space."""
+
+import csv
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jimpact as ji
+from jimpact.bodies.solids import rotation
+
+G = 9.80665
+CUBE = Path(__file__).parent / "data" / "cube_pairs.csv"
+
+
+def status(motion):
+    return motion.to_dict()["status"]
+
+
+# ------------------------------------------------------------- a block shaken by one pulse
+
+
+class Pulse(eqx.Module):
+    """One period of a sine: the horizontal acceleration of the ground."""
+
+    amplitude: jax.Array
+    frequency: jax.Array
+
+    def __call__(self, t):
+        phase = jnp.clip(self.frequency * t, 0, 2 * jnp.pi)
+        x = self.amplitude / self.frequency**2 * (phase - jnp.sin(phase))
+        return jnp.stack([x, 0 * x])
+
+
+def overturns(width, height, amplitude, frequency, duration):
+    """Housner's block: rocks about one corner at a time, angular momentum kept at each change."""
+    far, slender = np.hypot(width, height) / 2, np.arctan2(width, height)
+    stiffness, kept = 3 * G / (4 * far), 1 - 1.5 * np.sin(slender) ** 2
+
+    def pull(t):
+        return amplitude / G * np.sin(frequency * t) if t < 2 * np.pi / frequency else 0.0
+
+    if amplitude <= G * np.tan(slender):
+        return False
+    t = np.arcsin(G * np.tan(slender) / amplitude) / frequency
+    side, angle, spin = -1.0, -1e-14, 0.0
+    while True:
+
+        def field(t, y, side=side):
+            a = side * slender - y[0]
+            return [y[1], -stiffness * (np.sin(a) + pull(t) * np.cos(a))]
+
+        def lands(s, y, begin=t, side=side):
+            return y[0] if s > begin + 1e-9 else side
+
+        def falls(t, y):
+            return abs(y[0]) - np.pi / 2
+
+        lands.terminal = falls.terminal = True
+        path = solve_ivp(
+            field, (t, duration), [angle, spin], events=[lands, falls],
+            rtol=1e-9, atol=1e-12, max_step=0.02,
+        )  # fmt: skip
+        if path.t_events[1].size:
+            return True
+        if not path.t_events[0].size:
+            return False
+        t, spin, angle = path.t_events[0][0], path.y_events[0][0][1] * kept, 0.0
+        if abs(spin) < 1e-4:
+            return False
+        side = np.sign(spin)
+
+
+def test_pulses_overturn_the_blocks_that_housner_says():
+    """24 pulses; a fallen block lies on its side, on corners that did not touch before."""
+    width, height, fallen = 0.2, 1.0, 0
+    for strength in (1.2, 2.0, 3.0, 5.0, 8.0, 12.0):
+        for frequency in (3.0, 6.0, 12.0, 24.0):
+            amplitude = strength * G * width / height
+            base = Pulse(jnp.asarray(amplitude), jnp.asarray(frequency))
+            motion = ji.simulate(
+                ji.block_system(width, height, base=base), ji.Moreau(0.0, friction=1.0),
+                [0.0, height / 2, 0.0], [0.0] * 3, 6.0,
+                samples=2, method="time_stepping", step=2e-3,
+            )  # fmt: skip
+            expected = overturns(width, height, amplitude, frequency, 6.0)
+            assert status(motion) == "ok", (strength, frequency)
+            angle = abs(float(motion.q[-1, 2]))
+            np.testing.assert_allclose(angle, np.pi / 2 if expected else 0.0, atol=0.02)
+            fallen += expected
+    assert 12 < fallen < 24
+
+
+# ------------------------------------------------------------------- the range of a geometry
+
+
+class Table(ji.Body):
+    """A point above a table that ends at x = 1."""
+
+    def gap_function(self, q):
+        return q[1:]
+
+    def valid(self, q):
+        return 1 - q[0]
+
+    @property
+    def mass(self):
+        return jnp.ones(2)
+
+    def gravity(self, acceleration):
+        return lambda q: acceleration * q[1]
+
+
+@pytest.mark.parametrize("options", [{}, {"method": "time_stepping", "step": 1e-2}])
+def test_leaving_the_range_of_a_gap_function_is_told(options):
+    system = ji.System(Table(), potential=Table().gravity(G))
+    motion = ji.simulate(system, ji.Moreau(0.5), [0.0, 0.1], [1.0, 0.0], 2.0, samples=11, **options)
+    assert status(motion) == "out_of_range"
+    assert 5 <= np.isfinite(np.asarray(motion.q[:, 0])).sum() <= 7  # x = 1 at the sixth sample
+    with pytest.raises(ValueError, match="in the range of the gap function"):
+        ji.simulate(system, ji.Moreau(0.5), [1.5, 0.1], [1.0, 0.0], 2.0, **options)
+
+
+# -------------------------------------------------------------------------- bodies in space
+
+
+def test_a_spinning_brick_comes_to_rest_on_a_face():
+    brick = ji.Box([0.1, 0.06, 0.04], mass=0.5)
+    motion = ji.simulate(
+        ji.System(brick, potential=ji.gravity(brick)), ji.Moreau(0.3, friction=0.4),
+        brick.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]), [0.5, 0.2, 0.0, 3.0, 12.0, 5.0], 2.0,
+        samples=21, method="time_stepping", step=1e-3,
+    )  # fmt: skip
+    assert status(motion) == "ok"
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-8)
+    assert np.diff(motion.energy).max() < 1e-12
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-10)
+    heights = np.sort(np.asarray(motion.gaps[-1]))
+    np.testing.assert_allclose(heights[:4], 0, atol=2e-4)
+    assert min(abs(heights[4:].mean() - side) for side in (0.1, 0.06, 0.04)) < 2e-4
+    np.testing.assert_allclose(np.linalg.norm(motion.q[:, 3:], axis=1), 1, atol=1e-14)
+
+
+def test_a_free_brick_keeps_its_momentum():
+    """Far from the plane: a ball falls, and the angular momentum in space stays; order 2."""
+    brick, spin = ji.Box([0.1, 0.06, 0.04]), jnp.array([3.0, 12.0, 5.0])
+    inertia = np.asarray(brick.mass)[3:]
+    wrong = []
+    for step in (2e-3, 1e-3):
+        motion = ji.simulate(
+            ji.System(brick), ji.Moreau(0.3, friction=0.4), brick.at([0.0, 0.0, 1.0]),
+            jnp.concatenate([jnp.zeros(3), spin]), 1.0,
+            samples=2, method="time_stepping", step=step,
+        )  # fmt: skip
+        turned = np.asarray(rotation(motion.q[-1])) @ (
+            inertia * np.asarray(motion.velocity[-1, 3:])
+        )
+        wrong.append(np.abs(turned / (inertia * np.asarray(spin)) - 1).max())
+    assert wrong[1] < 1e-4
+    assert 3.5 < wrong[0] / wrong[1] < 4.5
+
+
+@pytest.mark.slow
+def test_a_tossed_cube_makes_its_second_impact_where_it_was_measured():
+    """From the measured state at one impact to the next; e and mu are medians over all tosses."""
+    rows = list(csv.DictReader(CUBE.open()))
+
+    def numbers(row, name, axes, tail):
+        return np.array([float(row[f"{name}_{x}{tail}"]) for x in axes])
+
+    def velocities(row):
+        return numbers(row, "v", "xyz", "_pre_m_s"), numbers(row, "omega", "xyz", "_pre_rad_s")
+
+    cube = ji.Box(
+        [0.102] * 3, mass=0.37, inertia=[9.57e-4, 9.57e-4, 9.09e-4], centre=[0, 0, 0.0057],
+        rounding=0.0036,
+    )  # fmt: skip
+    system, law = ji.System(cube, potential=ji.gravity(cube, 9.604)), ji.Moreau(0.27, friction=0.16)
+    misses = []
+    for first, second in zip(rows[::2], rows[1::2], strict=True):
+        e, (v, spin), (v2, spin2) = (
+            numbers(first, "quat", "wxyz", ""), velocities(first), velocities(second)
+        )  # fmt: skip
+        x = numbers(first, "com", "xyz", "_m")
+        q0 = jnp.asarray(np.concatenate([x, e / np.linalg.norm(e)]))
+        q0 = q0.at[2].add(-jnp.min(cube.gap_function(q0)))
+        motion = ji.simulate(
+            system, law, q0, np.concatenate([v, np.asarray(rotation(q0)).T @ spin]), 0.25,
+            samples=2, method="time_stepping", step=1e-4,
+        )  # fmt: skip
+        events, wait = motion.events, float(second["t_s"]) - float(first["t_s"])
+        times = np.asarray(events.time)[: int(events.count)]
+        k = int(np.argmax(times > 0.5 * wait))
+        found = np.asarray(events.velocity_before[k])
+        turned = np.asarray(rotation(events.q[k])) @ found[3:]
+        misses.append(
+            [
+                abs(times[k] - wait) / wait,
+                np.linalg.norm(found[:3] - v2) / np.linalg.norm(v2),
+                np.linalg.norm(turned - spin2) / np.linalg.norm(spin2),
+            ]
+        )
+    assert (np.median(misses, axis=0) < [0.1, 0.1, 0.2]).all(), np.median(misses, axis=0)
