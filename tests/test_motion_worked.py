@@ -60,7 +60,7 @@ def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
     e = float(ji.theory.housner_restitution(3.0))
     motion = ji.simulate(
-        ji.block_system(0.2, 0.6),
+        ji.block_system(0.2, 0.6, corners="base"),
         ji.RestitutionMatrix(ji.theory.rocking_matrix(e)),
         upright(0.15),
         [0.0] * 3,
@@ -138,7 +138,12 @@ def test_overturning_on_a_harmonic_base():
         start = base(jnp.zeros(()))[0]
         q0 = jnp.stack([start, jnp.full((), 0.3), jnp.zeros(())])
         return ji.simulate(
-            ji.block_system(0.2, 0.6, base=base), law, q0, jnp.zeros(3), 2.0, friction=5.0
+            ji.block_system(0.2, 0.6, base=base, corners="base"),
+            law,
+            q0,
+            jnp.zeros(3),
+            2.0,
+            friction=5.0,
         )
 
     motion = shake(jnp.array([0.33, 0.36, 0.4, 0.6]))
@@ -176,7 +181,7 @@ def test_basketball_and_tennis_ball():
 def rocks(x):
     q0 = jnp.stack([0 * x[1], jnp.sin(x[1]) * 0.1 + jnp.cos(x[1]) * x[2] / 2, x[1]])
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(x[0]))
-    return ji.block_system(0.2, x[2]), law, q0, jnp.zeros(3), 1.5, 5.0
+    return ji.block_system(0.2, x[2], corners="base"), law, q0, jnp.zeros(3), 1.5, 5.0
 
 
 def swings(x):
@@ -191,7 +196,7 @@ def collides(x):
 
 
 def slides(x):
-    block = ji.block_system(0.2, 0.4)
+    block = ji.block_system(0.2, 0.4, corners="base")
     system = ji.System(
         block.gap_function,
         block.mass,

@@ -28,11 +28,13 @@ from jimpact.motion.flow import (
     Settings,
     State,
     allowed_errors,
+    decoded,
     encoded,
     first_flight,
     flow_of,
     no_samples,
     one_pass,
+    out_of_range,
     packed,
     put,
     sampled_states,
@@ -40,7 +42,7 @@ from jimpact.motion.flow import (
     step_again,
     toward_sample,
 )
-from jimpact.motion.persistent_contact import Modes, no_modes
+from jimpact.motion.persistent_contact import no_modes
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events
 from jimpact.motion.system import System
 from jimpact.motion.transitions import After, Decision, resolve, resolved_again
@@ -74,12 +76,18 @@ class Given(NamedTuple):
         return State(self.q0, self.v0, self.times[0], zero, zero, rest, rest[:0])
 
 
+class Event(NamedTuple):
+    """What is kept of an event."""
+
+    happens: jax.Array  # () whether there is one
+    written: jax.Array  # () whether it has a row in the record
+    decision: Decision
+
+
 class Row(NamedTuple):
     """Of a plan: an event perhaps, a step after it perhaps."""
 
-    happens: jax.Array  # ()
-    written: jax.Array  # () whether the event has a row in the record
-    decision: Decision
+    event: Event
     accepted: jax.Array  # ()
     aim: stepper.Step
 
@@ -102,11 +110,10 @@ class Table(NamedTuple):
 
 class _Run(NamedTuple):
     flight: Flight
-    modes: Modes
     struck: jax.Array
     allowed: jax.Array  # errors of the ledger
     waits: jax.Array  # whether an event is to be resolved
-    last: Row  # the event before the next step
+    last: Event  # before the next step, or a longer time ago
     table: Table
     seen: jax.Array  # events
     status: jax.Array
@@ -209,16 +216,16 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
     decision = Decision(no, none, none, none, none, none, Scales(zero, zero, zero))
-    last = Row(no, no, decision, no, flight.aim)
+    last = Event(no, no, decision)
     plan = None
     if records:
         size = min(times.shape[0] + ROWS_PER_EVENT * max_events + ROWS_MORE, settings.max_steps)
         size = -(-size // BLOCK) * BLOCK + 1  # one more to write what is not kept
-        rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), last)
+        row = Row(last, no, flight.aim)
+        rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), row)
         plan = Plan(rows, jnp.int32(0), no)
     return _Run(
         flight,
-        no_modes(m, dtype),
         jnp.full((2, m), -jnp.inf, dtype),
         packed(state)[q0.size + v0.size :, 0],
         jnp.asarray(True),
@@ -241,15 +248,14 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
     flight, old = run.flight, run.flight.state
 
     def now(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
-        scales = run.last.decision.scales
+        scales, modes = run.last.decision.scales, decoded(flight.aim.modes, old.q.dtype)
         found = resolve(
-            system, law, mu, settings, old, run.modes, flight.event & mine, scales, run.struck
+            system, law, mu, settings, old, modes, flight.event & mine, scales, run.struck
         )
         happened = found.kind != KIND_CODE["none"]
         full = (run.seen >= max_events) & happened
         status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
         kept = mine & happened & ~full
-        row = Row(jnp.asarray(True), kept, found.decision, jnp.asarray(False), flight.aim)
         state = found.after.state
         ready = flight._replace(
             state=state,
@@ -258,11 +264,10 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
         )
         new = run._replace(
             flight=toward_sample(ready, times, flight.free),
-            modes=found.modes,
             struck=found.after.struck,
             allowed=allowed_errors(system, settings, state),
             waits=jnp.asarray(False),
-            last=row,
+            last=Event(jnp.asarray(True), kept, found.decision),
             seen=run.seen + kept.astype(jnp.int32),
             status=status,
         )
@@ -289,17 +294,16 @@ def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
     system, _, mu, settings, *_, times, _ = given
     begin, last = run.flight, times.shape[0]
     scales = run.last.decision.scales
-    flow = flow_of(system, mu, settings, run.modes, scales, times, begin.state)
-    after, accept = one_pass(flow, settings, run.allowed, times, begin)
-    accept = accept & flies
-    flight = selected(flies, after, begin)
+    modes = decoded(begin.aim.modes, begin.state.q.dtype)
+    flow = flow_of(system, mu, settings, modes, scales, times, begin.state)
+    flight, accept = one_pass(flow, settings, run.allowed, times, begin, flies)
     samples = put(
         run.table.samples, packed(flight.state)[:, 0], jnp.where(flies, begin.sample, last)
     )
     plan, still = run.plan, jnp.asarray(False)
     if plan is not None:
-        size = plan.rows.happens.shape[0] - 1
-        row = run.last._replace(accepted=accept, aim=begin.aim)
+        size = plan.rows.accepted.shape[0] - 1
+        row = Row(run.last, accept, begin.aim)
         index = plan.used
         rows = jax.tree.map(lambda all_, x: put(all_, x, index), plan.rows, row)
         used = jnp.minimum(index + accept.astype(jnp.int32), size)
@@ -324,6 +328,7 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
     parts = (state.q, state.v, rates, gaps(system, q, t))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
+    code = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], code)
     if not callable(system.mass):
         return code
     begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))
@@ -382,34 +387,35 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
     system, law, mu, settings, *_, times, _ = given
     start, m = given.start, given.contacts
     width = _width(given)
-    size = plan.rows.happens.shape[0] - 1
+    size = plan.rows.accepted.shape[0] - 1
     rows = jax.tree.map(lambda x: x[:size], plan.rows)
     index = jnp.arange(size, dtype=jnp.int32)
     # what an event without a step leaves is in the row after the last step
     there = index <= plan.used
-    happens, accepted = rows.happens & there, rows.accepted & (index < plan.used)
+    happens, accepted = rows.event.happens & there, rows.accepted & (index < plan.used)
     sampled = accepted & rows.aim.target[:, -1, 0]
-    written = rows.written & happens
+    written = rows.event.written & happens
     reached = jnp.cumsum(sampled, dtype=jnp.int32) + (~sampled).astype(jnp.int32)  # before the step
 
-    def event(y: Any, row: Row) -> tuple[Any, jax.Array]:
+    def event(y: Any, now: Event) -> tuple[Any, jax.Array]:
         state, struck = y
-        after = resolved_again(system, law, mu, settings, state, struck, row.decision)
-        new = selected(row.happens, (after.state, after.struck), y)
-        return new, jnp.where(row.happens, _numbers(state, after), 0.0)
+        after = resolved_again(system, law, mu, settings, state, struck, now.decision)
+        new = selected(now.happens, (after.state, after.struck), y)
+        return new, jnp.where(now.happens, _numbers(state, after), 0.0)
 
     def step(state: State, row: Row, sample: jax.Array) -> State:
         aim = row.aim._replace(modes=row.aim.modes.astype(jnp.int32))
-        active, stick, sign = aim.modes[:, 0].reshape(3, m)
-        modes = Modes(active > 0, stick > 0, sign.astype(state.q.dtype))
-        flow = flow_of(system, mu, settings, modes, row.decision.scales, times, state)
+        modes, scales = decoded(aim.modes, state.q.dtype), row.event.decision.scales
+        flow = flow_of(system, mu, settings, modes, scales, times, state)
         flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
         return selected(row.accepted, step_again(flow, aim, state), state)
 
     def one(y: Any, x: Any) -> tuple[Any, Any]:
         row, sample = x
         nothing = jnp.zeros(width, start.q.dtype)
-        y, numbers = jax.lax.cond(any_lane(row.happens), event, lambda y, row: (y, nothing), y, row)
+        y, numbers = jax.lax.cond(
+            any_lane(row.event.happens), event, lambda y, _: (y, nothing), y, row.event
+        )
         state = jax.lax.cond(
             any_lane(row.accepted), step, lambda state, *_: state, y[0], row, sample
         )
@@ -423,10 +429,10 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
             nothing = jnp.zeros((BLOCK, len(packed(start)) + width), start.q.dtype)
             return y, (nothing[:, width:], nothing[:, :width])
 
-        some = xs[0].happens | xs[0].accepted
+        some = xs[0].event.happens | xs[0].accepted
         return jax.lax.cond(any_lane(jnp.any(some)), walk, stay, y)
 
-    xs = rows._replace(happens=happens, accepted=accepted), reached
+    xs = Row(rows.event._replace(happens=happens), accepted, rows.aim), reached
     blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
     # rows beyond those that there was room for: no number at all
     lost = jnp.where(plan.lost, jnp.nan, 1.0)

@@ -125,9 +125,8 @@ def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -
     scale = jnp.where(held, 1 / jnp.sqrt(jnp.diagonal(w)), 1.0)
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = held[:, None] & held[None, :]
-    k = jnp.where(
-        both, w * scale[:, None] * (scale * weight)[None], jnp.eye(len(held), dtype=w.dtype)
-    )
+    scaled = w * scale[:, None] * (scale * weight)[None]
+    k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
     ridge = jnp.where(held, _RIDGE, 0.0)
     z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)
