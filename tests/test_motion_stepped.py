@@ -205,3 +205,89 @@ def test_a_tossed_cube_makes_its_second_impact_where_it_was_measured():
             ]
         )
     assert (np.median(misses, axis=0) < [0.1, 0.1, 0.2]).all(), np.median(misses, axis=0)
+
+
+# ------------------------------------------------------------------------------- bad input
+
+
+def stepped(system, law, q0, v0):
+    options = {"samples": 3, "method": "time_stepping", "step": 1e-3, "closed_below": 1e-4}
+    return ji.simulate(system, law, q0, v0, 0.01, **options)
+
+
+def lost(q):
+    """A gap that is NaN below 0.5."""
+    return jnp.where(q < 0.5, jnp.nan, q)
+
+
+def shrinking(q):
+    """A mass that turns negative below 0.5."""
+    return q - 0.5
+
+
+@pytest.mark.parametrize(
+    ("gap", "mass", "restitution", "expected"),
+    [
+        (lost, [1.0], 0.5, "not_finite"),
+        (lambda q: q, shrinking, 0.5, "singular_mass"),
+        (lambda q: q - 0.5, [1.0], np.nan, "not_finite"),
+        (lambda q: q - 0.5, [1.0], 1.5, "law_failed"),
+    ],
+)
+def test_what_goes_wrong_on_the_way_is_told(gap, mass, restitution, expected):
+    run = jax.jit(lambda e: stepped(ji.System(gap, mass), ji.Moreau(e), [0.5003], [-1.0]))
+    assert status(run(restitution)) == expected
+
+
+def test_friction_below_0_is_told():
+    run = jax.jit(
+        lambda mu: stepped(
+            ji.block_system(0.2, 0.4), ji.Moreau(0.0, friction=mu), [0.0, 0.2, 0.0], [1.0, 0.0, 0.0]
+        )
+    )
+    assert status(run(-0.3)) == "not_finite"
+
+
+def test_a_quaternion_of_length_2_is_told():
+    ball = ji.Sphere(0.1)
+    run = jax.jit(lambda q: stepped(ji.System(ball), ji.Moreau(0.5), q, jnp.zeros(6)))
+    assert status(run(ball.at([0.0, 0.0, 0.2]).at[3].set(2.0))) == "out_of_range"
+
+
+def test_an_elastic_row_never_gains_energy():
+    """The left ball strikes while the other two still leave each other."""
+    row = ji.System(lambda q: q[1:] - q[:-1] - 0.2, [1.0, 1.0, 1.0])
+    motion = stepped(row, ji.Moreau(1.0), [0.0, 0.2004, 0.4004], [1.0, 0.0, 0.1])
+    np.testing.assert_allclose(motion.kinetic_energy, motion.kinetic_energy[0], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("law", "named"),
+    [
+        (ji.Moreau(jnp.full(3, 0.5)), "`restitution`"),
+        (
+            ji.Moreau(0.5, friction=0.3, tangential_restitution=jnp.zeros(3)),
+            "`tangential_restitution`",
+        ),
+    ],
+)
+def test_coefficients_that_do_not_fit_are_named(law, named):
+    pile = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])
+    for body, q0 in ((pile, pile.at([[0.0, 0.1], [0.5, 0.1]])), (ji.Block(0.2, 0.4), [0, 0.2, 0])):
+        with pytest.raises(ValueError, match=named):
+            stepped(ji.System(body), law, q0, np.zeros(len(q0)))
+
+
+def test_tangents_that_do_not_fit_are_named():
+    system = ji.System(
+        lambda q: q[:1], [1.0, 1.0], tangent_function=lambda q: q[jnp.array([1] * 3)]
+    )
+    with pytest.raises(ValueError, match="one tangent a contact"):
+        stepped(system, ji.Moreau(0.5, friction=0.2), [1.0, 0.0], [0.0, 0.0])
+
+
+def test_steps_too_many_to_count_are_refused():
+    with pytest.raises(ValueError, match="`step` must give at most"):
+        ji.simulate(
+            ji.ball_system(), ji.Moreau(0.5), [1.0], [0.0], 1.0, method="time_stepping", step=1e-300
+        )

@@ -55,7 +55,7 @@ SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an im
 FEW, PILE, ROUNDINGS, OFF = 1e-9, 1e-6, 32, 1e-2
 ITERATIONS = 1000
 MEAN = 4  # tries for the mean velocity that forces depend on; each gains h omega, of spin omega
-GIVEN = 2.0  # times what forces push contacts in a step they may give an impact within it
+GIVEN = 1.0  # times what forces push contacts in a step they may give an impact within it
 APART = 3  # steps: a contact that is struck again before is told
 
 WHY = (
