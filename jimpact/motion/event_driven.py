@@ -21,7 +21,13 @@ from jimpact.bodies.base import GivenBody
 from jimpact.events import stepper
 from jimpact.events.batches import any_lane, over_lanes
 from jimpact.law import Law
-from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
+from jimpact.motion.dynamics import (
+    free_acceleration,
+    gaps,
+    in_range,
+    mass_at,
+    user_force,
+)
 from jimpact.motion.flow import (
     Course,
     Flight,
@@ -231,6 +237,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
     )
     penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
+    status = jnp.where(in_range(system, q0, times[0]), status, MOTION_CODE["out_of_range"])
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
@@ -349,6 +356,8 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
     parts = (state.q, state.v, rates, gaps(system, q, t))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
+    left = finite & ~in_range(system, state.q, state.t)
+    code = jnp.where(left, MOTION_CODE["out_of_range"], code)
     if not callable(system.mass):
         return code
     begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))

@@ -13,6 +13,7 @@ from jimpact.events import stepper
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
+    in_range,
     kinematics,
     mass_at,
     user_force,
@@ -375,7 +376,7 @@ def one_pass(
         event=landed[:-1],
         sample=flight.sample + sampled.astype(flight.sample.dtype),
         steps=steps,
-        stuck=vanishes | (steps >= settings.max_steps),
+        stuck=vanishes | (steps >= settings.max_steps) | ~in_range(flow.system, state.q, state.t),
     )
     aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)

@@ -23,12 +23,12 @@ from jimpact.motion.dynamics import (
 from jimpact.motion.system import System
 from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.linear import solve_definite
 from jimpact.status import CODE
 
-# Beside a matrix with unit diagonal: it decides where that is singular (redundant sticking contacts)
-# and refinements remove what it changes elsewhere. Ten times less, and rounding decides, too.
+# Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts), and
+# refinements remove what it changes elsewhere. Ten times less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
+_WRITTEN_OUT = 4  # rows up to which it is eliminated by scalars: beyond, that takes long to compile
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
@@ -91,9 +91,8 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     """The forces that keep the modes, and the acceleration with them."""
     m = given.normal.value.shape[0]
     if given.tangent is None or mu is None:
-        both = modes.active[:, None] & modes.active[None, :]
-        k = jnp.where(both, given.delassus, jnp.eye(m, dtype=given.free.dtype))
-        normal = solve_definite(k, jnp.where(modes.active, -given.approach, 0.0))
+        even = jnp.ones_like(given.approach)
+        normal = _least(given.delassus, -given.approach[:, None], modes.active, even)[:, 0]
         return Forces(normal, None, given.free + given.moved @ normal)
     held = jnp.concatenate([modes.active, modes.active & modes.stick])
     sliding = modes.active & ~modes.stick
@@ -125,10 +124,18 @@ def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -
     scale = jnp.where(held, 1 / jnp.sqrt(jnp.diagonal(w)), 1.0)
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = held[:, None] & held[None, :]
-    k = jnp.where(both, w * scale[:, None] * scale * weight, jnp.eye(len(held), dtype=w.dtype))
+    k = jnp.where(
+        both, w * scale[:, None] * (scale * weight)[None, :], jnp.eye(len(held), dtype=w.dtype)
+    )
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
     ridge = jnp.where(held, _RIDGE, 0.0)
-    z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)
+    if len(held) <= _WRITTEN_OUT:
+        z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)
+    else:
+        inverted = jnp.linalg.inv(jax.lax.stop_gradient(k + jnp.diag(ridge)))
+        z = inverted @ right
+        for _ in range(_REFINEMENTS):
+            z = z + inverted @ (right - k @ z)
     return (scale * weight)[:, None] * z
 
 
@@ -147,11 +154,7 @@ def constraint_impulse(
     held = held[: rates.shape[0]]
     size = held.shape[0]
     w, columns = given.delassus[:size, :size], rates.reshape(size, -1)
-    if friction:
-        p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
-    else:
-        k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(size, dtype=rates.dtype))
-        p = solve_definite(k, jnp.where(held[:, None], -columns, 0.0))
+    p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
     rest = given.delassus.shape[0] - size
     return jnp.pad(p.reshape(rates.shape), ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
 

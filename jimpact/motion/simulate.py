@@ -326,8 +326,7 @@ def _friction_of(
     if not is_traced(mu) and not np.any(mu):
         return None  # frictionless systems pay nothing
     m = jax.eval_shape(system.body.gap_function, q).shape[0]
-    planar = jax.eval_shape(system.body.tangent_function, q) is not None
-    if not (in_space or planar):
+    if not (in_space or tangents.shape[1] == m):
         raise ValueError(
             "Argument `friction` must be 0 for a body with tangents in space: with "
             "method='time_stepping' alone motions know friction in space."
