@@ -20,6 +20,28 @@ CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=1)  # outline of a ba
 
 Potential = Callable[[jax.Array], jax.Array]  # q (n,) -> V () [J]
 
+PLANAR = ("x [m]", "y [m]", "angle [rad]")  # names of coordinates
+
+
+def rate_of(name: str) -> str:
+    """Name and unit of the rate of "x [m]": "x' [m/s]"."""
+    word, unit = split_name(name)
+    return f"{word}' [{unit}/s]" if unit else f"{word}'"
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """ "x [m]" as "x" and "m"; without a unit that is empty."""
+    word, _, unit = name.removesuffix("]").partition(" [")
+    return word, unit
+
+
+def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """Names of so many bodies: "x [m]" as "x1 [m]", "x2 [m]", ...; of one alone as they are."""
+    if count == 1:
+        return tuple(names)
+    parts = [split_name(name) for name in names]
+    return tuple(f"{word}{i + 1} [{unit}]" for i in range(count) for word, unit in parts)
+
 
 class Body(eqx.Module):
     """One or several bodies with contacts, as functions of their configuration q.
@@ -126,6 +148,16 @@ class Body(eqx.Module):
     def outlines(self, q: np.ndarray, point: float) -> Sequence[np.ndarray]:
         """Curves (k, 2) of points (x, y) [m] that show it; mass points get the radius `point`."""
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Coordinates of q by name and unit, "x [m]", for pictures; (): nobody named them."""
+        return ()
+
+    @property
+    def velocity_names(self) -> tuple[str, ...]:
+        """Velocities by name and unit; here the rates of q, "x' [m/s]"."""
+        return tuple(rate_of(name) for name in self.names)
 
     @property
     def floors(self) -> Sequence[Any]:
@@ -324,6 +356,11 @@ class OnGround(Body):
     def base_directions(self) -> jax.Array:
         """The ground moves in x and y (3, 2)."""
         return jnp.eye(3, 2, dtype=self.mass.dtype)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, angle."""
+        return PLANAR
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = m g y`."""

@@ -40,11 +40,6 @@ def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     return jnp.atleast_1d(system.body.gap_function(seen_from_base(system, q, t)))
 
 
-def in_range(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """Whether the gap function holds ()."""
-    return system.body.valid(seen_from_base(system, q, t)) >= 0
-
-
 def kinematics(
     system: System, q: jax.Array, v: jax.Array, t: jax.Array, *, of_tangents: bool = False
 ) -> Kinematics:

@@ -23,10 +23,11 @@ from jimpact.motion.dynamics import (
 from jimpact.motion.system import System
 from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.linear import solve_definite
 from jimpact.status import CODE
 
-# Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts), and
-# refinements remove what it changes elsewhere. Ten times less, and rounding decides, too.
+# Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
+# stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
 _WRITTEN_OUT = 4  # rows up to which it is eliminated by scalars: beyond, that takes long to compile
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
@@ -91,14 +92,15 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     """The forces that keep the modes, and the acceleration with them."""
     m = given.normal.value.shape[0]
     if given.tangent is None or mu is None:
-        even = jnp.ones_like(given.approach)
-        normal = _least(given.delassus, -given.approach[:, None], modes.active, even)[:, 0]
+        both = modes.active[:, None] & modes.active[None, :]
+        k = jnp.where(both, given.delassus, jnp.eye(m, dtype=given.free.dtype))
+        normal = solve_definite(k, jnp.where(modes.active, -given.approach, 0.0))
         return Forces(normal, None, given.free + given.moved @ normal)
     held = jnp.concatenate([modes.active, modes.active & modes.stick])
     sliding = modes.active & ~modes.stick
     drag = jnp.where(sliding, modes.sign * mu, 0.0)
     # what slides goes with its normal force
-    w = given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag)
+    w = given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag[None])
     right = -given.approach
     none = jnp.zeros(m, w.dtype)
 
@@ -124,9 +126,8 @@ def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -
     scale = jnp.where(held, 1 / jnp.sqrt(jnp.diagonal(w)), 1.0)
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = held[:, None] & held[None, :]
-    k = jnp.where(
-        both, w * scale[:, None] * (scale * weight)[None, :], jnp.eye(len(held), dtype=w.dtype)
-    )
+    scaled = w * scale[:, None] * (scale * weight)[None]
+    k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
     ridge = jnp.where(held, _RIDGE, 0.0)
     if len(held) <= _WRITTEN_OUT:
@@ -154,7 +155,11 @@ def constraint_impulse(
     held = held[: rates.shape[0]]
     size = held.shape[0]
     w, columns = given.delassus[:size, :size], rates.reshape(size, -1)
-    p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
+    if friction:
+        p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
+    else:
+        k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(size, dtype=rates.dtype))
+        p = solve_definite(k, jnp.where(held[:, None], -columns, 0.0))
     rest = given.delassus.shape[0] - size
     return jnp.pad(p.reshape(rates.shape), ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
 

@@ -144,19 +144,27 @@ class Motion(eqx.Module):
         row = MOTION_STATUS[int(self.status)]
         reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
         last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
-        lost = -np.asarray(self.contact_work)[max(last, 0)].sum(axis=0)
+        normal, tangential = np.asarray(self.contact_work)[max(last, 0)].sum(axis=-1)
+        sides = {
+            "the contacts": normal,
+            "friction": tangential,
+            "the base": self.base_work[last],
+            "forces": self.force_work[last],
+        }
         lines = [
             f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: {row.name}"
             + (f" ({row.message})" if row.failure else ""),
             f"  events: {', '.join(counts)}",
             f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
             f" at {reached[-1] if len(reached) else np.nan:g} s",
-            "  taken by the contacts: " + ", ".join(f"{x:.4g}" for x in lost) + " J",
-            f"  work of forces {float(self.force_work[last]):.6g} J, "
-            f"of the base {float(self.base_work[last]):.6g} J",
+            "  " + (", ".join(_told(*side) for side in sides.items() if side[1]) or "no work done"),
             f"  ledger closes to {np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J",
         ]
         return "\n".join(lines)
+
+
+def _told(who: str, work: Any) -> str:
+    return f"{who} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
 
 
 def _batch_report(motion: Motion) -> str:
