@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from programs import OPTIMIZED
 
 import jimpact as ji
+from jimpact.motion import event_driven
 
 G = 9.80665
 
@@ -108,6 +110,131 @@ def test_ledger_closes(balls):
         taken = -np.asarray(motion.events.energy)[:5, 0, 0]
         expected = float(motion.energy[0]) * (1 - e**2) * e ** (2 * np.arange(5.0))
         np.testing.assert_allclose(taken, expected, rtol=1e-11)
+
+
+def times_of(x):
+    """Event times of a ball by e, q0 and g."""
+    ball = ji.ball_system(acceleration=x[2])
+    motion = ji.simulate(
+        ball, ji.Newton(x[0]), x[1][None], [0.0], 5.0, samples=2, max_events=90
+    )  # fmt: skip
+    return motion.events.time[:20]
+
+
+def exact_times(x):
+    e, q0, g = x
+    powers = e ** jnp.arange(1.0, 20)
+    return jnp.sqrt(2 * q0 / g) * (1 + 2 * jnp.concatenate([jnp.zeros(1), jnp.cumsum(powers)]))
+
+
+def test_derivatives_over_twenty_bounces_in_both_modes():
+    both = jax.jit(lambda x: (jax.jacfwd(times_of)(x), jax.jacrev(times_of)(x)))
+    x = jnp.array([0.8, 1.0, G])
+    exact = jax.jacfwd(exact_times)(x)
+    for slope in both(x):
+        np.testing.assert_allclose(slope, exact, rtol=1e-9, atol=1e-11)
+
+
+@pytest.mark.slow
+def test_second_derivatives_over_twenty_bounces():
+    x = jnp.array([0.8, 1.0, G])
+    found = jax.jit(jax.hessian(lambda x: times_of(x)[19]))(x)
+    exact = jax.hessian(lambda x: exact_times(x)[19])(x)
+    np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_in_what_functions_close_over():
+    def second(height):
+        system = ji.System(lambda q: q - height, [1.0], potential=lambda q: 9.0 * q[0])
+        motion = ji.simulate(system, ji.Newton(0.7), [1.0], [0.0], 1.2, samples=3, max_events=10)
+        return motion.events.time[1]
+
+    exact = jax.grad(lambda h: 2.4 * jnp.sqrt(2 * (1 - h) / 9))(0.1)
+    np.testing.assert_allclose(jax.grad(second)(0.1), exact, rtol=1e-12)
+    np.testing.assert_allclose(jax.jvp(second, (0.1,), (1.0,))[1], exact, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_motion_of_more_steps_than_a_plan_has_rows_has_no_derivative(monkeypatch):
+    monkeypatch.setattr(event_driven, "ROWS_MORE", 16)
+    monkeypatch.setattr(event_driven, "ROWS_PER_EVENT", 0)
+    ball = ji.ball_system(base=ji.HarmonicBase(1e-3, 20.0))  # too fast for so few steps
+    value, slope = jax.jvp(
+        lambda e: ji.simulate(ball, ji.Newton(e), [1.0], [0.0], 1.0, samples=2).q[-1, 0],
+        (0.8,), (1.0,),
+    )  # fmt: skip
+    assert np.isfinite(value)
+    assert np.isnan(slope)
+
+
+# ------------------------------------------------------------- events that are easily missed
+
+
+class Plate(eqx.Module):
+    """It vibrates, and rises for a moment."""
+
+    amplitude: jax.Array
+    frequency: jax.Array
+    phase: jax.Array
+    rise: jax.Array
+    centre: jax.Array
+    width: jax.Array
+
+    def __call__(self, t):
+        y = self.amplitude * jnp.sin(2 * np.pi * self.frequency * t + self.phase)
+        return (y + self.rise * jnp.exp(-(((t - self.centre) / self.width) ** 2)))[None]
+
+
+def first_contact(plate, q0, v0):
+    """When a ball first touches its plate, by many looks and bisection."""
+    a, f, phase, rise, centre, width = plate
+
+    def gap(t):
+        y = a * np.sin(2 * np.pi * f * t + phase) + rise * np.exp(-(((t - centre) / width) ** 2))
+        return q0 + v0 * t - G * t * t / 2 - y
+
+    looks = np.linspace(0, 0.4, 100_001)
+    first = np.flatnonzero(gap(looks) < 0)[0]
+    low, high = looks[first - 1], looks[first]
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if gap(middle) >= 0 else (low, middle)
+    return high
+
+
+def test_no_event_is_missed_between_two_looks():
+    """384 vibrating plates, 120 that rise for a moment; a wall that an oscillator grazes."""
+    r, n, k = np.random.default_rng(0), 384, 120
+    a, f = 10 ** r.uniform(-4, -1.5, n), 10 ** r.uniform(0.5, 2.3, n)
+    still = np.zeros(n)
+    moves = [a, f, r.uniform(0, 6.28, n), still, still, still + 1]
+    rises = [r.uniform(0.01, 0.2, k), r.uniform(0.05, 0.35, k), 10 ** r.uniform(-2.5, -1.3, k)]
+    plates = [np.r_[x, y] for x, y in zip(moves, [np.zeros(k)] * 3 + rises)]
+    high = r.uniform(0, 0.2, n) * (r.random(n) < 0.5)
+    q = np.r_[a * r.uniform(1.001, 3, n) + high, r.uniform(0.21, 0.4, k)]
+    v = np.r_[r.uniform(-1, 1, n), r.uniform(-0.5, 0.5, k)]
+    depth = np.array([1e-2, 1e-3, 1e-4, 1e-5, 1e-6, -1e-5])
+
+    def hit(plate, q, v):
+        ball = ji.ball_system(base=Plate(*plate))
+        options = {"samples": 2, "max_events": 1}
+        return ji.simulate(ball, ji.Newton(0.5), q[None], v[None], 0.4, **options).events.time[0]
+
+    def graze(depth):
+        system = ji.System(lambda q: q + 1 - depth, [1.0], potential=lambda q: 0.5 * q[0] ** 2)
+        found = [
+            ji.simulate(system, ji.Newton(0.5), [1.0], [0.0], 20.0, samples=s, max_events=1)
+            for s in (2, 11)
+        ]
+        return jnp.stack([motion.events.time[0] for motion in found])
+
+    run = jax.jit(lambda p, q, v, d: (jax.vmap(hit)(p, q, v), jax.vmap(graze)(d)))
+    hits, grazes = run(plates, q, v, depth)
+    exact = [first_contact(*given) for given in zip(np.transpose(plates), q, v)]
+    np.testing.assert_allclose(hits, exact, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(grazes[:5].T, [np.arccos(depth[:5] - 1)] * 2, rtol=0, atol=1e-9)
+    assert np.isnan(np.asarray(grazes[5])).all()
 
 
 # ------------------------------------------------------- persistent contact, moving base

@@ -95,6 +95,36 @@ def test_pulses_overturn_the_blocks_that_housner_says():
     assert 12 < fallen < 24
 
 
+# ------------------------------------------------------------------- the range of a geometry
+
+
+class Table(ji.Body):
+    """A point above a table that ends at x = 1."""
+
+    def gap_function(self, q):
+        return q[1:]
+
+    def valid(self, q):
+        return 1 - q[0]
+
+    @property
+    def mass(self):
+        return jnp.ones(2)
+
+    def gravity(self, acceleration):
+        return lambda q: acceleration * q[1]
+
+
+@pytest.mark.parametrize("options", [{}, {"method": "time_stepping", "step": 1e-2}])
+def test_leaving_the_range_of_a_gap_function_is_told(options):
+    system = ji.System(Table(), potential=Table().gravity(G))
+    motion = ji.simulate(system, ji.Moreau(0.5), [0.0, 0.1], [1.0, 0.0], 2.0, samples=11, **options)
+    assert status(motion) == "out_of_range"
+    assert 5 <= np.isfinite(np.asarray(motion.q[:, 0])).sum() <= 7  # x = 1 at the sixth sample
+    with pytest.raises(ValueError, match="in the range of the gap function"):
+        ji.simulate(system, ji.Moreau(0.5), [1.5, 0.1], [1.0, 0.0], 2.0, **options)
+
+
 # -------------------------------------------------------------------------- bodies in space
 
 

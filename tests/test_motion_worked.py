@@ -60,7 +60,7 @@ def test_free_rocking_to_rest():
     """Each impact keeps e of the angular velocity; swings last as Housner's quadrature says."""
     e = float(ji.theory.housner_restitution(3.0))
     motion = ji.simulate(
-        ji.block_system(0.2, 0.6),
+        ji.block_system(0.2, 0.6, corners="base"),
         ji.RestitutionMatrix(ji.theory.rocking_matrix(e)),
         upright(0.15),
         [0.0] * 3,
@@ -115,6 +115,17 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
     np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-12)
 
 
+def test_an_overturned_block_lies_on_its_side():
+    motion = ji.simulate(
+        ji.block_system(0.2, 0.6), ji.LZB(0.3), upright(0.5), [0.0] * 3, 3.0, samples=31
+    )
+    assert ended(motion) == ["ok"]
+    np.testing.assert_allclose(motion.q[-1], [0, 0.1, np.pi / 2], atol=1e-12)
+    np.testing.assert_allclose(motion.gaps[-1], [0.2, 0, 0, 0.2], atol=1e-12)
+    assert np.asarray(motion.gaps).min() > -1e-12
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_overturning_on_a_harmonic_base():
     """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
@@ -127,7 +138,12 @@ def test_overturning_on_a_harmonic_base():
         start = base(jnp.zeros(()))[0]
         q0 = jnp.stack([start, jnp.full((), 0.3), jnp.zeros(())])
         return ji.simulate(
-            ji.block_system(0.2, 0.6, base=base), law, q0, jnp.zeros(3), 2.0, friction=5.0
+            ji.block_system(0.2, 0.6, base=base, corners="base"),
+            law,
+            q0,
+            jnp.zeros(3),
+            2.0,
+            friction=5.0,
         )
 
     motion = shake(jnp.array([0.33, 0.36, 0.4, 0.6]))
@@ -162,24 +178,69 @@ def test_basketball_and_tennis_ball():
     assert float(abs(q[0, 1] - q[1, 1])) > 0.01
 
 
+def rocks(x):
+    q0 = jnp.stack([0 * x[1], jnp.sin(x[1]) * 0.1 + jnp.cos(x[1]) * x[2] / 2, x[1]])
+    law = ji.RestitutionMatrix(ji.theory.rocking_matrix(x[0]))
+    return ji.block_system(0.2, x[2], corners="base"), law, q0, jnp.zeros(3), 1.5, 5.0
+
+
+def swings(x):
+    system = ji.cradle_system([0.1, 0.15], length=x[1], diameter=0.02)
+    return system, ji.Newton(x[0]), jnp.stack([x[2], 0 * x[2]]), jnp.zeros(2), 1.5, None
+
+
+def collides(x):
+    system = ji.cradle_system([0.1] * 3, length=0.1, diameter=0.02)
+    start = jnp.stack([-x[1], 0 * x[1], 0 * x[1]])
+    return system, ji.LZB(x[0]), start, jnp.zeros(3).at[0].set(x[2]), 0.6, None
+
+
+def slides(x):
+    block = ji.block_system(0.2, 0.4, corners="base")
+    system = ji.System(
+        block.gap_function,
+        block.mass,
+        potential=lambda q: G * (jnp.cos(x[1]) * q[1] - jnp.sin(x[1]) * q[0]),
+        tangent_function=block.tangent_function,
+    )
+    return system, ji.Moreau(0.0), [0.0, 0.2, 0.0], jnp.zeros(3).at[0].set(x[2]), 1.0, x[0]
+
+
+def shaken(x):
+    system = ji.ball_system(base=ji.HarmonicBase(x[0], x[1]))
+    return system, ji.Newton(x[2]), [0.2], [0.0], 1.0, None
+
+
 @pytest.mark.slow
-def test_derivatives_of_a_motion_against_differences():
-    """Two pendulums, curved paths: e, length and start, against a tightened solver."""
+@pytest.mark.parametrize(
+    ("given", "at", "events"),
+    [
+        (rocks, [0.85, 0.15, 0.6], 4),
+        (swings, [0.7, 0.2, -0.6], 3),
+        (collides, [0.9, 0.3, 0.1], 2),
+        (slides, [0.3, 0.1, 1.0], 1),
+        (shaken, [0.02, 5.0, 0.7], 3),
+    ],
+)
+def test_derivatives_of_a_motion_against_differences(given, at, events):
+    """In both modes, of the end, event times and the ledger; differences at a finer tolerance."""
 
     def run(x, rtol=1e-10):
-        system = ji.cradle_system([0.1, 0.15], length=x[1], diameter=0.02)
+        *start, friction = given(x)
         motion = ji.simulate(
-            system, ji.Newton(x[0]), jnp.stack([x[2], 0 * x[2]]), jnp.zeros(2), 1.5, samples=4,
-            rtol=rtol, atol=rtol / 100,
-        )  # fmt: skip
-        return jnp.concatenate([motion.q[-1], motion.velocity[-1], motion.events.time[:3]])
+            *start, friction=friction, samples=4, max_events=60, rtol=rtol, atol=rtol / 100
+        )
+        assert motion.events.time.shape == (60,)
+        end = [motion.q[-1], motion.velocity[-1], motion.contact_work[-1].ravel()]
+        return jnp.concatenate([*end, motion.base_work[-1:], motion.events.time[:events]])
 
-    x, step = jnp.array([0.7, 0.2, -0.6]), 1e-4
-    slope = jax.jit(jax.jacfwd(run))(x)
+    x, step = jnp.array(at), 1e-4
+    forward, reverse = jax.jit(lambda x: (jax.jacfwd(run)(x), jax.jacrev(run)(x)))(x)
+    np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-12)
     moves = jnp.concatenate([k * step * jnp.eye(3) for k in (1, -1, 2, -2)])
     fine = jax.jit(jax.vmap(lambda x: run(x, 1e-12)))(x[None] + moves).reshape(4, 3, -1)
     differences = (8 * (fine[0] - fine[1]) - (fine[2] - fine[3])) / (12 * step)
-    np.testing.assert_allclose(slope, differences.T, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(forward, differences.T, rtol=1e-8, atol=1e-8)
 
 
 @pytest.mark.slow

@@ -38,10 +38,10 @@ class PlanarBodies(Body):
     on polygons, polygon by polygon; polygons, two contacts a pair. `between` names their bodies.
 
     The gap functions hold (`valid`, [m]) while the centre of a disc is outside the other body, and
-    while polygons that touch overlap along their sides, turned by less than 90 degrees against each
-    other, with no other corner of the first one beyond the second side: a body that slides off
-    another or rolls on it to its next side leaves this range. Bodies that are no pair do not feel
-    each other.
+    while two sides overlap or the line of one of them keeps them apart, turned by less than 90
+    degrees against each other, with no other corner of the first body beyond the second side: a
+    body that falls beside another or rolls on it to its next side leaves this range. Bodies that
+    are no pair do not feel each other.
 
     Args:
         bodies: `Polygon`, `Block`, `Disc`; `Dimer` on planes only.
@@ -288,8 +288,11 @@ def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> Cont
         side = other_a - a
         share = _dot(side, b - a) / _dot(side, side)
         over = _dot(b - other_b, a - b) > 0  # a overhangs: b is under the side, or beyond it
-        by_side, by_end = over & (share >= 0) & (share <= 1), over & ((share < 0) | (share > 1))
-        end = jnp.where((share > 1)[:, None], other_a, a)
+        past = _dot(other_b - b, a - other_b) > 0  # the sides do not overlap
+        by_side = over & (share >= 0) & (share <= 1)
+        by_end = past | (over & ~by_side)
+        end = jnp.where((over & (share > 1))[:, None], other_a, a)
+        b = jnp.where(past[:, None], other_b, b)
         apart, toward = _length(end - b)
         gap = jnp.where(by_end, apart, jnp.where(by_side, _dot(n_a, b - a), _dot(n_b, a - b)))
         n = jnp.where(by_end[:, None], toward, jnp.where(by_side[:, None], -n_a, n_b))
@@ -319,7 +322,9 @@ def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
     facing = along @ (a_begin - a_end)
     shared = jnp.minimum(along @ (a_begin - b_end), 0.0) + along @ (b_end - b_begin)
     shared = shared - jnp.maximum(along @ (a_end - b_begin), 0.0)
-    apart = jnp.min(_facing_sides(places, ((first, second),)).gap)
+    above = jnp.minimum((a_begin - b_begin) @ n, (a_end - b_begin) @ n)
+    n_a = _outward(a_end - a_begin)
+    apart = jnp.maximum(above, jnp.minimum((b_begin - a_begin) @ n_a, (b_end - a_begin) @ n_a))
     return jnp.minimum(jnp.minimum(beyond, facing), jnp.maximum(shared, apart))
 
 

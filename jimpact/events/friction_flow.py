@@ -13,7 +13,8 @@ break loose together.
 """
 
 import dataclasses
-from typing import Any
+import math
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,10 +35,11 @@ from jimpact.events.stepper import any_of
 from jimpact.solvers.friction import distribute
 
 AHEAD = 1e-6  # of the unit of time: at the first touch there are no forces yet to decide by
-# Forces of sticking minimize sum lambda^2 / (mu F) with this weight beside K_tt: it decides where
-# K_tt is singular only, and refinements remove what it changes elsewhere.
-SHARING = 1e-7
-REFINEMENTS = 2
+# Forces of sticking minimize sum lambda^2 / (mu F) with this weight beside K_tt, in square roots of
+# rounding: it decides where K_tt is singular only, and a refinement removes what it changes
+# elsewhere.
+SHARING = 1.0
+REFINEMENTS = 1
 LEFT = 0.1  # of the tolerance: a loaded contact with less energy ends the impact all the same
 
 
@@ -78,6 +80,39 @@ def regularized(
     for _ in range(refinements):
         z = z + times(inverted, right - times(matrix, z))
     return z
+
+
+@jax.custom_jvp
+def refined(k: jax.Array, share: jax.Array, right: jax.Array) -> jax.Array:
+    """As `regularized`, with tangents by the same equations: one inverse does for both."""
+    return regularized(k, right, share, REFINEMENTS)
+
+
+@refined.defjvp
+def _refined_rate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    (k, share, right), (dk, _, dright) = primals, tangents
+    z = refined(k, share, right)
+    return z, refined(k, share, dright - times(dk, z))
+
+
+class Modes(NamedTuple):
+    """What of the field does not change while the modes last."""
+
+    frozen: Frozen
+    stick: jax.Array  # (m, B)
+    drag: jax.Array  # lambda / F of those that slide (m, B)
+    pull: jax.Array  # u' = pull F, but for what is held (m, m, B)
+    along: jax.Array  # K_tt of those that stick (m, m, B)
+    share: jax.Array  # beside its diagonal (m, B)
+
+
+class Forces(NamedTuple):
+    """Forces and what follows from them, (m, B) each."""
+
+    normal: jax.Array  # F
+    side: jax.Array  # lambda
+    rate: jax.Array  # u'
+    room: jax.Array  # in the cones of those that stick: 1 nothing is held, 0 on the cone
 
 
 @as_pytree
@@ -121,52 +156,59 @@ class FrictionFlow(ContactFlow):
         phase = modes[: self.contacts]
         return (phase == COMPRESSION) | (phase == EXPANSION)
 
-    def forces(
-        self, const: Frozen, modes: jax.Array, y: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """F, mu F, lambda, and who sticks."""
+    def constants(self, modes: jax.Array) -> Any:
         m = self.contacts
-        x, g, _ = self.rows(y)
-        f = self.force(const, x, g)
-        most = self.friction * f
-        stick = (modes[2 * m :] == 0) & self.loaded(modes)
-        sliding = jnp.where(stick, 0.0, -modes[2 * m :].astype(most.dtype) * most)
-        missing = times(jnp.swapaxes(self.across, 0, 1), f) + times(self.along, sliding)
-        holding = self.holding(jnp.where(stick, -missing, 0.0), stick, most)
-        return f, most, jnp.where(stick, holding, sliding), stick
+        slip = modes[2 * m :]
+        stick = (slip == 0) & self.loaded(modes)
+        drag = -slip.astype(self.friction.dtype) * self.friction
+        k = jnp.where(stick[:, None] & stick[None], self.along, 0.0)
+        share = SHARING * math.sqrt(float(jnp.finfo(k.dtype).eps))
+        return Modes(
+            frozen=super().constants(modes),
+            stick=stick,
+            drag=drag,
+            pull=jnp.swapaxes(self.across, 0, 1) + self.along * drag[None],
+            along=k,
+            share=jnp.where(stick, share, 1.0),
+        )
 
-    def holding(self, right: jax.Array, stick: jax.Array, most: jax.Array) -> jax.Array:
-        """`K_tt lambda = right` on the rows that stick, shared in proportion to `most`."""
+    def forces(self, const: Modes, y: jax.Array) -> Forces:
+        """The forces in a state."""
+        x, g, _ = self.rows(y)
+        f = self.force(const.frozen, x, g)
+        most, pull = self.friction * f, times(const.pull, f)
         largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
         weight = most / jnp.where(largest > 0, largest, 1.0)
-        k = jnp.where(stick[:, None] & stick[None], self.along, 0.0) * weight[None]
-        return weight * regularized(k, right, jnp.where(stick, SHARING, 1.0), REFINEMENTS)
+        held = refined(const.along * weight[None], const.share, jnp.where(const.stick, -pull, 0.0))
+        hold, size = weight * held, jnp.abs(held)
+        # in parts of the force: those of a contact that opens vanish together
+        some = const.stick & (largest + size > 0)
+        room = jnp.where(some, (largest - size) / jnp.where(some, largest + size, 1.0), 1.0)
+        rate = jnp.where(const.stick, 0.0, pull + times(self.along, hold))
+        return Forces(f, const.drag * f + hold, rate, room)
 
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        _, g, _ = self.rows(y)
-        f, _, side, stick = self.forces(const, modes, y)
-        pull = self.coupling.times(f) + times(self.across, side)
-        slip = times(jnp.swapaxes(self.across, 0, 1), f) + times(self.along, side)
+        frozen, found = const.frozen, self.forces(const, y)
+        pull = self.coupling.times(found.normal) + times(self.across, found.side)
         return jnp.concatenate(
             [
-                const.closing * g,
-                const.ratio * pull,
-                const.unit * f,
-                const.unit * jnp.where(stick, 0.0, slip),
-                const.unit * side,
-                const.unit,
+                frozen.closing * self.rows(y)[1],
+                frozen.ratio * pull,
+                frozen.unit * found.normal,
+                frozen.unit * found.rate,
+                frozen.unit * found.side,
+                frozen.unit,
             ]
         )
 
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         m = self.contacts
-        _, most, side, stick = self.forces(const, modes, y)
-        slides = ~stick & self.loaded(modes)
+        slides = (modes[2 * m :] != 0) & self.loaded(modes)
         return jnp.concatenate(
             [
-                super().margins(const, modes, y),
+                super().margins(const.frozen, modes, y),
                 jnp.where(slides, modes[2 * m :].astype(y.dtype) * self.slip(y), 1.0),
-                jnp.where(stick, most - jnp.abs(side), 1.0),
+                self.forces(const, y).room,
             ]
         )
 
@@ -179,7 +221,7 @@ class FrictionFlow(ContactFlow):
     ) -> tuple[jax.Array, jax.Array]:
         m = self.contacts
         stopped, broke = which[2 * m : 3 * m], which[3 * m :]
-        _, _, side, _ = self.forces(self.constants(modes), modes, y)
+        side = self.forces(self.constants(modes), y).side
         turned = jnp.where(broke, -jnp.sign(side).astype(modes.dtype), modes[2 * m :])
         after, y = super().switch(modes, y, which[: 2 * m])
         after = jnp.concatenate([after[: 2 * m], turned])
@@ -199,7 +241,7 @@ class FrictionFlow(ContactFlow):
         asked = ask & loaded & (stopped | resting | (slip == 0))
         u = jnp.where(asked, 0.0, u)
         still = jax.lax.stop_gradient(self)
-        const = still.constants(modes)
+        const = ContactFlow.constants(still, modes)
         x, g, _ = jax.lax.stop_gradient(self.rows(y))
         soon = jnp.maximum(x + AHEAD * const.closing * g, 0.0)
         f = still.force(const, soon, g)
@@ -214,7 +256,7 @@ class FrictionFlow(ContactFlow):
         return jnp.concatenate([modes[: 2 * m], slip]), jnp.concatenate([y[: 3 * m], u, y[4 * m :]])
 
     def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
-        m, side = self.contacts, self.forces(self.constants(modes), modes, y)[2]
+        m, side = self.contacts, self.forces(self.constants(modes), y).side
         return (
             super()
             .measured(modes, y)

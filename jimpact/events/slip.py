@@ -198,7 +198,7 @@ class SlipFlow(FrictionFlow):
         pull = up - product(self.along, held)
         along = self.along - product(self.along, carried)
         return Reduced(
-            frozen=super().constants(modes),
+            frozen=ContactFlow.constants(self, modes),
             coupling=coupling - product(self.across, held),
             across=self.across - product(self.across, carried),
             pull=jnp.where(free[:, None], pull, 0.0),

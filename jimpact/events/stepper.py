@@ -82,7 +82,7 @@ _WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
 class Flow(Protocol):
     """What the stepper asks of a flow (see above)."""
 
-    longest: float
+    longest: Any  # a number, or ()
     near: float
 
     @property

@@ -293,7 +293,7 @@ def turning_impact(
 
     Returns:
         `TurningImpact`; `ended` False where it went on for 200 contact times or `max_steps`.
-        Forward derivatives (a motion has no reverse ones).
+        Forward derivatives (motions by contact forces have no reverse ones).
 
     >>> import jimpact as ji
     >>> block, q, v = ji.Block(1.0, 1.0), [0.0, 0.5, 0.0], [0.0, -0.5, -1.0]

@@ -4,8 +4,8 @@ One loop, one pass: where an event waits it is resolved, then a step is tried. L
 advance independently; an event waits until as many lanes wait as fly.
 
 DERIVATIVES   The run writes down its accepted steps and what was decided at its events (`Plan`). A
-second walk through them, in which nothing is decided, is a scan: JAX differentiates it in both modes
-and any order. Its blocks of rows are checkpoints, and blocks without a step are skipped.
+second walk through them, in which nothing is decided, is a scan: JAX differentiates it in both
+modes and any order. Its blocks of rows are checkpoints, and blocks without a step are skipped.
 """
 
 from typing import Any, NamedTuple
@@ -17,7 +17,6 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 
-from jimpact.bodies.base import GivenBody
 from jimpact.events import stepper
 from jimpact.events.batches import any_lane, over_lanes
 from jimpact.law import Law
@@ -29,11 +28,13 @@ from jimpact.motion.flow import (
     Settings,
     State,
     allowed_errors,
+    decoded,
     encoded,
     first_flight,
     flow_of,
     no_samples,
     one_pass,
+    out_of_range,
     packed,
     put,
     sampled_states,
@@ -41,7 +42,7 @@ from jimpact.motion.flow import (
     step_again,
     toward_sample,
 )
-from jimpact.motion.persistent_contact import Modes, no_modes
+from jimpact.motion.persistent_contact import no_modes
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events
 from jimpact.motion.system import System
 from jimpact.motion.transitions import After, Decision, resolve, resolved_again
@@ -75,12 +76,18 @@ class Given(NamedTuple):
         return State(self.q0, self.v0, self.times[0], zero, zero, rest, rest[:0])
 
 
+class Event(NamedTuple):
+    """What is kept of an event."""
+
+    happens: jax.Array  # () whether there is one
+    written: jax.Array  # () whether it has a row in the record
+    decision: Decision
+
+
 class Row(NamedTuple):
     """Of a plan: an event perhaps, a step after it perhaps."""
 
-    happens: jax.Array  # ()
-    written: jax.Array  # () whether the event has a row in the record
-    decision: Decision
+    event: Event
     accepted: jax.Array  # ()
     aim: stepper.Step
 
@@ -103,13 +110,12 @@ class Table(NamedTuple):
 
 class _Run(NamedTuple):
     flight: Flight
-    modes: Modes
     struck: jax.Array
     allowed: jax.Array  # errors of the ledger
     waits: jax.Array  # whether an event is to be resolved
-    last: Row  # the event before the next step
+    last: Event  # before the next step, or a longer time ago
     table: Table
-    count: jax.Array  # events
+    seen: jax.Array  # events
     status: jax.Array
     plan: Plan | None
 
@@ -117,15 +123,15 @@ class _Run(NamedTuple):
 class _End(NamedTuple):
     table: Table
     reached: jax.Array  # samples
-    count: jax.Array  # events
+    seen: jax.Array  # events
     steps: jax.Array
     status: jax.Array
     plan: Plan | None
 
 
 def event_driven(given: Given, max_events: int) -> Course:
-    """The motion from `times[0]` to `times[-1]`, sampled at `times`. Both derivatives, any order."""
-    leaves, tree = jax.tree.flatten(_without_closures(given))
+    """The motion from `times[0]` to `times[-1]`, sampled at `times`; it has both derivatives."""
+    leaves, tree = jax.tree.flatten(given)
     fixed = [None if eqx.is_array(x) else x for x in leaves]
 
     def rebuilt(arrays: tuple[jax.Array, ...]) -> Given:
@@ -140,7 +146,7 @@ def event_driven(given: Given, max_events: int) -> Course:
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
         end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
         assert end.plan is not None
-        plan = end.plan
+        plan: Plan = end.plan
 
         def smooth(*moved: jax.Array) -> tuple[jax.Array, jax.Array]:
             some = iter(moved)
@@ -154,40 +160,13 @@ def event_driven(given: Given, max_events: int) -> Course:
         samples, events = selected(plan.lost, recorded, found)
         end = end._replace(table=Table(samples, events, end.table.marks), plan=None)
         none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)
-        return end, none._replace(table=Table(*slopes, none.table.marks))
+        return end, none._replace(table=Table(slopes[0], slopes[1], none.table.marks))
 
     value.defjvp(rule, symbolic_zeros=True)
     end = value(*(x for x, y in zip(leaves, fixed) if y is None))
     samples = sampled_states(end.table.samples, given.start, end.reached)
-    events = _events(end.table, end.count, given)
+    events = _events(end.table, end.seen, given)
     return Course(samples, events, end.steps, end.status)
-
-
-def _without_closures(given: Given) -> Given:
-    """Functions of the system that close over traced arrays have these as arguments instead."""
-
-    def closed(function: Any, *args: jax.Array) -> Any:
-        if function is None or isinstance(function, eqx.Module) or not callable(function):
-            return function
-        opened = eqx.filter_closure_convert(function, *args)
-        traced = any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(opened))
-        return opened if traced else function
-
-    q, v, t, system = given.q0, given.v0, given.times[0], given.system
-    parts = [
-        closed(system.force, q, v, t), closed(system.potential, q), closed(system.base, t)
-    ]  # fmt: skip
-    new = eqx.tree_at(
-        lambda s: (s.force, s.potential, s.base), system, parts, is_leaf=lambda x: x is None
-    )
-    if isinstance(new.body, GivenBody):
-        body = new.body
-        parts = [closed(body.gaps, q), closed(body.sliding, q), closed(body.mass_given, q)]
-        new = eqx.tree_at(
-            lambda s: (s.body.gaps, s.body.sliding, s.body.mass_given), new, parts,
-            is_leaf=lambda x: x is None,
-        )  # fmt: skip
-    return given._replace(system=new)
 
 
 # ------------------------------------------------------------------------------ the run
@@ -215,7 +194,7 @@ def _run(given: Given, max_events: int, records: bool) -> _End:
         stuck, why_stuck(given.system, end.flight, given.q0, given.times), end.status
     ).astype(jnp.int32)
     flight = end.flight
-    return _End(end.table, flight.sample, end.count, flight.steps, status, end.plan)
+    return _End(end.table, flight.sample, end.seen, flight.steps, status, end.plan)
 
 
 def _begin(given: Given, max_events: int, records: bool) -> _Run:
@@ -235,16 +214,16 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
     status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
     decision = Decision(no, none, none, none, none, none, Scales(zero, zero, zero))
-    last = Row(no, no, decision, no, flight.aim)
+    last = Event(no, no, decision)
     plan = None
     if records:
         size = min(times.shape[0] + ROWS_PER_EVENT * max_events + ROWS_MORE, settings.max_steps)
         size = -(-size // BLOCK) * BLOCK + 1  # one more to write what is not kept
-        rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), last)
+        row = Row(last, no, flight.aim)
+        rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), row)
         plan = Plan(rows, jnp.int32(0), no)
     return _Run(
         flight,
-        no_modes(m, dtype),
         jnp.full((2, m), -jnp.inf, dtype),
         packed(state)[q0.size + v0.size :, 0],
         jnp.asarray(True),
@@ -267,15 +246,14 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
     flight, old = run.flight, run.flight.state
 
     def now(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
-        scales = run.last.decision.scales
+        scales, modes = run.last.decision.scales, decoded(flight.aim.modes, old.q.dtype)
         found = resolve(
-            system, law, mu, settings, old, run.modes, flight.event & mine, scales, run.struck
+            system, law, mu, settings, old, modes, flight.event & mine, scales, run.struck
         )
         happened = found.kind != KIND_CODE["none"]
-        full = (run.count >= max_events) & happened
+        full = (run.seen >= max_events) & happened
         status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
         kept = mine & happened & ~full
-        row = Row(jnp.asarray(True), kept, found.decision, jnp.asarray(False), flight.aim)
         state = found.after.state
         ready = flight._replace(
             state=state,
@@ -284,12 +262,11 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
         )
         new = run._replace(
             flight=toward_sample(ready, times, flight.free),
-            modes=found.modes,
             struck=found.after.struck,
             allowed=allowed_errors(system, settings, state),
             waits=jnp.asarray(False),
-            last=row,
-            count=run.count + kept.astype(jnp.int32),
+            last=Event(jnp.asarray(True), kept, found.decision),
+            seen=run.seen + kept.astype(jnp.int32),
             status=status,
         )
         codes = jnp.stack([found.kind, found.after.jump.code])
@@ -304,7 +281,7 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
     table, plan = run.table, run.plan
     light = run._replace(table=Table(table.samples[:1], *(x[:1] for x in table[1:])), plan=None)
     new, numbers, marks = jax.lax.cond(due, now, later, light)
-    index = jnp.where(new.count > run.count, run.count, max_events)
+    index = jnp.where(new.seen > run.seen, run.seen, max_events)
     table = table._replace(events=put(table.events, numbers, index))
     table = table._replace(marks=put(table.marks, marks, index))
     return new._replace(table=table, plan=plan)
@@ -315,20 +292,20 @@ def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
     system, _, mu, settings, *_, times, _ = given
     begin, last = run.flight, times.shape[0]
     scales = run.last.decision.scales
-    flow = flow_of(system, mu, settings, run.modes, scales, times, begin.state)
-    after, accept = one_pass(flow, settings, run.allowed, times, begin)
-    accept = accept & flies
-    flight = selected(flies, after, begin)
+    modes = decoded(begin.aim.modes, begin.state.q.dtype)
+    flow = flow_of(system, mu, settings, modes, scales, times, begin.state)
+    flight, accept = one_pass(flow, settings, run.allowed, times, begin, flies)
     samples = put(
         run.table.samples, packed(flight.state)[:, 0], jnp.where(flies, begin.sample, last)
     )
     plan, still = run.plan, jnp.asarray(False)
     if plan is not None:
-        size = plan.rows.happens.shape[0] - 1
-        row = run.last._replace(accepted=accept, aim=begin.aim)
-        rows = jax.tree.map(lambda all_, x: put(all_, x, plan.used), plan.rows, row)
-        used = plan.used + accept.astype(jnp.int32)
-        plan = Plan(rows, jnp.minimum(used, size), plan.lost | (used > size))
+        size = plan.rows.accepted.shape[0] - 1
+        row = Row(run.last, accept, begin.aim)
+        index = plan.used
+        rows = jax.tree.map(lambda all_, x: put(all_, x, index), plan.rows, row)
+        used = jnp.minimum(index + accept.astype(jnp.int32), size)
+        plan = Plan(rows, used, plan.lost | (used == size))
     return run._replace(
         flight=flight,
         waits=run.waits | (flies & jnp.any(flight.event)),
@@ -349,6 +326,7 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
     parts = (state.q, state.v, rates, gaps(system, q, t))
     finite = jnp.all(jnp.isfinite(jnp.concatenate(parts)))
     code = jnp.where(finite, MOTION_CODE["max_steps"], MOTION_CODE["not_finite"])
+    code = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], code)
     if not callable(system.mass):
         return code
     begin, now = (jax.lax.stop_gradient(mass_at(system, q)) for q in (q0, state.q))
@@ -407,34 +385,35 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
     system, law, mu, settings, *_, times, _ = given
     start, m = given.start, given.contacts
     width = _width(given)
-    size = plan.rows.happens.shape[0] - 1
+    size = plan.rows.accepted.shape[0] - 1
     rows = jax.tree.map(lambda x: x[:size], plan.rows)
     index = jnp.arange(size, dtype=jnp.int32)
     # what an event without a step leaves is in the row after the last step
     there = index <= plan.used
-    happens, accepted = rows.happens & there, rows.accepted & (index < plan.used)
+    happens, accepted = rows.event.happens & there, rows.accepted & (index < plan.used)
     sampled = accepted & rows.aim.target[:, -1, 0]
-    written = rows.written & happens
+    written = rows.event.written & happens
     reached = jnp.cumsum(sampled, dtype=jnp.int32) + (~sampled).astype(jnp.int32)  # before the step
 
-    def event(y: Any, row: Row) -> tuple[Any, jax.Array]:
+    def event(y: Any, now: Event) -> tuple[Any, jax.Array]:
         state, struck = y
-        after = resolved_again(system, law, mu, settings, state, struck, row.decision)
-        new = selected(row.happens, (after.state, after.struck), y)
-        return new, jnp.where(row.happens, _numbers(state, after), 0.0)
+        after = resolved_again(system, law, mu, settings, state, struck, now.decision)
+        new = selected(now.happens, (after.state, after.struck), y)
+        return new, jnp.where(now.happens, _numbers(state, after), 0.0)
 
     def step(state: State, row: Row, sample: jax.Array) -> State:
         aim = row.aim._replace(modes=row.aim.modes.astype(jnp.int32))
-        active, stick, sign = aim.modes[:, 0].reshape(3, m)
-        modes = Modes(active > 0, stick > 0, sign.astype(state.q.dtype))
-        flow = flow_of(system, mu, settings, modes, row.decision.scales, times, state)
+        modes, scales = decoded(aim.modes, state.q.dtype), row.event.decision.scales
+        flow = flow_of(system, mu, settings, modes, scales, times, state)
         flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
         return selected(row.accepted, step_again(flow, aim, state), state)
 
     def one(y: Any, x: Any) -> tuple[Any, Any]:
         row, sample = x
         nothing = jnp.zeros(width, start.q.dtype)
-        y, numbers = jax.lax.cond(any_lane(row.happens), event, lambda y, row: (y, nothing), y, row)
+        y, numbers = jax.lax.cond(
+            any_lane(row.event.happens), event, lambda y, _: (y, nothing), y, row.event
+        )
         state = jax.lax.cond(
             any_lane(row.accepted), step, lambda state, *_: state, y[0], row, sample
         )
@@ -448,10 +427,10 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
             nothing = jnp.zeros((BLOCK, len(packed(start)) + width), start.q.dtype)
             return y, (nothing[:, width:], nothing[:, :width])
 
-        some = xs[0].happens | xs[0].accepted
+        some = xs[0].event.happens | xs[0].accepted
         return jax.lax.cond(any_lane(jnp.any(some)), walk, stay, y)
 
-    xs = rows._replace(happens=happens, accepted=accepted), reached
+    xs = Row(rows.event._replace(happens=happens), accepted, rows.aim), reached
     blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
     # rows beyond those that there was room for: no number at all
     lost = jnp.where(plan.lost, jnp.nan, 1.0)

@@ -97,7 +97,8 @@ def fit_motion(
     """The parameters of `law` with which `simulate` comes nearest to a measured motion.
 
     Equation: `min sum ((observe(motion) - measured) / sigma)^2` by Levenberg-Marquardt, with the
-    exact derivatives of the simulated motion, event times included.
+    exact derivatives of the simulated motion, event times included: forward ones, which cost less
+    than reverse ones as long as parameters are fewer than residuals.
 
     Args:
         system: as in `simulate`.

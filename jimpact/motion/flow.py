@@ -9,12 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jimpact.bodies.base import Body
 from jimpact.events import stepper
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
     kinematics,
     mass_at,
+    seen_from_base,
     user_force,
 )
 from jimpact.motion.persistent_contact import (
@@ -210,8 +212,7 @@ class MechanicalFlow(MotionFlow):
 
     def constants(self, modes: jax.Array) -> Modes:
         """The modes, of each contact."""
-        active, stick, sign = modes[:, 0].reshape(3, -1)
-        return Modes(active > 0, stick > 0, sign.astype(self.sizes.dtype))
+        return decoded(modes, self.sizes.dtype)
 
     def _contacts(self, at: State) -> Contacts:
         return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
@@ -258,6 +259,12 @@ def unpacked(like: State, y: jax.Array) -> State:
     """The state of rows (.., 1); `spare` ones come last."""
     flat, back = ravel_pytree(like)
     return back(y[: len(flat), 0])
+
+
+def decoded(rows: jax.Array, dtype: Any) -> Modes:
+    """The modes of such rows."""
+    active, stick, sign = rows[:, 0].reshape(3, -1)
+    return Modes(active > 0, stick > 0, sign.astype(dtype))
 
 
 def encoded(modes: Modes) -> jax.Array:
@@ -341,11 +348,17 @@ def selected(which: jax.Array, new: Any, old: Any) -> Any:
 
 
 def one_pass(
-    flow: MotionFlow, settings: Settings, allowed: jax.Array, targets: jax.Array, flight: Flight
+    flow: MotionFlow,
+    settings: Settings,
+    allowed: jax.Array,
+    targets: jax.Array,
+    flight: Flight,
+    flies: jax.Array | bool = True,
 ) -> tuple[Flight, jax.Array]:
     """One pass of the stepper, and whether its step is accepted.
 
-    `allowed` are the errors of all rows of the state but q and v.
+    `allowed` are the errors of all rows of the state but q and v. Of a lane that does not fly all
+    stays as it is but the step to try, which `toward_sample` then sets anew.
     """
     state = flight.state
     flow = dataclasses.replace(
@@ -356,12 +369,12 @@ def one_pass(
     # passes are counted here: their number does not lower the tolerance
     carry = stepper.Carry(_rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0))
     after, accept = stepper.advance(flow, carry, 2)
-    accept = accept[0, 0]
+    accept = accept[0, 0] & flies
     landed = flight.aim.target[:, 0] & accept
     sampled = landed[-1]
     state = selected(accept, _reached(flow, flight.aim, after.y), state)
-    steps = flight.steps + 1
-    vanishes = ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * _span(targets))
+    steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
+    vanishes = flies & ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * _span(targets))
     # what an event or a sample shortens says nothing of the steps after it
     tried, lands = flight.aim.clock[1, 0], flight.aim.clock[3, 0] > 0
     proposed = after.step.clock[1, 0]
@@ -372,16 +385,26 @@ def one_pass(
         free=free,
         aim=jax.lax.stop_gradient(after.step),
         plan=jax.lax.stop_gradient(after.plan),
-        event=landed[:-1],
+        event=jnp.where(flies, landed[:-1], flight.event),
         sample=flight.sample + sampled.astype(flight.sample.dtype),
         steps=steps,
-        stuck=vanishes | (steps >= settings.max_steps),
+        stuck=flight.stuck
+        | vanishes
+        | (steps >= settings.max_steps)
+        | out_of_range(flow.system, state),
     )
     aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
     plain = sampled | (accept & in_time)
     aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
     return moved._replace(aim=aim, plan=plan), accept
+
+
+def out_of_range(system: System, at: State) -> jax.Array:
+    """Whether () the gap function does not hold here any more."""
+    if type(system.body).valid is Body.valid:
+        return jnp.asarray(False)
+    return ~(system.body.valid(seen_from_base(system, at.q, at.t)) >= 0)
 
 
 def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:

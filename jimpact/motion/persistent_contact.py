@@ -26,8 +26,8 @@ from jimpact.solvers.lcp import solve_lcp
 from jimpact.solvers.linear import solve_definite
 from jimpact.status import CODE
 
-# Beside a matrix with unit diagonal: it decides where that is singular (redundant sticking contacts)
-# and refinements remove what it changes elsewhere. Ten times less, and rounding decides, too.
+# Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
+# stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
@@ -99,7 +99,7 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     sliding = modes.active & ~modes.stick
     drag = jnp.where(sliding, modes.sign * mu, 0.0)
     # what slides goes with its normal force
-    w = given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag)
+    w = given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag[None])
     right = -given.approach
     none = jnp.zeros(m, w.dtype)
 
@@ -125,7 +125,8 @@ def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -
     scale = jnp.where(held, 1 / jnp.sqrt(jnp.diagonal(w)), 1.0)
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = held[:, None] & held[None, :]
-    k = jnp.where(both, w * scale[:, None] * scale * weight, jnp.eye(len(held), dtype=w.dtype))
+    scaled = w * scale[:, None] * (scale * weight)[None]
+    k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
     ridge = jnp.where(held, _RIDGE, 0.0)
     z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +17,7 @@ from jimpact._checks import (
     check_values,
     is_traced,
 )
+from jimpact.bodies.base import GivenBody
 from jimpact.compiling import quick_jit
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
@@ -86,8 +88,12 @@ def simulate(
         max_steps: of the integrator, in all.
 
     Returns:
-        `Motion`. Pure: jit, vmap, and forward derivatives (jvp, jacfwd) in everything that is an
-        array, event times included. A bad motion of a batch ends alone, with its status.
+        `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
+        Method 'events' has derivatives in both modes (grad, jvp, hessian) of everything in it,
+        event times and ledger included, in everything that is an array, and in what functions of
+        the system close over. They are those of the order of events that occurs, one-sided where
+        two events change places or a contact is only grazed; NaN for motions of more steps than
+        samples + 16 `max_events` + 1024. Method 'contact_forces' has forward ones (jvp, jacfwd).
 
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step.
@@ -124,6 +130,7 @@ def simulate(
             f"value {rtol:g}: enable jax_enable_x64, or give a coarser one."
         )
     mu = _friction_of(system, law, friction, q, in_space=method == "time_stepping")
+    system = _opened(system, q, v, start)
     q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     settings = Settings(
         rtol,
@@ -282,14 +289,18 @@ def _check_system(
             f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
             f"velocities, but has one of shape {mass.shape}."
         )
-    if is_traced((system, q, v, start, end)):
+    # functions of a system may close over traced numbers
+    mass, f = mass_at(system, q), gaps(system, q, start)
+    if is_traced((system, q, v, start, end, mass, f)):
         return
     if callable(system.mass):
-        check_mass(mass_at(system, q))
+        check_mass(mass)
     if system.base is not None:
         looks = np.linspace(float(start), float(end), _BASE_LOOKS)
         moved = system.base
         base = jax.vmap(lambda t: jnp.atleast_1d(moved(t)))(jnp.asarray(looks, q.dtype))
+        if is_traced(base):
+            return
         bad = ~np.isfinite(np.asarray(base)).all(axis=1)
         if bad.any():
             raise ValueError(
@@ -302,13 +313,36 @@ def _check_system(
             "Argument `q0` must be in the range of the gap function "
             f"({system.body.range_in_words}), but its margin has value {margin:g}."
         )
-    f = np.asarray(gaps(system, q, start))
     if not (f >= -closed_below).all():
-        worst = int(np.argmin(f))
+        worst = int(jnp.argmin(f))
         raise ValueError(
             f"Argument `q0` must have no penetration (f >= -{closed_below:g} m), "
             f"but gap {worst} has value {f[worst]:g} m."
         )
+
+
+def _opened(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> System:
+    """The system; functions that close over traced arrays have these as arguments instead."""
+
+    def opened(function: Any, *args: jax.Array) -> Any:
+        if isinstance(function, eqx.Module) or not callable(function):
+            return function
+        args = tuple(jnp.zeros(x.shape, x.dtype) for x in args)
+        if not is_traced(function(*args)):
+            return function
+        new = eqx.filter_closure_convert(function, *args)
+        return new if is_traced(new) else function
+
+    def parts(s: System) -> list[Any]:
+        body = s.body
+        found: list[Any] = [s.force, s.potential, s.base]
+        if isinstance(body, GivenBody):
+            found += [body.gaps, body.sliding, body.mass_given]
+        return found
+
+    args = [(q, v, t), (q,), (t,), (q,), (q,), (q,)]
+    new = [opened(function, *x) for function, x in zip(parts(system), args)]
+    return eqx.tree_at(parts, system, new, is_leaf=lambda x: x is None)
 
 
 def _friction_of(

@@ -16,7 +16,7 @@ from harness import arguments
 from kernels import compiled
 from rich.console import Console
 
-SCRIPTS = ("three_balls", "derivatives", "economy", "long_chains")
+SCRIPTS = ("three_balls", "derivatives", "economy", "long_chains", "motions")
 PACKAGES = ("jimpact", "jax", "jaxlib", "equinox", "diffrax", "numpy", "numba")
 
 

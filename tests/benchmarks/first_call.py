@@ -47,7 +47,7 @@ def measure(row):
     shots = ji.Experiments(pre=[[1.0, 0, 0]], post=[[-0.0605, 0.1049, 0.9978]])
     if row == "another number of balls":
         ji.impact(ji.LZB(0.9), balls, v)
-    ball, rocks = ji.ball_system(), ji.block_system(0.2, 0.6)
+    ball, rocks = ji.ball_system(), ji.block_system(0.2, 0.6, corners="base")
     matrix = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))
     tilted = [0.0, 0.1 * math.sin(0.15) + 0.3 * math.cos(0.15), 0.15]
     run = diffrax_event.dopri8()
