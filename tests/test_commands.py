@@ -2,12 +2,14 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 import tomllib
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -282,6 +284,22 @@ def test_every_body_has_a_table(kind):
     assert len(body.names) == (body.coordinates or velocities)
     assert len(body.velocity_names) == velocities
     assert all(name.endswith("]") for name in (*body.names, *body.velocity_names))
+
+
+def test_the_study_of_the_documents(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "motions.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```toml\n(.*?)```", text, re.S)
+    study = read_motion_study(written(tmp_path, block))
+    gaps = study.system.body.gap_function(np.array(study.arguments["q0"]))
+    np.testing.assert_allclose(gaps, [0.0, 0.0, 0.6, 0.6, 0.0, 0.1], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["rocking_block", "discs_in_a_box", "tossed_brick"])
+def test_bundled_motions_begin_without_penetration(name):
+    study = read_motion_study(f"{name}.toml")
+    q = np.array(study.arguments["q0"])
+    assert study.system.body.gap_function(q).min() >= 0
+    assert len(study.arguments["v0"]) == len(study.system.body.velocity_names)
 
 
 def test_motions_of_several_bodies_and_a_base_in_space(tmp_path):

@@ -229,7 +229,7 @@ def phase_portrait(
     >>> dimer = ji.dimer_system(0.1, 1.0)
     >>> motion = ji.simulate(dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21)
     >>> ji.plot.phase_portrait(motion, system=dimer).axes[0].get_xlabel()
-    'y [m]'
+    'angle [rad]'
     """
     one_motion(motion)
     labels, rates = _labels(motion, names, system)
