@@ -145,6 +145,8 @@ def test_picture_of_a_motion(tmp_path):
     np.testing.assert_array_equal(turn.get_ydata()[2:6], [-2.0, -2.0, 3.0, 3.0])
     first, second = axes["gaps [m]"].lines[:2]
     assert (min(first.get_ydata()), min(second.get_ydata())) == (0.0, 0.1)
+    energy, gained = axes["energy [J]"].lines[0], 0.5 * system.body.inertia * (3.0**2 - 2.0**2)
+    np.testing.assert_allclose(np.diff(energy.get_ydata()[3:5]), [gained], rtol=1e-12)
     bare = [x.get_ylabel() for x in ji.plot.motion(found, names=["x [m]", "y [m]"]).axes]
     assert bare[:2] == ["coordinates [m]", "velocities [m/s]"]
     assert {"q3", "q3'"} <= set(bare)
