@@ -111,7 +111,8 @@ def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, n
 
 def _titled(study: Study, before: np.ndarray) -> str:
     """The first line of what is printed of one impact."""
-    return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) m/s"
+    unit = "m/s" if study.scene.walls is not None else "m/s, rad/s"
+    return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) {unit}"
 
 
 # -------------------------------------------------------------------------------------------- fit

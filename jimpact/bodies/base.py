@@ -94,6 +94,10 @@ class Body(eqx.Module):
         """Displacements (m,) [m] along the contact planes; their rates are the sliding speeds."""
         return None
 
+    def normals(self, q: jax.Array) -> jax.Array:
+        """N (n, m): gap velocities are `N^T v`."""
+        return self._gradient(self.gap_function, q)
+
     def tangents(self, q: jax.Array) -> jax.Array | None:
         """H_t (n, m), planar, or (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
         if self.tangent_function(q) is None:
@@ -205,7 +209,7 @@ _Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
 
 def _parts(body: Body, q: jax.Array) -> _Parts:
     margin = body.valid(q)
-    normals = jnp.where(margin >= 0, body._gradient(body.gap_function, q), jnp.nan)
+    normals = jnp.where(margin >= 0, body.normals(q), jnp.nan)
     return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q), margin
 
 

@@ -371,8 +371,7 @@ def _friction_of(
             "Argument `system` must have one tangent a contact in the plane, two in space: "
             f"{m} or {2 * m} for its {m} contacts, but has {tangents.shape[1]}."
         )
-    planar = jax.eval_shape(system.body.tangent_function, q) is not None
-    if not (in_space or planar):
+    if not (in_space or tangents.shape[1] == m):
         raise ValueError(
             "Argument `friction` must be 0 for a body with tangents in space: with "
             "method='time_stepping' alone motions know friction in space."

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jimpact.bodies.base import projected, rate_of, split_name
-from jimpact.motion.dynamics import seen_from_base
+from jimpact.motion.dynamics import kinetic, potential, seen_from_base
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.plot.style import COLOURS, GREY
@@ -75,7 +75,7 @@ def motion(
         for axes in every[len(units) : -1, j]:
             axes.remove()
     _gaps(every[-1, 0], motion)
-    _ledger(every[-1, 1], motion)
+    _ledger(every[-1, 1], motion, course, system)
     every[0, 0].set_title(title, loc="left")
     for axes in figure.axes:
         if axes is not every[-1, 1]:
@@ -189,11 +189,17 @@ def _event_lines(axes: Axes, motion: Motion) -> None:
             axes.axvline(t, color="black", lw=0.8, ls=style, zorder=0)
 
 
-def _ledger(axes: Axes, motion: Motion) -> None:
-    """Energy, and what has gone where since the start."""
-    time, energy = np.asarray(motion.time), np.asarray(motion.energy)
-    axes.plot(time, energy, color="black", label="T + V")
-    axes.plot(time, motion.kinetic_energy, color=GREY, lw=0.8, label="T")
+def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
+    """Energy, and what has gone where since the start; of a known system with its jumps."""
+    time = np.asarray(motion.time)
+    if system is None:
+        drawn = time, motion.kinetic_energy, motion.energy
+    else:
+        q, v = jnp.asarray(course.q), jnp.asarray(course.v)
+        moving = jax.vmap(partial(kinetic, system))(q, v)
+        drawn = course.time, moving, moving + jax.vmap(partial(potential, system))(q)
+    axes.plot(drawn[0], drawn[2], color="black", label="T + V")
+    axes.plot(drawn[0], drawn[1], color=GREY, lw=0.8, label="T")
     # the shares of single contacts in a multiple impact may have either sign: their sum is shown
     normal, tangential = np.asarray(motion.contact_work).sum(axis=-1).T
     axes.plot(time, -normal, color=COLOURS[0], label="contacts took")
@@ -229,7 +235,7 @@ def phase_portrait(
     >>> dimer = ji.dimer_system(0.1, 1.0)
     >>> motion = ji.simulate(dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21)
     >>> ji.plot.phase_portrait(motion, system=dimer).axes[0].get_xlabel()
-    'y [m]'
+    'angle [rad]'
     """
     one_motion(motion)
     labels, rates = _labels(motion, names, system)
