@@ -5,8 +5,9 @@ Public names are taken from `jimpact` itself, so that a command imports no more 
 
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,6 +21,7 @@ import jimpact as ji
 from jimpact import options
 from jimpact.comparison import registered_laws
 from jimpact.fits.fitting import Fit
+from jimpact.progress import waiting
 from jimpact.records import as_data, table
 from jimpact.study import Study, import_laws, read_study
 
@@ -38,7 +40,7 @@ class Answer(NamedTuple):
     title: str
     data: dict[str, Any]
     text: str
-    pictures: dict[Path, "Figure"]
+    pictures: Mapping[Path, "Figure | Callable[[Path], Any]"]  # to be saved, or what draws it
     failure: str = ""
 
 
@@ -47,9 +49,13 @@ def run(given: options.Command) -> int:
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
     try:
         answer = _COMMANDS[given.name()](given)
-        for path, figure in answer.pictures.items():
+        replaced = [path for path in answer.pictures if path.exists()]
+        for path, picture in answer.pictures.items():
             path.parent.mkdir(parents=True, exist_ok=True)
-            figure.savefig(path, dpi=DPI)
+            if callable(picture):
+                picture(path)
+            else:
+                picture.savefig(path, dpi=DPI)
     except KeyboardInterrupt as stop:
         return _refuse(given, str(stop) or "stopped.", INTERRUPTED)
     except (ValueError, TypeError, OSError, ImportError) as error:
@@ -63,6 +69,8 @@ def run(given: options.Command) -> int:
     else:
         lines = [answer.title, answer.text, *(f"Picture: {path}" for path in pictures)]
         print("\n".join(line for line in lines if line))
+    for path in replaced:
+        print(f"jimpact {given.name()}: {path} was there before: replaced.", file=sys.stderr)
     return _refuse(given, answer.failure, FAILURE) if answer.failure else 0
 
 
@@ -72,8 +80,12 @@ def _refuse(given: options.Command, reason: str, code: int) -> int:
 
 
 def _picture(given: options.DrawingCommand) -> Path:
-    """The file --out, or the command's own in the directory --out."""
-    return _checked(given.out if given.out.suffix else given.out / f"jimpact-{given.name()}.png")
+    """The file --out, or the command's own in the directory --out, named after the study."""
+    if given.out.suffix:
+        return _checked(given.out)
+    study, default = (getattr(x, "study", None) for x in (given, type(given)))
+    named = "" if study is None or study == default else f"-{study.stem}"
+    return given.out / f"jimpact-{given.name()}{named}.png"
 
 
 def _checked(path: Path, option: str = "--out") -> Path:
@@ -99,7 +111,8 @@ def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, n
 
 def _titled(study: Study, before: np.ndarray) -> str:
     """The first line of what is printed of one impact."""
-    return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) m/s"
+    unit = "m/s" if study.scene.walls is not None else "m/s, rad/s"
+    return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) {unit}"
 
 
 # -------------------------------------------------------------------------------------------- fit
@@ -194,7 +207,8 @@ def compare(given: options.CompareCommand) -> Answer:
     study = read_study(given.study)
     before, measured = _velocities(study, given)
     laws, left_out = registered_laws(study.parameters)
-    found = ji.compare(study.scene, before, laws)
+    with waiting("laws"):
+        found = ji.compare(study.scene, before, laws)
     found = replace(found, left_out=left_out, measured=measured)
     fits = _fits_of_all(study) if given.fit else {}
     values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
@@ -369,24 +383,23 @@ def simulate(given: options.SimulateCommand) -> Answer:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
     from jimpact.motion.study_motion import read_motion_study
 
-    path = _picture(given)
-    if given.portrait is not None:
-        _checked(given.portrait, "--portrait")
+    portrait = None if given.portrait is None else _checked(given.portrait, "--portrait")
     if given.gif is not None and given.gif.suffix != ".gif":
         raise ValueError(f"--gif must end in .gif, but is '{given.gif}'.")
+    path = _picture(given)
+    if portrait == path:
+        raise ValueError(f"--portrait and --out must be two files, but are both '{path}'.")
     study = read_motion_study(given.study)
-    terminal = Console(stderr=True)  # where a spinner turns: nobody knows how long it will take
-    with terminal.status("compiling and simulating ..."):
-        motion = jax.block_until_ready(study.run(t_end=given.t_end, samples=given.samples))
-    pictures = {path: ji.plot.motion(motion, study.title)}
-    if given.portrait is not None:
-        pictures[given.portrait] = ji.plot.phase_portrait(motion, given.coordinate - 1, study.title)
-    data, text = motion.to_dict(), str(motion)
+    system, title = study.system, study.title
+    with waiting("motion"):
+        found = jax.block_until_ready(study.run(t_end=given.t_end, samples=given.samples))
+    pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
+    if portrait is not None:
+        which = None if given.coordinate is None else given.coordinate - 1
+        pictures[portrait] = ji.plot.phase_portrait(found, which, title, system=system)
     if given.gif is not None:
-        with terminal.status("drawing ..."):
-            ji.plot.animation(study.system, motion, given.gif, title=study.title)
-        data["animation"], text = str(given.gif), f"{text}\nAnimation: {given.gif}"
-    return Answer(study.title, data, text, pictures, _failure(motion))
+        pictures[given.gif] = partial(ji.plot.animation, system, found, title=title)
+    return Answer(title, found.to_dict(), str(found), pictures, _failure(found))
 
 
 def _failure(motion: "ji.Motion") -> str:

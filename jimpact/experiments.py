@@ -14,13 +14,15 @@ import numpy as np
 from jimpact._checks import as_float_array, check_values
 from jimpact.scene import Scene, dense_mass, stackable
 
-UNITS = {  # in m/s
+UNITS = {  # in m/s, and rad/s of bodies that turn
     "m/s": 1.0,
     "cm/s": 0.01,
     "mm/s": 0.001,
     "km/h": 1 / 3.6,
     "in/s": 0.0254,
     "ft/s": 0.3048,
+    "rad/s": 1.0,
+    "deg/s": np.pi / 180,
 }
 _KINDS = ("pre", "post", "sigma")
 _HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[([^]]*)\])?")
@@ -246,7 +248,8 @@ def read_experiments(path: str | Path) -> Experiments:
 
     Columns: `pre_1[m/s]`, `post_1[m/s]` and so on for every body, optional `sigma_1[m/s]`, ...
     (standard errors of `post`) and `shot` (a label). Units: m/s, cm/s, mm/s, km/h, in/s, ft/s,
-    converted to m/s. An empty `post` cell is a value that was not measured.
+    converted to m/s; rad/s, deg/s, converted to rad/s. An empty `post` cell is a value that was
+    not measured.
 
     Raises:
         FileNotFoundError: no such file.

@@ -28,7 +28,8 @@ class DrawingCommand(Command):
     """Options of a command that draws a picture."""
 
     out: Path = Path()
-    """Picture (.png, .pdf, .svg), or a directory for it; default: ./jimpact-<command>.png."""
+    """Picture (.png, .pdf, .svg), or a directory for it; default: ./jimpact-<command>.png,
+    with a study named ./jimpact-<command>-<study>.png. What is there is replaced, and told."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +133,8 @@ class SimulateCommand(DrawingCommand):
     """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
 
     study: StudyFile = Path("cradle_motion.toml")
-    """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml)."""
+    """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml,
+    rocking_block.toml, tossed_brick.toml, discs_in_a_box.toml)."""
     t_end: float | None = None
     """End of the motion [s]; default: the study's."""
     samples: int | None = None
@@ -141,8 +143,8 @@ class SimulateCommand(DrawingCommand):
     """Animation (.gif), one frame a sample."""
     portrait: Path | None = None
     """Phase portrait (.png, .pdf, .svg)."""
-    coordinate: int = 1
-    """Coordinate of the phase portrait, counted from 1."""
+    coordinate: int | None = None
+    """Coordinate of the phase portrait, counted from 1; default: one that moves."""
 
 
 @dataclasses.dataclass(frozen=True)

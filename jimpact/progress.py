@@ -13,8 +13,8 @@ BAR_AFTER = 2.0  # seconds after which work counts as long
 
 
 @contextlib.contextmanager
-def progress_bar(progress: bool | None) -> Iterator[Callable[[str, float, float], None]]:
-    """Yield `show(what, done, total)`.
+def progress_bar(progress: bool | None) -> Iterator[Callable[[str, float, float | None], None]]:
+    """Yield `show(what, done, total)`; total None: nobody knows.
 
     The bar is there at once if `progress`; None: only on a terminal, once the work turns out long.
     """
@@ -34,6 +34,14 @@ def progress_bar(progress: bool | None) -> Iterator[Callable[[str, float, float]
     finally:
         timer.cancel()
         bar.stop()
+
+
+@contextlib.contextmanager
+def waiting(what: str, progress: bool | None = None) -> Iterator[None]:
+    """A bar for work that does not tell how far it is: only its time runs."""
+    with progress_bar(progress) as show:
+        show(what, 0.0, None)
+        yield
 
 
 @contextlib.contextmanager

@@ -1,6 +1,7 @@
 """A study: one TOML file with scene, law, what is free, and the data file."""
 
 import importlib.util
+import inspect
 import sys
 import tomllib
 from collections.abc import Callable, Mapping
@@ -11,6 +12,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from jimpact.bodies.assemblies import PlanarBodies
+from jimpact.bodies.base import CLOSED_BELOW, Body
+from jimpact.bodies.blocks import Block
+from jimpact.bodies.dimers import Dimer, SpatialDimer
+from jimpact.bodies.discs import DiskBalls
+from jimpact.bodies.particles import Column, Corner
+from jimpact.bodies.pendulums import PendulumCradle
+from jimpact.bodies.piles import Discs
+from jimpact.bodies.polygons import Disc, Polygon
+from jimpact.bodies.solids import Box, Sphere
 from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.law import Law
@@ -20,12 +31,31 @@ from jimpact.registry import Row
 from jimpact.scene import Scene, chain
 
 _SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
+_AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
 _FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
 _DATA_KEYS = ("file", "momentum_corrected")
 _SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
 _ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
 _DISTRIBUTIONS: dict[tuple[str, ...], Any] = {("high", "low"): Uniform, ("mean", "std"): Normal}
-
+_BODIES: dict[str, type[Body]] = {
+    body.__name__.lower(): body
+    for body in (
+        *(Block, Polygon, Disc, Dimer, PlanarBodies),
+        *(Box, Sphere, SpatialDimer),
+        *(Column, Corner, PendulumCradle, Discs, DiskBalls),
+    )
+}
+# Units of the bodies' parameters, which stand behind their names in a study. Without one are words
+# and directions, and lists that are points [m] or mix units, as the classes say: `corners` of a
+# Polygon, `planes`, `walls`, `at`.
+_UNITS = {
+    **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
+    **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
+    **dict.fromkeys(("width", "height", "length", "radius", "radii", "gaps", "sizes"), "m"),
+    **dict.fromkeys(("centre", "rounding", "disk_radius", "ball_radius"), "m"),
+    "inertia": "kg_m2",
+    "angle": "rad",
+}
 
 T = TypeVar("T")
 
@@ -65,7 +95,8 @@ class Study:
 def read_study(path: str | Path, law: str | None = None) -> Study:
     """Read a study file; `law` puts another law in the place of the study's.
 
-    Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`); `[law]` name, options and
+    Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`), or a body (see `body_of`) and
+    q, its configuration at the impact, closed_below_m; `[law]` name, options and
     start values, a number for all contacts or a list with one each, module (a file or module that
     registers the law, see `ji.register`), and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
@@ -138,7 +169,42 @@ def _experiments(table: Mapping[str, Any], path: Path, scene: Scene) -> Experime
     return experiments.momentum_corrected(scene) if corrected else experiments
 
 
+def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) -> Body:
+    """The body that a table of a study describes.
+
+    `kind` is the name of a body's class (`Block`, `Box`, `PlanarBodies`, ..., in any case); the
+    other keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
+    `inertia_kg_m2`, `angle_rad`. Bodies of `PlanarBodies` are tables of this kind themselves.
+    `others` are keys of the table that belong to somebody else.
+
+    >>> from jimpact.study import body_of
+    >>> body_of("[scene]", {"kind": "Block", "width_m": 0.2, "height_m": 0.6}).names
+    ('x [m]', 'y [m]', 'angle [rad]')
+    """
+    check_keys(where, table, tuple(table), required=("kind",))
+    kind = table["kind"]
+    body = _BODIES.get(str(kind).lower())
+    if body is None:
+        names = ", ".join(row.__name__ for row in _BODIES.values())
+        raise ValueError(f"`kind` in {where} must be one of {names}, but is {kind!r}.")
+    arguments = list(inspect.signature(body.__init__).parameters.values())[1:]
+    keys = {f"{x.name}_{_UNITS[x.name]}" if x.name in _UNITS else x.name: x for x in arguments}
+    needed = tuple(key for key, x in keys.items() if x.default is x.empty)
+    check_keys(where, table, ("kind", *keys, *others), needed)
+    given = {x.name: table[key] for key, x in keys.items() if key in table}
+    if "bodies" in given:
+        within = f"{where.removesuffix(']')}.bodies]"
+        if not isinstance(given["bodies"], list):
+            raise ValueError(f"[{within}] must be tables, each headed by [{within}].")
+        given["bodies"] = [body_of(within, x) for x in given["bodies"]]
+    return body(**given)
+
+
 def _scene(table: Mapping[str, Any]) -> Scene:
+    if "kind" in table:
+        body = body_of("[scene]", table, _AT_KEYS)
+        check_keys("[scene]", table, tuple(table), required=("q",))
+        return body.scene(table["q"], table.get("closed_below_m", CLOSED_BELOW))
     check_keys("[scene]", table, _SCENE_KEYS, required=("masses_kg",))
     wall = table.get("wall", False)
     if not isinstance(wall, bool | str):
@@ -231,6 +297,8 @@ def check_keys(
     where: str, table: Mapping[str, Any], allowed: tuple[str, ...], required: tuple[str, ...] = ()
 ) -> None:
     """Raise a ValueError for unknown or missing keys of a table."""
+    if not isinstance(table, Mapping):
+        raise ValueError(f"{where} must be a table, but is {table!r}.")
     for key in required:
         if key not in table:
             raise ValueError(

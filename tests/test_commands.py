@@ -2,16 +2,22 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+import tomllib
+from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 import jimpact as ji
 from jimpact.cli import main
+from jimpact.motion.study_motion import read_motion_study
+from jimpact.study import body_of, read_study
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.4,1.6\n"
 STUDY = """
@@ -250,12 +256,145 @@ def test_simulate(tmp_path, capsys):
     assert "svg" in (tmp_path / "p.svg").read_text()[:200]
 
 
+BODIES = {
+    "Block": "width_m = 0.2\nheight_m = 0.6\ncorners = 'base'",
+    "Polygon": "corners = [[0, 0], [1, 0], [0, 1]]\nmass_kg = 2",
+    "Disc": "radius_m = 0.1\ninertia_kg_m2 = 0.01",
+    "Dimer": "radius_m = 0.1\nlength_m = 1\nrod_mass_kg = 0",
+    "PlanarBodies": "planes = [0.1]\n[[system.bodies]]\nkind = 'disc'\nradius_m = 0.1",
+    "Box": "sizes_m = [0.2, 0.1, 0.3]\nrounding_m = 0.01",
+    "Sphere": "radius_m = 0.1\nnormal = [0.1, 0, 1]",
+    "SpatialDimer": "radius_m = 0.1\nlength_m = 1",
+    "Column": "masses_kg = [1, 2]\nradii_m = 0.1",
+    "Corner": "angle_rad = 1.0",
+    "PendulumCradle": "masses_kg = [1, 1]\nlength_m = 0.3\nradius_m = 0.01\ngaps_m = 0.01",
+    "Discs": "masses_kg = 1\nradii_m = [0.1, 0.1]\nwalls = [[0, 1, 0]]",
+    "DiskBalls": "disk_radius_m = 1\nball_radius_m = 0.1\ndisk_mass_kg = 1\nball_masses_kg = [1]",
+}
+
+
+@pytest.mark.parametrize("kind", BODIES)
+def test_every_body_has_a_table(kind):
+    """By its constructor's arguments; its coordinates and velocities have names with units."""
+    table = tomllib.loads(f"[system]\nkind = '{kind}'\n{BODIES[kind]}")["system"]
+    body = body_of("[system]", table)
+    assert type(body) is getattr(ji, kind)
+    q = np.zeros(len(body.names))
+    velocities = body.mass_matrix(q).shape[0]
+    assert len(body.names) == (body.coordinates or velocities)
+    assert len(body.velocity_names) == velocities
+    assert all(name.endswith("]") for name in (*body.names, *body.velocity_names))
+
+
+def test_the_study_of_the_documents(tmp_path):
+    text = (Path(__file__).parents[1] / "docs" / "motions.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```toml\n(.*?)```", text, re.S)
+    study = read_motion_study(written(tmp_path, block))
+    gaps = study.system.body.gap_function(np.array(study.arguments["q0"]))
+    np.testing.assert_allclose(gaps, [0.0, 0.0, 0.6, 0.6, 0.0, 0.1], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["rocking_block", "discs_in_a_box", "tossed_brick"])
+def test_bundled_motions_begin_without_penetration(name):
+    study = read_motion_study(f"{name}.toml")
+    q = np.array(study.arguments["q0"])
+    assert study.system.body.gap_function(q).min() >= 0
+    assert len(study.arguments["v0"]) == len(study.system.body.velocity_names)
+
+
+def test_motions_of_several_bodies_and_a_base_in_space(tmp_path):
+    bodies = MOTION.replace("width_m = 0.2\nheight_m = 0.6\n", f"{BODIES['PlanarBodies']}\n")
+    bodies = bodies.replace('kind = "block"', 'kind = "PlanarBodies"').replace(
+        "horizontal", "vertical"
+    )
+    system = read_motion_study(written(tmp_path, bodies)).system
+    assert system.body.bodies[0].radius == 0.1
+    np.testing.assert_array_equal(system.base_directions, [[0.0], [1.0], [0.0]])
+    floating = MOTION.replace("block", "sphere").replace(
+        "width_m = 0.2\nheight_m = 0.6", "radius_m = 1"
+    )
+    floating = floating.replace('"horizontal"', '"y"').replace(
+        "[base]", "gravity_m_per_s2 = 0\n[base]"
+    )
+    system = read_motion_study(written(tmp_path, floating)).system
+    assert system.potential is None
+    np.testing.assert_array_equal(system.base_directions, np.eye(6)[:, 1:2])
+    hanging = "kind = 'pendulumcradle'\n" + BODIES["PendulumCradle"]
+    hanging = MOTION.replace('kind = "block"\nwidth_m = 0.2\nheight_m = 0.6', hanging)
+    with pytest.raises(ValueError, match="a PendulumCradle has no base"):
+        read_motion_study(written(tmp_path, hanging))
+
+
+ON_GROUND = STUDY.replace("masses_kg = [1.0, 1.0]", """
+kind = "Block"
+width_m = 0.2
+height_m = 0.6
+q = [0.0, 0.3, 0.0]""")  # fmt: skip
+TILTED = """pre_1[m/s],pre_2[m/s],pre_3[rad/s],post_1[m/s],post_2[m/s],post_3[rad/s]
+0,-1,0,0,0.5,0\n0,-2,0,0,1.0,0
+"""
+
+
+def test_fit_of_a_body(tmp_path, capsys):
+    """A block that falls flat on its base, e = 0.5; the same tables as of a motion."""
+    path = written(tmp_path, ON_GROUND, TILTED)
+    block = ji.Block(0.2, 0.6)
+    np.testing.assert_array_equal(
+        read_study(path).scene.normals, block.scene(block.touching()).normals
+    )
+    code, said = call(capsys, "fit", path, "--json")
+    assert code == 0
+    found = json.loads(said.out)["fits"]["as measured"]["parameters"][0]
+    np.testing.assert_allclose(found["value"], 0.5, atol=1e-6)
+    for old, new, message in (
+        ("q = [0.0, 0.3, 0.0]", "", "[scene] must have the key `q`"),
+        ("width_m = 0.2", "masses_kg = 1", "[scene] must have the key `width_m`"),
+        ("0.3, 0.0]", "0.2, 0.0]", "must have no penetration"),
+    ):
+        code, said = call(capsys, "fit", written(tmp_path, ON_GROUND.replace(old, new), TILTED))
+        assert code == 2
+        assert message in said.err
+
+
+@pytest.mark.slow
+def test_compare_of_a_body(tmp_path, capsys):
+    code, said = call(capsys, "compare", written(tmp_path, ON_GROUND, TILTED), "--json")
+    assert code == 0
+    told = json.loads(said.out)["laws"]["newton"]["velocity"]
+    np.testing.assert_allclose(told, [0.0, 0.9, 0.0], atol=1e-9)
+
+
+def test_simulate_in_space(tmp_path, capsys):
+    """A bundled study by time stepping: named after the study; what is replaced is told."""
+    study = (files("jimpact") / "data" / "tossed_brick.toml").read_text()
+    path = written(tmp_path, study.replace("t_end_s = 1.5", "t_end_s = 0.02"))
+    options = ["--samples", "3", "--gif", "m.gif", "--portrait", "p.svg"]
+    code, said = call(capsys, "simulate", path, *options)
+    assert (code, said.err) == (0, "")
+    assert "nothing did work" in said.out
+    assert "Picture: jimpact-simulate-study.png" in said.out
+    assert (tmp_path / "m.gif").read_bytes().startswith(b"GIF89a")
+    code, said = call(capsys, "simulate", path, "--samples", "3")
+    assert code == 0
+    assert said.err == (
+        "jimpact simulate: jimpact-simulate-study.png was there before: replaced.\n"
+    )
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('kind = "block"', 'kind = "car"', "`kind` must be one of ball, column"),
-        ("width_m", "width", "may have the keys kind, width_m"),
-        ('"horizontal"', '"line"', "`direction` of a block must be vertical or horizontal"),
+        (
+            'kind = "block"',
+            'kind = "car"',
+            "must be one of Block, Polygon, Disc, Dimer, PlanarBodies",
+        ),
+        ('kind = "block"', 'kind = "planarbodies"', "[system] must have the key `bodies`"),
+        ('kind = "block"', 'kind = "pendulumcradle"', "must have the key `masses_kg`"),
+        ("width_m", "width", "[system] must have the key `width_m`, but has kind, width"),
+        ("width_m", "depth_m = 1.0\nwidth_m", "may have the keys kind, width_m, height_m, mass_kg"),
+        ('"horizontal"', '"line"', "`direction` of a Block must be horizontal or vertical"),
+        ("amplitude_m", "size_m", "[base] must have the key `amplitude_m`"),
         ("t_end_s", "t_end", "must have the key `t_end_s`"),
         ("[law]", "[laws]", "must have the key `law`"),
         ("0.2\nheight", "-0.2\nheight", "`width` must lie in"),
@@ -314,9 +453,10 @@ def test_laws(capsys):
         (["montecarlo", "three_balls.toml"], "must have a [monte_carlo] table"),
         (["montecarlo", "--scheduler", "tcp://nowhere:1"], "--scheduler needs --executor dask"),
         (["montecarlo", "--out", "picture.txt"], "--out must end in"),
-        (["simulate", "nothing.toml"], "cradle_motion.toml, shaken_dimer.toml"),
+        (["simulate", "nothing.toml"], "cradle_motion.toml, discs_in_a_box.toml"),
         (["simulate", "--out", "picture.jpg"], "--out must end in .png"),
         (["simulate", "--portrait", "portrait.gif"], "--portrait must end in .png"),
+        (["simulate", "--portrait", "jimpact-simulate.png"], "must be two files"),
         (["simulate", "--gif", "motion.mp4"], "--gif must end in .gif"),
         (["advise", "--tolerance", "2"], "`tolerance` must lie in"),
         (["advise", "--shot", "2"], "--shot must lie in [1, 1]"),

@@ -127,6 +127,20 @@ def test_an_overturned_block_lies_on_its_side():
 
 
 @pytest.mark.slow
+def test_a_body_on_a_tilted_plane_slides():
+    """By its tangents alone, no displacements: s'' = g (sin a - mu cos a)."""
+    slope = ji.PlanarBodies([ji.Block(0.2, 0.1)], planes=[0.3])
+    system = ji.System(slope, potential=ji.gravity(slope))
+    rest = [0.0] * 3
+    motion = ji.simulate(
+        system, ji.Moreau(0.0), slope.touching(), rest, 1.0, samples=11, friction=0.25
+    )
+    assert ended(motion) == ["ok"]
+    way = np.linalg.norm(np.asarray(motion.q[-1] - motion.q[0])[:2])
+    assert way == pytest.approx(0.5 * G * (np.sin(0.3) - 0.25 * np.cos(0.3)), rel=1e-12)
+
+
+@pytest.mark.slow
 def test_overturning_on_a_harmonic_base():
     """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))

@@ -2,11 +2,13 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jimpact as ji
 from jimpact.fits.fitting import Fit, Start
+from jimpact.motion.record import KIND_CODE, no_events, with_row
 
 
 def canned(shots, **change):
@@ -100,3 +102,69 @@ def test_picture_of_a_rocking_record():
     v = ji.plot.rocking_dispersion(record)
     np.testing.assert_allclose(v.axes[0].lines[0].get_ydata(), np.abs(gamma[:, 1]))
     assert "critical angle 79.42 degrees" in str(record)
+
+
+def rocked(base=None):
+    """A dimer and its motion as if simulated: contact 1 strikes at 0.25 s, between two samples."""
+    body = ji.Dimer(radius=0.1, length=1.0)
+    system = ji.System(body, potential=ji.gravity(body), base=base)
+    time, zero = np.linspace(0.0, 0.5, 6), np.zeros(6)
+    q = np.stack([zero, 0.2 + 0.01 * time, 0.3 - time], axis=1)
+    before, after = np.array([0.0, -1.0, -2.0]), np.array([0.0, 1.0, 3.0])
+    velocity = np.where((time < 0.25)[:, None], before, after)
+    row = {
+        "time": 0.25,
+        "kind": KIND_CODE["impact"],
+        "contacts": np.array([True, False]),
+        "q": np.array([0.0, 0.2, 0.05]),
+        "velocity_before": before,
+        "velocity_after": after,
+    }
+    events = with_row(no_events(4, jnp.asarray(q[0]), jnp.asarray(before), 2), jnp.array(True), row)
+    work = np.zeros((6, 2, 2))
+    work[3:, 0, 0] = -0.5
+    record = ji.Motion(
+        *(time, q, velocity, 1 + zero, 2 - 0.5 * (time > 0.25)),
+        *(zero, zero, work, np.full((6, 2), 0.1), events, jnp.int32(9), jnp.int32(0)),
+    )
+    return system, record
+
+
+def test_picture_of_a_motion(tmp_path):
+    system, found = rocked(ji.HarmonicBase(0.01, 4.0, direction="vertical"))
+    figure = ji.plot.motion(found, "dimer", system=system)
+    axes = {x.get_ylabel(): x for x in figure.axes}
+    assert set(axes) == {
+        *("coordinates [m]", "angle [rad]", "velocities [m/s]", "angle' [rad/s]"),
+        *("gaps [m]", "energy [J]"),
+    }
+    words = [text.get_text() for text in axes["coordinates [m]"].get_legend().get_texts()]
+    assert words == ["x", "y", "base y"]
+    turn = axes["angle' [rad/s]"].lines[0]
+    np.testing.assert_array_equal(turn.get_xdata()[3:5], [0.25, 0.25])
+    np.testing.assert_array_equal(turn.get_ydata()[2:6], [-2.0, -2.0, 3.0, 3.0])
+    first, second = axes["gaps [m]"].lines[:2]
+    assert (min(first.get_ydata()), min(second.get_ydata())) == (0.0, 0.1)
+    energy, gained = axes["energy [J]"].lines[0], 0.5 * system.body.inertia * (3.0**2 - 2.0**2)
+    np.testing.assert_allclose(np.diff(energy.get_ydata()[3:5]), [gained], rtol=1e-12)
+    bare = [x.get_ylabel() for x in ji.plot.motion(found, names=["x [m]", "y [m]"]).axes]
+    assert bare[:2] == ["coordinates [m]", "velocities [m/s]"]
+    assert {"q3", "q3'"} <= set(bare)
+    film = ji.plot.animation(system, found, tmp_path / "dimer.gif")
+    assert film.read_bytes().startswith(b"GIF89a")
+
+
+def test_phase_portrait_of_what_moves():
+    system, found = rocked()
+    axes = ji.plot.phase_portrait(found, system=system).axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("angle [rad]", "angle' [rad/s]")
+    jump = axes.lines[1]
+    np.testing.assert_array_equal(jump.get_ydata().ravel(), [-2.0, 3.0])
+    with pytest.raises(ValueError, match=r"`coordinate` must lie in \[0, 2\], but is 3"):
+        ji.plot.phase_portrait(found, 3)
+
+
+def test_report_of_a_motion():
+    text = str(rocked()[1])
+    assert "the contacts took 0.5 J" in text
+    assert "friction" not in text.splitlines()[3]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import Body, LinearPotential, OnGround, number
+from jimpact.bodies.base import PLANAR, Body, LinearPotential, OnGround, number, numbered
 from jimpact.bodies.polygons import Cornered, Disc
 
 _PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
@@ -169,6 +169,11 @@ class PlanarBodies(Body):
         """Those of all bodies."""
         each = zip(self.bodies, np.reshape(q, (-1, 3)))
         return [curve for body, x in each for curve in body.outlines(x, point)]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, angle of each body."""
+        return numbered(PLANAR, len(self.bodies))
 
     @property
     def floors(self) -> list[Any]:

@@ -20,6 +20,28 @@ CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=1)  # outline of a ba
 
 Potential = Callable[[jax.Array], jax.Array]  # q (n,) -> V () [J]
 
+PLANAR = ("x [m]", "y [m]", "angle [rad]")  # names of coordinates
+
+
+def rate_of(name: str) -> str:
+    """Name and unit of the rate of "x [m]": "x' [m/s]"."""
+    word, unit = split_name(name)
+    return f"{word}' [{unit}/s]" if unit else f"{word}'"
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """ "x [m]" as "x" and "m"; without a unit that is empty."""
+    word, _, unit = name.removesuffix("]").partition(" [")
+    return word, unit
+
+
+def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
+    """Names of so many bodies: "x [m]" as "x1 [m]", "x2 [m]", ...; of one alone as they are."""
+    if count == 1:
+        return tuple(names)
+    parts = [split_name(name) for name in names]
+    return tuple(f"{word}{i + 1} [{unit}]" for i in range(count) for word, unit in parts)
+
 
 class Body(eqx.Module):
     """One or several bodies with contacts, as functions of their configuration q.
@@ -71,6 +93,10 @@ class Body(eqx.Module):
     def tangent_function(self, q: jax.Array) -> jax.Array | None:
         """Displacements (m,) [m] along the contact planes; their rates are the sliding speeds."""
         return None
+
+    def normals(self, q: jax.Array) -> jax.Array:
+        """N (n, m): gap velocities are `N^T v`."""
+        return self._gradient(self.gap_function, q)
 
     def tangents(self, q: jax.Array) -> jax.Array | None:
         """H_t (n, m), planar, or (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
@@ -124,6 +150,16 @@ class Body(eqx.Module):
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Coordinates of q by name and unit, "x [m]", for pictures; (): nobody named them."""
+        return ()
+
+    @property
+    def velocity_names(self) -> tuple[str, ...]:
+        """Velocities by name and unit; here the rates of q, "x' [m/s]"."""
+        return tuple(rate_of(name) for name in self.names)
+
+    @property
     def floors(self) -> Sequence[Any]:
         """Planes to draw, (angle, offset) each; in space and where all hang none."""
         return ((0.0, 0.0),)
@@ -173,7 +209,7 @@ _Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
 
 def _parts(body: Body, q: jax.Array) -> _Parts:
     margin = body.valid(q)
-    normals = jnp.where(margin >= 0, body._gradient(body.gap_function, q), jnp.nan)
+    normals = jnp.where(margin >= 0, body.normals(q), jnp.nan)
     return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q), margin
 
 
@@ -320,6 +356,11 @@ class OnGround(Body):
     def base_directions(self) -> jax.Array:
         """The ground moves in x and y (3, 2)."""
         return jnp.eye(3, 2, dtype=self.mass.dtype)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, angle."""
+        return PLANAR
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = m g y`."""

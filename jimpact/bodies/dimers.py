@@ -186,6 +186,11 @@ class SpatialDimer(Body):
         return jnp.stack([zero, zero, low, turn.astype(zero.dtype), pitch, zero])
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, z, yaw, pitch, spin."""
+        return ("x [m]", "y [m]", "z [m]", "yaw [rad]", "pitch [rad]", "spin [rad]")
+
+    @property
     def floors(self) -> tuple[()]:
         """None: outlines have a shadow on the plane instead."""
         return ()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.bodies.base import CIRCLE, Body, positive, positives, turned
+from jimpact.bodies.base import CIRCLE, PLANAR, Body, numbered, positive, positives, turned
 from jimpact.scene import Scene
 
 
@@ -73,6 +73,11 @@ class DiskBalls(Body):
             far = far + off
         balls = jnp.stack([far * jnp.cos(phi), far * jnp.sin(phi), jnp.zeros_like(phi)], axis=1)
         return jnp.concatenate([jnp.zeros(3, balls.dtype), balls.reshape(-1)])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, angle of the disk, as number 1, and of each ball."""
+        return numbered(PLANAR, 1 + self.ball_masses.shape[0])
 
     @property
     def floors(self) -> tuple[()]:

@@ -7,7 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import is_traced
-from jimpact.bodies.base import CIRCLE, Body, LinearPotential, number, positive, positives
+from jimpact.bodies.base import (
+    CIRCLE,
+    PLANAR,
+    Body,
+    LinearPotential,
+    number,
+    numbered,
+    positive,
+    positives,
+)
 from jimpact.scene import Scene
 
 
@@ -65,6 +74,11 @@ class Corner(Body):
         return jnp.zeros(2, self.angle.dtype)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """x, y."""
+        return PLANAR[:2]
+
+    @property
     def floors(self) -> list[tuple[float, float]]:
         """The walls."""
         return [(0.0, 0.0), (float(self.angle), 0.0)]
@@ -115,6 +129,11 @@ class Column(Body):
         """Distances from the floor and between neighbours."""
         top_below = jnp.concatenate([jnp.zeros(1, q.dtype), (q + self.radii)[:-1]])
         return q - self.radii - top_below
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Heights."""
+        return numbered(("height [m]",), self.masses.shape[0])
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles; mass points are drawn above their height."""

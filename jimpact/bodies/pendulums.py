@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.bodies.base import CIRCLE, Body, positive, positives
+from jimpact.bodies.base import CIRCLE, PLANAR, Body, numbered, positive, positives
 from jimpact.scene import Scene
 
 
@@ -79,6 +79,11 @@ class PendulumCradle(Body):
         right, up = at + self.length * jnp.sin(q), self.length * jnp.cos(q)
         apart = jnp.sqrt((right[i] - right[j]) ** 2 + (up[i] - up[j]) ** 2)
         return jnp.min(apart - self.radius[i] - self.radius[j])
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Angles of the strings."""
+        return numbered(PLANAR[2:], self.masses.shape[0])
 
     @property
     def floors(self) -> tuple[()]:

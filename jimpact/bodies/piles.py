@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
-from jimpact.bodies.base import CIRCLE, Body, LinearPotential, positives, turned
+from jimpact.bodies.base import CIRCLE, PLANAR, Body, LinearPotential, numbered, positives, turned
 
 ROOM = 4  # contacts per disc: equal discs have 3, and walls
 
@@ -155,6 +155,16 @@ class Discs(Body):
             jnp.where(there[:, None, None, None], directions, 0.0),
             jnp.sum(closed) > self.room,
         )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, angle of each disc."""
+        return numbered(PLANAR, self.count)
+
+    @property
+    def floors(self) -> list[tuple[float, float]]:
+        """The walls."""
+        return [(float(np.arctan2(-x, y)), float(d)) for x, y, d in np.asarray(self.walls)]
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles, each with the radius that shows how far it has turned."""

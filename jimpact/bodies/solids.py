@@ -144,6 +144,16 @@ class Solid(Body):
         return q.at[:3].set(-jnp.min(self.gap_function(q)) * self.normal)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, z and the quaternion."""
+        return ("x [m]", "y [m]", "z [m]", "e0 [1]", "e1 [1]", "e2 [1]", "e3 [1]")
+
+    @property
+    def velocity_names(self) -> tuple[str, ...]:
+        """x', y', z' and the angular velocity in the body's axes."""
+        return ("x' [m/s]", "y' [m/s]", "z' [m/s]", *(f"omega{i} [rad/s]" for i in (1, 2, 3)))
+
+    @property
     def floors(self) -> tuple[()]:
         """None: outlines have a shadow on the plane instead."""
         return ()

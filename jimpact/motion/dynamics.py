@@ -11,7 +11,7 @@ from jimpact.motion.system import System
 class Kinematics(NamedTuple):
     """Of the m contacts at one instant; `rate' = grad^T q'' + drift`."""
 
-    value: jax.Array  # (m,) gaps, or tangential displacements
+    value: jax.Array  # (m,) gaps; 0 of what slides
     rate: jax.Array  # (m,) as seen from the base
     drift: jax.Array  # (m,) second derivative for q'' = 0
     gradient: jax.Array  # (n, m)
@@ -40,29 +40,30 @@ def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     return jnp.atleast_1d(system.body.gap_function(seen_from_base(system, q, t)))
 
 
-def tangential(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """Tangential displacements h (m,) [m]."""
-    found = system.body.tangent_function(seen_from_base(system, q, t))
-    assert found is not None
-    return found
-
-
 def kinematics(
     system: System, q: jax.Array, v: jax.Array, t: jax.Array, *, of_tangents: bool = False
 ) -> Kinematics:
-    """Value, rate, drift and gradient of the gaps, or of the tangential displacements."""
-    function = tangential if of_tangents else gaps
+    """Value, rate, drift and gradient of the gaps, or of what slides (its value is 0)."""
+    body, zero, one = system.body, jnp.zeros_like(t), jnp.ones_like(t)
 
-    def moved(s: jax.Array) -> jax.Array:
-        return function(system, system.body.moved(q, s * v), t + s)
+    def gap(u: jax.Array, s: jax.Array) -> jax.Array:
+        return gaps(system, body.moved(q, u), t + s)
+
+    def slips(s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        h = body.tangents(seen_from_base(system, body.moved(q, s * v), t + s))
+        assert h is not None
+        carried = base_velocity(system, t + s)
+        return h.T @ (v if carried is None else v - carried), h
+
+    if of_tangents:
+        (rate, h), (drift, _) = jax.jvp(slips, (zero,), (one,))
+        return Kinematics(jnp.zeros_like(rate), rate, drift, h)
 
     def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.jvp(moved, (s,), (jnp.ones_like(s),))
+        return jax.jvp(lambda s: gap(s * v, s), (s,), (jnp.ones_like(s),))
 
-    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
     (value, rate), (_, drift) = jax.jvp(rates, (zero,), (one,))
-    gradient = jax.jacfwd(lambda u: function(system, system.body.moved(q, u), t))(0 * v).T
-    return Kinematics(value, rate, drift, gradient)
+    return Kinematics(value, rate, drift, jax.jacfwd(gap)(0 * v, zero).T)
 
 
 def mass_at(system: System, q: jax.Array) -> jax.Array:

@@ -29,6 +29,7 @@ from jimpact.status import CODE
 # Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
 # stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
+_WRITTEN_OUT = 4  # rows up to which it is eliminated by scalars: beyond, that takes long to compile
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
@@ -129,7 +130,13 @@ def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -
     k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
     ridge = jnp.where(held, _RIDGE, 0.0)
-    z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)
+    if len(held) <= _WRITTEN_OUT:
+        z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)
+    else:
+        inverted = jnp.linalg.inv(jax.lax.stop_gradient(k + jnp.diag(ridge)))
+        z = inverted @ right
+        for _ in range(_REFINEMENTS):
+            z = z + inverted @ (right - k @ z)
     return (scale * weight)[:, None] * z
 
 

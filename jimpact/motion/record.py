@@ -31,6 +31,8 @@ MOTION_STATUS = (
 MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 
 EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction")
+_ROUNDING = 1e-12  # of the largest work: what is smaller is not told
+
 KIND_CODE = {name: code for code, name in enumerate(EVENT_KINDS)}
 
 
@@ -144,19 +146,34 @@ class Motion(eqx.Module):
         row = MOTION_STATUS[int(self.status)]
         reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
         last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
-        lost = -np.asarray(self.contact_work)[max(last, 0)].sum(axis=0)
+        normal, tangential = np.asarray(self.contact_work)[max(last, 0)].sum(axis=-1)
+        works = {
+            "the contacts": normal,
+            "friction": tangential,
+            "the base": self.base_work[last],
+            "forces": self.force_work[last],
+        }
         lines = [
             f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: {row.name}"
             + (f" ({row.message})" if row.failure else ""),
             f"  events: {', '.join(counts)}",
             f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
             f" at {reached[-1] if len(reached) else np.nan:g} s",
-            "  taken by the contacts: " + ", ".join(f"{x:.4g}" for x in lost) + " J",
-            f"  work of forces {float(self.force_work[last]):.6g} J, "
-            f"of the base {float(self.base_work[last]):.6g} J",
+            f"  {_told(works)}",
             f"  ledger closes to {np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J",
         ]
         return "\n".join(lines)
+
+
+def _told(works: dict[str, Any]) -> str:
+    """Who gave and who took energy, without what is rounding of the others."""
+    least = _ROUNDING * max(abs(float(work)) for work in works.values())
+    told = [
+        f"{who} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
+        for who, work in works.items()
+        if abs(float(work)) > least
+    ]
+    return ", ".join(told) or "nothing did work"
 
 
 def _batch_report(motion: Motion) -> str:

@@ -13,6 +13,7 @@ from jimpact._checks import (
     as_float_array,
     as_whole,
     check_kind,
+    check_per_contact,
     check_shape,
     check_values,
     is_traced,
@@ -37,6 +38,7 @@ RTOL, ATOL = 1e-10, 1e-12  # of the flights
 SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
 MAX_EVENTS, MAX_STEPS = 500, 100_000
 METHODS = ("events", "time_stepping", "contact_forces")
+MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
 _BASE_LOOKS = 64  # times at which the base is looked at before the motion starts
 
 
@@ -149,6 +151,8 @@ def simulate(
                 "Argument `law` must be Moreau's, with its own `friction` and one `restitution`, "
                 f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
             )
+        if joint:
+            _check_coefficients(system, law, q)
         sizes = count, substeps, joint, max_events
         return _stepped(system, law, mu, q, v, start, end, settings.closed_below, *sizes)
     if method == "contact_forces":
@@ -357,11 +361,17 @@ def _friction_of(
         raise ValueError("Argument `friction` needs a system with a `tangent_function`.")
     mu = as_float_array("friction", mu)
     check_values("friction", mu, low=0.0)
-    if not is_traced(mu) and not np.any(mu):
+    if is_traced(mu):
+        mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
+    elif not np.any(mu):
         return None  # frictionless systems pay nothing
-    m = jax.eval_shape(system.body.gap_function, q).shape[0]
-    planar = jax.eval_shape(system.body.tangent_function, q) is not None
-    if not (in_space or planar):
+    m = _contacts_of(system, q)
+    if tangents.shape[1] not in (m, 2 * m):
+        raise ValueError(
+            "Argument `system` must have one tangent a contact in the plane, two in space: "
+            f"{m} or {2 * m} for its {m} contacts, but has {tangents.shape[1]}."
+        )
+    if not (in_space or tangents.shape[1] == m):
         raise ValueError(
             "Argument `friction` must be 0 for a body with tangents in space: with "
             "method='time_stepping' alone motions know friction in space."
@@ -372,6 +382,22 @@ def _friction_of(
     if mu.shape not in ((), (m,)):
         raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
+
+
+def _contacts_of(system: System, q: jax.Array) -> int:
+    """m."""
+    found: int = jax.eval_shape(system.body.gap_function, q).shape[0]
+    return found
+
+
+def _check_coefficients(system: System, law: Law, q: jax.Array) -> None:
+    """Raise a ValueError where a law that joins the steps does not fit the contacts."""
+    for name in ("restitution", "tangential_restitution"):
+        value = getattr(law, name)
+        if value is not None and is_pile(system):
+            check_shape(name, value, (), "one for all contacts of a pile")
+        elif value is not None:
+            check_per_contact(name, value, _contacts_of(system, q))
 
 
 def _force_of(law: Law, mu: jax.Array | None) -> Force:
@@ -391,4 +417,9 @@ def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
     if is_traced((start, end)):
         raise ValueError("Arguments `t_start`, `t_end` must not be traced in time stepping.")
     between = (float(end) - float(start)) / (samples - 1)
-    return max(1, int(np.ceil(between / float(step) * (1 - 1e-9))))
+    count = max(1.0, np.ceil(between / float(step) * (1 - 1e-9)))
+    if count * (samples - 1) > MOST_STEPS:
+        raise ValueError(
+            f"Argument `step` must give at most {MOST_STEPS} steps, but has value {step:g}."
+        )
+    return int(count)

@@ -27,6 +27,7 @@ from jimpact.law import Law
 from jimpact.laws.kinematic import Moreau
 from jimpact.motion.dynamics import (
     base_velocity,
+    definite,
     free_acceleration,
     gaps,
     kinematics,
@@ -42,7 +43,7 @@ from jimpact.motion.transitions import FAILS, scene_at
 from jimpact.scene import Scene
 from jimpact.solvers.many_contacts import Many, solve_many
 from jimpact.solvers.sensitivity import without_derivatives
-from jimpact.status import CODE
+from jimpact.status import CODE, sign_tolerance
 
 # Gap velocities below this share of the largest speed of the motion, or below so many roundings of
 # it, are what solving for contacts at rest leaves. Ten times less, and resting beads strike in
@@ -54,6 +55,7 @@ SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an im
 FEW, PILE, ROUNDINGS, OFF = 1e-9, 1e-6, 32, 1e-2
 ITERATIONS = 1000
 MEAN = 4  # tries for the mean velocity that forces depend on; each gains h omega, of spin omega
+GIVEN = 2.0  # times what forces push contacts in a step they may give an impact within it
 APART = 3  # steps: a contact that is struck again before is told
 
 WHY = (
@@ -215,7 +217,9 @@ def time_stepping(
     finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0))
     status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"])
     penetrates = jnp.any(recorded_gaps(system, q0, times[0]) < -closed_below)
-    status = jnp.where(penetrates, MOTION_CODE["penetration"], status).astype(jnp.int32)
+    status = jnp.where(penetrates, MOTION_CODE["penetration"], status)
+    inside = system.body.valid(seen_from_base(system, q0, times[0])) >= 0
+    status = jnp.where(inside, status, MOTION_CODE["out_of_range"]).astype(jnp.int32)
     h = (times[1] - times[0]) / substeps
     start = _Progress(
         begin,
@@ -263,12 +267,12 @@ def _contacts(
     given = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
     gap, normals = given.value, given.gradient
     n, m = normals.shape
-    directions = normals[:, :, None]
+    directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
     if friction:
         sides = system.body.tangents(at)
         assert sides is not None
         directions = jnp.concatenate([directions, sides.reshape(n, m, -1)], axis=2)
-    there = gap <= closed_below
+    there = ~(gap > closed_below)  # NaN does not pass for open
     directions = jnp.where(there[:, None], directions, 0.0)
     moved = solve_mass(mass, directions.reshape(n, -1)).reshape(directions.shape)
     return _Few(there, directions, moved, jnp.tensordot(directions, moved, axes=([0], [0])))
@@ -301,13 +305,14 @@ def _one_step(
     eps = float(jnp.finfo(dtype).eps)
     speed = jnp.maximum(course.speed, close.fastest(state.v))
     noise = max(_ROUNDING, _ROUNDINGS * eps) * speed
-    slow = noise + SLOW * h * jnp.abs(close.rates(pushed(state.v)[1])[:, 0])
+    pressed = h * jnp.abs(close.rates(pushed(state.v)[1]))
+    slow = noise + SLOW * pressed[:, 0]
     strikes = close.there & (before[:, 0] < -slow)
     wanted = jnp.zeros_like(before)
     given, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
     if joint:
         assert isinstance(law, Moreau)
-        wanted = wanted.at[:, 0].set(law.restitution * jnp.minimum(before[:, 0], 0.0))
+        wanted = wanted.at[:, 0].set(law.restitution * before[:, 0])
         if law.tangential_restitution is not None and before.shape[1] > 1:
             turned = jnp.where(strikes, law.tangential_restitution, 0.0)
             wanted = wanted.at[:, 1:].set(turned[:, None] * before[:, 1:])
@@ -345,6 +350,11 @@ def _one_step(
     x = given + found.impulse
     energy = x * close.rates(mean - carried)
     sides = jnp.sum(energy[:, 1:], axis=1)
+    if joint and isinstance(close, _Few):
+        size = 0.5 * jnp.vdot(x, close.product(x))
+        unknown = sign_tolerance(dtype) * size + GIVEN * jnp.vdot(jnp.abs(x), pressed)
+        gains = jnp.any(strikes) & (jnp.sum(energy) > unknown)
+        code = jnp.where(gains, CODE["energy_gain"], code)
     moved = state._replace(
         q=body.moved(q, 0.5 * h * v),
         v=v,
@@ -359,8 +369,14 @@ def _one_step(
     status = jnp.where(inside, status, MOTION_CODE["out_of_range"])
     if isinstance(close, _Heap):
         status = jnp.where(close.near.lost, MOTION_CODE["room"], status)
-    finite = jnp.all(jnp.isfinite(v))
-    status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
+    # a base that is NaN shows in its work, a coefficient in that of the contacts
+    finite = jnp.all(jnp.isfinite(v)) & jnp.isfinite(moved.base_work)
+    finite &= jnp.all(jnp.isfinite(moved.contact_work))
+    status = jnp.where(finite, status, MOTION_CODE["not_finite"])
+    if callable(system.mass):
+        sound = definite(mass) | ~jnp.all(jnp.isfinite(mass))
+        status = jnp.where(sound, status, MOTION_CODE["singular_mass"])
+    status = status.astype(jnp.int32)
     again = isinstance(close, _Few) & jnp.any(strikes & (course.since < APART))
     coarse = jnp.where(again, MOTION_CODE["coarse_step"], 0)
     missed = jnp.where(found.misfit > OFF, MOTION_CODE["unsolved_step"], 0)

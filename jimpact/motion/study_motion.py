@@ -5,39 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from jimpact.bodies.base import STANDARD_GRAVITY
 from jimpact.law import Law
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
-from jimpact.motion.system import (
-    HarmonicBase,
-    System,
-    ball_system,
-    block_system,
-    column_system,
-    cradle_system,
-    dimer_system,
-)
-from jimpact.study import check_keys, check_tables, from_file, law_table
+from jimpact.motion.system import HarmonicBase, System, gravity
+from jimpact.study import body_of, check_keys, check_tables, from_file, law_table
 
-# kind -> builder, {key of the study: its argument}
-_SYSTEMS: dict[str, tuple[Any, dict[str, str]]] = {
-    "ball": (ball_system, {"mass_kg": "mass"}),
-    "column": (column_system, {"masses_kg": "masses", "radii_m": "radii"}),
-    "cradle": (
-        cradle_system,
-        {"masses_kg": "masses", "length_m": "length", "diameter_m": "diameter", "gap_m": "gap"},
-    ),
-    "block": (block_system, {"width_m": "width", "height_m": "height", "mass_kg": "mass"}),
-    "dimer": (
-        dimer_system,
-        {
-            "radius_m": "radius",
-            "length_m": "length",
-            "sphere_mass_kg": "sphere_mass",
-            "rod_mass_kg": "rod_mass",
-        },
-    ),
-}
 _MOTION = {
     "q0": "q0",
     "v0": "v0",
@@ -48,15 +22,15 @@ _MOTION = {
     "step_s": "step",
     "friction": "friction",
     "max_events": "max_events",
+    "closed_below_m": "closed_below",
+    "max_steps": "max_steps",
     "rtol": "rtol",
     "slow": "slow",
 }
-_BASE = {
-    "amplitude_m": "amplitude",
-    "frequency_hz": "frequency",
-    "phase_rad": "phase",
-    "direction": "direction",
-}
+_BASE = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
+_GRAVITY = "gravity_m_per_s2"
+# directions of a base by how many a body has
+_DIRECTIONS = {1: ("vertical",), 2: ("horizontal", "vertical"), 3: ("x", "y", "vertical")}
 
 
 @dataclass(frozen=True)
@@ -77,9 +51,10 @@ class MotionStudy:
 def read_motion_study(path: str | Path) -> MotionStudy:
     """Read the study of a motion.
 
-    Tables: `[system]` kind (ball, column, cradle, block, dimer), its dimensions and
-    gravity_m_per_s2; `[base]` amplitude_m, frequency_hz, phase_rad, direction; `[law]` as in other
-    studies; `[motion]` q0, v0, t_end_s and the options of `simulate`.
+    Tables: `[system]` a body (see `jimpact.study.body_of`) and gravity_m_per_s2, 0 for none;
+    `[base]` amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
+    horizontal, in space x or y); `[law]` as in other studies; `[motion]` q0, v0, t_end_s and the
+    options of `simulate`.
 
     Raises:
         FileNotFoundError: no such study; ValueError: no TOML, unknown or missing keys, and what
@@ -105,25 +80,22 @@ def _study(tables: Mapping[str, Any], path: Path) -> MotionStudy:
 
 
 def _system(table: Mapping[str, Any], base: Mapping[str, Any] | None) -> System:
-    check_keys("[system]", table, tuple(table), required=("kind",))
-    kind = table["kind"]
-    if kind not in _SYSTEMS:
-        raise ValueError(f"`kind` must be one of {', '.join(_SYSTEMS)}, but is {kind!r}.")
-    build, names = _SYSTEMS[kind]
-    names = names | {"gravity_m_per_s2": "acceleration"}
-    check_keys("[system]", table, ("kind", *names))
-    given = {names[key]: value for key, value in table.items() if key != "kind"}
+    body = body_of("[system]", table, (_GRAVITY,))
+    acceleration = table.get(_GRAVITY, STANDARD_GRAVITY)
+    weight = gravity(body, acceleration) if acceleration else None
     if base is None:
-        return build(**given)
-    if kind == "cradle":
-        raise ValueError("[base] is not known to a cradle.")
-    check_keys("[base]", base, tuple(_BASE), required=("amplitude_m", "frequency_hz"))
-    told = {_BASE[key]: value for key, value in base.items()}
-    line = kind in ("ball", "column")
-    told.setdefault("direction", "line" if line else "vertical")
-    if line != (told["direction"] == "line"):
+        return System(body, potential=weight)
+    check_keys("[base]", base, (*_BASE, "direction"), required=("amplitude_m", "frequency_hz"))
+    ways = body.base_directions
+    if ways is None:
+        raise ValueError(f"[base] must be left out: a {type(body).__name__} has no base.")
+    names = _DIRECTIONS[ways.shape[1]]
+    chosen = base.get("direction", "vertical")
+    if chosen not in names:
         raise ValueError(
-            f"`direction` of a {kind} must be {'line' if line else 'vertical or horizontal'}, "
-            f"but is {told['direction']!r}."
+            f"`direction` of a {type(body).__name__} must be {' or '.join(names)}, "
+            f"but is {chosen!r}."
         )
-    return build(**given, base=HarmonicBase(**told))
+    moves = HarmonicBase(**{_BASE[key]: x for key, x in base.items() if key != "direction"})
+    along = ways[:, names.index(chosen), None]
+    return System(body, potential=weight, base=moves, base_directions=along)

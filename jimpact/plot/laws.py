@@ -32,6 +32,7 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     """
     names, entries = list(found.entries), list(found.entries.values())
     bodies = len(found.velocity)
+    what, unit = ("body", "m/s") if found.scene.walls is not None else ("coordinate", "m/s, rad/s")
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / max(bodies, 1)
     figure = Figure(figsize=(float(np.clip(1.5 + 1.1 * len(names), 6.4, 14)), 6.0))
     figure.set_layout_engine("constrained")
@@ -41,7 +42,7 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     fine = np.array([bool(entry.audit.consistent) for entry in entries])
     for i in range(bodies):
         colour = COLOURS[i % len(COLOURS)]
-        top.plot(x + dodge[i], velocity[:, i], "o", color=colour, label=f"body {i + 1}")
+        top.plot(x + dodge[i], velocity[:, i], "o", color=colour, label=f"{what} {i + 1}")
         if measured is not None and np.isfinite(measured[i]):
             top.axhline(measured[i], color=colour, lw=1, ls="--", zorder=0)
         if not fine.all():
@@ -50,7 +51,7 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     if measured is not None:
         top.plot([], [], color="black", lw=1, ls="--", label="measured")
     top.axhline(0, color="black", lw=0.6)
-    top.set_ylabel("velocity after the impact [m/s]")
+    top.set_ylabel(f"velocity after the impact [{unit}]")
     top.set_title(title, loc="left")
     kept = [entry.energy_ratio for entry in entries]
     spread = [entry.dispersion_index for entry in entries]

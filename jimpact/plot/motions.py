@@ -1,8 +1,9 @@
 """Pictures of motions: coordinates over time, phase portraits, animations."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,15 +12,20 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jimpact.bodies.base import projected, rate_of, split_name
+from jimpact.motion.dynamics import kinetic, potential, seen_from_base
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.plot.style import COLOURS, GREY
+from jimpact.progress import counting_bar
 
 # q (n,) -> curves (k, 2) of points (x, y) in metres
 Outlines = Callable[[np.ndarray], Sequence[np.ndarray]]
 _POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a mark of their own
 _MANY = 60  # impacts up to which each gets its line
+_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film: a layout would be made for each frame
+_BASE_POINTS = 1000  # at which a base is drawn
 _LEGEND = 6  # coordinates that get an entry in the legend
 
 
@@ -29,42 +35,148 @@ def one_motion(motion: Motion) -> None:
         raise ValueError("Argument `motion` must be one motion, but is a batch: pick one of it.")
 
 
-def motion(motion: Motion, title: str = "", names: Sequence[str] = ()) -> Figure:
-    """Coordinates and velocities against time, events, and where the energy goes.
+def motion(
+    motion: Motion, title: str = "", names: Sequence[str] = (), system: System | None = None
+) -> Figure:
+    """Coordinates, velocities and gaps against time, events, and where the energy goes.
+
+    Each unit has axes of its own. Curves go through the states before and after every event, so
+    that a jump stands upright at its time.
 
     Args:
         motion: one motion (of a batch: `jax.tree.map(lambda x: x[i], motion)`).
         title: of the picture.
-        names: of the coordinates; default q1, q2, ...
+        names: of the coordinates, with their units as in "x [m]"; default: those of the body.
+        system: that moved: its body names the coordinates, and its base is shown; without it and
+            without names they are q1, q2, ...
 
     >>> import jimpact as ji
-    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> len(ji.plot.motion(motion).axes)
-    3
+    >>> ball = ji.ball_system()
+    >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
+    >>> [axes.get_ylabel() for axes in ji.plot.motion(motion, system=ball).axes]
+    ['height [m]', "height' [m/s]", 'gaps [m]', 'energy [J]']
     """
     one_motion(motion)
-    figure = Figure(figsize=(7.5, 7.5), layout="constrained")
-    top, middle, bottom = figure.subplots(3, 1, sharex=True)
-    time, q, v = (np.asarray(x) for x in (motion.time, motion.q, motion.velocity))
-    for i in range(q.shape[1]):
-        colour = COLOURS[i % len(COLOURS)]
-        label = names[i] if i < len(names) else f"q{i + 1}"
-        top.plot(time, q[:, i], color=colour, label=label if i < _LEGEND else None)
-    for i in range(v.shape[1]):
-        middle.plot(time, v[:, i], color=COLOURS[i % len(COLOURS)])
-    top.set_ylabel("coordinates [m, rad]")
-    middle.set_ylabel("velocities [m/s, rad/s]")
-    for axes in (top, middle):
-        _event_lines(axes, motion)
-    _ledger(bottom, motion)
-    bottom.set_xlabel("time [s]")
-    top.set_title(title, loc="left")
-    for axes in (top, middle, bottom):
+    labels, rates = _labels(motion, names, system)
+    course = _course(motion)
+    columns = [_by_unit(labels), _by_unit(rates)]
+    rows = max(map(len, columns)) + 1
+    figure = Figure(figsize=(11.0, 2.5 * rows), layout="constrained")
+    every = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
+        for axes, (unit, which) in zip(every[:, j], units.items(), strict=False):
+            for c, (i, word) in enumerate(which):
+                label = word if c < _LEGEND else None
+                axes.plot(course.time, values[:, i], color=COLOURS[c % len(COLOURS)], label=label)
+            if j == 0 and unit == "m" and system is not None:
+                _moving_base(axes, system, motion)
+            what = which[0][1] if len(which) == 1 else ("coordinates", "velocities")[j]
+            axes.set_ylabel(f"{what} [{unit}]" if unit else what)
+        for axes in every[len(units) : -1, j]:
+            axes.remove()
+    _gaps(every[-1, 0], motion)
+    _ledger(every[-1, 1], motion, course, system)
+    every[0, 0].set_title(title, loc="left")
+    for axes in figure.axes:
+        if axes is not every[-1, 1]:
+            _event_lines(axes, motion)
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", lw=0.4, alpha=0.5)
-    top.legend(frameon=False, fontsize="small", ncols=3, loc="best")
-    bottom.legend(frameon=False, fontsize="small", ncols=2, loc="best")
+        if len(axes.get_legend_handles_labels()[0]) > 1:
+            axes.legend(frameon=False, fontsize="small", ncols=3, loc="best")
+    for axes in every[-1]:
+        axes.set_xlabel("time [s]")
     return figure
+
+
+def _labels(
+    motion: Motion, names: Sequence[str], system: System | None
+) -> tuple[list[str], list[str]]:
+    """Names, with units, of coordinates and velocities."""
+    n, rates = motion.q.shape[-1], motion.velocity.shape[-1]
+    own = () if system is None else system.body.names
+    told = [*own, *(f"q{i + 1}" for i in range(len(own), n))]
+    for i, name in enumerate(names[:n]):
+        unit = split_name(told[i])[1]
+        told[i] = f"{name} [{unit}]" if unit and not split_name(name)[1] else name
+    if n == rates:
+        return told, [rate_of(name) for name in told]
+    given = () if system is None else system.body.velocity_names
+    return told, [*given] or [f"v{i + 1}" for i in range(rates)]
+
+
+def _by_unit(names: list[str]) -> dict[str, list[tuple[int, str]]]:
+    """Unit -> (index, word) of what has it."""
+    found: dict[str, list[tuple[int, str]]] = {}
+    for i, name in enumerate(names):
+        word, unit = split_name(name)
+        found.setdefault(unit, []).append((i, word))
+    return found
+
+
+class _Course(NamedTuple):
+    """The samples, and the states before and after every event, in time."""
+
+    time: np.ndarray  # (S,)
+    q: np.ndarray  # (S, n)
+    v: np.ndarray  # (S, n)
+    after: np.ndarray  # (S,) whether it is the state after an event
+
+
+def _course(motion: Motion) -> _Course:
+    events, rows = motion.events, np.asarray(motion.events.kind) > 0
+    there = [np.asarray(x)[rows] for x in (events.time, events.q)]
+    jumps = [np.asarray(x)[rows] for x in (events.velocity_before, events.velocity_after)]
+    time = np.concatenate([motion.time, there[0], there[0]])
+    q = np.concatenate([motion.q, there[1], there[1]])
+    v = np.concatenate([motion.velocity, *jumps])
+    state = np.repeat([0, 1, 2], [len(motion.time), rows.sum(), rows.sum()])
+    # of events at one time each has its own before and after
+    number = np.concatenate([np.full(len(motion.time), -1), *(2 * [np.arange(rows.sum())])])
+    order = np.lexsort((state, number, time))
+    return _Course(time[order], q[order], v[order], state[order] == 2)
+
+
+def _base_path(system: System, time: np.ndarray) -> np.ndarray:
+    """Displacement of the base (S, d) along the directions of the body, where it has them."""
+    assert system.base is not None
+    path = np.asarray(jax.vmap(lambda t: jnp.atleast_1d(system.base(t)))(jnp.asarray(time)))  # type: ignore[misc]
+    every = system.body.base_directions
+    if every is None:
+        return path
+    moved = path @ np.asarray(system.base_directions).T
+    return np.linalg.lstsq(np.asarray(every), moved.T, rcond=None)[0].T
+
+
+def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
+    """Where the base is, along the directions in which it moves."""
+    if system.base is None:
+        return
+    reached = np.asarray(motion.time)[np.isfinite(np.asarray(motion.energy))]
+    if not len(reached):
+        return
+    time = np.linspace(reached[0], reached[-1], _BASE_POINTS)
+    path = _base_path(system, time)
+    words = ("",) if path.shape[1] == 1 else (" x", " y", " z")
+    for values, word, style in zip(path.T, words, ("--", ":", "-."), strict=False):
+        if np.ptp(values) > 0:
+            axes.plot(time, values, style, color="black", lw=0.8, label=f"base{word}")
+
+
+def _gaps(axes: Axes, motion: Motion) -> None:
+    """Gaps; they are 0 at the events of their contacts."""
+    values, events = np.asarray(motion.gaps), motion.events
+    single = events.contacts.shape[-1] == values.shape[1]
+    for j in range(values.shape[1]):
+        rows = np.zeros(len(events.time), bool)
+        if single:
+            rows = (np.asarray(events.kind) > 0) & np.asarray(events.contacts)[:, j]
+        time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
+        order = np.argsort(time, kind="stable")
+        gap = np.concatenate([values[:, j], np.zeros(rows.sum())])[order]
+        label = f"contact {j + 1}" if j < _LEGEND else None
+        axes.plot(time[order], gap, color=COLOURS[j % len(COLOURS)], label=label)
+    axes.set_ylabel("gaps [m]" if single else "least gap [m]")
 
 
 def _event_lines(axes: Axes, motion: Motion) -> None:
@@ -77,67 +189,90 @@ def _event_lines(axes: Axes, motion: Motion) -> None:
             axes.axvline(t, color="black", lw=0.8, ls=style, zorder=0)
 
 
-def _ledger(axes: Axes, motion: Motion) -> None:
-    """Energy, and what has gone where since the start."""
-    time, energy = np.asarray(motion.time), np.asarray(motion.energy)
-    axes.plot(time, energy, color="black", label="T + V")
-    axes.plot(time, motion.kinetic_energy, color=GREY, lw=0.8, label="T")
-    work = np.asarray(motion.contact_work)
+def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
+    """Energy, and what has gone where since the start; of a known system with its jumps."""
+    time = np.asarray(motion.time)
+    if system is None:
+        drawn = time, motion.kinetic_energy, motion.energy
+    else:
+        q, v = jnp.asarray(course.q), jnp.asarray(course.v)
+        moving = jax.vmap(partial(kinetic, system))(q, v)
+        drawn = course.time, moving, moving + jax.vmap(partial(potential, system))(q)
+    axes.plot(drawn[0], drawn[2], color="black", label="T + V")
+    axes.plot(drawn[0], drawn[1], color=GREY, lw=0.8, label="T")
     # the shares of single contacts in a multiple impact may have either sign: their sum is shown
-    axes.plot(time, -work[:, 0].sum(axis=1), color=COLOURS[0], label="taken by impacts")
-    if np.nanmax(np.abs(work[:, 1]), initial=0.0) > 0:
-        axes.plot(time, -work[:, 1].sum(axis=1), color=COLOURS[1], label="taken by friction")
-    for name, value in (("base", motion.base_work), ("forces", motion.force_work)):
+    normal, tangential = np.asarray(motion.contact_work).sum(axis=-1).T
+    axes.plot(time, -normal, color=COLOURS[0], label="contacts took")
+    others = (
+        ("friction took", -tangential),
+        ("the base gave", motion.base_work),
+        ("forces gave", motion.force_work),
+    )
+    for (label, value), colour in zip(others, COLOURS[1:], strict=False):
         if np.nanmax(np.abs(np.asarray(value)), initial=0.0) > 0:
-            axes.plot(time, value, "--", color=COLOURS[2], label=f"work of the {name}")
+            axes.plot(time, value, "--", color=colour, label=label)
     axes.set_ylabel("energy [J]")
 
 
-def phase_portrait(motion: Motion, coordinate: int = 0, title: str = "") -> Figure:
+def phase_portrait(
+    motion: Motion,
+    coordinate: int | None = None,
+    title: str = "",
+    names: Sequence[str] = (),
+    system: System | None = None,
+) -> Figure:
     """Velocity against one coordinate; impacts are the dashed jumps.
 
     Args:
         motion: one motion.
-        coordinate: which, counted from 0.
+        coordinate: which, counted from 0; None: the one with the largest range times range of
+            its velocity, in SI units.
         title: of the picture.
+        names: of the coordinates, as in `motion`.
+        system: that moved, as in `motion`; needed where velocities are not the rates of q.
 
     >>> import jimpact as ji
-    >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> len(ji.plot.phase_portrait(motion).axes)
-    1
+    >>> dimer = ji.dimer_system(0.1, 1.0)
+    >>> motion = ji.simulate(dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21)
+    >>> ji.plot.phase_portrait(motion, system=dimer).axes[0].get_xlabel()
+    'angle [rad]'
     """
     one_motion(motion)
-    n = motion.q.shape[-1]
-    n = n if n == motion.velocity.shape[-1] else 3  # in space: of the position only
-    if not 0 <= coordinate < n:
-        raise ValueError(f"Argument `coordinate` must lie in [0, {n - 1}], but is {coordinate}.")
+    labels, rates = _labels(motion, names, system)
+    course = _course(motion)
+    # coordinate -> its velocity
+    pairs = {i: i for i in range(len(labels))}
+    if len(labels) != len(rates):
+        pairs = {i: rates.index(x) for i, x in enumerate(map(rate_of, labels)) if x in rates}
+    if not pairs:
+        raise ValueError("Argument `system` must be given where velocities are not rates of q.")
+    if coordinate is None:
+        size = {i: _range(course.q[:, i]) * _range(course.v[:, j]) for i, j in pairs.items()}
+        coordinate = max(size, key=lambda i: size[i])
+    if coordinate not in pairs:
+        raise ValueError(
+            f"Argument `coordinate` must lie in [{min(pairs)}, {max(pairs)}], but is {coordinate}."
+        )
+    rate = pairs[coordinate]
     figure = Figure(figsize=(6.0, 5.0), layout="constrained")
     axes = figure.subplots()
-    rows = np.asarray(motion.events.kind) > 0
-    jumps = [
-        np.asarray(x)[rows, coordinate]
-        for x in (motion.events.q, motion.events.velocity_before, motion.events.velocity_after)
-    ]
-    # the curve passes through the states before and after every event
-    time = np.concatenate([motion.time, *(2 * [np.asarray(motion.events.time)[rows]])])
-    position = np.concatenate([motion.q[:, coordinate], jumps[0], jumps[0]])
-    speed = np.concatenate([motion.velocity[:, coordinate], jumps[1], jumps[2]])
-    event = np.concatenate(
-        [np.zeros(len(motion.time)), np.ones(rows.sum()), np.full(rows.sum(), 2)]
-    )
-    order = np.lexsort((event, time))
-    position, speed, event = position[order], speed[order], event[order]
-    cut = np.flatnonzero(event == 2)
+    position, speed = course.q[:, coordinate], course.v[:, rate]
+    cut = np.flatnonzero(course.after)
     axes.plot(np.insert(position, cut, np.nan), np.insert(speed, cut, np.nan), color=COLOURS[0])
-    axes.plot(
-        np.stack([jumps[0]] * 2), np.stack(jumps[1:]), "--", color=COLOURS[1], lw=0.8, zorder=0
-    )
-    axes.set_xlabel(f"q{coordinate + 1} [m, rad]")
-    axes.set_ylabel(f"velocity of q{coordinate + 1} [m/s, rad/s]")
+    jumps = np.stack([cut - 1, cut])
+    axes.plot(position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0)
+    axes.set_xlabel(labels[coordinate])
+    axes.set_ylabel(rates[rate])
     axes.set_title(title, loc="left")
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(lw=0.4, alpha=0.5)
     return figure
+
+
+def _range(values: np.ndarray) -> float:
+    """Of what was reached."""
+    there = values[np.isfinite(values)]
+    return float(np.ptp(there)) if len(there) else 0.0
 
 
 def animation(
@@ -147,8 +282,12 @@ def animation(
     outlines: Outlines | None = None,
     frames_per_second: float = 25.0,
     title: str = "",
+    progress: bool | None = None,
 ) -> Path:
     """The motion as an animated GIF, one frame a sample (those that were reached).
+
+    Bodies in space are shown in parallel projection, with their shadows. What moves with the base
+    moves in the picture.
 
     Args:
         system: that moved.
@@ -157,14 +296,16 @@ def animation(
         outlines: q (n,) -> curves (k, 2) [m]; None: those of the body.
         frames_per_second: of the GIF.
         title: of the picture; the time stands below it.
+        progress: a bar on stderr; None: on a terminal, where it takes long.
 
     Raises:
-        ValueError: another ending, a batch; TypeError: a body without outlines.
+        ValueError: another ending, a batch, no sample; TypeError: a body without outlines.
 
-    >>> import jimpact as ji
+    >>> import tempfile, pathlib, jimpact as ji
     >>> ball = ji.ball_system()
     >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> ji.plot.animation(ball, motion, "ball.gif").name
+    >>> place = pathlib.Path(tempfile.mkdtemp())
+    >>> ji.plot.animation(ball, motion, place / "ball.gif").name
     'ball.gif'
     """
     one_motion(motion)
@@ -174,52 +315,77 @@ def animation(
     q = np.asarray(motion.q)
     reached = np.isfinite(q).all(axis=1)
     q, time = q[reached], np.asarray(motion.time)[reached]
-    point = _POINT * (np.nanmax(q) - np.nanmin(q) or 1.0)
-    curves = [system.body.outlines(x, point) if outlines is None else outlines(x) for x in q]
+    if not len(q):
+        raise ValueError("Argument `motion` must have a sample that was reached, but has none.")
     ground = _grounds(system, time)
-    figure = Figure(figsize=(4.8, 4.8), layout="constrained", dpi=80)
-    axes = figure.subplots()
-    _limits(axes, curves, ground, bool(system.body.floors))
+    curves = [outlines(x) for x in q] if outlines else _curves(system, q, time, ground)
+    figure = Figure(figsize=(4.8, 4.8), dpi=80)
+    axes = figure.add_axes(_PLACE)
+    floors = [_plane(angle, offset) for angle, offset in system.body.floors]
+    _limits(axes, curves, ground, floors)
     lines = [
         axes.plot([], [], color=COLOURS[i // 2 % len(COLOURS)])[0] for i in range(len(curves[0]))
     ]
-    floors = [axes.plot([], [], color=GREY, lw=2)[0] for _ in system.body.floors]
+    drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in floors]
     view = np.array([axes.get_xlim(), axes.get_ylim()])
+    middle, reach = view.mean(axis=1), np.ptp(view[0])
 
     def draw(k: int) -> list[Any]:
         for line, points in zip(lines, curves[k], strict=True):
             line.set_data(points[:, 0], points[:, 1])
-        for floor, (angle, offset) in zip(floors, system.body.floors, strict=True):
-            n, along = np.array([[-np.sin(angle), np.cos(angle)], [np.cos(angle), np.sin(angle)]])
-            middle, half = view.mean(axis=1), 0.5 * np.ptp(view[0])
-            middle = (n @ ground[k] + offset) * n + along @ (middle + ground[k]) * along
-            floor.set_data(*(middle[:, None] + half * np.array([-1, 1]) * along[:, None]))
+        for line, (n, offset) in zip(drawn, floors, strict=True):
+            along = np.array([n[1], -n[0]])
+            foot = middle - (n @ (middle - ground[k]) - offset) * n
+            line.set_data(*(foot[:, None] + reach * np.array([-1, 1]) * along[:, None]))
         axes.set_title(f"{title}\n{time[k]:.2f} s" if title else f"{time[k]:.2f} s", loc="left")
-        return [*lines, *floors]
+        return [*lines, *drawn]
 
     path.parent.mkdir(parents=True, exist_ok=True)
     shown = FuncAnimation(figure, draw, frames=len(q))
-    shown.save(path, writer=PillowWriter(fps=round(frames_per_second)))
+    with counting_bar(len(q), "frames", progress) as advance:
+        writer = PillowWriter(fps=round(frames_per_second))
+        shown.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
     return path
 
 
+def _curves(
+    system: System, q: np.ndarray, time: np.ndarray, ground: np.ndarray
+) -> list[list[np.ndarray]]:
+    """Outlines of the body, of every sample, where they are in space."""
+    point = _POINT * (np.ptp(q) or 1.0)
+    if system.base is not None:
+        q = np.asarray(jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time)))
+    return [
+        [curve + moved for curve in system.body.outlines(x, point)]
+        for x, moved in zip(q, ground, strict=True)
+    ]
+
+
 def _grounds(system: System, time: np.ndarray) -> np.ndarray:
-    """Where the base is (S, 2)."""
-    base = system.base
-    if base is None:
+    """Where the base is on the picture (S, 2)."""
+    if system.base is None:
         return np.zeros((len(time), 2))
-    moved = np.asarray(jax.vmap(lambda t: jnp.atleast_1d(base(t)))(jnp.asarray(time)))
-    return np.insert(moved, 0, 0.0, axis=1) if moved.shape[1] == 1 else moved[:, :2]
+    path = _base_path(system, time)
+    if path.shape[1] == 3:
+        return projected(path)
+    return np.insert(path, 0, 0.0, axis=1) if path.shape[1] == 1 else path
 
 
-def _limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: bool) -> None:
+def _plane(angle: Any, offset: Any) -> tuple[np.ndarray, float]:
+    """Normal (2,) and offset of a plane."""
+    return np.array([-np.sin(angle), np.cos(angle)]), float(offset)
+
+
+def _limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[Any]) -> None:
     every = np.concatenate([points for frame in curves for points in frame])
-    if floors:
-        every = np.concatenate([every, np.stack([every[:1, 0], ground[:1, 1]], axis=1)])
+    middle = (every.min(axis=0) + every.max(axis=0)) / 2
+    feet = [middle - (n @ (middle - ground[0]) - offset) * n for n, offset in floors]
+    every = np.concatenate([every, *(foot[None] for foot in feet)])
     low, high = every.min(axis=0), every.max(axis=0)
     half = 0.55 * float((high - low).max()) or 1.0
     centre = (low + high) / 2
     axes.set_xlim(centre[0] - half, centre[0] + half)
     axes.set_ylim(centre[1] - half, centre[1] + half)
     axes.set_aspect("equal")
+    axes.locator_params(nbins=5)
     axes.spines[["top", "right"]].set_visible(False)

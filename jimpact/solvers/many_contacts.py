@@ -92,7 +92,7 @@ def solve_many(
         p = jnp.maximum(x[:, :1], 0.0)
         side, bound = x[:, 1:], slope[:, None] * p
         length = jnp.sqrt(jnp.sum(side**2, axis=1, keepdims=True))
-        shrink = jnp.where(length > bound, bound / jnp.where(length > 0, length, 1.0), 1.0)
+        shrink = jnp.where(length <= bound, 1.0, bound / jnp.where(length > 0, length, 1.0))
         return jnp.concatenate([p, side * shrink], axis=1)
 
     def times(x: jax.Array) -> jax.Array:
@@ -114,7 +114,7 @@ def solve_many(
         gain = jnp.where(back, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
         x, ax = jnp.where(long, at.x, x), jnp.where(long, at.ax, ax)
         misfit = jnp.where(long, jnp.inf, at.steepness * jnp.max(jnp.abs(step)))
-        better = misfit < at.misfit
+        better = ~(misfit >= at.misfit)  # also NaN, which so comes out
         return _At(
             x,
             ax,
@@ -127,7 +127,7 @@ def solve_many(
             at.tries + 1,
         )
 
-    x = projected(start / scale)
+    x = projected(start / scale) + 0 * size  # NaN where a rate is not finite
     ax = times(x)
     unit = jnp.ones((), x.dtype)
     steepness = jnp.maximum(RELAX * steepness, unit)
