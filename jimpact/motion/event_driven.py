@@ -434,9 +434,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
 
     xs = Row(rows.event._replace(happens=happens), accepted, rows.aim), reached
     blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
-    # rows beyond those that there was room for: no number at all
-    lost = jnp.where(plan.lost, jnp.nan, 1.0)
-    begin = jax.tree.map(lambda x: x * lost, start), jnp.full((2, m), -jnp.inf, start.q.dtype)
+    begin = start, jnp.full((2, m), -jnp.inf, start.q.dtype)
     states, numbers = jax.lax.scan(jax.checkpoint(block), begin, blocks)[1]
 
     def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
@@ -448,4 +446,9 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
 
     samples = at(sampled, states, times.shape[0])
     first = packed(begin[0])[:, 0][None]
-    return jnp.concatenate([first, samples]), at(written, numbers, max_events + 1)
+    # where there were too few rows nothing is known, of what derivative whatsoever
+    inputs = [x for x in jax.tree.leaves(given) if eqx.is_inexact_array(x)]
+    finite = [jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)).astype(first.dtype) for x in inputs]
+    unknown = jnp.where(plan.lost, jnp.nan, 0.0) * jnp.sum(jnp.stack(finite))
+    events = at(written, numbers, max_events + 1)
+    return jnp.concatenate([first, samples]) + unknown, events + unknown

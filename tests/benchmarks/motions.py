@@ -21,8 +21,8 @@ AIMS = {"ball": 26.0, "block": 100.0}
 
 def ball(e):
     """Dropped from 1 m, to rest."""
-    given = (ji.ball_system(), ji.Newton(e), [1.0], [0.0], 5.0)
-    return ji.simulate(*given, samples=11, max_events=150)
+    given = (ji.ball_system(), ji.Newton(e), [1.0], [0.0], 9.0)
+    return ji.simulate(*given, samples=11, max_events=200)
 
 
 def block(e):
@@ -30,19 +30,20 @@ def block(e):
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
     q0 = [0.0, 0.1 * np.sin(0.15) + 0.3 * np.cos(0.15), 0.15]
     given = (ji.block_system(0.2, 0.6, corners="base"), law, q0, [0.0] * 3, 4.0)
-    return ji.simulate(*given, friction=5.0, samples=11, max_events=150)
+    return ji.simulate(*given, friction=5.0, samples=11, max_events=200)
 
 
 def main():
     given = arguments(__doc__)
     batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if given.quick else (BATCH, REPEATS)
-    e, one, runs, events = np.linspace(0.7, 0.85, batch), jnp.asarray(0.8), {}, {}
+    e, one, runs, events = np.linspace(0.85, 0.9, batch), jnp.asarray(0.85), {}, {}
     for name, motion in (("ball", ball), ("block", block)):
         many, single = jax.jit(jax.vmap(motion)), jax.jit(motion)
         slope = jax.jit(jax.grad(lambda e, f=motion: f(e).contact_work[-1].sum()))
         runs[name, "batch"] = lambda f=many: f(e).events.count
         runs[name, "one"] = lambda f=single: f(one).events.count
         runs[name, "gradient"] = lambda f=slope: f(one)
+        ji.raise_on_failed_motion(many(e))
         events[name, "batch"] = int(many(e).events.count.sum())
         events[name, "one"] = events[name, "gradient"] = int(single(one).events.count)
     timings = alternating(runs, repeats)
