@@ -147,8 +147,9 @@ def simulate(
         joint = joins_step(law) and friction is None
         if is_pile(system) and not joint:
             raise ValueError(
-                "Argument `law` must be Moreau's, with its own `friction`, one `restitution` and no "
-                f"`tangential_restitution`, for the many contacts of {type(system.body).__name__}, but is {law!r}."
+                "Argument `law` must be Moreau's, with its own `friction`, one `restitution` and "
+                "no `tangential_restitution`, for the many contacts of "
+                f"{type(system.body).__name__}, but is {law!r}."
             )
         sizes = count, substeps, joint, max_events
         return _stepped(system, law, mu, q, v, start, end, settings.closed_below, *sizes)
