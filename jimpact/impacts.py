@@ -1,5 +1,6 @@
 """`impact`: the one place that turns a law's impulses into velocities, energy and status."""
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,7 +11,7 @@ import numpy as np
 from jimpact._checks import check_kind, check_values, in_common_dtype, is_traced
 from jimpact.compiling import is_own, quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
-from jimpact.law import Impulses, Law, check_law, is_separable, of_contacts
+from jimpact.law import Impulses, Law, check_law, is_separable, of_contacts, within_domains
 from jimpact.scene import Scene, as_velocity, filled_up, momentum, velocity_change
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import CODE, STATUS, sign_tolerance
@@ -84,7 +85,19 @@ def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
     alike = few and groups is None and separable and law.fills_up
     if alike and not is_traced((law, scene, v, noise)) and is_own(()):
         return _filled_up(law, scene, v, noise)
-    return _impact(law, scene, v, groups, noise)
+    out = _impact(law, scene, v, groups, noise)
+    return _held(law, out) if is_traced(law) else out  # else the law was checked when it was made
+
+
+def _held(law: Law, out: Impact) -> Impact:
+    """The outcome; `not_finite` where a parameter is outside its domain."""
+    held = within_domains(law)
+    return dataclasses.replace(
+        out,
+        velocity=jnp.where(held, out.velocity, jnp.nan),
+        impulse=jnp.where(held, out.impulse, jnp.nan),
+        status=jnp.where(held, out.status, CODE["not_finite"]),
+    )
 
 
 def _filled_up(law: Law, scene: Scene, v: jax.Array, noise: jax.Array | None) -> Impact:

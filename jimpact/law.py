@@ -256,6 +256,12 @@ def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
     return {k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)}
 
 
+def within_domains(law: eqx.Module) -> jax.Array:
+    """Whether () all parameters are finite and in their domains, on the device."""
+    every = free_parameters_of(law).values()
+    return jnp.all(jnp.stack([jnp.asarray(x.domain.holds(x.value)) for x in every]))
+
+
 def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
     """Names of the fields that say how a law is solved."""
     fields = dataclasses.fields(kind)

@@ -13,7 +13,6 @@ from jimpact._checks import (
     as_float_array,
     as_whole,
     check_kind,
-    check_per_contact,
     check_shape,
     check_values,
     is_traced,
@@ -148,11 +147,9 @@ def simulate(
         joint = joins_step(law) and friction is None
         if is_pile(system) and not joint:
             raise ValueError(
-                "Argument `law` must be Moreau's, with its own `friction` and one `restitution`, "
-                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
+                "Argument `law` must be Moreau's, with its own `friction`, one `restitution` and no "
+                f"`tangential_restitution`, for the many contacts of {type(system.body).__name__}, but is {law!r}."
             )
-        if joint:
-            _check_coefficients(system, law, q)
         sizes = count, substeps, joint, max_events
         return _stepped(system, law, mu, q, v, start, end, settings.closed_below, *sizes)
     if method == "contact_forces":
@@ -388,16 +385,6 @@ def _contacts_of(system: System, q: jax.Array) -> int:
     """m."""
     found: int = jax.eval_shape(system.body.gap_function, q).shape[0]
     return found
-
-
-def _check_coefficients(system: System, law: Law, q: jax.Array) -> None:
-    """Raise a ValueError where a law that joins the steps does not fit the contacts."""
-    for name in ("restitution", "tangential_restitution"):
-        value = getattr(law, name)
-        if value is not None and is_pile(system):
-            check_shape(name, value, (), "one for all contacts of a pile")
-        elif value is not None:
-            check_per_contact(name, value, _contacts_of(system, q))
 
 
 def _force_of(law: Law, mu: jax.Array | None) -> Force:

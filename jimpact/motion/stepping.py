@@ -21,9 +21,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact._checks import is_traced
 from jimpact.bodies.piles import Discs, Near
 from jimpact.impacts import impact
-from jimpact.law import Law
+from jimpact.law import Law, within_domains
 from jimpact.laws.kinematic import Moreau
 from jimpact.motion.dynamics import (
     base_velocity,
@@ -213,7 +214,7 @@ def time_stepping(
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     rows = 1 if is_pile(system) else max_events
     events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
-    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0))
+    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & within_domains(law)
     status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"])
     penetrates = jnp.any(recorded_gaps(system, q0, times[0]) < -closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], status)
@@ -313,9 +314,6 @@ def _one_step(
         # what leaves while others strike may come back, or energy would be gained; slowly, it rests
         counts = (before[:, 0] < 0) | (before[:, 0] > slow)
         wanted = wanted.at[:, 0].set(law.restitution * jnp.where(counts, before[:, 0], 0.0))
-        if law.tangential_restitution is not None and before.shape[1] > 1:
-            turned = jnp.where(strikes, law.tangential_restitution, 0.0)
-            wanted = wanted.at[:, 1:].set(turned[:, None] * before[:, 1:])
     else:
         scene = scene_at(system, q, state.v, middle, close.there)
         given, code = jax.lax.cond(
@@ -406,8 +404,11 @@ def _one_step(
 
 
 def joins_step(law: Law) -> bool:
-    """Whether the law is a condition on v' of each contact: Moreau's."""
-    return isinstance(law, Moreau) and law.restitution.ndim < 2
+    """Whether the law is a condition on v' that cannot gain energy: Moreau's, one e, e_t = 0."""
+    if not isinstance(law, Moreau) or law.restitution.ndim > 0:
+        return False
+    e_t = law.tangential_restitution
+    return e_t is None or (e_t.ndim == 0 and not is_traced(e_t) and float(e_t) == 0)
 
 
 def _struck(
