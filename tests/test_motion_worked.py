@@ -227,16 +227,16 @@ def shaken(x):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("given", "at", "events"),
+    ("given", "at", "events", "step", "allowed"),
     [
-        (rocks, [0.85, 0.15, 0.6], 4),
-        (swings, [0.7, 0.2, -0.6], 3),
-        (collides, [0.9, 0.3, 0.1], 2),
-        (slides, [0.3, 0.1, 1.0], 1),
-        (shaken, [0.02, 5.0, 0.7], 3),
+        (rocks, [0.85, 0.15, 0.6], 4, 1e-4, 1e-8),
+        (swings, [0.7, 0.2, -0.6], 3, 1e-4, 1e-9),
+        (collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8),
+        (slides, [0.3, 0.1, 1.0], 1, 1e-4, 1e-8),
+        (shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7),  # the plate of 2 cm: differences see no more
     ],
 )
-def test_derivatives_of_a_motion_against_differences(given, at, events):
+def test_derivatives_of_a_motion_against_differences(given, at, events, step, allowed):
     """In both modes, of the end, event times and the ledger; differences at a finer tolerance."""
 
     def run(x, rtol=1e-10):
@@ -248,13 +248,13 @@ def test_derivatives_of_a_motion_against_differences(given, at, events):
         end = [motion.q[-1], motion.velocity[-1], motion.contact_work[-1].ravel()]
         return jnp.concatenate([*end, motion.base_work[-1:], motion.events.time[:events]])
 
-    x, step = jnp.array(at), 1e-4
+    x = jnp.array(at)
     forward, reverse = jax.jit(lambda x: (jax.jacfwd(run)(x), jax.jacrev(run)(x)))(x)
     np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-12)
     moves = jnp.concatenate([k * step * jnp.eye(3) for k in (1, -1, 2, -2)])
     fine = jax.jit(jax.vmap(lambda x: run(x, 1e-12)))(x[None] + moves).reshape(4, 3, -1)
     differences = (8 * (fine[0] - fine[1]) - (fine[2] - fine[3])) / (12 * step)
-    np.testing.assert_allclose(forward, differences.T, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(forward, differences.T, rtol=allowed, atol=allowed / 10)
 
 
 @pytest.mark.slow
