@@ -90,14 +90,9 @@ def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
 
 
 def _held(law: Law, out: Impact) -> Impact:
-    """The outcome; `not_finite` where a parameter is outside its domain."""
-    held = within_domains(law)
-    return dataclasses.replace(
-        out,
-        velocity=jnp.where(held, out.velocity, jnp.nan),
-        impulse=jnp.where(held, out.impulse, jnp.nan),
-        status=jnp.where(held, out.status, CODE["not_finite"]),
-    )
+    """The outcome, told as `out_of_range` where a parameter is outside its domain."""
+    told = jnp.maximum(out.status, CODE["out_of_range"])
+    return dataclasses.replace(out, status=jnp.where(within_domains(law), out.status, told))
 
 
 def _filled_up(law: Law, scene: Scene, v: jax.Array, noise: jax.Array | None) -> Impact:

@@ -24,11 +24,8 @@ STATUS = (
     Status("negative_impulse", "a contact would have to pull (p < 0)", True),
     Status("infeasible", "the law has no solution for this scene", True),
     Status("max_steps", "the step limit ended the impact before it was over", True),
-    Status(
-        "not_finite",
-        "a result or input is NaN or infinite, or a parameter out of range",
-        True,
-    ),
+    Status("out_of_range", "a parameter is outside its range", True),
+    Status("not_finite", "the result or its input is NaN or infinite", True),
 )
 
 CODE = {row.name: code for code, row in enumerate(STATUS)}

@@ -39,7 +39,7 @@ class Row:
 LAWS = {
     "newton": Row("newton", lambda e, k, eta, stored: ji.Newton(e)),
     "moreau": Row("moreau", lambda e, k, eta, stored: ji.Moreau(e)),
-    "poisson": Row("poisson", lambda e, k, eta, stored: ji.Poisson(e)),
+    "poisson": Row("poisson", lambda e, k, eta, stored: ji.Poisson(e, allow_above_one=True)),
     "matrix": Row(
         "restitution_matrix", lambda e, k, eta, stored: ji.RestitutionMatrix(jnp.diag(e))
     ),

@@ -180,7 +180,7 @@ def test_montecarlo(tmp_path, capsys):
     assert code == 0
     assert "600 samples of Binary, 3 coordinates, 2 contacts" in said.out
     assert "ok: 600" in said.out
-    assert (tmp_path / "new" / "jimpact-montecarlo.png").stat().st_size > 10_000
+    assert (tmp_path / "new" / "jimpact-montecarlo-study.png").stat().st_size > 10_000
     options = ["--json", "--out", "a.svg", "--folder", "run", "--keep-samples"]
     first = json.loads(call(capsys, "montecarlo", path, *options)[1].out)
     more = json.loads(call(capsys, "montecarlo", path, *options, "--samples", "700")[1].out)

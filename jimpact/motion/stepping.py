@@ -214,8 +214,9 @@ def time_stepping(
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     rows = 1 if is_pile(system) else max_events
     events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
-    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & within_domains(law)
+    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0))
     status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"])
+    status = jnp.where(within_domains(law), status, MOTION_CODE["law_failed"])
     penetrates = jnp.any(recorded_gaps(system, q0, times[0]) < -closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], status)
     inside = system.body.valid(seen_from_base(system, q0, times[0])) >= 0
