@@ -364,6 +364,7 @@ def test_compare_of_a_body(tmp_path, capsys):
     np.testing.assert_allclose(told, [0.0, 0.9, 0.0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_simulate_in_space(tmp_path, capsys):
     """A bundled study by time stepping: named after the study; what is replaced is told."""
     study = (files("jimpact") / "data" / "tossed_brick.toml").read_text()

@@ -105,6 +105,7 @@ def test_numbers_of_contacts_share_one_program(caplog):
     assert "impact" not in caplog.text
 
 
+@pytest.mark.slow
 def test_directions_at_one_point():
     """Their steps are found once: as one direction alone, and in reverse."""
     given, way = jnp.array([0.9, 0.7, 1.0, 2.5]), jnp.array([0.3, -1.0, 0.5, 2.0])

@@ -46,6 +46,7 @@ def chart():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ORDERS)
 def test_methods_converge_at_their_order(chart, name):
     settings, least, most, finest = ORDERS[name]

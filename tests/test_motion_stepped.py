@@ -145,6 +145,7 @@ def test_a_spinning_brick_comes_to_rest_on_a_face():
     np.testing.assert_allclose(np.linalg.norm(motion.q[:, 3:], axis=1), 1, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_free_brick_keeps_its_momentum():
     """Far from the plane: a ball falls, and the angular momentum in space stays; order 2."""
     brick, spin = ji.Box([0.1, 0.06, 0.04]), jnp.array([3.0, 12.0, 5.0])

@@ -115,6 +115,7 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
     np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_an_overturned_block_lies_on_its_side():
     motion = ji.simulate(
         ji.block_system(0.2, 0.6), ji.LZB(0.3), upright(0.5), [0.0] * 3, 3.0, samples=31

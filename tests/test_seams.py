@@ -255,6 +255,7 @@ def test_light_balls_with_gaps_and_knife_edges_are_right_or_told():
     assert told.mean() < 0.05
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_checked_outcome_are_those_of_the_plain_one():
     balls, v = ji.chain(np.ones(3)), jnp.array([1.0, 0.0, 0.0])
 
