@@ -427,7 +427,11 @@ def discs_in_a_box(n, columns, duration, step, samples):
 
 
 @pytest.mark.parametrize(
-    ("n", "columns", "duration"), [(30, 6, 1.0), pytest.param(300, 18, 2.0, marks=pytest.mark.slow)]
+    ("n", "columns", "duration"),
+    [
+        (30, 6, 1.0),
+        pytest.param(300, 18, 2.0, marks=[pytest.mark.slow, pytest.mark.long_run]),
+    ],
 )
 def test_discs_fall_into_a_box_and_come_to_rest(n, columns, duration):
     motion = discs_in_a_box(n, columns, duration, 1e-3, 21)
