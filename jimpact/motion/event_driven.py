@@ -111,7 +111,7 @@ class Table(NamedTuple):
 
 class _Run(NamedTuple):
     flight: Flight
-    struck: jax.Array
+    struck: jax.Array  # (m,) contacts that had an impact
     allowed: jax.Array  # errors of the ledger
     waits: jax.Array  # whether an event is to be resolved
     last: Event  # before the next step, or a longer time ago
@@ -210,7 +210,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         jnp.zeros((max_events + 1, 2 + m), jnp.int32),
     )
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
-    decision = Decision(no, none, none, none, none, none, Scales(zero, zero, zero))
+    decision = Decision(no, none, none, none, none, Scales(zero, zero, zero))
     last = Event(no, no, decision)
     plan = None
     if records:
@@ -221,7 +221,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         plan = Plan(rows, jnp.int32(0), no)
     return _Run(
         flight,
-        jnp.full((2, m), -jnp.inf, dtype),
+        none,
         packed(state)[q0.size + v0.size :, 0],
         jnp.asarray(True),
         last,
@@ -259,7 +259,7 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
         )
         new = run._replace(
             flight=toward_sample(ready, times, flight.free),
-            struck=found.after.struck,
+            struck=run.struck | (found.contacts & found.decision.strikes),
             allowed=allowed_errors(system, settings, state),
             waits=jnp.asarray(False),
             last=Event(jnp.asarray(True), kept, found.decision),
@@ -340,14 +340,14 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
 
 def _width(given: Given) -> int:
     """Numbers of an event."""
-    return 2 + given.q0.size + 2 * given.v0.size + 4 * given.contacts
+    return 3 + given.q0.size + 2 * given.v0.size + 4 * given.contacts
 
 
 def _numbers(before: State, after: After) -> jax.Array:
     """Those of one event, in a row."""
     jump = after.jump
     parts = (before.t, before.q, before.v, jump.v, jump.impulse, jump.tangential, jump.energy)
-    return ravel_pytree((parts, after.accumulation_end))[0]
+    return ravel_pytree((parts, after.passed))[0]
 
 
 def _events(table: Table, count: jax.Array, given: Given) -> Events:
@@ -357,7 +357,8 @@ def _events(table: Table, count: jax.Array, given: Given) -> Events:
     rows = jnp.where(there[:, None], table.events[:-1], jnp.nan)
     n, m = given.v0.size, given.contacts
     sizes = np.cumsum([1, given.q0.size, n, n, m, m, 2 * m])
-    time, q, before, after, impulse, side, energy, end = jnp.split(rows, sizes, axis=1)
+    time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
+    ends = marks[:, 0] == KIND_CODE["accumulation"]
     return Events(
         count=count,
         time=time[:, 0],
@@ -370,7 +371,8 @@ def _events(table: Table, count: jax.Array, given: Given) -> Events:
         tangential_impulse=side,
         energy=energy.reshape(-1, 2, m),
         status=marks[:, 1],
-        accumulation_end=end[:, 0],
+        accumulation_end=jnp.where(ends, time[:, 0] + passed[:, 0], jnp.nan),
+        accumulation_gap=jnp.where(ends, passed[:, 1], jnp.nan),
     )
 
 
@@ -380,7 +382,7 @@ def _events(table: Table, count: jax.Array, given: Given) -> Events:
 def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Array]:
     """Samples and events of a run, as a smooth function of `given`."""
     system, law, mu, settings, *_, times, _ = given
-    start, m = given.start, given.contacts
+    start = given.start
     width = _width(given)
     size = plan.rows.accepted.shape[0] - 1
     rows = jax.tree.map(lambda x: x[:size], plan.rows)
@@ -392,10 +394,9 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
     written = rows.event.written & happens
     reached = jnp.cumsum(sampled, dtype=jnp.int32) + (~sampled).astype(jnp.int32)  # before the step
 
-    def event(y: Any, now: Event) -> tuple[Any, jax.Array]:
-        state, struck = y
-        after = resolved_again(system, law, mu, settings, state, struck, now.decision)
-        new = selected(now.happens, (after.state, after.struck), y)
+    def event(state: State, now: Event) -> tuple[State, jax.Array]:
+        after = resolved_again(system, law, mu, settings, state, now.decision)
+        new = selected(now.happens, after.state, state)
         return new, jnp.where(now.happens, _numbers(state, after), 0.0)
 
     def step(state: State, row: Row, sample: jax.Array) -> State:
@@ -405,16 +406,14 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
         flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
         return selected(row.accepted, step_again(flow, aim, state), state)
 
-    def one(y: Any, x: Any) -> tuple[Any, Any]:
+    def one(state: State, x: Any) -> tuple[State, Any]:
         row, sample = x
         nothing = jnp.zeros(width, start.q.dtype)
-        y, numbers = jax.lax.cond(
-            any_lane(row.event.happens), event, lambda y, _: (y, nothing), y, row.event
+        state, numbers = jax.lax.cond(
+            any_lane(row.event.happens), event, lambda y, _: (y, nothing), state, row.event
         )
-        state = jax.lax.cond(
-            any_lane(row.accepted), step, lambda state, *_: state, y[0], row, sample
-        )
-        return (state, y[1]), (packed(state)[:, 0], numbers)
+        state = jax.lax.cond(any_lane(row.accepted), step, lambda y, *_: y, state, row, sample)
+        return state, (packed(state)[:, 0], numbers)
 
     def block(y: Any, xs: Any) -> tuple[Any, Any]:
         def walk(y: Any) -> tuple[Any, Any]:
@@ -429,8 +428,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
 
     xs = Row(rows.event._replace(happens=happens), accepted, rows.aim), reached
     blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
-    begin = start, jnp.full((2, m), -jnp.inf, start.q.dtype)
-    states, numbers = jax.lax.scan(jax.checkpoint(block), begin, blocks)[1]
+    states, numbers = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
 
     def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
         """The values in the first rows with a flag."""
@@ -440,7 +438,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
         return jnp.where((wanted < seen[-1])[:, None], found, 0.0)
 
     samples = at(sampled, states, times.shape[0])
-    first = packed(begin[0])[:, 0][None]
+    first = packed(start)[:, 0][None]
     # where there were too few rows nothing is known, of what derivative whatsoever
     inputs = [x for x in jax.tree.leaves(given) if eqx.is_inexact_array(x)]
     finite = [jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)).astype(first.dtype) for x in inputs]
