@@ -177,7 +177,7 @@ def resolve(
         after, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
         return _Resting(pressed, still, force, held, ends, after, passed)
 
-    slow = closed & (gamma <= slowly)
+    slow = closed & (jnp.abs(gamma) <= slowly)
     if m == 1:
         found = resting(slow)
     else:
@@ -222,8 +222,8 @@ def _share_bodies(given: Contacts, touched: jax.Array) -> jax.Array:
     m = touched.shape[0]
     w = jnp.abs(given.delassus[:m, :m])
     size = jnp.sqrt(jnp.diagonal(w))
-    coupled = w > LEAST_COUPLING * size[:, None] * size
-    return jnp.any(coupled & touched & ~jnp.eye(m, dtype=bool), axis=1)
+    others = touched[None] & ~jnp.eye(m, dtype=bool)
+    return jnp.any(others & (w > LEAST_COUPLING * jnp.outer(size, size)), axis=1)
 
 
 def _undisturbed(
@@ -368,7 +368,7 @@ def _passed(
     r = jnp.sqrt(jnp.where(some, left, 0.25) / jnp.where(some, left + jnp.maximum(lost, 0), 1.0))
     hop = jnp.max(jnp.where(ends, 2 * jnp.abs(p) / safe, 0.0))
     lift = jnp.max(jnp.where(ends, left / safe, 0.0))
-    return Passed(jnp.sum(ends) * hop / (1 - r), lift)
+    return Passed(jnp.sum(ends.astype(p.dtype)) * hop / (1 - r), lift)
 
 
 def _kind(
