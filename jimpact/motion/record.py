@@ -85,6 +85,17 @@ def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None =
     )
 
 
+def joined(parts: list[Events], most: int) -> Events:
+    """The events of runs that follow each other, on the host; `most` rows at most."""
+    if len(parts) == 1 and len(parts[0].time) <= most:
+        return parts[0]
+    rows = [dataclasses.replace(part, count=part.count[None]) for part in parts]
+    events = jax.tree.map(lambda *x: np.concatenate(x)[:most], *rows)
+    return jax.tree.map(
+        jnp.asarray, dataclasses.replace(events, count=np.sum(events.count, dtype=np.int32))
+    )
+
+
 def with_row(events: Events, happened: jax.Array, values: dict[str, jax.Array]) -> Events:
     """One row more if it `happened` and there is room; beyond the last row nothing is written."""
     size = events.time.shape[0]
