@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from io import BytesIO
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,17 +22,15 @@ import jimpact as ji
 from jimpact import options
 from jimpact.comparison import registered_laws
 from jimpact.fits.fitting import Fit
-from jimpact.progress import waiting
+from jimpact.progress import LONG, Steps, waiting
 from jimpact.records import as_data, table
 from jimpact.study import Study, import_laws, read_study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
-KINDS = (".png", ".pdf", ".svg")
 DPI = 150
-BAD_INPUT, FAILURE = 2, 1  # exit codes
-INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
+TOLD = LONG  # seconds after which work is told, also where no one looks at a terminal
 
 
 class Answer(NamedTuple):
@@ -44,24 +43,20 @@ class Answer(NamedTuple):
     failure: str = ""
 
 
-def run(given: options.Command) -> int:
-    """The exit code of a command: 0; wrong input 2, a method or law that fails 1, ctrl-C 130."""
+def run(given: options.Command, steps: Steps) -> str:
+    """Do what a command says, and print it; what went wrong all the same, '' if nothing did."""
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
-    try:
-        answer = _COMMANDS[given.name()](given)
-        replaced = [path for path in answer.pictures if path.exists()]
-        for path, picture in answer.pictures.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if callable(picture):
-                picture(path)
-            else:
-                picture.savefig(path, dpi=DPI)
-    except KeyboardInterrupt as stop:
-        return _refuse(given, str(stop) or "stopped.", INTERRUPTED)
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        return _refuse(given, str(error), BAD_INPUT)
-    except RuntimeError as error:
-        return _refuse(given, str(error), FAILURE)
+    answer = _COMMANDS[given.name()](given, steps)
+    replaced = [path for path in answer.pictures if path.exists()]
+    for path, picture in answer.pictures.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if callable(picture):
+            picture(path)
+        else:
+            whole = BytesIO()  # what is interrupted leaves no half a picture
+            picture.savefig(whole, format=path.suffix[1:], dpi=DPI)
+            path.write_bytes(whole.getvalue())
+        steps(f"picture {path}")
     pictures = [str(path) for path in answer.pictures]
     if given.json:
         about = {"title": answer.title, "pictures": pictures} if pictures else {}
@@ -71,30 +66,7 @@ def run(given: options.Command) -> int:
         print("\n".join(line for line in lines if line))
     for path in replaced:
         print(f"jimpact {given.name()}: {path} was there before: replaced.", file=sys.stderr)
-    return _refuse(given, answer.failure, FAILURE) if answer.failure else 0
-
-
-def _refuse(given: options.Command, reason: str, code: int) -> int:
-    print(f"jimpact {given.name()}: {reason}", file=sys.stderr)
-    return code
-
-
-def _picture(given: options.DrawingCommand) -> Path:
-    """The file --out, or the command's own in the directory --out, named after the study."""
-    if given.out.suffix:
-        return _checked(given.out)
-    study, default = (getattr(x, "study", None) for x in (given, type(given)))
-    named = "" if study is None or study == default else f"-{study.stem}"
-    return given.out / f"jimpact-{given.name()}{named}.png"
-
-
-def _checked(path: Path, option: str = "--out") -> Path:
-    """The path of a picture; other endings are refused."""
-    if path.suffix not in KINDS:
-        raise ValueError(
-            f"{option} must end in .png, .pdf or .svg or be a directory, but is '{path}'."
-        )
-    return path
+    return answer.failure
 
 
 def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
@@ -102,10 +74,7 @@ def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, n
     if given.velocity is not None:
         return np.asarray(given.velocity, float), None
     data = study.experiments
-    if data is None:
-        raise ValueError("--velocity must be given, because the study has no [data].")
-    if not 1 <= given.shot <= len(data.shots):
-        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
+    assert data is not None  # `ShotCommand.check`
     return np.asarray(data.pre[given.shot - 1]), np.asarray(data.post[given.shot - 1])
 
 
@@ -120,30 +89,37 @@ def _titled(study: Study, before: np.ndarray) -> str:
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
-def fit(given: options.FitCommand) -> Answer:
+def fit(given: options.FitCommand, steps: Steps) -> Answer:
     """The study's fit and its yardsticks."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study, given.law)
-    fits = _all_fits(study, {"method": given.method, "starts": given.starts, "seed": given.seed})
+    options = {"method": given.method, "starts": given.starts, "seed": given.seed}
+    fits = _all_fits(study, options | {"progress": TOLD}, steps)
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     picture = ji.plot.fit(fits[RAW], others, study.title)
     text = "\n".join([*_summary(fits), "", str(fits[RAW]), ""])
     return Answer(study.title, as_data({"fits": fits}), text, {path: picture})
 
 
-def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:
+def _all_fits(study: Study, options: dict[str, Any], steps: Steps) -> dict[str, Fit]:
     """The study's fit and its yardsticks; fits of one law share one compiled program."""
     own, everything = _per_contact(study)
-    fits = {RAW: own.run(**options)}
+    fits: dict[str, Fit] = {}
+
+    def run(name: str, study: Study) -> None:
+        fits[name] = study.run(**options)
+        steps(_in_words(name, fits[name]))
+
+    run(RAW, own)
     if any("break momentum" in line for line in fits[RAW].warnings):
         assert study.experiments is not None  # it was fitted
         data = study.experiments.momentum_corrected(study.scene)
-        fits[CORRECTED] = replace(own, experiments=data).run(**options)
+        run(CORRECTED, replace(own, experiments=data))
     if not isinstance(study.law, ji.Newton):
         newton = replace(study, law=ji.Newton(0.5), free={"restitution": True}, bounds={})
-        fits[YARDSTICK] = newton.run(**options)
+        run(YARDSTICK, newton)
     if everything is not None:
-        fits[ALL_FREE] = everything.run(**options)
+        run(ALL_FREE, everything)
     return fits
 
 
@@ -190,6 +166,11 @@ def _summary(fits: dict[str, Fit]) -> list[str]:
     return lines
 
 
+def _in_words(name: str, found: Fit) -> str:
+    values = ", ".join(f"{x} {_value(found, i)}" for i, x in enumerate(found.names))
+    return f"{name}: {values}, rms {found.rms:.4f} m/s"
+
+
 def _value(found: Fit, i: int) -> str:
     error = found.standard_error[i]
     if found.at_bound[i]:
@@ -201,16 +182,17 @@ def _value(found: Fit, i: int) -> str:
 # ---------------------------------------------------------------------------------------- compare
 
 
-def compare(given: options.CompareCommand) -> Answer:
+def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     """Every law on one scene."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     before, measured = _velocities(study, given)
     laws, left_out = registered_laws(study.parameters)
-    with waiting("laws"):
+    with waiting("laws", TOLD):
         found = ji.compare(study.scene, before, laws)
+    steps(f"{len(laws)} laws compared")
     found = replace(found, left_out=left_out, measured=measured)
-    fits = _fits_of_all(study) if given.fit else {}
+    fits = _fits_of_all(study, steps) if given.fit else {}
     values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     lines = [
         str(found),
@@ -224,7 +206,7 @@ def compare(given: options.CompareCommand) -> Answer:
     return Answer(_titled(study, before), as_data(data), "\n".join(lines), {path: picture})
 
 
-def _fits_of_all(study: Study) -> dict[str, Fit]:
+def _fits_of_all(study: Study, steps: Steps) -> dict[str, Fit]:
     """Every law with restitution coefficients at its best, one for all contacts and one each."""
     start = {**study.parameters, "restitution": 0.9}
     each = {**start, "restitution": np.full(study.scene.contacts, 0.9)}
@@ -233,7 +215,8 @@ def _fits_of_all(study: Study) -> dict[str, Fit]:
         for name, law in registered_laws(values)[0].items():
             if hasattr(law, "restitution") and (label == "one e" or study.scene.contacts > 1):
                 own = replace(study, law=law, free={"restitution": True}, bounds={})
-                fits[f"{name}, {label}"] = own.run()
+                fits[f"{name}, {label}"] = own.run(progress=TOLD)
+                steps(_in_words(f"{name}, {label}", fits[f"{name}, {label}"]))
     return fits
 
 
@@ -248,13 +231,14 @@ def _fit_table(fits: dict[str, Fit]) -> list[str]:
 # ------------------------------------------------------------------------------------- montecarlo
 
 
-def montecarlo(given: options.MonteCarloCommand) -> Answer:
+def montecarlo(given: options.MonteCarloCommand, steps: Steps) -> Answer:
     """Random gaps, velocities, parameters."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = ji.monte_carlo(**_sampling(study, given))
+        found = ji.monte_carlo(**_sampling(study, given), progress=TOLD)
+    steps(f"{found.samples:,} samples")
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
     picture = ji.plot.monte_carlo(found, study.title)
@@ -263,12 +247,8 @@ def montecarlo(given: options.MonteCarloCommand) -> Answer:
 
 def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
     """Of `monte_carlo`: those of the study, or in their place those of the command line."""
-    if not study.monte_carlo:
-        raise ValueError(f"the study '{given.study}' must have a [monte_carlo] table.")
     executor: Any = given.executor
     if given.scheduler is not None:
-        if executor != "dask":
-            raise ValueError(f"--scheduler needs --executor dask, but it is {executor}.")
         from jimpact.montecarlo.executors import DaskExecutor
 
         executor = DaskExecutor(given.scheduler)
@@ -282,9 +262,9 @@ def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
 SLOW_TO_COMPILE = ("tsit5", "kvaerno5")  # left to --full
 
 
-def chart(given: options.ChartCommand) -> Answer:
+def chart(given: options.ChartCommand, steps: Steps) -> Answer:
     """Speed against accuracy on one scene."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     law = _lzb(study)
     before, _ = _velocities(study, given)
@@ -296,6 +276,7 @@ def chart(given: options.ChartCommand) -> Answer:
         batch=given.batch,
         repeats=given.repeats,
         gradients=not given.no_gradients,
+        progress=TOLD,
     )
     picture = ji.plot.work_precision(found, study.title)
     return Answer(_titled(study, before), found.to_dict(), str(found), {path: picture})
@@ -328,13 +309,13 @@ QUICK_RESOLUTION, FULL_RESOLUTION, FULL_SAMPLES = 7, 9, 300
 TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
 
 
-def stability(given: options.StabilityCommand) -> Answer:
+def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
     """Maps of methods; the picture of single axes, and of pairs, one more beside it a method."""
-    path = _picture(given)
+    path = given.picture()
     size: dict[str, Any] = {"resolution": QUICK_RESOLUTION}
     if given.full:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
-    found = ji.stability_map(given.methods, **size, max_steps=STEPS)
+    found = ji.stability_map(given.methods, **size, max_steps=STEPS, progress=TOLD)
     pictures = {path: ji.plot.stability_map(found, TITLE)}
     for name in found.methods if given.full else ():
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
@@ -347,9 +328,9 @@ def stability(given: options.StabilityCommand) -> Answer:
 _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 
 
-def advise(given: options.AdviseCommand) -> Answer:
+def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
     """The simplest law that a scene needs."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     before, _ = _velocities(study, given)
     found = ji.advise(
@@ -359,6 +340,7 @@ def advise(given: options.AdviseCommand) -> Answer:
         stiffness_range=given.stiffness_range,
         samples=given.samples,
         seed=given.seed,
+        progress=TOLD,
         **_lzb_parameters(study),
     )
     picture = ji.plot.advice(found, study.title)
@@ -379,26 +361,22 @@ def _lzb_parameters(study: Study) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------- simulate
 
 
-def simulate(given: options.SimulateCommand) -> Answer:
+def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
     from jimpact.motion.study_motion import read_motion_study
 
-    portrait = None if given.portrait is None else _checked(given.portrait, "--portrait")
-    if given.gif is not None and given.gif.suffix != ".gif":
-        raise ValueError(f"--gif must end in .gif, but is '{given.gif}'.")
-    path = _picture(given)
-    if portrait == path:
-        raise ValueError(f"--portrait and --out must be two files, but are both '{path}'.")
+    path, portrait = given.picture(), given.portrait
     study = read_motion_study(given.study)
     system, title = study.system, study.title
-    with waiting("motion"):
+    with waiting("motion", TOLD):
         found = jax.block_until_ready(study.run(t_end=given.t_end, samples=given.samples))
+    steps("motion computed")
     pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
     if portrait is not None:
         which = None if given.coordinate is None else given.coordinate - 1
         pictures[portrait] = ji.plot.phase_portrait(found, which, title, system=system)
     if given.gif is not None:
-        pictures[given.gif] = partial(ji.plot.animation, system, found, title=title)
+        pictures[given.gif] = partial(ji.plot.animation, system, found, title=title, progress=TOLD)
     return Answer(title, found.to_dict(), str(found), pictures, _failure(found))
 
 
@@ -415,7 +393,7 @@ def _failure(motion: "ji.Motion") -> str:
 COLUMNS = ("parameters", "summary", "right_when", "fails_when", "source")
 
 
-def laws(given: options.LawsCommand) -> Answer:
+def laws(given: options.LawsCommand, steps: Steps) -> Answer:
     """The registry as a table, as JSON or as references."""
     if given.module is not None:
         import_laws(given.module, Path())
@@ -435,7 +413,7 @@ def laws(given: options.LawsCommand) -> Answer:
     return Answer("", rows, text.get().rstrip(), {})
 
 
-_COMMANDS: dict[str, Callable[[Any], Answer]] = {
+_COMMANDS: dict[str, Callable[[Any, Steps], Answer]] = {
     command.__name__: command
     for command in (fit, compare, montecarlo, chart, stability, advise, simulate, laws)
 }

@@ -1,12 +1,19 @@
-"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, a class a command."""
+"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, a class a command.
+
+`check` refuses what is wrong before JAX is imported, that is at once.
+"""
 
 import dataclasses
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
 
+from jimpact import study_file
+from jimpact._checks import check_choice
+
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
+PICTURES = (".png", ".pdf", ".svg")
 StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
 
 
@@ -16,11 +23,23 @@ class Command:
 
     json: bool = False
     """Print JSON instead of text."""
+    no_cache: bool = False
+    """Compile anew. Else compiled programs are kept in the user's cache folder, or in the
+    folder that the environment variable JIMPACT_CACHE names (empty: nowhere)."""
+
+    light: ClassVar[bool] = False  # has a `run` of its own, which does not need JAX
 
     @classmethod
     def name(cls) -> str:
         """The command's name."""
         return cls.__name__.removesuffix("Command").lower()
+
+    def check(self) -> None:
+        """Raise a ValueError or OSError for options or a study that are wrong."""
+
+    def kept(self) -> str:
+        """What is left of an interrupted command."""
+        return "Programs compiled so far are kept, nothing else." if not self.no_cache else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +49,33 @@ class DrawingCommand(Command):
     out: Path = Path()
     """Picture (.png, .pdf, .svg), or a directory for it; default: ./jimpact-<command>.png,
     with a study named ./jimpact-<command>-<study>.png. What is there is replaced, and told."""
+
+    def check(self) -> None:
+        """Also the picture's kind."""
+        self.picture()
+
+    def picture(self) -> Path:
+        """The file --out, or the command's own in the directory --out, named after the study."""
+        if self.out.suffix:
+            return checked_picture(self.out)
+        study, default = (getattr(x, "study", None) for x in (self, type(self)))
+        named = "" if study is None or study == default else f"-{study.stem}"
+        return self.out / f"jimpact-{self.name()}{named}.png"
+
+
+def checked_picture(path: Path, option: str = "--out") -> Path:
+    """The path of a picture; other endings are refused."""
+    if path.suffix not in PICTURES:
+        raise ValueError(
+            f"{option} must end in .png, .pdf or .svg or be a directory, but is '{path}'."
+        )
+    return path
+
+
+def check_methods(methods: tuple[str, ...] | None, known: tuple[str, ...]) -> None:
+    """Raise a ValueError unless all methods are known."""
+    for method in methods or ():
+        check_choice("methods", method, known)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +88,17 @@ class ShotCommand(DrawingCommand):
     """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
     shot: int = 1
     """Which measured shot, counted from 1."""
+
+    def check(self) -> None:
+        """Also the study, and whether it has velocities."""
+        super().check()
+        shots = study_file.check_study(self.study).shots
+        if self.velocity is not None:
+            return
+        if not shots:
+            raise ValueError("--velocity must be given, because the study has no [data].")
+        if not 1 <= self.shot <= shots:
+            raise ValueError(f"--shot must lie in [1, {shots}], but is {self.shot}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +115,12 @@ class FitCommand(DrawingCommand):
     """Number of starts; default: the study's, or 8."""
     seed: int | None = None
     """Seed of the random starts."""
+
+    def check(self) -> None:
+        """Also the study, which must have data."""
+        super().check()
+        if not study_file.check_study(self.study, self.law).shots:
+            raise ValueError(study_file.NO_DATA)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +150,20 @@ class MonteCarloCommand(DrawingCommand):
     keep_samples: bool = False
     """Keep the raw samples in the folder, too."""
 
+    def check(self) -> None:
+        """Also the study, which must say what is random."""
+        super().check()
+        if not study_file.check_study(self.study).sampled:
+            raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
+        if self.scheduler is not None and self.executor != "dask":
+            raise ValueError(f"--scheduler needs --executor dask, but it is {self.executor}.")
+
+    def kept(self) -> str:
+        """Finished chunks are."""
+        if self.folder is None:
+            return "Nothing is kept, because no --folder was given."
+        return f"Finished chunks are in '{self.folder}': the same command continues from there."
+
 
 @dataclasses.dataclass(frozen=True)
 class ChartCommand(ShotCommand):
@@ -103,6 +180,11 @@ class ChartCommand(ShotCommand):
     repeats: int = 5
     """Timings of each entry, taken in turn."""
 
+    def check(self) -> None:
+        """Also the methods' names."""
+        super().check()
+        check_methods(self.methods, tuple(study_file.names()["methods"]))
+
 
 @dataclasses.dataclass(frozen=True)
 class StabilityCommand(DrawingCommand):
@@ -112,6 +194,12 @@ class StabilityCommand(DrawingCommand):
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: bool = False
     """All pairs of axes, each method its own picture, and 300 points over all of them besides."""
+
+    def check(self) -> None:
+        """Also the methods' names."""
+        super().check()
+        batched = [name for name, jax in study_file.names()["methods"].items() if jax]
+        check_methods(self.methods, ("default", *batched))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +233,17 @@ class SimulateCommand(DrawingCommand):
     """Phase portrait (.png, .pdf, .svg)."""
     coordinate: int | None = None
     """Coordinate of the phase portrait, counted from 1; default: one that moves."""
+
+    def check(self) -> None:
+        """Also the other pictures and the study."""
+        super().check()
+        if self.portrait is not None:
+            checked_picture(self.portrait, "--portrait")
+        if self.gif is not None and self.gif.suffix != ".gif":
+            raise ValueError(f"--gif must end in .gif, but is '{self.gif}'.")
+        if self.portrait == (path := self.picture()):
+            raise ValueError(f"--portrait and --out must be two files, but are both '{path}'.")
+        study_file.check_motion_study(self.study)
 
 
 @dataclasses.dataclass(frozen=True)

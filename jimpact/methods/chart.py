@@ -142,7 +142,7 @@ def work_precision(
     batch: int = 256,
     repeats: int = 5,
     gradients: bool = True,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> WorkPrecision:
     """Error against time and against field evaluations of many ways to integrate one impact.
 
@@ -502,7 +502,7 @@ def _errors(case: Case, moment: Moment, truth: Moment) -> dict[str, float]:
 
 
 def _times(
-    rows: list[tuple[Programs, float | None]], repeats: int, progress: bool | None
+    rows: list[tuple[Programs, float | None]], repeats: int, progress: float | None
 ) -> list[list[Timing]]:
     """Single and batched time of every row, and with its gradient if it has one; all in turns."""
     tasks = []

@@ -201,7 +201,7 @@ def stability_map(
     *,
     max_steps: int = 10_000,
     seed: int = 0,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> StabilityMap:
     """Where methods integrate the LZB law rightly, and where they do not, over six axes.
 
