@@ -152,10 +152,10 @@ def test_proposition_6_4_and_remark_6_6():
 
 
 class Block:
-    """m = 1 [kg], 1 x 1.5 [m], flat on the ground: G, n_q^T H, t_q^T H and so on of (6.53)-(6.61)."""
+    """m = 1 [kg], 1 x 0.5 [m], flat on the ground: G, n_q^T H, t_q^T H and so on of (6.53)-(6.61)."""
 
     def __init__(self):
-        m, wide, high = 1.0, 1.0, 1.5
+        m, wide, high = 1.0, 1.0, 0.5
         self.mass = np.diag([m, m, m * (wide**2 + high**2) / 12])
         self.N = np.array([[0, 0], [1, 1], [-wide / 2, wide / 2]])
         self.H = np.array([[1, 1], [0, 0], [high / 2, high / 2]])
