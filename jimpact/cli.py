@@ -14,7 +14,7 @@ from typing import Any
 
 BAD_INPUT, FAILURE = 2, 1  # exit codes
 INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
-WORTH_KEEPING = "0.1"  # seconds of compiling; smaller programs are compiled anew
+WORTH_KEEPING = "0"  # seconds of compiling: also single operations, of which there are many
 SHOW_CURSOR = b"\r\n\x1b[?25h"  # which a progress bar had hidden
 
 WELCOME = """\

@@ -188,7 +188,7 @@ def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     study = read_study(given.study)
     before, measured = _velocities(study, given)
     laws, left_out = registered_laws(study.parameters)
-    with waiting("laws", TOLD):
+    with waiting("comparing laws", TOLD):
         found = ji.compare(study.scene, before, laws)
     steps(f"{len(laws)} laws compared")
     found = replace(found, left_out=left_out, measured=measured)
@@ -259,7 +259,8 @@ def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------ chart
 
-SLOW_TO_COMPILE = ("tsit5", "kvaerno5")  # left to --full
+QUICK = "\nThis is the quick look; --full does all of it."
+QUICK_METHODS = ("dop853", "rk4", "verlet", "impulse_euler", "scipy_dop853")
 
 
 def chart(given: options.ChartCommand, steps: Steps) -> Answer:
@@ -275,11 +276,12 @@ def chart(given: options.ChartCommand, steps: Steps) -> Answer:
         given.methods or _able(law, study, given.full),
         batch=given.batch,
         repeats=given.repeats,
-        gradients=not given.no_gradients,
+        gradients=given.full,
         progress=TOLD,
     )
     picture = ji.plot.work_precision(found, study.title)
-    return Answer(_titled(study, before), found.to_dict(), str(found), {path: picture})
+    text = str(found) + ("" if given.full or given.methods else QUICK)
+    return Answer(_titled(study, before), found.to_dict(), text, {path: picture})
 
 
 def _lzb(study: Study) -> ji.LZB:
@@ -291,14 +293,13 @@ def _lzb(study: Study) -> ji.LZB:
 
 
 def _able(law: ji.LZB, study: Study, full: bool) -> tuple[str, ...]:
-    """Methods that can solve the study's impact, without those that compile for long."""
+    """Methods that can solve the study's impact; without `full` those that compile soon."""
     from jimpact.methods.contenders import METHODS
 
-    left_out = () if full else SLOW_TO_COMPILE
     return tuple(
         name
         for name, method in METHODS.items()
-        if name not in left_out and method.supports(law, study.scene) is None
+        if (full or name in QUICK_METHODS) and method.supports(law, study.scene) is None
     )
 
 
@@ -312,15 +313,21 @@ TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at 
 def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
     """Maps of methods; the picture of single axes, and of pairs, one more beside it a method."""
     path = given.picture()
-    size: dict[str, Any] = {"resolution": QUICK_RESOLUTION}
-    if given.full:
+    if not given.full:  # three balls and no exponent 1: a program a method
+        from jimpact.methods.stability import default_axes
+
+        axes = default_axes(QUICK_RESOLUTION)
+        chosen = {name: values for name, values in axes.items() if name != "balls"}
+        size: dict[str, Any] = {"axes": chosen | {"exponent": axes["exponent"][1:]}}
+    else:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
     found = ji.stability_map(given.methods, **size, max_steps=STEPS, progress=TOLD)
     pictures = {path: ji.plot.stability_map(found, TITLE)}
     for name in found.methods if given.full else ():
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
         pictures[beside] = ji.plot.stability_pairs(found, name)
-    return Answer("", found.to_dict(), str(found), pictures)
+    text = str(found) + ("" if given.full else QUICK)
+    return Answer("", found.to_dict(), text, pictures)
 
 
 # ----------------------------------------------------------------------------------------- advise

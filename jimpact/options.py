@@ -170,11 +170,9 @@ class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
     methods: tuple[str, ...] | None = None
-    """Methods by name; default: those that the scene allows and that compile fast."""
+    """Methods by name; default: five that compile soon, as far as the scene allows."""
     full: bool = False
-    """The methods that compile slowly, too."""
-    no_gradients: bool = False
-    """Leave out the errors of the derivatives."""
+    """Every method, and the errors of the derivatives."""
     batch: int = 256
     """Impacts solved side by side."""
     repeats: int = 5
@@ -193,7 +191,8 @@ class StabilityCommand(DrawingCommand):
     methods: tuple[str, ...] | None = None
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: bool = False
-    """All pairs of axes, each method its own picture, and 300 points over all of them besides."""
+    """Also other numbers of balls and exponent 1, finer, all pairs of axes with a picture a method,
+    and 300 points over all axes besides."""
 
     def check(self) -> None:
         """Also the methods' names."""
