@@ -260,7 +260,8 @@ def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------ chart
 
 QUICK = "\nThis is the quick look; --full does all of it."
-QUICK_METHODS = ("dop853", "rk4", "verlet", "impulse_euler", "scipy_dop853")
+QUICK_METHODS = ("dop853", "verlet", "impulse_euler", "scipy_dop853")
+QUICK_LAWS = ("moreau", "binary")
 
 
 def chart(given: options.ChartCommand, steps: Steps) -> Answer:
@@ -274,9 +275,11 @@ def chart(given: options.ChartCommand, steps: Steps) -> Answer:
         before,
         law,
         given.methods or _able(law, study, given.full),
+        laws=None if given.full else _quick_laws(law),
         batch=given.batch,
         repeats=given.repeats,
         gradients=given.full,
+        durations=given.full,
         progress=TOLD,
     )
     picture = ji.plot.work_precision(found, study.title)
@@ -290,6 +293,11 @@ def _lzb(study: Study) -> ji.LZB:
         return study.law
     known = {"restitution": 1.0} | study.parameters
     return ji.LZB(**{key: known[key] for key in ji.REGISTRY["lzb"].parameters if key in known})
+
+
+def _quick_laws(law: ji.LZB) -> dict[str, ji.Law]:
+    known, _ = registered_laws({"restitution": law.restitution})
+    return {name: known[name] for name in QUICK_LAWS}
 
 
 def _able(law: ji.LZB, study: Study, full: bool) -> tuple[str, ...]:

@@ -170,9 +170,9 @@ class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
     methods: tuple[str, ...] | None = None
-    """Methods by name; default: five that compile soon, as far as the scene allows."""
+    """Methods by name; default: four that compile soon, as far as the scene allows."""
     full: bool = False
-    """Every method, and the errors of the derivatives."""
+    """Every method and algebraic law, durations, and the errors of the derivatives."""
     batch: int = 256
     """Impacts solved side by side."""
     repeats: int = 5

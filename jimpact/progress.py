@@ -102,7 +102,8 @@ def counting_bar(
 
         def tell() -> None:
             rate = new / max(time.perf_counter() - begin, 1e-9)
-            show(f"{done + new:,} of {total:,} {unit}, {rate:,.0f}/s", done + new, total)
+            fast = f", {rate:,.0f}/s" if rate >= 10 else ""
+            show(f"{done + new:,} of {total:,} {unit}{fast}", done + new, total)
 
         def advance(more: int) -> None:
             nonlocal new
