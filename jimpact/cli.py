@@ -20,18 +20,19 @@ SHOW_CURSOR = b"\r\n\x1b[?25h"  # which a progress bar had hidden
 WELCOME = """\
 jimpact: differentiable laws for impacts with several contacts.
 
-  jimpact fit                     fit a law to measured velocities (bundled: three balls)
-  jimpact compare                 every law on one impact, side by side
-  jimpact simulate                a whole motion (bundled: Newton's cradle)
-  jimpact montecarlo              random gaps, velocities and parameters
-  jimpact advise                  the simplest law and method that an impact needs
-  jimpact chart, stability        how exact, how fast, how safe the methods are
-  jimpact laws                    the laws: what they say, when they are right
+  jimpact fit          fit a law to measured velocities (bundled: three balls)
+  jimpact compare      every law on one impact, side by side
+  jimpact simulate     a whole motion (bundled: Newton's cradle)
+  jimpact montecarlo   random gaps, velocities and parameters
+  jimpact advise       the simplest law and method that an impact needs
+  jimpact chart        how exact and how fast the methods are
+  jimpact stability    where they fail
+  jimpact laws         what the laws say, and when they are right
 
-  jimpact new fit MY_FOLDER       a study, data and a notebook of your own to start from
-  jimpact fit MY_FOLDER/study.toml
+Your own data: `jimpact new fit` writes a study, a CSV file and a notebook to
+start from; then `jimpact fit my_fit/study.toml`.
 
-jimpact COMMAND --help tells all options, --version the version.
+`jimpact COMMAND --help` tells all options, `jimpact --version` the version.
 """
 
 
@@ -92,6 +93,9 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
         call.steps = Steps(call.name)
         failure = run(given, call.steps)
         return call.refused(failure, FAILURE) if failure else 0
+    except BrokenPipeError:  # whoever read has read enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except (ValueError, TypeError, OSError, ImportError) as error:
         return call.refused(error, BAD_INPUT)
     except RuntimeError as error:

@@ -5,18 +5,17 @@ Public names are taken from `jimpact` itself, so that a command imports no more 
 
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from json import dumps
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 import jimpact as ji
 from jimpact import options
@@ -24,6 +23,7 @@ from jimpact.comparison import registered_laws
 from jimpact.fits.fitting import Fit
 from jimpact.progress import LONG, Steps, waiting
 from jimpact.records import as_data, table
+from jimpact.starting import as_csv, fitting
 from jimpact.study import Study, import_laws, read_study
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 
 DPI = 150
 TOLD = LONG  # seconds after which work is told, also where no one looks at a terminal
+
+
+Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 
 
 class Answer(NamedTuple):
@@ -41,6 +44,8 @@ class Answer(NamedTuple):
     text: str
     pictures: Mapping[Path, "Figure | Callable[[Path], Any]"]  # to be saved, or what draws it
     failure: str = ""
+    table: Table | None = None  # for --csv
+    printed: bool = False  # the text is what was asked for, be it JSON
 
 
 def run(given: options.Command, steps: Steps) -> str:
@@ -58,12 +63,17 @@ def run(given: options.Command, steps: Steps) -> str:
             path.write_bytes(whole.getvalue())
         steps(f"picture {path}")
     pictures = [str(path) for path in answer.pictures]
-    if given.json:
+    if answer.printed:
+        print(answer.text)
+    elif given.csv:
+        assert answer.table is not None  # every command has one
+        print(as_csv(*answer.table))
+    elif given.json:
         about = {"title": answer.title, "pictures": pictures} if pictures else {}
         print(dumps(about | answer.data, indent=2))
     else:
         lines = [answer.title, answer.text, *(f"Picture: {path}" for path in pictures)]
-        print("\n".join(line for line in lines if line))
+        print("\n".join(fitting(line) for line in lines if line))
     for path in replaced:
         print(f"jimpact {given.name()}: {path} was there before: replaced.", file=sys.stderr)
     return answer.failure
@@ -98,7 +108,13 @@ def fit(given: options.FitCommand, steps: Steps) -> Answer:
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     picture = ji.plot.fit(fits[RAW], others, study.title)
     text = "\n".join([*_summary(fits), "", str(fits[RAW]), ""])
-    return Answer(study.title, as_data({"fits": fits}), text, {path: picture})
+    heads = ["fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank"]
+    rows = [
+        [what, type(x.law).__name__, name, x.value[i], x.standard_error[i], x.rms, x.rank]
+        for what, x in fits.items()
+        for i, name in enumerate(x.names)
+    ]
+    return Answer(study.title, as_data({"fits": fits}), text, {path: picture}, table=(heads, rows))
 
 
 def _all_fits(study: Study, options: dict[str, Any], steps: Steps) -> dict[str, Fit]:
@@ -203,7 +219,12 @@ def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     ]
     data = {"velocity": before, "laws": found, "fits": fits, "left_out": left_out}
     picture = ji.plot.comparison(found, measured, study.title)
-    return Answer(_titled(study, before), as_data(data), "\n".join(lines), {path: picture})
+    bodies = [f"v_{i + 1}_plus" for i in range(len(before))]
+    heads = ["law", *bodies, "energy_ratio", "dispersion", "time_s", "audit"]
+    told = attrgetter("energy_ratio", "dispersion_index", "time", "verdict")
+    rows = [[name, *np.asarray(x.outcome.velocity), *told(x)] for name, x in found.entries.items()]
+    text = "\n".join(lines)
+    return Answer(_titled(study, before), as_data(data), text, {path: picture}, table=(heads, rows))
 
 
 def _fits_of_all(study: Study, steps: Steps) -> dict[str, Fit]:
@@ -242,7 +263,10 @@ def montecarlo(given: options.MonteCarloCommand, steps: Steps) -> Answer:
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
     picture = ji.plot.monte_carlo(found, study.title)
-    return Answer(study.title, found.to_dict(), str(found), {path: picture})
+    columns = found.mean, found.standard_error, found.std, found.minimum, found.maximum
+    heads = ["coordinate", "mean", "standard_error", "std", "least", "largest"]
+    rows = [[i + 1, *row] for i, row in enumerate(zip(*columns))]
+    return Answer(study.title, found.to_dict(), str(found), {path: picture}, table=(heads, rows))
 
 
 def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
@@ -284,7 +308,17 @@ def chart(given: options.ChartCommand, steps: Steps) -> Answer:
     )
     picture = ji.plot.work_precision(found, study.title)
     text = str(found) + ("" if given.full or given.methods else QUICK)
-    return Answer(_titled(study, before), found.to_dict(), text, {path: picture})
+    from jimpact.methods.chart import QUANTITIES
+
+    heads = ["method", "setting", *QUANTITIES, "evaluations", "alone_s", "batch_s", "status"]
+    told = attrgetter("evaluations", "single.median", "batched.median", "status")
+    rows = [
+        [name, x.setting, *(x.error[q] for q in QUANTITIES), *told(x)]
+        for name, points in found.points.items()
+        for x in points
+    ]
+    title = _titled(study, before)
+    return Answer(title, found.to_dict(), text, {path: picture}, table=(heads, rows))
 
 
 def _lzb(study: Study) -> ji.LZB:
@@ -335,7 +369,9 @@ def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
         pictures[beside] = ji.plot.stability_pairs(found, name)
     text = str(found) + ("" if given.full else QUICK)
-    return Answer("", found.to_dict(), text, pictures)
+    counts = [[name, *found.counts(name).values()] for name in found.methods]
+    table = ["method", *found.counts(found.methods[0])], counts
+    return Answer("", found.to_dict(), text, pictures, table=table)
 
 
 # ----------------------------------------------------------------------------------------- advise
@@ -359,7 +395,9 @@ def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
         **_lzb_parameters(study),
     )
     picture = ji.plot.advice(found, study.title)
-    return Answer(_titled(study, before), found.to_dict(), str(found), {path: picture})
+    title, heads = _titled(study, before), ["law", "worst", "chosen"]
+    rows = [[name, x.worst, name == found.name] for name, x in found.candidates.items()]
+    return Answer(title, found.to_dict(), str(found), {path: picture}, table=(heads, rows))
 
 
 def _lzb_parameters(study: Study) -> dict[str, Any]:
@@ -392,7 +430,9 @@ def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
         pictures[portrait] = ji.plot.phase_portrait(found, which, title, system=system)
     if given.gif is not None:
         pictures[given.gif] = partial(ji.plot.animation, system, found, title=title, progress=TOLD)
-    return Answer(title, found.to_dict(), str(found), pictures, _failure(found))
+    heads = ["time [s]", *system.body.names, *system.body.velocity_names]
+    table = heads, np.column_stack([found.time, found.q, found.velocity]).tolist()
+    return Answer(title, found.to_dict(), str(found), pictures, _failure(found), table)
 
 
 def _failure(motion: "ji.Motion") -> str:
@@ -405,27 +445,18 @@ def _failure(motion: "ji.Motion") -> str:
 
 # ------------------------------------------------------------------------------------------- laws
 
-COLUMNS = ("parameters", "summary", "right_when", "fails_when", "source")
-
 
 def laws(given: options.LawsCommand, steps: Steps) -> Answer:
-    """The registry as a table, as JSON or as references."""
-    if given.module is not None:
-        import_laws(given.module, Path())
-    rows = {name: {k: getattr(row, k) for k in COLUMNS} for name, row in ji.REGISTRY.items()}
-    if given.bibtex:
+    """The registry with the laws of a module; without one `LawsCommand.run` does it."""
+    assert given.module is not None
+    import_laws(given.module, Path())
+    if given.bibtex and not given.json:
         entries = dict.fromkeys(row.bibtex for row in ji.REGISTRY.values())
-        return Answer("", rows, "\n\n".join(entries), {})
-    told = Table()
-    for title in ("law", "parameters", "says", "right when", "fails when"):
-        told.add_column(title, overflow="fold")
-    for name, row in ji.REGISTRY.items():
-        parameters = ", ".join(row.parameters)
-        told.add_row(name, parameters, row.summary, row.right_when, row.fails_when)
-    console = Console()
-    with console.capture() as text:
-        console.print(told)
-    return Answer("", rows, text.get().rstrip(), {})
+        return Answer("", {}, "\n\n".join(entries), {})
+    rows = {
+        name: row._asdict() | {"parameters": row.parameters} for name, row in ji.REGISTRY.items()
+    }
+    return Answer("", {}, given.listed(rows), {}, printed=True)
 
 
 _COMMANDS: dict[str, Callable[[Any, Steps], Answer]] = {

@@ -4,12 +4,15 @@
 """
 
 import dataclasses
+import json
+from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from jimpact import study_file
+from jimpact import starting, study_file
 from jimpact._checks import check_choice
 
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
@@ -23,11 +26,16 @@ class Command:
 
     json: bool = False
     """Print JSON instead of text."""
+    csv: bool = False
+    """Print the table as CSV instead of text."""
     no_cache: bool = False
     """Compile anew. Else compiled programs are kept in the user's cache folder, or in the
     folder that the environment variable JIMPACT_CACHE names (empty: nowhere)."""
 
-    light: ClassVar[bool] = False  # has a `run` of its own, which does not need JAX
+    @property
+    def light(self) -> bool:
+        """Whether it has a `run` of its own, which does not need JAX."""
+        return False
 
     @classmethod
     def name(cls) -> str:
@@ -36,6 +44,8 @@ class Command:
 
     def check(self) -> None:
         """Raise a ValueError or OSError for options or a study that are wrong."""
+        if self.json and self.csv:
+            raise ValueError("--json and --csv must not both be given.")
 
     def kept(self) -> str:
         """What is left of an interrupted command."""
@@ -52,6 +62,7 @@ class DrawingCommand(Command):
 
     def check(self) -> None:
         """Also the picture's kind."""
+        super().check()
         self.picture()
 
     def picture(self) -> Path:
@@ -254,8 +265,68 @@ class LawsCommand(Command):
     bibtex: bool = False
     """Print the references as BibTeX."""
 
+    @property
+    def light(self) -> bool:
+        """Those of the package are known without JAX."""
+        return self.module is None
 
-COMMANDS: tuple[type[Command], ...] = (
+    def run(self) -> int:
+        """Print them."""
+        if self.bibtex and not self.json:
+            bundled = files("jimpact") / "data" / "laws.bib"
+            print(bundled.read_text(encoding="utf-8").strip())
+        else:
+            print(self.listed(study_file.names()["laws"]))
+        return 0
+
+    def listed(self, laws: Mapping[str, Mapping[str, Any]]) -> str:
+        """The laws as text, JSON or CSV."""
+        keys = ("parameters", "summary", "right_when", "fails_when", "source")
+        rows = {name: {key: row[key] for key in keys} for name, row in laws.items()}
+        if self.json:
+            return json.dumps(rows, indent=2)
+        if self.csv:
+            lines = [
+                [name, " ".join(row["parameters"]), *[*row.values()][1:]]
+                for name, row in rows.items()
+            ]
+            return starting.as_csv(["law", *keys], lines)
+        return starting.laws_as_text(rows)
+
+
+@dataclasses.dataclass(frozen=True)
+class NewCommand:
+    """Begin a study of your own: a commented study file, data where it needs some, a notebook."""
+
+    kind: Annotated[Literal["fit", "compare", "montecarlo", "simulate"], tyro.conf.Positional]
+    """What the study is for."""
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
+    """Where it is written; default: ./my_<kind>. What is there is never replaced."""
+
+    light: ClassVar[bool] = True
+
+    @classmethod
+    def name(cls) -> str:
+        """The command's name."""
+        return "new"
+
+    def check(self) -> None:
+        """Nothing to refuse beforehand."""
+
+    def kept(self) -> str:
+        """Files are written whole or not at all."""
+        return ""
+
+    def run(self) -> int:
+        """Write the files, and say what comes next."""
+        folder = self.folder or Path(f"my_{self.kind}")
+        for path in starting.begin(self.kind, folder):
+            print(f"written: {path}")
+        print(f"Next: jimpact {self.kind} {folder / 'study.toml'}")
+        return 0
+
+
+COMMANDS: tuple[type[Command] | type[NewCommand], ...] = (
     FitCommand,
     CompareCommand,
     MonteCarloCommand,
@@ -264,4 +335,5 @@ COMMANDS: tuple[type[Command], ...] = (
     AdviseCommand,
     SimulateCommand,
     LawsCommand,
+    NewCommand,
 )

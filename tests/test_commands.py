@@ -1,5 +1,6 @@
 """One end-to-end call a command; what is refused is one line on stderr and exit code 2."""
 
+import csv
 import json
 import os
 import re
@@ -12,6 +13,8 @@ from importlib.resources import files
 from pathlib import Path
 
 import names
+import nbclient
+import nbformat
 import numpy as np
 import pytest
 
@@ -177,6 +180,9 @@ def test_compare(tmp_path, capsys):
     np.testing.assert_allclose(told["laws"]["moreau"]["velocity"], [-0.3, 0.65, 0.65], atol=1e-12)
     assert set(told["laws"]) >= {"lzb", "newton", "moreau", "poisson", "binary"}
     assert (tmp_path / "jimpact-compare.png").stat().st_size > 10_000
+    code, said = call(capsys, "compare", "--csv", "--out", tmp_path / "b.png")
+    (row,) = [x for x in csv.DictReader(said.out.splitlines()) if x["law"] == "moreau"]
+    np.testing.assert_allclose(float(row["v_3_plus"]), 0.65, atol=1e-12)
     code, said = call(capsys, "compare", "--velocity", "2", "0", "0", "--out", tmp_path / "a.svg")
     assert code == 0
     assert "measured" not in said.out
@@ -490,9 +496,56 @@ def test_stability(tmp_path, capsys):
     assert json.loads(said.out)["methods"]["verlet"]["counts"]["right"] > 3
 
 
-def test_laws(capsys):
-    assert "restitution" in call(capsys, "laws")[1].out
+def test_bare_call_greets(capsys):
+    code, said = call(capsys)
+    assert code == 0
+    for verb in (*VERBS, "new", "laws"):
+        assert f"{verb}" in said.out
+    assert max(map(len, said.out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("kind", ["fit", "compare", "montecarlo", "simulate"])
+def test_a_study_of_ones_own(tmp_path, capsys, kind):
+    """What `jimpact new` writes is read, runs up to the numbers, and is never replaced."""
+    code, said = call(capsys, "new", kind)
+    assert (code, f"Next: jimpact {kind} my_{kind}" in said.out) == (0, True)
+    study = tmp_path / f"my_{kind}" / "study.toml"
+    if kind == "simulate":
+        assert read_motion_study(study).title
+    else:
+        found = read_study(study)
+        assert (found.experiments is None) == (kind == "montecarlo")
+    cells = nbformat.read(study.with_suffix(".ipynb"), as_version=4).cells
+    code_cells = [cell.source for cell in cells if cell.cell_type == "code"]
+    for source in code_cells:
+        for name in re.findall(r"\bji\.(\w+)", source):
+            assert hasattr(ji, name)
+    code, said = call(capsys, "new", kind)
+    assert code == 2
+    assert "must not exist" in said.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fit", "compare", "montecarlo", "simulate"])
+def test_the_notebook_of_a_study_of_ones_own_runs(tmp_path, capsys, kind):
+    assert call(capsys, "new", kind, ".")[0] == 0
+    place = {"metadata": {"path": str(tmp_path)}}
+    notebook = nbformat.read(tmp_path / "study.ipynb", as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=place).execute()
+
+
+def test_laws(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    told = call(capsys, "laws")[1].out
+    assert "restitution" in told
+    assert max(map(len, told.splitlines())) <= 80
     assert set(json.loads(call(capsys, "laws", "--json")[1].out)) == set(ji.REGISTRY)
+    rows = list(csv.DictReader(call(capsys, "laws", "--csv")[1].out.splitlines()))
+    assert [row["law"] for row in rows] == list(ji.REGISTRY)
+    assert rows[0]["source"] == ji.REGISTRY["lzb"].source
+    (tmp_path / "empty_module.py").write_text("")
+    again = call(capsys, "laws", "--module", str(tmp_path / "empty_module.py"))[1].out
+    assert again == told
     assert call(capsys, "laws", "--bibtex")[1].out.count("@book{brogliato2016") == 1
 
 
@@ -501,6 +554,7 @@ def test_laws(capsys):
     [
         (["fit", "nowhere.toml"], "Study 'nowhere.toml' does not exist"),
         (["fit", "--out", "fit.docx"], "--out must end in .png, .pdf or .svg"),
+        (["fit", "--json", "--csv"], "--json and --csv must not both be given"),
         (["fit", "--law", "aristotle"], "the law must be one of"),
         (["compare", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["compare", "--velocity", "1", "0"], "`velocity` must have shape (3,)"),

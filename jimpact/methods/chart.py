@@ -122,7 +122,7 @@ class WorkPrecision:
             f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items() if not np.isnan(v)
         )
         lines = [
-            *table(heads, rows, left=["status"]),
+            *table(heads, rows, left=["status"], keys=2),
             f"Reference: {self.reference.how}; uncertain by {uncertain}.",
             f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; of a law its model error.",
