@@ -1,9 +1,8 @@
 """Strict JAX flags for every test, and the count of the programs that the tests compile.
 
-Compiling is what the suite's time goes into. So the default suite compiles with little
-optimization, in half the time (`programs.values`, the held values, and the slow tests with all of
-it). A session tells the tests that compile most; one of the whole default suite fails beyond
-BUDGET programs.
+Compiling is what the suite's time goes into. So tests compile with little optimization, in half the
+time (`programs.values` and the held values with all of it). A session tells the tests that compile
+most; one of the whole default suite fails beyond BUDGET programs.
 """
 
 import os
@@ -72,9 +71,8 @@ def compiled(event, duration, **_):
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
     jax.monitoring.register_event_duration_secs_listener(compiled)
-    quick = config.option.markexpr == "not slow"
-    jax.config.update("jax_disable_most_optimizations", quick)
-    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(quick)  # for what tests run as commands
+    jax.config.update("jax_disable_most_optimizations", True)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "True"  # for what tests run as commands
     if hasattr(config, "workerinput"):
         return
     config.pluginmanager.register(Workers())

@@ -80,7 +80,8 @@ def test_chart_in_words_and_picture(chart):
 @pytest.mark.slow
 def test_gradients_and_the_other_methods():
     linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
-    found = ji.work_precision(BALLS, STRIKE, linear, laws={}, batch=8, repeats=1)
+    others = ("verlet", "impulse_rk4", "tsit5", "scipy_lsoda")  # and one of each kind
+    found = ji.work_precision(BALLS, STRIKE, linear, others, laws={}, batch=8, repeats=1)
     assert not found.left_out
     assert found.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
     for name, row in found.points.items():
@@ -165,12 +166,8 @@ def check_hypercube(n, steps):
     return np.mean(~told)
 
 
-@pytest.mark.parametrize(
-    ("n", "share"),
-    [(3, 0.6), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((6, 0.3), (20, 0.1)))],
-)
-def test_right_or_flagged(n, share):
-    assert check_hypercube(n, STEPS) > share  # and not all flagged
+def test_right_or_flagged():
+    assert check_hypercube(3, STEPS) > 0.6  # and not all flagged
 
 
 @pytest.mark.slow
