@@ -63,7 +63,7 @@ def simulate(
     closed_below: float = CLOSED_BELOW,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
@@ -179,14 +179,14 @@ def _on_host(given: Any) -> bool:
     return not is_traced(given) and is_own(())
 
 
-def _waited(run: Callable[..., Motion], given: Any, progress: bool | None) -> Motion:
+def _waited(run: Callable[..., Motion], given: Any, progress: float | None) -> Motion:
     if not _on_host(given):
         return run(*given)
     with waiting("motion", progress):
         return jax.block_until_ready(run(*given))
 
 
-def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: bool | None) -> Motion:
+def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: float | None) -> Motion:
     """The motion in runs of `CHUNK` events, each of which goes on where the last one ended."""
     system, *_, q, v, start, end = given
     numbers: Any = no_past(q, v, _contacts_of(system, q), samples)
