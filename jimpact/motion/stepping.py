@@ -164,7 +164,7 @@ class _Tried(NamedTuple):
     force: jax.Array
     found: Many
     gains: jax.Array  # () whether the impulses give energy
-    count: jax.Array  # () of tries
+    tries: jax.Array  # () so far, this one included
 
 
 class _Progress(NamedTuple):
@@ -338,7 +338,7 @@ def _one_step(
         """The step with the forces at its mean velocity, as far as that is known."""
         force, free = pushed(tried.mean)
         pulled = rates + h * close.rates(free)
-        goal = pulled + jnp.where(tried.count < least, wanted, against_mean)
+        goal = pulled + jnp.where(tried.tries < least, wanted, against_mean)
         found = solve_many(
             close.product,
             close.diagonal,
@@ -353,10 +353,10 @@ def _one_step(
         after = pulled + close.product(found.impulse)
         gained = 0.5 * jnp.vdot(found.impulse, rates + after)
         gains = gained > (noise + found.missed) * jnp.sum(jnp.abs(found.impulse))
-        return _Tried(v, 0.5 * (state.v + v), force, found, gains, tried.count + 1)
+        return _Tried(v, 0.5 * (state.v + v), force, found, gains, tried.tries + 1)
 
     def goes_on(tried: _Tried) -> jax.Array:
-        return (tried.count < least) | (tried.gains & (tried.count < 2 * least))
+        return (tried.tries < least) | (tried.gains & (tried.tries < 2 * least))
 
     begun = Many(close.recall(course.memory), 0 * speed, 0 * speed, jnp.int32(0), course.steepness)
     start = _Tried(
