@@ -213,7 +213,8 @@ def time_stepping(
     m = recorded_gaps(system, q0, times[0]).shape[0]
 
     def rates_at(q: jax.Array) -> jax.Array:
-        return _contacts(system, q, times[0], closed_below, mu is not None).rates(v0)
+        t = times[0]
+        return _contacts(system, q, t, q, t, closed_below, mu is not None).rates(v0)
 
     contacts, b = jax.eval_shape(rates_at, q0).shape
     kept = _numbers(system.body) if isinstance(system.body, Discs) else contacts
@@ -261,13 +262,19 @@ def _numbers(pile: Discs) -> int:
 
 
 def _contacts(
-    system: System, q: jax.Array, t: jax.Array, closed_below: jax.Array, friction: bool
+    system: System,
+    q: jax.Array,
+    t: jax.Array,
+    q_end: jax.Array,
+    t_end: jax.Array,
+    closed_below: jax.Array,
+    friction: bool,
 ) -> _Few | _Heap:
-    """The contacts of a step whose middle is at (q, t)."""
-    at = seen_from_base(system, q, t)
+    """The contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end."""
+    at, end = seen_from_base(system, q, t), seen_from_base(system, q_end, t_end)
     mass = mass_at(system, q)
     if isinstance(system.body, Discs):
-        near = system.body.near(at, closed_below)
+        near = system.body.near(at, end, closed_below)
         near = near if friction else near._replace(directions=near.directions[:, :1])
         return _Heap(near, jnp.pad(1 / mass.reshape(-1, 3), ((0, 1), (0, 0))))
     given = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
@@ -278,7 +285,8 @@ def _contacts(
         sides = system.body.tangents(at)
         assert sides is not None
         directions = jnp.concatenate([directions, sides.reshape(n, m, -1)], axis=2)
-    there = ~(gap > closed_below)  # NaN does not pass for open
+    least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))
+    there = ~(least > closed_below)  # NaN does not pass for open
     directions = jnp.where(there[:, None], directions, 0.0)
     moved = solve_mass(mass, directions.reshape(n, -1)).reshape(directions.shape)
     return _Few(there, directions, moved, jnp.tensordot(directions, moved, axes=([0], [0])))
@@ -297,7 +305,6 @@ def _one_step(
     state, dtype, body = course.state, course.state.q.dtype, system.body
     middle = t + 0.5 * h
     q = body.moved(state.q, 0.5 * h * state.v)
-    close = _contacts(system, q, middle, closed_below, mu is not None)
     carried = carried_along(system, state.v, middle)
     mass = mass_at(system, q)
 
@@ -307,6 +314,8 @@ def _one_step(
         return force, free_acceleration(system, q, v, force, mass)
 
     free_before = pushed(state.v)[1]
+    falls = body.moved(q, 0.5 * h * (state.v + h * free_before))
+    close = _contacts(system, q, middle, falls, t + h, closed_below, mu is not None)
     before = close.rates(state.v - carried)
     eps = float(jnp.finfo(dtype).eps)
     speed = jnp.maximum(course.speed, close.fastest(state.v))
