@@ -391,8 +391,7 @@ def simulate(given: options.SimulateCommand) -> Answer:
         raise ValueError(f"--portrait and --out must be two files, but are both '{path}'.")
     study = read_motion_study(given.study)
     system, title = study.system, study.title
-    with waiting("motion"):
-        found = jax.block_until_ready(study.run(t_end=given.t_end, samples=given.samples))
+    found = jax.block_until_ready(study.run(t_end=given.t_end, samples=given.samples))
     pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
     if portrait is not None:
         which = None if given.coordinate is None else given.coordinate - 1

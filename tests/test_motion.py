@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from programs import OPTIMIZED
+from programs import OPTIMIZED, both_ways
 
 import jimpact as ji
 from jimpact.motion import event_driven
@@ -272,29 +272,25 @@ def test_ball_leaves_a_vibrating_plate():
     np.testing.assert_allclose(np.asarray(motion.q)[together, 0], plate[together], atol=1e-13)
 
 
+def on_slope(angle, speed, mu, corners="all"):
+    weights = G * jnp.stack([-jnp.sin(angle), jnp.cos(angle), jnp.zeros_like(angle)])
+    block = ji.block_system(0.2, 0.4, corners=corners)
+    system = ji.System(
+        block.gap_function,
+        block.mass,
+        potential=type(ji.gravity([0.0]))(weights),
+        tangent_function=block.tangent_function,
+    )
+    v0 = jnp.stack([speed, 0 * speed, 0 * speed])
+    return ji.simulate(system, ji.Moreau(0.0), [0.0, 0.2, 0.0], v0, 1.0, samples=21, friction=mu)
+
+
 @pytest.fixture(scope="module")
 def slides():
     """A block on a slope: slides to stick; is held; slips; tips about its corner."""
     rows = [(0.0, 1.0, 0.3), (np.arctan(0.29), 0.0, 0.3), (np.arctan(0.31), 0.0, 0.3)]
     rows += [(np.arctan(0.6), 0.0, 2.0)]
-
-    @jax.jit
-    @jax.vmap
-    def run(angle, speed, mu):
-        weights = G * jnp.stack([-jnp.sin(angle), jnp.cos(angle), jnp.zeros_like(angle)])
-        block = ji.block_system(0.2, 0.4)
-        system = ji.System(
-            block.gap_function,
-            block.mass,
-            potential=type(ji.gravity([0.0]))(weights),
-            tangent_function=block.tangent_function,
-        )
-        v0 = jnp.stack([speed, 0 * speed, 0 * speed])
-        return ji.simulate(
-            system, ji.Moreau(0.0), [0.0, 0.2, 0.0], v0, 1.0, samples=21, friction=mu
-        )
-
-    return run(*np.array(rows, float).T)
+    return jax.jit(jax.vmap(on_slope))(*np.array(rows, float).T)
 
 
 def test_sliding_block_comes_to_stick(slides):
@@ -314,6 +310,25 @@ def test_stick_and_slip_on_a_slope(slides):
     x = 0.5 * G * (np.sin(angle) - 0.3 * np.cos(angle))
     np.testing.assert_allclose(slips.q[-1], [x, 0.2, 0.0], atol=1e-12)
     np.testing.assert_allclose(slips.ledger_residual, 0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_block_that_comes_to_stick():
+    """Where it stops, when, and what friction took, in both modes."""
+
+    def found(x):
+        motion = on_slope(*x, corners="base")
+        return jnp.stack([motion.q[-1, 0], motion.events.time[0], motion.contact_work[-1].sum()])
+
+    def exact(x):
+        angle, speed, mu = x
+        slowing = G * (mu * jnp.cos(angle) - jnp.sin(angle))
+        way = speed**2 / (2 * slowing)
+        return jnp.stack([way, speed / slowing, -mu * G * jnp.cos(angle) * way])
+
+    x = jnp.array([0.1, 1.0, 0.3])
+    for slopes in both_ways(found)(x):
+        np.testing.assert_allclose(slopes, jax.jit(jax.jacfwd(exact))(x), rtol=1e-11)
 
 
 def test_block_tips_about_its_corner(slides):
@@ -437,7 +452,11 @@ def discs_in_a_box(n, columns, duration, step, samples):
 
 
 @pytest.mark.parametrize(
-    ("n", "columns", "duration"), [(30, 6, 1.0), pytest.param(150, 12, 1.5, marks=pytest.mark.slow)]
+    ("n", "columns", "duration"),
+    [
+        (30, 6, 1.0),
+        pytest.param(300, 18, 2.0, marks=[pytest.mark.slow, pytest.mark.long_run]),
+    ],
 )
 def test_discs_fall_into_a_box_and_come_to_rest(n, columns, duration):
     motion = discs_in_a_box(n, columns, duration, 1e-3, 21)
