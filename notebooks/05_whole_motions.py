@@ -78,8 +78,8 @@ ji.plot.phase_portrait(motion, title="Bouncing ball, e = 0.8")
 # angular velocity. It must not slip: friction at rest is part of the motion. The base swings with
 # 2 Hz and a given acceleration, in multiples of g. One batch answers for a tilted block on a still
 # base and for one that stands on a shaken base, for many accelerations at once. Below width / height
-# nothing happens. (Overturned means beyond pi / 2: the other two corners are no contacts of this
-# system.)
+# nothing happens. The upper corners are no contacts of this system: a motion in which one of them
+# reaches the ground ends there, `out_of_range`, and the block is overturned.
 
 # %%
 e = ji.theory.housner_restitution(3.0)
@@ -104,8 +104,14 @@ print(free)
 ji.plot.phase_portrait(free, 2, "Free rocking, angle")
 
 # %%
-for level, angle in zip(levels[1:], np.nanmax(np.abs(motions.q[1:, :, 2]), axis=1)):
-    told = "overturns" if angle > np.pi / 2 else f"at most {np.degrees(angle):.2f} degrees"
+for i, level in enumerate(levels[1:], 1):
+    lane = jax.tree.map(lambda x, i=i: x[i], motions)
+    most = np.degrees(np.nanmax(np.abs(lane.q[:, 2])))
+    told = (
+        "overturns"
+        if lane.to_dict()["status"] == "out_of_range"
+        else f"at most {most:.2f} degrees"
+    )
     print(f"{level:.1f} g: {told}")
 
 # %% [markdown]
