@@ -59,11 +59,11 @@ def no_jump(state: State, m: int) -> Jump:
 
 
 def scene_at(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
-    """The scene that a law sees: normals and tangents at q, gaps 0 where `closed`."""
+    """The scene that a law sees: normals and tangents at q; open contacts are out of reach."""
     normal = kinematics(system, q, v, t)
     tangents = system.body.tangents(seen_from_base(system, q, t))
-    open_gaps = jnp.where(closed, 0.0, jnp.maximum(gaps(system, q, t), 0.0))
-    return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
+    away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
+    return Scene(mass_at(system, q), normal.gradient, tangents, away)
 
 
 def impact_jump(
@@ -183,7 +183,7 @@ def resolve(
     else:
         nested = closed & strikes & _share_bodies(given, closed | struck)
         nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
-        both = jax.vmap(resting)(jnp.stack([slow, slow | nested]))
+        both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
         found, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
         found = selected(_undisturbed(system, given, cluster, tight, t), cluster, found)
     jump, held, pressed = found.jump, found.held, found.pressed
