@@ -9,7 +9,6 @@ from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.motion.dynamics import (
     carried_along,
-    gaps,
     kinematics,
     kinetic,
     mass_at,
