@@ -63,7 +63,7 @@ def simulate(
     closed_below: float = CLOSED_BELOW,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
@@ -155,14 +155,15 @@ def simulate(
     if method == "time_stepping":
         substeps = _substeps_of(step, t_start, t_end, count)
         joint = joins_step(law) and friction is None
-        if is_pile(system) and not joint:
+        if joint:
+            _check_coefficients(system, law, q)
+        elif is_pile(system):
             raise ValueError(
-                "Argument `law` must be Moreau's, with its own `friction`, one `restitution` and "
-                "no `tangential_restitution`, for the many contacts of "
-                f"{type(system.body).__name__}, but is {law!r}."
+                "Argument `law` must be Moreau's, with its own `friction` and without a matrix, "
+                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
             )
-        sizes = count, substeps, joint, rows
-        given: Any = system, law, mu, q, v, start, end, settings.closed_below, *sizes
+        below = settings.closed_below
+        given: Any = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
         return _waited(_stepped, given, progress)
     if method == "contact_forces":
         force = _force_of(law, mu)
@@ -179,14 +180,14 @@ def _on_host(given: Any) -> bool:
     return not is_traced(given) and is_own(())
 
 
-def _waited(run: Callable[..., Motion], given: Any, progress: bool | None) -> Motion:
+def _waited(run: Callable[..., Motion], given: Any, progress: float | None) -> Motion:
     if not _on_host(given):
         return run(*given)
     with waiting("motion", progress):
         return jax.block_until_ready(run(*given))
 
 
-def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: bool | None) -> Motion:
+def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: float | None) -> Motion:
     """The motion in runs of `CHUNK` events, each of which goes on where the last one ended."""
     system, *_, q, v, start, end = given
     numbers: Any = no_past(q, v, _contacts_of(system, q), samples)
@@ -249,8 +250,8 @@ def _stepped(
     start: jax.Array,
     end: jax.Array,
     closed_below: jax.Array,
+    substeps: jax.Array,
     samples: int,
-    substeps: int,
     joint: bool,
     max_events: int,
 ) -> Motion:
@@ -426,6 +427,17 @@ def _friction_of(
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
 
 
+def _check_coefficients(system: System, law: Law, q: jax.Array) -> None:
+    """One value of each for all contacts, or one a contact; of a pile one."""
+    m = _contacts_of(system, q)
+    for name in ("restitution", "tangential_restitution"):
+        value = getattr(law, name)
+        if is_pile(system):
+            check_shape(name, value, (), "one for all contacts of a pile")
+        elif np.ndim(value) > 0:
+            check_shape(name, value, (m,), "one entry per contact, or a scalar")
+
+
 def _contacts_of(system: System, q: jax.Array) -> int:
     """m."""
     found: int = jax.eval_shape(system.body.gap_function, q).shape[0]
@@ -441,8 +453,8 @@ def _force_of(law: Law, mu: jax.Array | None) -> Force:
     return law.force
 
 
-def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
-    """Steps between two samples, none longer than `step`."""
+def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> jax.Array:
+    """Steps () between two samples, none longer than `step`."""
     if step is None or is_traced(step):
         raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
     check_values("step", step, low=0.0, open_low=True)
@@ -454,4 +466,4 @@ def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
         raise ValueError(
             f"Argument `step` must give at most {MOST_STEPS} steps, but has value {step:g}."
         )
-    return int(count)
+    return jnp.asarray(int(count), jnp.int32)  # an array: one program for all steps
