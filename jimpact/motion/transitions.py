@@ -340,6 +340,8 @@ def _brought_to_rest(
     p, force = constraint_impulse(given, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
     energy = jnp.pad(0.5 * p * rates, (0, 2 * m - size)).reshape(2, m)
+    # the gaps, up to `closed_below`, are closed by the flight that follows
+    fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * given.normal.value, 0.0)
     side = jnp.pad(p, (0, 2 * m - size))[m:]
     carried = carried_along(system, jump.v, t)
     passed = _passed(p[:m], force[:m], ends, -jnp.sum(energy), -jnp.sum(jump.energy))
@@ -347,7 +349,7 @@ def _brought_to_rest(
         v=jump.v + given.moved @ p,
         impulse=jump.impulse + p[:m],
         tangential=jump.tangential + side,
-        energy=jump.energy + energy,
+        energy=(jump.energy + energy).at[0].add(-fallen),
         base_work=jump.base_work + (given.directions @ p) @ carried,
     )
     return jump, passed
