@@ -16,7 +16,7 @@ MOTION_STATUS = (
     Status("ok", "the motion reaches t_end", False),
     Status("law_failed", "the law fails at an impact (see `event_status`)", True),
     Status("no_contact_force", "persistent contact with friction has no solution", True),
-    Status("max_events", "more events than `max_events`: an accumulation without end?", True),
+    Status("max_events", "more events than `max_events`", True),
     Status("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
     Status("penetration", "a gap is negative at the start", True),
     Status("singular_mass", "the mass matrix is not positive definite on the way", True),
