@@ -421,8 +421,8 @@ def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
     path, portrait = given.picture(), given.portrait
     study = read_motion_study(given.study)
     system, title = study.system, study.title
-    with waiting("motion", TOLD):
-        found = jax.block_until_ready(study.run(t_end=given.t_end, samples=given.samples))
+    run = study.run(t_end=given.t_end, samples=given.samples, progress=TOLD)
+    found = jax.block_until_ready(run)
     steps("motion computed")
     pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
     if portrait is not None:

@@ -170,6 +170,7 @@ def test_right_or_flagged():
     assert check_hypercube(3, STEPS) > 0.6  # and not all flagged
 
 
+@pytest.mark.long_run
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "share"), [(2, 0.99), (3, 0.7), (6, 0.6), (20, 0.15), (100, 0.0)])
 def test_right_or_flagged_with_more_steps(n, share):
@@ -188,6 +189,7 @@ def test_hard_points(point):
     check_right(point, STEPS)
 
 
+@pytest.mark.long_run
 @pytest.mark.slow
 @pytest.mark.parametrize("point", HARD_LATER, ids=HARD_LATER.get)
 def test_hard_points_after_many_steps(point):
@@ -249,6 +251,7 @@ def _random_chains(bodies, wall, count, seed):
     return masses, k, e, v
 
 
+@pytest.mark.long_run
 @pytest.mark.slow
 @pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
 def test_honest_tolerance_over_random_scenes(rtol):
@@ -534,6 +537,7 @@ def test_dispersion_index_and_energy_ratio():
     assert float(ji.energy_ratio(heavy, [1.0, 0.0], [0.5, 0.0])) == pytest.approx(0.25)
 
 
+@pytest.mark.long_run
 @pytest.mark.slow
 def test_docs_hold_the_chooser_table():
     import chooser
