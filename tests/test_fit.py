@@ -280,6 +280,77 @@ def test_nine_parameters_of_a_chain_before_a_wall():
     assert 0.0007 < found.noise < 0.0013
 
 
+# --------------------------------------------------------------------- the problem itself
+
+
+def test_the_problem_is_what_fit_solves():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    post[1, 0] = np.nan
+    data = ji.Experiments(SHOTS, post, sigma=0.05)
+    problem = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, data)
+    found = ji.fit(problem)
+    assert (problem.names, problem.start.tolist()) == (("restitution",), [0.9])
+    np.testing.assert_array_equal(problem.domains, [[0.0, 1.0]])
+    known = ~np.isnan(post)
+    np.testing.assert_allclose(problem.residual(found.value), -found.residual[known] / 0.05)
+    slope = simulated(ji.Newton(1.0), PAIR, SHOTS) - simulated(ji.Newton(0.0), PAIR, SHOTS)
+    np.testing.assert_allclose(problem.jacobian([0.3])[:, 0], slope[known] / 0.05)
+    expected = stats.norm.logpdf(found.residual[known], scale=0.05).sum()
+    np.testing.assert_allclose(problem.log_density(found.value), expected)
+    np.testing.assert_array_equal(problem.to_law([0.25]).restitution, 0.25)
+    unknown = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    gain = unknown.log_density([0.6]) - unknown.log_density([0.9])
+    ratio = np.sum(unknown.residual([0.9]) ** 2) / np.sum(unknown.residual([0.6]) ** 2)
+    np.testing.assert_allclose(gain, 3.5 * np.log(ratio))
+
+
+def test_a_users_own_observable():
+    """Heights of two bounces, and the same as a residual; errors by hand."""
+    power, heights = jnp.array([2.0, 4.0]), np.array([0.49, 0.25])
+    observe = lambda law: law.restitution**power  # noqa: E731
+    found = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), observe, heights, [0.01, 0.02]))
+    e = float(found.law.restitution)
+    slope = np.array([2 * e, 4 * e**3]) / [0.01, 0.02]
+    np.testing.assert_allclose(found.standard_error, [1 / np.linalg.norm(slope)], rtol=1e-6)
+    assert abs(slope @ (found.residual / [0.01, 0.02])) < 1e-5 * np.linalg.norm(slope)
+    assert found.experiments is None
+    assert "2 measured values" in str(found)
+    assert json.dumps(found.to_dict())
+
+    def residual(law):
+        return (observe(law) - heights) / np.array([0.01, 0.02])
+
+    same = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), residual, np.zeros(2), 1.0))
+    np.testing.assert_allclose(same.value, found.value, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (([np.nan],), "at least one value that is not NaN"),
+        (([1.0, 2.0],), r"`observe` must give values of shape \(2,\)"),
+        (([1.0], 0.0), r"`sigma` must lie in \(0, inf\)"),
+    ],
+)
+def test_bad_observables(given, message):
+    with pytest.raises(ValueError, match=message):
+        ji.FitProblem.from_observable(ji.Newton(0.9), lambda law: law.restitution[None], *given)
+
+
+def test_another_number_of_shots_is_served_by_the_same_program(caplog):
+    pre = np.stack([np.linspace(1, 2, 8), np.zeros(8)], axis=1)
+    post = simulated(ji.Newton(0.6), PAIR, pre, noise=0.01)
+    ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post))
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        few = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre[:3], post[:3]))
+        assert "advance_all" not in caplog.text
+        ji.fit(ji.Newton([0.9]), PAIR, ji.Experiments(pre, post), starts=1)
+        assert "advance_all" in caplog.text  # this is how it would be told
+    e, error, rest = newton_in_closed_form(post[:3], np.ones((3, 2)), pre[:3])
+    np.testing.assert_allclose(few.value, [e], rtol=1e-9)
+    np.testing.assert_allclose(few.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-9)
+
+
 # --------------------------------------------------------------------- any law
 
 

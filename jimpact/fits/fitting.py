@@ -8,22 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from jimpact._checks import check_kind
 from jimpact.experiments import Experiments
 from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Search, search
-from jimpact.fits.parameters import (
-    DEFAULT_FREE,
-    AnyLaw,
-    Parameters,
-    bounds_of,
-    free_parameters,
-    with_entries,
-)
-from jimpact.fits.problem import FitProblem, build_problem
+from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
+from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import fit_warnings, report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
-from jimpact.law import Law
 from jimpact.scene import Scene
 
 
@@ -40,11 +31,12 @@ class Start:
 class Fit(Generic[AnyLaw]):
     """What `fit` found. `print(fit)` is a report.
 
-    P free parameters `names`, contacts numbered from 1; K shots of n velocities.
+    P free parameters `names`, contacts numbered from 1; `predicted` and `residual` are shaped like
+    what was measured, (K, n) for K shots of n velocities.
     `standard_error` is inf where the data cannot see a parameter, NaN where no degree of freedom
     is left to estimate the noise from. `rank` < P: see `identifiability`. `starts`: the distinct
-    minima, best first. `noise`: estimated standard error of one velocity [m/s], NaN where no
-    degree of freedom is left, 1 where `sigma` was given.
+    minima, best first. `noise`: estimated standard error of one value, NaN where no degree of
+    freedom is left, 1 where `sigma` was given. `problem`: what was solved.
     """
 
     law: AnyLaw
@@ -70,7 +62,12 @@ class Fit(Generic[AnyLaw]):
     steps: int
     lost_starts: int
     warnings: tuple[str, ...]
-    experiments: Experiments
+    problem: FitProblem
+
+    @property
+    def experiments(self) -> Experiments | None:
+        """The shots; None where something else was fitted."""
+        return self.problem.experiments
 
     def confidence_interval(self, level: float = 0.95) -> np.ndarray:
         """Two-sided intervals (P, 2), linearized, cut at the bounds.
@@ -81,7 +78,7 @@ class Fit(Generic[AnyLaw]):
         if not 0 < level < 1:
             raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
         tail = 0.5 + 0.5 * level
-        known = self.experiments.sigma is not None or self.degrees_of_freedom < 1
+        known = self.problem.sigma is not None or self.degrees_of_freedom < 1
         quantile = ndtri(tail) if known else stdtrit(self.degrees_of_freedom, tail)
         half = quantile * self.standard_error
         return np.clip(
@@ -99,9 +96,9 @@ class Fit(Generic[AnyLaw]):
 
 
 def fit(
-    law: AnyLaw,
-    scene: Scene | None,
-    experiments: Experiments,
+    law: AnyLaw | FitProblem,
+    scene: Scene | None = None,
+    experiments: Experiments | None = None,
     free: Any = DEFAULT_FREE,
     *,
     bounds: Mapping[str, Any] | None = None,
@@ -121,6 +118,7 @@ def fit(
             ratios matter, so contact 1 is held, and a scalar stiffness cannot be fitted.
             The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
             approach velocity, at every evaluation and with every method; the start must be so.
+            Or a `FitProblem`, which holds the next three arguments and `bounds`.
         scene: the scene of all shots; not used where the experiments carry one a shot.
         experiments: measured shots.
         free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of
@@ -143,68 +141,56 @@ def fit(
     >>> round(float(found.law.restitution), 4)
     0.4
     """
-    check_kind("law", law, Law)
-    check_kind("experiments", experiments, Experiments)
     check_method(method)
     steps = default_steps(method) if max_steps is None else max_steps
     for name, count in (("starts", starts), ("max_steps", steps)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"Argument `{name}` must be an integer >= 1, but has value {count!r}.")
-    contacts = experiments.largest_scene(scene).contacts
-    parameters, notes = free_parameters(law, contacts, free)
-    limits = bounds_of(parameters, law, bounds)
-    problem = build_problem(law, scene, experiments, parameters, limits)
-    found = search(problem, parameters, method, starts, seed, steps, progress)
-    return _as_fit(problem, parameters, experiments, scene, found, limits, method, notes)
+    if isinstance(law, FitProblem):
+        problem = law
+    else:
+        problem = FitProblem.from_shots(law, scene, experiments, free, bounds)  # type: ignore[arg-type]
+    return _as_fit(problem, search(problem, method, starts, seed, steps, progress), method)
 
 
-def _as_fit(
-    problem: FitProblem,
-    parameters: Parameters,
-    experiments: Experiments,
-    scene: Scene | None,
-    found: Search,
-    limits: tuple[np.ndarray, np.ndarray],
-    method: Method,
-    notes: list[str],
-) -> Fit[Any]:
-    measured, sigma_known = experiments.measured, experiments.sigma is not None
-    size = float(problem.size)
+def _as_fit(problem: FitProblem, found: Search, method: Method) -> Fit[Any]:
+    residuals, names = problem.residuals, problem.names
+    size = float(residuals.size)
     spread = uncertainty(
-        names=parameters.names,
+        names=names,
         jacobian=size * found.jacobian,
         scale=found.scale,
         log=found.log,
         sum_of_squares=size**2 * found.minima[0][0],
-        values=int(measured.sum()) - experiments.lost_freedom,
-        noise_is_known=sigma_known,
-        rank_tolerance=RANK_TOLERANCE[str(problem.pre.dtype)],
+        values=problem.values,
+        noise_is_known=problem.sigma is not None,
+        rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
+        value_name=problem.value_name,
     )
-    residual = np.where(measured, np.asarray(experiments.post, float) - found.velocity, np.nan)
-    law = with_entries(problem.law, problem.fields, jnp.asarray(found.entries))
+    residual = np.asarray(problem.measured, float) - found.seen
     return Fit(
-        law=law,
+        law=with_entries(problem.law, residuals.fields, jnp.asarray(found.entries)),
         method=method if isinstance(method, str) else "optax",
-        names=parameters.names,
+        names=names,
         value=found.value,
         standard_error=spread.standard_error,
         covariance=spread.covariance,
         correlation=spread.correlation,
-        bounds=limits,
+        bounds=(problem.domains[:, 0], problem.domains[:, 1]),
         at_bound=found.at_bound,
-        predicted=found.velocity,
+        predicted=found.seen,
         residual=residual,
         rms=float(np.sqrt(np.nanmean(residual**2))),
         noise=spread.noise,
         degrees_of_freedom=spread.degrees_of_freedom,
         rank=spread.rank,
         singular_values=spread.singular_values,
-        identifiability=(*notes, *spread.unseen),
+        identifiability=(*problem.notes, *spread.unseen),
         starts=tuple(Start(size**2 * cost, value, count) for cost, value, count in found.minima),
         status=found.status,
         converged=found.converged,
         steps=found.steps,
         lost_starts=found.lost,
-        warnings=tuple(fit_warnings(law, problem, parameters, experiments, scene, found, spread)),
-        experiments=experiments,
+        warnings=tuple(fit_warnings(problem, found, spread)),
+        problem=problem,
     )

@@ -243,7 +243,7 @@ def matrix_region(
         ValueError: redundant contacts, too many contacts, a start that is not admissible, held
             entries that leave no room.
     """
-    if not encloses(law, scenes[0]):
+    if not scenes or not encloses(law, scenes[0].contacts):
         return None
     assert isinstance(law, RestitutionMatrix)
     m, dtype = scenes[0].contacts, law.matrix.dtype
@@ -274,13 +274,9 @@ def matrix_region(
     return eqx.tree_at(lambda r: r.center, region, _center(region, slack, rows, moving))
 
 
-def encloses(law: Law, scene: Scene) -> bool:
+def encloses(law: Law, contacts: int) -> bool:
     """Whether a fit keeps this law's matrix admissible."""
-    return (
-        isinstance(law, RestitutionMatrix)
-        and law.admissible
-        and law.matrix.shape[0] == scene.contacts
-    )
+    return isinstance(law, RestitutionMatrix) and law.admissible and law.matrix.shape[0] == contacts
 
 
 def _inverse(scene: Scene) -> np.ndarray:

@@ -66,7 +66,7 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: jax.Array) -> Any
     return law
 
 
-def free_parameters(law: Law, contacts: int, free: Any) -> tuple[Parameters, list[str]]:
+def free_parameters(law: Law, free: Any) -> tuple[Parameters, list[str]]:
     """The parameters that `free` names, and notes on what was held instead."""
     known = list(free_parameters_of(law))
     labels, notes = {}, []

@@ -37,6 +37,7 @@ def uncertainty(
     values: int,
     noise_is_known: bool,
     rank_tolerance: float,
+    value_name: str,
 ) -> Uncertainty:
     """Linearized errors at a minimum.
 
@@ -53,6 +54,7 @@ def uncertainty(
         values: independent measured values.
         noise_is_known: whether the weights are 1 / sigma.
         rank_tolerance: see `RANK_TOLERANCE`.
+        value_name: what a measured value is called.
     """
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=True)
     singular = np.pad(singular, (0, len(names) - len(singular)))
@@ -71,7 +73,7 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    unseen = tuple(_in_words(names, row, scale, log) for row in _reduced(null))
+    unseen = tuple(_in_words(names, row, scale, log, value_name) for row in _reduced(null))
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, unseen)
 
 
@@ -88,7 +90,11 @@ def _reduced(null: np.ndarray) -> np.ndarray:
 
 
 def _in_words(
-    names: tuple[str, ...], direction: np.ndarray, scale: np.ndarray, log: np.ndarray
+    names: tuple[str, ...],
+    direction: np.ndarray,
+    scale: np.ndarray,
+    log: np.ndarray,
+    value_name: str,
 ) -> str:
     """A direction that leaves all predictions as they are, as small changes of parameters."""
     parts = []
@@ -99,8 +105,10 @@ def _in_words(
             parts.append(f"{names[i]} goes {'up' if step[i] > 0 else 'down'} by {change}")
     if len(parts) == 1:
         name = parts[0].split(" ")[0]
-        return f"The data cannot see {name}: no measured velocity depends on it (to first order)."
+        return (
+            f"The data cannot see {name}: no measured {value_name} depends on it (to first order)."
+        )
     return (
-        "The data cannot see a combination: no measured velocity changes (to first order) when "
-        f"{', '.join(parts[:-1])} and {parts[-1]} together."
+        f"The data cannot see a combination: no measured {value_name} changes (to first order) "
+        f"when {', '.join(parts[:-1])} and {parts[-1]} together."
     )
