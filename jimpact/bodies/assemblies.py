@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import PLANAR, Body, LinearPotential, OnGround, number, numbered
+from jimpact.bodies.base import (
+    PLANAR,
+    Body,
+    LinearPotential,
+    OnGround,
+    number,
+    numbered,
+    planar_directions,
+    planar_weight,
+)
 from jimpact.bodies.polygons import Cornered, Disc
 
 _PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
@@ -103,12 +112,11 @@ class PlanarBodies(Body):
     @property
     def base_directions(self) -> jax.Array:
         """All planes move in x and y (3 b, 2)."""
-        return jnp.tile(jnp.eye(3, 2, dtype=self.mass.dtype), (len(self.bodies), 1))
+        return planar_directions(self.mass)
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = g sum m_i y_i`."""
-        up = jnp.tile(jnp.array([0.0, 1.0, 0.0], self.mass.dtype), len(self.bodies))
-        return LinearPotential(self.mass * up * acceleration)
+        return planar_weight(self.mass, acceleration)
 
     def contacts(self, q: jax.Array) -> Contacts:
         """Gaps, points and normals at q (3 b,); `between` says of which bodies."""

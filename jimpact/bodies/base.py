@@ -322,6 +322,17 @@ def positives(
     return found
 
 
+def planar_directions(mass: jax.Array) -> jax.Array:
+    """Of a base that carries planar bodies of diagonal mass (n,) in x and y (n, 2)."""
+    return jnp.tile(jnp.eye(3, 2, dtype=mass.dtype), (mass.shape[0] // 3, 1))
+
+
+def planar_weight(mass: jax.Array, acceleration: Any) -> LinearPotential:
+    """`V = g sum m_i y_i` of planar bodies of diagonal mass (n,)."""
+    up = jnp.tile(jnp.array([0.0, 1.0, 0.0], mass.dtype), mass.shape[0] // 3)
+    return LinearPotential(mass * up * acceleration)
+
+
 class OnGround(Body):
     """A rigid planar body above the ground y = 0; q = (x, y, theta) of its centre of mass.
 
@@ -343,8 +354,7 @@ class OnGround(Body):
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Heights of the contact points over the ground."""
-        c = self.points
-        return q[1] + (jnp.sin(q[2]) * c[:, 0] + jnp.cos(q[2]) * c[:, 1]) - self.rim
+        return heights(self.points, q) - self.rim
 
     def tangent_function(self, q: jax.Array) -> jax.Array:
         """Ways that the contact points slide along the ground."""
@@ -355,7 +365,7 @@ class OnGround(Body):
     @property
     def base_directions(self) -> jax.Array:
         """The ground moves in x and y (3, 2)."""
-        return jnp.eye(3, 2, dtype=self.mass.dtype)
+        return planar_directions(self.mass)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -364,8 +374,7 @@ class OnGround(Body):
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = m g y`."""
-        up = jnp.array([0.0, 1.0, 0.0], self.mass.dtype)
-        return LinearPotential(self.mass * up * acceleration)
+        return planar_weight(self.mass, acceleration)
 
     def touching(self, angle: Any = 0.0) -> jax.Array:
         """q (3,) with x = 0, turned by `angle`, at which its lowest contacts touch the ground."""
@@ -374,10 +383,30 @@ class OnGround(Body):
         return jnp.stack([zero, -jnp.min(self.gap_function(jnp.stack([zero, zero, turn]))), turn])
 
 
+def heights(points: jax.Array, q: jax.Array) -> jax.Array:
+    """y (m,) of points (m, 2) of a planar body at q = (x, y, theta)."""
+    return q[1] + (jnp.sin(q[2]) * points[:, 0] + jnp.cos(q[2]) * points[:, 1])
+
+
 def turned(points: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Points (k, 2) of a planar body, in its own frame, at q = (x, y, theta)."""
     c, s = np.cos(q[2]), np.sin(q[2])
     return q[:2] + points @ np.array([[c, s], [-s, c]])
+
+
+def wheel(radius: Any, q: np.ndarray, middle: Any = (0.0, 0.0)) -> np.ndarray:
+    """A circle about `middle`, with the radius that shows how far it has turned."""
+    spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
+    return turned(float(radius) * spoke + np.asarray(middle), q)
+
+
+def inertia_of(inertia: Any, homogeneous: Any, centre: Any) -> Any:
+    """The inertia given, or that of a homogeneous body, whose centre of mass is known."""
+    if inertia is not None:
+        return inertia
+    if centre is not None:
+        raise ValueError("Argument `inertia` must be given with `centre`.")
+    return homogeneous
 
 
 _AZIMUTH, _ELEVATION = np.deg2rad(30.0), np.deg2rad(20.0)  # from where bodies in space are seen

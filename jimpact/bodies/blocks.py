@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import check_choice
-from jimpact.bodies.base import positive
+from jimpact.bodies.base import heights, positive
 from jimpact.bodies.polygons import Cornered
 from jimpact.scene import Scene
 
@@ -78,8 +78,7 @@ class Block(Cornered):
         """With the lower corners only: height () of the lower one of the upper corners [m]."""
         if self.contacts == "all":
             return super().valid(q)
-        up = self.corners[2:]
-        return q[1] + jnp.min(jnp.sin(q[2]) * up[:, 0] + jnp.cos(q[2]) * up[:, 1])
+        return jnp.min(heights(self.corners[2:], q))
 
 
 def rocking_block(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values
-from jimpact.bodies.base import CIRCLE, PLANAR, Body, numbered, positive, positives, turned
+from jimpact.bodies.base import PLANAR, Body, numbered, positive, positives, wheel
 from jimpact.scene import Scene
 
 
@@ -87,8 +87,7 @@ class DiskBalls(Body):
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles, each with the radius that shows how far it has turned."""
         radii = [self.disk_radius, *self.ball_radius]
-        spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
-        return [turned(float(r) * spoke, at) for r, at in zip(radii, q.reshape(-1, 3))]
+        return [wheel(r, at) for r, at in zip(radii, q.reshape(-1, 3))]
 
     def _apart(self, q: jax.Array) -> jax.Array:
         """Centres of the balls from that of the disk (m, 2)."""

@@ -8,7 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, as_whole, check_values
-from jimpact.bodies.base import CIRCLE, PLANAR, Body, LinearPotential, numbered, positives, turned
+from jimpact.bodies.base import (
+    PLANAR,
+    Body,
+    LinearPotential,
+    numbered,
+    planar_directions,
+    planar_weight,
+    positives,
+    wheel,
+)
 
 ROOM = 4  # contacts per disc: equal discs have 3, and walls
 
@@ -84,14 +93,12 @@ class Discs(Body):
 
     def gravity(self, acceleration: Any) -> LinearPotential:
         """`V = g sum m_i y_i`."""
-        none = jnp.zeros_like(self.masses)
-        up = jnp.stack([none, self.masses, none], axis=1).reshape(-1)
-        return LinearPotential(up * acceleration)
+        return planar_weight(self.mass, acceleration)
 
     @property
     def base_directions(self) -> jax.Array:
         """The walls move in x and y (n, 2)."""
-        return jnp.tile(jnp.eye(3, 2, dtype=self.radii.dtype), (self.count, 1))
+        return planar_directions(self.mass)
 
     # ---- all contacts
 
@@ -168,5 +175,4 @@ class Discs(Body):
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles, each with the radius that shows how far it has turned."""
-        spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
-        return [turned(float(r) * spoke, at) for r, at in zip(self.radii, q.reshape(-1, 3))]
+        return [wheel(r, at) for r, at in zip(self.radii, q.reshape(-1, 3))]

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.bodies.base import CIRCLE, OnGround, positive, turned
+from jimpact.bodies.base import OnGround, inertia_of, positive, turned, wheel
 
 _CONVEX = "must be those of a convex polygon, in order around it"
 _FULL_TURN = 1e-6  # [rad] rounding of the angles of a polygon; ten times more would do as well
@@ -93,10 +93,7 @@ class Polygon(Cornered):
         self.ring = _ring(c)
         self.total_mass = positive("mass", mass)
         middle, about_middle = _moments(c[jnp.array(self.ring)])
-        if inertia is None:
-            if centre is not None:
-                raise ValueError("Argument `inertia` must be given with `centre`.")
-            inertia = self.total_mass * about_middle
+        inertia = inertia_of(inertia, self.total_mass * about_middle, centre)
         if centre is not None:
             middle = as_float_array("centre", centre)
             check_shape("centre", middle, (2,), "a point in the frame of the corners")
@@ -149,10 +146,7 @@ class Disc(OnGround):
             check_values("centre", self.middle)
             far = jnp.sqrt(jnp.sum(self.middle**2))
             check_values("centre", far, high=np.inf if is_traced(radius) else float(radius))
-        if inertia is None:
-            if centre is not None:
-                raise ValueError("Argument `inertia` must be given with `centre`.")
-            inertia = 0.5 * self.total_mass * self.radius**2
+        inertia = inertia_of(inertia, 0.5 * self.total_mass * self.radius**2, centre)
         self.inertia = positive("inertia", inertia)
 
     @property
@@ -172,8 +166,7 @@ class Disc(OnGround):
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """The circle, with the radius that shows how far it has turned."""
-        spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
-        return [turned(float(self.radius) * spoke + np.asarray(self.middle), q)]
+        return [wheel(self.radius, q, self.middle)]
 
 
 def _cross(a: jax.Array, b: jax.Array) -> jax.Array:

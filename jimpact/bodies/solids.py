@@ -12,6 +12,7 @@ from jimpact.bodies.base import (
     CIRCLE,
     Body,
     LinearPotential,
+    inertia_of,
     number,
     positive,
     positives,
@@ -54,11 +55,7 @@ class Solid(Body):
         """Set what all bodies have; `homogeneous` are the moments of inertia over the mass."""
         self.total_mass = positive("mass", mass)
         self.middle = -_vector("centre", (0.0,) * 3 if centre is None else centre)
-        if inertia is None:
-            if centre is not None:
-                raise ValueError("Argument `inertia` must be given with `centre`.")
-            inertia = self.total_mass * homogeneous
-        self.inertia = _inertia(inertia)
+        self.inertia = _inertia(inertia_of(inertia, self.total_mass * homogeneous, centre))
         n = _vector("normal", normal)
         if not is_traced(n) and not float(n[2]) > 0:
             raise ValueError(

@@ -14,6 +14,7 @@ break loose together.
 
 import dataclasses
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -68,14 +69,18 @@ def inverse(matrix: jax.Array) -> jax.Array:
 
 
 def regularized(
-    matrix: jax.Array, right: jax.Array, ridge: jax.Array, refinements: int
+    matrix: jax.Array,
+    right: jax.Array,
+    ridge: jax.Array,
+    refinements: int,
+    invert: Callable[[jax.Array], jax.Array] = inverse,
 ) -> jax.Array:
     """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) beside it.
 
     Each refinement takes out what the ridge changes where the matrix is regular, and makes the
     derivatives right in one order more: the inverse has none.
     """
-    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
+    inverted = jax.lax.stop_gradient(invert(matrix + unit(matrix) * ridge[:, None]))
     z = times(inverted, right)
     for _ in range(refinements):
         z = z + times(inverted, right - times(matrix, z))

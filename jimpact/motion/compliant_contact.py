@@ -31,6 +31,7 @@ from jimpact.motion.flow import (
     put,
     roundings,
     sampled_states,
+    status_at_start,
     toward_sample,
     unpacked,
 )
@@ -189,8 +190,6 @@ def compliant_motion(
     phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), COMPRESSION, OPEN)
     if not force.slackens:
         phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
-    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
-    status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"]).astype(jnp.int32)
     begin = first_flight(system, state, phase[:, None].astype(jnp.int32), 2 * m, times)
     events = no_events(max_events, q0, v0, m)
     start = _Run(
@@ -198,7 +197,7 @@ def compliant_motion(
         no_samples(state, times),
         jax.lax.stop_gradient(jnp.maximum(-gamma, 0.0)),
         events,
-        status,
+        status_at_start(system, state, times[-1], jnp.inf),
         jnp.all((phase == OPEN) & (gamma >= 0)),
     )
     blank = jnp.zeros((packed(state).shape[0], 1), dtype)

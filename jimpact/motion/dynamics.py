@@ -21,10 +21,16 @@ def base_velocity(system: System, t: jax.Array) -> jax.Array | None:
     """`B y_b'(t)` (n,), None without a base."""
     if system.base is None:
         return None
-    return jax.jvp(lambda s: _carried(system, s), (t,), (jnp.ones_like(t),))[1]
+    return jax.jvp(lambda s: _displaced(system, s), (t,), (jnp.ones_like(t),))[1]
 
 
-def _carried(system: System, t: jax.Array) -> jax.Array:
+def carried_along(system: System, v: jax.Array, t: jax.Array) -> jax.Array:
+    """Velocity of the base (n,), 0 without one."""
+    found = base_velocity(system, t)
+    return jnp.zeros_like(v) if found is None else found
+
+
+def _displaced(system: System, t: jax.Array) -> jax.Array:
     assert system.base is not None
     assert system.base_directions is not None
     return system.base_directions @ jnp.atleast_1d(system.base(t))
@@ -32,7 +38,7 @@ def _carried(system: System, t: jax.Array) -> jax.Array:
 
 def seen_from_base(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     """The configuration, displaced by `-B y_b(t)`."""
-    return q if system.base is None else system.body.moved(q, -_carried(system, t))
+    return q if system.base is None else system.body.moved(q, -_displaced(system, t))
 
 
 def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:

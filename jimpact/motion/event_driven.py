@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 from jimpact.events import stepper
 from jimpact.events.batches import any_lane, over_lanes
 from jimpact.law import Law
-from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, seen_from_base, user_force
+from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
 from jimpact.motion.flow import (
     Course,
     Flight,
@@ -39,6 +39,7 @@ from jimpact.motion.flow import (
     put,
     sampled_states,
     selected,
+    status_at_start,
     step_again,
     toward_sample,
 )
@@ -208,12 +209,6 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         jnp.zeros((max_events + 1, _width(given)), dtype),
         jnp.zeros((max_events + 1, 2 + m), jnp.int32),
     )
-    penetrates = jnp.any(gaps(system, q0, times[0]) < -settings.closed_below)
-    status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
-    inside = system.body.valid(seen_from_base(system, q0, times[0])) >= 0
-    status = jnp.where(inside, status, MOTION_CODE["out_of_range"])
-    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0)) & jnp.isfinite(times[-1])
-    status = jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
     decision = Decision(no, none, none, none, none, none, Scales(zero, zero, zero))
     last = Event(no, no, decision)
@@ -232,7 +227,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         last,
         table,
         jnp.int32(0),
-        status,
+        status_at_start(system, state, times[-1], settings.closed_below),
         plan,
     )
 

@@ -14,6 +14,7 @@ from jimpact.events import stepper
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
+    gaps,
     kinematics,
     mass_at,
     seen_from_base,
@@ -28,7 +29,7 @@ from jimpact.motion.persistent_contact import (
     forces,
     powers,
 )
-from jimpact.motion.record import Events
+from jimpact.motion.record import MOTION_CODE, Events
 from jimpact.motion.system import System
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
@@ -405,6 +406,15 @@ def out_of_range(system: System, at: State) -> jax.Array:
     if type(system.body).valid is Body.valid:
         return jnp.asarray(False)
     return ~(system.body.valid(seen_from_base(system, at.q, at.t)) >= 0)
+
+
+def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any) -> jax.Array:
+    """MotionStatus () of a motion that begins here and shall last until `end`."""
+    penetrates = jnp.any(gaps(system, at.q, at.t) < -closed_below)
+    status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
+    status = jnp.where(out_of_range(system, at), MOTION_CODE["out_of_range"], status)
+    finite = jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
+    return jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
 
 
 def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.friction_flow import regularized
+from jimpact.events.friction_flow import inverse, regularized
 from jimpact.motion.dynamics import (
     Kinematics,
     base_velocity,
@@ -130,14 +130,13 @@ def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -
     k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
     ridge = jnp.where(held, _RIDGE, 0.0)
-    if len(held) <= _WRITTEN_OUT:
-        z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS)
-    else:
-        inverted = jnp.linalg.inv(jax.lax.stop_gradient(k + jnp.diag(ridge)))
-        z = inverted @ right
-        for _ in range(_REFINEMENTS):
-            z = z + inverted @ (right - k @ z)
+    invert = inverse if len(held) <= _WRITTEN_OUT else _inverse_by_library
+    z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS, invert)
     return (scale * weight)[:, None] * z
+
+
+def _inverse_by_library(matrix: jax.Array) -> jax.Array:
+    return jnp.linalg.inv(matrix[..., 0])[..., None]
 
 
 def constraint_impulse(

@@ -173,8 +173,7 @@ def _events(
     max_events: int,
 ) -> Motion:
     times = _equal_times(start, end, samples)
-    contacts = jax.eval_shape(system.body.gap_function, q).shape[0]
-    given = Given(system, law, mu, settings, q, v, times, contacts)
+    given = Given(system, law, mu, settings, q, v, times, _contacts_of(system, q))
     return _recorded(system, times, event_driven(given, max_events))
 
 

@@ -27,7 +27,7 @@ from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
 from jimpact.laws.kinematic import Moreau
 from jimpact.motion.dynamics import (
-    base_velocity,
+    carried_along,
     definite,
     free_acceleration,
     gaps,
@@ -37,7 +37,7 @@ from jimpact.motion.dynamics import (
     solve_mass,
     user_force,
 )
-from jimpact.motion.flow import Course, State
+from jimpact.motion.flow import Course, State, out_of_range, status_at_start
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
 from jimpact.motion.system import System
 from jimpact.motion.transitions import FAILS, scene_at
@@ -214,13 +214,9 @@ def time_stepping(
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     rows = 1 if is_pile(system) else max_events
     events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
-    finite = jnp.all(jnp.isfinite(q0)) & jnp.all(jnp.isfinite(v0))
-    status = jnp.where(finite, MOTION_CODE["ok"], MOTION_CODE["not_finite"])
-    status = jnp.where(within_domains(law), status, MOTION_CODE["law_failed"])
-    penetrates = jnp.any(recorded_gaps(system, q0, times[0]) < -closed_below)
-    status = jnp.where(penetrates, MOTION_CODE["penetration"], status)
-    inside = system.body.valid(seen_from_base(system, q0, times[0])) >= 0
-    status = jnp.where(inside, status, MOTION_CODE["out_of_range"]).astype(jnp.int32)
+    status = status_at_start(system, begin, times[-1], closed_below)
+    fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
+    status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
     h = (times[1] - times[0]) / substeps
     start = _Progress(
         begin,
@@ -293,8 +289,7 @@ def _one_step(
     middle = t + 0.5 * h
     q = body.moved(state.q, 0.5 * h * state.v)
     close = _contacts(system, q, middle, closed_below, mu is not None)
-    carried = base_velocity(system, middle)
-    carried = jnp.zeros_like(state.v) if carried is None else carried
+    carried = carried_along(system, state.v, middle)
     mass = mass_at(system, q)
 
     def pushed(v: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -359,8 +354,7 @@ def _one_step(
     )
     fails = jnp.asarray(FAILS)[code]
     status = jnp.where(fails, MOTION_CODE["law_failed"], course.status)
-    inside = body.valid(seen_from_base(system, moved.q, t + h)) >= 0
-    status = jnp.where(inside, status, MOTION_CODE["out_of_range"])
+    status = jnp.where(out_of_range(system, moved), MOTION_CODE["out_of_range"], status)
     if isinstance(close, _Heap):
         status = jnp.where(close.near.lost, MOTION_CODE["room"], status)
     # a base that is NaN shows in its work, a coefficient in that of the contacts

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.motion.dynamics import (
-    base_velocity,
+    carried_along,
     gaps,
     kinematics,
     kinetic,
@@ -74,7 +74,7 @@ def impact_jump(
     """
     m = closed.shape[0]
     scene = scene_at(system, state.q, state.v, t, closed)
-    carried = _carried(system, state.v, t)
+    carried = carried_along(system, state.v, t)
     relative = state.v - carried
     out = impact(law, scene, relative, noise)
     mean = 0.5 * (out.velocity + relative)
@@ -165,7 +165,7 @@ def resolve(
         active = pressed | (tight & resting & ~released)
         choice = Choice(no_modes(m, gamma.dtype)._replace(active=active), jnp.asarray(True))
     else:
-        relative = jump.v - _carried(system, state.v, t)
+        relative = jump.v - carried_along(system, state.v, t)
         choice = _with_friction(given, mu, before, held, released, relative, rest, slack)
     # a contact accumulates if it was brought to rest from more than rounding
     ends = held & ~tight & strikes
@@ -230,12 +230,6 @@ def _after(decision: Decision, state: State, struck: jax.Array, jump: Jump) -> A
     return After(work, jnp.where(decision.took, now, struck), jump, end)
 
 
-def _carried(system: System, v: jax.Array, t: jax.Array) -> jax.Array:
-    """Velocity of the base (n,)."""
-    carried = base_velocity(system, t)
-    return jnp.zeros_like(v) if carried is None else carried
-
-
 def _with_friction(
     given: Contacts,
     mu: jax.Array,
@@ -254,7 +248,7 @@ def _with_friction(
 
 def _grown(system: System, scales: Scales, given: Contacts, t: jax.Array, state: State) -> Scales:
     m = given.normal.rate.shape[0]
-    seen = state.v - _carried(system, state.v, t)
+    seen = state.v - carried_along(system, state.v, t)
     energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, seen))
     now = Scales(
         jnp.abs(given.normal.rate).max(),
@@ -282,7 +276,7 @@ def _brought_to_rest(
     # work at the mean velocity: half of that before, 0 after
     energy = jnp.pad(0.5 * p * rates, (0, 2 * m - p.shape[0])).reshape(2, m)
     side = jnp.pad(p, (0, 2 * m - p.shape[0]))[m:]
-    carried = _carried(system, jump.v, t)
+    carried = carried_along(system, jump.v, t)
     return jump._replace(
         v=jump.v + given.moved @ p,
         impulse=jump.impulse + p[:m],
