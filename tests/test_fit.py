@@ -88,6 +88,107 @@ def test_corrected_momentum_costs_degrees_of_freedom():
     assert ji.fit(ji.Newton(0.9), PAIR, data).degrees_of_freedom == 8 - 4 - 1
 
 
+# --------------------------------------------------------------------- does the law fit
+
+
+def told(found):
+    return " ".join(found.warnings)
+
+
+def test_data_that_another_law_made_are_told():
+    """One e for two contacts; without sigma the noise is what momentum shows."""
+    pre = np.random.default_rng(0).uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))
+    for scene, reason in ((BALLS, "noise that momentum"), (WALLED, "follow the velocities")):
+        post = simulated(ji.Newton([0.9, 0.4]), scene, pre[:, : scene.size], noise=0.01)
+        data = ji.Experiments(pre[:, : scene.size], post)
+        assert reason in told(ji.fit(ji.Newton(0.8), scene, data))
+        right = ji.fit(ji.Newton([0.8, 0.8]), scene, data)
+        assert "Lack of fit" not in told(right)
+        assert "Suspicious" not in told(right)
+
+
+WALLED = ji.chain([1.0, 2.0], wall=True)
+
+
+def test_honest_noise_breaks_no_momentum():
+    pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
+    post = simulated(ji.Newton(0.98), PAIR, pre, noise=0.02)
+    assert ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)).warnings == ()
+    assert "break momentum" in told(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, 1.1 * post)))
+
+
+def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
+    pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
+    post = simulated(ji.Newton(0.9), PAIR, pre, noise=0.005)
+    post[17] += [0.8, -0.4]  # momentum is conserved
+    data = ji.Experiments(pre, post)
+    moved = ji.fit(ji.Newton(0.5), PAIR, data)
+    assert "Suspicious: shot 18," in told(moved)
+    assert abs(moved.value[0] - 0.9) > 0.02
+    for loss in ("huber", "student"):
+        found = ji.fit(ji.Newton(0.5), PAIR, data, loss=loss)
+        assert abs(found.value[0] - 0.9) < 0.005
+        assert abs(found.value[0] - 0.9) < 4 * found.standard_error[0] < 0.02
+        assert "Suspicious: shot 18," in told(found)
+
+
+def test_robust_losses_minimize_what_they_say():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05)
+    problem = ji.FitProblem.from_shots(
+        ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.01)
+    )
+    huber = lambda u: np.where(np.abs(u) < 1.345, u**2 / 2, 1.345 * (np.abs(u) - 1.345 / 2))  # noqa: E731
+    student = lambda u: 2.5 * np.log1p(u**2 / 4)  # noqa: E731
+    grid = np.linspace(0.4, 0.8, 4001)
+    at_0, at_1 = (np.asarray(problem.residual([e])) for e in (0.0, 1.0))
+    u = at_0 + grid[:, None] * (at_1 - at_0)  # linear in e
+    for loss, rho in (("huber", huber), ("student", student)):
+        best = grid[np.argmin(rho(u).sum(axis=1))]
+        np.testing.assert_allclose(ji.fit(problem, loss=loss).value, best, atol=2e-4)
+
+
+def test_swapped_velocities_are_told():
+    post = simulated(ji.Newton(0.9), PAIR, SHOTS)
+    assert "No contact approaches in 4 of 4 shots" in told(
+        ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(post, SHOTS), starts=1)
+    )
+
+
+class Steep(ji.Newton):
+    """The derivative of fast impacts is garbage."""
+
+    def impulses(self, contact):
+        p, side, status = super().impulses(contact)
+        e = self.restitution
+        wrong = 1 + 1e6 * (e - jax.lax.stop_gradient(e))
+        return ji.Impulses(jnp.where(contact.gap_velocity < -1.8, wrong * p, p), side, status)
+
+
+def test_shots_whose_derivatives_are_garbage_are_left_out_and_named():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01)
+    slow = [0, 1, 3]
+    found = ji.fit(Steep(0.9), PAIR, ji.Experiments(SHOTS, post))
+    expected = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[slow], post[slow]))
+    assert "Left out: 1 of 4 shots (3)" in told(found)
+    assert found.converged
+    np.testing.assert_allclose(found.value, expected.value, rtol=1e-6)
+    assert found.degrees_of_freedom == 5
+    assert np.isnan(found.residual[2]).all()
+
+
+def test_turning_weighs_by_kinetic_energy():
+    """A rod that strikes with its end: rad/s and m/s, with no sigma."""
+    scene = ji.Scene([1.0, 0.01], [[1.0], [0.2]])
+    pre = np.array([[-1.0, 2.0], [-2.0, 1.0], [-1.0, 0.0]])
+    post = simulated(ji.Newton(0.5), scene, pre, noise=0.01)
+    data = ji.Experiments(pre, post, units=["m/s", "rad/s"])
+    found = ji.fit(ji.Newton(0.8), scene, data)
+    same = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, post, sigma=[[1.0, 10.0]] * 3))
+    np.testing.assert_allclose(found.value, same.value, rtol=1e-8)
+    assert "same kinetic energy" in told(found)
+    assert " rad/s" in str(found)
+
+
 def test_stated_errors_that_are_too_small_are_noticed():
     post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.1)
     found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.01))

@@ -1,21 +1,30 @@
 """`fit`: parameters of a law from measured velocities, with their errors and what stays unseen."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Generic
+from dataclasses import dataclass, replace
+from typing import Any, Generic, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from jimpact._checks import check_choice
 from jimpact.experiments import Experiments
+from jimpact.fits.adequacy import unusable
 from jimpact.fits.least_squares import Method, check_method, default_steps
-from jimpact.fits.multistart import Search, search
+from jimpact.fits.multistart import Search, search, search_near
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.report import fit_warnings, report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.scene import Scene
+
+LISTED = 10  # shots that were left out, named one by one
+HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
+STUDENT = 4.0  # degrees of freedom of the tails
+MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
+ROUNDS = 50  # of weights
+SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +112,7 @@ def fit(
     *,
     bounds: Mapping[str, Any] | None = None,
     method: Method = "levenberg-marquardt",
+    loss: str = "squares",
     starts: int = 8,
     seed: int = 0,
     max_steps: int | None = None,
@@ -126,10 +136,17 @@ def fit(
         bounds: {field: (low, high)}; default [0, 1] for restitution, > 0 for stiffness, ...
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
+        loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
+            value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
+            not known, it is taken from the median of the residuals.
         starts: number of starts, the first from the law's values, the others random (`seed`); if
             more than one, further ones around the best follow as long as they improve it.
         max_steps: iterations per start.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
+
+    Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
+    absurd, are left out, and `Fit.warnings` names them. There is told, too, whether the law fits
+    at all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
 
     Raises:
         ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of
@@ -146,14 +163,97 @@ def fit(
     for name, count in (("starts", starts), ("max_steps", steps)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"Argument `{name}` must be an integer >= 1, but has value {count!r}.")
+    check_choice("loss", loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
         problem = law
     else:
         problem = FitProblem.from_shots(law, scene, experiments, free, bounds)  # type: ignore[arg-type]
-    return _as_fit(problem, search(problem, method, starts, seed, steps, progress), method)
+    found = search(problem, method, starts, seed, steps, progress)
+    while (lost := unusable(problem, found)).any() and not lost.all():
+        problem = _without(problem, lost)
+        found = search(problem, method, starts, seed, steps, progress)
+    robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
+    return _as_fit(problem, robust or Robust(found, None, None), method)
 
 
-def _as_fit(problem: FitProblem, found: Search, method: Method) -> Fit[Any]:
+def _rms(problem: FitProblem, residual: np.ndarray) -> float:
+    """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
+    data = problem.experiments
+    worth = 1.0 if data is None else data.natural_errors(problem.scene)
+    return float(np.sqrt(np.nanmean((residual / worth) ** 2)))
+
+
+def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
+    """The problem without these shots (K,), which it names."""
+    assert problem.experiments is not None
+    labels = [problem.experiments.shots[k] for k in np.flatnonzero(lost)]
+    line = (
+        f"Left out: {len(labels)} of {len(lost)} shots ({', '.join(labels[:LISTED])}"
+        f"{', ...' * (len(labels) > LISTED)}), whose impacts fail, or whose derivatives cannot be "
+        "used."
+    )
+    kept = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
+    return replace(problem.weighed(kept), left_out=(*problem.left_out, line))
+
+
+class Robust(NamedTuple):
+    """The end of a search, the factors its loss puts on the weights, and its noise."""
+
+    found: Search
+    factor: np.ndarray | None
+    noise: float | None
+
+
+def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    inside = np.abs(u) <= HUBER
+    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
+
+
+def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    below = STUDENT + u**2
+    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
+
+
+LOSSES = {"huber": _huber, "student": _student}
+
+
+def _robust(
+    problem: FitProblem, found: Search, loss: str, method: Method, max_steps: int
+) -> Robust:
+    """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
+
+    Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
+    """
+    factor = np.ones(problem.measured.shape)
+    here = ~np.isnan(problem.measured)
+    weight = np.asarray(problem.residuals.weight, float) * float(problem.residuals.size)
+    for _ in range(ROUNDS):
+        error = weight * (np.nan_to_num(problem.measured) - found.seen)
+        scale = 1.0
+        if problem.sigma is None:
+            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
+        share, slope = LOSSES[loss](error / scale)
+        factor, before = np.sqrt(share), found.y
+        found = search_near(problem.weighed(factor), found.y, method, max_steps)
+        if np.abs(found.y - before).max() <= SAME:
+            break
+    psi = (share * error / scale)[here]
+    freedom = max(int(here.sum()) - len(problem.names), 1)
+    noise = scale * np.sqrt(np.sum(psi**2) / freedom) / max(slope[here].mean(), SAME)
+    return Robust(found, factor, float(noise))
+
+
+def _as_fit(problem: FitProblem, robust: Robust, method: Method) -> Fit[Any]:
+    found = robust.found
+    if robust.factor is not None:  # as without the factors, but for the place
+        r, weighed = problem.residuals, problem.weighed(robust.factor).residuals
+        back = float(weighed.size) / float(r.size) / robust.factor.reshape(-1, 1)
+        weight = np.asarray(r.weight, float)
+        squares = float(np.sum((weight * (np.nan_to_num(problem.measured) - found.seen)) ** 2))
+        minima = [(squares, found.value, 1)]
+        found = found._replace(jacobian=back * found.jacobian, minima=minima)
     residuals, names = problem.residuals, problem.names
     size = float(residuals.size)
     spread = uncertainty(
@@ -163,7 +263,7 @@ def _as_fit(problem: FitProblem, found: Search, method: Method) -> Fit[Any]:
         log=found.log,
         sum_of_squares=size**2 * found.minima[0][0],
         values=problem.values,
-        noise_is_known=problem.sigma is not None,
+        noise=robust.noise if robust.noise else None if problem.sigma is None else 1.0,
         rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
         value_name=problem.value_name,
     )
@@ -180,7 +280,7 @@ def _as_fit(problem: FitProblem, found: Search, method: Method) -> Fit[Any]:
         at_bound=found.at_bound,
         predicted=found.seen,
         residual=residual,
-        rms=float(np.sqrt(np.nanmean(residual**2))),
+        rms=_rms(problem, residual),
         noise=spread.noise,
         degrees_of_freedom=spread.degrees_of_freedom,
         rank=spread.rank,

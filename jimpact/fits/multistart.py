@@ -58,6 +58,7 @@ class Search(NamedTuple):
     """The best end point (weighted as in `Residuals`), and all distinct minima, best first."""
 
     value: np.ndarray  # of the parameters (P,)
+    y: np.ndarray  # the same in scaled form, (Q,)
     entries: np.ndarray  # of all entries (Q,) of the named fields
     scale: np.ndarray  # natural size of a change of each parameter, at the value found
     log: np.ndarray  # whether it is fitted in its logarithm
@@ -95,6 +96,12 @@ def search(
             if np.nanmin(more.cost) > (1 - SLOW) * least:
                 break
     return _found(problem, states)
+
+
+def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Search:
+    """The minimum next to y (Q,)."""
+    residuals = repeated(filled_up(problem.residuals), 1)
+    return _found(problem, run(residuals, y[None], method, max_steps, lambda *told: None))
 
 
 def repeated(residuals: Residuals, count: int) -> Residuals:
@@ -174,6 +181,7 @@ def _found(problem: FitProblem, states: SolverState) -> Search:
     rows = len(problem.measured) if problem.measured.ndim else None  # without what filled up
     return Search(
         value=values[best],
+        y=np.asarray(states.y)[best],
         entries=_all_entries(r, np.asarray(states.y)[best]),
         scale=np.where(log, values[best], scale),
         log=log,

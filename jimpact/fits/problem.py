@@ -133,8 +133,8 @@ class Residuals(eqx.Module):
 class FitProblem:
     """The least-squares problem behind a fit, in the parameters x (P,) themselves.
 
-    Equation: `residual = (observed(law(x)) - measured) / sigma` (sigma = 1 where it is not known)
-    over the R measured values; `fit` minimizes its sum of squares. `residual`, `jacobian`,
+    Equation: `residual = (observed(law(x)) - measured) / sigma` (where it is not known, sigma = 1
+    for m/s, and for rad/s what has the same kinetic energy) over the R measured values; `fit` minimizes its sum of squares. `residual`, `jacobian`,
     `log_density` and `to_law` are pure functions of x for jit, vmap and grad, and so for any solver
     or sampler; `start` (P,), `domains` (P, 2) and `names` say where to begin, how far x may go, and
     what it means. `fit(problem)` does all that `fit` does.
@@ -159,6 +159,7 @@ class FitProblem:
     values: int  # independent measured values
     experiments: Experiments | None = None
     scene: Scene | None = None
+    left_out: tuple[str, ...] = ()  # which shots, in words
 
     @classmethod
     def from_shots(
@@ -186,7 +187,10 @@ class FitProblem:
         filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
         observe = Shots(_in(dtype, stacked), jnp.asarray(filled, dtype), n)
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
-        problem = _build(law, observe, post, sigma, free, bounds, dtype, unit, energy, alike)
+        errors = experiments.natural_errors(scene) if sigma is None else sigma
+        problem = _build(
+            law, observe, post, sigma, errors, free, bounds, dtype, unit, energy, alike
+        )
         values = problem.values - experiments.lost_freedom
         return replace(problem, values=values, experiments=experiments, scene=scene)
 
@@ -232,7 +236,8 @@ class FitProblem:
         seen = Observed(observe) if not isinstance(observe, eqx.Module) else observe
         unit = np.nanmax(np.abs(post)) or 1.0
         dtype = _dtype(law, seen, post)
-        problem = _build(law, seen, post, sigma, free, bounds, dtype, unit, 1.0, [])
+        errors = np.ones(()) if sigma is None else sigma
+        problem = _build(law, seen, post, sigma, errors, free, bounds, dtype, unit, 1.0, [])
         shape = eqx.filter_eval_shape(seen, law).value.shape
         if shape != post.shape:
             raise ValueError(
@@ -286,6 +291,17 @@ class FitProblem:
         seen = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
         return -0.5 * squares - float(np.sum(np.log(seen * math.sqrt(2 * math.pi))))
 
+    def weighed(self, factor: np.ndarray) -> "FitProblem":
+        """With weights 1 / sigma times a factor, shaped like `measured`; 0 leaves a value out."""
+        r = self.residuals
+        weight = np.asarray(r.weight, float) * float(r.size) * factor
+        size = float(r.unit) * np.linalg.norm(weight)
+        arrays = (jnp.asarray(weight / size, r.weight.dtype), jnp.asarray(size, r.size.dtype))
+        kept = np.where(factor > 0, self.measured, np.nan)
+        lost = int(np.isnan(kept).sum() - np.isnan(self.measured).sum())
+        residuals = eqx.tree_at(lambda r: (r.weight, r.size), r, arrays)
+        return replace(self, residuals=residuals, measured=kept, values=self.values - lost)
+
     def _scaled(self, x: Any) -> jax.Array:
         """y (Q,) of x (P,)."""
         r, first = self.residuals, np.asarray(self.parameters.first)
@@ -310,6 +326,7 @@ def _build(
     observe: Observable,
     measured: np.ndarray,
     sigma: np.ndarray | None,
+    errors: np.ndarray,
     free: Any,
     bounds: Mapping[str, Any] | None,
     dtype: np.dtype,
@@ -322,7 +339,7 @@ def _build(
     limits = bounds_of(parameters, law, bounds)
     law = _in(dtype, law)
     here = ~np.isnan(measured)
-    weight = np.where(here, 1.0 if sigma is None else 1 / np.where(here, sigma, 1.0), 0.0)
+    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
     size = unit * np.linalg.norm(weight)
     values = entries(law, parameters.fields)
     scale, log = _scales(parameters, values, energy)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.experiments import data_defects
+from jimpact.fits.adequacy import adequacy
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.problem import FitProblem
@@ -20,8 +21,6 @@ _MINIMA_SHOWN = 5
 # Minima whose sums of squares differ by less than this many noise variances fit equally well:
 # the difference is what moving by one standard error costs.
 EQUALLY_GOOD = 1.0
-# Scatter beyond the stated sigma is worth a word above this ratio (chi^2 per degree of freedom 4).
-TOO_MUCH_SCATTER = 2.0
 
 
 def report(fit: Any) -> str:
@@ -102,7 +101,9 @@ def _shots(fit: Any) -> list[str]:
     if data is None:
         return []
     pre, post = np.asarray(data.pre, float), np.asarray(data.post, float)
-    lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s} [m/s]"]
+    mixed = len(set(data.units)) > 1
+    unit = "" if mixed else f" [{data.units[0]}]"
+    lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}{unit}"]
     shown = max(1, _VELOCITIES_SHOWN // pre.shape[1])
     for k in range(min(len(pre), shown)):
         code = int(fit.status[k])
@@ -111,7 +112,8 @@ def _shots(fit: Any) -> list[str]:
             label = data.shots[k] if i == 0 else ""
             seen = "-" if np.isnan(post[k, i]) else f"{post[k, i]:.6g}"
             values = f"{pre[k, i]:12.6g} {seen:>12s} {fit.predicted[k, i]:12.6g}"
-            lines.append(f"{label:>8s} {i + 1:5d} {values}{note if i == 0 else ''}")
+            each = f" {data.units[i]}" if mixed else ""
+            lines.append(f"{label:>8s} {i + 1:5d} {values}{each}{note if i == 0 else ''}")
     if len(pre) > shown:
         lines.append(f"     ... and {len(pre) - shown} more shots")
     return lines
@@ -158,7 +160,7 @@ def to_json(fit: Any) -> dict[str, Any]:
 
 def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> list[str]:
     """All warnings, those about the data first."""
-    lines, data = [], problem.experiments
+    lines, data = list(problem.left_out), problem.experiments
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(jnp.broadcast_to(problem.law.stored, contacts)))
@@ -171,6 +173,11 @@ def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> lis
     if data is not None:
         lines += _statuses(found.status, data.shots)
         lines += _matrix(problem, found, contacts)
+    lines += adequacy(problem, found, spread.rank)
+    if data is not None and problem.sigma is None and len(set(data.units)) > 1:
+        lines.append(
+            "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
+        )
     names = problem.names
     for i in np.flatnonzero(found.at_bound):
         lines.append(
@@ -187,14 +194,6 @@ def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> lis
         lines.append(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
-    if problem.sigma is not None and spread.degrees_of_freedom > 0:
-        chi_squared = float(problem.residuals.size) ** 2 * found.minima[0][0]
-        scatter = np.sqrt(chi_squared / spread.degrees_of_freedom)
-        if scatter > TOO_MUCH_SCATTER:
-            lines.append(
-                f"The residuals are {scatter:.1f} times what sigma allows: the law or the stated "
-                "errors are wrong, and the standard errors too small."
-            )
     if problem.residuals.offset.dtype == np.float32:
         lines.append(
             "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "

@@ -35,15 +35,15 @@ def uncertainty(
     log: np.ndarray,
     sum_of_squares: float,
     values: int,
-    noise_is_known: bool,
+    noise: float | None,
     rank_tolerance: float,
     value_name: str,
 ) -> Uncertainty:
     """Linearized errors at a minimum.
 
-    Equation: `C = s^2 (J^T J)^-1` on the seen subspace, `s^2 = |r|^2 / (values - rank)`, or 1
-    where the weights are known errors; rank = number of singular values of J, its columns scaled
-    by the natural size of each parameter, above `rank_tolerance` times the largest.
+    Equation: `C = s^2 (J^T J)^-1` on the seen subspace, `s^2 = |r|^2 / (values - rank)`, or the
+    given noise (1 where the weights are known errors); rank = number of singular values of J, its
+    columns scaled by the natural size of each parameter, above `rank_tolerance` times the largest.
 
     Args:
         names: of the parameters (P,).
@@ -52,7 +52,7 @@ def uncertainty(
         log: (P,) whether changes are told in percent.
         sum_of_squares: |r|^2.
         values: independent measured values.
-        noise_is_known: whether the weights are 1 / sigma.
+        noise: s; None: from |r|^2.
         rank_tolerance: see `RANK_TOLERANCE`.
         value_name: what a measured value is called.
     """
@@ -60,9 +60,8 @@ def uncertainty(
     singular = np.pad(singular, (0, len(names) - len(singular)))
     rank = int(np.sum(singular > rank_tolerance * singular[0]))
     freedom = values - rank
-    noise = 1.0 if noise_is_known else np.nan
-    if not noise_is_known and freedom > 0:
-        noise = float(np.sqrt(sum_of_squares / freedom))
+    if noise is None:
+        noise = float(np.sqrt(sum_of_squares / freedom)) if freedom > 0 else np.nan
     seen = directions[:rank] / singular[:rank, None]
     covariance = noise**2 * (seen.T @ seen) * np.outer(scale, scale)
     null = directions[rank:]

@@ -29,6 +29,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     2
     """
     check_kind("fit: its experiments", fit.experiments, Experiments)
+    assert fit.experiments is not None
     shots, bodies = fit.predicted.shape
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
     x = np.arange(shots)[:, None] + dodge[None, :]
@@ -47,8 +48,9 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
         bottom.errorbar(x[:, i], fit.residual[:, i], bars, **style)
     for j, other in enumerate((others or {}).values()):
         top.plot(x, other.predicted, "x+*"[j % 3], color=GREY, ms=0.8 * size)
-    top.set_ylabel("velocity after the impact [m/s]")
-    bottom.set_ylabel("measured − fitted [m/s]")
+    units = ", ".join(dict.fromkeys(fit.experiments.units))
+    top.set_ylabel(f"velocity after the impact [{units}]")
+    bottom.set_ylabel(f"measured − fitted [{units}]")
     bottom.axhline(0, color=GREY, lw=0.8)
     _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
