@@ -32,6 +32,7 @@ from .contact import (
 from .experiments import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import Fit as Fit, fit as fit
 from .fits.problem import FitProblem as FitProblem
+from .fits.profiles import Profile as Profile, profile as profile
 from .histories import history as history
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .law import (

@@ -479,6 +479,79 @@ class Even(Law):
         return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
 
 
+class Shared(ji.Law):
+    """Newton's law with e = one * other: only the product is seen."""
+
+    one: jax.Array = ji.parameter(low=0, high=1)
+    other: jax.Array = ji.parameter(low=0, high=1)
+
+    def impulses(self, contact):
+        change = -(1 + self.one * self.other) * contact.gap_velocity
+        return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
+
+
+# --------------------------------------------------------------------- profiles
+
+
+def test_profile_of_a_linear_problem_is_the_interval_of_linear_regression():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    for sigma in (None, 0.02):
+        found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma), profiles=True)
+        (scan,) = found.profiles
+        np.testing.assert_allclose(scan.intervals, found.confidence_interval(), rtol=1e-5)
+        expected = ((scan.value - found.value) / found.standard_error) ** 2
+        np.testing.assert_allclose(scan.deviance, expected, rtol=1e-5, atol=1e-6)
+        assert scan.better is None
+        assert scan.words in str(found)
+        assert found.to_dict()["parameters"][0]["profile_95"]
+
+
+def test_profile_ends_at_a_bound_on_one_side():
+    post = simulated(ji.Newton(0.995), PAIR, SHOTS, noise=0.02)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.02))
+    (scan,) = ji.profile(found, "restitution", level=0.9)
+    assert scan.intervals[0][1] == 1.0
+    assert scan.words.startswith("at least 0.9")
+
+
+def test_profile_of_two_minima_is_a_union():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.49), PAIR, SHOTS), sigma=0.01)
+    found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root", starts=1)
+    (scan,) = ji.profile(found, points=12)
+    np.testing.assert_allclose(scan.intervals[1], 0.7, atol=0.02)
+    np.testing.assert_allclose(scan.intervals[0], -np.array(scan.intervals[1])[::-1], atol=1e-5)
+    assert " or " in scan.words
+
+
+def test_profile_of_a_valley_is_what_the_bounds_leave_of_it():
+    """one * other = 0.5 with both at most 1, of a single shot that is reproduced exactly."""
+    post = simulated(ji.Newton(0.5), PAIR, SHOTS[:1])
+    found = ji.fit(Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-3), ("one", "other"))
+    assert np.isinf(found.standard_error).all()
+    for scan in ji.profile(found):
+        width = 1.96 * 1e-3 / np.sqrt(2) / 0.5  # of the product, roughly
+        assert scan.intervals[0][1] == 1.0
+        np.testing.assert_allclose(scan.intervals[0][0], 0.5, atol=3 * width)
+        assert scan.intervals[0][0] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"level": 95}, r"`level` must lie in \(0, 1\)"),
+        ({"points": 2}, "`points` must be at least 3"),
+        ({"names": "stiffness"}, "`names` must be among restitution"),
+    ],
+)
+def test_bad_profiles(options, message):
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1)
+    with pytest.raises(ValueError, match=message):
+        ji.profile(found, **options)
+    robust = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1, loss="huber")
+    with pytest.raises(ValueError, match="by least squares"):
+        ji.profile(robust)
+
+
 def test_a_law_with_a_matrix_field():
     truth = Coupled(jnp.array([[0.6, 0.1], [0.05, 0.4]]))
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))

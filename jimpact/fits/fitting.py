@@ -15,6 +15,7 @@ from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Search, search, search_near
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
+from jimpact.fits.profiles import Profile, profile
 from jimpact.fits.report import fit_warnings, report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
 from jimpact.scene import Scene
@@ -72,6 +73,8 @@ class Fit(Generic[AnyLaw]):
     lost_starts: int
     warnings: tuple[str, ...]
     problem: FitProblem
+    loss: str = "squares"
+    profiles: tuple[Profile, ...] = ()
 
     @property
     def experiments(self) -> Experiments | None:
@@ -116,6 +119,7 @@ def fit(
     starts: int = 8,
     seed: int = 0,
     max_steps: int | None = None,
+    profiles: bool = False,
     progress: bool | None = None,
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
@@ -142,6 +146,7 @@ def fit(
         starts: number of starts, the first from the law's values, the others random (`seed`); if
             more than one, further ones around the best follow as long as they improve it.
         max_steps: iterations per start.
+        profiles: whether the report tells intervals by `profile`, not by standard errors.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 
     Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
@@ -173,7 +178,8 @@ def fit(
         problem = _without(problem, lost)
         found = search(problem, method, starts, seed, steps, progress)
     robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
-    return _as_fit(problem, robust or Robust(found, None, None), method)
+    end = replace(_as_fit(problem, robust or Robust(found, None, None), method), loss=loss)
+    return replace(end, profiles=profile(end, progress=progress)) if profiles else end
 
 
 def _rms(problem: FitProblem, residual: np.ndarray) -> float:

@@ -119,8 +119,12 @@ def run(
     method: Method,
     max_steps: int,
     show: Callable[[str, float, float], None],
+    rivals: bool = True,
 ) -> SolverState:
-    """Solve S problems from points (S, Q), a few at a time; the states come back to the host."""
+    """Solve S problems from points (S, Q), a few at a time; the states come back to the host.
+
+    Rivals are starts of one problem: those far behind the best are given up sooner.
+    """
     lanes = min(len(points), LANES)
     points = points.astype(problems.offset.dtype)
     begun = [
@@ -141,7 +145,8 @@ def run(
             show(f"fit: {counts}", steps, max_steps)
         ended = states.done | (states.steps >= max_steps)
         if method == "levenberg-marquardt":
-            share = np.where(states.cost > BEHIND * np.nanmin(states.cost), SLOW_BEHIND, SLOW)
+            behind = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
+            share = np.where(behind, SLOW_BEHIND, SLOW)
             ended |= (before - states.cost <= share * before) & np.isfinite(before)
         active = [i for i in active if not ended[i]]
     return states

@@ -134,10 +134,11 @@ class FitProblem:
     """The least-squares problem behind a fit, in the parameters x (P,) themselves.
 
     Equation: `residual = (observed(law(x)) - measured) / sigma` (where it is not known, sigma = 1
-    for m/s, and for rad/s what has the same kinetic energy) over the R measured values; `fit` minimizes its sum of squares. `residual`, `jacobian`,
-    `log_density` and `to_law` are pure functions of x for jit, vmap and grad, and so for any solver
-    or sampler; `start` (P,), `domains` (P, 2) and `names` say where to begin, how far x may go, and
-    what it means. `fit(problem)` does all that `fit` does.
+    for m/s, and for rad/s what has the same kinetic energy) over the R measured values; `fit`
+    minimizes its sum of squares. `residual`, `jacobian`, `log_density` and `to_law` are pure
+    functions of x for jit, vmap and grad, and so for any solver or sampler; `start` (P,), `domains`
+    (P, 2) and `names` say where to begin, how far x may go, and what it means. `fit(problem)` does
+    all that `fit` does.
 
     Make one with `from_shots` or `from_observable`.
 

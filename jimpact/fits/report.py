@@ -55,6 +55,8 @@ def _parameters(fit: Any) -> list[str]:
         error = fit.standard_error[i]
         word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
         interval = f"{low:.5g} to {high:.5g}" if np.isfinite(error) else "-"
+        if fit.profiles:
+            interval = fit.profiles[i].words
         note = "   at its bound" if fit.at_bound[i] else ""
         lines.append(f"{fit.names[i]:{width}s} {fit.value[i]:12.6g} {word:>12s}   {interval}{note}")
     return lines
@@ -130,6 +132,7 @@ def to_json(fit: Any) -> dict[str, Any]:
             "confidence_interval_95": as_data(interval[i]),
             "at_bound": bool(fit.at_bound[i]),
             "seen": bool(not np.isinf(fit.standard_error[i])),
+            "profile_95": as_data(fit.profiles[i].intervals) if fit.profiles else None,
         }
         for i, name in enumerate(fit.names)
     ]
