@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -160,8 +160,8 @@ class Experiments(eqx.Module):
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """`T+ / T-` of every shot (K,); NaN for shots with missing values."""
         ratios = []
-        for k, (pre, post) in enumerate(zip(np.asarray(self.pre), np.asarray(self.post))):
-            mass = dense_mass(self.scene_of(scene, k))
+        masses = self.each(scene, dense_mass)
+        for mass, pre, post in zip(masses, np.asarray(self.pre), np.asarray(self.post)):
             before = pre @ mass @ pre
             ratios.append(post @ mass @ post / before if before > 0 else np.nan)
         return np.array(ratios)
@@ -199,16 +199,19 @@ class Experiments(eqx.Module):
         turns = np.array(self.units) == ANGULAR
         if turns.all() or not turns.any():
             return np.ones(len(turns))
-        masses = np.mean(
-            [np.diag(dense_mass(self.scene_of(scene, k))) for k in range(len(self.shots))], axis=0
-        )
+        masses = np.mean([np.diag(mass) for mass in self.each(scene, dense_mass)], axis=0)
         return np.where(turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0)
 
     def balances(self, scene: Scene | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Of every shot: C^T M (c, n), v-, v+."""
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
-        scenes = [self.scene_of(scene, k) for k in range(len(pre))]
-        return [(conserved_momenta(s), a, b) for s, a, b in zip(scenes, pre, post)]
+        return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
+
+    def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
+        """`function` of the scene of every shot; of a common one only once."""
+        if self.scenes is None:
+            return [function(self.scene_of(scene, 0))] * len(self.shots)
+        return [function(self.scene_of(scene, k)) for k in range(len(self.shots))]
 
 
 def _filled(rows: list[np.ndarray]) -> np.ndarray:
@@ -438,9 +441,9 @@ def data_defects(
     momenta: dict[int, list[tuple[int, _Defect]]] = {}
     energies, resting = [], []
     energy_ratios = experiments.energy_ratio(scene)
+    masses, closed = experiments.each(scene, dense_mass), experiments.each(scene, _closed_normals)
     for k, (rows, pre, post) in enumerate(experiments.balances(scene)):
-        own = experiments.scene_of(scene, k)
-        normals = np.asarray(own.normals, float)[:, np.asarray(own.closed)]
+        normals, mass = closed[k], masses[k]
         slowest = -SEPARATION * np.abs(normals).T @ np.abs(pre)
         if stored_energy == 0 and (normals.T @ pre >= slowest).all():
             resting.append(k)
@@ -452,7 +455,6 @@ def data_defects(
             ratio = 1 + excess / scale if scale else np.inf
             defect = _Defect(excess, scale, row, sigma, ratio)
             momenta.setdefault(j, []).append((k, defect))
-        mass = dense_mass(own)
         t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
         gain = t_plus - t_minus - stored_energy
         energies.append((k, _Defect(gain, t_minus, mass @ post, sigma, energy_ratios[k])))
@@ -474,6 +476,11 @@ def data_defects(
             "are pre and post swapped, or is a sign wrong?"
         )
     return lines
+
+
+def _closed_normals(scene: Scene) -> np.ndarray:
+    """Normals (n, c) of the closed contacts."""
+    return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
 
 
 class _Defect(NamedTuple):

@@ -439,7 +439,7 @@ def test_bad_observables(given, message):
 
 
 def test_another_number_of_shots_is_served_by_the_same_program(caplog):
-    pre = np.stack([np.linspace(1, 2, 8), np.zeros(8)], axis=1)
+    pre = np.stack([np.linspace(1, 2, 4), np.zeros(4)], axis=1)
     post = simulated(ji.Newton(0.6), PAIR, pre, noise=0.01)
     ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post))
     with jax.log_compiles(), caplog.at_level("WARNING"):

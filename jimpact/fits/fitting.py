@@ -178,7 +178,7 @@ def fit(
         problem = _without(problem, lost)
         found = search(problem, method, starts, seed, steps, progress)
     robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
-    end = replace(_as_fit(problem, robust or Robust(found, None, None), method), loss=loss)
+    end = replace(as_fit(problem, found, method, robust), loss=loss)
     return replace(end, profiles=profile(end, progress=progress)) if profiles else end
 
 
@@ -206,8 +206,8 @@ class Robust(NamedTuple):
     """The end of a search, the factors its loss puts on the weights, and its noise."""
 
     found: Search
-    factor: np.ndarray | None
-    noise: float | None
+    factor: np.ndarray
+    noise: float
 
 
 def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -251,11 +251,14 @@ def _robust(
     return Robust(found, factor, float(noise))
 
 
-def _as_fit(problem: FitProblem, robust: Robust, method: Method) -> Fit[Any]:
-    found = robust.found
-    if robust.factor is not None:  # as without the factors, but for the place
-        r, weighed = problem.residuals, problem.weighed(robust.factor).residuals
-        back = float(weighed.size) / float(r.size) / robust.factor.reshape(-1, 1)
+def as_fit(
+    problem: FitProblem, found: Search, method: Method, robust: Robust | None = None
+) -> Fit[Any]:
+    """Errors, rank and warnings at the end of a search."""
+    if robust is not None:  # as without the factors, but for the place
+        found, factor = robust.found, robust.factor
+        r, weighed = problem.residuals, problem.weighed(factor).residuals
+        back = float(weighed.size) / float(r.size) / factor.reshape(-1, 1)
         weight = np.asarray(r.weight, float)
         squares = float(np.sum((weight * (np.nan_to_num(problem.measured) - found.seen)) ** 2))
         minima = [(squares, found.value, 1)]
@@ -269,7 +272,7 @@ def _as_fit(problem: FitProblem, robust: Robust, method: Method) -> Fit[Any]:
         log=found.log,
         sum_of_squares=size**2 * found.minima[0][0],
         values=problem.values,
-        noise=robust.noise if robust.noise else None if problem.sigma is None else 1.0,
+        noise=robust.noise if robust else None if problem.sigma is None else 1.0,
         rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
         value_name=problem.value_name,
     )

@@ -10,6 +10,7 @@ import numpy as np
 
 from jimpact.fits.least_squares import Method, SolverState
 from jimpact.fits.problem import (
+    FEW,
     FitProblem,
     Residuals,
     advance_all,
@@ -82,7 +83,7 @@ def search(
 ) -> Search:
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)
-    points, residuals = _start_points(problem, starts, rng), filled_up(problem.residuals)
+    points, residuals = start_points(problem, starts, rng), filled_up(problem.residuals)
     with progress_bar(progress) as show:
         states = run(repeated(residuals, len(points)), points, method, max_steps, show)
         for _ in range(ROUNDS if starts > 1 else 0):
@@ -95,13 +96,13 @@ def search(
             states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
             if np.nanmin(more.cost) > (1 - SLOW) * least:
                 break
-    return _found(problem, states)
+    return ends(problem, states)
 
 
 def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Search:
     """The minimum next to y (Q,)."""
     residuals = repeated(filled_up(problem.residuals), 1)
-    return _found(problem, run(residuals, y[None], method, max_steps, lambda *told: None))
+    return ends(problem, run(residuals, y[None], method, max_steps, lambda *told: None))
 
 
 def repeated(residuals: Residuals, count: int) -> Residuals:
@@ -125,7 +126,8 @@ def run(
 
     Rivals are starts of one problem: those far behind the best are given up sooner.
     """
-    lanes = min(len(points), LANES)
+    few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for LANES
+    lanes = LANES if few else min(len(points), LANES)
     points = points.astype(problems.offset.dtype)
     begun = [
         begin_all(_rows(problems, rows), points[rows], method, max_steps)
@@ -167,7 +169,7 @@ def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray
     return leaf
 
 
-def _found(problem: FitProblem, states: SolverState) -> Search:
+def ends(problem: FitProblem, states: SolverState) -> Search:
     """Pick the best end (the states are on the host)."""
     parameters, r = problem.parameters, problem.residuals
     count, first = len(parameters.names), parameters.first
@@ -242,7 +244,7 @@ def _near(
     return np.clip(points, np.asarray(problem.low), np.asarray(problem.high))
 
 
-def _start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
+def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
     parameters, r = problem.parameters, problem.residuals
     first = parameters.first

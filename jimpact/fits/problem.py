@@ -38,9 +38,9 @@ from jimpact.status import CODE
 UNUSABLE = ("infeasible", "max_steps", "not_finite")
 PENALTY = 1e3  # times the largest measured value
 
-# Shots are filled up to 8, 32, 128, ... of them: a program serves all numbers in between, and the
-# copies that fill up cost at most four times the run of a fit, far less than compiling it.
-FEWEST, GROWTH = 8, 4
+# Shots are filled up to 4, 16, 64 and then 128, 256, ... of them: a program serves all numbers in
+# between, and the copies that fill up cost far less than compiling another one.
+FEWEST, FEW = 4, 64
 
 
 class Seen(NamedTuple):
@@ -174,14 +174,15 @@ class FitProblem:
         """The problem of measured shots; arguments and errors as of `fit`."""
         check_kind("law", law, Law)
         check_kind("experiments", experiments, Experiments)
-        own = [experiments.scene_of(scene, k) for k in range(len(experiments.shots))]
-        dtype = _dtype(law, own, experiments.pre)
+        own = experiments.each(scene, lambda s: s)
         same = experiments.scenes is None
         alike, extra = stackable(own[:1] if same else own)
+        dtype = _dtype(law, alike, experiments.pre)
         pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
         unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
         count, n = pre.shape
-        energy = max(0.5 * v @ dense_mass(s)[:n, :n] @ v for s, v in zip(own, pre)) or 1.0
+        masses = experiments.each(scene, dense_mass)
+        energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
         stacked = jax.tree.map(
             lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
         )
@@ -394,7 +395,7 @@ def filled_up(residuals: Residuals) -> Residuals:
     count = len(residuals.measured)
     goal = FEWEST
     while goal < count:
-        goal *= GROWTH
+        goal *= 4 if goal < FEW else 2
 
     last = np.minimum(np.arange(goal), count - 1)
     parts = (residuals.observe, residuals.measured, residuals.weight)

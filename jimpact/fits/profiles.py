@@ -82,9 +82,9 @@ def profile(
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
 
     Held values cover the whole domain and the neighbourhood of the minimum; all are solved side by
-    side, from the fit and once more from their neighbours. Where a scan finds a further valley, it
-    is followed to its minimum. Without sigma and with no degree of freedom left, the interval is
-    that of the values which reproduce the data exactly.
+    side, from the fit and once more from their better neighbours. Where a scan finds a further
+    valley, it is followed to its minimum. Without sigma and with no degree of freedom left, the
+    interval is that of the values which reproduce the data exactly.
 
     Args:
         fit: by least squares.
@@ -190,17 +190,21 @@ class _Scans:
             self.least, self.lower = best
 
     def add(self, held: Sequence[tuple[int, float]]) -> None:
-        """New held values: from the nearest known minimum, then from both neighbours."""
+        """New held values: from the nearest known minimum, then from their better neighbour."""
         self._take([(i, _with(self._nearest(i, y), i, y)) for i, y in held])
-        if len(self.fit.names) > 1:
-            for side in (-1, 1):
-                again = []
-                for i, y in held:
-                    values = sorted(self.found[i])
-                    k = values.index(float(y)) + side
-                    if 0 <= k < len(values):
-                        again.append((i, _with(self.found[i][values[k]][1], i, y)))
-                self._take(again)
+        if len(self.fit.names) == 1:
+            return
+        again = []
+        for i, y in held:
+            values = sorted(self.found[i])
+            k = values.index(float(y))
+            beside = [
+                self.found[i][x] for x in (*values[max(k - 1, 0) : k], *values[k + 1 : k + 2])
+            ]
+            squares, start = min(beside, key=_first)
+            if squares < self.found[i][float(y)][0]:
+                again.append((i, _with(start, i, y)))
+        self._take(again)
 
     def _nearest(self, i: int, y: float) -> np.ndarray:
         return self.found[i][min(self.found[i], key=lambda known: abs(known - y))][1]
