@@ -120,7 +120,7 @@ def fit(
     seed: int = 0,
     max_steps: int | None = None,
     profiles: bool = False,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
 

@@ -31,7 +31,7 @@ def fit_many(
     starts: int = 1,
     seed: int = 0,
     max_steps: int = DEFAULT_STEPS[_METHOD],
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> list[Fit[AnyLaw]]:
     """`fit` of one law to each of many data sets, side by side in one compiled program.
 
@@ -83,7 +83,7 @@ class Refits:
 
 
 def bootstrap(
-    fit: Fit, samples: int = 200, *, seed: int = 0, progress: bool | None = None
+    fit: Fit, samples: int = 200, *, seed: int = 0, progress: float | None = None
 ) -> Refits:
     """Fits to data that the fitted law made, with the noise of the fit (parametric bootstrap).
 
@@ -123,7 +123,7 @@ def bootstrap(
     return _refits(fit, many, samples, progress)
 
 
-def leave_one_out(fit: Fit, *, progress: bool | None = None) -> Refits:
+def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     """A fit without each of the K shots in turn; `predicted` (K, n) is of the shot left out.
 
     `measured - predicted` is an honest error of prediction: laws with different numbers of
@@ -150,7 +150,7 @@ def leave_one_out(fit: Fit, *, progress: bool | None = None) -> Refits:
     return Refits(found.names, found.value, one_each)
 
 
-def _refits(fit: Fit, many: Residuals, count: int, progress: bool | None) -> Refits:
+def _refits(fit: Fit, many: Residuals, count: int, progress: float | None) -> Refits:
     """Minima of so many problems next to a fit."""
     r, first = fit.problem.residuals, fit.problem.parameters.first
     scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]

@@ -74,7 +74,7 @@ def profile(
     *,
     level: float = 0.95,
     points: int = 33,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> tuple[Profile, ...]:
     """Profile likelihoods of parameters: intervals that need no parabola.
 

@@ -254,11 +254,11 @@ class _Tried(NamedTuple):
 
 def pressed_together(
     given: Contacts, touching: jax.Array, slack: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`0 <= lambda _|_ W lambda + approach >= 0` over touching contacts, without friction.
 
     Returns:
-        Which contacts (m,) are pressed, and which (m,) neither press nor part.
+        Which contacts (m,) are pressed, which (m,) neither press nor part, and lambda (m,).
     """
     given = jax.lax.stop_gradient(given)
     m = touching.shape[0]
@@ -268,4 +268,4 @@ def pressed_together(
     # redundant contacts: any of the solutions will do
     found = solve_lcp(jnp.where(both, w, eye), b, regular=True)
     pressed = touching & (found.z * jnp.diagonal(w) > slack)
-    return pressed, touching & ~pressed & (found.w <= slack)
+    return pressed, touching & ~pressed & (found.w <= slack), found.z

@@ -1,5 +1,6 @@
 """`simulate`: whole motions."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -13,29 +14,34 @@ from jimpact._checks import (
     as_float_array,
     as_whole,
     check_kind,
+    check_per_contact,
     check_shape,
     check_values,
+    in_common_dtype,
     is_traced,
 )
 from jimpact.bodies.base import GivenBody
-from jimpact.compiling import quick_jit
+from jimpact.compiling import is_own, quick_jit
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential, seen_from_base
-from jimpact.motion.event_driven import Given, event_driven
+from jimpact.motion.event_driven import Given, Past, event_driven, no_past
 from jimpact.motion.flow import Course, Settings
-from jimpact.motion.record import Motion
+from jimpact.motion.record import MOTION_CODE, Events, Motion, joined
 from jimpact.motion.stepping import is_pile, joins_step, recorded_gaps, time_stepping
 from jimpact.motion.system import System
+from jimpact.progress import progress_bar, waiting
 from jimpact.scene import check_mass
 
 CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
 RTOL, ATOL = 1e-10, 1e-12  # of the flights
 SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
-MAX_EVENTS, MAX_STEPS = 500, 100_000
+MAX_STEPS = 100_000
+CHUNK = 500  # events of one run of the program
+MOST_EVENTS = 100_000  # that a motion has on the host where nothing is said
 METHODS = ("events", "time_stepping", "contact_forces")
 MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
 _BASE_LOOKS = 64  # times at which the base is looked at before the motion starts
@@ -53,12 +59,13 @@ def simulate(
     method: str = "events",
     step: float | None = None,
     friction: Any = None,
-    max_events: int = MAX_EVENTS,
+    max_events: int | None = None,
     rtol: float = RTOL,
     atol: float = ATOL,
     closed_below: float = CLOSED_BELOW,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
+    progress: float | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
@@ -80,13 +87,16 @@ def simulate(
         friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
             `tangent_function`, in time stepping with any tangents; None: that of the law, if it
             has a field `friction`.
-        max_events: rows for events; one more ends the motion with the status `max_events` (in
-            time stepping it is not written).
+        max_events: one more ends the motion with the status `max_events` (in time stepping it is
+            not written). None: 500; with method 'events' outside jit, vmap and derivatives 100 000,
+            found by the program for 500 in as many runs as needed.
         rtol, atol: tolerances of the flights.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed.
         max_steps: of the integrator, in all.
+        progress: bar on stderr, after each of those runs with the share of the duration that is
+            done; None: on a terminal, for long motions.
 
     Returns:
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
@@ -113,12 +123,16 @@ def simulate(
     check_kind("system", system, System)
     check_kind("law", law, Law)
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
-    dtype = jnp.result_type(q, v)
     start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))
+    system, law, q, v = in_common_dtype(system, law, q, v)
+    dtype = q.dtype
+    start, end = start.astype(dtype), end.astype(dtype)
     deepest = np.inf if method == "contact_forces" else closed_below
     _check_motion(system, q, v, start, end, deepest)
     count = as_whole("samples", samples, 2)
-    as_whole("max_events", max_events, 1)
+    if max_events is not None:
+        as_whole("max_events", max_events, 1)
+    rows = CHUNK if max_events is None else max_events
     as_whole("max_steps", max_steps, 1)
     for name, value in (("rtol", rtol), ("atol", atol), ("closed_below", closed_below)):
         check_values(name, value, low=0.0, open_low=True)
@@ -132,7 +146,6 @@ def simulate(
         )
     mu = _friction_of(system, law, friction, q, in_space=method == "time_stepping")
     system = _opened(system, q, v, start)
-    q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     settings = Settings(
         rtol,
         atol,
@@ -145,18 +158,52 @@ def simulate(
     if method == "time_stepping":
         substeps = _substeps_of(step, t_start, t_end, count)
         joint = joins_step(law) and friction is None
-        if is_pile(system) and not joint:
+        if joint:
+            _check_coefficients(system, law, q)
+        elif is_pile(system):
             raise ValueError(
-                "Argument `law` must be Moreau's, with its own `friction`, one `restitution` and "
-                "no `tangential_restitution`, for the many contacts of "
-                f"{type(system.body).__name__}, but is {law!r}."
+                "Argument `law` must be Moreau's, with its own `friction` and without a matrix, "
+                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
             )
-        sizes = count, substeps, joint, max_events
-        return _stepped(system, law, mu, q, v, start, end, settings.closed_below, *sizes)
+        sizes = substeps, count, joint, rows
+        given: Any = system, law, mu, q, v, start, end, settings.closed_below, *sizes
+        return _waited(_stepped, given, progress)
     if method == "contact_forces":
         force = _force_of(law, mu)
-        return _forced(system, force, settings, q, v, start, end, count, max_events)
-    return _events(system, law, mu, settings, q, v, start, end, count, max_events)
+        given = system, force, settings, q, v, start, end, count, rows
+        return _waited(_forced, given, progress)
+    given = system, law, mu, settings, q, v, start, end
+    if _on_host(given):
+        return _in_runs(given, count, MOST_EVENTS if max_events is None else max_events, progress)
+    return _events(*(*given, None, count, rows))[0]
+
+
+def _on_host(given: Any) -> bool:
+    """Whether what follows from it is known at once: not within jit, vmap or derivatives."""
+    return not is_traced(given) and is_own(())
+
+
+def _waited(run: Callable[..., Motion], given: Any, progress: float | None) -> Motion:
+    if not _on_host(given):
+        return run(*given)
+    with waiting("motion", progress):
+        return jax.block_until_ready(run(*given))
+
+
+def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: float | None) -> Motion:
+    """The motion in runs of `CHUNK` events, each of which goes on where the last one ended."""
+    system, *_, q, v, start, end = given
+    numbers: Any = no_past(q, v, _contacts_of(system, q), samples)
+    parts: list[Events] = []
+    with progress_bar(progress) as show:
+        show("motion", 0.0, float(end - start))
+        while True:
+            left = jnp.asarray(np.int32(most - CHUNK * len(parts)))
+            motion, numbers = _events(*(*given, Past(left, numbers), samples, CHUNK))
+            parts.append(motion.events)
+            if int(motion.status) != MOTION_CODE["max_events"] or CHUNK * len(parts) >= most:
+                return dataclasses.replace(motion, events=joined(parts, most))
+            show("motion", float(motion.events.time[-1] - start), float(end - start))
 
 
 @quick_jit
@@ -169,12 +216,14 @@ def _events(
     v: jax.Array,
     start: jax.Array,
     end: jax.Array,
+    past: Past | None,
     samples: int,
     max_events: int,
-) -> Motion:
+) -> tuple[Motion, jax.Array | None]:
     times = _equal_times(start, end, samples)
-    given = Given(system, law, mu, settings, q, v, times, _contacts_of(system, q))
-    return _recorded(system, times, event_driven(given, max_events))
+    given = Given(system, law, mu, settings, q, v, times, _contacts_of(system, q), past)
+    course, numbers = event_driven(given, max_events)
+    return _recorded(system, times, course), numbers
 
 
 @quick_jit
@@ -204,8 +253,8 @@ def _stepped(
     start: jax.Array,
     end: jax.Array,
     closed_below: jax.Array,
+    substeps: jax.Array,
     samples: int,
-    substeps: int,
     joint: bool,
     max_events: int,
 ) -> Motion:
@@ -272,7 +321,53 @@ def _check_motion(
             f"Argument `t_end` must be larger than `t_start` = {float(start):g}, "
             f"but has value {float(end):g}."
         )
+    _check_functions(system, q, v, start)
     _check_system(system, q, v, start, end, closed_below)
+
+
+def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
+    """Raise where a function of the system returns what cannot be used, by its shape alone."""
+    body, n = system.body, v.shape[0]
+
+    def returned(name: str, function: Any, *args: jax.Array) -> tuple[int, ...]:
+        out = jax.eval_shape(lambda: jnp.asarray(function(*args)))
+        if jnp.promote_types(out.dtype, q.dtype) != q.dtype:
+            raise TypeError(
+                f"Argument `system` must compute in the precision of `q0`, {q.dtype}, but its "
+                f"`{name}` returns {out.dtype}: give `q0` in it, too."
+            )
+        found: tuple[int, ...] = out.shape
+        return found
+
+    def check(name: str, found: tuple[int, ...], allowed: str, fine: bool) -> None:
+        if not fine:
+            raise ValueError(
+                f"Argument `system` must have a `{name}` that returns shape {allowed}, "
+                f"but it returns {found}."
+            )
+
+    f = returned("gap_function", body.gap_function, q)
+    check("gap_function", f, "(m,), a gap for each of m >= 1 contacts", len(f) == 1 and f[0] > 0)
+    if isinstance(body, GivenBody) and body.sliding is not None:
+        h = returned("tangent_function", body.tangent_function, q)
+        check("tangent_function", h, "(m,), one displacement a contact", len(h) == 1)
+    if system.force is not None:
+        force = returned("force", system.force, q, v, t)
+        check("force", force, f"({n},), one per velocity", force == (n,))
+    if system.potential is not None:
+        energy = returned("potential", system.potential, q)
+        check("potential", energy, "(), an energy", energy == ())
+    if system.base is not None:
+        assert system.base_directions is not None
+        d = system.base_directions.shape[1]
+        check_shape("base_directions", system.base_directions, (n, d), "a row for each velocity")
+        place = returned("base", system.base, t)
+        check(
+            "base",
+            place,
+            f"({d},), as `base_directions` has {d} columns",
+            place == (d,) or (place == () and d == 1),
+        )
 
 
 def _check_system(
@@ -381,6 +476,17 @@ def _friction_of(
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
 
 
+def _check_coefficients(system: System, law: Law, q: jax.Array) -> None:
+    """One value of each for all contacts, or one a contact; of a pile one."""
+    m = _contacts_of(system, q)
+    for name in ("restitution", "tangential_restitution"):
+        value = getattr(law, name)
+        if is_pile(system):
+            check_shape(name, value, (), "one for all contacts of a pile")
+        elif value is not None:
+            check_per_contact(name, value, m)
+
+
 def _contacts_of(system: System, q: jax.Array) -> int:
     """m."""
     found: int = jax.eval_shape(system.body.gap_function, q).shape[0]
@@ -396,8 +502,8 @@ def _force_of(law: Law, mu: jax.Array | None) -> Force:
     return law.force
 
 
-def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
-    """Steps between two samples, none longer than `step`."""
+def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> jax.Array:
+    """Steps () between two samples, none longer than `step`."""
     if step is None or is_traced(step):
         raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
     check_values("step", step, low=0.0, open_low=True)
@@ -409,4 +515,4 @@ def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
         raise ValueError(
             f"Argument `step` must give at most {MOST_STEPS} steps, but has value {step:g}."
         )
-    return int(count)
+    return jnp.asarray(int(count), jnp.int32)  # an array: one program for all steps
