@@ -108,9 +108,7 @@ for i, level in enumerate(levels[1:], 1):
     lane = jax.tree.map(lambda x, i=i: x[i], motions)
     most = np.degrees(np.nanmax(np.abs(lane.q[:, 2])))
     told = (
-        "overturns"
-        if lane.to_dict()["status"] == "out_of_range"
-        else f"at most {most:.2f} degrees"
+        "overturns" if lane.to_dict()["status"] == "out_of_range" else f"at most {most:.2f} degrees"
     )
     print(f"{level:.1f} g: {told}")
 
