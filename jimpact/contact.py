@@ -154,6 +154,19 @@ class Contact(eqx.Module):
             (gamma - small, jnp.maximum(self.noise, noise)),
         )
 
+    def closed_only(self) -> "Contact":
+        """The same with open contacts decoupled, so that they take no part."""
+        closed, cross, along, slip = self.closed, self.cross, self.tangential, self.slip
+        w, gamma = decoupled(self.delassus, closed), jnp.where(closed, self.gap_velocity, 0.0)
+        if cross is not None and along is not None and slip is not None:
+            cross, along, slip = _closed_block(closed, w, cross, along, slip)
+        return eqx.tree_at(
+            lambda c: (c.delassus, c.gap_velocity, c.cross, c.tangential, c.slip),
+            self,
+            (w, gamma, cross, along, slip),
+            is_leaf=lambda x: x is None,
+        )
+
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """gamma+ (m,) [m/s] of impulses p (m,) and p_t (t,)."""
         after = self.gap_velocity + self.delassus @ normal
@@ -203,12 +216,7 @@ def contact_of(
     norm = jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene)
     stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, (m,))
     stored = jnp.where(scene.closed, stored, 0.0)
-    if gaps is not None and not uses_gaps:
-        closed = scene.closed
-        w, gamma = decoupled(w, closed), jnp.where(closed, gamma, 0.0)
-        if cross is not None and tangential is not None and slip is not None:
-            cross, tangential, slip = _closed_block(closed, w, cross, tangential, slip)
-    return Contact(
+    found = Contact(
         w,
         gamma,
         closed=scene.closed,
@@ -220,6 +228,7 @@ def contact_of(
         tangential=tangential,
         slip=slip,
     )
+    return found if gaps is None or uses_gaps else found.closed_only()
 
 
 def settled(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -41,7 +41,9 @@ class Impact(eqx.Module):
     status: jax.Array
 
 
-def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
+def impact(
+    law: Law, scene: Scene, velocity: Any, noise: Any = None, closed_only: bool = False
+) -> Impact:
     """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
 
     Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
@@ -56,6 +58,8 @@ def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
         velocity: v- (n,) [m/s].
         noise: gap velocities () up to which are rounding, too [m/s]: in a motion v- holds the
             rounding of its largest speeds. None: of v- only.
+        closed_only: contacts with gap > 0 take no part in laws that use gaps, either: in a motion
+            their impacts come later.
 
     Returns:
         `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
@@ -85,7 +89,7 @@ def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
     alike = few and groups is None and separable and law.fills_up
     if alike and not is_traced((law, scene, v, noise)) and is_own(()):
         return _filled_up(law, scene, v, noise)
-    out = _impact(law, scene, v, groups, noise)
+    out = _impact(law, scene, v, groups, noise, closed_only)
     return _held(law, out) if is_traced(law) else out  # else the law was checked when it was made
 
 
@@ -101,7 +105,7 @@ def _filled_up(law: Law, scene: Scene, v: jax.Array, noise: jax.Array | None) ->
     velocity: Any = np.zeros(filled.scene.size, v.dtype)
     velocity[filled.coordinates] = v
     on_host = of_contacts(jax.tree.map(np.asarray, law), filled.copied)
-    out = _impact(on_host, filled.scene, velocity, None, noise)
+    out = _impact(on_host, filled.scene, velocity, None, noise, closed_only=False)
     return Impact(
         jnp.asarray(np.asarray(out.velocity)[filled.coordinates]),
         jnp.asarray(np.asarray(out.impulse)[filled.contacts]),
@@ -129,10 +133,16 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
 
 @quick_jit
 def _impact(
-    law: Law, scene: Scene, v: jax.Array, groups: Groups | None, noise: jax.Array | None
+    law: Law,
+    scene: Scene,
+    v: jax.Array,
+    groups: Groups | None,
+    noise: jax.Array | None,
+    closed_only: bool,
 ) -> Impact:
     if groups is None:
         contact = law.contact(scene, v)
+        contact = contact.closed_only() if law.uses_gaps and closed_only else contact
         contact = contact if noise is None else contact.within(noise)
         happens = contact.happens
         outcome = _resolved(law, contact, happens)

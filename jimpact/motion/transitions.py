@@ -77,7 +77,7 @@ def impact_jump(
     scene = scene_at(system, state.q, state.v, t, closed)
     carried = carried_along(system, state.v, t)
     relative = state.v - carried
-    out = impact(law, scene, relative, noise)
+    out = impact(law, scene, relative, noise, closed_only=True)
     mean = 0.5 * (out.velocity + relative)
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
