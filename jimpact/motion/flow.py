@@ -96,9 +96,10 @@ def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales)
     if given.tangent is None or mu is None or found.tangential is None:
         return normal
     cone = (mu * found.normal - jnp.abs(found.tangential)) * w[m:] + slack
-    # sliding ends where slip does, and where its forces stop to exist
+    # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     lasts = regularity(given, mu, modes) - least_regularity(w.dtype)
-    slip = modes.sign * given.tangent.rate * lasts
+    slip = modes.sign * given.tangent.rate
+    slip = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
     side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)
     return jnp.concatenate([normal, side])
 
