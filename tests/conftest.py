@@ -1,9 +1,8 @@
 """Strict JAX flags for every test, and the count of the programs that the tests compile.
 
-Compiling is what the suite's time goes into. So the default suite compiles with little
-optimization, in half the time (`programs.values`, the held values, and the slow tests with all of
-it). A session tells the tests that compile most; one of the whole default suite fails beyond
-BUDGET programs.
+Compiling is what the suite's time goes into. So tests compile with little optimization, in half the
+time; `programs.values`, the held values and tests marked `long_run` with all of it. A session tells
+the tests that compile most; one of the whole default suite fails beyond BUDGET programs.
 """
 
 import os
@@ -69,12 +68,16 @@ def compiled(event, duration, **_):
             seconds[running[0]] += took
 
 
+def optimize(fully):
+    """How programs are compiled from now on, those of what tests run as commands, too."""
+    jax.config.update("jax_disable_most_optimizations", not fully)
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not fully)
+
+
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
     jax.monitoring.register_event_duration_secs_listener(compiled)
-    quick = config.option.markexpr == "not slow"
-    jax.config.update("jax_disable_most_optimizations", quick)
-    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(quick)  # for what tests run as commands
+    optimize(False)
     if hasattr(config, "workerinput"):
         return
     config.pluginmanager.register(Workers())
@@ -154,10 +157,11 @@ def pytest_runtest_setup(item):
 
 
 @pytest.fixture(autouse=True)
-def each_test():
+def each_test(request):
     """Fixed seeds; a process does not hold too many programs."""
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002
+    optimize(request.node.get_closest_marker("long_run") is not None)
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:

@@ -154,6 +154,18 @@ def one(make):
     return run
 
 
+def both_ways(function):
+    """x (n,) -> Jacobian (k, n) of a function, forward and transposed, from one linearization."""
+
+    @jax.jit
+    def run(x):
+        end, forward = jax.linearize(function, x)
+        (reverse,) = jax.vmap(jax.linear_transpose(forward, x))(jnp.eye(len(end)))
+        return jax.vmap(forward, out_axes=1)(jnp.eye(len(x))), reverse
+
+    return run
+
+
 OPTIMIZED = {"xla_backend_optimization_level": 3, "xla_llvm_disable_expensive_passes": False}
 
 

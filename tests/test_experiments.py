@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.experiments import UNITS, data_defects
+from jimpact.experiments import data_defects
+from jimpact.shots_file import UNITS
 
 DATA = files("jimpact") / "data"
 CHAIN = ji.chain([1.0, 1.0, 1.0])

@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 
 import jimpact as ji
 from jimpact.bodies.solids import rotation
+from jimpact.motion.record import MOTION_CODE
 
 G = 9.80665
 CUBE = Path(__file__).parent / "data" / "cube_pairs.csv"
@@ -254,11 +255,45 @@ def test_a_quaternion_of_length_2_is_told():
     assert status(run(ball.at([0.0, 0.0, 0.2]).at[3].set(2.0))) == "out_of_range"
 
 
+ROW = ji.System(lambda q: q[1:] - q[:-1] - 0.2, [1.0, 1.0, 1.0])
+
+
 def test_an_elastic_row_never_gains_energy():
     """The left ball strikes while the other two still leave each other."""
-    row = ji.System(lambda q: q[1:] - q[:-1] - 0.2, [1.0, 1.0, 1.0])
-    motion = stepped(row, ji.Moreau(1.0), [0.0, 0.2004, 0.4004], [1.0, 0.0, 0.1])
+    motion = stepped(ROW, ji.Moreau(1.0), [0.0, 0.2004, 0.4004], [1.0, 0.0, 0.1])
     np.testing.assert_allclose(motion.kinetic_energy, motion.kinetic_energy[0], rtol=1e-8)
+
+
+def test_impacts_closer_than_a_step_are_one():
+    """The right ball is nearer by what it moves in 3 and in 0.1 steps: two impacts, and one."""
+    for steps, after in ((3.0, [-2.0, 0.0, 1.0]), (0.1, [-5 / 3, -2 / 3, 4 / 3])):
+        first, late = 2.5e-3, steps * 1e-3
+        start = [-0.2 - first - late, 0.0, 0.2 + 2 * first]
+        motion = stepped(ROW, ji.Moreau(1.0), start, [1.0, 0.0, -2.0])
+        np.testing.assert_allclose(motion.velocity[-1], after, atol=1e-8)
+
+
+def test_a_tossed_block_never_gains_energy():
+    """From step to step: at rest, in a stop, with unequal e, in impacts whose slip turns round."""
+    rng, n = np.random.default_rng(0), 60
+    q = np.stack([np.zeros(n), np.full(n, 0.35), rng.uniform(-3, 3, n)], axis=1)
+    v = rng.normal(size=(n, 3)) * [1, 1, 5]
+    e, mu, e_t = (np.repeat(rng.uniform(low, 1, (n, 1)), 4, 1) for low in (0, 0, -1))
+    e[n // 2 :] = rng.uniform(size=(n // 2, 4))
+    e_t[::2] = 0
+
+    @jax.jit
+    @jax.vmap
+    def toss(q, v, e, mu, e_t):
+        return ji.simulate(
+            ji.block_system(0.2, 0.4), ji.Moreau(e, friction=mu, tangential_restitution=e_t),
+            q, v, 0.6, samples=601, method="time_stepping", step=1e-3,
+        )  # fmt: skip
+
+    motion = toss(q, v, e, mu, e_t)
+    assert np.isin(motion.status, [MOTION_CODE["ok"], MOTION_CODE["coarse_step"]]).all()
+    assert np.diff(motion.energy, axis=1).max() < 1e-6
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import both_ways
 from scipy.integrate import quad
 
 import jimpact as ji
@@ -200,28 +201,9 @@ def collides(x):
     return system, law, start, jnp.zeros(3).at[0].set(x[2]), 0.6, None
 
 
-def slides(x):
-    block = ji.block_system(0.2, 0.4, corners="base")
-    system = ji.System(
-        block.gap_function,
-        block.mass,
-        potential=lambda q: G * (jnp.cos(x[1]) * q[1] - jnp.sin(x[1]) * q[0]),
-        tangent_function=block.tangent_function,
-    )
-    return system, ji.Moreau(0.0), [0.0, 0.2, 0.0], jnp.zeros(3).at[0].set(x[2]), 1.0, x[0]
-
-
 def shaken(x):
     system = ji.ball_system(base=ji.HarmonicBase(x[0], x[1]))
     return system, ji.Newton(x[2]), [0.2], [0.0], 1.0, None
-
-
-@pytest.fixture
-def quick_to_compile():
-    """Little optimization: these programs compile for longer than they run."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)  # as for all slow tests
 
 
 @pytest.mark.slow
@@ -229,13 +211,10 @@ def quick_to_compile():
     ("given", "at", "events", "step", "allowed"),
     [
         (collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8),
-        (slides, [0.3, 0.1, 1.0], 1, 1e-4, 1e-8),
         (shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7),  # the plate of 2 cm: differences see no more
     ],
 )
-def test_derivatives_of_a_motion_against_differences(
-    quick_to_compile, given, at, events, step, allowed
-):
+def test_derivatives_of_a_motion_against_differences(given, at, events, step, allowed):
     """In both modes, of the end, event times and the ledger; differences at a finer tolerance."""
 
     def run(x, rtol=1e-10):
@@ -248,7 +227,7 @@ def test_derivatives_of_a_motion_against_differences(
         return jnp.concatenate([*end, motion.base_work[-1:], motion.events.time[:events]])
 
     x = jnp.array(at)
-    forward, reverse = jax.jit(lambda x: (jax.jacfwd(run)(x), jax.jacrev(run)(x)))(x)
+    forward, reverse = both_ways(run)(x)
     np.testing.assert_allclose(forward, reverse, rtol=1e-11, atol=1e-12)
     moves = jnp.concatenate([k * step * jnp.eye(3) for k in (1, -1, 2, -2)])
     fine = jax.jit(jax.vmap(lambda x: run(x, 1e-12)))(x[None] + moves).reshape(4, 3, -1)

@@ -132,9 +132,9 @@ class Discs(Body):
 
     # ---- closed contacts only
 
-    def near(self, q: jax.Array, below: jax.Array) -> Near:
-        """The contacts with gaps up to `below`."""
-        gaps = self._all_gaps(q)
+    def near(self, q: jax.Array, later: jax.Array, below: jax.Array) -> Near:
+        """The contacts, at q, with gaps up to `below` at q or `later`."""
+        gaps = jnp.minimum(self._all_gaps(q), self._all_gaps(later))
         none, across = gaps.size, gaps.shape[1]
         closed = gaps.reshape(-1) <= below
         number = jnp.nonzero(closed, size=self.room, fill_value=none)[0]

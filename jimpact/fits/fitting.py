@@ -109,7 +109,7 @@ def fit(
     starts: int = 8,
     seed: int = 0,
     max_steps: int | None = None,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
 

@@ -71,7 +71,7 @@ def search(
     starts: int,
     seed: int,
     max_steps: int,
-    progress: bool | None,
+    progress: float | None,
 ) -> Search:
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)

@@ -54,7 +54,15 @@ AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
 # Rows of a plan beside one a sample: accepted steps of a motion that has derivatives. A motion of
 # more steps has none: NaN.
 ROWS_PER_EVENT, ROWS_MORE = 16, 1024
+ROOM = 32  # numbers a contact that a run may hand over, beside states
 BLOCK = 16  # rows between two checkpoints
+
+
+class Past(NamedTuple):
+    """What a run takes over from the one before it."""
+
+    most: jax.Array  # () events that are still allowed
+    numbers: jax.Array  # (k,) see `_handed_over`; 0 where the motion begins
 
 
 class Given(NamedTuple):
@@ -68,6 +76,7 @@ class Given(NamedTuple):
     v0: jax.Array
     times: jax.Array  # (S,)
     contacts: int  # m
+    past: Past | None = None  # where the motion may go on, run after run
 
     @property
     def start(self) -> State:
@@ -111,7 +120,7 @@ class Table(NamedTuple):
 
 class _Run(NamedTuple):
     flight: Flight
-    struck: jax.Array
+    struck: jax.Array  # (m,) contacts that had an impact
     allowed: jax.Array  # errors of the ledger
     waits: jax.Array  # whether an event is to be resolved
     approach: jax.Array  # of an impact without collision, 0 where another event waits
@@ -130,10 +139,21 @@ class _End(NamedTuple):
     steps: jax.Array
     status: jax.Array
     plan: Plan | None
+    past: jax.Array | None  # numbers for the next run
 
 
-def event_driven(given: Given, max_events: int) -> Course:
-    """The motion from `times[0]` to `times[-1]`, sampled at `times`; it has both derivatives."""
+def no_past(q: jax.Array, v: jax.Array, contacts: int, samples: int) -> jax.Array:
+    """Numbers of a `Past` for a motion that begins."""
+    state = q.shape[0] + v.shape[0] + 2 * contacts + 3
+    return jnp.asarray(np.zeros((samples + 2) * state + ROOM * (contacts + 2), q.dtype))
+
+
+def event_driven(given: Given, max_events: int) -> tuple[Course, jax.Array | None]:
+    """The motion from `times[0]` to `times[-1]`, sampled at `times`; it has both derivatives.
+
+    With it, where there is a `given.past`, what the next run takes over, which goes on after the
+    last of `max_events`.
+    """
     leaves, tree = jax.tree.flatten(given)
     fixed = [None if eqx.is_array(x) else x for x in leaves]
 
@@ -169,7 +189,7 @@ def event_driven(given: Given, max_events: int) -> Course:
     end = value(*(x for x, y in zip(leaves, fixed) if y is None))
     samples = sampled_states(end.table.samples, given.start, end.reached)
     events = _events(end.table, end.seen, given)
-    return Course(samples, events, end.steps, end.status)
+    return Course(samples, events, end.steps, end.status), end.past
 
 
 # ------------------------------------------------------------------------------ the run
@@ -178,6 +198,8 @@ def event_driven(given: Given, max_events: int) -> Course:
 def _run(given: Given, max_events: int, records: bool) -> _End:
     """From event to event; with its plan, if it `records`."""
     start = _begin(given, max_events, records)
+    if given.past is not None:
+        start = _continued(start, given.past.numbers)
 
     def goes_on(run: _Run) -> jax.Array:
         flight = run.flight
@@ -198,12 +220,49 @@ def _run(given: Given, max_events: int, records: bool) -> _End:
     ).astype(jnp.int32)
     told = end.several & (status == MOTION_CODE["ok"])
     status = jnp.where(told, MOTION_CODE["several_outcomes"], status).astype(jnp.int32)
-    flight = end.flight
-    return _End(end.table, flight.sample, end.seen, flight.steps, status, end.plan)
+    flight, past = end.flight, None
+    if given.past is not None:
+        past = _handed_over(end, given.past.numbers.shape[0])
+    return _End(end.table, flight.sample, end.seen, flight.steps, status, end.plan, past)
+
+
+def _remembered(run: _Run) -> Any:
+    """What a run must know of the one before it."""
+    waits = run.waits, run.approach, run.several
+    return run.flight, run.struck, run.allowed, waits, run.last, run.table.samples
+
+
+def _handed_over(run: _Run, size: int) -> jax.Array:
+    """1, and what is remembered, as numbers (size,)."""
+    parts = [jnp.ravel(x).astype(run.allowed.dtype) for x in jax.tree.leaves(_remembered(run))]
+    flat = jnp.concatenate([jnp.ones(1, run.allowed.dtype), *parts])
+    return jnp.pad(flat, (0, size - flat.shape[0]))
+
+
+def _continued(start: _Run, past: jax.Array) -> _Run:
+    """The run that goes on from `past`, or `start` if there is none."""
+    leaves, tree = jax.tree.flatten(_remembered(start))
+    ends = np.cumsum([1] + [x.size for x in leaves])
+    parts = jnp.split(past, ends)[1:-1]
+    known = [x.reshape(like.shape).astype(like.dtype) for x, like in zip(parts, leaves)]
+    on = past[0] > 0
+    found = selected(on, jax.tree.unflatten(tree, known), _remembered(start))
+    flight, struck, allowed, waits, last, samples = found
+    return start._replace(
+        flight=flight,
+        struck=struck,
+        allowed=allowed,
+        waits=waits[0],
+        approach=waits[1],
+        several=waits[2],
+        last=last,
+        table=start.table._replace(samples=samples),
+        status=jnp.where(on, MOTION_CODE["ok"], start.status).astype(jnp.int32),
+    )
 
 
 def _begin(given: Given, max_events: int, records: bool) -> _Run:
-    system, _, _, settings, q0, v0, times, _ = given
+    system, _, _, settings, q0, v0, times, *_ = given
     m, dtype = given.contacts, q0.dtype
     state = given.start
     watched = 2 * m if settings.friction else m
@@ -214,7 +273,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         jnp.zeros((max_events + 1, 2 + m), jnp.int32),
     )
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
-    decision = Decision(no, zero, none, none, none, none, none, Scales(zero, zero, zero))
+    decision = Decision(no, zero, none, none, none, none, Scales(zero, zero, zero))
     last = Event(no, no, decision)
     plan = None
     if records:
@@ -225,7 +284,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         plan = Plan(rows, jnp.int32(0), no)
     return _Run(
         flight,
-        jnp.full((2, m), -jnp.inf, dtype),
+        none,
         packed(state)[q0.size + v0.size :, 0],
         jnp.asarray(True),
         zero,
@@ -245,25 +304,18 @@ def _short(x: jax.Array) -> Any:
 
 def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: jax.Array) -> _Run:
     """The event resolved and written down in lanes where it is `mine`, if it is `due`."""
-    system, law, mu, settings, *_, times, _ = given
+    system, law, mu, settings, *_ = given
     flight, old = run.flight, run.flight.state
 
     def now(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
         scales, modes = run.last.decision.scales, decoded(flight.aim.modes, old.q.dtype)
+        fired = flight.event & mine
         found = resolve(
-            system,
-            law,
-            mu,
-            settings,
-            old,
-            modes,
-            flight.event & mine,
-            scales,
-            run.struck,
-            run.approach,
+            system, law, mu, settings, old, modes, fired, scales, run.struck, run.approach
         )
         happened = found.kind != KIND_CODE["none"]
-        full = (run.seen >= max_events) & happened
+        most = max_events if given.past is None else jnp.minimum(given.past.most, max_events)
+        full = (run.seen >= most) & happened
         status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
         kept = mine & happened & ~full
         state = found.after.state
@@ -273,8 +325,8 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
             event=jnp.zeros_like(flight.event),
         )
         new = run._replace(
-            flight=toward_sample(ready, times, flight.free),
-            struck=found.after.struck,
+            flight=toward_sample(ready, given.times, flight.free),
+            struck=run.struck | (found.contacts & found.decision.strikes),
             allowed=allowed_errors(system, settings, state),
             waits=found.approach > 0,
             approach=found.approach,
@@ -286,7 +338,8 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
         codes = jnp.stack([found.kind, found.code])
         marks = jnp.concatenate([codes.astype(jnp.int32), found.contacts.astype(jnp.int32)])
         numbers = _numbers(old, found.after)
-        return selected(mine, new, run), numbers, marks
+        # one that has no row any more is not resolved
+        return selected(mine, selected(full, run._replace(status=status), new), run), numbers, marks
 
     def later(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
         events, marks = (jnp.zeros_like(x[0]) for x in run.table[1:])
@@ -303,7 +356,8 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
 
 def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
     """One pass of the stepper in lanes that fly."""
-    system, _, mu, settings, *_, times, _ = given
+    system, _, mu, settings, *_ = given
+    times = given.times
     begin, last = run.flight, times.shape[0]
     scales = run.last.decision.scales
     modes = decoded(begin.aim.modes, begin.state.q.dtype)
@@ -359,14 +413,14 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
 
 def _width(given: Given) -> int:
     """Numbers of an event."""
-    return 2 + given.q0.size + 2 * given.v0.size + 4 * given.contacts
+    return 3 + given.q0.size + 2 * given.v0.size + 4 * given.contacts
 
 
 def _numbers(before: State, after: After) -> jax.Array:
     """Those of one event, in a row."""
     jump = after.jump
     parts = (before.t, before.q, before.v, jump.v, jump.impulse, jump.tangential, jump.energy)
-    return ravel_pytree((parts, after.accumulation_end))[0]
+    return ravel_pytree((parts, after.passed))[0]
 
 
 def _events(table: Table, count: jax.Array, given: Given) -> Events:
@@ -376,7 +430,8 @@ def _events(table: Table, count: jax.Array, given: Given) -> Events:
     rows = jnp.where(there[:, None], table.events[:-1], jnp.nan)
     n, m = given.v0.size, given.contacts
     sizes = np.cumsum([1, given.q0.size, n, n, m, m, 2 * m])
-    time, q, before, after, impulse, side, energy, end = jnp.split(rows, sizes, axis=1)
+    time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
+    ends = marks[:, 0] == KIND_CODE["accumulation"]
     return Events(
         count=count,
         time=time[:, 0],
@@ -389,7 +444,8 @@ def _events(table: Table, count: jax.Array, given: Given) -> Events:
         tangential_impulse=side,
         energy=energy.reshape(-1, 2, m),
         status=marks[:, 1],
-        accumulation_end=end[:, 0],
+        accumulation_end=jnp.where(ends, time[:, 0] + passed[:, 0], jnp.nan),
+        accumulation_gap=jnp.where(ends, passed[:, 1], jnp.nan),
     )
 
 
@@ -398,8 +454,9 @@ def _events(table: Table, count: jax.Array, given: Given) -> Events:
 
 def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Array]:
     """Samples and events of a run, as a smooth function of `given`."""
-    system, law, mu, settings, *_, times, _ = given
-    start, m = given.start, given.contacts
+    system, law, mu, settings, *_ = given
+    times = given.times
+    start = given.start
     width = _width(given)
     size = plan.rows.accepted.shape[0] - 1
     rows = jax.tree.map(lambda x: x[:size], plan.rows)
@@ -411,10 +468,9 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
     written = rows.event.written & happens
     reached = jnp.cumsum(sampled, dtype=jnp.int32) + (~sampled).astype(jnp.int32)  # before the step
 
-    def event(y: Any, now: Event) -> tuple[Any, jax.Array]:
-        state, struck = y
-        after = resolved_again(system, law, mu, settings, state, struck, now.decision)
-        new = selected(now.happens, (after.state, after.struck), y)
+    def event(state: State, now: Event) -> tuple[State, jax.Array]:
+        after = resolved_again(system, law, mu, settings, state, now.decision)
+        new = selected(now.happens, after.state, state)
         return new, jnp.where(now.happens, _numbers(state, after), 0.0)
 
     def step(state: State, row: Row, sample: jax.Array) -> State:
@@ -424,16 +480,14 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
         flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
         return selected(row.accepted, step_again(flow, aim, state), state)
 
-    def one(y: Any, x: Any) -> tuple[Any, Any]:
+    def one(state: State, x: Any) -> tuple[State, Any]:
         row, sample = x
         nothing = jnp.zeros(width, start.q.dtype)
-        y, numbers = jax.lax.cond(
-            any_lane(row.event.happens), event, lambda y, _: (y, nothing), y, row.event
+        state, numbers = jax.lax.cond(
+            any_lane(row.event.happens), event, lambda y, _: (y, nothing), state, row.event
         )
-        state = jax.lax.cond(
-            any_lane(row.accepted), step, lambda state, *_: state, y[0], row, sample
-        )
-        return (state, y[1]), (packed(state)[:, 0], numbers)
+        state = jax.lax.cond(any_lane(row.accepted), step, lambda y, *_: y, state, row, sample)
+        return state, (packed(state)[:, 0], numbers)
 
     def block(y: Any, xs: Any) -> tuple[Any, Any]:
         def walk(y: Any) -> tuple[Any, Any]:
@@ -448,8 +502,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
 
     xs = Row(rows.event._replace(happens=happens), accepted, rows.aim), reached
     blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
-    begin = start, jnp.full((2, m), -jnp.inf, start.q.dtype)
-    states, numbers = jax.lax.scan(jax.checkpoint(block), begin, blocks)[1]
+    states, numbers = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
 
     def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
         """The values in the first rows with a flag."""
@@ -459,7 +512,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
         return jnp.where((wanted < seen[-1])[:, None], found, 0.0)
 
     samples = at(sampled, states, times.shape[0])
-    first = packed(begin[0])[:, 0][None]
+    first = packed(start)[:, 0][None]
     # where there were too few rows nothing is known, of what derivative whatsoever
     inputs = [x for x in jax.tree.leaves(given) if eqx.is_inexact_array(x)]
     finite = [jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)).astype(first.dtype) for x in inputs]

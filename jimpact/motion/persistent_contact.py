@@ -141,22 +141,22 @@ def regularity(given: Contacts, mu: jax.Array, modes: Modes) -> jax.Array:
     scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(given.delassus), 1.0))
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = (held[:, None] & held[None, :])[None]
-    k = jnp.stack([w, given.delassus]) * scale[:, None] * scale[None, :]
-    eye = jnp.eye(len(held), dtype=w.dtype)
+    k = jnp.stack([w, given.delassus]) * jnp.outer(scale, scale)[None]
+    eye = jnp.eye(len(held), dtype=w.dtype)[None]
     ridge = float(jnp.finfo(w.dtype).eps) ** _FAINT_RIDGE
     with_friction, without = _determinants(jnp.where(both, k, eye) + ridge * eye)
     return with_friction / without
 
 
 def _determinants(k: jax.Array) -> jax.Array:
-    """Of (.., n, n); of two contacts by minors of two rows, which is quick to compile."""
+    """Of (N, n, n); of two contacts by minors of two rows, which is quick to compile."""
     if k.shape[-1] != 4:
         return jnp.linalg.det(k)
     left, right = np.triu_indices(4, 1)
     upper = k[..., 0, left] * k[..., 1, right] - k[..., 0, right] * k[..., 1, left]
     lower = k[..., 2, left] * k[..., 3, right] - k[..., 2, right] * k[..., 3, left]
     signs = np.where((left + right) % 2, 1, -1)
-    return jnp.sum(upper * lower[..., ::-1] * signs, axis=-1)
+    return jnp.sum(upper * lower[..., ::-1] * signs[None], axis=-1)
 
 
 def least_regularity(dtype: jnp.dtype) -> float:
@@ -322,11 +322,11 @@ class _Tried(NamedTuple):
 
 def pressed_together(
     given: Contacts, touching: jax.Array, slack: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`0 <= lambda _|_ W lambda + approach >= 0` over touching contacts, without friction.
 
     Returns:
-        Which contacts (m,) are pressed, and which (m,) neither press nor part.
+        Which contacts (m,) are pressed, which (m,) neither press nor part, and lambda (m,).
     """
     given = jax.lax.stop_gradient(given)
     m = touching.shape[0]
@@ -336,4 +336,4 @@ def pressed_together(
     # redundant contacts: any of the solutions will do
     found = solve_lcp(jnp.where(both, w, eye), b, regular=True)
     pressed = touching & (found.z * jnp.diagonal(w) > slack)
-    return pressed, touching & ~pressed & (found.w <= slack)
+    return pressed, touching & ~pressed & (found.w <= slack), found.z

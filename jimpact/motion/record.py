@@ -50,9 +50,11 @@ class Events(eqx.Module):
     """Rows of events, in time; rows beyond `count` are NaN or 0.
 
     `kind` is an index of `jimpact.motion.record.EVENT_KINDS`: an `accumulation` is the impact at
-    which the rest of an infinite sequence is passed; `accumulation_end` says when that sequence
-    would end; a `paroxysm` is an impact without collision. `energy` (2, m) is what each contact
-    gave (< 0: took), normally and tangentially.
+    which the rest of an infinite sequence is passed; by estimates from its energy, the force that
+    presses and what the impact took, `accumulation_end` [s] is when that sequence would end, and
+    `accumulation_gap` [m] how far its contacts might still have opened. A `paroxysm` is an impact
+    without collision. `energy` (2, m) is what each contact gave (< 0: took), normally and
+    tangentially.
     """
 
     count: jax.Array
@@ -67,6 +69,7 @@ class Events(eqx.Module):
     energy: jax.Array  # (E, 2, m)
     status: jax.Array  # (E,) of the law, see `jimpact.STATUS`
     accumulation_end: jax.Array  # (E,)
+    accumulation_gap: jax.Array
 
 
 def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None = None) -> Events:
@@ -89,6 +92,18 @@ def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None =
         energy=blank(2, m),
         status=jnp.zeros(size, jnp.int32),
         accumulation_end=blank(),
+        accumulation_gap=blank(),
+    )
+
+
+def joined(parts: list[Events], most: int) -> Events:
+    """The events of runs that follow each other, on the host; `most` rows at most."""
+    if len(parts) == 1 and len(parts[0].time) <= most:
+        return parts[0]
+    rows = [dataclasses.replace(part, count=part.count[None]) for part in parts]
+    events = jax.tree.map(lambda *x: np.concatenate(x)[:most], *rows)
+    return jax.tree.map(
+        jnp.asarray, dataclasses.replace(events, count=np.sum(events.count, dtype=np.int32))
     )
 
 

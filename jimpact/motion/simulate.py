@@ -1,5 +1,6 @@
 """`simulate`: whole motions."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -18,24 +19,27 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.bodies.base import GivenBody
-from jimpact.compiling import quick_jit
+from jimpact.compiling import is_own, quick_jit
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
 from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import gaps, kinetic, mass_at, potential, seen_from_base
-from jimpact.motion.event_driven import Given, event_driven
+from jimpact.motion.event_driven import Given, Past, event_driven, no_past
 from jimpact.motion.flow import Course, Settings
-from jimpact.motion.record import Motion
+from jimpact.motion.record import MOTION_CODE, Events, Motion, joined
 from jimpact.motion.stepping import is_pile, joins_step, recorded_gaps, time_stepping
 from jimpact.motion.system import System
+from jimpact.progress import progress_bar, waiting
 from jimpact.scene import check_mass
 
 CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
 RTOL, ATOL = 1e-10, 1e-12  # of the flights
 SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
-MAX_EVENTS, MAX_STEPS = 500, 100_000
+MAX_STEPS = 100_000
+CHUNK = 500  # events of one run of the program
+MOST_EVENTS = 100_000  # that a motion has on the host where nothing is said
 METHODS = ("events", "time_stepping", "contact_forces")
 MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
 _BASE_LOOKS = 64  # times at which the base is looked at before the motion starts
@@ -53,12 +57,13 @@ def simulate(
     method: str = "events",
     step: float | None = None,
     friction: Any = None,
-    max_events: int = MAX_EVENTS,
+    max_events: int | None = None,
     rtol: float = RTOL,
     atol: float = ATOL,
     closed_below: float = CLOSED_BELOW,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
+    progress: float | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
@@ -80,13 +85,16 @@ def simulate(
         friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
             `tangent_function`, in time stepping with any tangents; None: that of the law, if it
             has a field `friction`.
-        max_events: rows for events; one more ends the motion with the status `max_events` (in
-            time stepping it is not written).
+        max_events: one more ends the motion with the status `max_events` (in time stepping it is
+            not written). None: 500; with method 'events' outside jit, vmap and derivatives 100 000,
+            found by the program for 500 in as many runs as needed.
         rtol, atol: tolerances of the flights.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed.
         max_steps: of the integrator, in all.
+        progress: bar on stderr, after each of those runs with the share of the duration that is
+            done; None: on a terminal, for long motions.
 
     Returns:
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
@@ -118,7 +126,9 @@ def simulate(
     deepest = np.inf if method == "contact_forces" else closed_below
     _check_motion(system, q, v, start, end, deepest)
     count = as_whole("samples", samples, 2)
-    as_whole("max_events", max_events, 1)
+    if max_events is not None:
+        as_whole("max_events", max_events, 1)
+    rows = CHUNK if max_events is None else max_events
     as_whole("max_steps", max_steps, 1)
     for name, value in (("rtol", rtol), ("atol", atol), ("closed_below", closed_below)):
         check_values(name, value, low=0.0, open_low=True)
@@ -145,18 +155,52 @@ def simulate(
     if method == "time_stepping":
         substeps = _substeps_of(step, t_start, t_end, count)
         joint = joins_step(law) and friction is None
-        if is_pile(system) and not joint:
+        if joint:
+            _check_coefficients(system, law, q)
+        elif is_pile(system):
             raise ValueError(
-                "Argument `law` must be Moreau's, with its own `friction`, one `restitution` and "
-                "no `tangential_restitution`, for the many contacts of "
-                f"{type(system.body).__name__}, but is {law!r}."
+                "Argument `law` must be Moreau's, with its own `friction` and without a matrix, "
+                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
             )
-        sizes = count, substeps, joint, max_events
-        return _stepped(system, law, mu, q, v, start, end, settings.closed_below, *sizes)
+        below = settings.closed_below
+        given: Any = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
+        return _waited(_stepped, given, progress)
     if method == "contact_forces":
         force = _force_of(law, mu)
-        return _forced(system, force, settings, q, v, start, end, count, max_events)
-    return _events(system, law, mu, settings, q, v, start, end, count, max_events)
+        given = system, force, settings, q, v, start, end, count, rows
+        return _waited(_forced, given, progress)
+    given = system, law, mu, settings, q, v, start, end
+    if _on_host(given):
+        return _in_runs(given, count, MOST_EVENTS if max_events is None else max_events, progress)
+    return _events(*(*given, None, count, rows))[0]
+
+
+def _on_host(given: Any) -> bool:
+    """Whether what follows from it is known at once: not within jit, vmap or derivatives."""
+    return not is_traced(given) and is_own(())
+
+
+def _waited(run: Callable[..., Motion], given: Any, progress: float | None) -> Motion:
+    if not _on_host(given):
+        return run(*given)
+    with waiting("motion", progress):
+        return jax.block_until_ready(run(*given))
+
+
+def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: float | None) -> Motion:
+    """The motion in runs of `CHUNK` events, each of which goes on where the last one ended."""
+    system, *_, q, v, start, end = given
+    numbers: Any = no_past(q, v, _contacts_of(system, q), samples)
+    parts: list[Events] = []
+    with progress_bar(progress) as show:
+        show("motion", 0.0, float(end - start))
+        while True:
+            left = jnp.asarray(np.int32(most - CHUNK * len(parts)))
+            motion, numbers = _events(*(*given, Past(left, numbers), samples, CHUNK))
+            parts.append(motion.events)
+            if int(motion.status) != MOTION_CODE["max_events"] or CHUNK * len(parts) >= most:
+                return dataclasses.replace(motion, events=joined(parts, most))
+            show("motion", float(motion.events.time[-1] - start), float(end - start))
 
 
 @quick_jit
@@ -169,12 +213,14 @@ def _events(
     v: jax.Array,
     start: jax.Array,
     end: jax.Array,
+    past: Past | None,
     samples: int,
     max_events: int,
-) -> Motion:
+) -> tuple[Motion, jax.Array | None]:
     times = _equal_times(start, end, samples)
-    given = Given(system, law, mu, settings, q, v, times, _contacts_of(system, q))
-    return _recorded(system, times, event_driven(given, max_events))
+    given = Given(system, law, mu, settings, q, v, times, _contacts_of(system, q), past)
+    course, numbers = event_driven(given, max_events)
+    return _recorded(system, times, course), numbers
 
 
 @quick_jit
@@ -204,8 +250,8 @@ def _stepped(
     start: jax.Array,
     end: jax.Array,
     closed_below: jax.Array,
+    substeps: jax.Array,
     samples: int,
-    substeps: int,
     joint: bool,
     max_events: int,
 ) -> Motion:
@@ -381,6 +427,17 @@ def _friction_of(
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
 
 
+def _check_coefficients(system: System, law: Law, q: jax.Array) -> None:
+    """One value of each for all contacts, or one a contact; of a pile one."""
+    m = _contacts_of(system, q)
+    for name in ("restitution", "tangential_restitution"):
+        value = getattr(law, name)
+        if is_pile(system):
+            check_shape(name, value, (), "one for all contacts of a pile")
+        elif np.ndim(value) > 0:
+            check_shape(name, value, (m,), "one entry per contact, or a scalar")
+
+
 def _contacts_of(system: System, q: jax.Array) -> int:
     """m."""
     found: int = jax.eval_shape(system.body.gap_function, q).shape[0]
@@ -396,8 +453,8 @@ def _force_of(law: Law, mu: jax.Array | None) -> Force:
     return law.force
 
 
-def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
-    """Steps between two samples, none longer than `step`."""
+def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> jax.Array:
+    """Steps () between two samples, none longer than `step`."""
     if step is None or is_traced(step):
         raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
     check_values("step", step, low=0.0, open_low=True)
@@ -409,4 +466,4 @@ def _substeps_of(step: Any, start: Any, end: Any, samples: int) -> int:
         raise ValueError(
             f"Argument `step` must give at most {MOST_STEPS} steps, but has value {step:g}."
         )
-    return int(count)
+    return jnp.asarray(int(count), jnp.int32)  # an array: one program for all steps

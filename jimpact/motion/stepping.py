@@ -1,16 +1,21 @@
 """Moreau-Jean time stepping with any impact law: for many contacts, no event is located.
 
-One step of length h (Remark 6.9 of Brogliato, with the forces of contact at rest split off):
+One step of length h (after Remark 6.9 of Brogliato):
 
-    q_m = q + h/2 v                            the midpoint says which contacts are closed
-    v+  = impact(law, scene(q_m), v)           if a closed contact approaches
-    v'  = v+ + h M^-1 F + M^-1 (N p + H p_t)   0 <= p _|_ gamma' >= 0,  p_t in -mu p Sgn(u')
-    q'  = q_m + h/2 v'
+    q_m = q + h/2 v                              the midpoint says which contacts are closed
+    v'  = v + h M^-1 F + M^-1 (N p + H p_t)      0 <= p _|_ gamma' + w >= 0
+    q'  = q_m + h/2 v'                           p_t in -mu p Sgn(u' + w_t)
 
-The complementarity keeps resting contacts at rest, sticking or sliding; with the law in its place
-they would hop with e h g. Approach within what forces give in two steps is rest. Moreau's law needs
-no impact of its own: its `gamma' + e gamma >= 0` is put into the same problem. Order 1: impacts are
-late by up to h, gaps negative by up to h times the approach.
+with `w = e gamma` of a contact that approaches by Moreau's law, which so joins the problem. Any
+other law acts before it, in the middle of the forces, `v+ = impact(law, scene(q_m), v + h/2 M^-1
+F)`, and slow approach (within what forces give in two steps) is rest, `w = 0`. Order 1: an impact
+is late by up to h.
+
+ENERGY. A contact gives `p (gamma' + gamma) / 2`: no energy where `w >= gamma`. So what leaves may
+come back as fast as it leaves, `w = gamma`, and is at rest two steps later. Friction is against the
+slip at the end, `w_t = 0` (`e_t u` in an impact). That may give energy where the slip reverses
+within the step, up to (h g)^2 in a stop on a slope, and more in Kane's paradox; such a step is
+solved again with all friction against the mean slip, `w_t = u`, which cannot.
 
 DERIVATIVES of such a step do not converge: with h the time of an impact is constant, while its
 derivative is not. They are refused.
@@ -21,7 +26,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import is_traced
 from jimpact.bodies.piles import Discs, Near
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
@@ -159,12 +163,15 @@ class _Tried(NamedTuple):
     mean: jax.Array
     force: jax.Array
     found: Many
+    gains: jax.Array  # () whether the impulses give energy
+    tries: jax.Array  # () so far, this one included
 
 
 class _Progress(NamedTuple):
     state: State
     speed: jax.Array  # the largest that velocities could give a gap so far
     memory: jax.Array  # impulses of the last step
+    missed: jax.Array  # gap velocity () that they miss
     steepness: jax.Array
     since: jax.Array  # (m,) steps since each was struck
     events: Events
@@ -191,11 +198,11 @@ def time_stepping(
     v0: jax.Array,
     times: jax.Array,
     closed_below: jax.Array,
-    substeps: int,
+    substeps: jax.Array,
     joint: bool,
     max_events: int,
 ) -> Course:
-    """The motion with `substeps` steps between neighbours of `times` (S,).
+    """The motion with `substeps` () steps between neighbours of `times` (S,).
 
     `joint`: the law is a condition on v' that joins the problem of the step (`joins_step`).
     """
@@ -206,7 +213,8 @@ def time_stepping(
     m = recorded_gaps(system, q0, times[0]).shape[0]
 
     def rates_at(q: jax.Array) -> jax.Array:
-        return _contacts(system, q, times[0], closed_below, mu is not None).rates(v0)
+        t = times[0]
+        return _contacts(system, q, t, q, t, closed_below, mu is not None).rates(v0)
 
     contacts, b = jax.eval_shape(rates_at, q0).shape
     kept = _numbers(system.body) if isinstance(system.body, Discs) else contacts
@@ -217,11 +225,12 @@ def time_stepping(
     status = status_at_start(system, begin, times[-1], closed_below)
     fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
     status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
-    h = (times[1] - times[0]) / substeps
+    h = (times[1] - times[0]) / substeps.astype(dtype)
     start = _Progress(
         begin,
         zero,
         jnp.zeros((kept, b), dtype),
+        zero,
         jnp.ones((), dtype),
         jnp.full(contacts, substeps * len(times)),
         events,
@@ -229,20 +238,21 @@ def time_stepping(
         jnp.int32(MOTION_CODE["ok"]),
     )
 
-    def one(course: _Progress, t: jax.Array) -> tuple[_Progress, None]:
-        def go() -> _Progress:
-            return _one_step(system, law, mu, h, closed_below, joint, course, t)
-
-        return jax.lax.cond(course.status == MOTION_CODE["ok"], go, lambda: course), None
-
     def to_sample(course: _Progress, t: jax.Array) -> tuple[_Progress, State]:
-        course, _ = jax.lax.scan(one, course, t + h * jnp.arange(substeps, dtype=t.dtype))
+        def one(i: jax.Array, course: _Progress) -> _Progress:
+            def go() -> _Progress:
+                now = t + i.astype(dtype) * h
+                return _one_step(system, law, mu, h, closed_below, joint, course, now)
+
+            return jax.lax.cond(course.status == MOTION_CODE["ok"], go, lambda: course)
+
+        course = jax.lax.fori_loop(0, substeps, one, course)
         fine = course.status == MOTION_CODE["ok"]
         return course, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), course.state)
 
     end, later = jax.lax.scan(to_sample, start, times[:-1])
     samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, later)
-    steps = jnp.int32(substeps * (times.shape[0] - 1))
+    steps = substeps * (times.shape[0] - 1)
     status = jnp.where(end.status == MOTION_CODE["ok"], end.told, end.status)
     return Course(samples, end.events, steps, status)
 
@@ -252,13 +262,19 @@ def _numbers(pile: Discs) -> int:
 
 
 def _contacts(
-    system: System, q: jax.Array, t: jax.Array, closed_below: jax.Array, friction: bool
+    system: System,
+    q: jax.Array,
+    t: jax.Array,
+    q_end: jax.Array,
+    t_end: jax.Array,
+    closed_below: jax.Array,
+    friction: bool,
 ) -> _Few | _Heap:
-    """The contacts of a step whose middle is at (q, t)."""
-    at = seen_from_base(system, q, t)
+    """The contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end."""
+    at, end = seen_from_base(system, q, t), seen_from_base(system, q_end, t_end)
     mass = mass_at(system, q)
     if isinstance(system.body, Discs):
-        near = system.body.near(at, closed_below)
+        near = system.body.near(at, end, closed_below)
         near = near if friction else near._replace(directions=near.directions[:, :1])
         return _Heap(near, jnp.pad(1 / mass.reshape(-1, 3), ((0, 1), (0, 0))))
     given = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
@@ -269,7 +285,8 @@ def _contacts(
         sides = system.body.tangents(at)
         assert sides is not None
         directions = jnp.concatenate([directions, sides.reshape(n, m, -1)], axis=2)
-    there = ~(gap > closed_below)  # NaN does not pass for open
+    least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))
+    there = ~(least > closed_below)  # NaN does not pass for open
     directions = jnp.where(there[:, None], directions, 0.0)
     moved = solve_mass(mass, directions.reshape(n, -1)).reshape(directions.shape)
     return _Few(there, directions, moved, jnp.tensordot(directions, moved, axes=([0], [0])))
@@ -288,7 +305,6 @@ def _one_step(
     state, dtype, body = course.state, course.state.q.dtype, system.body
     middle = t + 0.5 * h
     q = body.moved(state.q, 0.5 * h * state.v)
-    close = _contacts(system, q, middle, closed_below, mu is not None)
     carried = carried_along(system, state.v, middle)
     mass = mass_at(system, q)
 
@@ -297,51 +313,69 @@ def _one_step(
         force = user_force(system, q, v, middle)
         return force, free_acceleration(system, q, v, force, mass)
 
+    free_before = pushed(state.v)[1]
+    falls = body.moved(q, 0.5 * h * (state.v + h * free_before))
+    close = _contacts(system, q, middle, falls, t + h, closed_below, mu is not None)
     before = close.rates(state.v - carried)
     eps = float(jnp.finfo(dtype).eps)
     speed = jnp.maximum(course.speed, close.fastest(state.v))
-    noise = max(_ROUNDING, _ROUNDINGS * eps) * speed
-    slow = noise + SLOW * h * jnp.abs(close.rates(pushed(state.v)[1])[:, 0])
+    noise = max(_ROUNDING, _ROUNDINGS * eps) * speed + course.missed
+    slow = noise + SLOW * h * jnp.abs(close.rates(free_before)[:, 0])
     strikes = close.there & (before[:, 0] < -slow)
-    wanted = jnp.zeros_like(before)
-    given, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
+    struck, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
+    e, e_t = jnp.zeros((), dtype), jnp.zeros((), dtype)
+    # half of the forces before an impact, half after it: over the whole step they take as much
+    # energy from the velocities as the potential gains
+    met = state.v if joint else state.v + 0.5 * h * free_before
     if joint:
         assert isinstance(law, Moreau)
-        # what leaves while others strike may come back, or energy would be gained; slowly, it rests
-        counts = (before[:, 0] < 0) | (before[:, 0] > slow)
-        wanted = wanted.at[:, 0].set(law.restitution * jnp.where(counts, before[:, 0], 0.0))
+        e = law.restitution
+        e_t = e_t if law.tangential_restitution is None else law.tangential_restitution
     else:
         scene = scene_at(system, q, state.v, middle, close.there)
-        given, code = jax.lax.cond(
+        struck, code = jax.lax.cond(
             jnp.any(strikes),
-            lambda: _struck(law, scene, state.v - carried, noise, before.shape),
-            lambda: (given, code),
+            lambda: _struck(law, scene, met - carried, noise, before.shape),
+            lambda: (struck, code),
         )
-    wanted = wanted + close.product(given)
+    rates = before + close.product(struck)
+    late = jnp.where(strikes, 0.5 * h * close.rates(free_before)[:, 0], 0.0)
+    wanted, against_mean = _wanted(e, jnp.where(strikes, e_t, 0.0), rates, late)
+    tolerance = max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps)
 
-    def solved(_: Any, tried: _Tried) -> _Tried:
+    def solved(tried: _Tried) -> _Tried:
         """The step with the forces at its mean velocity, as far as that is known."""
         force, free = pushed(tried.mean)
-        rates = close.rates(state.v + h * free - carried) + wanted
+        pulled = rates + h * close.rates(free)
+        goal = pulled + jnp.where(tried.tries < least, wanted, against_mean)
         found = solve_many(
             close.product,
             close.diagonal,
-            jnp.where(close.there[:, None], rates, 0.0),
+            jnp.where(close.there[:, None], goal, 0.0),
             jnp.zeros((), dtype) if mu is None else mu,
             tried.found.impulse,
             tried.found.steepness,
-            max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps),
+            tolerance,
             ITERATIONS,
         )
-        v = state.v + h * free + close.push(given + found.impulse)
-        return _Tried(v, 0.5 * (state.v + v), force, found)
+        v = state.v + h * free + close.push(struck + found.impulse)
+        after = pulled + close.product(found.impulse)
+        gained = 0.5 * jnp.vdot(found.impulse, rates + after)
+        gains = gained > (noise + found.missed) * jnp.sum(jnp.abs(found.impulse))
+        return _Tried(v, 0.5 * (state.v + v), force, found, gains, tried.tries + 1)
 
-    begun = Many(close.recall(course.memory), 0 * speed, jnp.int32(0), course.steepness)
-    start = _Tried(state.v, state.v, jnp.zeros_like(state.v), begun)
+    def goes_on(tried: _Tried) -> jax.Array:
+        return (tried.tries < least) | (tried.gains & (tried.tries < 2 * least))
+
+    begun = Many(close.recall(course.memory), 0 * speed, 0 * speed, jnp.int32(0), course.steepness)
+    start = _Tried(
+        state.v, state.v, jnp.zeros_like(state.v), begun, jnp.asarray(False), jnp.int32(0)
+    )
     constant = system.force is None and not callable(system.mass) and body.coordinates is None
-    end = jax.lax.fori_loop(0, 1 if constant else MEAN, solved, start)
+    least = 1 if constant else MEAN
+    end = jax.lax.while_loop(goes_on, solved, start)
     found, v, mean = end.found, end.v, end.mean
-    x = given + found.impulse
+    x = struck + found.impulse
     energy = x * close.rates(mean - carried)
     sides = jnp.sum(energy[:, 1:], axis=1)
     moved = state._replace(
@@ -371,25 +405,26 @@ def _one_step(
     told = jnp.maximum(course.told, jnp.maximum(coarse, missed)).astype(jnp.int32)
     events = course.events
     if isinstance(close, _Few):
-        struck = x if joint else given
+        given = x if joint else struck
         row = {
             "time": middle,
             "kind": jnp.int32(KIND_CODE["impact"]),
             "contacts": strikes,
             "q": q,
-            "velocity_before": state.v,
-            "velocity_after": v if joint else state.v + close.push(given),
-            "impulse": struck[:, 0],
+            "velocity_before": met,
+            "velocity_after": v if joint else met + close.push(struck),
+            "impulse": given[:, 0],
             "energy": jnp.stack([energy[:, 0], sides]),
             "status": code,
         }
         if before.shape[1] > 1:
-            row["tangential_impulse"] = struck[:, 1:].reshape(-1)
+            row["tangential_impulse"] = given[:, 1:].reshape(-1)
         events = with_row(events, jnp.any(strikes), row)
     return _Progress(
         moved,
         speed,
         close.keep(course.memory, found.impulse),
+        found.missed,
         found.steepness,
         jnp.where(strikes, 1, course.since + 1),
         events,
@@ -398,12 +433,26 @@ def _one_step(
     )
 
 
+def _wanted(
+    e: jax.Array, e_t: jax.Array, rates: jax.Array, late: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """w (m, b) of `0 <= p _|_ gamma' + w >= 0` and of friction; also with that for the mean slip.
+
+    `rates` (m, b) without the forces of the step, which give struck contacts `late` until they
+    strike. Where `w >= rates`, as always in normal direction, impulses give no energy.
+    """
+    gamma = rates[:, 0]
+    normal = jnp.where(gamma < 0, e * (gamma + late) - late, gamma)[:, None]
+    slip = rates[:, 1:]
+    return (
+        jnp.concatenate([normal, e_t[:, None] * slip], axis=1),
+        jnp.concatenate([normal, slip], axis=1),
+    )
+
+
 def joins_step(law: Law) -> bool:
-    """Whether the law is a condition on v' that cannot gain energy: Moreau's, one e, e_t = 0."""
-    if not isinstance(law, Moreau) or law.restitution.ndim > 0:
-        return False
-    e_t = law.tangential_restitution
-    return e_t is None or (e_t.ndim == 0 and not is_traced(e_t) and float(e_t) == 0)
+    """Whether the law is a condition on v' contact by contact: Moreau's, without a matrix."""
+    return isinstance(law, Moreau) and law.restitution.ndim < 2
 
 
 def _struck(

@@ -15,7 +15,7 @@ from jimpact.motion.dynamics import (
     mass_at,
     seen_from_base,
 )
-from jimpact.motion.flow import ROUNDING_GAP, Scales, Settings, State
+from jimpact.motion.flow import ROUNDING_GAP, Scales, Settings, State, selected
 from jimpact.motion.persistent_contact import (
     REST_ACCELERATION,
     Choice,
@@ -37,6 +37,7 @@ from jimpact.status import CODE, STATUS
 FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STATUS)
 # Gap velocities below this share of what the kinetic energy could give are 0: rounding.
 REST_SPEED = 1e-9
+LEAST_COUPLING = 1e-9  # |W_ij| / sqrt(W_ii W_jj) of two contacts: less is rounding
 ROUNDINGS = 64  # of the time: velocities that arise within them are 0
 # An impact without collision is that of contacts that approach at this power of rounding, of the
 # slip: it errs by about as much. To this so many times what is left of `regularity` is added, or
@@ -108,20 +109,25 @@ class Decision(NamedTuple):
     strikes: jax.Array  # () whether there is an impact
     approach: jax.Array  # () gap velocity that the law is shown of one without collision, else 0
     closed: jax.Array  # (m,) contacts that take part in it
-    took: jax.Array  # (m,) those that it gave an impulse
     held: jax.Array  # (m,) those brought to rest
     stick: jax.Array  # (m,) tangentially, too
     ends: jax.Array  # (m,) accumulations that are passed
     scales: Scales
 
 
+class Passed(NamedTuple):
+    """What of an accumulation is passed at once, as estimated; 0 where there is none."""
+
+    time: jax.Array  # () [s]
+    gap: jax.Array  # () [m] to which its contacts might open within it
+
+
 class After(NamedTuple):
     """The smooth part of an event."""
 
     state: State
-    struck: jax.Array  # (2, m) times of the last two impacts of each contact
     jump: Jump
-    accumulation_end: jax.Array
+    passed: Passed
 
 
 class Outcome(NamedTuple):
@@ -159,6 +165,12 @@ def resolve(
     Where friction leaves no contact forces, the next event, at the same instant, is an impact
     without collision: the limit of that of contacts that approach ever more slowly. `approach` ()
     is how fast they do at this one, 0 where it is an ordinary event.
+
+    Clusters: where contacts share bodies, accumulations are nested: their numbers of impacts
+    multiply. A contact that shares a body with another one that is closed or was `struck` before
+    stays closed below the square root of that share of velocity, which is that share of height.
+    That is done for all of them at once, and only if no other contact is reached within the time
+    that is passed: the state after it is then that at the end of the sequence.
     """
     m, t = before.active.shape[0], state.t
     given = contacts_at(system, state.q, state.v, t, settings.friction)
@@ -175,41 +187,92 @@ def resolve(
     floor = ROUNDING_GAP * settings.closed_below
     slowly = jnp.maximum(slowly, jnp.sqrt(2 * scales.acceleration * floor))
     slowly = jnp.maximum(slowly, SUPPLIED * approach)
-    slow = closed & (gamma <= slowly)
     tight = closed & (jnp.abs(gamma) <= rest)
     slack = REST_ACCELERATION * scales.acceleration
-    pressed, resting = pressed_together(given, slow, slack)
-    held, stick = tight | (slow & pressed), jnp.zeros(m, bool)
+    stick = jnp.zeros(m, bool)
     if given.tangent is not None:
         stick = jnp.abs(given.tangent.rate) <= slowly
-    jump = _brought_to_rest(system, given, mu, held, stick, t, jump)
+
+    def resting(slow: jax.Array) -> _Resting:
+        pressed, still, force = pressed_together(given, slow, slack)
+        held = tight | (slow & pressed)
+        # a contact accumulates if it was brought to rest from more than rounding
+        ends = held & ~tight & strikes & ~jams
+        after, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
+        return _Resting(pressed, still, force, held, ends, after, passed)
+
+    slow = closed & (jnp.abs(gamma) <= slowly)
+    if m == 1:
+        found = resting(slow)
+    else:
+        nested = closed & strikes & _share_bodies(given, closed | struck)
+        nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
+        both = jax.vmap(resting)(jnp.stack([slow, slow | nested]))
+        found, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+        found = selected(_undisturbed(system, given, cluster, tight, t), cluster, found)
+    jump, held, pressed = found.jump, found.held, found.pressed
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strikes
     if mu is None:
-        active = pressed | (tight & resting & ~released)
+        active = pressed | (tight & found.still & ~released)
         no = jnp.asarray(False)
         modes = no_modes(m, gamma.dtype)._replace(active=active)
         choice = Choice(modes, ~no, rest, no, jnp.zeros(m, bool))
     else:
         relative = jump.v - carried_along(system, state.v, t)
         choice = _with_friction(given, mu, before, held, released, relative, rest, slack)
-    # a contact accumulates if it was brought to rest from more than rounding
-    ends = held & ~tight & strikes & ~jams
     fails = jnp.asarray(FAILS)[jump.code]
-    status, code, wedges = jnp.asarray(MOTION_CODE["ok"]), jump.code, jnp.zeros_like(rest)
+    status = jnp.where(fails, MOTION_CODE["law_failed"], MOTION_CODE["ok"])
+    code, wedges = jump.code, jnp.zeros_like(rest)
     if given.tangent is not None and earlier.tangent is not None:
         change = jnp.max(jnp.abs(given.tangent.rate - earlier.tangent.rate))
         wedges = jnp.where(choice.consistent, 0.0, _approach(choice, given.tangent.rate, held))
         none = (jams & (change <= SUPPLIED * approach)) | (~choice.consistent & (wedges == 0))
         status = jnp.where(none, MOTION_CODE["no_contact_force"], status)
         code = jnp.where(choice.several, jnp.maximum(code, CODE["several_outcomes"]), code)
-    status = jnp.where(fails, MOTION_CODE["law_failed"], status)
     took = jnp.where(strikes, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
     took = took | choice.parts
-    decision = Decision(strikes, approach, closed, took & strikes, held, stick, ends, scales)
-    after = _after(decision, state, struck, jump)
-    kind = _kind(strikes, jams, jnp.any(ends), released[:m] | choice.parts, fired)
+    decision = Decision(strikes, approach, closed, held, stick, found.ends, scales)
+    after = After(_booked(state, jump), jump, found.passed)
+    kind = _kind(strikes, jams, jnp.any(found.ends), released[:m] | choice.parts, fired)
     return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
+
+
+class _Resting(NamedTuple):
+    """What comes to rest of slow contacts: (m,) flags and forces; velocities after it."""
+
+    pressed: jax.Array
+    still: jax.Array
+    force: jax.Array
+    held: jax.Array
+    ends: jax.Array
+    jump: Jump
+    passed: Passed
+
+
+def _share_bodies(given: Contacts, touched: jax.Array) -> jax.Array:
+    """Which contacts (m,) feel another one that is `touched`."""
+    m = touched.shape[0]
+    w = jnp.abs(given.delassus[:m, :m])
+    size = jnp.sqrt(jnp.diagonal(w))
+    others = touched[None] & ~jnp.eye(m, dtype=bool)
+    return jnp.any(others & (w > LEAST_COUPLING * jnp.outer(size, size)), axis=1)
+
+
+def _undisturbed(
+    system: System, given: Contacts, found: _Resting, tight: jax.Array, t: jax.Array
+) -> jax.Array:
+    """Whether () no other contact is reached within the time that is passed, by parabolas."""
+    m = tight.shape[0]
+    gap, normals = jnp.maximum(given.normal.value, 0.0), given.normal.gradient
+    rate = normals.T @ (found.jump.v - carried_along(system, found.jump.v, t))
+    fall = given.approach[:m] + given.delassus[:m, :m] @ found.force
+    square = rate * rate - 2 * fall * gap
+    root = jnp.sqrt(jnp.maximum(square, 0.0))
+    later = (rate + root) / jnp.where(fall < 0, -fall, 1.0)
+    reached = jnp.where(rate < 0, 2 * gap / jnp.where(rate < 0, root - rate, 1.0), later)
+    never = (square < 0) | ((rate >= 0) & (fall >= 0))
+    return jnp.all(found.held | tight | never | (reached > found.passed.time))
 
 
 def resolved_again(
@@ -218,15 +281,14 @@ def resolved_again(
     mu: jax.Array | None,
     settings: Settings,
     state: State,
-    struck: jax.Array,
     decision: Decision,
 ) -> After:
     """What `resolve` does to the state, as a smooth function: all is decided already."""
-    t, (strikes, approach, closed, _, held, stick, _, scales) = state.t, decision
+    t, (strikes, approach, closed, held, stick, ends, scales) = state.t, decision
     jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
     given = contacts_at(system, state.q, jump.v, t, settings.friction)
-    jump = _brought_to_rest(system, given, mu, held, stick, t, jump)
-    return _after(decision, state, struck, jump)
+    jump, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
+    return After(_booked(state, jump), jump, passed)
 
 
 def _approach(choice: Choice, slip: jax.Array, held: jax.Array) -> jax.Array:
@@ -262,15 +324,13 @@ def _struck(
     )
 
 
-def _after(decision: Decision, state: State, struck: jax.Array, jump: Jump) -> After:
-    work = state._replace(
+def _booked(state: State, jump: Jump) -> State:
+    """The state after a jump."""
+    return state._replace(
         v=jump.v,
         base_work=state.base_work + jump.base_work,
         contact_work=state.contact_work + jump.energy,
     )
-    end = _accumulation_end(state.t, struck, decision.ends)
-    now = jnp.stack([jnp.full_like(struck[0], state.t), struck[0]])
-    return After(work, jnp.where(decision.took, now, struck), jump, end)
 
 
 def _with_friction(
@@ -307,26 +367,51 @@ def _brought_to_rest(
     mu: jax.Array | None,
     held: jax.Array,
     stick: jax.Array,
+    ends: jax.Array,
     t: jax.Array,
     jump: Jump,
-) -> Jump:
-    """Gap velocities of `held` contacts set to 0, tangential ones of those that `stick`, too."""
+) -> tuple[Jump, Passed]:
+    """Gap velocities of `held` contacts set to 0, tangential ones of those that `stick`, too.
+
+    And what is passed by that at contacts whose accumulation `ends`.
+    """
     m = held.shape[0]
     modes, rates = no_modes(m, jump.v.dtype)._replace(active=held, stick=stick), given.normal.rate
     if given.tangent is not None:
         rates = jnp.concatenate([rates, given.tangent.rate])
-    p = constraint_impulse(given, mu, modes, rates)
+    size = rates.shape[0]
+    columns = jnp.stack([rates, given.approach[:size]], axis=1)
+    p, force = constraint_impulse(given, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
-    energy = jnp.pad(0.5 * p * rates, (0, 2 * m - p.shape[0])).reshape(2, m)
-    side = jnp.pad(p, (0, 2 * m - p.shape[0]))[m:]
+    energy = jnp.pad(0.5 * p * rates, (0, 2 * m - size)).reshape(2, m)
+    side = jnp.pad(p, (0, 2 * m - size))[m:]
     carried = carried_along(system, jump.v, t)
-    return jump._replace(
+    passed = _passed(p[:m], force[:m], ends, -jnp.sum(energy), -jnp.sum(jump.energy))
+    jump = jump._replace(
         v=jump.v + given.moved @ p,
         impulse=jump.impulse + p[:m],
         tangential=jump.tangential + side,
         energy=jump.energy + energy,
         base_work=jump.base_work + (given.directions @ p) @ carried,
     )
+    return jump, passed
+
+
+def _passed(
+    p: jax.Array, force: jax.Array, ends: jax.Array, left: jax.Array, lost: jax.Array
+) -> Passed:
+    """By the energy `left` in hops, and what the impact took.
+
+    Under the force F that will keep a contact closed a hop takes 2 p / F, and energy E lifts it by
+    E / F at most. If each impact keeps r^2 of the energy, and k contacts strike in turn, hops
+    take `2 k p / F (1 + r + ..)` in all: exact for a single contact.
+    """
+    ends = ends & (force > 0)
+    safe, some = jnp.where(ends, force, 1.0), jnp.any(ends) & (left > 0)
+    r = jnp.sqrt(jnp.where(some, left, 0.25) / jnp.where(some, left + jnp.maximum(lost, 0), 1.0))
+    hop = jnp.max(jnp.where(ends, 2 * jnp.abs(p) / safe, 0.0))
+    lift = jnp.max(jnp.where(ends, left / safe, 0.0))
+    return Passed(jnp.sum(ends.astype(p.dtype)) * hop / (1 - r), lift)
 
 
 def _kind(
@@ -340,13 +425,3 @@ def _kind(
     hit = jnp.where(ends, KIND_CODE["accumulation"], KIND_CODE["impact"])
     hit = jnp.where(jams, KIND_CODE["paroxysm"], hit)
     return jnp.where(strikes, hit, kind).astype(jnp.int32)
-
-
-def _accumulation_end(t: jax.Array, struck: jax.Array, ends: jax.Array) -> jax.Array:
-    """`t + d r / (1 - r)`: the limit of a geometric series with the last two intervals' ratio."""
-    last, previous = t - struck[0], struck[0] - struck[1]
-    known = ends & jnp.isfinite(previous) & (last < previous) & (last > 0)
-    safe_last, safe_previous = jnp.where(known, last, 0.0), jnp.where(known, previous, 1.0)
-    r = safe_last / safe_previous
-    end = t + jnp.max(safe_last * r / (1 - r))
-    return jnp.where(jnp.any(ends), end, jnp.nan)

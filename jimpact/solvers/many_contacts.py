@@ -25,10 +25,11 @@ MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
 
 
 class Many(NamedTuple):
-    """Impulses x (m, b), what they miss () [m/s], iterations, the steepness found."""
+    """Impulses x (m, b), what they miss, iterations, the steepness found."""
 
     impulse: jax.Array
-    misfit: jax.Array
+    misfit: jax.Array  # () over the largest rate, both scaled to a diagonal of 1
+    missed: jax.Array  # () [m/s] at most
     iterations: jax.Array
     steepness: jax.Array
 
@@ -134,4 +135,5 @@ def solve_many(
     begin = _At(x, ax, x, ax, unit, steepness, x, jnp.inf * unit, jnp.int32(0))
     end = jax.lax.while_loop(going, one, begin)
     missed = end.misfit / jnp.where(size > 0, size, 1.0)
-    return Many(end.best * scale, missed, end.tries, end.steepness)
+    wrong = end.misfit * jnp.sqrt(jnp.max(diagonal))
+    return Many(end.best * scale, missed, wrong, end.tries, end.steepness)

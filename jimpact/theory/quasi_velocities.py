@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, is_traced
+from jimpact.compiling import quick_jit
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
 from jimpact.scene import Scene, as_velocity, dense_mass, gap_velocity, momentum, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix
@@ -63,6 +64,11 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     ([-0.5, 0.5], [0.5, 0.5])
     """
     check_independent(scene)
+    return _basis(scene)
+
+
+@quick_jit
+def _basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     fixed = _directions(scene)
     metric = jax.vmap(partial(momentum, scene), 1, 1)  # M X
     gram = as_matrix(normalized_delassus(fixed))
