@@ -154,6 +154,10 @@ class Contact(eqx.Module):
             (gamma - small, jnp.maximum(self.noise, noise)),
         )
 
+    def approaching(self, speed: jax.Array) -> "Contact":
+        """The same with all gap velocities lower by `speed` () [m/s]."""
+        return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
+
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """gamma+ (m,) [m/s] of impulses p (m,) and p_t (t,)."""
         after = self.gap_velocity + self.delassus @ normal
