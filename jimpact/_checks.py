@@ -1,22 +1,33 @@
-"""Host-side argument checks with one error template; tracers pass unchecked."""
+"""Host-side argument checks with one error template; tracers pass unchecked.
+
+JAX is imported by those functions that need it: a study file is checked without.
+"""
 
 import operator
+import sys
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
+
+if TYPE_CHECKING:
+    import jax
 
 
 def is_traced(value: Any) -> bool:
     """Whether `value` is (or holds) an abstract value inside a JAX transformation."""
+    if "jax" not in sys.modules:
+        return False
+    import jax
+
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value))
 
 
-def as_float_array(name: str, value: Any) -> jax.Array:
+def as_float_array(name: str, value: Any) -> "jax.Array":
     """`value` as a floating JAX array; text, objects and complex numbers are refused."""
+    import jax
+    import jax.numpy as jnp
+
     if isinstance(value, jax.Array):
         array = value
     else:
@@ -109,6 +120,10 @@ def check_per_contact(name: str, value: Any, contacts: int) -> None:
 
 def in_common_dtype(*trees: Any) -> Any:
     """All of them in the widest floating type among them (Python numbers follow the arrays)."""
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+
     leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
     if len({x.dtype for x in leaves}) == 1:
         return trees

@@ -5,33 +5,35 @@ Public names are taken from `jimpact` itself, so that a command imports no more 
 
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from io import BytesIO
 from json import dumps
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 import jimpact as ji
 from jimpact import options
 from jimpact.comparison import registered_laws
 from jimpact.fits.fitting import Fit
-from jimpact.progress import waiting
+from jimpact.progress import LONG, Steps, waiting
 from jimpact.records import as_data, table
+from jimpact.starting import as_csv, fitting
 from jimpact.study import Study, import_laws, read_study
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
-KINDS = (".png", ".pdf", ".svg")
 DPI = 150
-BAD_INPUT, FAILURE = 2, 1  # exit codes
-INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
+TOLD = LONG  # seconds after which work is told, also where no one looks at a terminal
+
+
+Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 
 
 class Answer(NamedTuple):
@@ -42,59 +44,39 @@ class Answer(NamedTuple):
     text: str
     pictures: Mapping[Path, "Figure | Callable[[Path], Any]"]  # to be saved, or what draws it
     failure: str = ""
+    table: Table | None = None  # for --csv
+    printed: bool = False  # the text is what was asked for, be it JSON
 
 
-def run(given: options.Command) -> int:
-    """The exit code of a command: 0; wrong input 2, a method or law that fails 1, ctrl-C 130."""
+def run(given: options.Command, steps: Steps) -> str:
+    """Do what a command says, and print it; what went wrong all the same, '' if nothing did."""
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
-    try:
-        answer = _COMMANDS[given.name()](given)
-        replaced = [path for path in answer.pictures if path.exists()]
-        for path, picture in answer.pictures.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if callable(picture):
-                picture(path)
-            else:
-                picture.savefig(path, dpi=DPI)
-    except KeyboardInterrupt as stop:
-        return _refuse(given, str(stop) or "stopped.", INTERRUPTED)
-    except (ValueError, TypeError, OSError, ImportError) as error:
-        return _refuse(given, str(error), BAD_INPUT)
-    except RuntimeError as error:
-        return _refuse(given, str(error), FAILURE)
+    answer = _COMMANDS[given.name()](given, steps)
+    replaced = [path for path in answer.pictures if path.exists()]
+    for path, picture in answer.pictures.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if callable(picture):
+            picture(path)
+        else:
+            whole = BytesIO()  # what is interrupted leaves no half a picture
+            picture.savefig(whole, format=path.suffix[1:], dpi=DPI)
+            path.write_bytes(whole.getvalue())
+        steps(f"picture {path}")
     pictures = [str(path) for path in answer.pictures]
-    if given.json:
+    if answer.printed:
+        print(answer.text)
+    elif given.csv:
+        assert answer.table is not None  # every command has one
+        print(as_csv(*answer.table))
+    elif given.json:
         about = {"title": answer.title, "pictures": pictures} if pictures else {}
         print(dumps(about | answer.data, indent=2))
     else:
         lines = [answer.title, answer.text, *(f"Picture: {path}" for path in pictures)]
-        print("\n".join(line for line in lines if line))
+        print("\n".join(fitting(line) for line in lines if line))
     for path in replaced:
         print(f"jimpact {given.name()}: {path} was there before: replaced.", file=sys.stderr)
-    return _refuse(given, answer.failure, FAILURE) if answer.failure else 0
-
-
-def _refuse(given: options.Command, reason: str, code: int) -> int:
-    print(f"jimpact {given.name()}: {reason}", file=sys.stderr)
-    return code
-
-
-def _picture(given: options.DrawingCommand) -> Path:
-    """The file --out, or the command's own in the directory --out, named after the study."""
-    if given.out.suffix:
-        return _checked(given.out)
-    study, default = (getattr(x, "study", None) for x in (given, type(given)))
-    named = "" if study is None or study == default else f"-{study.stem}"
-    return given.out / f"jimpact-{given.name()}{named}.png"
-
-
-def _checked(path: Path, option: str = "--out") -> Path:
-    """The path of a picture; other endings are refused."""
-    if path.suffix not in KINDS:
-        raise ValueError(
-            f"{option} must end in .png, .pdf or .svg or be a directory, but is '{path}'."
-        )
-    return path
+    return answer.failure
 
 
 def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
@@ -102,10 +84,7 @@ def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, n
     if given.velocity is not None:
         return np.asarray(given.velocity, float), None
     data = study.experiments
-    if data is None:
-        raise ValueError("--velocity must be given, because the study has no [data].")
-    if not 1 <= given.shot <= len(data.shots):
-        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
+    assert data is not None  # `ShotCommand.check`
     return np.asarray(data.pre[given.shot - 1]), np.asarray(data.post[given.shot - 1])
 
 
@@ -120,30 +99,43 @@ def _titled(study: Study, before: np.ndarray) -> str:
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
-def fit(given: options.FitCommand) -> Answer:
+def fit(given: options.FitCommand, steps: Steps) -> Answer:
     """The study's fit and its yardsticks."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study, given.law)
-    fits = _all_fits(study, {"method": given.method, "starts": given.starts, "seed": given.seed})
+    options = {"method": given.method, "starts": given.starts, "seed": given.seed}
+    fits = _all_fits(study, options | {"progress": TOLD}, steps)
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     picture = ji.plot.fit(fits[RAW], others, study.title)
     text = "\n".join([*_summary(fits), "", str(fits[RAW]), ""])
-    return Answer(study.title, as_data({"fits": fits}), text, {path: picture})
+    heads = ["fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank"]
+    rows = [
+        [what, type(x.law).__name__, name, x.value[i], x.standard_error[i], x.rms, x.rank]
+        for what, x in fits.items()
+        for i, name in enumerate(x.names)
+    ]
+    return Answer(study.title, as_data({"fits": fits}), text, {path: picture}, table=(heads, rows))
 
 
-def _all_fits(study: Study, options: dict[str, Any]) -> dict[str, Fit]:
+def _all_fits(study: Study, options: dict[str, Any], steps: Steps) -> dict[str, Fit]:
     """The study's fit and its yardsticks; fits of one law share one compiled program."""
     own, everything = _per_contact(study)
-    fits = {RAW: own.run(**options)}
+    fits: dict[str, Fit] = {}
+
+    def run(name: str, study: Study) -> None:
+        fits[name] = study.run(**options)
+        steps(_in_words(name, fits[name]))
+
+    run(RAW, own)
     if any("break momentum" in line for line in fits[RAW].warnings):
         assert study.experiments is not None  # it was fitted
         data = study.experiments.momentum_corrected(study.scene)
-        fits[CORRECTED] = replace(own, experiments=data).run(**options)
+        run(CORRECTED, replace(own, experiments=data))
     if not isinstance(study.law, ji.Newton):
         newton = replace(study, law=ji.Newton(0.5), free={"restitution": True}, bounds={})
-        fits[YARDSTICK] = newton.run(**options)
+        run(YARDSTICK, newton)
     if everything is not None:
-        fits[ALL_FREE] = everything.run(**options)
+        run(ALL_FREE, everything)
     return fits
 
 
@@ -190,6 +182,11 @@ def _summary(fits: dict[str, Fit]) -> list[str]:
     return lines
 
 
+def _in_words(name: str, found: Fit) -> str:
+    values = ", ".join(f"{x} {_value(found, i)}" for i, x in enumerate(found.names))
+    return f"{name}: {values}, rms {found.rms:.4f} m/s"
+
+
 def _value(found: Fit, i: int) -> str:
     error = found.standard_error[i]
     if found.at_bound[i]:
@@ -201,16 +198,17 @@ def _value(found: Fit, i: int) -> str:
 # ---------------------------------------------------------------------------------------- compare
 
 
-def compare(given: options.CompareCommand) -> Answer:
+def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     """Every law on one scene."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     before, measured = _velocities(study, given)
     laws, left_out = registered_laws(study.parameters)
-    with waiting("laws"):
+    with waiting("comparing laws", TOLD):
         found = ji.compare(study.scene, before, laws)
+    steps(f"{len(laws)} laws compared")
     found = replace(found, left_out=left_out, measured=measured)
-    fits = _fits_of_all(study) if given.fit else {}
+    fits = _fits_of_all(study, steps) if given.fit else {}
     values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     lines = [
         str(found),
@@ -221,10 +219,15 @@ def compare(given: options.CompareCommand) -> Answer:
     ]
     data = {"velocity": before, "laws": found, "fits": fits, "left_out": left_out}
     picture = ji.plot.comparison(found, measured, study.title)
-    return Answer(_titled(study, before), as_data(data), "\n".join(lines), {path: picture})
+    bodies = [f"v_{i + 1}_plus" for i in range(len(before))]
+    heads = ["law", *bodies, "energy_ratio", "dispersion", "time_s", "audit"]
+    told = attrgetter("energy_ratio", "dispersion_index", "time", "verdict")
+    rows = [[name, *np.asarray(x.outcome.velocity), *told(x)] for name, x in found.entries.items()]
+    text = "\n".join(lines)
+    return Answer(_titled(study, before), as_data(data), text, {path: picture}, table=(heads, rows))
 
 
-def _fits_of_all(study: Study) -> dict[str, Fit]:
+def _fits_of_all(study: Study, steps: Steps) -> dict[str, Fit]:
     """Every law with restitution coefficients at its best, one for all contacts and one each."""
     start = {**study.parameters, "restitution": 0.9}
     each = {**start, "restitution": np.full(study.scene.contacts, 0.9)}
@@ -233,7 +236,8 @@ def _fits_of_all(study: Study) -> dict[str, Fit]:
         for name, law in registered_laws(values)[0].items():
             if hasattr(law, "restitution") and (label == "one e" or study.scene.contacts > 1):
                 own = replace(study, law=law, free={"restitution": True}, bounds={})
-                fits[f"{name}, {label}"] = own.run()
+                fits[f"{name}, {label}"] = own.run(progress=TOLD)
+                steps(_in_words(f"{name}, {label}", fits[f"{name}, {label}"]))
     return fits
 
 
@@ -248,27 +252,27 @@ def _fit_table(fits: dict[str, Fit]) -> list[str]:
 # ------------------------------------------------------------------------------------- montecarlo
 
 
-def montecarlo(given: options.MonteCarloCommand) -> Answer:
+def montecarlo(given: options.MonteCarloCommand, steps: Steps) -> Answer:
     """Random gaps, velocities, parameters."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = ji.monte_carlo(**_sampling(study, given))
+        found = ji.monte_carlo(**_sampling(study, given), progress=TOLD)
+    steps(f"{found.samples:,} samples")
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
     picture = ji.plot.monte_carlo(found, study.title)
-    return Answer(study.title, found.to_dict(), str(found), {path: picture})
+    columns = found.mean, found.standard_error, found.std, found.minimum, found.maximum
+    heads = ["coordinate", "mean", "standard_error", "std", "least", "largest"]
+    rows = [[i + 1, *row] for i, row in enumerate(zip(*columns))]
+    return Answer(study.title, found.to_dict(), str(found), {path: picture}, table=(heads, rows))
 
 
 def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
     """Of `monte_carlo`: those of the study, or in their place those of the command line."""
-    if not study.monte_carlo:
-        raise ValueError(f"the study '{given.study}' must have a [monte_carlo] table.")
     executor: Any = given.executor
     if given.scheduler is not None:
-        if executor != "dask":
-            raise ValueError(f"--scheduler needs --executor dask, but it is {executor}.")
         from jimpact.montecarlo.executors import DaskExecutor
 
         executor = DaskExecutor(given.scheduler)
@@ -279,12 +283,14 @@ def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
 
 # ------------------------------------------------------------------------------------------ chart
 
-SLOW_TO_COMPILE = ("tsit5", "kvaerno5")  # left to --full
+QUICK = "\nThis is the quick look; --full does all of it."
+QUICK_METHODS = ("dop853", "verlet", "impulse_euler", "scipy_dop853")
+QUICK_LAWS = ("moreau", "binary")
 
 
-def chart(given: options.ChartCommand) -> Answer:
+def chart(given: options.ChartCommand, steps: Steps) -> Answer:
     """Speed against accuracy on one scene."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     law = _lzb(study)
     before, _ = _velocities(study, given)
@@ -293,12 +299,26 @@ def chart(given: options.ChartCommand) -> Answer:
         before,
         law,
         given.methods or _able(law, study, given.full),
+        laws=None if given.full else _quick_laws(law),
         batch=given.batch,
         repeats=given.repeats,
-        gradients=not given.no_gradients,
+        gradients=given.full,
+        durations=given.full,
+        progress=TOLD,
     )
     picture = ji.plot.work_precision(found, study.title)
-    return Answer(_titled(study, before), found.to_dict(), str(found), {path: picture})
+    text = str(found) + ("" if given.full or given.methods else QUICK)
+    from jimpact.methods.chart import QUANTITIES
+
+    heads = ["method", "setting", *QUANTITIES, "evaluations", "alone_s", "batch_s", "status"]
+    told = attrgetter("evaluations", "single.median", "batched.median", "status")
+    rows = [
+        [name, x.setting, *(x.error[q] for q in QUANTITIES), *told(x)]
+        for name, points in found.points.items()
+        for x in points
+    ]
+    title = _titled(study, before)
+    return Answer(title, found.to_dict(), text, {path: picture}, table=(heads, rows))
 
 
 def _lzb(study: Study) -> ji.LZB:
@@ -309,15 +329,19 @@ def _lzb(study: Study) -> ji.LZB:
     return ji.LZB(**{key: known[key] for key in ji.REGISTRY["lzb"].parameters if key in known})
 
 
+def _quick_laws(law: ji.LZB) -> dict[str, ji.Law]:
+    known, _ = registered_laws({"restitution": law.restitution})
+    return {name: known[name] for name in QUICK_LAWS}
+
+
 def _able(law: ji.LZB, study: Study, full: bool) -> tuple[str, ...]:
-    """Methods that can solve the study's impact, without those that compile for long."""
+    """Methods that can solve the study's impact; without `full` those that compile soon."""
     from jimpact.methods.contenders import METHODS
 
-    left_out = () if full else SLOW_TO_COMPILE
     return tuple(
         name
         for name, method in METHODS.items()
-        if name not in left_out and method.supports(law, study.scene) is None
+        if (full or name in QUICK_METHODS) and method.supports(law, study.scene) is None
     )
 
 
@@ -328,18 +352,26 @@ QUICK_RESOLUTION, FULL_RESOLUTION, FULL_SAMPLES = 7, 9, 300
 TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
 
 
-def stability(given: options.StabilityCommand) -> Answer:
+def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
     """Maps of methods; the picture of single axes, and of pairs, one more beside it a method."""
-    path = _picture(given)
-    size: dict[str, Any] = {"resolution": QUICK_RESOLUTION}
-    if given.full:
+    path = given.picture()
+    if not given.full:  # three balls and no exponent 1: a program a method
+        from jimpact.methods.stability import default_axes
+
+        axes = default_axes(QUICK_RESOLUTION)
+        chosen = {name: values for name, values in axes.items() if name != "balls"}
+        size: dict[str, Any] = {"axes": chosen | {"exponent": axes["exponent"][1:]}}
+    else:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
-    found = ji.stability_map(given.methods, **size, max_steps=STEPS)
+    found = ji.stability_map(given.methods, **size, max_steps=STEPS, progress=TOLD)
     pictures = {path: ji.plot.stability_map(found, TITLE)}
     for name in found.methods if given.full else ():
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
         pictures[beside] = ji.plot.stability_pairs(found, name)
-    return Answer("", found.to_dict(), str(found), pictures)
+    text = str(found) + ("" if given.full else QUICK)
+    counts = [[name, *found.counts(name).values()] for name in found.methods]
+    table = ["method", *found.counts(found.methods[0])], counts
+    return Answer("", found.to_dict(), text, pictures, table=table)
 
 
 # ----------------------------------------------------------------------------------------- advise
@@ -347,9 +379,9 @@ def stability(given: options.StabilityCommand) -> Answer:
 _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 
 
-def advise(given: options.AdviseCommand) -> Answer:
+def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
     """The simplest law that a scene needs."""
-    path = _picture(given)
+    path = given.picture()
     study = read_study(given.study)
     before, _ = _velocities(study, given)
     found = ji.advise(
@@ -359,10 +391,13 @@ def advise(given: options.AdviseCommand) -> Answer:
         stiffness_range=given.stiffness_range,
         samples=given.samples,
         seed=given.seed,
+        progress=TOLD,
         **_lzb_parameters(study),
     )
     picture = ji.plot.advice(found, study.title)
-    return Answer(_titled(study, before), found.to_dict(), str(found), {path: picture})
+    title, heads = _titled(study, before), ["law", "worst", "chosen"]
+    rows = [[name, x.worst, name == found.name] for name, x in found.candidates.items()]
+    return Answer(title, found.to_dict(), str(found), {path: picture}, table=(heads, rows))
 
 
 def _lzb_parameters(study: Study) -> dict[str, Any]:
@@ -379,26 +414,25 @@ def _lzb_parameters(study: Study) -> dict[str, Any]:
 # --------------------------------------------------------------------------------------- simulate
 
 
-def simulate(given: options.SimulateCommand) -> Answer:
+def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
     from jimpact.motion.study_motion import read_motion_study
 
-    portrait = None if given.portrait is None else _checked(given.portrait, "--portrait")
-    if given.gif is not None and given.gif.suffix != ".gif":
-        raise ValueError(f"--gif must end in .gif, but is '{given.gif}'.")
-    path = _picture(given)
-    if portrait == path:
-        raise ValueError(f"--portrait and --out must be two files, but are both '{path}'.")
+    path, portrait = given.picture(), given.portrait
     study = read_motion_study(given.study)
     system, title = study.system, study.title
-    found = jax.block_until_ready(study.run(t_end=given.t_end, samples=given.samples))
+    run = study.run(t_end=given.t_end, samples=given.samples, progress=TOLD)
+    found = jax.block_until_ready(run)
+    steps("motion computed")
     pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
     if portrait is not None:
         which = None if given.coordinate is None else given.coordinate - 1
         pictures[portrait] = ji.plot.phase_portrait(found, which, title, system=system)
     if given.gif is not None:
-        pictures[given.gif] = partial(ji.plot.animation, system, found, title=title)
-    return Answer(title, found.to_dict(), str(found), pictures, _failure(found))
+        pictures[given.gif] = partial(ji.plot.animation, system, found, title=title, progress=TOLD)
+    heads = ["time [s]", *system.body.names, *system.body.velocity_names]
+    table = heads, np.column_stack([found.time, found.q, found.velocity]).tolist()
+    return Answer(title, found.to_dict(), str(found), pictures, _failure(found), table)
 
 
 def _failure(motion: "ji.Motion") -> str:
@@ -411,30 +445,21 @@ def _failure(motion: "ji.Motion") -> str:
 
 # ------------------------------------------------------------------------------------------- laws
 
-COLUMNS = ("parameters", "summary", "right_when", "fails_when", "source")
 
-
-def laws(given: options.LawsCommand) -> Answer:
-    """The registry as a table, as JSON or as references."""
-    if given.module is not None:
-        import_laws(given.module, Path())
-    rows = {name: {k: getattr(row, k) for k in COLUMNS} for name, row in ji.REGISTRY.items()}
-    if given.bibtex:
+def laws(given: options.LawsCommand, steps: Steps) -> Answer:
+    """The registry with the laws of a module; without one `LawsCommand.run` does it."""
+    assert given.module is not None
+    import_laws(given.module, Path())
+    if given.bibtex and not given.json:
         entries = dict.fromkeys(row.bibtex for row in ji.REGISTRY.values())
-        return Answer("", rows, "\n\n".join(entries), {})
-    told = Table()
-    for title in ("law", "parameters", "says", "right when", "fails when"):
-        told.add_column(title, overflow="fold")
-    for name, row in ji.REGISTRY.items():
-        parameters = ", ".join(row.parameters)
-        told.add_row(name, parameters, row.summary, row.right_when, row.fails_when)
-    console = Console()
-    with console.capture() as text:
-        console.print(told)
-    return Answer("", rows, text.get().rstrip(), {})
+        return Answer("", {}, "\n\n".join(entries), {})
+    rows = {
+        name: row._asdict() | {"parameters": row.parameters} for name, row in ji.REGISTRY.items()
+    }
+    return Answer("", {}, given.listed(rows), {}, printed=True)
 
 
-_COMMANDS: dict[str, Callable[[Any], Answer]] = {
+_COMMANDS: dict[str, Callable[[Any, Steps], Answer]] = {
     command.__name__: command
     for command in (fit, compare, montecarlo, chart, stability, advise, simulate, laws)
 }

@@ -154,18 +154,9 @@ class Contact(eqx.Module):
             (gamma - small, jnp.maximum(self.noise, noise)),
         )
 
-    def closed_only(self) -> "Contact":
-        """The same with open contacts decoupled, so that they take no part."""
-        closed, cross, along, slip = self.closed, self.cross, self.tangential, self.slip
-        w, gamma = decoupled(self.delassus, closed), jnp.where(closed, self.gap_velocity, 0.0)
-        if cross is not None and along is not None and slip is not None:
-            cross, along, slip = _closed_block(closed, w, cross, along, slip)
-        return eqx.tree_at(
-            lambda c: (c.delassus, c.gap_velocity, c.cross, c.tangential, c.slip),
-            self,
-            (w, gamma, cross, along, slip),
-            is_leaf=lambda x: x is None,
-        )
+    def approaching(self, speed: jax.Array) -> "Contact":
+        """The same with all gap velocities lower by `speed` () [m/s]."""
+        return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
 
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """gamma+ (m,) [m/s] of impulses p (m,) and p_t (t,)."""
@@ -209,14 +200,22 @@ class Contact(eqx.Module):
 def contact_of(
     scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
 ) -> Contact:
-    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part."""
+    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part.
+
+    Those with a gap of infinity never do.
+    """
     gamma, noise = settled(scene, velocity)
     w, gaps, m = delassus_matrix(scene), scene.gaps, scene.contacts
     cross, tangential, slip = _tangential_block(scene, velocity)
     norm = jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene)
     stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, (m,))
     stored = jnp.where(scene.closed, stored, 0.0)
-    found = Contact(
+    if gaps is not None:
+        part = gaps < jnp.inf if uses_gaps else scene.closed
+        w, gamma, gaps = decoupled(w, part), jnp.where(part, gamma, 0.0), jnp.where(part, gaps, 1.0)
+        if cross is not None and tangential is not None and slip is not None:
+            cross, tangential, slip = _closed_block(part, w, cross, tangential, slip)
+    return Contact(
         w,
         gamma,
         closed=scene.closed,
@@ -228,7 +227,6 @@ def contact_of(
         tangential=tangential,
         slip=slip,
     )
-    return found if gaps is None or uses_gaps else found.closed_only()
 
 
 def settled(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -1,12 +1,22 @@
-"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, a class a command."""
+"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, a class a command.
+
+`check` refuses what is wrong before JAX is imported, that is at once.
+"""
 
 import dataclasses
+import json
+from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from jimpact import starting, study_file
+from jimpact._checks import check_choice
+
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
+PICTURES = (".png", ".pdf", ".svg")
 StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
 
 
@@ -16,11 +26,30 @@ class Command:
 
     json: bool = False
     """Print JSON instead of text."""
+    csv: bool = False
+    """Print the table as CSV instead of text."""
+    no_cache: bool = False
+    """Compile anew. Else compiled programs are kept in the user's cache folder, or in the
+    folder that the environment variable JIMPACT_CACHE names (empty: nowhere)."""
+
+    @property
+    def light(self) -> bool:
+        """Whether it has a `run` of its own, which does not need JAX."""
+        return False
 
     @classmethod
     def name(cls) -> str:
         """The command's name."""
         return cls.__name__.removesuffix("Command").lower()
+
+    def check(self) -> None:
+        """Raise a ValueError or OSError for options or a study that are wrong."""
+        if self.json and self.csv:
+            raise ValueError("--json and --csv must not both be given.")
+
+    def kept(self) -> str:
+        """What is left of an interrupted command."""
+        return "Programs compiled so far are kept, nothing else." if not self.no_cache else ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +59,34 @@ class DrawingCommand(Command):
     out: Path = Path()
     """Picture (.png, .pdf, .svg), or a directory for it; default: ./jimpact-<command>.png,
     with a study named ./jimpact-<command>-<study>.png. What is there is replaced, and told."""
+
+    def check(self) -> None:
+        """Also the picture's kind."""
+        super().check()
+        self.picture()
+
+    def picture(self) -> Path:
+        """The file --out, or the command's own in the directory --out, named after the study."""
+        if self.out.suffix:
+            return checked_picture(self.out)
+        study, default = (getattr(x, "study", None) for x in (self, type(self)))
+        named = "" if study is None or study == default else f"-{study.stem}"
+        return self.out / f"jimpact-{self.name()}{named}.png"
+
+
+def checked_picture(path: Path, option: str = "--out") -> Path:
+    """The path of a picture; other endings are refused."""
+    if path.suffix not in PICTURES:
+        raise ValueError(
+            f"{option} must end in .png, .pdf or .svg or be a directory, but is '{path}'."
+        )
+    return path
+
+
+def check_methods(methods: tuple[str, ...] | None, known: tuple[str, ...]) -> None:
+    """Raise a ValueError unless all methods are known."""
+    for method in methods or ():
+        check_choice("methods", method, known)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +99,17 @@ class ShotCommand(DrawingCommand):
     """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
     shot: int = 1
     """Which measured shot, counted from 1."""
+
+    def check(self) -> None:
+        """Also the study, and whether it has velocities."""
+        super().check()
+        shots = study_file.check_study(self.study).shots
+        if self.velocity is not None:
+            return
+        if not shots:
+            raise ValueError("--velocity must be given, because the study has no [data].")
+        if not 1 <= self.shot <= shots:
+            raise ValueError(f"--shot must lie in [1, {shots}], but is {self.shot}.")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +126,12 @@ class FitCommand(DrawingCommand):
     """Number of starts; default: the study's, or 8."""
     seed: int | None = None
     """Seed of the random starts."""
+
+    def check(self) -> None:
+        """Also the study, which must have data."""
+        super().check()
+        if not study_file.check_study(self.study, self.law).shots:
+            raise ValueError(study_file.NO_DATA)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,21 +161,38 @@ class MonteCarloCommand(DrawingCommand):
     keep_samples: bool = False
     """Keep the raw samples in the folder, too."""
 
+    def check(self) -> None:
+        """Also the study, which must say what is random."""
+        super().check()
+        if not study_file.check_study(self.study).sampled:
+            raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
+        if self.scheduler is not None and self.executor != "dask":
+            raise ValueError(f"--scheduler needs --executor dask, but it is {self.executor}.")
+
+    def kept(self) -> str:
+        """Finished chunks are."""
+        if self.folder is None:
+            return "Nothing is kept, because no --folder was given."
+        return f"Finished chunks are in '{self.folder}': the same command continues from there."
+
 
 @dataclasses.dataclass(frozen=True)
 class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
     methods: tuple[str, ...] | None = None
-    """Methods by name; default: those that the scene allows and that compile fast."""
+    """Methods by name; default: four that compile soon, as far as the scene allows."""
     full: bool = False
-    """The methods that compile slowly, too."""
-    no_gradients: bool = False
-    """Leave out the errors of the derivatives."""
+    """Every method and algebraic law, durations, and the errors of the derivatives."""
     batch: int = 256
     """Impacts solved side by side."""
     repeats: int = 5
     """Timings of each entry, taken in turn."""
+
+    def check(self) -> None:
+        """Also the methods' names."""
+        super().check()
+        check_methods(self.methods, tuple(study_file.names()["methods"]))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +202,14 @@ class StabilityCommand(DrawingCommand):
     methods: tuple[str, ...] | None = None
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: bool = False
-    """All pairs of axes, each method its own picture, and 300 points over all of them besides."""
+    """Also other numbers of balls and exponent 1, finer, all pairs of axes with a picture a method,
+    and 300 points over all axes besides."""
+
+    def check(self) -> None:
+        """Also the methods' names."""
+        super().check()
+        batched = [name for name, jax in study_file.names()["methods"].items() if jax]
+        check_methods(self.methods, ("default", *batched))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,6 +244,17 @@ class SimulateCommand(DrawingCommand):
     coordinate: int | None = None
     """Coordinate of the phase portrait, counted from 1; default: one that moves."""
 
+    def check(self) -> None:
+        """Also the other pictures and the study."""
+        super().check()
+        if self.portrait is not None:
+            checked_picture(self.portrait, "--portrait")
+        if self.gif is not None and self.gif.suffix != ".gif":
+            raise ValueError(f"--gif must end in .gif, but is '{self.gif}'.")
+        if self.portrait == (path := self.picture()):
+            raise ValueError(f"--portrait and --out must be two files, but are both '{path}'.")
+        study_file.check_motion_study(self.study)
+
 
 @dataclasses.dataclass(frozen=True)
 class LawsCommand(Command):
@@ -156,8 +265,68 @@ class LawsCommand(Command):
     bibtex: bool = False
     """Print the references as BibTeX."""
 
+    @property
+    def light(self) -> bool:
+        """Those of the package are known without JAX."""
+        return self.module is None
 
-COMMANDS: tuple[type[Command], ...] = (
+    def run(self) -> int:
+        """Print them."""
+        if self.bibtex and not self.json:
+            bundled = files("jimpact") / "data" / "laws.bib"
+            print(bundled.read_text(encoding="utf-8").strip())
+        else:
+            print(self.listed(study_file.names()["laws"]))
+        return 0
+
+    def listed(self, laws: Mapping[str, Mapping[str, Any]]) -> str:
+        """The laws as text, JSON or CSV."""
+        keys = ("parameters", "summary", "right_when", "fails_when", "source")
+        rows = {name: {key: row[key] for key in keys} for name, row in laws.items()}
+        if self.json:
+            return json.dumps(rows, indent=2)
+        if self.csv:
+            lines = [
+                [name, " ".join(row["parameters"]), *[*row.values()][1:]]
+                for name, row in rows.items()
+            ]
+            return starting.as_csv(["law", *keys], lines)
+        return starting.laws_as_text(rows)
+
+
+@dataclasses.dataclass(frozen=True)
+class NewCommand:
+    """Begin a study of your own: a commented study file, data where it needs some, a notebook."""
+
+    kind: Annotated[Literal["fit", "compare", "montecarlo", "simulate"], tyro.conf.Positional]
+    """What the study is for."""
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
+    """Where it is written; default: ./my_<kind>. What is there is never replaced."""
+
+    light: ClassVar[bool] = True
+
+    @classmethod
+    def name(cls) -> str:
+        """The command's name."""
+        return "new"
+
+    def check(self) -> None:
+        """Nothing to refuse beforehand."""
+
+    def kept(self) -> str:
+        """Files are written whole or not at all."""
+        return ""
+
+    def run(self) -> int:
+        """Write the files, and say what comes next."""
+        folder = self.folder or Path(f"my_{self.kind}")
+        for path in starting.begin(self.kind, folder):
+            print(f"written: {path}")
+        print(f"Next: jimpact {self.kind} {folder / 'study.toml'}")
+        return 0
+
+
+COMMANDS: tuple[type[Command] | type[NewCommand], ...] = (
     FitCommand,
     CompareCommand,
     MonteCarloCommand,
@@ -166,4 +335,5 @@ COMMANDS: tuple[type[Command], ...] = (
     AdviseCommand,
     SimulateCommand,
     LawsCommand,
+    NewCommand,
 )

@@ -1,4 +1,4 @@
-"""Progress bars on stderr for work that turns out to be long: fits, samples, stages of a chart."""
+"""How far long work is, on stderr: a bar on a terminal, elsewhere a line a step."""
 
 import contextlib
 import sys
@@ -6,27 +6,45 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+LONG = 2.0  # seconds after which work counts as long
+LINE_EVERY = 10.0  # seconds between two lines about one step
 
-BAR_AFTER = 2.0  # seconds after which work counts as long
+Show = Callable[[str, float, float | None], None]
 
 
 @contextlib.contextmanager
-def progress_bar(progress: bool | None) -> Iterator[Callable[[str, float, float | None], None]]:
+def progress_bar(progress: float | None) -> Iterator[Show]:
     """Yield `show(what, done, total)`; total None: nobody knows.
 
-    The bar is there at once if `progress`; None: only on a terminal, once the work turns out long.
+    `progress`: seconds after which the work is long enough to be told; True: at once; False:
+    never; None: after two seconds, and only on a terminal.
     """
-    if not (sys.stderr.isatty() if progress is None else progress):
+    terminal = sys.stderr.isatty()
+    if progress is False or (progress is None and not terminal):
         yield lambda what, done, total: None
         return
-    console = Console(stderr=True, force_terminal=True if progress else None)
-    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    bar = Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
+    after = LONG if progress is None else 0.0 if progress is True else progress
+    with (_bar if terminal else _lines)(after) as show:
+        yield show
+
+
+@contextlib.contextmanager
+def _bar(after: float) -> Iterator[Show]:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn as Remaining,
+    )
+
+    columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), Remaining()
+    bar = Progress(*columns, console=Console(stderr=True), transient=True)
     task = bar.add_task("", total=None)
-    timer = threading.Timer(BAR_AFTER, bar.start)
-    (bar if progress else timer).start()
+    timer = threading.Timer(after, bar.start)
+    timer.daemon = True
+    timer.start()
     try:
         yield lambda what, done, total: bar.update(
             task, description=what, completed=done, total=total
@@ -37,8 +55,38 @@ def progress_bar(progress: bool | None) -> Iterator[Callable[[str, float, float 
 
 
 @contextlib.contextmanager
-def waiting(what: str, progress: bool | None = None) -> Iterator[None]:
-    """A bar for work that does not tell how far it is: only its time runs."""
+def _lines(after: float) -> Iterator[Show]:
+    """A line once the work is long, then now and then, and at its end."""
+    begun, ended = time.monotonic(), threading.Event()
+    latest = ""
+
+    def tell() -> None:
+        print(f"{latest or 'working'}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
+
+    def run() -> None:
+        wait = after or LINE_EVERY
+        while not ended.wait(wait):
+            tell()
+            wait = LINE_EVERY
+
+    def show(what: str, done: float, total: float | None) -> None:
+        nonlocal latest
+        latest = what
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield show
+    finally:
+        ended.set()
+        thread.join()
+        if time.monotonic() - begun >= after:
+            tell()
+
+
+@contextlib.contextmanager
+def waiting(what: str, progress: float | None = None) -> Iterator[None]:
+    """Progress of work that does not tell how far it is: only its time runs."""
     with progress_bar(progress) as show:
         show(what, 0.0, None)
         yield
@@ -46,16 +94,36 @@ def waiting(what: str, progress: bool | None = None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def counting_bar(
-    total: int, unit: str, progress: bool | None, done: int = 0
+    total: int, unit: str, progress: float | None, done: int = 0
 ) -> Iterator[Callable[[int], None]]:
     """Yield `advance(more)`: how many of all there are; `done` before count for no rate."""
     begin, new = time.perf_counter(), 0
     with progress_bar(progress) as show:
 
+        def tell() -> None:
+            rate = new / max(time.perf_counter() - begin, 1e-9)
+            fast = f", {rate:,.0f}/s" if rate >= 10 else ""
+            show(f"{done + new:,} of {total:,} {unit}{fast}", done + new, total)
+
         def advance(more: int) -> None:
             nonlocal new
             new += more
-            rate = new / max(time.perf_counter() - begin, 1e-9)
-            show(f"{done + new:,} of {total:,} {unit}, {rate:,.0f}/s", done + new, total)
+            tell()
 
+        tell()
         yield advance
+
+
+class Steps:
+    """The steps that a command has done: each is told on stderr, once the command is long."""
+
+    def __init__(self, command: str):
+        self.command, self.begun = command, time.monotonic()
+        self.done: list[str] = []
+
+    def __call__(self, step: str) -> None:
+        """A step is done."""
+        self.done.append(step)
+        seconds = time.monotonic() - self.begun
+        if seconds > LONG:
+            print(f"{self.command}: {step} ({seconds:.0f} s)", file=sys.stderr)

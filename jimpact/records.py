@@ -1,6 +1,7 @@
 """What results have in common: as data for a JSON file, as a table in text."""
 
 import dataclasses
+import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -47,9 +48,12 @@ def number(value: float | None, form: str) -> str:
 
 
 def table(
-    heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = ()
+    heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = (), keys: int = 1
 ) -> list[str]:
     """Lines of a table; the first column and those with a head in `left` are text, others numbers.
+
+    On a terminal that is too narrow the columns are told in several tables, one below the other,
+    each with the first columns, as many as `keys`.
 
     >>> from jimpact.records import table
     >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
@@ -58,10 +62,33 @@ def table(
     whole = [list(heads), *map(list, rows)]
     widths = [max(map(len, column)) for column in zip(*whole)]
     is_text = [i == 0 or head in left for i, head in enumerate(heads)]
-    return [
-        "  ".join(
-            cell.ljust(width) if text else cell.rjust(width)
-            for cell, width, text in zip(row, widths, is_text)
-        ).rstrip()
-        for row in whole
-    ]
+    room = shutil.get_terminal_size((sum(widths) + 2 * len(widths), 0)).columns  # no terminal: all
+    lines: list[str] = []
+    for part in _parts(widths, keys, room):
+        lines += [""] if lines else []
+        lines += [
+            "  ".join(
+                row[i].ljust(widths[i]) if is_text[i] else row[i].rjust(widths[i]) for i in part
+            ).rstrip()
+            for row in whole
+        ]
+    return lines
+
+
+def _parts(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
+    """Columns of tables side by side that fit the room, each with the first `keys`.
+
+    >>> from jimpact.records import _parts
+    >>> _parts([6, 6, 6, 6], 1, 22), _parts([6, 60], 1, 22)
+    ([[0, 1, 2], [0, 3]], [[0, 1]])
+    """
+    first = list(range(keys))
+    parts = [list(first)]
+    for i in range(keys, len(widths)):
+        longer = [*parts[-1], i]
+        fits = sum(widths[j] + 2 for j in longer) - 2 <= room
+        if not fits and parts[-1] != first:
+            parts.append([*first, i])
+        else:
+            parts[-1] = longer
+    return parts

@@ -142,14 +142,6 @@ def test_sequence():
     assert ji.Binary(e).sequence(scene, np.arange(5.0)) == []
 
 
-def test_open_contacts_wait_where_they_shall():
-    """In a motion the ball behind a gap is hit later."""
-    row = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1])
-    for closed_only, after in ((False, [0.0, 0.0, 1.0]), (True, [0.0, 1.0, 0.0])):
-        out = ji.impact(ji.Binary(1.0), row, [1.0, 0.0, 0.0], closed_only=closed_only)
-        np.testing.assert_allclose(out.velocity, after, atol=1e-14)
-
-
 def test_ball_and_ground_in_both_orders():
     """(6.3) and (6.4); ball 1 on top, +x up in the formulas: -v for `chain`."""
     scene, v = ji.chain([2.0, 5.0], wall=True), [1.0, 0.5]

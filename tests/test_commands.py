@@ -1,5 +1,6 @@
 """One end-to-end call a command; what is refused is one line on stderr and exit code 2."""
 
+import csv
 import json
 import os
 import re
@@ -11,11 +12,14 @@ import tomllib
 from importlib.resources import files
 from pathlib import Path
 
+import names
+import nbclient
+import nbformat
 import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.cli import main
+from jimpact.cli import keep_programs, main
 from jimpact.motion.study_motion import read_motion_study
 from jimpact.study import body_of, read_study
 
@@ -140,6 +144,14 @@ REFUSED = [
 ]  # fmt: skip
 
 
+TYPOS = [  # what needs no numbers is told before JAX is imported
+    *((old, new) for old, new, _ in REFUSED if "1.0" not in old and "high" not in new),
+    ('free = ["restitution"]', 'free = ["restituton"]'),
+    ("restitution = 0.9", "restitution = 0.9\nmethod = 'rk4'"),
+    ('name = "Newton"\nrestitution = 0.9', "name = 'lzb'\nrestitution = 1.0\nmethod = 'rk4'"),
+]
+
+
 @pytest.mark.parametrize(("old", "new", "message"), REFUSED)
 def test_fit_refuses(tmp_path, capsys, old, new, message):
     assert old in STUDY
@@ -168,6 +180,9 @@ def test_compare(tmp_path, capsys):
     np.testing.assert_allclose(told["laws"]["moreau"]["velocity"], [-0.3, 0.65, 0.65], atol=1e-12)
     assert set(told["laws"]) >= {"lzb", "newton", "moreau", "poisson", "binary"}
     assert (tmp_path / "jimpact-compare.png").stat().st_size > 10_000
+    code, said = call(capsys, "compare", "--csv", "--out", tmp_path / "b.png")
+    (row,) = [x for x in csv.DictReader(said.out.splitlines()) if x["law"] == "moreau"]
+    np.testing.assert_allclose(float(row["v_3_plus"]), 0.65, atol=1e-12)
     code, said = call(capsys, "compare", "--velocity", "2", "0", "0", "--out", tmp_path / "a.svg")
     assert code == 0
     assert "measured" not in said.out
@@ -223,23 +238,71 @@ def test_failed_samples_are_told_on_stderr(tmp_path, capsys):
     assert ", left out (" in said.out
 
 
-@pytest.mark.slow
-def test_a_real_ctrl_c(tmp_path):
-    path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
-    folder = tmp_path / "run"
-    command = [sys.executable, "-m", "jimpact.cli", "montecarlo", path, "--folder", str(folder)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+def interrupted(arguments, folder, moment):
+    """Exit code and stderr of a command that gets ctrl-C at a moment: seconds, or a condition."""
+    command = [sys.executable, "-m", "jimpact.cli", *arguments]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # an ignored one would be inherited
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=folder,
+    )
     try:
-        end = time.monotonic() + 60
-        while len(list(folder.glob("chunk-*.npz"))) < 3 and time.monotonic() < end:
+        end = time.monotonic() + (60 if callable(moment) else moment)
+        while time.monotonic() < end and not (callable(moment) and moment()):
             time.sleep(0.02)
-        os.kill(process.pid, signal.SIGINT)
-        told = process.communicate(timeout=60)[1]
+        process.send_signal(signal.SIGINT)
+        told = process.communicate(timeout=20)[1]
     finally:
         process.kill()
-    assert process.returncode == 130
-    assert "continues from there" in told
+    return process.returncode, told
+
+
+def test_ctrl_c_keeps_finished_chunks(tmp_path):
+    path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
+    run = tmp_path / "run"
+    options = ["montecarlo", path, "--folder", "run"]
+    code, told = interrupted(options, tmp_path, lambda: list(run.glob("chunk-*.npz")))
+    assert code == 130
+    assert "Finished chunks are in 'run': the same command continues from there." in told
     assert "Traceback" not in told
+
+
+VERBS = ("fit", "compare", "montecarlo", "chart", "stability", "advise", "simulate")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", VERBS)
+def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
+    monkeypatch.setenv("JIMPACT_CACHE", "")
+    for moment in (0.7, 1.5, 3.0, 4.5):
+        code, told = interrupted([verb], tmp_path, moment)
+        assert code == 130
+        assert told.splitlines()[-1].startswith("jimpact")
+        assert "Traceback" not in told
+
+
+def test_programs_are_kept_where_nobody_says_otherwise(tmp_path, monkeypatch):
+    folder, enabled = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
+    for name in (folder, enabled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JIMPACT_CACHE"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    keep_programs(no_cache=False)
+    assert "jimpact" in os.environ.pop(folder)
+    monkeypatch.setenv("JIMPACT_CACHE", "")
+    keep_programs(no_cache=False)
+    assert folder not in os.environ
+    monkeypatch.setenv("JIMPACT_CACHE", "mine")
+    keep_programs(no_cache=False)
+    monkeypatch.setenv("JIMPACT_CACHE", "other")
+    keep_programs(no_cache=False)  # what is set already stays
+    assert (os.environ[folder], enabled in os.environ) == ("mine", False)
+    keep_programs(no_cache=True)
+    assert os.environ[enabled] == "false"
 
 
 def test_simulate(tmp_path, capsys):
@@ -371,15 +434,14 @@ def test_simulate_in_space(tmp_path, capsys):
     path = written(tmp_path, study.replace("t_end_s = 1.5", "t_end_s = 0.02"))
     options = ["--samples", "3", "--gif", "m.gif", "--portrait", "p.svg"]
     code, said = call(capsys, "simulate", path, *options)
-    assert (code, said.err) == (0, "")
+    assert code == 0
+    assert "replaced" not in said.err
     assert "nothing did work" in said.out
     assert "Picture: jimpact-simulate-study.png" in said.out
     assert (tmp_path / "m.gif").read_bytes().startswith(b"GIF89a")
     code, said = call(capsys, "simulate", path, "--samples", "3")
     assert code == 0
-    assert said.err == (
-        "jimpact simulate: jimpact-simulate-study.png was there before: replaced.\n"
-    )
+    assert "jimpact simulate: jimpact-simulate-study.png was there before: replaced.\n" in said.err
 
 
 @pytest.mark.parametrize(
@@ -419,11 +481,11 @@ def test_advise(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_chart(tmp_path, capsys):
-    options = ["--no-gradients", "--batch", "4", "--repeats", "1", "--methods", "verlet"]
+    options = ["--batch", "4", "--repeats", "1", "--methods", "verlet"]
     code, said = call(capsys, "chart", *options, "--out", tmp_path, "--json")
     told = json.loads(said.out)
     assert code == 0
-    assert {"verlet", "newton", "moreau", "poisson", "binary"} <= set(told["points"])
+    assert {"verlet", "moreau", "binary"} == set(told["points"])
     assert (tmp_path / "jimpact-chart.png").stat().st_size > 10_000
 
 
@@ -434,9 +496,56 @@ def test_stability(tmp_path, capsys):
     assert json.loads(said.out)["methods"]["verlet"]["counts"]["right"] > 3
 
 
-def test_laws(capsys):
-    assert "restitution" in call(capsys, "laws")[1].out
+def test_bare_call_greets(capsys):
+    code, said = call(capsys)
+    assert code == 0
+    for verb in (*VERBS, "new", "laws"):
+        assert f"{verb}" in said.out
+    assert max(map(len, said.out.splitlines())) <= 80
+
+
+@pytest.mark.parametrize("kind", ["fit", "compare", "montecarlo", "simulate"])
+def test_a_study_of_ones_own(tmp_path, capsys, kind):
+    """What `jimpact new` writes is read, runs up to the numbers, and is never replaced."""
+    code, said = call(capsys, "new", kind)
+    assert (code, f"Next: jimpact {kind} my_{kind}" in said.out) == (0, True)
+    study = tmp_path / f"my_{kind}" / "study.toml"
+    if kind == "simulate":
+        assert read_motion_study(study).title
+    else:
+        found = read_study(study)
+        assert (found.experiments is None) == (kind == "montecarlo")
+    cells = nbformat.read(study.with_suffix(".ipynb"), as_version=4).cells
+    code_cells = [cell.source for cell in cells if cell.cell_type == "code"]
+    for source in code_cells:
+        for name in re.findall(r"\bji\.(\w+)", source):
+            assert hasattr(ji, name)
+    code, said = call(capsys, "new", kind)
+    assert code == 2
+    assert "must not exist" in said.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["fit", "compare", "montecarlo", "simulate"])
+def test_the_notebook_of_a_study_of_ones_own_runs(tmp_path, capsys, kind):
+    assert call(capsys, "new", kind, ".")[0] == 0
+    place = {"metadata": {"path": str(tmp_path)}}
+    notebook = nbformat.read(tmp_path / "study.ipynb", as_version=4)
+    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=place).execute()
+
+
+def test_laws(capsys, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    told = call(capsys, "laws")[1].out
+    assert "restitution" in told
+    assert max(map(len, told.splitlines())) <= 80
     assert set(json.loads(call(capsys, "laws", "--json")[1].out)) == set(ji.REGISTRY)
+    rows = list(csv.DictReader(call(capsys, "laws", "--csv")[1].out.splitlines()))
+    assert [row["law"] for row in rows] == list(ji.REGISTRY)
+    assert rows[0]["source"] == ji.REGISTRY["lzb"].source
+    (tmp_path / "empty_module.py").write_text("")
+    again = call(capsys, "laws", "--module", str(tmp_path / "empty_module.py"))[1].out
+    assert again == told
     assert call(capsys, "laws", "--bibtex")[1].out.count("@book{brogliato2016") == 1
 
 
@@ -445,6 +554,7 @@ def test_laws(capsys):
     [
         (["fit", "nowhere.toml"], "Study 'nowhere.toml' does not exist"),
         (["fit", "--out", "fit.docx"], "--out must end in .png, .pdf or .svg"),
+        (["fit", "--json", "--csv"], "--json and --csv must not both be given"),
         (["fit", "--law", "aristotle"], "the law must be one of"),
         (["compare", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["compare", "--velocity", "1", "0"], "`velocity` must have shape (3,)"),
@@ -476,14 +586,31 @@ def test_refused(capsys, arguments, message):
     assert said.err.count("\n") == 1
 
 
-def test_version_and_help(capsys):
-    assert call(capsys, "--version")[1].out == f"jimpact {ji.__version__}\n"
+def test_words_of_studies_are_those_of_the_classes():
+    """`python tests/names.py` writes them anew."""
+    assert names.PATH.read_text(encoding="utf-8") == names.as_text()
+
+
+def test_typos_are_told_before_jax_is_imported(tmp_path):
+    """Version, help, and a wrong word of each kind, one process for all."""
+    written(tmp_path)
+    calls = [["--version"], ["--help"], ["fit", "nowhere.toml"], ["chart", "--methods", "magic"]]
+    for i, (old, new) in enumerate(TYPOS):
+        (tmp_path / f"{i}.toml").write_text(STUDY.replace(old, new))
+        calls.append(["fit", f"{i}.toml"])
     code = (
         "import sys\nfrom jimpact.cli import main\n"
-        "try: main(['--help'])\n"
-        "except SystemExit: pass\n"
-        "print([m for m in ('jax', 'matplotlib', 'numpy', 'scipy') if m in sys.modules])"
+        f"for arguments in {calls}:\n"
+        "    try: print(main(arguments))\n"
+        "    except SystemExit: pass\n"
+        "print([m for m in ('jax', 'matplotlib', 'scipy') if m in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert f"jimpact {ji.__version__}\n" in done.stdout
     assert "montecarlo" in done.stdout
-    assert done.stdout.splitlines()[-1] == "[]"
+    lines = done.stdout.splitlines()
+    assert lines[-1] == "[]"
+    assert lines[-len(calls) + 1 : -1] == ["2"] * (len(calls) - 2)
+    assert done.stderr.count("\n") == len(calls) - 2

@@ -104,9 +104,9 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
         [0.0] * 3,
         3.0,
         samples=61,
-        max_events=1000,
     )
     assert ended(motion) == ["ok"]
+    assert 100 < int(motion.events.count) < 200  # 496 if each contact came to rest for itself
     assert int(motion.steps) < 10 * int(motion.events.count)
     energy = np.asarray(motion.energy)
     assert np.diff(energy).max() < 1e-11 * energy[0]
@@ -114,6 +114,27 @@ def test_a_corner_hops_while_the_other_is_the_pivot():
     assert np.asarray(motion.gaps).min() > -1e-9
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
     np.testing.assert_allclose(motion.gaps[-1, :2], 0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_three_touching_beads_come_to_rest():
+    """Nested accumulations: 4183 events if each contact came to rest for itself."""
+    beads = 0.1 + 0.01 * np.array([1.0, 3.0, 5.0])
+
+    def drop(slow):
+        return ji.simulate(
+            ji.column_system([0.1] * 3, 0.01), ji.LZB(0.9), beads, [0.0] * 3, 2.0, slow=slow
+        )
+
+    motion, fine = drop(1e-6), drop(1e-10)
+    last, late = int(motion.events.count) - 1, int(fine.events.count) - 1
+    assert ended(motion) == ended(fine) == ["ok"]
+    assert last < 400 < 4 * last < late
+    rest = float(fine.events.time[late])
+    assert motion.events.time[last] < rest < motion.events.accumulation_end[last] < rest + 0.01
+    for found in (motion, fine):
+        np.testing.assert_allclose(found.q[-1], beads - 0.1, atol=1e-12)
+        np.testing.assert_allclose(found.ledger_residual, 0, atol=1e-13)
 
 
 @pytest.mark.slow

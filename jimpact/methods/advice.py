@@ -136,7 +136,7 @@ def advise(
     samples: int = 128,
     seed: int = 0,
     timing: bool = True,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> Advice:
     """The simplest law whose v+ is within a tolerance of LZB on this scene, with the evidence.
 
@@ -199,7 +199,7 @@ def _found(
     tried: Rows,
     tolerance: float,
     timing: bool,
-    progress: bool | None,
+    progress: float | None,
 ) -> Advice:
     name = list(laws)[-1]
     own = {key: outcomes(law, at, tried.stiffness, progress) for key, law in laws.items()}
@@ -391,7 +391,9 @@ def trials(at: Situation, restitution: Any, stiffness: np.ndarray, eta: Any) -> 
     return found
 
 
-def outcomes(trial: Trial, at: Situation, stiffness: np.ndarray, progress: bool | None) -> Outcomes:
+def outcomes(
+    trial: Trial, at: Situation, stiffness: np.ndarray, progress: float | None
+) -> Outcomes:
     """Outcomes over rows of stiffness (r, m), a chunk at a time; one of a law that knows none."""
     r, chunk = len(stiffness) if trial.knows_stiffness else 1, _chunk(stiffness)
     parts = []

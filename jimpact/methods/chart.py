@@ -116,9 +116,13 @@ class WorkPrecision:
             for point in points:
                 rows.append([first[0], *point.cells(), first[1], point.status])
                 first = ["", ""]
-        uncertain = ", ".join(f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items())
+        known = [i for i, column in enumerate(zip(*rows)) if any(column)]
+        heads, rows = [heads[i] for i in known], [[row[i] for i in known] for row in rows]
+        uncertain = ", ".join(
+            f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items() if not np.isnan(v)
+        )
         lines = [
-            *table(heads, rows, left=["status"]),
+            *table(heads, rows, left=["status"], keys=2),
             f"Reference: {self.reference.how}; uncertain by {uncertain}.",
             f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; of a law its model error.",
@@ -142,7 +146,8 @@ def work_precision(
     batch: int = 256,
     repeats: int = 5,
     gradients: bool = True,
-    progress: bool | None = None,
+    durations: bool = True,
+    progress: float | None = None,
 ) -> WorkPrecision:
     """Error against time and against field evaluations of many ways to integrate one impact.
 
@@ -163,7 +168,8 @@ def work_precision(
         reference: method that errors are measured from, at rtol 1e-14; None: the
             event-aligned order 8. Its uncertainty is its distance from
             a second solution: order 8 at 1e-12.
-        batch: impacts in a batch. repeats: of every time. gradients: measure them, too.
+        batch: impacts in a batch. repeats: of every time. gradients, durations: measure them, too
+            (each asks for programs of its own).
         progress: bar on stderr; None: on a terminal.
 
     Raises:
@@ -186,7 +192,7 @@ def work_precision(
         known = registered_laws({"restitution": law.restitution})[0]
         laws = {name: known[name] for name in ALGEBRAIC}
     needed = {m.name: m for m in (*chosen, exact, second)}
-    programs = {name: _of_method(m, case, gradients) for name, m in needed.items()}
+    programs = {name: _of_method(m, case, gradients, durations) for name, m in needed.items()}
     programs |= {name: _of_law(other, case) for name, other in laws.items()}
     rows: list[tuple[str, float | None]] = [(n, x) for n, row in ladders.items() for x in row]
     rows += [(name, None) for name in laws]
@@ -212,7 +218,7 @@ def work_precision(
             uncertainty=_errors(case, other_truth, truth),
             velocity=np.asarray(truth[0].out.velocity[0]),
             impulse=np.asarray(truth[0].out.impulse[0]),
-            duration=float(truth[0].duration[0]),
+            duration=float(np.ravel(truth[0].duration)[0]),
         ),
         compile_time={name: programs[name].compile_time for name in points},
         left_out=left_out,
@@ -337,7 +343,7 @@ class Programs:
         return answer._replace(evaluations=work), slopes
 
 
-def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
+def _of_method(method: Method, case: Case, gradients: bool, durations: bool) -> Programs:
     if not method.jax:
         return _on_host(method, case)
 
@@ -348,7 +354,8 @@ def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
 
     def fast(*given: Any) -> Answer:
         answer = whole(*given)
-        return answer._replace(duration=jnp.nan) if method.duration_apart else answer
+        apart = method.duration_apart or not durations
+        return answer._replace(duration=jnp.nan) if apart else answer
 
     def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
         def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
@@ -367,7 +374,9 @@ def _of_method(method: Method, case: Case, gradients: bool) -> Programs:
         return _compiled(seconds, name, each, k, *constant)
 
     batched = program("batched", fast, len(case.stiffness))
-    account = program("errors", whole, case.sample) if method.duration_apart else batched
+    account = batched
+    if durations and method.duration_apart:
+        account = program("errors", whole, case.sample)
     count = _counter(method, program) if method.counting else None
 
     def accounted(setting: Any) -> Answer:
@@ -502,7 +511,7 @@ def _errors(case: Case, moment: Moment, truth: Moment) -> dict[str, float]:
 
 
 def _times(
-    rows: list[tuple[Programs, float | None]], repeats: int, progress: bool | None
+    rows: list[tuple[Programs, float | None]], repeats: int, progress: float | None
 ) -> list[list[Timing]]:
     """Single and batched time of every row, and with its gradient if it has one; all in turns."""
     tasks = []

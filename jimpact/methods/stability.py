@@ -201,7 +201,7 @@ def stability_map(
     *,
     max_steps: int = 10_000,
     seed: int = 0,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> StabilityMap:
     """Where methods integrate the LZB law rightly, and where they do not, over six axes.
 
@@ -294,17 +294,22 @@ def _known(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
     return values
 
 
+def default_axes(r: int) -> dict[str, np.ndarray]:
+    """r values of each axis (number of balls: at most six)."""
+    return {
+        "setting": np.linspace(0, 1, r),
+        "stiffness_ratio": np.logspace(-8, 8, r),
+        "exponent": np.linspace(1, 5, r),
+        "restitution": np.append(0.0, np.logspace(-3, 0, r - 1)),
+        "mass_ratio": np.logspace(-6, 6, r),
+        "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
+    }
+
+
 def _axes(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str, np.ndarray]:
-    """The axes to map: those given, or r values of each (number of balls: at most six)."""
+    """The axes to map: those given, or the default ones."""
     if axes is None:
-        return {
-            "setting": np.linspace(0, 1, r),
-            "stiffness_ratio": np.logspace(-8, 8, r),
-            "exponent": np.linspace(1, 5, r),
-            "restitution": np.append(0.0, np.logspace(-3, 0, r - 1)),
-            "mass_ratio": np.logspace(-6, 6, r),
-            "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
-        }
+        return default_axes(r)
     axes = _known("axes", axes or {"": ()})
     found = {name: np.unique(np.asarray(x, float)) for name, x in axes.items()}
     balls = found.get("balls", np.zeros(0))

@@ -36,7 +36,7 @@ def monte_carlo(
     folder: str | Path | None = None,
     keep_samples: bool = False,
     bins: int = BINS,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> MonteCarlo:
     """Statistics of the velocities after an impact whose gaps (velocities, law) are random.
 
@@ -101,7 +101,7 @@ def monte_carlo(
 
 
 def _total(
-    run: Run, executor: Executor, store: Store | None, progress: bool | None
+    run: Run, executor: Executor, store: Store | None, progress: float | None
 ) -> tuple[Chunk, int]:
     """All chunks, read or computed, joined in their order; how many samples were read."""
     keep = run.plan.keep_samples

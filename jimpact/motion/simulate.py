@@ -65,7 +65,7 @@ def simulate(
     closed_below: float = CLOSED_BELOW,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> Motion:
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
@@ -93,7 +93,8 @@ def simulate(
         rtol, atol: tolerances of the flights.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
-            gap velocity of the motion, and would be pressed back, stays closed.
+            gap velocity of the motion, and would be pressed back, stays closed; contacts that share
+            bodies below the root of that share (docs/motions.md). `events` tells what is passed.
         max_steps: of the integrator, in all.
         progress: bar on stderr, after each of those runs with the share of the duration that is
             done; None: on a terminal, for long motions.
@@ -183,14 +184,14 @@ def _on_host(given: Any) -> bool:
     return not is_traced(given) and is_own(())
 
 
-def _waited(run: Callable[..., Motion], given: Any, progress: bool | None) -> Motion:
+def _waited(run: Callable[..., Motion], given: Any, progress: float | None) -> Motion:
     if not _on_host(given):
         return run(*given)
     with waiting("motion", progress):
         return jax.block_until_ready(run(*given))
 
 
-def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: bool | None) -> Motion:
+def _in_runs(given: tuple[Any, ...], samples: int, most: int, progress: float | None) -> Motion:
     """The motion in runs of `CHUNK` events, each of which goes on where the last one ended."""
     system, *_, q, v, start, end = given
     numbers: Any = no_past(q, v, _contacts_of(system, q), samples)

@@ -459,7 +459,7 @@ def _struck(
     law: Law, scene: Scene, v: jax.Array, noise: jax.Array, shape: tuple[int, ...]
 ) -> tuple[jax.Array, jax.Array]:
     """Impulses (m, b) of the law, and its status."""
-    out: Any = impact(law, scene, v, noise, closed_only=True)
+    out: Any = impact(law, scene, v, noise)
     x = out.impulse[:, None]
     if shape[1] > 1:
         x = jnp.concatenate([x, out.tangential_impulse.reshape(shape[0], -1)], axis=1)

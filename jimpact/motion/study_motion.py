@@ -10,25 +10,15 @@ from jimpact.law import Law
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.system import HarmonicBase, System, gravity
-from jimpact.study import body_of, check_keys, check_tables, from_file, law_table
+from jimpact.study import body_of, law_table
+from jimpact.study_file import (
+    BASE_KEYS,
+    GRAVITY,
+    MOTION_KEYS,
+    check_motion_tables,
+    from_file,
+)
 
-_MOTION = {
-    "q0": "q0",
-    "v0": "v0",
-    "t_end_s": "t_end",
-    "t_start_s": "t_start",
-    "samples": "samples",
-    "method": "method",
-    "step_s": "step",
-    "friction": "friction",
-    "max_events": "max_events",
-    "closed_below_m": "closed_below",
-    "max_steps": "max_steps",
-    "rtol": "rtol",
-    "slow": "slow",
-}
-_BASE = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
-_GRAVITY = "gravity_m_per_s2"
 # directions of a base by how many a body has
 _DIRECTIONS = {1: ("vertical",), 2: ("horizontal", "vertical"), 3: ("x", "y", "vertical")}
 
@@ -68,24 +58,21 @@ def read_motion_study(path: str | Path) -> MotionStudy:
 
 
 def _study(tables: Mapping[str, Any], path: Path) -> MotionStudy:
-    check_tables(tables, ("system", "law", "motion"), ("base",))
+    check_motion_tables(tables)
     row, values, _ = law_table(tables["law"], None, path.parent)
     if isinstance(values.get("exponent"), list):
         values["exponent"] = tuple(values["exponent"])
-    motion = tables["motion"]
-    check_keys("[motion]", motion, tuple(_MOTION), required=("q0", "v0", "t_end_s"))
-    arguments = {_MOTION[key]: value for key, value in motion.items()}
+    arguments = {MOTION_KEYS[key]: value for key, value in tables["motion"].items()}
     system = _system(tables["system"], tables.get("base"))
     return MotionStudy(str(tables.get("title", path.stem)), system, row.build(**values), arguments)
 
 
 def _system(table: Mapping[str, Any], base: Mapping[str, Any] | None) -> System:
-    body = body_of("[system]", table, (_GRAVITY,))
-    acceleration = table.get(_GRAVITY, STANDARD_GRAVITY)
+    body = body_of("[system]", table, (GRAVITY,))
+    acceleration = table.get(GRAVITY, STANDARD_GRAVITY)
     weight = gravity(body, acceleration) if acceleration else None
     if base is None:
         return System(body, potential=weight)
-    check_keys("[base]", base, (*_BASE, "direction"), required=("amplitude_m", "frequency_hz"))
     ways = body.base_directions
     if ways is None:
         raise ValueError(f"[base] must be left out: a {type(body).__name__} has no base.")
@@ -96,6 +83,6 @@ def _system(table: Mapping[str, Any], base: Mapping[str, Any] | None) -> System:
             f"`direction` of a {type(body).__name__} must be {' or '.join(names)}, "
             f"but is {chosen!r}."
         )
-    moves = HarmonicBase(**{_BASE[key]: x for key, x in base.items() if key != "direction"})
+    moves = HarmonicBase(**{BASE_KEYS[key]: x for key, x in base.items() if key != "direction"})
     along = ways[:, names.index(chosen), None]
     return System(body, potential=weight, base=moves, base_directions=along)

@@ -282,7 +282,7 @@ def animation(
     outlines: Outlines | None = None,
     frames_per_second: float = 25.0,
     title: str = "",
-    progress: bool | None = None,
+    progress: float | None = None,
 ) -> Path:
     """The motion as an animated GIF, one frame a sample (those that were reached).
 

@@ -1,0 +1,281 @@
+"""The errata of docs/equations.md: both sides of each are computed again, in plain numpy.
+
+Named as in the table there. What is printed must be wrong, what is used right.
+"""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+rng = np.random.default_rng(0)
+
+
+def collide(masses, velocity, restitution, order, end=False):
+    """Pairs one after another; with `end` until nothing approaches. Velocities, collisions."""
+    m, v = list(masses), list(velocity)
+    count = 0
+    while count < (40 if end else len(order)):
+        j = order[count % len(order)]
+        gamma = v[j + 1] - v[j]
+        if end and gamma >= 0:
+            break
+        p = -(1 + restitution[j]) * gamma / (1 / m[j] + 1 / m[j + 1])
+        v[j], v[j + 1], count = v[j] - p / m[j], v[j + 1] + p / m[j + 1], count + 1
+    return v, count
+
+
+def test_equation_6_13():
+    m, (e1, e2) = (1.0, 2.0, 3.0), (0.9, 0.8)
+    m21, m32 = m[1] / m[0], m[2] / m[1]
+    v, _ = collide(m, (1.0, 0.0, 0.0), (e1, e2), (0, 1))
+    assert np.isclose(v[1], (1 - m32 * e2) * (1 + e1) / (1 + m21) / (1 + m32), rtol=1e-14)
+    assert not np.isclose(v[1], (1 - m32 * e2) * (1 + m21 * e1) / (1 + m21), rtol=0.1)
+
+
+def number_of_collisions(m, e1, e2, most):
+    """The count of docs/equations.md for v- = (v, 0, 0)."""
+    a, b = (1 + e1) / (1 + m[1] / m[0]), (1 + e2) / (1 + m[1] / m[2])
+    cos = (a * b - e1 - e2) / (2 * np.sqrt(e1 * e2))
+    sines, count = [0.0, 1.0], 0  # sin(k chi) / sin(chi), for |cos chi| > 1 too
+    while count < most:
+        k = count // 2
+        while len(sines) < k + 2:
+            sines.append(2 * cos * sines[-1] - sines[-2])
+        if sines[k + 1] + (np.sqrt(e2 / e1) * sines[k] if count % 2 == 0 else 0) <= 0:
+            break
+        count += 1
+    return count, cos
+
+
+def test_number_of_collisions_of_unequal_coefficients():
+    """In exact arithmetic, so that no count is a matter of rounding."""
+    counts, few = set(), set()
+    for _ in range(500):
+        m = np.exp(rng.uniform(-2, 2, 3)).round(3)
+        e = rng.uniform(0.02, 1, 2).round(3)
+        exact = [[Fraction(x) for x in row] for row in (m, (1, 0, 0), e)]
+        _, count = collide(*exact, (0, 1), end=True)
+        told, cos = number_of_collisions(m, *e, 40)
+        assert told == count
+        counts.add(count)
+        few |= {count} if cos <= -1 else set()
+    assert counts >= {2, 3, 4, 5, 40}
+    assert few == {2, 3}
+
+
+def test_equations_6_19_and_6_20():
+    """floor is one too low where pi / arccos z is no integer."""
+    e, z = 0.9, 1.9 / (2 * np.sqrt(0.9)) * 0.5
+    ratio = np.pi / np.arccos(z)
+    _, count = collide(*([Fraction(x) for x in row] for row in ((1, 1, 1), (1, 0, 0), (e, e))),
+                       (0, 1), end=True)  # fmt: skip
+    assert (count, int(np.ceil(ratio) - 1), int(np.floor(ratio - 1))) == (3, 3, 2)
+
+
+@pytest.mark.parametrize("ratio", [0.3, 1.0, 2.0])
+def test_equation_6_16(ratio):
+    """Three equal balls on linear springs: where contact 1 opens, x_1 = x_2."""
+    root = np.sqrt(ratio**2 - ratio + 1)
+    low, high = (np.sqrt(1 + ratio + sign * root) for sign in (-1, 1))
+    stiffness = np.array([[1.0, -1, 0], [-1, 1 + ratio, -ratio], [0, -ratio, ratio]])
+    values, vectors = np.linalg.eigh(stiffness)
+    rates = np.sqrt(np.abs(values))
+
+    def compression(t):  # of contact 1, from x' = (1, 0, 0)
+        phase = np.where(rates < 1e-7, t, np.sin(rates * t) / np.where(rates < 1e-7, 1, rates))
+        x = vectors @ (vectors[0] * phase)
+        return x[0] - x[1]
+
+    def used(t, sign=1):
+        return (root - 1 + sign * ratio) * high * np.sin(low * t) + (
+            root + 1 - ratio
+        ) * low * np.sin(high * t)
+
+    times = np.linspace(0.5, 4, 3501)
+    opens = times[np.argmax([compression(t) < 0 for t in times])]
+    assert used(opens - 2e-3) > 0 > used(opens + 2e-3)
+    printed = [used(t, -1) for t in (opens - 2e-3, opens + 2e-3)]
+    assert printed[0] * printed[1] > 0
+
+
+def test_limit_of_a_stiff_second_contact():
+    """omega_1 -> sqrt(3/2) omega: one ball against two that move as one."""
+    k = 1e8
+    rates = np.linalg.eigvalsh(np.array([[1.0, -1, 0], [-1, 1 + k, -k], [0, -k, k]]))
+    assert np.isclose(rates[1], 1.5, rtol=1e-7)
+
+
+def chain_quasi(m):
+    """Delassus matrix normalized (G), its norms, and the normals of a chain."""
+    normals = np.diff(np.eye(len(m)), axis=0).T
+    delassus = normals.T @ np.diag(1 / np.array(m)) @ normals
+    norms = np.sqrt(np.diag(delassus))
+    return delassus / np.outer(norms, norms), norms, normals
+
+
+def test_example_6_1():
+    m = 2.0
+    _, norms, normals = chain_quasi([m] * 4)
+    v = np.array([0.3, -0.2, 0.5, 0.7])
+    qn = normals.T @ v / norms
+    np.testing.assert_allclose(qn, np.sqrt(m / 2) * np.diff(v), rtol=1e-14)
+    assert not np.allclose(qn, np.diff(v) / np.sqrt(2 * m), rtol=0.1)
+
+
+def test_equations_6_49_and_6_50():
+    G, _, _ = chain_quasi([1.0, 2.0, 3.0])
+    inverse, one = np.linalg.inv(G), np.eye(2)
+    E, before = np.array([[0.7, 0.1], [0.25, 0.6]]), np.array([-1.0, -0.3])
+
+    def change(E):
+        after = -E @ before
+        return 0.5 * (after @ inverse @ after - before @ inverse @ before)
+
+    p = -inverse @ (one + E) @ before
+    quadratic = (one - E) @ G @ p  # xi = 0 where qn+ = -E qn-
+    assert np.isclose(change(E), -0.5 * p @ np.linalg.inv(one + E) @ quadratic, rtol=1e-13)
+    assert not np.isclose(change(E), -0.5 * p @ quadratic, rtol=0.1)
+    own = G @ np.array([[0.5, 0.1], [0.1, 0.3]])  # self-adjoint
+    used = 0.5 * before @ (own.T @ own.T - one) @ inverse @ before
+    assert np.isclose(change(own), used, rtol=1e-13)
+    assert not np.isclose(change(own), 0.5 * before @ (own.T @ own - one) @ inverse @ before, 1e-3)
+
+
+def test_proposition_6_4_and_remark_6_6():
+    """The largest eigenvalue 0.5 does not keep diag(0.5, -2) from gaining energy; nor does e I."""
+    E, before = np.diag([0.5, -2.0]), np.array([0.0, -1.0])
+    assert np.linalg.eigvals(E).max() <= 1 < np.abs(np.linalg.eigvals(E)).max()
+    assert np.linalg.norm(E @ before) > np.linalg.norm(before)
+    G = np.array([[1.0, 0.25], [0.25, 1.0]])  # a block twice as high as wide
+    assert (-np.linalg.solve(G, 1.5 * before)).min() < 0  # an impulse that pulls
+
+
+class Block:
+    """m = 1 [kg], 1 x 0.5 [m], flat on the ground: G, n_q^T H, t_q^T H and so on of (6.53)-(6.61)."""
+
+    def __init__(self):
+        m, wide, high = 1.0, 1.0, 0.5
+        self.mass = np.diag([m, m, m * (wide**2 + high**2) / 12])
+        self.N = np.array([[0, 0], [1, 1], [-wide / 2, wide / 2]])
+        self.H = np.array([[1, 1], [0, 0], [high / 2, high / 2]])
+        inverse = np.linalg.inv(self.mass)
+        delassus = self.N.T @ inverse @ self.N
+        self.norms = np.sqrt(np.diag(delassus))
+        self.n = inverse @ self.N / self.norms  # columns n_q
+        t = np.linalg.svd(self.N.T)[2][-1]  # M-orthogonal to all n_q
+        self.t = (t / np.sqrt(t @ self.mass @ t))[:, None]
+        self.Xi = np.hstack([self.n, self.t]).T
+        self.G = self.n.T @ self.mass @ self.n
+        self.slip = np.array([0.2, 0.3]) / self.norms * np.array([1.0, -0.4])  # [mubar][xi]
+        self.nH = self.n.T @ self.H
+        self.G_mu = self.G - self.nH * self.slip
+        self.E = np.array([[0.5, 0.1], [0.2, 0.3]])
+        self.before = np.array([-1.0, -0.3, 0.7])  # qn-, qt-
+
+    def after(self):
+        """(qn+, qt+), pbar, p_t."""
+        p = -np.linalg.solve(self.G_mu, (np.eye(2) + self.E) @ self.before[:2])
+        p_t = -self.slip * p
+        change = self.Xi @ (self.N / self.norms @ p + self.H @ p_t)
+        return self.before + change, p, p_t
+
+
+def test_equations_6_54_to_6_57():
+    """v_t = H^T Xi^T D v with D = (Xi M Xi^T)^-1; normal velocities in units of |grad f|."""
+    block = Block()
+    qdot = np.array([0.1, 0.2, 1.0])
+    v = block.Xi @ block.mass @ qdot
+    D = np.linalg.inv(block.Xi @ block.mass @ block.Xi.T)
+    np.testing.assert_allclose(block.H.T @ block.Xi.T @ D @ v, block.H.T @ qdot, rtol=1e-12)
+    assert not np.allclose(block.H.T @ block.Xi.T @ v, block.H.T @ qdot, rtol=0.05)
+    after, _, _ = block.after()
+    rates = block.N.T @ block.Xi.T @ D @ after  # grad f^T qdot+
+    target = -block.E @ block.before[:2]
+    np.testing.assert_allclose(rates / block.norms, target, rtol=1e-12)
+    assert not np.allclose(rates, target, rtol=0.05)
+
+
+def test_equations_6_58_and_6_59():
+    """G^-1, not G: then M is G^-1 whatever friction does."""
+    block = Block()
+    after, p, p_t = block.after()
+    D = np.linalg.inv(block.Xi @ block.mass @ block.Xi.T)
+    change = 0.5 * (after @ D @ after - block.before @ D @ block.before)
+    qn, qt = (after + block.before)[:2], (after + block.before)[2:]
+    tangential = 0.5 * qt @ D[2:, 2:] @ block.t.T @ block.H @ p_t
+    inverse = np.linalg.inv(block.G)
+    used = 0.5 * qn @ (p + inverse @ block.nH @ p_t) + tangential
+    printed = 0.5 * qn @ (p + block.G @ block.nH @ p_t) + tangential
+    assert np.isclose(used, change, rtol=1e-12)
+    assert not np.isclose(printed, change, rtol=2e-3)
+    G_mu, coupling = np.linalg.inv(block.G_mu), block.nH * block.slip
+    np.testing.assert_allclose(G_mu - inverse @ coupling @ G_mu, inverse, atol=1e-12)
+    assert not np.allclose(G_mu - block.G @ coupling @ G_mu, inverse, rtol=0.05)
+
+
+def test_proposition_6_6_2():
+    """M = G^-1 is positive definite without its condition, which fails here."""
+    block = Block()
+    norm = [
+        np.linalg.norm(x, 2) for x in (block.G_mu, np.linalg.inv(block.G_mu), block.G, block.nH)
+    ]
+    friction = 20 * np.abs(block.slip).max()
+    assert np.prod(norm) * friction > 1
+    assert np.linalg.eigvalsh(np.linalg.inv(block.G)).min() > 0
+
+
+def test_proposition_6_6_3():
+    """|E| (1 + 2 |E|) is not what its proof bounds: an M for which it promises too much."""
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    M, s = np.eye(2) + 10 * turn, 0.08
+    E, limit = s * turn, 1 / np.linalg.norm(M, 2)  # the symmetric part of M is the identity
+    bar = (np.eye(2) - E).T @ M @ (np.eye(2) + E)
+    assert s * (1 + 2 * s) < limit < s * (2 + s)
+    assert np.linalg.eigvalsh(bar + bar.T).max() < 0
+    for _ in range(50):  # with M = G^-1 the sharp condition is |E|^2 cond(G) < 1
+        A = rng.normal(size=(2, 2))
+        G, E = A @ A.T + 0.1 * np.eye(2), rng.normal(size=(2, 2))
+        E *= 0.999 / np.linalg.norm(E, 2) / np.sqrt(np.linalg.cond(G))
+        bar = (np.eye(2) - E).T @ np.linalg.inv(G) @ (np.eye(2) + E)
+        assert np.linalg.eigvalsh(bar + bar.T).min() > 0
+
+
+def test_remark_6_10():
+    """The kinetic angle of a flat, wide block tends to pi/3."""
+    high = 1e-4
+    mass, N = np.diag([1, 1, (1 + high**2) / 12]), np.array([[0, 0], [1, 1], [-0.5, 0.5]])
+    W = N.T @ np.linalg.inv(mass) @ N
+    assert np.isclose(np.arccos(-W[0, 1] / W[0, 0]), np.pi / 3, atol=1e-6)
+
+
+def test_rocking_matrix():
+    """Housner's block: the base turns from one corner to the other, the sliding rate keeps its sign."""
+    E, printed = (np.array([[0, s, 0], [s, 0, 0], [0, 0, -s]]) * 0.8 for s in (1.0, -1.0))
+    before = np.array([-1.0, 0.0, 0.5])  # corner 1 comes down about corner 2
+    after = -E @ before
+    assert after[1] > 0  # corner 2 lifts off
+    assert (-printed @ before)[1] < 0
+    assert (E[:2, :2] >= 0).all()  # Prop. 6.2 (i)
+
+
+def hertz(young, nu, radius):
+    """Stiffness of two equal spheres; of a sphere and a plane it is sqrt(2) times as large."""
+    return 4 / 3 * young / (2 * (1 - nu**2)) * np.sqrt(radius / 2)
+
+
+def test_young_modulus_of_the_bead_column():
+    for young, right in ((216e9, True), (210e9, False)):
+        k = hertz(young, 0.276, 4e-3)
+        assert np.isclose(k, 6.9716e9, rtol=2e-4) == right
+        assert np.isclose(np.sqrt(2) * k, 9.858e9, rtol=2e-4) == right
+
+
+def test_duration_of_one_bead():
+    """34.6, not less than 32 microseconds: compression, and e times as long the expansion."""
+    m, k, v, e = 2.05e-3, 9.858e9, 0.246, 0.92
+    depth = (5 * m * v**2 / (4 * k)) ** 0.4
+    s = (np.arange(20_000) + 0.5) / 20_000  # z = 1 - s^2 takes the singularity away
+    z = 1 - s**2
+    whole = np.mean(2 * s / np.sqrt(1 - z**2.5))
+    assert np.isclose((1 + e) * whole * depth / v, 34.6e-6, rtol=2e-3)
