@@ -200,18 +200,21 @@ class Contact(eqx.Module):
 def contact_of(
     scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
 ) -> Contact:
-    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part."""
+    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part.
+
+    Those with a gap of infinity never do.
+    """
     gamma, noise = settled(scene, velocity)
     w, gaps, m = delassus_matrix(scene), scene.gaps, scene.contacts
     cross, tangential, slip = _tangential_block(scene, velocity)
     norm = jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene)
     stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, (m,))
     stored = jnp.where(scene.closed, stored, 0.0)
-    if gaps is not None and not uses_gaps:
-        closed = scene.closed
-        w, gamma = decoupled(w, closed), jnp.where(closed, gamma, 0.0)
+    if gaps is not None:
+        part = gaps < jnp.inf if uses_gaps else scene.closed
+        w, gamma, gaps = decoupled(w, part), jnp.where(part, gamma, 0.0), jnp.where(part, gaps, 1.0)
         if cross is not None and tangential is not None and slip is not None:
-            cross, tangential, slip = _closed_block(closed, w, cross, tangential, slip)
+            cross, tangential, slip = _closed_block(part, w, cross, tangential, slip)
     return Contact(
         w,
         gamma,

@@ -321,6 +321,41 @@ def test_tangents_that_do_not_fit_are_named():
         stepped(system, ji.Moreau(0.5, friction=0.2), [1.0, 0.0], [0.0, 0.0])
 
 
+@pytest.mark.parametrize("options", [{}, {"method": "time_stepping", "step": 1e-2}])
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"force": lambda q, v, t: v[:1]}, r"`force` that returns shape \(2,\)"),
+        ({"gap_function": lambda q: q[None]}, r"`gap_function` that returns shape \(m,\)"),
+        ({"gap_function": lambda q: q[:0]}, r"each of m >= 1 contacts, but it returns \(0,\)"),
+        ({"potential": lambda q: q}, r"`potential` that returns shape \(\)"),
+        ({"tangent_function": lambda q: q[None]}, r"`tangent_function` that returns"),
+        ({"base": lambda t: jnp.stack([t, t]), "base_directions": [[1.0], [0.0]]}, "`base` that"),
+        ({"base": lambda t: t, "base_directions": [[1.0]]}, "`base_directions` must have shape"),
+    ],
+)
+def test_functions_of_a_system_must_return_what_they_should(given, named, options):
+    system = ji.System(**({"gap_function": lambda q: q[:1], "mass": [1.0, 1.0]} | given))
+    with pytest.raises(ValueError, match=named):
+        ji.simulate(system, ji.Moreau(0.5), [1.0, 0.0], [0.0, 0.0], 1.0, **options)
+
+
+def test_a_disc_without_walls_is_told():
+    disc = ji.Discs(1.0, [0.1])
+    with pytest.raises(ValueError, match="each of m >= 1 contacts"):
+        stepped(ji.System(disc), ji.Moreau(0.5), disc.at([[0.0, 1.0]]), np.zeros(3))
+
+
+def test_a_motion_is_in_the_widest_precision_given():
+    """A start in single precision, of a body in double; whole forces."""
+    system = ji.System(
+        lambda q: q[1:] - q[:-1] - 0.2, [1.0] * 3, force=lambda q, v, t: jnp.zeros(3, int)
+    )
+    start = np.array([0.0, 0.3, 0.6], np.float32), np.zeros(3, np.float32)
+    with jax.numpy_dtype_promotion("standard"):
+        assert stepped(system, ji.Moreau(1.0), *start).q.dtype == jnp.float64
+
+
 def test_steps_too_many_to_count_are_refused():
     with pytest.raises(ValueError, match="`step` must give at most"):
         ji.simulate(

@@ -104,7 +104,9 @@ def potential(system: System, q: jax.Array) -> jax.Array:
 
 def user_force(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> jax.Array:
     """F (n,) without the forces of the potential."""
-    return jnp.zeros_like(v) if system.force is None else jnp.asarray(system.force(q, v, t))
+    if system.force is None:
+        return jnp.zeros_like(v)
+    return jnp.asarray(system.force(q, v, t)).astype(v.dtype)
 
 
 def free_acceleration(

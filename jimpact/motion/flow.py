@@ -66,7 +66,7 @@ class Settings(NamedTuple):
     max_steps: int
     friction: bool
     duration: jax.Array
-    accumulation: jax.Array  # gap velocity that counts as slow, over the largest of the motion
+    accumulation: jax.Array  # `slow`: see `transitions.resolve`
 
 
 class Scales(NamedTuple):

@@ -21,7 +21,7 @@ MOTION_STATUS = (
         "collision for it: LZB with `friction` has one",
         True,
     ),
-    Status("max_events", "more events than `max_events`: an accumulation without end?", True),
+    Status("max_events", "more events than `max_events`", True),
     Status("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
     Status("penetration", "a gap is negative at the start", True),
     Status("singular_mass", "the mass matrix is not positive definite on the way", True),

@@ -14,8 +14,10 @@ from jimpact._checks import (
     as_float_array,
     as_whole,
     check_kind,
+    check_per_contact,
     check_shape,
     check_values,
+    in_common_dtype,
     is_traced,
 )
 from jimpact.bodies.base import GivenBody
@@ -91,7 +93,8 @@ def simulate(
         rtol, atol: tolerances of the flights.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
-            gap velocity of the motion, and would be pressed back, stays closed.
+            gap velocity of the motion, and would be pressed back, stays closed; contacts that share
+            bodies below the root of that share (docs/motions.md). `events` tells what is passed.
         max_steps: of the integrator, in all.
         progress: bar on stderr, after each of those runs with the share of the duration that is
             done; None: on a terminal, for long motions.
@@ -121,8 +124,10 @@ def simulate(
     check_kind("system", system, System)
     check_kind("law", law, Law)
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
-    dtype = jnp.result_type(q, v)
     start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))
+    system, law, q, v = in_common_dtype(system, law, q, v)
+    dtype = q.dtype
+    start, end = start.astype(dtype), end.astype(dtype)
     deepest = np.inf if method == "contact_forces" else closed_below
     _check_motion(system, q, v, start, end, deepest)
     count = as_whole("samples", samples, 2)
@@ -142,7 +147,6 @@ def simulate(
         )
     mu = _friction_of(system, law, friction, q, in_space=method == "time_stepping")
     system = _opened(system, q, v, start)
-    q, v, start, end = (x.astype(dtype) for x in (q, v, start, end))
     settings = Settings(
         rtol,
         atol,
@@ -162,8 +166,8 @@ def simulate(
                 "Argument `law` must be Moreau's, with its own `friction` and without a matrix, "
                 f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
             )
-        below = settings.closed_below
-        given: Any = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
+        sizes = substeps, count, joint, rows
+        given: Any = system, law, mu, q, v, start, end, settings.closed_below, *sizes
         return _waited(_stepped, given, progress)
     if method == "contact_forces":
         force = _force_of(law, mu)
@@ -318,7 +322,53 @@ def _check_motion(
             f"Argument `t_end` must be larger than `t_start` = {float(start):g}, "
             f"but has value {float(end):g}."
         )
+    _check_functions(system, q, v, start)
     _check_system(system, q, v, start, end, closed_below)
+
+
+def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
+    """Raise where a function of the system returns what cannot be used, by its shape alone."""
+    body, n = system.body, v.shape[0]
+
+    def returned(name: str, function: Any, *args: jax.Array) -> tuple[int, ...]:
+        out = jax.eval_shape(lambda: jnp.asarray(function(*args)))
+        if jnp.promote_types(out.dtype, q.dtype) != q.dtype:
+            raise TypeError(
+                f"Argument `system` must compute in the precision of `q0`, {q.dtype}, but its "
+                f"`{name}` returns {out.dtype}: give `q0` in it, too."
+            )
+        found: tuple[int, ...] = out.shape
+        return found
+
+    def check(name: str, found: tuple[int, ...], allowed: str, fine: bool) -> None:
+        if not fine:
+            raise ValueError(
+                f"Argument `system` must have a `{name}` that returns shape {allowed}, "
+                f"but it returns {found}."
+            )
+
+    f = returned("gap_function", body.gap_function, q)
+    check("gap_function", f, "(m,), a gap for each of m >= 1 contacts", len(f) == 1 and f[0] > 0)
+    if isinstance(body, GivenBody) and body.sliding is not None:
+        h = returned("tangent_function", body.tangent_function, q)
+        check("tangent_function", h, "(m,), one displacement a contact", len(h) == 1)
+    if system.force is not None:
+        force = returned("force", system.force, q, v, t)
+        check("force", force, f"({n},), one per velocity", force == (n,))
+    if system.potential is not None:
+        energy = returned("potential", system.potential, q)
+        check("potential", energy, "(), an energy", energy == ())
+    if system.base is not None:
+        assert system.base_directions is not None
+        d = system.base_directions.shape[1]
+        check_shape("base_directions", system.base_directions, (n, d), "a row for each velocity")
+        place = returned("base", system.base, t)
+        check(
+            "base",
+            place,
+            f"({d},), as `base_directions` has {d} columns",
+            place == (d,) or (place == () and d == 1),
+        )
 
 
 def _check_system(
@@ -434,8 +484,8 @@ def _check_coefficients(system: System, law: Law, q: jax.Array) -> None:
         value = getattr(law, name)
         if is_pile(system):
             check_shape(name, value, (), "one for all contacts of a pile")
-        elif np.ndim(value) > 0:
-            check_shape(name, value, (m,), "one entry per contact, or a scalar")
+        elif value is not None:
+            check_per_contact(name, value, m)
 
 
 def _contacts_of(system: System, q: jax.Array) -> int:

@@ -9,7 +9,6 @@ from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.motion.dynamics import (
     carried_along,
-    gaps,
     kinematics,
     kinetic,
     mass_at,
@@ -66,11 +65,11 @@ def no_jump(state: State, m: int) -> Jump:
 
 
 def scene_at(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
-    """The scene that a law sees: normals and tangents at q, gaps 0 where `closed`."""
+    """The scene that a law sees: normals and tangents at q; open contacts are out of reach."""
     normal = kinematics(system, q, v, t)
     tangents = system.body.tangents(seen_from_base(system, q, t))
-    open_gaps = jnp.where(closed, 0.0, jnp.maximum(gaps(system, q, t), 0.0))
-    return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
+    away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
+    return Scene(mass_at(system, q), normal.gradient, tangents, away)
 
 
 def impact_jump(
@@ -207,7 +206,7 @@ def resolve(
     else:
         nested = closed & strikes & _share_bodies(given, closed | struck)
         nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
-        both = jax.vmap(resting)(jnp.stack([slow, slow | nested]))
+        both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
         found, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
         found = selected(_undisturbed(system, given, cluster, tight, t), cluster, found)
     jump, held, pressed = found.jump, found.held, found.pressed
@@ -384,6 +383,8 @@ def _brought_to_rest(
     p, force = constraint_impulse(given, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
     energy = jnp.pad(0.5 * p * rates, (0, 2 * m - size)).reshape(2, m)
+    # the gaps, up to `closed_below`, are closed by the flight that follows
+    fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * given.normal.value, 0.0)
     side = jnp.pad(p, (0, 2 * m - size))[m:]
     carried = carried_along(system, jump.v, t)
     passed = _passed(p[:m], force[:m], ends, -jnp.sum(energy), -jnp.sum(jump.energy))
@@ -391,7 +392,7 @@ def _brought_to_rest(
         v=jump.v + given.moved @ p,
         impulse=jump.impulse + p[:m],
         tangential=jump.tangential + side,
-        energy=jump.energy + energy,
+        energy=(jump.energy + energy).at[0].add(-fallen),
         base_work=jump.base_work + (given.directions @ p) @ carried,
     )
     return jump, passed
