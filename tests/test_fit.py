@@ -573,9 +573,10 @@ def test_every_shot_is_predicted_from_the_others():
     for k in range(4):
         rest = [i for i in range(4) if i != k]
         e, _, _ = newton_in_closed_form(post[rest], np.ones((3, 2)), SHOTS[rest])
-        np.testing.assert_allclose(left.value[k], [e], rtol=1e-9)
+        # a solve ends a hundred-thousandth of a standard error from its minimum
+        np.testing.assert_allclose(left.value[k], [e], rtol=1e-7)
         expected = simulated(ji.Newton(e), PAIR, SHOTS[k : k + 1])[0]
-        np.testing.assert_allclose(left.predicted[k], expected, rtol=1e-9)
+        np.testing.assert_allclose(left.predicted[k], expected, rtol=1e-7)
     one = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[:1], post[:1]), starts=1)
     with pytest.raises(ValueError, match="at least 2 shots"):
         ji.leave_one_out(one)
