@@ -23,7 +23,7 @@ from jimpact.cli import keep_programs, main
 from jimpact.motion.study_motion import read_motion_study
 from jimpact.study import body_of, read_study
 
-SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.4,1.6\n"
+SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
 STUDY = """
 [scene]
 masses_kg = [1.0, 1.0]
@@ -485,7 +485,7 @@ def test_chart(tmp_path, capsys):
     code, said = call(capsys, "chart", *options, "--out", tmp_path, "--json")
     told = json.loads(said.out)
     assert code == 0
-    assert {"verlet", "newton", "moreau", "poisson", "binary"} <= set(told["points"])
+    assert {"verlet", "moreau", "binary"} == set(told["points"])
     assert (tmp_path / "jimpact-chart.png").stat().st_size > 10_000
 
 

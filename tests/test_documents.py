@@ -77,7 +77,7 @@ def test_readme_runs():
     done = doctest.testfile(str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS)
     assert done.attempted > 10
     assert done.failed == 0
-    assert len(README.splitlines()) <= 170
+    assert len(README.splitlines()) <= 150
 
 
 def code_of(path):
