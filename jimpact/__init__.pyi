@@ -31,6 +31,14 @@ from .contact import (
 )
 from .experiments import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import Fit as Fit, fit as fit
+from .fits.many import (
+    Refits as Refits,
+    bootstrap as bootstrap,
+    fit_many as fit_many,
+    leave_one_out as leave_one_out,
+)
+from .fits.problem import FitProblem as FitProblem
+from .fits.profiles import Profile as Profile, profile as profile
 from .histories import history as history
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .law import (

@@ -154,6 +154,10 @@ class Contact(eqx.Module):
             (gamma - small, jnp.maximum(self.noise, noise)),
         )
 
+    def approaching(self, speed: jax.Array) -> "Contact":
+        """The same with all gap velocities lower by `speed` () [m/s]."""
+        return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
+
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """gamma+ (m,) [m/s] of impulses p (m,) and p_t (t,)."""
         after = self.gap_velocity + self.delassus @ normal
@@ -196,18 +200,21 @@ class Contact(eqx.Module):
 def contact_of(
     scene: Scene, velocity: jax.Array, stored: jax.Array | None = None, uses_gaps: bool = False
 ) -> Contact:
-    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part."""
+    """The contacts of a scene at a velocity v- (n,); `uses_gaps`: open ones take part.
+
+    Those with a gap of infinity never do.
+    """
     gamma, noise = settled(scene, velocity)
     w, gaps, m = delassus_matrix(scene), scene.gaps, scene.contacts
     cross, tangential, slip = _tangential_block(scene, velocity)
     norm = jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene)
     stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, (m,))
     stored = jnp.where(scene.closed, stored, 0.0)
-    if gaps is not None and not uses_gaps:
-        closed = scene.closed
-        w, gamma = decoupled(w, closed), jnp.where(closed, gamma, 0.0)
+    if gaps is not None:
+        part = gaps < jnp.inf if uses_gaps else scene.closed
+        w, gamma, gaps = decoupled(w, part), jnp.where(part, gamma, 0.0), jnp.where(part, gaps, 1.0)
         if cross is not None and tangential is not None and slip is not None:
-            cross, tangential, slip = _closed_block(closed, w, cross, tangential, slip)
+            cross, tangential, slip = _closed_block(part, w, cross, tangential, slip)
     return Contact(
         w,
         gamma,

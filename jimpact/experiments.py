@@ -1,22 +1,25 @@
 """Measured shots: velocities before and after, read from CSV; momentum and energy they defy."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import ndtri, stdtr
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.scene import Scene, dense_mass, stackable
-from jimpact.shots_file import read_shots
+from jimpact.shots_file import ANGULAR, LINEAR, read_shots
 
 # Defects below this share of the momentum or energy before are no finding: a tenth of a percent
 # is what a good measured velocity is worth. With `sigma`, a defect is held against its own error.
 DEFECT_TOLERANCE = 1e-3
 DEFECT_SIGMAS = 3.0
+DEFECT_LEVEL = 0.02  # of the test by which shots show a defect, all of them together
+SEPARATION = 1e-9  # share of the velocities up to which an approach is rounding
 _LISTED = 6  # shots listed one by one; of more, the range is given
 
 
@@ -31,6 +34,8 @@ class Experiments(eqx.Module):
         scenes: one `Scene` a shot, with the same coordinates, but any number of contacts; a law's
             entry j belongs to contact j of each. None: `fit` gets the scene.
         shots: K labels for tables and pictures; None: 1, 2, ...
+        units: of each velocity, n times 'm/s' or 'rad/s'; None: all m/s. Without sigma, velocities
+            of different units weigh as much as others of the same kinetic energy.
 
     Raises:
         ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, nothing
@@ -48,6 +53,7 @@ class Experiments(eqx.Module):
     scenes: tuple[Scene, ...] | None
     shots: tuple[str, ...] = eqx.field(static=True)
     lost_freedom: int = eqx.field(static=True)  # independent values that a correction removed
+    units: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -57,6 +63,7 @@ class Experiments(eqx.Module):
         scenes: Sequence[Scene] | None = None,
         shots: Sequence[str] | None = None,
         lost_freedom: int = 0,
+        units: Sequence[str] | None = None,
     ):
         self.pre = _as_rows("pre", pre)
         self.post = _as_rows("post", post)
@@ -80,6 +87,13 @@ class Experiments(eqx.Module):
                 f"but has {len(self.shots)}."
             )
         self.lost_freedom = lost_freedom
+        n = measured.shape[1]
+        self.units = (LINEAR,) * n if units is None else tuple(units)
+        if len(self.units) != n or not set(self.units) <= {LINEAR, ANGULAR}:
+            raise ValueError(
+                f"Argument `units` must have {n} entries, each '{LINEAR}' or '{ANGULAR}', "
+                f"but has value {self.units}."
+            )
 
     @property
     def measured(self) -> np.ndarray:
@@ -131,8 +145,8 @@ class Experiments(eqx.Module):
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
         """`T+ / T-` of every shot (K,); NaN for shots with missing values."""
         ratios = []
-        for k, (pre, post) in enumerate(zip(np.asarray(self.pre), np.asarray(self.post))):
-            mass = dense_mass(self.scene_of(scene, k))
+        masses = self.each(scene, dense_mass)
+        for mass, pre, post in zip(masses, np.asarray(self.pre), np.asarray(self.post)):
             before = pre @ mass @ pre
             ratios.append(post @ mass @ post / before if before > 0 else np.nan)
         return np.array(ratios)
@@ -159,13 +173,30 @@ class Experiments(eqx.Module):
             weighted = variance[k][:, None] * m.T
             post[k] -= weighted @ np.linalg.solve(m @ weighted, m @ (row - pre))
             lost += len(m)
-        return Experiments(self.pre, post, self.sigma, self.scenes, self.shots, lost)
+        given = (self.pre, post, self.sigma, self.scenes, self.shots, lost, self.units)
+        return Experiments(*given)
+
+    def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
+        """What one m/s of error is worth in each velocity (n,): 1, in rad/s by kinetic energy.
+
+        Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
+        """
+        turns = np.array(self.units) == ANGULAR
+        if turns.all() or not turns.any():
+            return np.ones(len(turns))
+        masses = np.mean([np.diag(mass) for mass in self.each(scene, dense_mass)], axis=0)
+        return np.where(turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0)
 
     def balances(self, scene: Scene | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Of every shot: C^T M (c, n), v-, v+."""
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
-        scenes = [self.scene_of(scene, k) for k in range(len(pre))]
-        return [(conserved_momenta(s), a, b) for s, a, b in zip(scenes, pre, post)]
+        return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
+
+    def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
+        """`function` of the scene of every shot; of a common one only once."""
+        if self.scenes is None:
+            return [function(self.scene_of(scene, 0))] * len(self.shots)
+        return [function(self.scene_of(scene, k)) for k in range(len(self.shots))]
 
 
 def _filled(rows: list[np.ndarray]) -> np.ndarray:
@@ -248,16 +279,18 @@ def read_experiments(path: str | Path) -> Experiments:
     >>> [round(float(v), 4) for v in balls.post[0]]
     [-0.0605, 0.1049, 0.9978]
     """
-    values, shots = read_shots(path)
-    return Experiments(values["pre"], values["post"], values.get("sigma"), shots=shots)
+    values, units, shots = read_shots(path)
+    return Experiments(values["pre"], values["post"], values.get("sigma"), shots=shots, units=units)
 
 
 def data_defects(
     experiments: Experiments, scene: Scene | None = None, stored_energy: float = 0.0
 ) -> list[str]:
-    """What the data break beyond their error: at most one line each for momentum and energy.
+    """What the data break beyond their error: at most one line each for momentum, energy, approach.
 
     Momentum is told as `1 + excess / sum |m v-|`: after over before where all bodies move one way.
+    Without `sigma` the shots show their noise: a defect is one that they have in common (a t test),
+    of a single shot any above a tenth of a percent.
 
     Args:
         experiments: the shots; those with missing values are not judged.
@@ -269,23 +302,28 @@ def data_defects(
     >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
     'The data gain energy (1 = conserved): shot 1: 1.4400.'
     """
-    momentum, energy = {}, {}
+    momenta: dict[int, list[tuple[int, _Defect]]] = {}
+    energies, resting = [], []
     energy_ratios = experiments.energy_ratio(scene)
+    masses, closed = experiments.each(scene, dense_mass), experiments.each(scene, _closed_normals)
     for k, (rows, pre, post) in enumerate(experiments.balances(scene)):
+        normals, mass = closed[k], masses[k]
+        slowest = -SEPARATION * np.abs(normals).T @ np.abs(pre)
+        if stored_energy == 0 and (normals.T @ pre >= slowest).all():
+            resting.append(k)
         if np.isnan(post).any():
             continue
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma[k], float)
-        for row in rows:
+        for j, row in enumerate(rows):
             excess, scale = row @ (post - pre), np.abs(row) @ np.abs(pre)
-            error = None if sigma is None else float(np.linalg.norm(row * sigma))
-            if _is_defect(excess, scale, error):
-                momentum[k] = 1 + excess / scale if scale else np.inf
-        mass = dense_mass(experiments.scene_of(scene, k))
+            ratio = 1 + excess / scale if scale else np.inf
+            defect = _Defect(excess, scale, row, sigma, ratio)
+            momenta.setdefault(j, []).append((k, defect))
         t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
-        error = None if sigma is None else float(np.linalg.norm((mass @ post) * sigma))
         gain = t_plus - t_minus - stored_energy
-        if gain > 0 and _is_defect(gain, t_minus, error):
-            energy[k] = energy_ratios[k]
+        energies.append((k, _Defect(gain, t_minus, mass @ post, sigma, energy_ratios[k])))
+    momentum = {k: r for found in momenta.values() for k, r in _beyond_noise(found).items()}
+    energy = _beyond_noise(energies, gains=True)
     lines = []
     if momentum:
         lines.append(
@@ -294,13 +332,54 @@ def data_defects(
         )
     if energy:
         lines.append(f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.")
+    if resting:
+        labels = [experiments.shots[k] for k in resting]
+        which = ", ".join(labels[:_LISTED]) + ", ..." * (len(labels) > _LISTED)
+        lines.append(
+            f"No contact approaches in {len(labels)} of {len(experiments.shots)} shots ({which}): "
+            "are pre and post swapped, or is a sign wrong?"
+        )
     return lines
 
 
-def _is_defect(excess: float, scale: float, error: float | None) -> bool:
-    if error is not None:
-        return bool(abs(excess) > DEFECT_SIGMAS * error)
-    return bool(abs(excess) > DEFECT_TOLERANCE * scale)
+def _closed_normals(scene: Scene) -> np.ndarray:
+    """Normals (n, c) of the closed contacts."""
+    return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]
+
+
+class _Defect(NamedTuple):
+    """By how much a balance fails, its scale, its derivatives in v+, their errors, and a ratio."""
+
+    excess: float
+    scale: float
+    slope: np.ndarray
+    sigma: np.ndarray | None
+    ratio: float
+
+
+def _beyond_noise(found: list[tuple[int, _Defect]], gains: bool = False) -> dict[int, float]:
+    """Ratios of the shots whose balance fails by more than their noise; gains: upwards only."""
+    if any(d.sigma is not None for _, d in found):
+        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * DEFECT_LEVEL / len(found))))
+        return {
+            k: d.ratio
+            for k, d in found
+            if d.sigma is not None
+            and (d.excess if gains else abs(d.excess)) > sigmas * np.linalg.norm(d.slope * d.sigma)
+        }
+    told = {
+        k: d.ratio
+        for k, d in found
+        if (d.excess if gains else abs(d.excess)) > DEFECT_TOLERANCE * d.scale
+    }
+    if len(found) < 2 or not told:
+        return told
+    noise = np.array([d.excess / np.linalg.norm(d.slope) for _, d in found if d.slope.any()])
+    if len(noise) < 2:
+        return told
+    mean, error = noise.mean(), noise.std(ddof=1) / np.sqrt(len(noise))
+    chance = stdtr(len(noise) - 1, -mean / error if error else -np.inf * np.sign(mean))
+    return told if (chance if gains else 2 * min(chance, 1 - chance)) < DEFECT_LEVEL else {}
 
 
 def _listed(experiments: Experiments, ratios: dict[int, float]) -> str:

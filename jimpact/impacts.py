@@ -41,7 +41,9 @@ class Impact(eqx.Module):
     status: jax.Array
 
 
-def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
+def impact(
+    law: Law, scene: Scene, velocity: Any, noise: Any = None, approach: Any = None
+) -> Impact:
     """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
 
     Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
@@ -56,6 +58,8 @@ def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
         velocity: v- (n,) [m/s].
         noise: gap velocities () up to which are rounding, too [m/s]: in a motion v- holds the
             rounding of its largest speeds. None: of v- only.
+        approach: gap velocity () that the law is shown contacts to approach with beyond that of v-
+            [m/s]: a small one starts an impact without collision. None: 0.
 
     Returns:
         `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
@@ -78,14 +82,17 @@ def impact(law: Law, scene: Scene, velocity: Any, noise: Any = None) -> Impact:
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
     check_values("noise", noise, low=0.0)
+    check_values("approach", approach, low=0.0)
     noise = None if noise is None else jnp.asarray(noise, v.dtype)
+    approach = None if approach is None else jnp.asarray(approach, v.dtype)
+    shown = noise, approach
     separable = is_separable(law)
     groups = coupled_groups(scene) if separable else None
     few = scene.contacts <= SHARED and scene.walls != (True, True) and scene.tangents is None
     alike = few and groups is None and separable and law.fills_up
-    if alike and not is_traced((law, scene, v, noise)) and is_own(()):
-        return _filled_up(law, scene, v, noise)
-    out = _impact(law, scene, v, groups, noise)
+    if alike and not is_traced((law, scene, v, shown)) and is_own(()):
+        return _filled_up(law, scene, v, shown)
+    out = _impact(law, scene, v, groups, shown)
     return _held(law, out) if is_traced(law) else out  # else the law was checked when it was made
 
 
@@ -95,13 +102,24 @@ def _held(law: Law, out: Impact) -> Impact:
     return dataclasses.replace(out, status=jnp.where(within_domains(law), out.status, told))
 
 
-def _filled_up(law: Law, scene: Scene, v: jax.Array, noise: jax.Array | None) -> Impact:
+# `noise` and `approach` of an impact.
+_Shown = tuple[jax.Array | None, jax.Array | None]
+
+
+def _seen(contact: Contact, shown: _Shown) -> Contact:
+    """The contacts without what is noise, and with the approach that they lack."""
+    noise, approach = shown
+    contact = contact if noise is None else contact.within(noise)
+    return contact if approach is None else contact.approaching(approach)
+
+
+def _filled_up(law: Law, scene: Scene, v: jax.Array, shown: _Shown) -> Impact:
     """The impact by the program for SHARED contacts, only some of which are closed."""
     filled = filled_up(scene, SHARED)
     velocity: Any = np.zeros(filled.scene.size, v.dtype)
     velocity[filled.coordinates] = v
     on_host = of_contacts(jax.tree.map(np.asarray, law), filled.copied)
-    out = _impact(on_host, filled.scene, velocity, None, noise)
+    out = _impact(on_host, filled.scene, velocity, None, shown)
     return Impact(
         jnp.asarray(np.asarray(out.velocity)[filled.coordinates]),
         jnp.asarray(np.asarray(out.impulse)[filled.contacts]),
@@ -128,17 +146,14 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
 
 
 @quick_jit
-def _impact(
-    law: Law, scene: Scene, v: jax.Array, groups: Groups | None, noise: jax.Array | None
-) -> Impact:
+def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None, shown: _Shown) -> Impact:
     if groups is None:
-        contact = law.contact(scene, v)
-        contact = contact if noise is None else contact.within(noise)
+        contact = _seen(law.contact(scene, v), shown)
         happens = contact.happens
         outcome = _resolved(law, contact, happens)
         stored = contact.stored
     else:
-        outcome, happens, stored = _in_groups(law, scene, v, groups, noise)
+        outcome, happens, stored = _in_groups(law, scene, v, groups, shown)
     p, tangential = outcome.normal, outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
@@ -184,7 +199,7 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
 
 
 def _in_groups(
-    law: Law, scene: Scene, v: jax.Array, groups: Groups, noise: jax.Array | None
+    law: Law, scene: Scene, v: jax.Array, groups: Groups, shown: _Shown
 ) -> tuple[_Resolved, jax.Array, jax.Array]:
     """All groups solved side by side; whether anything happens, and the stored energy (m,).
 
@@ -193,9 +208,8 @@ def _in_groups(
     """
     m = scene.contacts
     stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
-    all_contacts = contacts_of_groups(scene, v, stored, groups)
-    if noise is not None:
-        all_contacts = [contact.within(noise) for contact in all_contacts]
+    of_groups = contacts_of_groups(scene, v, stored, groups)
+    all_contacts = [_seen(contact, shown) for contact in of_groups]
     own = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in all_contacts]
     happens = jnp.any(jnp.concatenate(own))
     p = jnp.zeros(m, v.dtype)

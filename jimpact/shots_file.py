@@ -17,13 +17,14 @@ UNITS = {  # in m/s, and rad/s of bodies that turn
     "rad/s": 1.0,
     "deg/s": np.pi / 180,
 }
+LINEAR, ANGULAR = "m/s", "rad/s"  # to which all are converted
 _KINDS = ("pre", "post", "sigma")
 _HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[([^]]*)\])?")
 _ALLOWED = "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ..."
 
 
-def read_shots(path: str | Path) -> tuple[dict[str, np.ndarray], list[str] | None]:
-    """Velocities (K, n) by kind ('pre', 'post', 'sigma' if there is one), and the shots' labels.
+def read_shots(path: str | Path) -> tuple[dict[str, np.ndarray], list[str], list[str] | None]:
+    """Velocities (K, n) by kind ('pre', 'post', 'sigma' if there is one), their units, labels.
 
     See `ji.read_experiments`.
     """
@@ -63,21 +64,23 @@ def read_shots(path: str | Path) -> tuple[dict[str, np.ndarray], list[str] | Non
                 _check_sigma(where, column, *(values[x][k, column.body - 1] for x in _KINDS[1:]))
     if not any(column.kind == "sigma" for column in columns):
         del values["sigma"]
-    return values, shots or None
+    units = {column.body: column.unit for column in columns if column.kind != "shot"}
+    return values, [units[i + 1] for i in range(bodies)], shots or None
 
 
 class Column(NamedTuple):
-    """One column: what it holds, of which body (from 1), and its unit in m/s."""
+    """One column: what it holds, of which body (from 1), its unit in m/s or rad/s, and which."""
 
     header: str
     kind: str
     body: int
     factor: float
+    unit: str
 
 
 def _column(where: str, index: int, header: str) -> Column:
     if header == "shot":
-        return Column(header, "shot", 0, 1.0)
+        return Column(header, "shot", 0, 1.0, "")
     match = _HEADER.fullmatch(header)
     if match is None:
         hint = " (columns are separated by commas)" if ";" in header or "\t" in header else ""
@@ -95,7 +98,8 @@ def _column(where: str, index: int, header: str) -> Column:
             f"{where}: the unit of column `{header}` must be one of {', '.join(UNITS)}, "
             f"but is {unit!r}."
         )
-    return Column(header, kind, int(body), UNITS[unit.strip()])
+    base = ANGULAR if unit.strip() in ("rad/s", "deg/s") else LINEAR
+    return Column(header, kind, int(body), UNITS[unit.strip()], base)
 
 
 def _check_columns(where: str, columns: list[Column]) -> int:
@@ -104,6 +108,12 @@ def _check_columns(where: str, columns: list[Column]) -> int:
     for column, key in zip(columns, found):
         if found.count(key) > 1:
             raise ValueError(f"{where}: column `{column.header}` must occur once, but is repeated.")
+        others = {c.unit for c in columns if c.body == column.body and c.kind != "shot"}
+        if len(others) > 1:
+            raise ValueError(
+                f"{where}: all columns of velocity {column.body} must be in m/s or all in rad/s, "
+                "but some are in each."
+            )
     bodies = max(1, *(body for _, body in found))
     kinds = [kind for kind in _KINDS if kind != "sigma" or any(x == kind for x, _ in found)]
     missing = [f"{k}_{i + 1}" for i in range(bodies) for k in kinds if (k, i + 1) not in found]

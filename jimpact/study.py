@@ -21,8 +21,11 @@ from jimpact.bodies.polygons import Disc, Polygon
 from jimpact.bodies.solids import Box, Sphere
 from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
-from jimpact.law import Law
+from jimpact.fits.matrix_fit import admissible_start
+from jimpact.fits.parameters import default_free
+from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
+from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
 from jimpact.registry import Row
 from jimpact.scene import Scene, chain
@@ -90,7 +93,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
 
     Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`), or a body (see `body_of`) and
     q, its configuration at the impact, closed_below_m; `[law]` name, options and
-    start values, a number for all contacts or a list with one each, module (a file or module that
+    start values, a number for all contacts or a list with one each (a `restitution_matrix` without
+    its `matrix` starts from an admissible one), module (a file or module that
     registers the law, see `ji.register`), and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
     to the study), momentum_corrected; without data a study can be compared, not fitted;
@@ -116,11 +120,15 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
     row, values, bounds = law_table(tables["law"], other_law, path.parent)
     if other_law is not None:
         free = {name: mask for name, mask in free.items() if name in row.parameters}
+    if row.law is RestitutionMatrix and "matrix" not in values:
+        values["matrix"] = admissible_start([scene])
     if "exponent" in values:  # fixed exponents are fast as numbers, free ones must be arrays
         given = values["exponent"]
         fixed = tuple(given) if isinstance(given, list) else given
         values["exponent"] = np.asarray(given, float) if "exponent" in free else fixed
     law = row.build(**values)
+    known = free_parameters_of(law)
+    free = free or dict.fromkeys({"restitution"} & set(known) or default_free(known), True)
     experiments = _experiments(tables["data"], path, scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
     sampled = _sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}

@@ -227,9 +227,9 @@ def _check_law(table: Mapping[str, Any], other: str | None) -> str | None:
 
 
 def check_fit(table: Mapping[str, Any]) -> dict[str, Any]:
-    """What is free, by name; the table's words are checked."""
+    """What is free, by name, nothing where nobody says; the table's words are checked."""
     check_keys("[fit]", table, FIT_KEYS)
-    free = table.get("free", ["restitution"])
+    free = table.get("free", [])
     if isinstance(free, dict):
         return free
     if isinstance(free, list) and all(isinstance(name, str) for name in free):

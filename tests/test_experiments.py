@@ -47,6 +47,15 @@ def test_units(tmp_path, unit, factor):
     assert unit in UNITS
 
 
+def test_turning_keeps_its_unit(tmp_path):
+    head = "pre_1[m/s],pre_2[deg/s],post_1[cm/s],post_2[rad/s]\n"
+    data = ji.read_experiments(written(tmp_path, head + "1,180,1,2\n"))
+    assert data.units == ("m/s", "rad/s")
+    np.testing.assert_allclose(data.pre, [[1.0, np.pi]])
+    with pytest.raises(ValueError, match=r"all columns of velocity 2 must be in m/s or all in rad"):
+        ji.read_experiments(written(tmp_path, head.replace("rad/s", "m/s") + "1,180,1,2\n"))
+
+
 def test_missing_values_labels_and_foreign_line_ends(tmp_path):
     text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\nNaN,1,,2,0\r\n"
     data = ji.read_experiments(written(tmp_path, text))
@@ -114,6 +123,7 @@ def test_files_that_cannot_be_read(tmp_path):
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "sigma": [0.1, 0.0]}, r"`sigma` must lie in \(0, inf\)"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "sigma": [0.1] * 3}, r"`sigma` must be a scalar or have shape"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "shots": ["a", "b"]}, r"`shots` must have 1 labels"),
+        ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "units": ["m/s", "m"]}, r"`units` must have 2 entries"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "scenes": []}, r"`scenes` must have one scene per shot"),
         ({"pre": [1.0, 0.0], "post": [0.0, 1.0], "scenes": [CHAIN]}, r"`scenes` must have 2 bodies"),
     ],

@@ -88,6 +88,107 @@ def test_corrected_momentum_costs_degrees_of_freedom():
     assert ji.fit(ji.Newton(0.9), PAIR, data).degrees_of_freedom == 8 - 4 - 1
 
 
+# --------------------------------------------------------------------- does the law fit
+
+
+def told(found):
+    return " ".join(found.warnings)
+
+
+def test_data_that_another_law_made_are_told():
+    """One e for two contacts; without sigma the noise is what momentum shows."""
+    pre = np.random.default_rng(0).uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))
+    for scene, reason in ((BALLS, "noise that momentum"), (WALLED, "follow the velocities")):
+        post = simulated(ji.Newton([0.9, 0.4]), scene, pre[:, : scene.size], noise=0.01)
+        data = ji.Experiments(pre[:, : scene.size], post)
+        assert reason in told(ji.fit(ji.Newton(0.8), scene, data))
+        right = ji.fit(ji.Newton([0.8, 0.8]), scene, data)
+        assert "Lack of fit" not in told(right)
+        assert "Suspicious" not in told(right)
+
+
+WALLED = ji.chain([1.0, 2.0], wall=True)
+
+
+def test_honest_noise_breaks_no_momentum():
+    pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
+    post = simulated(ji.Newton(0.98), PAIR, pre, noise=0.02)
+    assert ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)).warnings == ()
+    assert "break momentum" in told(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, 1.1 * post)))
+
+
+def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
+    pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
+    post = simulated(ji.Newton(0.9), PAIR, pre, noise=0.005)
+    post[17] += [0.8, -0.4]  # momentum is conserved
+    data = ji.Experiments(pre, post)
+    moved = ji.fit(ji.Newton(0.5), PAIR, data)
+    assert "Suspicious: shot 18," in told(moved)
+    assert abs(moved.value[0] - 0.9) > 0.02
+    for loss in ("huber", "student"):
+        found = ji.fit(ji.Newton(0.5), PAIR, data, loss=loss)
+        assert abs(found.value[0] - 0.9) < 0.005
+        assert abs(found.value[0] - 0.9) < 4 * found.standard_error[0] < 0.02
+        assert "Suspicious: shot 18," in told(found)
+
+
+def test_robust_losses_minimize_what_they_say():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05)
+    problem = ji.FitProblem.from_shots(
+        ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.01)
+    )
+    huber = lambda u: np.where(np.abs(u) < 1.345, u**2 / 2, 1.345 * (np.abs(u) - 1.345 / 2))  # noqa: E731
+    student = lambda u: 2.5 * np.log1p(u**2 / 4)  # noqa: E731
+    grid = np.linspace(0.4, 0.8, 4001)
+    at_0, at_1 = (np.asarray(problem.residual([e])) for e in (0.0, 1.0))
+    u = at_0 + grid[:, None] * (at_1 - at_0)  # linear in e
+    for loss, rho in (("huber", huber), ("student", student)):
+        best = grid[np.argmin(rho(u).sum(axis=1))]
+        np.testing.assert_allclose(ji.fit(problem, loss=loss).value, best, atol=2e-4)
+
+
+def test_swapped_velocities_are_told():
+    post = simulated(ji.Newton(0.9), PAIR, SHOTS)
+    assert "No contact approaches in 4 of 4 shots" in told(
+        ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(post, SHOTS), starts=1)
+    )
+
+
+class Steep(ji.Newton):
+    """The derivative of fast impacts is garbage."""
+
+    def impulses(self, contact):
+        p, side, status = super().impulses(contact)
+        e = self.restitution
+        wrong = 1 + 1e6 * (e - jax.lax.stop_gradient(e))
+        return ji.Impulses(jnp.where(contact.gap_velocity < -1.8, wrong * p, p), side, status)
+
+
+def test_shots_whose_derivatives_are_garbage_are_left_out_and_named():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01)
+    slow = [0, 1, 3]
+    found = ji.fit(Steep(0.9), PAIR, ji.Experiments(SHOTS, post))
+    expected = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[slow], post[slow]))
+    assert "Left out: 1 of 4 shots (3)" in told(found)
+    assert found.converged
+    np.testing.assert_allclose(found.value, expected.value, rtol=1e-6)
+    assert found.degrees_of_freedom == 5
+    assert np.isnan(found.residual[2]).all()
+
+
+def test_turning_weighs_by_kinetic_energy():
+    """A rod that strikes with its end: rad/s and m/s, with no sigma."""
+    scene = ji.Scene([1.0, 0.01], [[1.0], [0.2]])
+    pre = np.array([[-1.0, 2.0], [-2.0, 1.0], [-1.0, 0.0]])
+    post = simulated(ji.Newton(0.5), scene, pre, noise=0.01)
+    data = ji.Experiments(pre, post, units=["m/s", "rad/s"])
+    found = ji.fit(ji.Newton(0.8), scene, data)
+    same = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, post, sigma=[[1.0, 10.0]] * 3))
+    np.testing.assert_allclose(found.value, same.value, rtol=1e-8)
+    assert "same kinetic energy" in told(found)
+    assert " rad/s" in str(found)
+
+
 def test_stated_errors_that_are_too_small_are_noticed():
     post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.1)
     found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.01))
@@ -280,6 +381,77 @@ def test_nine_parameters_of_a_chain_before_a_wall():
     assert 0.0007 < found.noise < 0.0013
 
 
+# --------------------------------------------------------------------- the problem itself
+
+
+def test_the_problem_is_what_fit_solves():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    post[1, 0] = np.nan
+    data = ji.Experiments(SHOTS, post, sigma=0.05)
+    problem = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, data)
+    found = ji.fit(problem)
+    assert (problem.names, problem.start.tolist()) == (("restitution",), [0.9])
+    np.testing.assert_array_equal(problem.domains, [[0.0, 1.0]])
+    known = ~np.isnan(post)
+    np.testing.assert_allclose(problem.residual(found.value), -found.residual[known] / 0.05)
+    slope = simulated(ji.Newton(1.0), PAIR, SHOTS) - simulated(ji.Newton(0.0), PAIR, SHOTS)
+    np.testing.assert_allclose(problem.jacobian([0.3])[:, 0], slope[known] / 0.05)
+    expected = stats.norm.logpdf(found.residual[known], scale=0.05).sum()
+    np.testing.assert_allclose(problem.log_density(found.value), expected)
+    np.testing.assert_array_equal(problem.to_law([0.25]).restitution, 0.25)
+    unknown = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    gain = unknown.log_density([0.6]) - unknown.log_density([0.9])
+    ratio = np.sum(unknown.residual([0.9]) ** 2) / np.sum(unknown.residual([0.6]) ** 2)
+    np.testing.assert_allclose(gain, 3.5 * np.log(ratio))
+
+
+def test_a_users_own_observable():
+    """Heights of two bounces, and the same as a residual; errors by hand."""
+    power, heights = jnp.array([2.0, 4.0]), np.array([0.49, 0.25])
+    observe = lambda law: law.restitution**power  # noqa: E731
+    found = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), observe, heights, [0.01, 0.02]))
+    e = float(found.law.restitution)
+    slope = np.array([2 * e, 4 * e**3]) / [0.01, 0.02]
+    np.testing.assert_allclose(found.standard_error, [1 / np.linalg.norm(slope)], rtol=1e-6)
+    assert abs(slope @ (found.residual / [0.01, 0.02])) < 1e-5 * np.linalg.norm(slope)
+    assert found.experiments is None
+    assert "2 measured values" in str(found)
+    assert json.dumps(found.to_dict())
+
+    def residual(law):
+        return (observe(law) - heights) / np.array([0.01, 0.02])
+
+    same = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), residual, np.zeros(2), 1.0))
+    np.testing.assert_allclose(same.value, found.value, rtol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (([np.nan],), "at least one value that is not NaN"),
+        (([1.0, 2.0],), r"`observe` must give values of shape \(2,\)"),
+        (([1.0], 0.0), r"`sigma` must lie in \(0, inf\)"),
+    ],
+)
+def test_bad_observables(given, message):
+    with pytest.raises(ValueError, match=message):
+        ji.FitProblem.from_observable(ji.Newton(0.9), lambda law: law.restitution[None], *given)
+
+
+def test_another_number_of_shots_is_served_by_the_same_program(caplog):
+    pre = np.stack([np.linspace(1, 2, 4), np.zeros(4)], axis=1)
+    post = simulated(ji.Newton(0.6), PAIR, pre, noise=0.01)
+    ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post))
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        few = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre[:3], post[:3]))
+        assert "advance_all" not in caplog.text
+        ji.fit(ji.Newton([0.9]), PAIR, ji.Experiments(pre, post), starts=1)
+        assert "advance_all" in caplog.text  # this is how it would be told
+    e, error, rest = newton_in_closed_form(post[:3], np.ones((3, 2)), pre[:3])
+    np.testing.assert_allclose(few.value, [e], rtol=1e-9)
+    np.testing.assert_allclose(few.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-9)
+
+
 # --------------------------------------------------------------------- any law
 
 
@@ -305,6 +477,79 @@ class Even(Law):
     def impulses(self, contact):
         change = -(1 + self.root**2) * contact.gap_velocity
         return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
+
+
+class Shared(ji.Law):
+    """Newton's law with e = one * other: only the product is seen."""
+
+    one: jax.Array = ji.parameter(low=0, high=1)
+    other: jax.Array = ji.parameter(low=0, high=1)
+
+    def impulses(self, contact):
+        change = -(1 + self.one * self.other) * contact.gap_velocity
+        return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
+
+
+# --------------------------------------------------------------------- profiles
+
+
+def test_profile_of_a_linear_problem_is_the_interval_of_linear_regression():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    for sigma in (None, 0.02):
+        found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma), profiles=True)
+        (scan,) = found.profiles
+        np.testing.assert_allclose(scan.intervals, found.confidence_interval(), rtol=1e-5)
+        expected = ((scan.value - found.value) / found.standard_error) ** 2
+        np.testing.assert_allclose(scan.deviance, expected, rtol=1e-5, atol=1e-6)
+        assert scan.better is None
+        assert scan.words in str(found)
+        assert found.to_dict()["parameters"][0]["profile_95"]
+
+
+def test_profile_ends_at_a_bound_on_one_side():
+    post = simulated(ji.Newton(0.995), PAIR, SHOTS, noise=0.02)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma=0.02))
+    (scan,) = ji.profile(found, "restitution", level=0.9)
+    assert scan.intervals[0][1] == 1.0
+    assert scan.words.startswith("at least 0.9")
+
+
+def test_profile_of_two_minima_is_a_union():
+    data = ji.Experiments(SHOTS, simulated(ji.Newton(0.49), PAIR, SHOTS), sigma=0.01)
+    found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root", starts=1)
+    (scan,) = ji.profile(found, points=12)
+    np.testing.assert_allclose(scan.intervals[1], 0.7, atol=0.02)
+    np.testing.assert_allclose(scan.intervals[0], -np.array(scan.intervals[1])[::-1], atol=1e-5)
+    assert " or " in scan.words
+
+
+def test_profile_of_a_valley_is_what_the_bounds_leave_of_it():
+    """one * other = 0.5 with both at most 1, of a single shot that is reproduced exactly."""
+    post = simulated(ji.Newton(0.5), PAIR, SHOTS[:1])
+    found = ji.fit(Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-3), ("one", "other"))
+    assert np.isinf(found.standard_error).all()
+    for scan in ji.profile(found):
+        width = 1.96 * 1e-3 / np.sqrt(2) / 0.5  # of the product, roughly
+        assert scan.intervals[0][1] == 1.0
+        np.testing.assert_allclose(scan.intervals[0][0], 0.5, atol=3 * width)
+        assert scan.intervals[0][0] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"level": 95}, r"`level` must lie in \(0, 1\)"),
+        ({"points": 2}, "`points` must be at least 3"),
+        ({"names": "stiffness"}, "`names` must be among restitution"),
+    ],
+)
+def test_bad_profiles(options, message):
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1)
+    with pytest.raises(ValueError, match=message):
+        ji.profile(found, **options)
+    robust = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS), starts=1, loss="huber")
+    with pytest.raises(ValueError, match="by least squares"):
+        ji.profile(robust)
 
 
 def test_a_law_with_a_matrix_field():

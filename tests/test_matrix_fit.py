@@ -10,6 +10,8 @@ from scipy.optimize import minimize
 
 import jimpact as ji
 from jimpact import RestitutionMatrix, fit, normalized_delassus
+from jimpact.fits.matrix_fit import admissible_start
+from jimpact.study import read_study
 from jimpact.theory.restitution_matrices import margin
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])
@@ -48,9 +50,6 @@ def fitted(data, start=START, **options):
     return fit(RestitutionMatrix(start), CHAIN, data, {"matrix": free}, starts=2, **options)
 
 
-# -------------------------------------------------------------------------------- the set
-
-
 # ---------------------------------------------------------------------------------- fits
 
 
@@ -69,6 +68,43 @@ def test_one_shot_is_always_reproduced():
         np.testing.assert_allclose(found.residual, 0, atol=1e-8)
         assert found.rank == 2
         assert any("Nothing keeps this matrix consistent" in line for line in found.warnings)
+
+
+def test_all_entries_are_free_by_default():
+    data = shots(E_TRUE)
+    found = fit(RestitutionMatrix(START), CHAIN, data, starts=2)
+    assert found.names == ("matrix[1,1]", "matrix[1,2]", "matrix[2,1]", "matrix[2,2]")
+    np.testing.assert_allclose(found.law.matrix, E_TRUE, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        CHAIN,
+        ji.chain([1.0, 5.0, 0.1], wall=True, gaps=[0.0, 0.1, 0.0]),
+        ji.Scene([1.0, 1.0], [[1.0, 0.5], [0.0, 1.0]]),  # contacts that push the same way
+        ji.Scene([1.0, 1.0], [[1.0, 0.9], [0.0, 0.3]]),
+    ],
+)
+def test_an_admissible_matrix_to_start_from(scene):
+    among = np.ix_(scene.closed, scene.closed)
+    g = np.asarray(as_matrix(normalized_delassus(scene)))[among]
+    assert min(slacks(admissible_start([scene])[among], np.linalg.inv(g))) > -1e-9
+
+
+def test_a_study_of_a_matrix_needs_no_more_than_its_data(tmp_path):
+    (tmp_path / "shots.csv").write_text(
+        "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.25,0.75\n2,0,0.5,1.5\n"
+    )
+    text = '[scene]\nmasses_kg = [1, 1]\n[law]\nname = "%s"\n[data]\nfile = "shots.csv"\n'
+    for name, other in (
+        ("restitution_matrix", None),
+        ('newton"\nrestitution = 0.7 #', "restitution_matrix"),
+    ):
+        (tmp_path / "study.toml").write_text(text % name)
+        found = read_study(tmp_path / "study.toml", other).run(starts=1)
+        assert found.names == ("matrix[1,1]",)
+        np.testing.assert_allclose(found.value, 0.5, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from programs import OPTIMIZED, both_ways
 
 import jimpact as ji
 from jimpact.motion import event_driven
+from jimpact.motion.simulate import CHUNK
 
 G = 9.80665
 
@@ -89,6 +90,70 @@ def test_finite_accumulation_is_passed(balls):
     assert rest.any()
     np.testing.assert_allclose(motion.q[rest], 0, atol=1e-12)
     np.testing.assert_allclose(motion.velocity[rest], 0, atol=1e-12)
+
+
+class Pull(eqx.Module):
+    """Weights, and a force between the outer two of three bodies."""
+
+    weight: jax.Array
+    between: jax.Array
+
+    def __call__(self, q):
+        return self.weight * jnp.sum(q) + self.between * (q[2] - q[0])
+
+
+def stack_gaps(q):
+    return jnp.stack([q[0], q[1] - q[0], q[2] - q[1]])
+
+
+def stack(e, q, v, t_end, between=0.0, **options):
+    """Three bodies in a column, on the host: one program for many tests."""
+    system = ji.System(stack_gaps, [1.0] * 3, potential=Pull(*jnp.array([10.0, between])))
+    return ji.simulate(system, ji.Moreau(jnp.asarray(e)), q, v, t_end, samples=2, **options)
+
+
+def test_contacts_that_share_bodies_come_to_rest_together():
+    """What is passed lies within its estimates: in time, and in the gaps meanwhile."""
+    dropped = 0.9, [0.1, 0.101, 0.102], [0.0] * 3
+    fine = stack(*dropped, 2.0, slow=1e-12)
+    rest = fine.events.accumulation_end[int(fine.events.count) - 1]
+    for slow in (1e-8, 1e-6, 1e-4):
+        motion = stack(*dropped, 2.0, slow=slow)
+        last = int(motion.events.count) - 1
+        assert kinds(motion)[last] == "accumulation"
+        begin, gap = motion.events.time[last], motion.events.accumulation_gap[last]
+        assert begin < rest < motion.events.accumulation_end[last] < rest + 5 * (rest - begin)
+        assert gap < 10 * slow * 0.1  # about that share of the first fall
+        meanwhile = stack(*dropped, (begin + rest) / 2, slow=1e-12).gaps[-1]
+        assert 0 < np.max(meanwhile) <= gap
+        np.testing.assert_array_less(np.abs(motion.q[-1]), 1e-12)
+        np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-13)
+
+
+def test_bodies_come_to_rest_on_each_other_while_they_fall():
+    motion = stack(0.5, [50.0, 50.01, 50.03], [0.0, 1.0, 0.0], 3.0, between=5.0)
+    assert kinds(motion)[-1] == "accumulation"
+    np.testing.assert_allclose(motion.gaps[-1, 1:], 0, atol=1e-12)
+    np.testing.assert_allclose(motion.velocity[-1], 1 / 3 - 30.0, rtol=1e-12)
+    np.testing.assert_allclose(motion.q[-1], 150.04 / 3 + 1.0 - 45.0, rtol=1e-12)
+
+
+def test_runs_of_the_program_follow_each_other():
+    dropped = 0.97, [0.1, 0.101, 0.102], [0.0] * 3, 5.0
+    motion = stack(*dropped)
+    count = int(motion.events.count)
+    assert status(motion) == "ok"
+    assert count > 2 * CHUNK
+    assert motion.events.time.shape == (3 * CHUNK,)
+    assert (np.diff(motion.events.time[:count]) >= 0).all()
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
+    taken = np.nansum(motion.events.energy, axis=0)
+    np.testing.assert_allclose(taken, motion.contact_work[-1], rtol=1e-12)
+    ended = stack(*dropped, max_events=CHUNK + 100)
+    assert status(ended) == "max_events"
+    assert int(ended.events.count) == CHUNK + 100
+    for row, all_rows in zip(*(jax.tree.leaves(m.events)[1:] for m in (ended, motion))):
+        np.testing.assert_array_equal(row, all_rows[: CHUNK + 100])
 
 
 def test_a_bad_motion_ends_alone(balls):

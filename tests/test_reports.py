@@ -45,7 +45,9 @@ def canned(shots, **change):
         "steps": 17,
         "lost_starts": 0,
         "warnings": ("The data gain energy.",),
-        "experiments": ji.Experiments(pre, post),
+        "problem": ji.FitProblem.from_shots(
+            ji.LZB([0.6], [2.0]), ji.chain([1.0, 1.0]), ji.Experiments(pre, post), "restitution"
+        ),
     }
     return Fit(**(given | change))
 

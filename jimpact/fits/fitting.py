@@ -1,30 +1,31 @@
 """`fit`: parameters of a law from measured velocities, with their errors and what stays unseen."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Generic
+from dataclasses import dataclass, replace
+from typing import Any, Generic, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from jimpact._checks import check_kind
+from jimpact._checks import check_choice
 from jimpact.experiments import Experiments
+from jimpact.fits.adequacy import unusable
 from jimpact.fits.least_squares import Method, check_method, default_steps
-from jimpact.fits.multistart import Search, search
-from jimpact.fits.parameters import (
-    DEFAULT_FREE,
-    AnyLaw,
-    Parameters,
-    bounds_of,
-    free_parameters,
-    with_entries,
-)
-from jimpact.fits.problem import FitProblem, build_problem
+from jimpact.fits.multistart import Search, search, search_near
+from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.profiles import Profile, profile
 from jimpact.fits.report import fit_warnings, report, to_json
 from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
-from jimpact.law import Law
 from jimpact.scene import Scene
+
+LISTED = 10  # shots that were left out, named one by one
+HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
+STUDENT = 4.0  # degrees of freedom of the tails
+MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
+ROUNDS = 50  # of weights
+SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,11 +41,12 @@ class Start:
 class Fit(Generic[AnyLaw]):
     """What `fit` found. `print(fit)` is a report.
 
-    P free parameters `names`, contacts numbered from 1; K shots of n velocities.
+    P free parameters `names`, contacts numbered from 1; `predicted` and `residual` are shaped like
+    what was measured, (K, n) for K shots of n velocities.
     `standard_error` is inf where the data cannot see a parameter, NaN where no degree of freedom
     is left to estimate the noise from. `rank` < P: see `identifiability`. `starts`: the distinct
-    minima, best first. `noise`: estimated standard error of one velocity [m/s], NaN where no
-    degree of freedom is left, 1 where `sigma` was given.
+    minima, best first. `noise`: estimated standard error of one value, NaN where no degree of
+    freedom is left, 1 where `sigma` was given. `problem`: what was solved.
     """
 
     law: AnyLaw
@@ -70,7 +72,14 @@ class Fit(Generic[AnyLaw]):
     steps: int
     lost_starts: int
     warnings: tuple[str, ...]
-    experiments: Experiments
+    problem: FitProblem
+    loss: str = "squares"
+    profiles: tuple[Profile, ...] = ()
+
+    @property
+    def experiments(self) -> Experiments | None:
+        """The shots; None where something else was fitted."""
+        return self.problem.experiments
 
     def confidence_interval(self, level: float = 0.95) -> np.ndarray:
         """Two-sided intervals (P, 2), linearized, cut at the bounds.
@@ -81,7 +90,7 @@ class Fit(Generic[AnyLaw]):
         if not 0 < level < 1:
             raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
         tail = 0.5 + 0.5 * level
-        known = self.experiments.sigma is not None or self.degrees_of_freedom < 1
+        known = self.problem.sigma is not None or self.degrees_of_freedom < 1
         quantile = ndtri(tail) if known else stdtrit(self.degrees_of_freedom, tail)
         half = quantile * self.standard_error
         return np.clip(
@@ -99,16 +108,18 @@ class Fit(Generic[AnyLaw]):
 
 
 def fit(
-    law: AnyLaw,
-    scene: Scene | None,
-    experiments: Experiments,
+    law: AnyLaw | FitProblem,
+    scene: Scene | None = None,
+    experiments: Experiments | None = None,
     free: Any = DEFAULT_FREE,
     *,
     bounds: Mapping[str, Any] | None = None,
     method: Method = "levenberg-marquardt",
+    loss: str = "squares",
     starts: int = 8,
     seed: int = 0,
     max_steps: int | None = None,
+    profiles: bool = False,
     progress: float | None = None,
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
@@ -121,6 +132,7 @@ def fit(
             ratios matter, so contact 1 is held, and a scalar stiffness cannot be fitted.
             The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
             approach velocity, at every evaluation and with every method; the start must be so.
+            Or a `FitProblem`, which holds the next three arguments and `bounds`.
         scene: the scene of all shots; not used where the experiments carry one a shot.
         experiments: measured shots.
         free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of
@@ -128,10 +140,18 @@ def fit(
         bounds: {field: (low, high)}; default [0, 1] for restitution, > 0 for stiffness, ...
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
+        loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
+            value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
+            not known, it is taken from the median of the residuals.
         starts: number of starts, the first from the law's values, the others random (`seed`); if
             more than one, further ones around the best follow as long as they improve it.
         max_steps: iterations per start.
+        profiles: whether the report tells intervals by `profile`, not by standard errors.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
+
+    Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
+    absurd, are left out, and `Fit.warnings` names them. There is told, too, whether the law fits
+    at all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
 
     Raises:
         ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of
@@ -143,68 +163,143 @@ def fit(
     >>> round(float(found.law.restitution), 4)
     0.4
     """
-    check_kind("law", law, Law)
-    check_kind("experiments", experiments, Experiments)
     check_method(method)
     steps = default_steps(method) if max_steps is None else max_steps
     for name, count in (("starts", starts), ("max_steps", steps)):
         if not isinstance(count, int) or count < 1:
             raise ValueError(f"Argument `{name}` must be an integer >= 1, but has value {count!r}.")
-    contacts = experiments.largest_scene(scene).contacts
-    parameters, notes = free_parameters(law, contacts, free)
-    limits = bounds_of(parameters, law, bounds)
-    problem = build_problem(law, scene, experiments, parameters, limits)
-    found = search(problem, parameters, method, starts, seed, steps, progress)
-    return _as_fit(problem, parameters, experiments, scene, found, limits, method, notes)
+    check_choice("loss", loss, ("squares", *LOSSES))
+    if isinstance(law, FitProblem):
+        problem = law
+    else:
+        problem = FitProblem.from_shots(law, scene, experiments, free, bounds)  # type: ignore[arg-type]
+    found = search(problem, method, starts, seed, steps, progress)
+    while (lost := unusable(problem, found)).any() and not lost.all():
+        problem = _without(problem, lost)
+        found = search(problem, method, starts, seed, steps, progress)
+    robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
+    end = replace(as_fit(problem, found, method, robust), loss=loss)
+    return replace(end, profiles=profile(end, progress=progress)) if profiles else end
 
 
-def _as_fit(
-    problem: FitProblem,
-    parameters: Parameters,
-    experiments: Experiments,
-    scene: Scene | None,
-    found: Search,
-    limits: tuple[np.ndarray, np.ndarray],
-    method: Method,
-    notes: list[str],
+def _rms(problem: FitProblem, residual: np.ndarray) -> float:
+    """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
+    data = problem.experiments
+    worth = 1.0 if data is None else data.natural_errors(problem.scene)
+    return float(np.sqrt(np.nanmean((residual / worth) ** 2)))
+
+
+def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
+    """The problem without these shots (K,), which it names."""
+    assert problem.experiments is not None
+    labels = [problem.experiments.shots[k] for k in np.flatnonzero(lost)]
+    line = (
+        f"Left out: {len(labels)} of {len(lost)} shots ({', '.join(labels[:LISTED])}"
+        f"{', ...' * (len(labels) > LISTED)}), whose impacts fail, or whose derivatives cannot be "
+        "used."
+    )
+    kept = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
+    return replace(problem.weighed(kept), left_out=(*problem.left_out, line))
+
+
+class Robust(NamedTuple):
+    """The end of a search, the factors its loss puts on the weights, and its noise."""
+
+    found: Search
+    factor: np.ndarray
+    noise: float
+
+
+def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    inside = np.abs(u) <= HUBER
+    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
+
+
+def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """psi(u) / u and psi'(u)."""
+    below = STUDENT + u**2
+    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
+
+
+LOSSES = {"huber": _huber, "student": _student}
+
+
+def _robust(
+    problem: FitProblem, found: Search, loss: str, method: Method, max_steps: int
+) -> Robust:
+    """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
+
+    Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
+    """
+    factor = np.ones(problem.measured.shape)
+    here = ~np.isnan(problem.measured)
+    weight = np.asarray(problem.residuals.weight, float) * float(problem.residuals.size)
+    for _ in range(ROUNDS):
+        error = weight * (np.nan_to_num(problem.measured) - found.seen)
+        scale = 1.0
+        if problem.sigma is None:
+            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
+        share, slope = LOSSES[loss](error / scale)
+        factor, before = np.sqrt(share), found.y
+        found = search_near(problem.weighed(factor), found.y, method, max_steps)
+        if np.abs(found.y - before).max() <= SAME:
+            break
+    psi = (share * error / scale)[here]
+    freedom = max(int(here.sum()) - len(problem.names), 1)
+    noise = scale * np.sqrt(np.sum(psi**2) / freedom) / max(slope[here].mean(), SAME)
+    return Robust(found, factor, float(noise))
+
+
+def as_fit(
+    problem: FitProblem, found: Search, method: Method, robust: Robust | None = None
 ) -> Fit[Any]:
-    measured, sigma_known = experiments.measured, experiments.sigma is not None
-    size = float(problem.size)
+    """Errors, rank and warnings at the end of a search."""
+    if robust is not None:  # as without the factors, but for the place
+        found, factor = robust.found, robust.factor
+        r, weighed = problem.residuals, problem.weighed(factor).residuals
+        back = float(weighed.size) / float(r.size) / factor.reshape(-1, 1)
+        weight = np.asarray(r.weight, float)
+        squares = float(np.sum((weight * (np.nan_to_num(problem.measured) - found.seen)) ** 2))
+        minima = [(squares, found.value, 1)]
+        found = found._replace(jacobian=back * found.jacobian, minima=minima)
+    residuals, names = problem.residuals, problem.names
+    size = float(residuals.size)
     spread = uncertainty(
-        names=parameters.names,
+        names=names,
         jacobian=size * found.jacobian,
         scale=found.scale,
         log=found.log,
         sum_of_squares=size**2 * found.minima[0][0],
-        values=int(measured.sum()) - experiments.lost_freedom,
-        noise_is_known=sigma_known,
-        rank_tolerance=RANK_TOLERANCE[str(problem.pre.dtype)],
+        values=problem.values,
+        noise=robust.noise if robust else None if problem.sigma is None else 1.0,
+        rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
+        value_name=problem.value_name,
     )
-    residual = np.where(measured, np.asarray(experiments.post, float) - found.velocity, np.nan)
-    law = with_entries(problem.law, problem.fields, jnp.asarray(found.entries))
+    residual = np.asarray(problem.measured, float) - found.seen
     return Fit(
-        law=law,
+        law=with_entries(problem.law, residuals.fields, jnp.asarray(found.entries)),
         method=method if isinstance(method, str) else "optax",
-        names=parameters.names,
+        names=names,
         value=found.value,
         standard_error=spread.standard_error,
         covariance=spread.covariance,
         correlation=spread.correlation,
-        bounds=limits,
+        bounds=(problem.domains[:, 0], problem.domains[:, 1]),
         at_bound=found.at_bound,
-        predicted=found.velocity,
+        predicted=found.seen,
         residual=residual,
-        rms=float(np.sqrt(np.nanmean(residual**2))),
+        rms=_rms(problem, residual),
         noise=spread.noise,
         degrees_of_freedom=spread.degrees_of_freedom,
         rank=spread.rank,
         singular_values=spread.singular_values,
-        identifiability=(*notes, *spread.unseen),
+        identifiability=(*problem.notes, *spread.unseen),
         starts=tuple(Start(size**2 * cost, value, count) for cost, value, count in found.minima),
         status=found.status,
         converged=found.converged,
         steps=found.steps,
         lost_starts=found.lost,
-        warnings=tuple(fit_warnings(law, problem, parameters, experiments, scene, found, spread)),
-        experiments=experiments,
+        warnings=tuple(fit_warnings(problem, found, spread)),
+        problem=problem,
     )

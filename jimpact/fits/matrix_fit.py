@@ -36,6 +36,7 @@ LARGEST = 6
 # Conditions may be broken by rounding, in units of the entries of G^-1.
 _ROUNDING = {"float64": 1e-9, "float32": 1e-4}
 _REDUNDANT = 100.0  # G with an eigenvalue below this multiple of m eps has no inverse
+_CUTS = 60  # rounds of cutting planes in the search of a start
 _HALVINGS = 40  # from a start on the boundary towards the inside
 _FACES = ("E >= 0", "G^-1 (I + E) >= 0", "G^-1 - E^T G^-1 E copositive (energy)")
 
@@ -243,17 +244,11 @@ def matrix_region(
         ValueError: redundant contacts, too many contacts, a start that is not admissible, held
             entries that leave no room.
     """
-    if not encloses(law, scenes[0]):
+    if not scenes or not encloses(law, scenes[0].contacts):
         return None
     assert isinstance(law, RestitutionMatrix)
     m, dtype = scenes[0].contacts, law.matrix.dtype
-    if m > LARGEST:
-        raise ValueError(
-            f"Argument `law` must have at most {LARGEST} contacts to keep its matrix admissible, "
-            f"but has {m}. RestitutionMatrix(matrix, admissible=False) is fitted without that."
-        )
-    found = np.unique([_inverse(scene) for scene in scenes], axis=0)
-    inverse, closed = found[:, :m], found[:, m]
+    inverse, closed = _inverses(scenes)
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
     start = jnp.asarray(_start(law.matrix, origin, mix), dtype)
@@ -274,13 +269,71 @@ def matrix_region(
     return eqx.tree_at(lambda r: r.center, region, _center(region, slack, rows, moving))
 
 
-def encloses(law: Law, scene: Scene) -> bool:
-    """Whether a fit keeps this law's matrix admissible."""
-    return (
-        isinstance(law, RestitutionMatrix)
-        and law.admissible
-        and law.matrix.shape[0] == scene.contacts
+def admissible_start(scenes: list[Scene]) -> np.ndarray:
+    """A matrix E (m, m) strictly inside the admissible ones of all scenes.
+
+    `I / 2` where it will do (chains); else the point from which the conditions, all of them
+    concave, are farthest, found by cutting planes.
+
+    Raises:
+        ValueError: redundant or too many contacts, or no matrix that is admissible.
+
+    >>> import jimpact as ji
+    >>> from jimpact.fits.matrix_fit import admissible_start
+    >>> admissible_start([ji.chain([1.0, 1.0, 1.0])]).tolist()
+    [[0.5, 0.0], [0.0, 0.5]]
+    """
+    m = scenes[0].contacts
+    dtype = scenes[0].mass.dtype
+    inverse, closed = _inverses(scenes)
+    region = AdmissibleMatrices(
+        origin=jnp.zeros(m * m, dtype),
+        map=jnp.eye(m * m, dtype=dtype),
+        inverse=jnp.asarray(inverse, dtype),
+        closed=jnp.asarray(closed, dtype),
+        bounds=None,
+        center=jnp.zeros(m * m, dtype),
+        moving=jnp.ones((1 + len(inverse)) * m * m, bool),
     )
+    e, planes = 0.5 * np.eye(m).ravel(), np.zeros((0, m * m + 2))
+    for _ in range(_CUTS):
+        slack, rows = _host_conditions(region, e)
+        moving = np.any(rows != 0, axis=1)
+        if slack[moving].min() >= -_rounding(region):
+            return e.reshape(m, m)
+        # t <= slack + rows (E - e): least slack t at E, below the tangents found so far
+        new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ e])[moving]
+        planes = np.vstack([planes, new])
+        found = linprog(
+            np.append(np.zeros(m * m), -1.0),
+            A_ub=planes[:, :-1],
+            b_ub=planes[:, -1],
+            bounds=[*[(0.0, None)] * (m * m), (None, 1.0)],
+        )
+        if not found.success or found.x[-1] <= 0:
+            break
+        e = found.x[:-1]
+    raise ValueError(
+        "Argument `scene` must have an admissible restitution matrix to start from, but none was "
+        "found: give one, or RestitutionMatrix(matrix, admissible=False)."
+    )
+
+
+def _inverses(scenes: list[Scene]) -> tuple[np.ndarray, np.ndarray]:
+    """G^-1 (S, m, m) and closed contacts (S, m) of different scenes."""
+    m = scenes[0].contacts
+    if m > LARGEST:
+        raise ValueError(
+            f"Argument `law` must have at most {LARGEST} contacts to keep its matrix admissible, "
+            f"but has {m}. RestitutionMatrix(matrix, admissible=False) is fitted without that."
+        )
+    found = np.unique([_inverse(scene) for scene in scenes], axis=0)
+    return found[:, :m], found[:, m]
+
+
+def encloses(law: Law, contacts: int) -> bool:
+    """Whether a fit keeps this law's matrix admissible."""
+    return isinstance(law, RestitutionMatrix) and law.admissible and law.matrix.shape[0] == contacts
 
 
 def _inverse(scene: Scene) -> np.ndarray:

@@ -2,15 +2,23 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jimpact.fits.least_squares import Method, SolverState
-from jimpact.fits.parameters import Parameters, entries
-from jimpact.fits.problem import FitProblem, advance_all, begin_all, from_scaled, to_scaled
+from jimpact.fits.problem import (
+    FEW,
+    FitProblem,
+    Residuals,
+    advance_all,
+    begin_all,
+    filled_up,
+    from_scaled,
+    to_scaled,
+)
 from jimpact.progress import progress_bar
 
 LANES = 4  # starts that run together; those that are done make room
@@ -48,14 +56,15 @@ CONVERGED = 1e-6
 
 
 class Search(NamedTuple):
-    """The best end point (weighted as in `FitProblem`), and all distinct minima, best first."""
+    """The best end point (weighted as in `Residuals`), and all distinct minima, best first."""
 
     value: np.ndarray  # of the parameters (P,)
+    y: np.ndarray  # the same in scaled form, (Q,)
     entries: np.ndarray  # of all entries (Q,) of the named fields
     scale: np.ndarray  # natural size of a change of each parameter, at the value found
     log: np.ndarray  # whether it is fitted in its logarithm
-    jacobian: np.ndarray  # (K n, P), of the scaled parameters
-    velocity: np.ndarray
+    jacobian: np.ndarray  # (R, P), of the scaled parameters
+    seen: np.ndarray  # shaped like what was measured
     status: np.ndarray
     converged: bool
     at_bound: np.ndarray
@@ -66,7 +75,6 @@ class Search(NamedTuple):
 
 def search(
     problem: FitProblem,
-    parameters: Parameters,
     method: Method,
     starts: int,
     seed: int,
@@ -75,61 +83,97 @@ def search(
 ) -> Search:
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)
-    points = _start_points(problem, parameters, starts, rng)
+    points, residuals = start_points(problem, starts, rng), filled_up(problem.residuals)
     with progress_bar(progress) as show:
-        states = _run(problem, points, method, max_steps, show)
+        states = run(repeated(residuals, len(points)), points, method, max_steps, show)
         for _ in range(ROUNDS if starts > 1 else 0):
             best = int(np.nanargmin(states.cost))
             least = float(states.cost[best])
             if 2 * least <= EXACT[str(states.y.dtype)]:
                 break
-            points = _near(problem, states, best, min(starts, LANES), rng)
-            more = _run(problem, points, method, max_steps, show)
+            points = _near(residuals, states, best, min(starts, LANES), rng)
+            more = run(repeated(residuals, len(points)), points, method, max_steps, show)
             states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
             if np.nanmin(more.cost) > (1 - SLOW) * least:
                 break
-    return _found(problem, parameters, states)
+    return ends(problem, states)
 
 
-def _run(
-    problem: FitProblem,
+def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Search:
+    """The minimum next to y (Q,)."""
+    residuals = repeated(filled_up(problem.residuals), 1)
+    return ends(problem, run(residuals, y[None], method, max_steps, lambda *told: None))
+
+
+def repeated(residuals: Residuals, count: int) -> Residuals:
+    """So many times the same problem, without copies."""
+
+    def each(leaf: Any) -> Any:
+        return np.broadcast_to(leaf, (count, *np.shape(leaf))) if eqx.is_array(leaf) else leaf
+
+    return jax.tree.map(each, residuals)
+
+
+def run(
+    problems: Residuals,
     points: np.ndarray,
     method: Method,
     max_steps: int,
     show: Callable[[str, float, float], None],
+    rivals: bool = True,
 ) -> SolverState:
-    """Solve from points (S, Q), a few at a time; the states come back to the host."""
-    starts = jnp.asarray(points, problem.pre.dtype)
-    states = jax.device_get(begin_all(problem, starts, method, max_steps))
-    active, lanes = list(range(len(points))), min(len(points), LANES)
+    """Solve S problems from points (S, Q), a few at a time; the states come back to the host.
+
+    Rivals are starts of one problem: those far behind the best are given up sooner.
+    """
+    few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for LANES
+    lanes = LANES if few else min(len(points), LANES)
+    points = points.astype(problems.offset.dtype)
+    begun = [
+        begin_all(_rows(problems, rows), points[rows], method, max_steps)
+        for rows in _batches(list(range(len(points))), lanes)
+    ]
+    states = jax.tree.map(lambda *x: np.concatenate(x)[: len(points)], *begun)
+    active = list(range(len(points)))
     while active:
         before = states.cost.copy()
-        for batch in (active[i : i + lanes] for i in range(0, len(active), lanes)):
-            rows = [batch[min(i, len(batch) - 1)] for i in range(lanes)]
-            some = jax.tree.map(lambda leaf, rows=rows: leaf[rows], states)
-            some = jax.device_get(advance_all(problem, some, method, max_steps, PASSES))
-            states = jax.tree.map(partial(_with_rows, rows), states, some)
+        for rows in _batches(active, lanes):
+            some = advance_all(
+                _rows(problems, rows), _rows(states, rows), method, max_steps, PASSES
+            )
+            states = jax.tree.map(partial(_with_rows, rows), states, jax.device_get(some))
             ready, steps = len(points) - len(active), int(states.steps.max())
             counts = f"{ready} of {len(points)} starts done, step {steps} of at most {max_steps}"
             show(f"fit: {counts}", steps, max_steps)
         ended = states.done | (states.steps >= max_steps)
         if method == "levenberg-marquardt":
-            share = np.where(states.cost > BEHIND * np.nanmin(states.cost), SLOW_BEHIND, SLOW)
+            behind = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
+            share = np.where(behind, SLOW_BEHIND, SLOW)
             ended |= (before - states.cost <= share * before) & np.isfinite(before)
         active = [i for i in active if not ended[i]]
     return states
 
 
+def _batches(every: list[int], lanes: int) -> list[list[int]]:
+    """Lists of so many; the last repeats its last one."""
+    firsts = range(0, len(every), lanes)
+    return [[every[min(i + j, len(every) - 1)] for j in range(lanes)] for i in firsts]
+
+
+def _rows(tree: Any, rows: list[int]) -> Any:
+    return jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, tree)
+
+
 def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray:
-    leaf = np.array(leaf)
     leaf[rows] = new
     return leaf
 
 
-def _found(problem: FitProblem, parameters: Parameters, states: SolverState) -> Search:
+def ends(problem: FitProblem, states: SolverState) -> Search:
     """Pick the best end (the states are on the host)."""
+    parameters, r = problem.parameters, problem.residuals
     count, first = len(parameters.names), parameters.first
-    scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
+    scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
     y = np.asarray(states.y)[:, :count]
     squares = 2 * np.asarray(states.cost, float)
     values = from_scaled(np.asarray(y, float), scale, log)
@@ -137,17 +181,20 @@ def _found(problem: FitProblem, parameters: Parameters, states: SolverState) -> 
     converged = (2 * np.asarray(states.gain) <= CONVERGED * squares) | (squares <= exact)
     groups = _groups(squares, y, converged, exact)
     best = groups[0][0]
-    low, high = (np.asarray(end)[:count] for end in (problem.low, problem.high))
+    low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
     # starts that did not converge have no minimum to tell, unless they are the best there is
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
+    seen, status = states.kept
+    rows = len(problem.measured) if problem.measured.ndim else None  # without what filled up
     return Search(
         value=values[best],
-        entries=_all_entries(problem, np.asarray(states.y)[best]),
+        y=np.asarray(states.y)[best],
+        entries=_all_entries(r, np.asarray(states.y)[best]),
         scale=np.where(log, values[best], scale),
         log=log,
-        jacobian=np.asarray(states.jacobian[best][:, :count], float),
-        velocity=np.asarray(states.kept[0][best], float),
-        status=states.kept[1][best],
+        jacobian=np.asarray(states.jacobian[best][: problem.measured.size, :count], float),
+        seen=np.asarray(seen[best][:rows] if rows else seen[best], float),
+        status=status[best][:rows],
         converged=bool(converged[best]),
         at_bound=(y[best] <= low) | (y[best] >= high),
         steps=int(np.max(states.steps)),
@@ -156,9 +203,9 @@ def _found(problem: FitProblem, parameters: Parameters, states: SolverState) -> 
     )
 
 
-def _all_entries(problem: FitProblem, y: np.ndarray) -> np.ndarray:
-    scaled = np.asarray(problem.offset, float) + np.asarray(problem.mix, float) @ y
-    return from_scaled(scaled, np.asarray(problem.scale, float), np.asarray(problem.log))
+def _all_entries(residuals: Residuals, y: np.ndarray) -> np.ndarray:
+    scaled = np.asarray(residuals.offset, float) + np.asarray(residuals.mix, float) @ y
+    return from_scaled(scaled, np.asarray(residuals.scale, float), np.asarray(residuals.log))
 
 
 def _groups(
@@ -185,7 +232,7 @@ def _groups(
 
 
 def _near(
-    problem: FitProblem, states: SolverState, best: int, count: int, rng: np.random.Generator
+    problem: Residuals, states: SolverState, best: int, count: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Points (count, Q) around the best, as far off as its standard errors, inside the bounds."""
     jacobian = np.asarray(states.jacobian[best], float)
@@ -197,21 +244,19 @@ def _near(
     return np.clip(points, np.asarray(problem.low), np.asarray(problem.high))
 
 
-def _start_points(
-    problem: FitProblem, parameters: Parameters, starts: int, rng: np.random.Generator
-) -> np.ndarray:
+def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
+    parameters, r = problem.parameters, problem.residuals
     first = parameters.first
-    values = entries(problem.law, parameters.fields)[first]
-    scale, log = np.asarray(problem.scale, float)[first], np.asarray(problem.log)[first]
-    own = to_scaled(values, scale, log)
-    low, high = (np.array(end, float)[: len(own)] for end in (problem.low, problem.high))
+    scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
+    own = to_scaled(problem.start, scale, log)
+    low, high = (np.array(end, float)[: len(own)] for end in (r.low, r.high))
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
     low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
     high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
     elastic = [parameters.entry_fields[i] == "restitution" for i in first]
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
-    points = np.zeros((starts, len(problem.low)))
+    points = np.zeros((starts, len(r.low)))
     share = rng.random((starts, len(own)))
     points[:, : len(own)] = low + (high - low) * share
     points[0, : len(own)] = own

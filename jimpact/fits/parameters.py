@@ -2,7 +2,7 @@
 
 import dataclasses
 import operator
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -13,7 +13,7 @@ from jimpact.law import Law, free_parameters_of, parameters_of
 from jimpact.laws.lzb import LZB
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
-DEFAULT_FREE = ("restitution", "stiffness")
+DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
 
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
 # beyond, the softer contact has no further influence that a measurement could see.
@@ -66,7 +66,7 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: jax.Array) -> Any
     return law
 
 
-def free_parameters(law: Law, contacts: int, free: Any) -> tuple[Parameters, list[str]]:
+def free_parameters(law: Law, free: Any) -> tuple[Parameters, list[str]]:
     """The parameters that `free` names, and notes on what was held instead."""
     known = list(free_parameters_of(law))
     labels, notes = {}, []
@@ -112,9 +112,15 @@ def _as_mapping(free: Any, known: list[str]) -> dict[str, Any]:
     if isinstance(free, Mapping):
         return dict(free)
     names = (free,) if isinstance(free, str) else tuple(free)
-    if names == DEFAULT_FREE and "restitution" in known:  # the default serves laws without k too
-        names = tuple(name for name in names if name in known)
+    if names == DEFAULT_FREE:  # the default serves laws without these, too
+        names = default_free(known)
     return dict.fromkeys(names, True)
+
+
+def default_free(known: Collection[str]) -> tuple[str, ...]:
+    """What is fitted of a law with these parameters where nobody says: how its contacts bounce."""
+    bounce = tuple(name for name in (*DEFAULT_FREE, "matrix") if name in known)
+    return bounce or tuple(known)
 
 
 def _unknown_field(law: Law, field: str, known: list[str]) -> str:

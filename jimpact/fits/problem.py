@@ -1,17 +1,33 @@
-"""The least-squares problem of a fit: residuals of a law in scaled parameters, as arrays."""
+"""The least-squares problem of a fit: what is observed of a law, against what was measured.
 
-from typing import Any
+Shots, a motion and a user's own function are three observables. Solvers see `Residuals`: arrays
+alone, in scaled parameters, several problems side by side in the lanes of one program; people see
+`FitProblem`: the same in the parameters themselves, with their names.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact._checks import as_float_array, check_kind, check_values
 from jimpact.compiling import quick_jit
 from jimpact.experiments import Experiments
 from jimpact.fits.least_squares import Box, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
-from jimpact.fits.parameters import Parameters, entries, with_entries
+from jimpact.fits.parameters import (
+    DEFAULT_FREE,
+    Parameters,
+    bounds_of,
+    entries,
+    free_parameters,
+    with_entries,
+)
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.scene import Scene, dense_mass, stackable
@@ -20,11 +36,52 @@ from jimpact.status import CODE
 # Outcomes whose velocities mean nothing. A trial that meets one gets a residual far above any
 # honest one, so that a solver turns back; inadmissible or energetic outcomes are only reported.
 UNUSABLE = ("infeasible", "max_steps", "not_finite")
-PENALTY = 1e3  # times the largest velocity
+PENALTY = 1e3  # times the largest measured value
+
+# Shots are filled up to 4, 16, 64 and then 128, 256, ... of them: a program serves all numbers in
+# between, and the copies that fill up cost far less than compiling another one.
+FEWEST, FEW = 4, 64
 
 
-class FitProblem(eqx.Module):
-    """Law, shots and box of one fit: a pytree that compiled functions take as argument.
+class Seen(NamedTuple):
+    """What a law makes visible: values, where they mean nothing, and status codes (S,)."""
+
+    value: jax.Array
+    bad: jax.Array
+    status: jax.Array
+
+
+class Shots(eqx.Module):
+    """The observable of impacts: v+ (K, n)."""
+
+    scenes: Scene  # stacked, one a shot
+    pre: jax.Array  # (K, n), further columns where scenes were made alike
+    bodies: int = eqx.field(static=True)
+
+    def __call__(self, law: Law) -> Seen:
+        """Velocities after every shot, and the status of its impact."""
+        out = jax.vmap(impact, in_axes=(None, 0, 0))(law, self.scenes, self.pre)
+        codes = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
+        bad = jnp.any(out.status[:, None] == codes[None, :], axis=1)
+        return Seen(out.velocity[:, : self.bodies], bad[:, None], out.status)
+
+
+class Observed(eqx.Module):
+    """The observable of a user's own function of a law."""
+
+    function: Callable[[Law], Any] = eqx.field(static=True)
+
+    def __call__(self, law: Law) -> Seen:
+        """What the function gives; NaN means nothing."""
+        value = jnp.asarray(self.function(law))
+        return Seen(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
+
+
+Observable = Callable[[Law], Seen]
+
+
+class Residuals(eqx.Module):
+    """Law, observable and region of a fit: a pytree that compiled functions take as argument.
 
     Solvers work on y (Q,), of which the first P count, the rest is 0. The entries of the law's
     fields in scaled form are `offset + mix y`; an entry is `scale` times that, or its exponential
@@ -39,61 +96,275 @@ class FitProblem(eqx.Module):
     low: jax.Array  # bounds of y
     high: jax.Array
     region: Region  # where y may lie: the box, or a part of it
-    scenes: Scene  # one, or stacked one a shot
-    pre: jax.Array  # (K, n), further columns where scenes were made alike
-    post: jax.Array  # 0 where not measured
+    observe: Observable
+    measured: jax.Array  # 0 where not measured
     weight: jax.Array  # 0 where not measured; makes |r|^2 a mean square relative to `unit`
-    size: jax.Array  # () size r is (v+ - measured) / sigma, with sigma = 1 m/s where unknown
-    unit: jax.Array  # () the largest velocity [m/s]
+    size: jax.Array  # () size r is (seen - measured) / sigma, with sigma = 1 where unknown
+    unit: jax.Array  # () the largest measured value
     fields: tuple[str, ...] = eqx.field(static=True)
-    scene_per_shot: bool = eqx.field(static=True)
+
+    def law_at(self, y: jax.Array) -> Law:
+        """The law of scaled parameters y."""
+        scaled = self.offset + self.mix @ y
+        exponential = jnp.exp(jnp.where(self.log, scaled, 0.0))
+        values = jnp.where(self.log, exponential, scaled * self.scale)
+        return with_entries(self.law, self.fields, values)
+
+    def residual(self, y: jax.Array) -> tuple[jax.Array, Seen]:
+        """Weighted residual (R,), and what the law makes visible."""
+        seen = self.observe(self.law_at(y))
+        bad = jnp.broadcast_to(seen.bad, self.measured.shape)
+        harmless = jnp.where(bad, self.measured, seen.value)
+        error = jnp.where(bad, PENALTY * self.unit, harmless - self.measured)
+        return (error * self.weight).reshape(-1), seen
+
+    def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
+        """Weighted residual (R,), its Jacobian (R, Q), and (values seen, status)."""
+
+        def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
+            residual, seen = self.residual(y)
+            return residual, (residual, seen.value, seen.status)
+
+        jacobian, (residual, *kept) = jax.jacfwd(outcome, has_aux=True)(y)
+        return residual, jacobian, tuple(kept)
 
 
-def build_problem(
+@dataclass(frozen=True, eq=False)
+class FitProblem:
+    """The least-squares problem behind a fit, in the parameters x (P,) themselves.
+
+    Equation: `residual = (observed(law(x)) - measured) / sigma` (where it is not known, sigma = 1
+    for m/s, and for rad/s what has the same kinetic energy) over the R measured values; `fit`
+    minimizes its sum of squares. `residual`, `jacobian`, `log_density` and `to_law` are pure
+    functions of x for jit, vmap and grad, and so for any solver or sampler; `start` (P,), `domains`
+    (P, 2) and `names` say where to begin, how far x may go, and what it means. `fit(problem)` does
+    all that `fit` does.
+
+    Make one with `from_shots` or `from_observable`.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
+    >>> problem = ji.FitProblem.from_shots(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> problem.names, problem.domains.tolist()
+    (('restitution',), [[0.0, 1.0]])
+    >>> [round(float(r), 6) for r in problem.residual(problem.start)]
+    [-0.25, 0.25, -0.5, 0.5]
+    """
+
+    residuals: Residuals
+    parameters: Parameters
+    notes: tuple[str, ...]  # what was held instead of fitted
+    domains: np.ndarray
+    measured: np.ndarray  # NaN where not
+    sigma: np.ndarray | None
+    values: int  # independent measured values
+    experiments: Experiments | None = None
+    scene: Scene | None = None
+    left_out: tuple[str, ...] = ()  # which shots, in words
+
+    @classmethod
+    def from_shots(
+        cls,
+        law: Law,
+        scene: Scene | None,
+        experiments: Experiments,
+        free: Any = DEFAULT_FREE,
+        bounds: Mapping[str, Any] | None = None,
+    ) -> "FitProblem":
+        """The problem of measured shots; arguments and errors as of `fit`."""
+        check_kind("law", law, Law)
+        check_kind("experiments", experiments, Experiments)
+        own = experiments.each(scene, lambda s: s)
+        same = experiments.scenes is None
+        alike, extra = stackable(own[:1] if same else own)
+        dtype = _dtype(law, alike, experiments.pre)
+        pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
+        unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
+        count, n = pre.shape
+        masses = experiments.each(scene, dense_mass)
+        energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
+        stacked = jax.tree.map(
+            lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
+        )
+        filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
+        observe = Shots(_in(dtype, stacked), jnp.asarray(filled, dtype), n)
+        sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
+        errors = experiments.natural_errors(scene) if sigma is None else sigma
+        problem = _build(
+            law, observe, post, sigma, errors, free, bounds, dtype, unit, energy, alike
+        )
+        values = problem.values - experiments.lost_freedom
+        return replace(problem, values=values, experiments=experiments, scene=scene)
+
+    @classmethod
+    def from_observable(
+        cls,
+        law: Law,
+        observe: Callable[[Law], Any],
+        measured: Any,
+        sigma: Any = None,
+        free: Any = DEFAULT_FREE,
+        bounds: Mapping[str, Any] | None = None,
+    ) -> "FitProblem":
+        """The problem of a user's own observable, or residual.
+
+        Args:
+            law: start values.
+            observe: law -> array, differentiable in forward mode; NaN where the law fails. A
+                residual is an observable of which zeros were measured.
+            measured: what was measured of it, of the same shape; NaN where nothing was.
+            sigma: standard errors, scalar or of the same shape; None: one common, unknown.
+            free, bounds: as in `fit`.
+
+        Raises:
+            ValueError: nothing measured, sigma <= 0, an observable of another shape, and as `fit`.
+
+        >>> import jax.numpy as jnp
+        >>> import jimpact as ji
+        >>> def height(law):  # of two bounces from 1 m
+        ...     return law.restitution ** jnp.array([2, 4])
+        >>> problem = ji.FitProblem.from_observable(ji.Newton(0.9), height, [0.49, 0.24], 0.001)
+        >>> round(float(ji.fit(problem).law.restitution), 3)
+        0.7
+        """
+        check_kind("law", law, Law)
+        post = np.asarray(as_float_array("measured", measured))
+        check_values("measured", post, nan_allowed=True)
+        if not np.isfinite(post).any():
+            raise ValueError("Argument `measured` must have at least one value that is not NaN.")
+        if sigma is not None:
+            sigma = np.where(np.isnan(post), 1.0, np.asarray(as_float_array("sigma", sigma)))
+            check_values("sigma", sigma, low=0.0, open_low=True)
+        seen = Observed(observe) if not isinstance(observe, eqx.Module) else observe
+        unit = np.nanmax(np.abs(post)) or 1.0
+        dtype = _dtype(law, seen, post)
+        errors = np.ones(()) if sigma is None else sigma
+        problem = _build(law, seen, post, sigma, errors, free, bounds, dtype, unit, 1.0, [])
+        shape = eqx.filter_eval_shape(seen, law).value.shape
+        if shape != post.shape:
+            raise ValueError(
+                f"Argument `observe` must give values of shape {post.shape} like `measured`, "
+                f"but gives shape {shape}."
+            )
+        return problem
+
+    @property
+    def law(self) -> Law:
+        """The law with its start values."""
+        return self.residuals.law
+
+    @property
+    def value_name(self) -> str:
+        """What one of the measured values is."""
+        return "value" if self.experiments is None else "velocity"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the parameters x; contacts are numbered from 1."""
+        return self.parameters.names
+
+    @property
+    def start(self) -> np.ndarray:
+        """x of the law itself."""
+        return entries(self.law, self.parameters.fields)[self.parameters.first]
+
+    def to_law(self, x: Any) -> Law:
+        """The law with parameters x (P,)."""
+        return self.residuals.law_at(self._scaled(x))
+
+    def residual(self, x: Any) -> jax.Array:
+        """(R,) `(observed - measured) / sigma`; a large number where the law fails."""
+        residual, _ = self.residuals.residual(self._scaled(x))
+        return self.residuals.size * residual[np.flatnonzero(~np.isnan(self.measured))]
+
+    def jacobian(self, x: Any) -> jax.Array:
+        """(R, P) derivatives of `residual`, by forward mode."""
+        return jax.jacfwd(self.residual)(jnp.asarray(x, self.residuals.offset.dtype))
+
+    def log_density(self, x: Any) -> jax.Array:
+        """Logarithm () of the probability density of the data, normally distributed.
+
+        Equation: `-|r|^2 / 2 - sum log(sigma sqrt(2 pi))`; where sigma is unknown, it is integrated
+        over `d sigma / sigma`: `-R log |r|`, up to a constant.
+        """
+        squares = jnp.sum(self.residual(x) ** 2)
+        if self.sigma is None:
+            return -0.5 * self.values * jnp.log(squares)
+        seen = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
+        return -0.5 * squares - float(np.sum(np.log(seen * math.sqrt(2 * math.pi))))
+
+    def weighed(self, factor: np.ndarray) -> "FitProblem":
+        """With weights 1 / sigma times a factor, shaped like `measured`; 0 leaves a value out."""
+        r = self.residuals
+        weight = np.asarray(r.weight, float) * float(r.size) * factor
+        size = float(r.unit) * np.linalg.norm(weight)
+        arrays = (jnp.asarray(weight / size, r.weight.dtype), jnp.asarray(size, r.size.dtype))
+        kept = np.where(factor > 0, self.measured, np.nan)
+        lost = int(np.isnan(kept).sum() - np.isnan(self.measured).sum())
+        residuals = eqx.tree_at(lambda r: (r.weight, r.size), r, arrays)
+        return replace(self, residuals=residuals, measured=kept, values=self.values - lost)
+
+    def _scaled(self, x: Any) -> jax.Array:
+        """y (Q,) of x (P,)."""
+        r, first = self.residuals, np.asarray(self.parameters.first)
+        x = jnp.asarray(x, r.offset.dtype)
+        log = r.log[first]
+        y = jnp.where(log, jnp.log(jnp.where(log, x, 1.0)), x / r.scale[first])
+        return jnp.zeros_like(r.offset).at[: len(first)].set(y)
+
+
+def _dtype(*trees: Any) -> np.dtype:
+    leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
+    return np.result_type(*(x.dtype for x in leaves))
+
+
+def _in(dtype: np.dtype, tree: Any) -> Any:
+    """The tree with all numbers of this type, in arrays."""
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
+
+
+def _build(
     law: Law,
-    scene: Scene | None,
-    experiments: Experiments,
-    parameters: Parameters,
-    limits: tuple[np.ndarray, np.ndarray],
+    observe: Observable,
+    measured: np.ndarray,
+    sigma: np.ndarray | None,
+    errors: np.ndarray,
+    free: Any,
+    bounds: Mapping[str, Any] | None,
+    dtype: np.dtype,
+    unit: float,
+    energy: float,
+    scenes: list[Scene],
 ) -> FitProblem:
     """Arrays, weights and natural scales of a fit."""
-    own = [experiments.scene_of(scene, k) for k in range(len(experiments.shots))]
-    per_shot = experiments.scenes is not None
-    leaves = jax.tree.leaves((law, own, experiments.pre))
-    dtype = np.result_type(*(x.dtype for x in leaves if eqx.is_inexact_array(x)))
-    own, extra = stackable(own)
-    law, *own = jax.tree.map(
-        lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, (law, *own)
-    )
-    pre, post = np.asarray(experiments.pre), np.nan_to_num(np.asarray(experiments.post))
-    unit = max(np.abs(pre).max(), np.abs(post).max()) or 1.0
-    sigma = np.ones_like(post) if experiments.sigma is None else np.asarray(experiments.sigma)
-    weight = np.where(experiments.measured, 1 / sigma, 0.0)
+    parameters, notes = free_parameters(law, free)
+    limits = bounds_of(parameters, law, bounds)
+    law = _in(dtype, law)
+    here = ~np.isnan(measured)
+    weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
     size = unit * np.linalg.norm(weight)
-    n = pre.shape[1]
-    energy = max(0.5 * v @ dense_mass(s)[:n, :n] @ v for s, v in zip(own, pre)) or 1.0
-    pre = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
     values = entries(law, parameters.fields)
     scale, log = _scales(parameters, values, energy)
     offset, mix = to_scaled(values, scale, log), np.zeros((len(values), len(values)))
     for i, group in enumerate(parameters.groups):
         mix[list(group), i], offset[list(group)] = 1.0, 0.0
-    bounds = np.zeros((2, len(values)))
+    ends = np.zeros((2, len(values)))
     first, count = parameters.first, len(parameters.names)
-    bounds[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
-    arrays = {"mix": mix, "offset": offset, "scale": scale, "low": bounds[0], "high": bounds[1]}
-    arrays |= {"pre": pre, "post": post, "weight": weight / size, "size": size, "unit": unit}
-    shown = own if per_shot else own[:1]
-    region = matrix_region(law, shown, scale * offset, scale[:, None] * mix, bounds)
-    return FitProblem(
+    ends[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
+    arrays = {"mix": mix, "offset": offset, "scale": scale, "low": ends[0], "high": ends[1]}
+    arrays |= {"measured": np.nan_to_num(measured), "weight": weight / size}
+    arrays |= {"size": size, "unit": unit}
+    region = matrix_region(law, scenes, scale * offset, scale[:, None] * mix, ends)
+    residuals = Residuals(
         law=law,
-        region=region or Box(*(jnp.asarray(end, dtype) for end in bounds)),
+        region=region or Box(*(jnp.asarray(end, dtype) for end in ends)),
         log=jnp.asarray(log),
-        scenes=jax.tree.map(lambda *x: jnp.stack(x), *own) if per_shot else own[0],
+        observe=observe,
         fields=parameters.fields,
-        scene_per_shot=per_shot,
         **{name: jnp.asarray(array, dtype) for name, array in arrays.items()},
     )
+    count, domains = int(here.sum()), np.stack(limits, axis=1)
+    return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count)
 
 
 def _scales(
@@ -117,58 +388,45 @@ def from_scaled(scaled: np.ndarray, scale: np.ndarray, log: np.ndarray) -> np.nd
     return np.where(log, np.exp(np.where(log, scaled, 0.0)), scaled * scale)
 
 
-def _evaluate(problem: FitProblem, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
-    """Weighted residual (K n,), its Jacobian (K n, Q), and v+ (K, n), status (K,)."""
+def filled_up(residuals: Residuals) -> Residuals:
+    """With copies of the last shot, of no weight, up to a number that other fits have, too."""
+    if not isinstance(residuals.observe, Shots):
+        return residuals
+    count = len(residuals.measured)
+    goal = FEWEST
+    while goal < count:
+        goal *= 4 if goal < FEW else 2
 
-    def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
-        scaled = problem.offset + problem.mix @ y
-        exponential = jnp.exp(jnp.where(problem.log, scaled, 0.0))
-        values = jnp.where(problem.log, exponential, scaled * problem.scale)
-        law = with_entries(problem.law, problem.fields, values)
-        axes = (None, 0 if problem.scene_per_shot else None, 0)
-        out = jax.vmap(impact, in_axes=axes)(law, problem.scenes, problem.pre)
-        velocity = out.velocity[:, : problem.post.shape[1]]
-        codes = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
-        bad = jnp.any(out.status[:, None] == codes[None, :], axis=1)
-        error = jnp.where(bad[:, None], PENALTY * problem.unit, velocity - problem.post)
-        residual = (error * problem.weight).reshape(-1)
-        return residual, (residual, velocity, out.status)
-
-    jacobian, (residual, velocity, status) = jax.jacfwd(outcome, has_aux=True)(y)
-    return residual, jacobian, (velocity, status)
+    last = np.minimum(np.arange(goal), count - 1)
+    parts = (residuals.observe, residuals.measured, residuals.weight)
+    observe, measured, weight = jax.tree.map(lambda x: np.asarray(x)[last], parts)
+    weight[count:] = 0.0
+    return eqx.tree_at(
+        lambda r: (r.observe, r.measured, r.weight), residuals, (observe, measured, weight)
+    )
 
 
 @quick_jit
-def begin_all(
-    problem: FitProblem, starts: jax.Array, method: Method, max_steps: int
-) -> SolverState:
-    """States of a batch of starts y (S, Q)."""
-    shots, bodies = problem.post.shape
+def begin_all(problems: Residuals, starts: Any, method: Method, max_steps: int) -> SolverState:
+    """States of a batch of problems and their starts y (S, Q)."""
 
-    def one(y: jax.Array) -> SolverState:
-        y = problem.region.retract(y)
-        velocity, status = jnp.zeros_like(problem.post), jnp.zeros(shots, jnp.int32)
-        residual = jnp.zeros(shots * bodies, y.dtype)
-        jacobian = jnp.zeros((shots * bodies, y.shape[0]), y.dtype)
-        return begin(y, (residual, jacobian, (velocity, status)), method, max_steps)
+    def one(problem: Residuals, y: jax.Array) -> SolverState:
+        size, shape = problem.measured.size, problem.measured.shape
+        statuses = shape[0] if isinstance(problem.observe, Shots) else 1
+        kept = (jnp.zeros(shape, y.dtype), jnp.zeros(statuses, jnp.int32))
+        first = (jnp.zeros(size, y.dtype), jnp.zeros((size, y.shape[0]), y.dtype), kept)
+        return begin(problem.region.retract(y), first, method, max_steps)
 
-    return jax.vmap(one)(starts)
+    return eqx.filter_vmap(one)(problems, starts)
 
 
 @quick_jit
 def advance_all(
-    problem: FitProblem, states: SolverState, method: Method, max_steps: int, passes: int
+    problems: Residuals, states: SolverState, method: Method, max_steps: int, passes: int
 ) -> SolverState:
-    """Up to `passes` passes more of every start."""
+    """Up to `passes` passes more of every problem."""
 
-    def one(state: SolverState) -> SolverState:
-        return advance(
-            lambda y: _evaluate(problem, y),
-            problem.region,
-            method,
-            max_steps,
-            state,
-            passes,
-        )
+    def one(problem: Residuals, state: SolverState) -> SolverState:
+        return advance(problem.evaluate, problem.region, method, max_steps, state, passes)
 
-    return jax.vmap(one)(states)
+    return eqx.filter_vmap(one)(problems, states)

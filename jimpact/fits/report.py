@@ -5,16 +5,14 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.experiments import Experiments, data_defects
+from jimpact.experiments import data_defects
+from jimpact.fits.adequacy import adequacy
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
-from jimpact.fits.parameters import Parameters
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.uncertainty import Uncertainty
-from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.records import as_data
-from jimpact.scene import Scene
 from jimpact.status import STATUS
 
 _VELOCITIES_SHOWN = 24
@@ -23,8 +21,6 @@ _MINIMA_SHOWN = 5
 # Minima whose sums of squares differ by less than this many noise variances fit equally well:
 # the difference is what moving by one standard error costs.
 EQUALLY_GOOD = 1.0
-# Scatter beyond the stated sigma is worth a word above this ratio (chi^2 per degree of freedom 4).
-TOO_MUCH_SCATTER = 2.0
 
 
 def report(fit: Any) -> str:
@@ -42,10 +38,12 @@ def report(fit: Any) -> str:
 
 
 def _headline(fit: Any) -> str:
+    values, law = int(np.isfinite(fit.problem.measured).sum()), type(fit.law).__name__
+    if fit.experiments is None:
+        return f"Fit of {law} to {values} measured values, {fit.method}"
     shots, bodies = fit.predicted.shape
-    values = int(fit.experiments.measured.sum())
     return (
-        f"Fit of {type(fit.law).__name__} to {shots} shot{'s' * (shots > 1)} of {bodies} bodies "
+        f"Fit of {law} to {shots} shot{'s' * (shots > 1)} of {bodies} bodies "
         f"({values} measured velocities), {fit.method}"
     )
 
@@ -57,19 +55,22 @@ def _parameters(fit: Any) -> list[str]:
         error = fit.standard_error[i]
         word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
         interval = f"{low:.5g} to {high:.5g}" if np.isfinite(error) else "-"
+        if fit.profiles:
+            interval = fit.profiles[i].words
         note = "   at its bound" if fit.at_bound[i] else ""
         lines.append(f"{fit.names[i]:{width}s} {fit.value[i]:12.6g} {word:>12s}   {interval}{note}")
     return lines
 
 
 def _quality(fit: Any) -> list[str]:
-    lines = [f"rms residual   {fit.rms:.4g} m/s"]
-    if fit.experiments.sigma is not None:
+    unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
+    lines = [f"rms residual   {fit.rms:.4g}{unit}"]
+    if fit.problem.sigma is not None:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
         lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
     elif np.isfinite(fit.noise):
         lines.append(
-            f"noise          {fit.noise:.4g} m/s a velocity, estimated with "
+            f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
             f"{fit.degrees_of_freedom} degrees of freedom"
         )
     lines.append(f"rank           {fit.rank} of {len(fit.names)} parameters")
@@ -99,8 +100,12 @@ def _minima(fit: Any) -> list[str]:
 
 def _shots(fit: Any) -> list[str]:
     data = fit.experiments
+    if data is None:
+        return []
     pre, post = np.asarray(data.pre, float), np.asarray(data.post, float)
-    lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s} [m/s]"]
+    mixed = len(set(data.units)) > 1
+    unit = "" if mixed else f" [{data.units[0]}]"
+    lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}{unit}"]
     shown = max(1, _VELOCITIES_SHOWN // pre.shape[1])
     for k in range(min(len(pre), shown)):
         code = int(fit.status[k])
@@ -109,7 +114,8 @@ def _shots(fit: Any) -> list[str]:
             label = data.shots[k] if i == 0 else ""
             seen = "-" if np.isnan(post[k, i]) else f"{post[k, i]:.6g}"
             values = f"{pre[k, i]:12.6g} {seen:>12s} {fit.predicted[k, i]:12.6g}"
-            lines.append(f"{label:>8s} {i + 1:5d} {values}{note if i == 0 else ''}")
+            each = f" {data.units[i]}" if mixed else ""
+            lines.append(f"{label:>8s} {i + 1:5d} {values}{each}{note if i == 0 else ''}")
     if len(pre) > shown:
         lines.append(f"     ... and {len(pre) - shown} more shots")
     return lines
@@ -126,6 +132,7 @@ def to_json(fit: Any) -> dict[str, Any]:
             "confidence_interval_95": as_data(interval[i]),
             "at_bound": bool(fit.at_bound[i]),
             "seen": bool(not np.isinf(fit.standard_error[i])),
+            "profile_95": as_data(fit.profiles[i].intervals) if fit.profiles else None,
         }
         for i, name in enumerate(fit.names)
     ]
@@ -147,37 +154,38 @@ def to_json(fit: Any) -> dict[str, Any]:
         "covariance": as_data(fit.covariance),
         "correlation": as_data(fit.correlation),
         "starts": starts,
-        "shots": list(fit.experiments.shots),
+        "shots": [] if fit.experiments is None else list(fit.experiments.shots),
         "predicted": as_data(fit.predicted),
         "residual": as_data(fit.residual),
         "status": [STATUS[code].name for code in fit.status],
     }
 
 
-def fit_warnings(
-    law: Law,
-    problem: FitProblem,
-    parameters: Parameters,
-    experiments: Experiments,
-    scene: Scene | None,
-    found: Search,
-    spread: Uncertainty,
-) -> list[str]:
+def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> list[str]:
     """All warnings, those about the data first."""
-    stored = float(np.sum(jnp.broadcast_to(law.stored, experiments.largest_scene(scene).contacts)))
-    lines = data_defects(experiments, scene, stored)
+    lines, data = list(problem.left_out), problem.experiments
+    if data is not None:
+        contacts = data.largest_scene(problem.scene).contacts
+        stored = float(np.sum(jnp.broadcast_to(problem.law.stored, contacts)))
+        lines += data_defects(data, problem.scene, stored)
     if not found.converged:
         lines.append(
             "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
             "a kink of the law, where the sequence of contacts changes)."
         )
-    lines += _statuses(found.status, experiments.shots)
-    names = parameters.names
+    if data is not None:
+        lines += _statuses(found.status, data.shots)
+        lines += _matrix(problem, found, contacts)
+    lines += adequacy(problem, found, spread.rank)
+    if data is not None and problem.sigma is None and len(set(data.units)) > 1:
+        lines.append(
+            "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
+        )
+    names = problem.names
     for i in np.flatnonzero(found.at_bound):
         lines.append(
             f"{names[i]} ends at its bound {found.value[i]:g}: its error holds for one side."
         )
-    lines += _matrix(law, problem, experiments.largest_scene(scene), found)
     if spread.rank < len(names):
         lines.append(
             f"The data determine {spread.rank} of {len(names)} parameters (rank "
@@ -185,19 +193,11 @@ def fit_warnings(
         )
     elif (several := _equally_good(problem, found, spread)) > 1:
         lines.append(f"{several} different minima fit equally well: see the starts.")
-    if spread.degrees_of_freedom < 1 and experiments.sigma is None:
+    if spread.degrees_of_freedom < 1 and problem.sigma is None:
         lines.append(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
-    if experiments.sigma is not None and spread.degrees_of_freedom > 0:
-        chi_squared = float(problem.size) ** 2 * found.minima[0][0]
-        scatter = np.sqrt(chi_squared / spread.degrees_of_freedom)
-        if scatter > TOO_MUCH_SCATTER:
-            lines.append(
-                f"The residuals are {scatter:.1f} times what sigma allows: the law or the stated "
-                "errors are wrong, and the standard errors too small."
-            )
-    if problem.pre.dtype == np.float32:
+    if problem.residuals.offset.dtype == np.float32:
         lines.append(
             "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
             'jax.config.update("jax_enable_x64", True) gives float64.'
@@ -218,15 +218,15 @@ def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
     return lines
 
 
-def _matrix(law: Law, problem: FitProblem, scene: Scene, found: Search) -> list[str]:
+def _matrix(problem: FitProblem, found: Search, contacts: int) -> list[str]:
     """Where the conditions on a restitution matrix hold it back, or are not asked for."""
-    edges = boundary(problem.region, found.entries)
+    edges = boundary(problem.residuals.region, found.entries)
     if edges:
         return [
             f"The matrix ends at the edge of the admissible ones ({'; '.join(edges)}): the errors "
             "hold for the side inside."
         ]
-    if isinstance(law, RestitutionMatrix) and not encloses(law, scene):
+    if isinstance(problem.law, RestitutionMatrix) and not encloses(problem.law, contacts):
         return [
             "Nothing keeps this matrix consistent for other approach velocities than the measured: "
             "the conditions are for (m, m) matrices with admissible=True."
@@ -235,6 +235,7 @@ def _matrix(law: Law, problem: FitProblem, scene: Scene, found: Search) -> list[
 
 
 def _equally_good(problem: FitProblem, found: Search, spread: Uncertainty) -> int:
-    noise = spread.noise / float(problem.size) if np.isfinite(spread.noise) else 0.0
-    more = max(EQUALLY_GOOD * noise**2, EXACT[str(problem.pre.dtype)])
+    size, dtype = float(problem.residuals.size), str(problem.residuals.offset.dtype)
+    noise = spread.noise / size if np.isfinite(spread.noise) else 0.0
+    more = max(EQUALLY_GOOD * noise**2, EXACT[dtype])
     return sum(cost <= found.minima[0][0] + more for cost, _, _ in found.minima)

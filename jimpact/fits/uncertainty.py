@@ -35,14 +35,15 @@ def uncertainty(
     log: np.ndarray,
     sum_of_squares: float,
     values: int,
-    noise_is_known: bool,
+    noise: float | None,
     rank_tolerance: float,
+    value_name: str,
 ) -> Uncertainty:
     """Linearized errors at a minimum.
 
-    Equation: `C = s^2 (J^T J)^-1` on the seen subspace, `s^2 = |r|^2 / (values - rank)`, or 1
-    where the weights are known errors; rank = number of singular values of J, its columns scaled
-    by the natural size of each parameter, above `rank_tolerance` times the largest.
+    Equation: `C = s^2 (J^T J)^-1` on the seen subspace, `s^2 = |r|^2 / (values - rank)`, or the
+    given noise (1 where the weights are known errors); rank = number of singular values of J, its
+    columns scaled by the natural size of each parameter, above `rank_tolerance` times the largest.
 
     Args:
         names: of the parameters (P,).
@@ -51,16 +52,16 @@ def uncertainty(
         log: (P,) whether changes are told in percent.
         sum_of_squares: |r|^2.
         values: independent measured values.
-        noise_is_known: whether the weights are 1 / sigma.
+        noise: s; None: from |r|^2.
         rank_tolerance: see `RANK_TOLERANCE`.
+        value_name: what a measured value is called.
     """
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=True)
     singular = np.pad(singular, (0, len(names) - len(singular)))
     rank = int(np.sum(singular > rank_tolerance * singular[0]))
     freedom = values - rank
-    noise = 1.0 if noise_is_known else np.nan
-    if not noise_is_known and freedom > 0:
-        noise = float(np.sqrt(sum_of_squares / freedom))
+    if noise is None:
+        noise = float(np.sqrt(sum_of_squares / freedom)) if freedom > 0 else np.nan
     seen = directions[:rank] / singular[:rank, None]
     covariance = noise**2 * (seen.T @ seen) * np.outer(scale, scale)
     null = directions[rank:]
@@ -71,7 +72,7 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    unseen = tuple(_in_words(names, row, scale, log) for row in _reduced(null))
+    unseen = tuple(_in_words(names, row, scale, log, value_name) for row in _reduced(null))
     return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, unseen)
 
 
@@ -88,7 +89,11 @@ def _reduced(null: np.ndarray) -> np.ndarray:
 
 
 def _in_words(
-    names: tuple[str, ...], direction: np.ndarray, scale: np.ndarray, log: np.ndarray
+    names: tuple[str, ...],
+    direction: np.ndarray,
+    scale: np.ndarray,
+    log: np.ndarray,
+    value_name: str,
 ) -> str:
     """A direction that leaves all predictions as they are, as small changes of parameters."""
     parts = []
@@ -99,8 +104,10 @@ def _in_words(
             parts.append(f"{names[i]} goes {'up' if step[i] > 0 else 'down'} by {change}")
     if len(parts) == 1:
         name = parts[0].split(" ")[0]
-        return f"The data cannot see {name}: no measured velocity depends on it (to first order)."
+        return (
+            f"The data cannot see {name}: no measured {value_name} depends on it (to first order)."
+        )
     return (
-        "The data cannot see a combination: no measured velocity changes (to first order) when "
-        f"{', '.join(parts[:-1])} and {parts[-1]} together."
+        f"The data cannot see a combination: no measured {value_name} changes (to first order) "
+        f"when {', '.join(parts[:-1])} and {parts[-1]} together."
     )

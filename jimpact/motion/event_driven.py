@@ -123,6 +123,8 @@ class _Run(NamedTuple):
     struck: jax.Array  # (m,) contacts that had an impact
     allowed: jax.Array  # errors of the ledger
     waits: jax.Array  # whether an event is to be resolved
+    approach: jax.Array  # of an impact without collision, 0 where another event waits
+    several: jax.Array  # whether there were several solutions at an event
     last: Event  # before the next step, or a longer time ago
     table: Table
     seen: jax.Array  # events
@@ -216,6 +218,8 @@ def _run(given: Given, max_events: int, records: bool) -> _End:
     status = jnp.where(
         stuck, why_stuck(given.system, end.flight, given.q0, given.times), end.status
     ).astype(jnp.int32)
+    told = end.several & (status == MOTION_CODE["ok"])
+    status = jnp.where(told, MOTION_CODE["several_outcomes"], status).astype(jnp.int32)
     flight, past = end.flight, None
     if given.past is not None:
         past = _handed_over(end, given.past.numbers.shape[0])
@@ -224,7 +228,8 @@ def _run(given: Given, max_events: int, records: bool) -> _End:
 
 def _remembered(run: _Run) -> Any:
     """What a run must know of the one before it."""
-    return run.flight, run.struck, run.allowed, run.waits, run.last, run.table.samples
+    waits = run.waits, run.approach, run.several
+    return run.flight, run.struck, run.allowed, waits, run.last, run.table.samples
 
 
 def _handed_over(run: _Run, size: int) -> jax.Array:
@@ -247,7 +252,9 @@ def _continued(start: _Run, past: jax.Array) -> _Run:
         flight=flight,
         struck=struck,
         allowed=allowed,
-        waits=waits,
+        waits=waits[0],
+        approach=waits[1],
+        several=waits[2],
         last=last,
         table=start.table._replace(samples=samples),
         status=jnp.where(on, MOTION_CODE["ok"], start.status).astype(jnp.int32),
@@ -266,7 +273,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         jnp.zeros((max_events + 1, 2 + m), jnp.int32),
     )
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
-    decision = Decision(no, none, none, none, none, Scales(zero, zero, zero))
+    decision = Decision(no, zero, none, none, none, none, Scales(zero, zero, zero))
     last = Event(no, no, decision)
     plan = None
     if records:
@@ -280,6 +287,8 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         none,
         packed(state)[q0.size + v0.size :, 0],
         jnp.asarray(True),
+        zero,
+        no,
         last,
         table,
         jnp.int32(0),
@@ -300,8 +309,9 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
 
     def now(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
         scales, modes = run.last.decision.scales, decoded(flight.aim.modes, old.q.dtype)
+        fired = flight.event & mine
         found = resolve(
-            system, law, mu, settings, old, modes, flight.event & mine, scales, run.struck
+            system, law, mu, settings, old, modes, fired, scales, run.struck, run.approach
         )
         happened = found.kind != KIND_CODE["none"]
         most = max_events if given.past is None else jnp.minimum(given.past.most, max_events)
@@ -318,12 +328,14 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
             flight=toward_sample(ready, given.times, flight.free),
             struck=run.struck | (found.contacts & found.decision.strikes),
             allowed=allowed_errors(system, settings, state),
-            waits=jnp.asarray(False),
+            waits=found.approach > 0,
+            approach=found.approach,
+            several=run.several | found.several,
             last=Event(jnp.asarray(True), kept, found.decision),
             seen=run.seen + kept.astype(jnp.int32),
             status=status,
         )
-        codes = jnp.stack([found.kind, found.after.jump.code])
+        codes = jnp.stack([found.kind, found.code])
         marks = jnp.concatenate([codes.astype(jnp.int32), found.contacts.astype(jnp.int32)])
         numbers = _numbers(old, found.after)
         # one that has no row any more is not resolved
@@ -354,18 +366,20 @@ def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
     samples = put(
         run.table.samples, packed(flight.state)[:, 0], jnp.where(flies, begin.sample, last)
     )
+    # an event that another one follows at once has a row of its own
     plan, still = run.plan, jnp.asarray(False)
+    kept = accept | (run.waits & run.last.happens)
     if plan is not None:
         size = plan.rows.accepted.shape[0] - 1
         row = Row(run.last, accept, begin.aim)
         index = plan.used
         rows = jax.tree.map(lambda all_, x: put(all_, x, index), plan.rows, row)
-        used = jnp.minimum(index + accept.astype(jnp.int32), size)
+        used = jnp.minimum(index + kept.astype(jnp.int32), size)
         plan = Plan(rows, used, plan.lost | (used == size))
     return run._replace(
         flight=flight,
         waits=run.waits | (flies & jnp.any(flight.event)),
-        last=run.last._replace(happens=jnp.where(accept, still, run.last.happens)),
+        last=run.last._replace(happens=jnp.where(kept, still, run.last.happens)),
         table=run.table._replace(samples=samples),
         plan=plan,
     )

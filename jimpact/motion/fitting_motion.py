@@ -1,7 +1,6 @@
-"""Parameters of a law from a measured motion."""
+"""Parameters of a law from a measured motion: `fit` with a simulated motion as observable."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -9,16 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, as_whole, check_values
-from jimpact.fits.least_squares import Box, SolverState, advance, begin
-from jimpact.fits.parameters import (
-    Parameters,
-    bounds_of,
-    entries,
-    free_parameters,
-    with_entries as law_with,
-)
-from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
+from jimpact.fits.fitting import Fit, fit
+from jimpact.fits.problem import FitProblem, Seen
 from jimpact.law import Law
 from jimpact.motion.record import MOTION_STATUS, Motion
 from jimpact.motion.simulate import simulate
@@ -27,56 +18,22 @@ from jimpact.motion.system import System
 Observe = Callable[[Motion], jax.Array]
 
 MAX_PASSES = 50
-_PENALTY = 1e3  # times the largest measured value: residual of a motion that fails
 _FAILS = tuple(row.failure for row in MOTION_STATUS)
 
 
-@dataclass(frozen=True, eq=False)
-class MotionFit:
-    """What `fit_motion` found; `print(fit)` is a report.
+class Record(eqx.Module):
+    """The observable of a motion."""
 
-    `standard_error` is inf for parameters that the record does not determine (`unseen` says
-    which combinations); `degrees_of_freedom` is measured values less `rank`; `noise` is the
-    estimated error of the measurement, or 1 with `sigma`.
-    """
-
-    law: Law
-    names: tuple[str, ...]
-    value: np.ndarray
-    standard_error: np.ndarray
-    covariance: np.ndarray
-    rank: int
-    degrees_of_freedom: int
-    unseen: tuple[str, ...]
-    noise: float
-    predicted: np.ndarray
-    residual: np.ndarray
-    steps: int
-    converged: bool
-
-    def __str__(self) -> str:
-        rows = [
-            f"  {name} = {value:.6g} +- {error:.2g}"
-            for name, value, error in zip(self.names, self.value, self.standard_error, strict=True)
-        ]
-        head = f"{type(self.law).__name__} fitted to a motion in {self.steps} passes"
-        end = "" if self.converged else ", not converged"
-        rms = float(np.sqrt(np.nanmean(self.residual**2)))
-        return "\n".join([head + end, *rows, f"  rms residual {rms:.3g}", *self.unseen])
-
-
-class _Problem(eqx.Module):
     system: System
-    law: Law
     arguments: dict[str, Any]
-    observe: Observe
-    measured: jax.Array  # 0 where not measured
-    weight: jax.Array  # 0 where not measured
-    offset: jax.Array  # of all entries, scaled
-    scale: jax.Array
-    groups: jax.Array  # (Q, P)
-    log: jax.Array  # (Q,)
-    fields: tuple[str, ...] = eqx.field(static=True)
+    observe: Observe = eqx.field(static=True)
+
+    def __call__(self, law: Law) -> Seen:
+        """What is observed of the motion with this law, and the status of the motion."""
+        motion = simulate(self.system, law, **self.arguments)
+        value = self.observe(motion)
+        bad = jnp.asarray(_FAILS)[motion.status] | ~jnp.isfinite(value)
+        return Seen(value, bad, motion.status[None])
 
 
 def fit_motion(
@@ -91,9 +48,10 @@ def fit_motion(
     sigma: Any = None,
     bounds: Mapping[str, Any] | None = None,
     observe: Observe | None = None,
-    max_passes: int = MAX_PASSES,
+    starts: int = 1,
+    max_steps: int = MAX_PASSES,
     **options: Any,
-) -> MotionFit:
+) -> Fit:
     """The parameters of `law` with which `simulate` comes nearest to a measured motion.
 
     Equation: `min sum ((observe(motion) - measured) / sigma)^2` by Levenberg-Marquardt, with the
@@ -113,7 +71,7 @@ def fit_motion(
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
         bounds: field -> (low, high).
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
-        max_passes: of the solver.
+        starts, max_steps: as in `fit`.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
 
     Raises:
@@ -134,136 +92,10 @@ def fit_motion(
                 f"but has shape {record.shape}."
             )
         options = {"samples": record.shape[0]} | options
-    check_values("measured", record, nan_allowed=True)
-    as_whole("max_passes", max_passes, 1)
-    here = np.isfinite(record)
-    if not here.any():
-        raise ValueError("Argument `measured` must have at least one value that is not NaN.")
-    errors = np.broadcast_to(1.0 if sigma is None else np.asarray(sigma, float), record.shape)
-    check_values("sigma", errors, low=0.0, open_low=True)
-    contacts = jax.eval_shape(system.body.gap_function, as_float_array("q0", q0)).shape
-    parameters, _ = free_parameters(law, contacts[0] if contacts else 1, free)
-    limits = bounds_of(parameters, law, bounds)
-    arguments = {"q0": q0, "v0": v0, "t_end": t_end} | options
-    weight = np.where(here, 1 / errors, 0.0)
-    given = (np.nan_to_num(record), weight / np.linalg.norm(weight))
-    problem, y, box = _problem(
-        system, law, arguments, observe or _positions, given, parameters, limits
-    )
-    state = _solve(problem, box, y, max_passes)
-    size = float(np.linalg.norm(weight))
-    return _report(problem, state, parameters, here, size, sigma is not None)
+    seen = Record(system, {"q0": q0, "v0": v0, "t_end": t_end} | options, observe or _positions)
+    problem = FitProblem.from_observable(law, seen, measured, sigma, free, bounds)
+    return fit(problem, starts=starts, max_steps=max_steps)
 
 
 def _positions(motion: Motion) -> jax.Array:
     return motion.q
-
-
-def _problem(
-    system: System,
-    law: Law,
-    arguments: dict[str, Any],
-    observe: Observe,
-    given: tuple[np.ndarray, np.ndarray],
-    parameters: Parameters,
-    limits: tuple[np.ndarray, np.ndarray],
-) -> tuple[_Problem, jax.Array, Box]:
-    """The problem, its start and its box in scaled parameters."""
-    values = entries(law, parameters.fields)
-    log = parameters.log
-    scale = np.where(log, 1.0, np.maximum(np.abs(values), 1.0))
-    scaled = np.where(log, np.log(np.where(log, values, 1.0)), values / scale)
-    groups = np.zeros((len(values), len(parameters.names)))
-    offset = scaled.copy()
-    for i, members in enumerate(parameters.groups):
-        groups[list(members), i], offset[list(members)] = 1.0, 0.0
-    first = parameters.first
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = (np.where(log[first], np.log(x), x / scale[first]) for x in limits)
-    problem = _Problem(  # type: ignore[call-arg]
-        system,
-        law,
-        arguments,
-        observe,
-        *(jnp.asarray(x) for x in (*given, offset, scale, groups, log)),  # type: ignore[arg-type]
-        parameters.fields,
-    )
-    return problem, jnp.asarray(scaled[first]), Box(jnp.asarray(low), jnp.asarray(high))
-
-
-def _values(problem: _Problem, y: jax.Array) -> jax.Array:
-    """All entries (Q,) of the free fields."""
-    scaled = problem.offset + problem.groups @ y
-    exponential = jnp.exp(jnp.where(problem.log, scaled, 0.0))
-    return jnp.where(problem.log, exponential, scaled * problem.scale)
-
-
-def _evaluate(problem: _Problem, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Weighted residual (R,), Jacobian (R, P), what was observed."""
-
-    def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
-        law = law_with(problem.law, problem.fields, _values(problem, y))
-        motion = simulate(problem.system, law, **problem.arguments)
-        seen = problem.observe(motion)
-        bad = jnp.asarray(_FAILS)[motion.status] | ~jnp.isfinite(seen)
-        penalty = _PENALTY * jnp.abs(problem.measured).max()
-        error = jnp.where(bad, penalty, jnp.where(bad, 0.0, seen) - problem.measured)
-        residual = (error * problem.weight).reshape(-1)
-        return residual, (residual, seen)
-
-    jacobian, (residual, seen) = jax.jacfwd(outcome, has_aux=True)(y)
-    return residual, jacobian, seen
-
-
-@eqx.filter_jit
-def _solve(problem: _Problem, box: Box, y: jax.Array, passes: int) -> SolverState:
-    def evaluate(y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        return _evaluate(problem, y)
-
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(evaluate, y))
-    method = "levenberg-marquardt"
-    start = begin(box.retract(y), blank, method, passes)
-    return advance(evaluate, box, method, passes, start, passes)
-
-
-def _report(
-    problem: _Problem,
-    state: SolverState,
-    parameters: Parameters,
-    here: np.ndarray,
-    size: float,
-    noise_is_known: bool,
-) -> MotionFit:
-    y = np.asarray(state.y)
-    first = parameters.first
-    values = np.asarray(_values(problem, state.y))
-    log = np.asarray(problem.log)[first]
-    # a change of a parameter for one of y
-    slope = np.where(log, values[first], np.asarray(problem.scale)[first])
-    jacobian = size * np.asarray(state.jacobian)
-    lines = uncertainty(
-        parameters.names,
-        jacobian,
-        slope,
-        log,
-        float(np.sum((size * np.asarray(state.residual)) ** 2)),
-        int(here.sum()),
-        noise_is_known,
-        RANK_TOLERANCE[str(y.dtype)],
-    )
-    predicted = np.asarray(state.kept)
-    return MotionFit(
-        law=law_with(problem.law, problem.fields, jnp.asarray(values)),
-        names=parameters.names,
-        value=values[first],
-        standard_error=lines.standard_error,
-        covariance=lines.covariance,
-        rank=lines.rank,
-        degrees_of_freedom=int(here.sum()) - lines.rank,
-        unseen=tuple(s.replace("measured velocity", "measured value") for s in lines.unseen),
-        noise=lines.noise,
-        predicted=predicted,
-        residual=np.where(here, predicted - np.asarray(problem.measured), np.nan),
-        steps=int(state.steps),
-        converged=bool(state.done),
-    )

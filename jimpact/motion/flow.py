@@ -27,7 +27,9 @@ from jimpact.motion.persistent_contact import (
     constraint_impulse,
     contacts_at,
     forces,
+    least_regularity,
     powers,
+    regularity,
 )
 from jimpact.motion.record import MOTION_CODE, Events
 from jimpact.motion.system import System
@@ -64,7 +66,7 @@ class Settings(NamedTuple):
     max_steps: int
     friction: bool
     duration: jax.Array
-    accumulation: jax.Array  # gap velocity that counts as slow, over the largest of the motion
+    accumulation: jax.Array  # `slow`: see `transitions.resolve`
 
 
 class Scales(NamedTuple):
@@ -94,7 +96,10 @@ def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales)
     if given.tangent is None or mu is None or found.tangential is None:
         return normal
     cone = (mu * found.normal - jnp.abs(found.tangential)) * w[m:] + slack
+    # sliding ends where slip does, and where its forces stop to exist: both may be in one step
+    lasts = regularity(given, mu, modes) - least_regularity(w.dtype)
     slip = modes.sign * given.tangent.rate
+    slip = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
     side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)
     return jnp.concatenate([normal, side])
 
@@ -198,7 +203,7 @@ class MechanicalFlow(MotionFlow):
 
     Modes (rows): for each contact, whether it is persistent, whether it sticks, the sign of its
     sliding. Margins: gaps of open contacts, normal forces of persistent ones, then friction (the
-    cone, or the speed of sliding).
+    cone, or the speed of sliding times what is left of `regularity`).
     """
 
     mu: jax.Array | None

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jimpact.events.friction_flow import inverse, regularized
 from jimpact.motion.dynamics import (
@@ -35,6 +36,9 @@ _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts with
 # motion stay together: bodies that move side by side press on each other by rounding only.
 REST_ACCELERATION = 1e-11
 _PASSES = 3  # choices: contacts that would not slide as they are taken to are asked again
+# A power of rounding: of the matrix of the forces the rest would be rounding. What happens until it
+# has fallen from there to 0 is as small.
+_LEAST_REGULARITY, _FAINT_RIDGE = 1 / 2, 3 / 4  # the second beside redundant contacts
 
 
 class Modes(NamedTuple):
@@ -96,11 +100,7 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
         k = jnp.where(both, given.delassus, jnp.eye(m, dtype=given.free.dtype))
         normal = solve_definite(k, jnp.where(modes.active, -given.approach, 0.0))
         return Forces(normal, None, given.free + given.moved @ normal)
-    held = jnp.concatenate([modes.active, modes.active & modes.stick])
-    sliding = modes.active & ~modes.stick
-    drag = jnp.where(sliding, modes.sign * mu, 0.0)
-    # what slides goes with its normal force
-    w = given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag[None])
+    w, held, drag = _dragged(given, mu, modes)
     right = -given.approach
     none = jnp.zeros(m, w.dtype)
 
@@ -116,6 +116,52 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
     both = both.at[m:].add(-drag * both[:m])
     return Forces(both[:m], both[m:], given.free + given.moved @ both)
+
+
+def _dragged(
+    given: Contacts, mu: jax.Array, modes: Modes
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """What forces do to accelerations (k, k), friction going with the normal force where it slides.
+
+    Beside it, which rows are held (k,), and `-lambda_t / lambda_n` of what slides (m,).
+    """
+    m = modes.active.shape[0]
+    held = jnp.concatenate([modes.active, modes.active & modes.stick])
+    drag = jnp.where(modes.active & ~modes.stick, modes.sign * mu, 0.0)
+    return given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag[None]), held, drag
+
+
+def regularity(given: Contacts, mu: jax.Array, modes: Modes) -> jax.Array:
+    """Determinant () of the matrix of the forces, over what it is if nothing slides with friction.
+
+    Of one contact `1 - mu s W_nt / W_nn`, with s the sign of slip. Where it has fallen to 0 forces
+    that keep the modes do not exist, or elastic contacts would not settle at them.
+    """
+    w, held, _ = _dragged(given, mu, modes)
+    scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(given.delassus), 1.0))
+    scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
+    both = (held[:, None] & held[None, :])[None]
+    k = jnp.stack([w, given.delassus]) * jnp.outer(scale, scale)[None]
+    eye = jnp.eye(len(held), dtype=w.dtype)[None]
+    ridge = float(jnp.finfo(w.dtype).eps) ** _FAINT_RIDGE
+    with_friction, without = _determinants(jnp.where(both, k, eye) + ridge * eye)
+    return with_friction / without
+
+
+def _determinants(k: jax.Array) -> jax.Array:
+    """Of (N, n, n); of two contacts by minors of two rows, which is quick to compile."""
+    if k.shape[-1] != 4:
+        return jnp.linalg.det(k)
+    left, right = np.triu_indices(4, 1)
+    upper = k[..., 0, left] * k[..., 1, right] - k[..., 0, right] * k[..., 1, left]
+    lower = k[..., 2, left] * k[..., 3, right] - k[..., 2, right] * k[..., 3, left]
+    signs = np.where((left + right) % 2, 1, -1)
+    return jnp.sum(upper * lower[..., ::-1] * signs[None], axis=-1)
+
+
+def least_regularity(dtype: jnp.dtype) -> float:
+    """What of `regularity` is 0."""
+    return float(jnp.finfo(dtype).eps) ** _LEAST_REGULARITY
 
 
 def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -> jax.Array:
@@ -177,10 +223,17 @@ def powers(
 
 
 class Choice(NamedTuple):
-    """Modes, and whether they are consistent (friction only: they may not exist)."""
+    """Modes; with friction they may not be `consistent`, and there may be `several`.
+
+    Of several that is taken which sticks most. But a contact does not go on sliding where elastic
+    contacts would not settle at such forces (see `regularity`): it `parts` (m,).
+    """
 
     modes: Modes
     consistent: jax.Array
+    regularity: jax.Array  # of the modes
+    several: jax.Array
+    parts: jax.Array
 
 
 def choose_with_friction(
@@ -217,36 +270,51 @@ def choose_with_friction(
     held = forces(given, mu, now._replace(active=touching & ~released[:m]))
     assert held.tangential is not None
     sign = jnp.where(broken, jnp.where(held.tangential > 0, -1.0, 1.0), now.sign)
-    there = jnp.tile(touching, 2)
-    w = jnp.where(there[:, None] & there[None], given.delassus, jnp.eye(2 * m, dtype=sign.dtype))
-    free = jnp.where(there, given.approach, 0.0)
-    diagonal = jnp.diagonal(w)[:m]
+    eye, diagonal = jnp.eye(2 * m, dtype=sign.dtype), jnp.diagonal(given.delassus)[:m]
+    least = 2 * least_regularity(sign.dtype)  # twice: flights end at once it
 
     def choose(tried: _Tried) -> _Tried:
-        known = tried.known
+        known, rows = tried.known, jnp.tile(tried.there, 2)
+        w = jnp.where(rows[:, None] & rows[None], given.delassus, eye)
+        free = jnp.where(rows, given.approach, 0.0)
         found = solve(
             w, free[:m], free[m:], mu * jnp.ones(m, sign.dtype), complementary=True, sliding=known
         )
-        rate = free + w @ jnp.concatenate([found.normal, found.tangential])
-        active = touching & (rate[:m] <= slack)
+        rate = given.approach + given.delassus @ jnp.concatenate([found.normal, found.tangential])
+        active = tried.there & (rate[:m] <= slack)
         active = active & (~released[:m] | (found.normal * diagonal > slack))
         slips = (known != 0) | (jnp.abs(rate[m:]) > slack)
         modes = Modes(active, active & ~slips, jnp.where(known != 0, known, jnp.sign(rate[m:])))
         # what was taken to slide from rest must do so
         returns = active & (known != 0) & ~sliding & (known * rate[m:] < -slack)
+        several = found.status == CODE["several_outcomes"]
         solved = found.status <= CODE["several_outcomes"]
         known = jnp.where(jnp.where(solved, returns, ~sliding), 0.0, known)
-        return _Tried(modes, known, solved, solved & ~jnp.any(returns), tried.passes + 1)
+        # what would go on sliding though it cannot parts, where that is a solution, too
+        pressed = jnp.where(solved, active, tried.there)
+        regular = regularity(given, mu, modes._replace(active=pressed, stick=pressed & ~slips))
+        wedged = active & slips & (regular <= least)
+        leaves = wedged & several
+        stays = jnp.all(~touching | tried.there | (rate[:m] >= -slack))
+        solved = solved & stays & ~jnp.any(wedged)
+        done = solved & ~jnp.any(returns)
+        several = several | tried.several
+        there = tried.there & ~leaves
+        return _Tried(modes, known, there, regular, several, solved, done, tried.passes + 1)
 
     no = jnp.asarray(False)
-    start = _Tried(now, sign, no, no, jnp.asarray(0))
+    start = _Tried(now, sign, touching, jnp.ones_like(slack), no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(lambda t: ~t.done & (t.passes < _PASSES), choose, start)
-    return Choice(end.modes, end.solved)
+    parts, several = touching & ~end.there, end.several & end.solved
+    return Choice(end.modes, end.solved, end.regularity, several, parts)
 
 
 class _Tried(NamedTuple):
     modes: Modes
     known: jax.Array  # directions of slip that are not asked for
+    there: jax.Array  # (m,) contacts that may be pressed
+    regularity: jax.Array
+    several: jax.Array
     solved: jax.Array
     done: jax.Array
     passes: jax.Array

@@ -15,8 +15,13 @@ from jimpact.status import Status
 MOTION_STATUS = (
     Status("ok", "the motion reaches t_end", False),
     Status("law_failed", "the law fails at an impact (see `event_status`)", True),
-    Status("no_contact_force", "persistent contact with friction has no solution", True),
-    Status("max_events", "more events than `max_events`: an accumulation without end?", True),
+    Status(
+        "no_contact_force",
+        "contact forces with friction have no solution, and the law has no impact without "
+        "collision for it: LZB with `friction` has one",
+        True,
+    ),
+    Status("max_events", "more events than `max_events`", True),
     Status("max_steps", "the flight needs more than `max_steps` or vanishing steps", True),
     Status("penetration", "a gap is negative at the start", True),
     Status("singular_mass", "the mass matrix is not positive definite on the way", True),
@@ -27,10 +32,15 @@ MOTION_STATUS = (
     ),
     Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
     Status("room", "more contacts are closed than the body has `room` for", True),
+    Status(
+        "several_outcomes",
+        "contact forces with friction have several solutions: contacts stick or part (`events`)",
+        False,
+    ),
 )
 MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 
-EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction")
+EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction", "paroxysm")
 _ROUNDING = 1e-12  # of the largest work: what is smaller is not told
 
 KIND_CODE = {name: code for code, name in enumerate(EVENT_KINDS)}
@@ -42,8 +52,9 @@ class Events(eqx.Module):
     `kind` is an index of `jimpact.motion.record.EVENT_KINDS`: an `accumulation` is the impact at
     which the rest of an infinite sequence is passed; by estimates from its energy, the force that
     presses and what the impact took, `accumulation_end` [s] is when that sequence would end, and
-    `accumulation_gap` [m] how far its contacts might still have opened. `energy` (2, m) is what
-    each contact gave (< 0: took), normally and tangentially.
+    `accumulation_gap` [m] how far its contacts might still have opened. A `paroxysm` is an impact
+    without collision. `energy` (2, m) is what each contact gave (< 0: took), normally and
+    tangentially.
     """
 
     count: jax.Array

@@ -93,7 +93,8 @@ def simulate(
         rtol, atol: tolerances of the flights.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
-            gap velocity of the motion, and would be pressed back, stays closed.
+            gap velocity of the motion, and would be pressed back, stays closed; contacts that share
+            bodies below the root of that share (docs/motions.md). `events` tells what is passed.
         max_steps: of the integrator, in all.
         progress: bar on stderr, after each of those runs with the share of the duration that is
             done; None: on a terminal, for long motions.

@@ -9,7 +9,6 @@ from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.motion.dynamics import (
     carried_along,
-    gaps,
     kinematics,
     kinetic,
     mass_at,
@@ -24,6 +23,7 @@ from jimpact.motion.persistent_contact import (
     choose_with_friction,
     constraint_impulse,
     contacts_at,
+    least_regularity,
     no_modes,
     pressed_together,
 )
@@ -38,6 +38,12 @@ FAILS = tuple(row.failure and row.name != "inadmissible_velocity" for row in STA
 REST_SPEED = 1e-9
 LEAST_COUPLING = 1e-9  # |W_ij| / sqrt(W_ii W_jj) of two contacts: less is rounding
 ROUNDINGS = 64  # of the time: velocities that arise within them are 0
+# An impact without collision is that of contacts that approach at this power of rounding, of the
+# slip: it errs by about as much. To this so many times what is left of `regularity` is added, or
+# contacts would part before they are wedged.
+APPROACH, MORE = 1 / 2, 10.0
+# Slips that change by less than so many approaches change by what any impact does.
+SUPPLIED = 100.0
 
 
 class Jump(NamedTuple):
@@ -59,25 +65,31 @@ def no_jump(state: State, m: int) -> Jump:
 
 
 def scene_at(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
-    """The scene that a law sees: normals and tangents at q, gaps 0 where `closed`."""
+    """The scene that a law sees: normals and tangents at q; open contacts are out of reach."""
     normal = kinematics(system, q, v, t)
     tangents = system.body.tangents(seen_from_base(system, q, t))
-    open_gaps = jnp.where(closed, 0.0, jnp.maximum(gaps(system, q, t), 0.0))
-    return Scene(mass_at(system, q), normal.gradient, tangents, open_gaps)
+    away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
+    return Scene(mass_at(system, q), normal.gradient, tangents, away)
 
 
 def impact_jump(
-    system: System, law: Law, t: jax.Array, state: State, closed: jax.Array, noise: jax.Array
+    system: System,
+    law: Law,
+    t: jax.Array,
+    state: State,
+    closed: jax.Array,
+    noise: jax.Array,
+    approach: jax.Array | None,
 ) -> Jump:
     """`impact` in the frame of the base, and what it does to energies.
 
-    Gap velocities up to `noise` are rounding, on the scale of the motion.
+    Gap velocities up to `noise` are rounding, on the scale of the motion; `approach`: see `impact`.
     """
     m = closed.shape[0]
     scene = scene_at(system, state.q, state.v, t, closed)
     carried = carried_along(system, state.v, t)
     relative = state.v - carried
-    out = impact(law, scene, relative, noise)
+    out = impact(law, scene, relative, noise, approach)
     mean = 0.5 * (out.velocity + relative)
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
@@ -94,6 +106,7 @@ class Decision(NamedTuple):
     """What is decided at an event: with it the state after it is a smooth function."""
 
     strikes: jax.Array  # () whether there is an impact
+    approach: jax.Array  # () gap velocity that the law is shown of one without collision, else 0
     closed: jax.Array  # (m,) contacts that take part in it
     held: jax.Array  # (m,) those brought to rest
     stick: jax.Array  # (m,) tangentially, too
@@ -124,7 +137,10 @@ class Outcome(NamedTuple):
     modes: Modes
     kind: jax.Array
     contacts: jax.Array  # (m,)
+    code: jax.Array  # of the law, or that there are several solutions
     status: jax.Array
+    approach: jax.Array  # where there are no contact forces: of the impact without collision next
+    several: jax.Array  # whether there are several
 
 
 def resolve(
@@ -137,12 +153,17 @@ def resolve(
     fired: jax.Array,
     scales: Scales,
     struck: jax.Array,
+    approach: jax.Array,
 ) -> Outcome:
     """Impact if a closed contact approaches; contacts come to rest; new modes.
 
     A closed contact stays closed if it leaves by no more than rounding, or slower than
     `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
     impacts is then passed at once (its gap velocity is set to 0, energy is lost).
+
+    Where friction leaves no contact forces, the next event, at the same instant, is an impact
+    without collision: the limit of that of contacts that approach ever more slowly. `approach` ()
+    is how fast they do at this one, 0 where it is an ordinary event.
 
     Clusters: where contacts share bodies, accumulations are nested: their numbers of impacts
     multiply. A contact that shares a body with another one that is closed or was `struck` before
@@ -155,14 +176,16 @@ def resolve(
     closed = given.normal.value <= settings.closed_below
     scales = _grown(system, scales, given, t, state)
     rest = _rest(settings, scales)
-    strikes = jnp.any(closed & (given.normal.rate < -rest))
-    jump = _struck(system, law, settings, state, strikes, closed, scales)
+    jams, earlier = approach > 0, given
+    strikes = jnp.any(closed & (given.normal.rate < -rest)) | jams
+    jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
     given = contacts_at(system, state.q, jump.v, t, settings.friction)
     gamma = given.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
     # a hop below the rounding of gaps is none: it would strike faster than it left
     floor = ROUNDING_GAP * settings.closed_below
     slowly = jnp.maximum(slowly, jnp.sqrt(2 * scales.acceleration * floor))
+    slowly = jnp.maximum(slowly, SUPPLIED * approach)
     tight = closed & (jnp.abs(gamma) <= rest)
     slack = REST_ACCELERATION * scales.acceleration
     stick = jnp.zeros(m, bool)
@@ -173,7 +196,7 @@ def resolve(
         pressed, still, force = pressed_together(given, slow, slack)
         held = tight | (slow & pressed)
         # a contact accumulates if it was brought to rest from more than rounding
-        ends = held & ~tight & strikes
+        ends = held & ~tight & strikes & ~jams
         after, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
         return _Resting(pressed, still, force, held, ends, after, passed)
 
@@ -183,7 +206,7 @@ def resolve(
     else:
         nested = closed & strikes & _share_bodies(given, closed | struck)
         nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
-        both = jax.vmap(resting)(jnp.stack([slow, slow | nested]))
+        both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
         found, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
         found = selected(_undisturbed(system, given, cluster, tight, t), cluster, found)
     jump, held, pressed = found.jump, found.held, found.pressed
@@ -191,18 +214,27 @@ def resolve(
     released = fired & held_before & ~strikes
     if mu is None:
         active = pressed | (tight & found.still & ~released)
-        choice = Choice(no_modes(m, gamma.dtype)._replace(active=active), jnp.asarray(True))
+        no = jnp.asarray(False)
+        modes = no_modes(m, gamma.dtype)._replace(active=active)
+        choice = Choice(modes, ~no, rest, no, jnp.zeros(m, bool))
     else:
         relative = jump.v - carried_along(system, state.v, t)
         choice = _with_friction(given, mu, before, held, released, relative, rest, slack)
     fails = jnp.asarray(FAILS)[jump.code]
-    status = jnp.where(choice.consistent, MOTION_CODE["ok"], MOTION_CODE["no_contact_force"])
-    status = jnp.where(fails, MOTION_CODE["law_failed"], status)
+    status = jnp.where(fails, MOTION_CODE["law_failed"], MOTION_CODE["ok"])
+    code, wedges = jump.code, jnp.zeros_like(rest)
+    if given.tangent is not None and earlier.tangent is not None:
+        change = jnp.max(jnp.abs(given.tangent.rate - earlier.tangent.rate))
+        wedges = jnp.where(choice.consistent, 0.0, _approach(choice, given.tangent.rate, held))
+        none = (jams & (change <= SUPPLIED * approach)) | (~choice.consistent & (wedges == 0))
+        status = jnp.where(none, MOTION_CODE["no_contact_force"], status)
+        code = jnp.where(choice.several, jnp.maximum(code, CODE["several_outcomes"]), code)
     took = jnp.where(strikes, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
-    decision = Decision(strikes, closed, held, stick, found.ends, scales)
+    took = took | choice.parts
+    decision = Decision(strikes, approach, closed, held, stick, found.ends, scales)
     after = After(_booked(state, jump), jump, found.passed)
-    kind = _kind(strikes, jnp.any(found.ends), released, fired, m)
-    return Outcome(after, decision, choice.modes, kind, took, status)
+    kind = _kind(strikes, jams, jnp.any(found.ends), released[:m] | choice.parts, fired)
+    return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
 
 
 class _Resting(NamedTuple):
@@ -251,11 +283,18 @@ def resolved_again(
     decision: Decision,
 ) -> After:
     """What `resolve` does to the state, as a smooth function: all is decided already."""
-    t, (strikes, closed, held, stick, ends, scales) = state.t, decision
-    jump = _struck(system, law, settings, state, strikes, closed, scales)
+    t, (strikes, approach, closed, held, stick, ends, scales) = state.t, decision
+    jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
     given = contacts_at(system, state.q, jump.v, t, settings.friction)
     jump, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
     return After(_booked(state, jump), jump, passed)
+
+
+def _approach(choice: Choice, slip: jax.Array, held: jax.Array) -> jax.Array:
+    """Gap velocity () of the approach to an impact without collision, 0 where nothing slips."""
+    left = jnp.clip(choice.regularity, 0.0, 2 * least_regularity(slip.dtype))
+    share = float(jnp.finfo(slip.dtype).eps) ** APPROACH + MORE * left
+    return jax.lax.stop_gradient(share * jnp.max(jnp.where(held, jnp.abs(slip), 0.0)))
 
 
 def _rest(settings: Settings, scales: Scales) -> jax.Array:
@@ -271,12 +310,15 @@ def _struck(
     settings: Settings,
     state: State,
     strikes: jax.Array,
+    approach: jax.Array,
     closed: jax.Array,
     scales: Scales,
 ) -> Jump:
+    lead = approach if settings.friction else None
+    noise = _rest(settings, scales)
     return jax.lax.cond(
         strikes,
-        lambda: impact_jump(system, law, state.t, state, closed, _rest(settings, scales)),
+        lambda: impact_jump(system, law, state.t, state, closed, noise, lead),
         lambda: no_jump(state, closed.shape[0]),
     )
 
@@ -341,6 +383,8 @@ def _brought_to_rest(
     p, force = constraint_impulse(given, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
     energy = jnp.pad(0.5 * p * rates, (0, 2 * m - size)).reshape(2, m)
+    # the gaps, up to `closed_below`, are closed by the flight that follows
+    fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * given.normal.value, 0.0)
     side = jnp.pad(p, (0, 2 * m - size))[m:]
     carried = carried_along(system, jump.v, t)
     passed = _passed(p[:m], force[:m], ends, -jnp.sum(energy), -jnp.sum(jump.energy))
@@ -348,7 +392,7 @@ def _brought_to_rest(
         v=jump.v + given.moved @ p,
         impulse=jump.impulse + p[:m],
         tangential=jump.tangential + side,
-        energy=jump.energy + energy,
+        energy=(jump.energy + energy).at[0].add(-fallen),
         base_work=jump.base_work + (given.directions @ p) @ carried,
     )
     return jump, passed
@@ -372,11 +416,13 @@ def _passed(
 
 
 def _kind(
-    strikes: jax.Array, ends: jax.Array, released: jax.Array, fired: jax.Array, m: int
+    strikes: jax.Array, jams: jax.Array, ends: jax.Array, parts: jax.Array, fired: jax.Array
 ) -> jax.Array:
     """The kind of event, `none` at a beginning without impact."""
+    m = len(parts)
     kind = jnp.where(jnp.any(fired[:m]), KIND_CODE["contact"], KIND_CODE["none"])
     kind = jnp.where(jnp.any(fired[m:]), KIND_CODE["friction"], kind)
-    kind = jnp.where(jnp.any(released[:m]), KIND_CODE["detachment"], kind)
+    kind = jnp.where(jnp.any(parts), KIND_CODE["detachment"], kind)
     hit = jnp.where(ends, KIND_CODE["accumulation"], KIND_CODE["impact"])
+    hit = jnp.where(jams, KIND_CODE["paroxysm"], hit)
     return jnp.where(strikes, hit, kind).astype(jnp.int32)

@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from jimpact._checks import check_kind
+from jimpact.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.plot.style import COLOURS, GREY, SPREAD
 
@@ -26,6 +28,8 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     >>> len(figure.axes)
     2
     """
+    check_kind("fit: its experiments", fit.experiments, Experiments)
+    assert fit.experiments is not None
     shots, bodies = fit.predicted.shape
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
     x = np.arange(shots)[:, None] + dodge[None, :]
@@ -34,7 +38,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     figure.set_layout_engine("constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
     error = _error_bars(fit)
-    measured = np.asarray(fit.experiments.post, float)
+    measured = np.asarray(fit.problem.measured, float)
     for i in range(bodies):
         colour = COLOURS[i % len(COLOURS)]
         bars = None if error is None else error[:, i]
@@ -44,8 +48,9 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
         bottom.errorbar(x[:, i], fit.residual[:, i], bars, **style)
     for j, other in enumerate((others or {}).values()):
         top.plot(x, other.predicted, "x+*"[j % 3], color=GREY, ms=0.8 * size)
-    top.set_ylabel("velocity after the impact [m/s]")
-    bottom.set_ylabel("measured − fitted [m/s]")
+    units = ", ".join(dict.fromkeys(fit.experiments.units))
+    top.set_ylabel(f"velocity after the impact [{units}]")
+    bottom.set_ylabel(f"measured − fitted [{units}]")
     bottom.axhline(0, color=GREY, lw=0.8)
     _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
@@ -57,13 +62,14 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
 
 
 def _error_bars(fit: Fit) -> np.ndarray | None:
-    if fit.experiments.sigma is not None:
-        return np.asarray(fit.experiments.sigma, float)
+    if fit.problem.sigma is not None:
+        return np.broadcast_to(np.asarray(fit.problem.sigma, float), fit.predicted.shape)
     return np.full(fit.predicted.shape, fit.noise) if np.isfinite(fit.noise) else None
 
 
 def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
+    assert fit.experiments is not None  # checked
     labels = fit.experiments.shots
     if len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
@@ -78,7 +84,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
 
 
 def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
-    bars = "" if not has_bars else ", ± sigma" if fit.experiments.sigma is not None else ", ± noise"
+    bars = "" if not has_bars else ", ± sigma" if fit.problem.sigma is not None else ", ± noise"
     plain: dict[str, Any] = {"ls": "none", "color": "black"}
     handles = [
         Line2D([], [], marker="o", mfc="none", label=f"measured{bars}", **plain),

@@ -1,0 +1,212 @@
+"""Does the law fit at all: lack of fit, shots that do not belong, shots that cannot be used.
+
+No law changes a momentum that the contacts cannot change, and none tells shots apart that began
+alike: what residuals there are in these directions is noise. With it, or with the stated sigma,
+what the law leaves over is compared.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, fdtrc
+
+from jimpact.fits.multistart import EXACT, Search
+from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
+from jimpact.status import STATUS
+
+LEVEL = 0.01  # of each test: how often it speaks up on data that the law made
+_LEAST = 3  # degrees of freedom from which the noise is worth comparing with
+_RANGE = 1e-6  # singular values below this share are none (derivatives are good to 1e-7)
+_LISTED = 6  # shots named one by one
+# No velocity changes by so many times the largest one for a natural step of a parameter (as far as
+# from 0 to 1 for a restitution): derivatives beyond are errors, which would hold every step back.
+ABSURD = 1e3
+
+
+class Weighted(NamedTuple):
+    """Residuals (R,) of the measured values in units of sigma, derivatives (R, P), shots (R,)."""
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    shot: np.ndarray
+
+
+def unusable(problem: FitProblem, found: Search) -> np.ndarray:
+    """Shots (K,) whose impacts fail, or whose derivatives are no numbers or absurd."""
+    if not isinstance(problem.residuals.observe, Shots):
+        return np.zeros(1, bool)
+    shots, bodies = problem.measured.shape
+    weight = np.asarray(problem.residuals.weight, float)[..., None]
+    slope = np.abs(found.jacobian.reshape(shots, bodies, -1))
+    allowed = ABSURD * float(problem.residuals.unit) * weight
+    fails = [STATUS[code].name in UNUSABLE for code in found.status]
+    used = ~np.isnan(problem.measured).all(axis=1)
+    return used & (np.array(fails) | ~(slope <= allowed).all(axis=(1, 2)))
+
+
+def weighted(problem: FitProblem, found: Search) -> Weighted:
+    """Residuals and derivatives as the tests need them."""
+    r, here = problem.residuals, ~np.isnan(problem.measured)
+    size = float(r.size)
+    error = np.nan_to_num(problem.measured) - found.seen
+    rows = np.arange(len(here)) if here.ndim else np.zeros(1, int)
+    shot = np.broadcast_to(rows.reshape(-1, *(1,) * (here.ndim - 1)), here.shape)
+    return Weighted(
+        (size * np.asarray(r.weight, float) * error)[here],
+        size * found.jacobian[here.ravel()],
+        shot[here],
+    )
+
+
+def adequacy(problem: FitProblem, found: Search, rank: int) -> list[str]:
+    """Lack of fit and suspicious shots, in words; nothing of data that are reproduced exactly."""
+    data = weighted(problem, found)
+    squares, freedom = float(data.residual @ data.residual), problem.values - rank
+    dtype = str(problem.residuals.offset.dtype)
+    if freedom < 1 or squares <= EXACT[dtype] * float(problem.residuals.size) ** 2:
+        return []
+    lines = []
+    if problem.sigma is not None:
+        if chdtrc(freedom, squares) < LEVEL:
+            times = np.sqrt(squares / freedom)
+            lines.append(
+                f"Lack of fit: the residuals are {times:.2g} times what sigma allows (chi^2 = "
+                f"{squares:.4g} with {freedom} degrees of freedom): the law or the stated errors "
+                "are wrong, and the standard errors too small."
+            )
+    elif problem.experiments is not None:
+        lines += _beyond_noise(problem, data, freedom) or _pattern(problem, data, freedom)
+    if problem.experiments is not None:
+        lines += _suspicious(problem, data, freedom)
+    return lines
+
+
+def _beyond_noise(problem: FitProblem, data: Weighted, freedom: int) -> list[str]:
+    """What the law leaves over, against the noise of momentum and of repeated shots."""
+    noise, count = _noise(problem, data)
+    rest = freedom - count
+    if count < _LEAST or rest < 1:
+        return []
+    left = max(float(data.residual @ data.residual) - noise, 0.0)
+    floor = count * _reading_variance(problem)
+    ratio = left / rest / max(noise / count, floor / count)
+    if fdtrc(rest, count, ratio) >= LEVEL:
+        return []
+    return [
+        f"Lack of fit: the residuals are {np.sqrt(ratio):.2g} times the noise that momentum and "
+        f"repeated shots show ({rest} and {count} degrees of freedom): the law does not fit, and "
+        "the standard errors mean little."
+    ]
+
+
+def _noise(problem: FitProblem, data: Weighted) -> tuple[float, int]:
+    """Sum of squares that no law can change, and its degrees of freedom."""
+    experiments = problem.experiments
+    assert experiments is not None
+    groups: dict[Any, list[int]] = {}
+    scenes = experiments.scenes
+    for k, pre in enumerate(np.asarray(experiments.pre)):
+        own = k if scenes is not None else 0  # shots in scenes of their own are no repetitions
+        groups.setdefault((own, pre.tobytes()), []).append(k)
+    conserved, bodies = _conserved(problem), problem.measured.shape[1]
+    squares, count = 0.0, 0
+    for shots in groups.values():
+        blocks = [data.residual[data.shot == k] for k in shots]
+        whole = np.array([block for block in blocks if len(block) == bodies])
+        if len(whole) == 0:
+            continue
+        mean, basis = whole.mean(axis=0), conserved[shots[0]]
+        squares += float(np.sum((whole - mean) ** 2))
+        squares += len(whole) * float(np.sum((basis.T @ mean) ** 2))
+        count += (len(whole) - 1) * bodies + basis.shape[1]
+        if experiments.lost_freedom:  # a correction took the momentum of every shot
+            count -= len(whole) * basis.shape[1]
+    return squares, count
+
+
+def _conserved(problem: FitProblem) -> list[np.ndarray]:
+    """Of every shot the directions (n, c) in which residuals are momentum: orthonormal columns."""
+    assert problem.experiments is not None
+    weight = np.asarray(problem.residuals.weight, float) * float(problem.residuals.size)
+    found = []
+    for (rows, _, _), w in zip(problem.experiments.balances(problem.scene), weight):
+        whole = (w > 0).all() and len(rows)
+        found.append(np.linalg.qr((rows / w).T)[0] if whole else np.zeros((len(w), 0)))
+    return found
+
+
+def _reading_variance(problem: FitProblem) -> float:
+    """Of readings that were rounded: their last digit squared over 12, in weighted units."""
+    values = problem.measured[~np.isnan(problem.measured)]
+    largest = np.abs(values).max()
+    for digits in range(9):
+        if np.abs(values - values.round(digits)).max() <= 1e-9 * largest:
+            weight = float(problem.residuals.weight.max()) * float(problem.residuals.size)
+            return weight**2 * 10.0 ** (-2 * digits) / 12
+    return 0.0
+
+
+def _pattern(problem: FitProblem, data: Weighted, freedom: int) -> list[str]:
+    """Whether the residuals are proportional to the velocities before: by an F test."""
+    assert problem.experiments is not None
+    pre = np.asarray(problem.experiments.pre, float)
+    u, singular, _ = np.linalg.svd(pre, full_matrices=False)
+    basis = u[:, singular > 1e-9 * singular[0]]
+    body = np.broadcast_to(np.arange(pre.shape[1]), problem.measured.shape)
+    body = body[~np.isnan(problem.measured)]
+    more = np.hstack([basis[data.shot] * (body == i)[:, None] for i in range(pre.shape[1])])
+    residual, known = data.residual.copy(), _range(data.jacobian)
+    rest = freedom
+    for k, momentum in enumerate(_conserved(problem)):  # no law explains that part
+        if momentum.shape[1]:
+            rows = data.shot == k
+            more[rows] -= momentum @ (momentum.T @ more[rows])
+            residual[rows] -= momentum @ (momentum.T @ residual[rows])
+            rest -= 0 if problem.experiments.lost_freedom else momentum.shape[1]
+    extra = _range(more - known @ (known.T @ more), float(np.linalg.norm(more)))
+    rest -= extra.shape[1]
+    explained = float(np.sum((extra.T @ residual) ** 2))
+    left = float(residual @ residual) - explained
+    if rest < _LEAST or left <= 0 or extra.shape[1] == 0:
+        return []
+    ratio = explained / extra.shape[1] / (left / rest)
+    if fdtrc(extra.shape[1], rest, ratio) >= LEVEL:
+        return []
+    return [
+        "Lack of fit: the residuals follow the velocities before the impact (F = "
+        f"{ratio:.3g} with {extra.shape[1]} and {rest} degrees of freedom): the law does not fit."
+    ]
+
+
+def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
+    """Orthonormal columns that span those of the matrix, but for what is small beside `size`."""
+    u, singular, _ = np.linalg.svd(matrix, full_matrices=False)
+    return u[:, singular > _RANGE * (singular[0] if size is None else size)]
+
+
+def _suspicious(problem: FitProblem, data: Weighted, freedom: int) -> list[str]:
+    """Shots that the others, fitted without them, would not expect."""
+    assert problem.experiments is not None
+    known, labels = _range(data.jacobian), problem.experiments.shots
+    total = float(data.residual @ data.residual)
+    found, count, reading = [], len(np.unique(data.shot)), _reading_variance(problem)
+    for k in np.unique(data.shot):
+        rows = data.shot == k
+        r, q, n = data.residual[rows], known[rows], int(rows.sum())
+        rest = freedom - n
+        if rest < _LEAST:
+            return []
+        own = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
+        noise = max(total - own, 0.0) / rest + reading
+        if problem.sigma is not None:
+            noise = max(noise, 1.0)
+        if own > 0 and (noise == 0 or fdtrc(n, rest, own / n / noise) < LEVEL / count):
+            found.append((own, labels[k]))
+    if not found:
+        return []
+    worst = ", ".join(label for _, label in sorted(found, reverse=True)[:_LISTED])
+    more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+    return [
+        f"Suspicious: shot{'s' * (len(found) > 1)} {worst}{more}, which the others do not expect "
+        f"(of {count}); look there for errors, or fit with loss='huber'."
+    ]

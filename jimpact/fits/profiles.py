@@ -1,0 +1,307 @@
+"""Intervals that are true: how well the data are fitted with one parameter held, all others free.
+
+A standard error is half the width of a parabola. Where the sum of squares is none (a bound, a flat
+valley, several minima), the profile is the interval: one-sided, or of several pieces.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import numpy as np
+from scipy.special import ndtri, stdtrit
+
+from jimpact.fits.least_squares import DEFAULT_STEPS, Box, SolverState
+from jimpact.fits.multistart import EXACT, START_SCALES, repeated, run
+from jimpact.fits.problem import Residuals, filled_up, from_scaled, to_scaled
+from jimpact.progress import progress_bar
+
+if TYPE_CHECKING:
+    from jimpact.fits.fitting import Fit
+
+NEAR = np.linspace(-4, 4, 17)  # standard errors around a minimum
+ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
+_METHOD = "levenberg-marquardt"
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Deviance (G,) over the values (G,) of one parameter, and where it is below the limit.
+
+    `deviance` is the sum of squares with the parameter held, less its least value, over the noise
+    variance. `intervals` are the pieces of the confidence interval, in order; an end at `domain` is
+    none: the data do not bound the parameter there. `better`: values of a minimum below that of the
+    fit, or None.
+    """
+
+    name: str
+    value: np.ndarray
+    deviance: np.ndarray
+    limit: float
+    level: float
+    intervals: tuple[tuple[float, float], ...]
+    domain: tuple[float, float]
+    better: np.ndarray | None = None
+
+    @property
+    def words(self) -> str:
+        """The interval in words.
+
+        >>> import numpy as np
+        >>> from jimpact.fits.profiles import Profile
+        >>> given = ("e", np.zeros(1), np.zeros(1), 4.0, 0.95)
+        >>> Profile(*given, ((0.25, 0.5), (0.75, 1.0)), (0.0, 1.0)).words
+        '0.25 to 0.5 or at least 0.75'
+        """
+        return " or ".join(self._piece(*ends) for ends in self.intervals)
+
+    def _piece(self, low: float, high: float) -> str:
+        open_low, open_high = low <= self.domain[0], high >= self.domain[1]
+        if open_low and open_high:
+            return "anything"
+        if open_low or open_high:
+            return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+        return f"{low:.5g} to {high:.5g}"
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.words} ({100 * self.level:g} %)"
+
+
+def profile(
+    fit: "Fit",
+    names: str | Iterable[str] | None = None,
+    *,
+    level: float = 0.95,
+    points: int = 33,
+    progress: float | None = None,
+) -> tuple[Profile, ...]:
+    """Profile likelihoods of parameters: intervals that need no parabola.
+
+    Equation: `D(x_i) = (min over the others of |r|^2 - least |r|^2) / s^2 <= q^2`, q the quantile
+    of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
+
+    Held values cover the whole domain and the neighbourhood of the minimum; all are solved side by
+    side, from the fit and once more from their better neighbours. Where a scan finds a further
+    valley, it is followed to its minimum. Without sigma and with no degree of freedom left, the
+    interval is that of the values which reproduce the data exactly.
+
+    Args:
+        fit: by least squares.
+        names: of parameters; None: all.
+        level: of the confidence intervals, in (0, 1).
+        points: held values across the domain, besides those near the minimum, at least 3.
+        progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
+
+    Raises:
+        ValueError: level, points or names; a robust loss; a matrix that is kept admissible.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.01, 0.98], [0.0, 2.01]], sigma=0.02)
+    >>> found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> print(*ji.profile(found))
+    restitution: at least 0.97321 (95 %)
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+    if points < 3:
+        raise ValueError(f"Argument `points` must be at least 3, but has value {points}.")
+    if fit.loss != "squares" or not isinstance(fit.problem.residuals.region, Box):
+        raise ValueError(
+            "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."
+        )
+    wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
+    for name in wanted:
+        if name not in fit.names:
+            known = ", ".join(fit.names)
+            raise ValueError(f"Argument `names` must be among {known}, but has {name!r}.")
+    with progress_bar(progress) as show:
+        scans = _Scans(fit, [fit.names.index(name) for name in wanted], show)
+        scans.add([(i, y) for i in scans.which for y in scans.grid(i, points)])
+        scans.follow_valleys(level)
+        scans.find_ends(level)
+    return tuple(scans.profile(i, level) for i in scans.which)
+
+
+class _Scans:
+    """Held values of parameters and the minima with them, in scaled form, as far as known."""
+
+    def __init__(self, fit: "Fit", which: Sequence[int], show: Any):
+        self.fit, self.which, self.show = fit, which, show
+        r, first = fit.problem.residuals, fit.problem.parameters.first
+        self.residuals: Residuals = filled_up(r)
+        self.scale, self.log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
+        self.low, self.high = np.asarray(r.low, float), np.asarray(r.high, float)
+        self.size = float(r.size)
+        self.best = np.zeros(len(self.low))
+        self.best[: len(first)] = to_scaled(fit.value, self.scale, self.log)
+        self.least = fit.starts[0].sum_of_squares
+        # of each parameter: held value -> (sum of squares, y)
+        self.found: dict[int, dict[float, tuple[float, np.ndarray]]] = {
+            i: {float(self.best[i]): (self.least, self.best)} for i in which
+        }
+        self.lower: np.ndarray | None = None
+
+    def grid(self, i: int, points: int) -> np.ndarray:
+        """Values to hold: across the domain, and near the minimum."""
+        low = max(self.low[i], self.best[i] - START_SCALES) if not self.log[i] else self.low[i]
+        high = min(self.high[i], self.best[i] + START_SCALES) if not self.log[i] else self.high[i]
+        low = self.low[i] if np.isfinite(self.low[i]) else low
+        high = self.high[i] if np.isfinite(self.high[i]) else high
+        return np.r_[np.linspace(low, high, points), self._near(i, self.best, self._error(i))]
+
+    def _error(self, i: int) -> float:
+        step = self.fit.value[i] if self.log[i] else self.scale[i]
+        return float(self.fit.standard_error[i] / step)
+
+    def _near(self, i: int, y: np.ndarray, error: float) -> np.ndarray:
+        if not np.isfinite(error):
+            return np.zeros(0)
+        return np.clip(y[i] + error * NEAR, self.low[i], self.high[i])
+
+    def _solve(self, held: Sequence[tuple[int | None, np.ndarray]]) -> SolverState:
+        """Minima from y (Q,), with the i-th entry held, None: nothing."""
+        starts = np.array([y for _, y in held])
+        low, high = (np.tile(end, (len(held), 1)) for end in (self.low, self.high))
+        for k, (i, y) in enumerate(held):
+            if i is not None:
+                low[k, i] = high[k, i] = y[i]
+        dtype = self.residuals.offset.dtype
+        box: Any = Box(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
+        many = repeated(self.residuals, len(held))
+        many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
+        return run(many, starts, _METHOD, DEFAULT_STEPS[_METHOD], self.show, rivals=False)
+
+    def _take(self, held: Sequence[tuple[int, np.ndarray]]) -> None:
+        """Solve, and keep what is better than what was known."""
+        if not held:
+            return
+        states = self._solve(held)
+        squares = 2 * np.asarray(states.cost, float) * self.size**2
+        for k, (i, y) in enumerate(held):
+            known = self.found[i].get(float(y[i]), (np.inf, y))
+            if squares[k] < known[0]:
+                end = np.array(states.y[k], float)
+                end[i] = y[i]
+                self.found[i][float(y[i])] = (float(squares[k]), end)
+        best = min((entry for found in self.found.values() for entry in found.values()), key=_first)
+        exact = EXACT[str(self.residuals.offset.dtype)] * self.size**2
+        if best[0] < self.least * (1 - 1e-6) - exact:
+            self.least, self.lower = best
+
+    def add(self, held: Sequence[tuple[int, float]]) -> None:
+        """New held values: from the nearest known minimum, then from their better neighbour."""
+        self._take([(i, _with(self._nearest(i, y), i, y)) for i, y in held])
+        if len(self.fit.names) == 1:
+            return
+        again = []
+        for i, y in held:
+            values = sorted(self.found[i])
+            k = values.index(float(y))
+            beside = [
+                self.found[i][x] for x in (*values[max(k - 1, 0) : k], *values[k + 1 : k + 2])
+            ]
+            squares, start = min(beside, key=_first)
+            if squares < self.found[i][float(y)][0]:
+                again.append((i, _with(start, i, y)))
+        self._take(again)
+
+    def _nearest(self, i: int, y: float) -> np.ndarray:
+        return self.found[i][min(self.found[i], key=lambda known: abs(known - y))][1]
+
+    def deviance(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Held values and their deviances."""
+        values = np.array(sorted(self.found[i]))
+        squares = np.array([self.found[i][y][0] for y in values])
+        return values, np.maximum(squares - self.least, 0.0) / self._variance()
+
+    def _variance(self) -> float:
+        noise = self.fit.noise
+        if np.isfinite(noise) and noise > 0:
+            return float(noise**2)
+        return EXACT[str(self.residuals.offset.dtype)] * self.size**2
+
+    def limit(self, level: float) -> float:
+        """Deviance at the ends of an interval."""
+        freedom, tail = self.fit.degrees_of_freedom, 0.5 + 0.5 * level
+        known = self.fit.problem.sigma is not None or freedom < 1
+        return float(ndtri(tail) if known else stdtrit(freedom, tail)) ** 2
+
+    def follow_valleys(self, level: float) -> None:
+        """Held values around the minima that further valleys of the scans lead to."""
+        starts = []
+        for i in self.which:
+            values, d = self.deviance(i)
+            inside = np.flatnonzero((d[1:-1] < d[:-2]) & (d[1:-1] <= d[2:])) + 1
+            starts += [(i, self.found[i][values[k]][1]) for k in inside if d[k] > self.limit(level)]
+        if not starts:
+            return
+        states = self._solve([(None, y) for _, y in starts])
+        more = []
+        for k, (i, _) in enumerate(starts):
+            jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
+            inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
+            error = np.sqrt(self._variance() * inverse[i, i])
+            y = np.asarray(states.y[k], float)
+            squares = 2 * float(states.cost[k]) * self.size**2
+            if (squares - self.least) / self._variance() <= self.limit(level):
+                self.found[i].setdefault(float(y[i]), (squares, y))
+                more += [(i, float(x)) for x in self._near(i, y, float(error))]
+        self.add(more)
+
+    def find_ends(self, level: float) -> None:
+        """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
+        limit = np.sqrt(self.limit(level))
+        for turn in range(ROUNDS):
+            trials = []
+            for i in self.which:
+                values, d = self.deviance(i)
+                height = np.sqrt(d) - limit
+                for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
+                    a, b, p, q = values[k], values[k + 1], height[k], height[k + 1]
+                    share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
+                    y = a + np.clip(share, 0.02, 0.98) * (b - a)
+                    if a < y < b and abs(b - a) > 1e-6 * max(1.0, abs(a)):
+                        trials.append((i, _with(self._nearest(i, y), i, y)))
+            if not trials:
+                return
+            self._take(trials)
+
+    def profile(self, i: int, level: float) -> Profile:
+        """What is known of a parameter."""
+        values, d = self.deviance(i)
+        limit, real = self.limit(level), self._real(i, values)
+        below = np.flatnonzero(d <= limit)
+        pieces = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
+        intervals = []
+        for piece in pieces:
+            ends = []
+            for k, step in ((piece[0], -1), (piece[-1], 1)):
+                beyond = k + step
+                if not 0 <= beyond < len(values):
+                    ends.append(self.fit.problem.domains[i][(step + 1) // 2])
+                    continue
+                p, q = np.sqrt(d[k]), np.sqrt(d[beyond])
+                share = (np.sqrt(limit) - p) / (q - p)
+                y = values[k] + share * (values[beyond] - values[k])
+                ends.append(float(self._real(i, np.array([y]))[0]))
+            intervals.append((float(ends[0]), float(ends[1])))
+        low, high = self.fit.problem.domains[i]
+        better = None
+        if self.lower is not None:
+            better = from_scaled(self.lower[: len(self.scale)], self.scale, self.log)
+        given = (self.fit.names[i], real, d, limit, level, tuple(intervals))
+        return Profile(*given, (float(low), float(high)), better)
+
+    def _real(self, i: int, y: np.ndarray) -> np.ndarray:
+        return np.asarray(from_scaled(y, self.scale[i], np.broadcast_to(self.log[i], y.shape)))
+
+
+def _first(entry: tuple[float, Any]) -> float:
+    return entry[0]
+
+
+def _with(y: np.ndarray, i: int, value: float) -> np.ndarray:
+    changed = np.array(y, float)
+    changed[i] = value
+    return changed
