@@ -63,8 +63,15 @@ def program() -> int:
     """The entry point of the program `jimpact`; what `main` does, and ctrl-C ends it."""
     call = Call()
     end_on_interrupt(call.farewell)
-    code = main(call=call)
-    sys.stdout.flush()
+    try:
+        code = main(call=call)
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read has read enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 0
+    except KeyboardInterrupt:  # where signals cannot be waited for
+        print(call.farewell(), file=sys.stderr)
+        code = INTERRUPTED
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done; the interpreter may clean up
     return code
 
@@ -93,9 +100,8 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
         call.steps = Steps(call.name)
         failure = run(given, call.steps)
         return call.refused(failure, FAILURE) if failure else 0
-    except BrokenPipeError:  # whoever read has read enough, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except BrokenPipeError:
+        raise
     except (ValueError, TypeError, OSError, ImportError) as error:
         return call.refused(error, BAD_INPUT)
     except RuntimeError as error:
@@ -157,7 +163,7 @@ def end_on_interrupt(farewell: Callable[[], str]) -> None:
     main thread, which a compiler may keep for ten seconds, and an exception raised amid calls of
     XLA is lost or fatal. Where ctrl-C is ignored it stays so.
     """
-    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    if os.name != "posix" or signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         return
     once = threading.Lock()
     listen, tell = os.pipe()
