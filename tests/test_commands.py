@@ -23,7 +23,7 @@ from jimpact.cli import keep_programs, main
 from jimpact.motion.study_motion import read_motion_study
 from jimpact.study import body_of, read_study
 
-SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.4,1.64\n"
+SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
 STUDY = """
 [scene]
 masses_kg = [1.0, 1.0]

@@ -552,6 +552,72 @@ def test_bad_profiles(options, message):
         ji.profile(robust)
 
 
+# --------------------------------------------------------------------- many fits
+
+
+def test_many_data_sets_are_fitted_as_one_by_one():
+    posts = [simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02, seed=k) for k in range(5)]
+    sets = [ji.Experiments(SHOTS[: 2 + k % 3], post[: 2 + k % 3]) for k, post in enumerate(posts)]
+    for data, found in zip(sets, ji.fit_many(ji.Newton(0.9), PAIR, sets)):
+        alone = ji.fit(ji.Newton(0.9), PAIR, data)
+        np.testing.assert_allclose(found.value, alone.value, rtol=1e-9)
+        np.testing.assert_allclose(found.standard_error, alone.standard_error, rtol=1e-9)
+        assert found.degrees_of_freedom == alone.degrees_of_freedom
+        assert found.converged
+
+
+def test_every_shot_is_predicted_from_the_others():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    post[1, 0] = np.nan
+    left = ji.leave_one_out(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post)))
+    for k in range(4):
+        rest = [i for i in range(4) if i != k]
+        e, error, rest = newton_in_closed_form(post[rest], np.ones((3, 2)), SHOTS[rest])
+        near = 1e-4 * np.sqrt(rest / 4) * error  # of a standard error: converged
+        np.testing.assert_allclose(left.value[k], [e], atol=near)
+        expected = simulated(ji.Newton(e), PAIR, SHOTS[k : k + 1])[0]
+        np.testing.assert_allclose(left.predicted[k], expected, atol=2 * near)
+    one = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[:1], post[:1]), starts=1)
+    with pytest.raises(ValueError, match="at least 2 shots"):
+        ji.leave_one_out(one)
+
+
+def test_bootstrap_scatters_as_much_as_the_standard_error():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    for sigma in (None, 0.03):
+        found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, sigma))
+        many = ji.bootstrap(found, samples=400)
+        np.testing.assert_allclose(many.value.std(ddof=1), found.standard_error[0], rtol=0.15)
+        np.testing.assert_allclose(many.value.mean(), found.value[0], atol=0.005)
+        low, high = many.interval()[0]
+        assert low < found.value[0] < high
+    exact = ji.Experiments(SHOTS[:1], [[np.nan, 0.6]])
+    with pytest.raises(ValueError, match="must have a known noise"):
+        ji.bootstrap(ji.fit(ji.Newton(0.9), PAIR, exact, starts=1))
+
+
+def test_the_next_shot_is_the_one_that_tells_most():
+    """Against fits of all data together: the errors promised, and the best of the candidates."""
+    noise, law = 0.01, ji.Newton([0.8, 0.6])
+    seen = ji.Experiments(PRE_3[:1], simulated(law, BALLS, PRE_3[:1]), noise)
+    found = ji.fit(law, BALLS, seen, starts=1)
+    assert found.rank == 1  # nothing has approached contact 2
+    more = np.array([[2.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, -2.0]])
+    errors = []
+    for pre in more:
+        both = np.stack([PRE_3[0], pre])
+        data = ji.Experiments(both, simulated(law, BALLS, both), noise)
+        errors.append(ji.fit(law, BALLS, data, starts=1).standard_error)
+    plan = ji.design(found, ji.Experiments(more, more, noise))
+    assert plan.index.tolist() == [2]
+    np.testing.assert_allclose(plan.standard_error[0], errors[2], rtol=1e-3)
+    same = ji.design(found, ji.Experiments(more, more), count=2, target="restitution[1]")
+    assert same.index[0] == 0
+    assert same.standard_error.shape == (2, 2)
+    with pytest.raises(ValueError, match="`target` must be one of"):
+        ji.design(found, seen, target="friction")
+
+
 def test_a_law_with_a_matrix_field():
     truth = Coupled(jnp.array([[0.6, 0.1], [0.05, 0.4]]))
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))

@@ -635,3 +635,17 @@ def test_slopes_where_a_real_cube_comes_to_stick():
     close(slope[:, 0], (v[:, 1] - v[:, 2]) / (2 * step), atol=2e-2)
     sticks = rows["toss"] == 46
     assert np.abs(slope[0, 0, sticks]).max() < 0.01
+
+
+@pytest.mark.slow
+def test_history_of_contacts_with_friction():
+    """It starts and ends as the impact does, in the cone and against the slip meanwhile."""
+    law, scene = ji.LZB(0.8, friction=0.3), ji.rocking_block(width=1.0, height=2.0)
+    v = np.array([1.0, -1.0, 0.0])
+    out, h = ji.impact(law, scene, v), ji.history(law, scene, v, samples=50)
+    assert h.slip.shape == h.tangential_force.shape == (50, 2)
+    close(h.slip[0], np.asarray(scene.tangents).T @ v, rtol=1e-9)
+    close(h.velocity[-1], out.velocity, atol=1e-7)
+    close(h.tangential_impulse[-1], out.tangential_impulse, atol=1e-7)
+    assert (np.abs(h.tangential_force) <= 0.3 * h.force * (1 + 1e-9)).all()
+    assert (h.tangential_force * h.slip <= 1e-9).all()

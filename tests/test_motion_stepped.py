@@ -240,6 +240,16 @@ def test_what_goes_wrong_on_the_way_is_told(gap, mass, restitution, expected):
     assert status(run(restitution)) == expected
 
 
+def test_a_motion_says_how_its_law_fails():
+    motion = stepped(ROW, ji.Moreau(1.0), [0.0, 0.3, 0.6], [0.0] * 3)
+    codes = motion.events.status.at[0].set(ji.impacts.CODE["negative_impulse"])
+    failed = eqx.tree_at(
+        lambda m: (m.status, m.events.status), motion, (jnp.int32(MOTION_CODE["law_failed"]), codes)
+    )
+    with pytest.raises(RuntimeError, match=r"law_failed: .*: negative_impulse"):
+        ji.raise_on_failed_motion(failed)
+
+
 def test_friction_below_0_is_told():
     run = jax.jit(
         lambda mu: stepped(

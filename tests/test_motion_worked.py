@@ -138,6 +138,17 @@ def test_three_touching_beads_come_to_rest():
 
 
 @pytest.mark.slow
+def test_open_contacts_take_no_part_in_an_impact():
+    """Not by a law either that resolves the collisions to come (it knows no gravity meanwhile)."""
+    beads, start = ji.column_system([0.1] * 3), [0.1, 0.101, 0.102]
+    motion = ji.simulate(beads, ji.Binary(0.9), start, [0.0] * 3, 0.5, samples=2)
+    count = int(motion.events.count)
+    assert count > 10
+    gaps = np.asarray(jax.vmap(beads.body.gap_function)(motion.events.q[:count]))
+    assert gaps[np.asarray(motion.events.contacts)[:count]].max() < 1e-9
+
+
+@pytest.mark.slow
 def test_an_overturned_block_lies_on_its_side():
     motion = ji.simulate(
         ji.block_system(0.2, 0.6), ji.LZB(0.3), upright(0.5), [0.0] * 3, 3.0, samples=31

@@ -210,6 +210,10 @@ def test_rocking(aspect):
     np.testing.assert_allclose(out.impulse[1], 0, atol=1e-14)
     assert float(out.impulse[0]) > 0
     assert int(out.status) == 0
+    # and with less the block would have to be pulled there
+    for share, told in ((1.001, "ok"), (0.999, "negative_impulse")):
+        out = ji.impact(RestitutionMatrix(rocking_matrix(share * e)), scene, v)
+        assert int(out.status) == CODE[told]
 
 
 def test_rocking_ratios_are_a_conversion():

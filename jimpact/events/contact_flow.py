@@ -365,7 +365,7 @@ class ContactFlow:
 
     def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
         """Forces, velocities and the rate of time in a state."""
-        const, none = self.constants(modes), y[:0]
+        const, none = ContactFlow.constants(self, modes), y[:0]
         x, g, p = self.rows(y)
         force = self.force(const, x, g)
         return Measured(force, x, p, const.scale * g, none, none, none, const.unit)

@@ -158,6 +158,7 @@ class FitProblem:
     measured: np.ndarray  # NaN where not
     sigma: np.ndarray | None
     values: int  # independent measured values
+    free: Any  # as asked for
     experiments: Experiments | None = None
     scene: Scene | None = None
     left_out: tuple[str, ...] = ()  # which shots, in words
@@ -364,7 +365,7 @@ def _build(
         **{name: jnp.asarray(array, dtype) for name, array in arrays.items()},
     )
     count, domains = int(here.sum()), np.stack(limits, axis=1)
-    return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count)
+    return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count, free)
 
 
 def _scales(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.records import as_data, fields_as_data
-from jimpact.status import Status
+from jimpact.status import STATUS, Status
 
 # of these rows `failure` marks motions that end before t_end; the code is the row number
 MOTION_STATUS = (
@@ -208,6 +208,15 @@ def _batch_report(motion: Motion) -> str:
     return f"{np.size(motion.status)} motions: {told}"
 
 
+def _said(motion: Motion, row: Status, lanes: np.ndarray) -> str:
+    """What the law says where it fails."""
+    if row.name != "law_failed":
+        return ""
+    codes = np.asarray(motion.events.status).reshape(motion.status.size, -1)[lanes]
+    names = [STATUS[code].name for code in np.unique(codes.max(axis=1)) if code]
+    return f": {', '.join(names)}" if names else ""
+
+
 def raise_on_failed_motion(motion: Motion) -> Motion:
     """Raise a RuntimeError naming every failed motion (batched or not); else return it.
 
@@ -224,7 +233,7 @@ def raise_on_failed_motion(motion: Motion) -> Motion:
         if row.failure:
             at = np.flatnonzero(codes.ravel() == code)
             where = f" at {', '.join(map(str, at[:5]))}" if codes.size > 1 else ""
-            lines.append(f"{row.name}: {row.message} ({len(at)}{where})")
+            lines.append(f"{row.name}: {row.message} ({len(at)}{where}){_said(motion, row, at)}")
     if lines:
         raise RuntimeError(f"Failed motions among {codes.size}:\n  " + "\n  ".join(lines))
     return motion

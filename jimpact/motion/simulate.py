@@ -70,7 +70,8 @@ def simulate(
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
     Equation: between impacts that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at contacts that
-    are closed and at rest; at an impact `v+` of `ji.impact` in the frame of the base.
+    are closed and at rest; at an impact `v+` of `ji.impact` in the frame of the base. Where
+    friction leaves no such lambda, an impact without collision stops the slip, if the law has one.
 
     Args:
         system: gaps, mass, forces, base.

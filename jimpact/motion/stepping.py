@@ -2,14 +2,14 @@
 
 One step of length h (after Remark 6.9 of Brogliato):
 
-    q_m = q + h/2 v                              the midpoint says which contacts are closed
+    q_m = q + h/2 v                              closed: here, or at the end by forces alone
     v'  = v + h M^-1 F + M^-1 (N p + H p_t)      0 <= p _|_ gamma' + w >= 0
     q'  = q_m + h/2 v'                           p_t in -mu p Sgn(u' + w_t)
 
 with `w = e gamma` of a contact that approaches by Moreau's law, which so joins the problem. Any
 other law acts before it, in the middle of the forces, `v+ = impact(law, scene(q_m), v + h/2 M^-1
 F)`, and slow approach (within what forces give in two steps) is rest, `w = 0`. Order 1: an impact
-is late by up to h.
+is early or late by up to h / 2.
 
 ENERGY. A contact gives `p (gamma' + gamma) / 2`: no energy where `w >= gamma`. So what leaves may
 come back as fast as it leaves, `w = gamma`, and is at rest two steps later. Friction is against the

@@ -204,7 +204,7 @@ def resolve(
     if m == 1:
         found = resting(slow)
     else:
-        nested = closed & strikes & _share_bodies(given, closed | struck)
+        nested = closed & strikes & ~jams & _share_bodies(given, closed | struck)
         nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
         both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
         found, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))

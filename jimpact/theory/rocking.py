@@ -69,6 +69,10 @@ def rocking_matrix(restitution: Any) -> jax.Array:
     Returns:
         E for `RestitutionMatrix`, on a planar scene of one block with its two corners.
 
+    Status: an impact with less than Housner's value (`housner_restitution`) is `negative_impulse`:
+    the corner that is left behind would have to be pulled down. Exactly there its impulse is 0, and
+    derivatives are one-sided.
+
     Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.2.2, with the signs of
     `v+ = -E v-`.
 

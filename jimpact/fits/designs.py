@@ -1,0 +1,122 @@
+"""The next experiment: which shots would tell most about the parameters of a fit."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from jimpact._checks import as_whole, check_kind
+from jimpact.experiments import Experiments
+from jimpact.fits.fitting import Fit
+from jimpact.fits.least_squares import Box
+from jimpact.fits.multistart import repeated, run
+from jimpact.fits.problem import FitProblem, filled_up, to_scaled
+from jimpact.scene import Scene
+
+# Information that is added to that of the data, in shares of their largest: where they cannot see a
+# combination of parameters yet, it is gained first.
+_RIDGE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Shots to do next, in order, and the standard errors (count, P) after each of them."""
+
+    shots: tuple[str, ...]
+    index: np.ndarray
+    names: tuple[str, ...]
+    standard_error: np.ndarray
+
+    def __str__(self) -> str:
+        lines = []
+        for shot, errors in zip(self.shots, self.standard_error):
+            told = ", ".join(f"{name} +- {x:.2g}" for name, x in zip(self.names, errors))
+            lines.append(f"shot {shot}: {told}")
+        return "\n".join(lines)
+
+
+def design(
+    fit: Fit,
+    candidates: Experiments,
+    scene: Scene | None = None,
+    count: int = 1,
+    target: str | None = None,
+) -> Design:
+    """The candidates that would tell most, one after another, if the fitted law is right.
+
+    Equation: of every shot the information `J^T J / sigma^2`; greedily, the determinant of the sum
+    with what is known is made as large as possible, or the variance of the `target` least. All
+    candidates are computed by one program.
+
+    Args:
+        fit: to shots, with a known noise.
+        candidates: velocities before (K, n), scenes where they differ; of `post` it only counts
+            what is measured (NaN: is not). Without sigma, the noise of the fit, or the median of
+            its sigma.
+        scene: of the candidates; None: that of the fit.
+        count: how many to choose; one may be chosen several times.
+        target: name of the parameter that is wanted; None: all.
+
+    Raises:
+        ValueError: no shots or no known noise, count, target, scenes that do not fit.
+
+    >>> import jimpact as ji
+    >>> balls = ji.chain([1.0, 1.0, 1.0])
+    >>> data = ji.Experiments([[1.0, 0.0, 0.0]], [[0.1, 0.9, 0.0]], sigma=0.01)
+    >>> found = ji.fit(ji.Newton([0.8, 0.8]), balls, data, starts=1)  # contact 2 is not seen
+    >>> print(ji.design(found, ji.Experiments([[2.0, 0, 0], [0, 0, -1.0]], [[0.0] * 3] * 2)))
+    shot 2: restitution[1] +- 0.012, restitution[2] +- 0.012
+    """
+    check_kind("candidates", candidates, Experiments)
+    as_whole("count", count, 1)
+    if fit.experiments is None or not np.isfinite(fit.noise):
+        raise ValueError("Argument `fit` must be to shots, with a known noise.")
+    if target is not None and target not in fit.names:
+        known = ", ".join(fit.names)
+        raise ValueError(f"Argument `target` must be one of {known}, but has value {target!r}.")
+    own = fit.problem.scene if scene is None else scene
+    problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.free)
+    known = _information(fit.problem, fit, fit.noise).sum(axis=0)
+    noise = (
+        fit.noise
+        if fit.experiments.sigma is None
+        else float(np.nanmedian(np.asarray(fit.problem.sigma)))
+    )
+    each = _information(problem, fit, 1.0 if candidates.sigma is not None else noise)
+    known = known + _RIDGE * np.trace(known + each.sum(axis=0)) * np.eye(len(known))
+    first = fit.problem.parameters.first
+    r = fit.problem.residuals
+    scale = np.where(np.asarray(r.log)[first], fit.value, np.asarray(r.scale, float)[first])
+    chosen: list[int] = []
+    errors = []
+    for _ in range(count):
+        after = known + each
+        if target is None:
+            merit = np.linalg.slogdet(after)[1]
+        else:
+            i = fit.names.index(target)
+            merit = -np.linalg.inv(after)[:, i, i]
+        chosen.append(int(np.argmax(merit)))
+        known = after[chosen[-1]]
+        errors.append(scale * np.sqrt(np.diag(np.linalg.inv(known))))
+    labels = tuple(candidates.shots[k] for k in chosen)
+    return Design(labels, np.array(chosen), fit.names, np.array(errors))
+
+
+def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
+    """`J^T J / noise^2` (K, P, P) of every shot at the parameters of the fit, in scaled form."""
+    residuals, r, first = filled_up(problem.residuals), fit.problem.residuals, problem.parameters
+    y = np.zeros(len(r.offset))
+    log = np.asarray(r.log)[first.first]
+    y[: len(first.names)] = to_scaled(fit.value, np.asarray(r.scale, float)[first.first], log)
+    ends: Any = Box(*np.broadcast_to(y.astype(r.offset.dtype), (2, len(y))))  # held there
+    parts = (r.mix, r.offset, r.scale, ends.low, ends.high, ends)
+    here = eqx.tree_at(
+        lambda r: (r.mix, r.offset, r.scale, r.low, r.high, r.region), residuals, parts
+    )
+    states = run(repeated(here, 1), y[None], "levenberg-marquardt", 1, lambda *told: None)
+    shape = (*problem.measured.shape, -1)
+    slopes = np.asarray(states.jacobian[0][: problem.measured.size], float)
+    rows = slopes.reshape(shape)[..., : len(first.names)] * float(problem.residuals.size) / noise
+    return np.einsum("kip,kiq->kpq", rows, rows)
