@@ -284,7 +284,7 @@ def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------ chart
 
 QUICK = "\nThis is the quick look; --full does all of it."
-QUICK_METHODS = ("dop853", "verlet", "impulse_euler", "scipy_dop853")
+QUICK_METHODS = ("dop853", "verlet", "impulse_euler")
 QUICK_LAWS = ("moreau", "binary")
 
 

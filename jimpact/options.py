@@ -5,6 +5,7 @@
 
 import dataclasses
 import json
+import os
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -49,7 +50,8 @@ class Command:
 
     def kept(self) -> str:
         """What is left of an interrupted command."""
-        return "Programs compiled so far are kept, nothing else." if not self.no_cache else ""
+        cached = os.environ.get("JAX_COMPILATION_CACHE_DIR") and not self.no_cache
+        return "Compiled programs are kept, nothing else." if cached else "Nothing is kept."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,7 +183,7 @@ class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
     methods: tuple[str, ...] | None = None
-    """Methods by name; default: four that compile soon, as far as the scene allows."""
+    """Methods by name; default: three that compile soon, as far as the scene allows."""
     full: bool = False
     """Every method and algebraic law, durations, and the errors of the derivatives."""
     batch: int = 256
