@@ -330,6 +330,12 @@ def _check_motion(
 def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
     """Raise where a function of the system returns what cannot be used, by its shape alone."""
     body, n = system.body, v.shape[0]
+    mass = jax.eval_shape(partial(mass_at, system), q)
+    if mass.shape not in ((n,), (n, n)):
+        raise ValueError(
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
+            f"velocities, but has one of shape {mass.shape}."
+        )
 
     def returned(name: str, function: Any, *args: jax.Array) -> tuple[int, ...]:
         out = jax.eval_shape(lambda: jnp.asarray(function(*args)))
@@ -380,13 +386,6 @@ def _check_system(
     end: jax.Array,
     closed_below: float,
 ) -> None:
-    n = v.shape[0]
-    mass = jax.eval_shape(partial(mass_at, system), q)
-    if mass.shape not in ((n,), (n, n)):
-        raise ValueError(
-            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
-            f"velocities, but has one of shape {mass.shape}."
-        )
     # functions of a system may close over traced numbers
     mass, f = mass_at(system, q), gaps(system, q, start)
     if is_traced((system, q, v, start, end, mass, f)):
