@@ -270,7 +270,7 @@ class LawsCommand(Command):
     @property
     def light(self) -> bool:
         """Those of the package are known without JAX."""
-        return self.module is None
+        return self.module is None and not study_file.callers_laws()
 
     def run(self) -> int:
         """Print them."""

@@ -7,6 +7,7 @@ classes themselves.
 
 import functools
 import json
+import sys
 import tomllib
 from collections.abc import Callable, Mapping
 from importlib.resources import files
@@ -73,6 +74,12 @@ def known_laws() -> dict[str, Words]:
     """Those of the package by name; others are registered by modules."""
     rows = names()["laws"].items()
     return {name: Words(tuple(x["arguments"]), tuple(x["parameters"])) for name, x in rows}
+
+
+def callers_laws() -> set[str]:
+    """Names of laws that who calls this from Python has registered."""
+    registry = sys.modules.get("jimpact.registry")
+    return set() if registry is None else registry.REGISTRY.keys() - known_laws().keys()
 
 
 # ------------------------------------------------------------------------------- finding, reading
@@ -211,8 +218,9 @@ def law_values(
 
 
 def _check_law(table: Mapping[str, Any], other: str | None) -> str | None:
-    """Name of the law, None where a module must be imported to know; words and ranges checked."""
-    if "module" in table:
+    """Name of the law, None where only its class knows; words and ranges checked."""
+    wanted = {str(table.get("name", "")).lower(), (other or "").lower()}
+    if "module" in table or wanted & callers_laws():
         return None
     name, values, _ = law_values(table, other, known_laws())
     row = names()["laws"][name]
