@@ -447,9 +447,9 @@ def _failure(motion: "ji.Motion") -> str:
 
 
 def laws(given: options.LawsCommand, steps: Steps) -> Answer:
-    """The registry with the laws of a module; without one `LawsCommand.run` does it."""
-    assert given.module is not None
-    import_laws(given.module, Path())
+    """The registry with laws of others; those of the package alone `LawsCommand.run` lists."""
+    if given.module is not None:
+        import_laws(given.module, Path())
     if given.bibtex and not given.json:
         entries = dict.fromkeys(row.bibtex for row in ji.REGISTRY.values())
         return Answer("", {}, "\n\n".join(entries), {})
