@@ -134,6 +134,7 @@ def test_ties_within_rounding():
     assert z.min() >= 0
 
 
+@pytest.mark.slow
 def test_least_norm_of_many():
     """A table on four legs: of all impulses those of least norm, whatever their order."""
     legs = np.array([[1.0, 1, 1, 1], [1, 1, -1, -1], [1, -1, 1, -1]])

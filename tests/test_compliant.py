@@ -193,6 +193,7 @@ def test_damped_derivatives(force):
     assert total == pytest.approx(float(weight @ rate), rel=1e-8)
 
 
+@pytest.mark.slow
 def test_restitution_of_a_pair():
     """`measured_restitution` is what an impact gives; Hunt and Crossley's implicit relation."""
     k, m = 2.0, 0.7
@@ -213,6 +214,7 @@ def test_restitution_of_a_pair():
     assert float(ji.calibrate(ji.Hertz(1.0), 0.4, 1.0, 1.0).restitution) == 0.4
 
 
+@pytest.mark.slow
 def test_calibration_is_differentiable():
     def damping(x):
         return ji.calibrate(ji.KelvinVoigt(2.0, 0.0), x[0], x[1], x[2]).damping
@@ -344,6 +346,7 @@ def histories():
     return jax.jit(jax.vmap(one))
 
 
+@pytest.mark.slow
 def test_histories():
     """Half a sine, the energy ledger, the end of the impact, Falcon's wall force; no impact."""
     beads = np.append(np.full(2, 6.9716e9), 9.858e9)

@@ -80,6 +80,9 @@ def test_readme_runs():
     assert len(README.splitlines()) <= 150
 
 
+LONG_PAGES = ("fitting", "motions", "speed_accuracy")
+
+
 def code_of(path):
     """Python code of a page: fenced blocks, those with prompts by doctest."""
     text = path.read_text(encoding="utf-8")
@@ -91,7 +94,7 @@ def code_of(path):
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(p, id=p.stem, marks=[pytest.mark.slow] if p.stem == "speed_accuracy" else [])
+        pytest.param(p, id=p.stem, marks=[pytest.mark.slow] if p.stem in LONG_PAGES else [])
         for p in DOCS
         if any(code_of(p))
     ],

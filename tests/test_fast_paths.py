@@ -68,6 +68,7 @@ def test_exponents_and_chains(path):
     np.testing.assert_array_equal(out.status, same.status)
 
 
+@pytest.mark.slow
 def test_a_single_impact_is_one_of_a_batch():
     """Not batched, eager, filled up with open contacts; chains and their dense scenes."""
     given = [

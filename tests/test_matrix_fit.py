@@ -92,6 +92,7 @@ def test_an_admissible_matrix_to_start_from(scene):
     assert min(slacks(admissible_start([scene])[among], np.linalg.inv(g))) > -1e-9
 
 
+@pytest.mark.slow
 def test_a_study_of_a_matrix_needs_no_more_than_its_data(tmp_path):
     (tmp_path / "shots.csv").write_text(
         "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.25,0.75\n2,0,0.5,1.5\n"

@@ -62,6 +62,7 @@ def test_methods_converge_at_their_order(chart, name):
         assert point.batched.low <= point.batched.median <= point.batched.high
 
 
+@pytest.mark.slow
 def test_chart_in_words_and_picture(chart):
     np.testing.assert_allclose(chart.reference.velocity, HERTZ_AFTER, atol=1e-11)
     (binary,) = chart.points["binary"]  # the error of a model
@@ -332,6 +333,7 @@ def unknown():
     return quick(BALLS, STRIKE)
 
 
+@pytest.mark.slow
 def test_unknown_ratio_decides(unknown):
     """Nothing is within 1 % where k2/k1 is anywhere in [0.1, 10]; LZB is told, and what it lacks."""
     assert (unknown.name, unknown.within, unknown.reference) == ("lzb", False, "lzb")

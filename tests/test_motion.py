@@ -112,6 +112,7 @@ def stack(e, q, v, t_end, between=0.0, **options):
     return ji.simulate(system, ji.Moreau(jnp.asarray(e)), q, v, t_end, samples=2, **options)
 
 
+@pytest.mark.slow
 def test_contacts_that_share_bodies_come_to_rest_together():
     """What is passed lies within its estimates: in time, and in the gaps meanwhile."""
     dropped = 0.9, [0.1, 0.101, 0.102], [0.0] * 3
@@ -271,6 +272,7 @@ def first_contact(plate, q0, v0):
     return high
 
 
+@pytest.mark.slow
 def test_no_event_is_missed_between_two_looks():
     """384 vibrating plates, 120 that rise for a moment; a wall that an oscillator grazes."""
     r, n, k = np.random.default_rng(0), 384, 120

@@ -76,6 +76,7 @@ def overturns(width, height, amplitude, frequency, duration):
         side = np.sign(spin)
 
 
+@pytest.mark.slow
 def test_pulses_overturn_the_blocks_that_housner_says():
     """24 pulses; a fallen block lies on its side, on corners that did not touch before."""
     width, height, fallen = 0.2, 1.0, 0
@@ -283,6 +284,7 @@ def test_impacts_closer_than_a_step_are_one():
         np.testing.assert_allclose(motion.velocity[-1], after, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_tossed_block_never_gains_energy():
     """From step to step: at rest, in a stop, with unequal e, in impacts whose slip turns round."""
     rng, n = np.random.default_rng(0), 60

@@ -9,6 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jimpact as ji
+
+pytestmark = pytest.mark.slow  # they share a program, a dear one
 from jimpact.motion.record import EVENT_KINDS, MOTION_STATUS
 
 G = 9.81  # of a rod of mass 1 and length 2, whose end slides on the floor
@@ -185,7 +187,6 @@ def test_a_sliding_rod_jams():
     np.testing.assert_allclose(events.velocity_after[1], v, atol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["inconsistent", "jamming"])
 def test_its_derivatives(name):
     """Of the motion, along a direction of all that it starts with; its outcome is smooth."""

@@ -108,6 +108,7 @@ def test_shots_with_different_numbers_of_contacts_are_fitted_together():
     np.testing.assert_allclose(excess[[0, 2]][:, 0], 0.0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_padding_with_friction():
     """A cube's corner and its edge in one fit: contacts that are not there change nothing."""
     corner = ji.Scene([1.0, 1.0, 0.5], [[0.0], [1.0], [0.4]], tangents=[[1.0], [0.0], [0.3]])
@@ -142,6 +143,7 @@ def test_contacts_that_do_not_feel_each_other_are_solved_apart():
     np.testing.assert_allclose(apart.impulse, whole.impulse, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_groups_with_friction_and_open_contacts():
     normals, tangents = np.zeros((6, 3)), np.zeros((6, 3))
     for j in range(3):
@@ -158,6 +160,7 @@ def test_groups_with_friction_and_open_contacts():
     assert apart.velocity[4:].tolist() == [1.0, -1.0]
 
 
+@pytest.mark.slow
 def test_poisson_with_friction():
     """Coulomb's law in both phases, on random planar scenes; compression is a plastic Moreau impact."""
     rng = np.random.default_rng(0)
@@ -188,6 +191,7 @@ def test_poisson_with_friction():
     assert not slides.all()
 
 
+@pytest.mark.slow
 def test_poisson_of_one_contact_in_space():
     """A sphere that does not roll: with e_t = 0 both phases together are Moreau's impact."""
     sphere = ji.Scene(np.ones(3), [[0.0], [0.0], [1.0]], tangents=np.eye(3)[:, :2])
@@ -224,6 +228,7 @@ def test_ill_conditioned_is_told_and_nothing_else_is(dtype):
     assert list(status) == [CODE["ill_conditioned"], CODE["ok"]]
 
 
+@pytest.mark.slow
 def test_light_balls_with_gaps_and_knife_edges_are_right_or_told():
     """Masses and stiffnesses over three decades behind gaps; gaps of 1e-8 that open and close."""
     rng, half = np.random.default_rng(0), 48
