@@ -9,9 +9,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jimpact as ji
+from jimpact.motion.record import EVENT_KINDS, MOTION_STATUS
 
 pytestmark = pytest.mark.slow  # they share a program, a dear one
-from jimpact.motion.record import EVENT_KINDS, MOTION_STATUS
 
 G = 9.81  # of a rod of mass 1 and length 2, whose end slides on the floor
 INERTIA = np.array([1.0, 1.0, 1 / 3])
