@@ -155,13 +155,13 @@ def one(make):
 
 
 def both_ways(function):
-    """x (n,) -> Jacobian (k, n) of a function, forward and transposed, from one linearization."""
+    """x (n,) -> value (k,), Jacobian (k, n) forward and transposed, from one linearization."""
 
     @jax.jit
     def run(x):
         end, forward = jax.linearize(function, x)
         (reverse,) = jax.vmap(jax.linear_transpose(forward, x))(jnp.eye(len(end)))
-        return jax.vmap(forward, out_axes=1)(jnp.eye(len(x))), reverse
+        return end, jax.vmap(forward, out_axes=1)(jnp.eye(len(x))), reverse
 
     return run
 

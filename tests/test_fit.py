@@ -368,6 +368,7 @@ def test_a_contact_that_is_never_loaded_is_named():
     np.testing.assert_array_equal(found.standard_error[1:], np.inf)
 
 
+@pytest.mark.long_run
 @pytest.mark.slow
 def test_nine_parameters_of_a_chain_before_a_wall():
     scene = ji.chain([1.0, 2.0, 1.5, 3.0, 1.0], wall=True)

@@ -394,7 +394,7 @@ def test_derivatives_of_a_block_that_comes_to_stick():
         return jnp.stack([way, speed / slowing, -mu * G * jnp.cos(angle) * way])
 
     x = jnp.array([0.1, 1.0, 0.3])
-    for slopes in both_ways(found)(x):
+    for slopes in both_ways(found)(x)[1:]:
         np.testing.assert_allclose(slopes, jax.jit(jax.jacfwd(exact))(x), rtol=1e-11)
 
 

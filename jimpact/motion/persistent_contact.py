@@ -155,7 +155,7 @@ def _determinants(k: jax.Array) -> jax.Array:
     left, right = np.triu_indices(4, 1)
     upper = k[..., 0, left] * k[..., 1, right] - k[..., 0, right] * k[..., 1, left]
     lower = k[..., 2, left] * k[..., 3, right] - k[..., 2, right] * k[..., 3, left]
-    signs = np.where((left + right) % 2, 1, -1)
+    signs = jnp.asarray(np.where((left + right) % 2, 1, -1), k.dtype)
     return jnp.sum(upper * lower[..., ::-1] * signs[None], axis=-1)
 
 
