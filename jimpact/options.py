@@ -116,10 +116,11 @@ class ShotCommand(DrawingCommand):
 
 @dataclasses.dataclass(frozen=True)
 class FitCommand(DrawingCommand):
-    """Fit a law to measured velocities; without a file: the bundled three balls."""
+    """Fit a law to measured velocities, forces, times or a motion; without a file: three balls."""
 
     study: StudyFile = Path("three_balls.toml")
-    """Study file, or the name of a bundled one (three_balls.toml, air_track.toml)."""
+    """Study file, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
+    bead_column.toml, ...); also the study of a motion with [data]."""
     law: str | None = None
     """Law in the place of the study's (see `jimpact laws`)."""
     method: Method | None = None
@@ -132,7 +133,13 @@ class FitCommand(DrawingCommand):
     def check(self) -> None:
         """Also the study, which must have data."""
         super().check()
-        if not study_file.check_study(self.study, self.law).shots:
+        if study_file.is_motion(self.study):
+            if self.method is not None:
+                raise ValueError("--method must be left out for a motion.")
+            fitted = study_file.check_motion_study(self.study, self.law)
+        else:
+            fitted = study_file.check_study(self.study, self.law).fitted
+        if not fitted:
             raise ValueError(study_file.NO_DATA)
 
 

@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from jimpact._checks import check_kind
-from jimpact.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.plot.style import COLOURS, GREY, SPREAD
 
@@ -17,7 +16,7 @@ _LABELLED = 16  # shots up to which every one gets its label
 
 
 def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
-    """Velocities after every shot, measured and fitted, above their residuals.
+    """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
     fits of the same data, by label, drawn in grey.
@@ -28,9 +27,12 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     >>> len(figure.axes)
     2
     """
-    check_kind("fit: its experiments", fit.experiments, Experiments)
-    assert fit.experiments is not None
-    shots, bodies = fit.predicted.shape
+    check_kind("fit", fit, Fit)
+    data, measured, predicted = (
+        fit.experiments,
+        *map(_in_rows, (fit.problem.measured, fit.predicted)),
+    )
+    shots, bodies = predicted.shape
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
@@ -38,40 +40,46 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     figure.set_layout_engine("constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
     error = _error_bars(fit)
-    measured = np.asarray(fit.problem.measured, float)
     for i in range(bodies):
         colour = COLOURS[i % len(COLOURS)]
         bars = None if error is None else error[:, i]
         style: dict[str, Any] = {"fmt": "o", "mfc": "none", "color": colour, "ms": size, "lw": 1}
         top.errorbar(x[:, i], measured[:, i], bars, **style)
-        top.plot(x[:, i], fit.predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
-        bottom.errorbar(x[:, i], fit.residual[:, i], bars, **style)
+        top.plot(x[:, i], predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
+        bottom.errorbar(x[:, i], (measured - predicted)[:, i], bars, **style)
     for j, other in enumerate((others or {}).values()):
-        top.plot(x, other.predicted, "x+*"[j % 3], color=GREY, ms=0.8 * size)
-    units = ", ".join(dict.fromkeys(fit.experiments.units))
-    top.set_ylabel(f"velocity after the impact [{units}]")
-    bottom.set_ylabel(f"measured − fitted [{units}]")
+        top.plot(x, _in_rows(other.predicted), "x+*"[j % 3], color=GREY, ms=0.8 * size)
+    units = "" if data is None else f" [{', '.join(dict.fromkeys(data.units))}]"
+    top.set_ylabel(f"{'measured value' if data is None else 'velocity after the impact'}{units}")
+    bottom.set_ylabel(f"measured − fitted{units}")
     bottom.axhline(0, color=GREY, lw=0.8)
     _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
-    top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g} m/s", loc="left")
+    unit = "" if data is None else " m/s"
+    top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{unit}", loc="left")
     for axes in (top, bottom):
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", lw=0.4, alpha=0.5)
     return figure
 
 
+def _in_rows(values: np.ndarray) -> np.ndarray:
+    """A row a shot, a sample of a motion, or a value."""
+    values = np.asarray(values, float)
+    return values.reshape(len(values) if values.ndim else 1, -1)
+
+
 def _error_bars(fit: Fit) -> np.ndarray | None:
+    shape = fit.predicted.shape
     if fit.problem.sigma is not None:
-        return np.broadcast_to(np.asarray(fit.problem.sigma, float), fit.predicted.shape)
-    return np.full(fit.predicted.shape, fit.noise) if np.isfinite(fit.noise) else None
+        return _in_rows(np.broadcast_to(np.asarray(fit.problem.sigma, float), shape))
+    return _in_rows(np.full(shape, fit.noise)) if np.isfinite(fit.noise) else None
 
 
 def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
-    assert fit.experiments is not None  # checked
-    labels = fit.experiments.shots
-    if len(labels) == 1:
+    data, labels = fit.experiments, fit.problem.labels
+    if data is not None and len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
         axes.set_xlabel("body")
         axes.set_xlim(-SPREAD * 0.5, SPREAD * 0.5)
@@ -79,7 +87,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
     longest = max(len(labels[k]) for k in ticks)
     axes.set_xticks(list(ticks), [labels[k] for k in ticks], rotation=90 if longest > 4 else 0)
-    axes.set_xlabel("shot")
+    axes.set_xlabel("shot" if data is not None else "value")
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
@@ -92,8 +100,9 @@ def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool)
     ]
     for j, label in enumerate(others):
         handles.append(Line2D([], [], marker="x+*"[j % 3], ls="none", color=GREY, label=label))
-    if fit.predicted.shape[0] > 1:  # of a single shot the axis names the bodies
-        for i in range(min(fit.predicted.shape[1], len(COLOURS))):
+    shots, bodies = _in_rows(fit.predicted).shape
+    if shots > 1 and bodies > 1:  # of a single shot the axis names the bodies
+        for i in range(min(bodies, len(COLOURS))):
             handles.append(
                 Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
             )
