@@ -10,12 +10,11 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_choice, check_values
 from jimpact.bodies.base import STANDARD_GRAVITY
-from jimpact.fits.problem import UNUSABLE, Seen
+from jimpact.fits.problem import Seen, means_nothing
 from jimpact.histories import History, history
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.scene import Scene, with_gaps
-from jimpact.status import CODE
 
 QUANTITIES = ("peak_force", "duration", "arrival_time", "energy_ratio", "bounce_height")
 _OF_FORCES = QUANTITIES[:3]
@@ -85,7 +84,7 @@ class Observations(eqx.Module):
         raw = jnp.stack([self._value(row, velocity, seen) for row in self.rows])
         first = np.array([row.first for row in self.rows])
         values = jnp.where(first < 0, raw, raw / raw[np.maximum(first, 0)])
-        fails = jnp.any(status[:, None] == jnp.array([CODE[x] for x in UNUSABLE]), axis=1)
+        fails = means_nothing(status)
         shot = np.array([row.shot for row in self.rows])
         bad = fails[shot] | ~jnp.isfinite(values)
         return Seen(values, bad, status[jnp.argmax(fails)][None])

@@ -61,9 +61,14 @@ class Shots(eqx.Module):
     def __call__(self, law: Law) -> Seen:
         """Velocities after every shot, and the status of its impact."""
         out = jax.vmap(impact, in_axes=(None, 0, 0))(law, self.scenes, self.pre)
-        codes = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
-        bad = jnp.any(out.status[:, None] == codes[None, :], axis=1)
+        bad = means_nothing(out.status)
         return Seen(out.velocity[:, : self.bodies], bad[:, None], out.status)
+
+
+def means_nothing(status: jax.Array) -> jax.Array:
+    """Whether velocities with these codes (K,) mean nothing."""
+    codes = jnp.asarray([CODE[name] for name in UNUSABLE], status.dtype)
+    return jnp.any(status[:, None] == codes[None, :], axis=1)
 
 
 class Observed(eqx.Module):
