@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Generic, NamedTuple
 
 import jax.numpy as jnp
@@ -10,14 +11,14 @@ from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_choice
 from jimpact.experiments import Experiments
-from jimpact.fits.adequacy import unusable
+from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Search, search, search_near
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.profiles import Profile, profile
-from jimpact.fits.report import fit_warnings, report, to_json
-from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
+from jimpact.fits.report import fit_warnings, report, to_json, verdict
+from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.scene import Scene
 
 LISTED = 10  # shots that were left out, named one by one
@@ -46,7 +47,10 @@ class Fit(Generic[AnyLaw]):
     `standard_error` is inf where the data cannot see a parameter, NaN where no degree of freedom
     is left to estimate the noise from. `rank` < P: see `identifiability`. `starts`: the distinct
     minima, best first. `noise`: estimated standard error of one value, NaN where no degree of
-    freedom is left, 1 where `sigma` was given. `problem`: what was solved.
+    freedom is left; where `sigma` was given 1, or by how much chi^2 says that it is too small, and
+    the standard errors are stretched. `problem`: what was solved. `jacobian`: derivatives
+    of what was measured in the parameters, (K, n, P), NaN where nothing was measured. `seed`: of
+    the random starts. `verdict`: the report in one sentence.
     """
 
     law: AnyLaw
@@ -73,7 +77,9 @@ class Fit(Generic[AnyLaw]):
     lost_starts: int
     warnings: tuple[str, ...]
     problem: FitProblem
+    jacobian: np.ndarray
     loss: str = "squares"
+    seed: int = 0
     profiles: tuple[Profile, ...] = ()
 
     @property
@@ -102,6 +108,40 @@ class Fit(Generic[AnyLaw]):
     def to_dict(self) -> dict[str, Any]:
         """Everything a JSON file can hold; numbers that are not finite become None."""
         return to_json(self)
+
+    @property
+    def verdict(self) -> str:
+        """What was found, in one sentence: the last one of `print(fit)`."""
+        return verdict(self)
+
+    def report(self, path: str | Path, profiles: bool = True) -> Path:
+        """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
+
+        Parameters and intervals, profiles, correlations, residuals, what the data cannot see, what
+        is wrong with them, versions and seed.
+
+        Args:
+            path: the file, ending in .html; what is there is replaced.
+            profiles: find the profile likelihoods, too, unless the fit has them; some seconds.
+
+        Returns:
+            The path.
+        """
+        from jimpact.fits.page import write_page
+
+        return write_page(self, Path(path), profiles)
+
+    def to_pandas(self) -> Any:
+        """The parameters as a `pandas.DataFrame`, which must be installed."""
+        from jimpact.fits.tables import parameters_frame
+
+        return parameters_frame(self)
+
+    def to_xarray(self) -> Any:
+        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
+        from jimpact.fits.tables import dataset
+
+        return dataset(self)
 
     def __str__(self) -> str:
         return report(self)
@@ -178,7 +218,7 @@ def fit(
         problem = _without(problem, lost)
         found = search(problem, method, starts, seed, steps, progress)
     robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
-    end = replace(as_fit(problem, found, method, robust), loss=loss)
+    end = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
     return replace(end, profiles=profile(end, progress=progress)) if profiles else end
 
 
@@ -265,17 +305,25 @@ def as_fit(
         found = found._replace(jacobian=back * found.jacobian, minima=minima)
     residuals, names = problem.residuals, problem.names
     size = float(residuals.size)
-    spread = uncertainty(
-        names=names,
-        jacobian=size * found.jacobian,
-        scale=found.scale,
-        log=found.log,
-        sum_of_squares=size**2 * found.minima[0][0],
-        values=problem.values,
-        noise=robust.noise if robust else None if problem.sigma is None else 1.0,
-        rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
-        value_name=problem.value_name,
-    )
+
+    def spread_with(noise: float | None) -> Uncertainty:
+        return uncertainty(
+            names=names,
+            jacobian=size * found.jacobian,
+            scale=found.scale,
+            log=found.log,
+            sum_of_squares=squares,
+            values=problem.values,
+            noise=noise,
+            rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
+            value_name=problem.value_name,
+        )
+
+    squares = size**2 * found.minima[0][0]
+    spread = spread_with(robust.noise if robust else None if problem.sigma is None else 1.0)
+    if robust is None and problem.sigma is not None:
+        times = stretch(problem, weighted(problem, found), spread.rank)
+        spread = spread_with(times) if times > 1 else spread
     residual = np.asarray(problem.measured, float) - found.seen
     return Fit(
         law=with_entries(problem.law, residuals.fields, jnp.asarray(found.entries)),
@@ -302,4 +350,13 @@ def as_fit(
         lost_starts=found.lost,
         warnings=tuple(fit_warnings(problem, found, spread)),
         problem=problem,
+        jacobian=_slopes(problem, found),
     )
+
+
+def _slopes(problem: FitProblem, found: Search) -> np.ndarray:
+    """Derivatives of what was measured in the parameters themselves; NaN where nothing was."""
+    weight = np.broadcast_to(np.asarray(problem.residuals.weight, float), problem.measured.shape)
+    slope = found.jacobian.reshape(*problem.measured.shape, len(problem.names)) / found.scale
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(weight[..., None] > 0, slope / weight[..., None], np.nan)

@@ -8,6 +8,7 @@ from .charts import (
     work_precision as work_precision,
 )
 from .fits import fit as fit
+from .inference import correlation as correlation, profiles as profiles, residuals as residuals
 from .laws import comparison as comparison, forces as forces, rheologies as rheologies
 from .montecarlo import monte_carlo as monte_carlo
 from .motions import animation as animation, motion as motion, phase_portrait as phase_portrait
