@@ -18,6 +18,7 @@ from jimpact.fits.multistart import EXACT
 from jimpact.fits.problem import FEW
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws import SIMPLEST_FIRST
+from jimpact.laws.lzb import LZB
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar
 from jimpact.records import as_data, number, table
@@ -27,6 +28,7 @@ from jimpact.status import STATUS
 RESTITUTION = 0.8  # start of what nobody gives
 SPEED_EXPONENT = 0.1  # start of a dependence on the speed
 WORSE = 0.01  # chance at which a law counts as a worse predictor than the best
+WORSE_OF_FEW = 0.05  # the same by the residuals, of fewer shots
 _LEAST = 4  # shots from which predictions of two laws are compared
 _TIERS = ("fits", "lack of fit", "worse", "fails")
 
@@ -227,11 +229,11 @@ def fit_laws(
     Each law is fitted with one e for all contacts, with one each, and, where it has stiffnesses,
     with and without free ratios of them; a `RestitutionMatrix` from an admissible one. A law is
     adequate if its fit converges, shows no lack of fit (see `fit`), fails in no shot, and predicts
-    shots left out no worse than the best law does (a paired t test over shots at 1 %; of more than
-    64 shots linearized). Adequate laws come first, those with fewer parameters before others, and
-    of these the one that needs to know less of the contacts, in the order of `advise`. AICc is
-    told where it means something: rank full, nothing at a bound, no shot left out, degrees of
-    freedom left.
+    shots left out no worse than the best law does: a paired t test over shots at 1 %, of more than
+    64 shots linearized; of fewer than 4 an F test of the residuals at 5 %. Adequate laws come
+    first, those with fewer parameters before others, and of these the one that needs to know less
+    of the contacts, in the order of `advise`. AICc is told where it means something: rank full,
+    nothing at a bound, no shot left out, degrees of freedom left.
 
     Args:
         scene: of all shots; not used where the data carry one a shot.
@@ -310,6 +312,10 @@ def _candidates(
             left_out["restitution_matrix"] = f"has no start: {error}"
     built, missing = registered_laws(values)
     left_out = missing | left_out
+    if "compliant" in built and all(bool(np.all(scene.closed)) for scene in scenes):
+        left_out["compliant"] = "is lzb where no contact has a gap"
+    if "base" not in values:
+        left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
     built = {name: law for name, law in built.items() if name not in left_out}
     if laws is not None:
         from jimpact.laws import REGISTRY
@@ -340,14 +346,16 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
     if "restitution" not in known or np.ndim(known["restitution"].value) > 1:
         return {"": (law, _default(law, more))}
     fields = [name for name in ("restitution", "stiffness") if name in known]
+    others = {name: True for name in more if name in known and name not in fields}
+    if contacts == 1:  # the same program as a plain fit
+        return {"": (law, dict.fromkeys(("restitution", *others), True))}
     for name in fields:
         each = jnp.broadcast_to(known[name].value, (contacts,))
         law = with_parameter(law, name, each)
-    others = {name: True for name in more if name in known and name not in fields}
     one, each_own = np.ones(contacts, int), np.arange(1, contacts + 1)
-    coefficients = {"": one} | ({", e per contact": each_own} if contacts > 1 and alike else {})
+    coefficients = {"": one} | ({", e per contact": each_own} if alike else {})
     ratios: dict[str, Any] = {"": np.zeros(contacts, int)}
-    if "stiffness" in known and contacts > 1 and alike:
+    if alike and isinstance(law, LZB):  # of others the stiffness is one in SI units
         ratios[", free stiffness ratios"] = each_own
     return {
         f"{a}{b}": (
@@ -368,13 +376,19 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     against = {name: _against(found) for name, found in fits.items()}
     squares = {name: _per_shot(fits[name], errors[name]) for name in fits}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
-    best = min(usable, key=lambda name: (_total(squares[name]), len(fits[name].names)))
+    many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
+    least = {name: _total(squares[name]) if many else _variance(fits[name]) for name in usable}
+    best = min(usable, key=lambda name: (least[name], len(fits[name].names)))
     found = []
     for name, each in fits.items():
         tier, verdict = against[name]
-        if tier != "fails" and (chance := _chance(squares[name], squares[best])) < WORSE:
-            worse = f"predicts worse than {best} (chance {chance:.1g})"
-            tier, verdict = "worse", worse if tier == "fits" else f"{verdict}, {worse}"
+        if many:
+            chance, level, worse = _chance(squares[name], squares[best]), WORSE, "predicts worse"
+        else:
+            chance, level, worse = _by_residuals(each, fits[best]), WORSE_OF_FEW, "fits worse"
+        if tier != "fails" and chance < level:
+            worse = f"{worse} than {best} (chance {chance:.1g})"
+            tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
         error = _left_out_rms(each, errors[name])
         found.append(LawFit(name, each, error, _aicc(each), verdict, tier))
     return {x.name: x for x in sorted(found, key=_order)}
@@ -399,7 +413,8 @@ def _against(found: Fit) -> tuple[str, str]:
         return "fails", "does not converge"
     if any(line.startswith("Lack of fit") for line in found.warnings):
         return "lack of fit", "lack of fit"
-    return "fits", "fits"
+    unseen = found.rank < len(found.names)
+    return "fits", f"fits, {found.rank} of {len(found.names)} seen" if unseen else "fits"
 
 
 def _errors_left_out(found: Fit) -> np.ndarray:
@@ -451,6 +466,24 @@ def _chance(squares: np.ndarray, best: np.ndarray) -> float:
         return 1.0
     error = more.std(ddof=1) / np.sqrt(len(more))
     return float(stdtr(len(more) - 1, -more.mean() / error)) if error > 0 else 0.0
+
+
+def _variance(found: Fit) -> float:
+    """Of the residuals; infinite where no degree of freedom is left to tell it."""
+    freedom = found.degrees_of_freedom
+    return found.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
+
+
+def _by_residuals(found: Fit, best: Fit) -> float:
+    """Chance of residuals so much larger, as if the better law had one parameter more at least."""
+    more = max(best.rank - found.rank, 1)
+    variance = _variance(best)
+    gain = (found.starts[0].sum_of_squares - best.starts[0].sum_of_squares) / more
+    if not np.isfinite(variance) or gain <= 0:
+        return 1.0
+    exact = EXACT[str(best.problem.residuals.offset.dtype)]
+    least = exact * float(best.problem.residuals.size) ** 2  # of what is reproduced exactly
+    return float(fdtrc(more, best.degrees_of_freedom, gain / max(variance, least)))
 
 
 def _left_out_rms(found: Fit, error: np.ndarray) -> float:
