@@ -459,13 +459,24 @@ def _total(squares: np.ndarray) -> float:
 
 
 def _chance(squares: np.ndarray, best: np.ndarray) -> float:
-    """That a law predicting as well as the best shows such errors: a paired t test over shots."""
-    more = squares - best
-    more = more[np.isfinite(more)]
+    """That a law predicting as well as the best shows such errors: paired t tests over shots.
+
+    Of the squares, and of their logarithms, which a few large ones do not drown.
+    """
+    both = np.isfinite(squares) & np.isfinite(best)
+    some = both & (squares > 0) & (best > 0)
+    logs = np.log(squares[some]) - np.log(best[some])
+    return min(_above_zero(squares[both] - best[both]), _above_zero(logs))
+
+
+def _above_zero(more: np.ndarray) -> float:
+    """Chance of values of mean 0 that lie as far above it."""
     if len(more) < _LEAST or not more.any():
         return 1.0
     error = more.std(ddof=1) / np.sqrt(len(more))
-    return float(stdtr(len(more) - 1, -more.mean() / error)) if error > 0 else 0.0
+    if error == 0:
+        return float(more[0] < 0)
+    return float(stdtr(len(more) - 1, -more.mean() / error))
 
 
 def _variance(found: Fit) -> float:
