@@ -29,6 +29,7 @@ RESTITUTION = 0.8  # start of what nobody gives
 SPEED_EXPONENT = 0.1  # start of a dependence on the speed
 WORSE = 0.01  # chance at which a law counts as a worse predictor than the best
 WORSE_OF_FEW = 0.05  # the same by the residuals, of fewer shots
+SAME = 1e-5  # share by which squares of the same law differ, as solvers leave them
 _LEAST = 4  # shots from which predictions of two laws are compared
 _TIERS = ("fits", "lack of fit", "worse", "fails")
 
@@ -466,11 +467,13 @@ def _chance(squares: np.ndarray, best: np.ndarray) -> float:
     both = np.isfinite(squares) & np.isfinite(best)
     some = both & (squares > 0) & (best > 0)
     logs = np.log(squares[some]) - np.log(best[some])
-    return min(_above_zero(squares[both] - best[both]), _above_zero(logs))
+    gain = _above_zero(squares[both] - best[both], best[both])
+    return min(gain, _above_zero(logs, 1.0))
 
 
-def _above_zero(more: np.ndarray) -> float:
+def _above_zero(more: np.ndarray, size: Any) -> float:
     """Chance of values of mean 0 that lie as far above it."""
+    more = np.where(np.abs(more) > SAME * np.abs(size), more, 0.0)
     if len(more) < _LEAST or not more.any():
         return 1.0
     error = more.std(ddof=1) / np.sqrt(len(more))
