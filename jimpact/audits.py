@@ -50,6 +50,12 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
         velocity: v- (n,) [m/s].
         out: what `impact` returned, or an `Impact` filled by hand from measurements.
 
+    Returns:
+        `Audit`: a boolean () for each of the four, `consistent` for all; `print` says it in words.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
     Source: Brogliato (2016), section 6.2.4.
 
     >>> import jimpact as ji
@@ -107,6 +113,17 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
 
 def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     """A printable account of one impact (or, for a batch, of its status codes).
+
+    Args:
+        out: what `impact` returned, one or a batch.
+        scene: of the impact.
+        velocity: v- (n,) [m/s].
+
+    Returns:
+        Text of several lines: status, energy, audit, velocities and impulses of all contacts.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
 
     >>> import jimpact as ji
     >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]

@@ -268,6 +268,12 @@ def _closed_block(
 def delassus_matrix(scene: Scene) -> Symmetric:
     """`W = N^T M^-1 N` [1/kg]: (m, m), or `Tridiagonal` for a chain.
 
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        W (m, m) [1/kg], symmetric; indexed like an array where it is `Tridiagonal`.
+
     Source: Brogliato (2016), (6.35) where bilateral constraints are present.
 
     >>> import jimpact as ji
@@ -305,6 +311,12 @@ def normalized_delassus(scene: Scene) -> Symmetric:
 
     Bilateral constraints distort it, its diagonal included: Brogliato (2016), (6.35).
 
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        G (m, m), or `Tridiagonal` for a chain.
+
     >>> import jimpact as ji
     >>> ji.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(3).tolist()
     [-0.5]
@@ -314,6 +326,16 @@ def normalized_delassus(scene: Scene) -> Symmetric:
 
 def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     """`gamma_j / |grad f_j|` (m,) [sqrt(J)], the normal quasi-velocities.
+
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        qn (m,) [sqrt(J)], < 0 on approach.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
 
     Source: Brogliato (2016), (6.24).
 
@@ -326,6 +348,12 @@ def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
 
 def kinetic_angles(scene: Scene) -> jax.Array:
     """Angles `theta_ij = pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
+
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        Angles (m, m) [rad], pi on the diagonal.
 
     Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
     Source: Brogliato (2016), (6.66).

@@ -268,6 +268,12 @@ def read_experiments(path: str | Path) -> Experiments:
     converted to m/s; rad/s, deg/s, converted to rad/s. An empty `post` cell is a value that was
     not measured.
 
+    Args:
+        path: of the file.
+
+    Returns:
+        `Experiments` of K shots, all in m/s and rad/s.
+
     Raises:
         FileNotFoundError: no such file.
         ValueError: unknown or missing unit, missing, unknown or repeated column, text in a

@@ -271,6 +271,9 @@ def scene_from_gaps(
         q: (n,) configuration.
         closed_below: gaps with |f| up to this count as closed [m].
 
+    Returns:
+        `Scene` of n coordinates and m contacts, without tangents.
+
     Raises:
         ValueError: penetration (f < -closed_below), or what `Scene` refuses.
 

@@ -215,7 +215,8 @@ class FitProblem:
                 residual is an observable of which zeros were measured.
             measured: what was measured of it, of the same shape; NaN where nothing was.
             sigma: standard errors, scalar or of the same shape; None: one common, unknown.
-            free, bounds: as in `fit`.
+            free: as in `fit`.
+            bounds: as in `fit`.
 
         Raises:
             ValueError: nothing measured, sigma <= 0, an observable of another shape, and as `fit`.

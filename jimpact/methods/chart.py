@@ -168,9 +168,14 @@ def work_precision(
         reference: method that errors are measured from, at rtol 1e-14; None: the
             event-aligned order 8. Its uncertainty is its distance from
             a second solution: order 8 at 1e-12.
-        batch: impacts in a batch. repeats: of every time. gradients, durations: measure them, too
-            (each asks for programs of its own).
+        batch: impacts in a batch.
+        repeats: of every time.
+        gradients: measure those, too (with programs of their own).
+        durations: likewise.
         progress: bar on stderr; None: on a terminal.
+
+    Returns:
+        `WorkPrecision`; `print` gives a table, `ji.plot.work_precision` the chart.
 
     Raises:
         ValueError: a method unknown or unable (the reason is told), nothing approaches, single

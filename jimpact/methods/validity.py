@@ -95,6 +95,9 @@ def validity_map(
     Returns:
         `ValidityMap`; `ji.plot.validity_map` draws it, `print` tells where which law holds.
 
+    Raises:
+        ValueError: shapes or ranges, at rest, one contact, gaps, ratios that do not rise.
+
     Source: the kind of Brogliato, Nonsmooth Mechanics (2016), figure 6.9.
 
     >>> import jimpact as ji

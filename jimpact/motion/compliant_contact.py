@@ -294,6 +294,9 @@ def turning_impact(
         `TurningImpact`; `ended` False where it went on for 200 contact times or `max_steps`.
         Forward derivatives (motions by contact forces have no reverse ones).
 
+    Raises:
+        ValueError: sizes, NaN, penetration, a mass that is not positive. TypeError: no `Force`.
+
     >>> import jimpact as ji
     >>> block, q, v = ji.Block(1.0, 1.0), [0.0, 0.5, 0.0], [0.0, -0.5, -1.0]
     >>> out = ji.turning_impact(block, None, q, v, ji.Hertz(1e8))

@@ -51,6 +51,13 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker is
     a failure by status; laws are stars at their model error; below the grey band's edge the
     reference is no better.
+
+    Args:
+        found: what `ji.work_precision` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
     """
     figure = Figure(figsize=(11.5, 8.5))
     figure.set_layout_engine("constrained")
@@ -186,6 +193,9 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
         found: what `stability_map` returned.
         title: above the panels.
 
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     Example: `ji.plot.stability_map(ji.stability_map(["default", "rk4"])).savefig("map.png")`.
     """
     names = list(found.axes)
@@ -211,6 +221,14 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
 
 def stability_pairs(found: StabilityMap, method: str, title: str = "") -> Figure:
     """One panel for every pair of axes, for one method; a ring marks the base point.
+
+    Args:
+        found: what `ji.stability_map(slices='pairs')` returned.
+        method: one of its methods.
+        title: above the picture; default: the method's name.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
         ValueError: a map without pairs.
@@ -304,6 +322,14 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     Above one curve an exponent, between the levels of binary collisions and Moreau's law; below
     how far off they are, with the tolerance.
 
+    Args:
+        found: what `ji.validity_map` returned.
+        tolerance: of v+, relative to max |v-|; a line.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     >>> import jimpact as ji
     >>> found = ji.validity_map(ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0])
     >>> len(ji.plot.validity_map(found).axes)
@@ -338,6 +364,13 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
 
 def advice(found: Advice, title: str = "") -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
+
+    Args:
+        found: what `ji.advise` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> found = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)

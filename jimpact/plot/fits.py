@@ -22,6 +22,17 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
     fits of the same data, by label, drawn in grey.
 
+    Args:
+        fit: of shots.
+        others: label -> another fit of the same data.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: a fit of something else than shots.
+
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.3, 0.7])
     >>> figure = ji.plot.fit(ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data))

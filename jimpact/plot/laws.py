@@ -25,6 +25,14 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
 
     Measured velocities are horizontal lines; a law whose outcome fails the audit is crossed.
 
+    Args:
+        found: what `ji.compare` returned.
+        measured: v+ (n,) [m/s], or None.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     >>> import jimpact as ji
     >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
     >>> len(ji.plot.comparison(found).axes)
@@ -70,6 +78,13 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
 
     Args:
         found: of `compare_rheologies`, or of `compare` with `Compliant` laws.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: a law that is not `Compliant`.
 
     >>> import jimpact as ji
     >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
@@ -116,6 +131,13 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
 
 def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """Force at one contact over impact time, one line a history.
+
+    Args:
+        histories: label -> what `ji.history` returned.
+        contact: counted from 0; -1: the last one.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])

@@ -20,6 +20,13 @@ def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     The map shows the two gaps that vary most and the most scattered velocity; with one random
     gap, that velocity against it; without, no map.
 
+    Args:
+        found: what `ji.monte_carlo` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     >>> import jimpact as ji
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([1.0, 1.0, 1.0])
     >>> gaps = ji.Uniform(0.0, 1e-5)

@@ -50,6 +50,12 @@ def motion(
         system: that moved: its body names the coordinates, and its base is shown; without it and
             without names they are q1, q2, ...
 
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        ValueError: a batch of motions, or names of another number.
+
     >>> import jimpact as ji
     >>> ball = ji.ball_system()
     >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
@@ -231,6 +237,12 @@ def phase_portrait(
         names: of the coordinates, as in `motion`.
         system: that moved, as in `motion`; needed where velocities are not the rates of q.
 
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        ValueError: a batch, no such coordinate, velocities that are not rates of q.
+
     >>> import jimpact as ji
     >>> dimer = ji.dimer_system(0.1, 1.0)
     >>> motion = ji.simulate(dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21)
@@ -297,6 +309,9 @@ def animation(
         frames_per_second: of the GIF.
         title: of the picture; the time stands below it.
         progress: a bar on stderr; None: on a terminal, where it takes long.
+
+    Returns:
+        The path of the file that was written.
 
     Raises:
         ValueError: another ending, a batch, no sample; TypeError: a body without outlines.

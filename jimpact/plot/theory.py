@@ -41,6 +41,9 @@ def admissible_set(
             are not admissible (hollow).
         title: empty for a default one.
 
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     Raises:
         ValueError: an outcome of another size.
 
@@ -228,6 +231,13 @@ def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
 
     The dotted line is `critical_kinetic_angle`.
 
+    Args:
+        found: what `ji.theory.rocking_dispersion` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     >>> import jimpact as ji
     >>> import numpy as np
     >>> zero = np.zeros((2, 1, 1))
@@ -257,6 +267,14 @@ def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = S
     """Rest, rocking, half-rocking, free over the kinetic angle and e: a panel for each mu.
 
     The dotted line is `critical_kinetic_angle`; `stays` as in `RockingDispersion.outcomes`.
+
+    Args:
+        found: what `ji.theory.rocking_dispersion` returned.
+        title: above the picture.
+        stays: largest speed, over |gamma_B-|, of a corner that stays.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> import numpy as np

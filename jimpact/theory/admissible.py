@@ -27,9 +27,10 @@ _ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
 class AdmissibleSet:
     """The outcomes v+ of `admissible_set`; `print(found)` describes them.
 
-    Every outcome is `center + axes u` with u (d,) in a convex set `coordinates`, and has the
+    Every outcome is v = `center` + `axes` u, u (d,) in a convex set `coordinates`, and has the
     energy `T(center) + |u|^2 / 2`: u are kinetic coordinates [sqrt(J)]. `dimension` d is 0 where
     only one outcome is possible. `plastic` v+ (n,) has the `least_energy` [J]; `energy` is T-.
+    `scene` and `velocity` v- (n,) [m/s] are those asked for, `tolerance` that of `contains`.
     """
 
     scene: Scene
