@@ -27,7 +27,7 @@ _METHOD = "levenberg-marquardt"
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """`deviance` (G,) over the `value`s (G,) of the parameter `name`, and where it is below `limit`.
+    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
 
     `deviance` is the sum of squares with the parameter held, less its least value, over the noise
     variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at

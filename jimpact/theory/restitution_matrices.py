@@ -21,7 +21,7 @@ _SINGULAR = 100.0
 
 
 class Copositivity(NamedTuple):
-    """The `answer`, the `margin` min x^T Q x over `x >= 0`, `|x| = 1`, and its minimizer `witness`."""
+    """The `answer`, the `margin` min x^T Q x over `x >= 0`, `|x| = 1`, and where, `witness`."""
 
     answer: Literal["yes", "no", "boundary"]
     margin: float

@@ -226,6 +226,8 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     Raises:
         ValueError: friction < 0.
 
+    Source: own derivation; Brogliato (2016), section 6.3.2.2 has mu = 0.
+
     >>> import jimpact as ji
     >>> [round(float(ji.theory.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
     [1.5708, 1.3862, 1.231]
@@ -333,6 +335,8 @@ def search_critical_angle(
 
     Raises:
         ValueError: arguments out of range or with more than one axis.
+
+    Source: own; checks `critical_kinetic_angle`.
 
     >>> import jimpact as ji
     >>> ji.theory.search_critical_angle(0.1, -0.5)
