@@ -17,7 +17,18 @@ CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
 
 
 class Audit(eqx.Module):
-    """Four answers and the numbers behind them (`worst_*`: scaled by the impact's own size)."""
+    """Four answers, and the numbers behind them, scaled by the impact's own size.
+
+    Attributes:
+        kinematic: whether gamma+ >= 0 at closed contacts ().
+        kinetic: whether p >= 0 ().
+        energetic: whether no energy is gained ().
+        momentum: whether contact impulses explain the change ().
+        worst_gap_velocity: the least gamma+ ().
+        worst_impulse: the least p ().
+        energy_gain: T+ - T- less what was stored ().
+        momentum_residual: largest entry of M (v+ - v-) - N p ().
+    """
 
     kinematic: jax.Array
     kinetic: jax.Array

@@ -105,9 +105,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found: `entries[name]`; `left_out[name]` says why; `print` gives a table.
+    """What `compare` found; `print` gives a table.
 
-    `measured` (n,), where it is known, is v+ beside which the laws are put.
+    Attributes:
+        scene: as asked for.
+        velocity: v- (n,) [m/s].
+        entries: outcome, audit, energy ratio, dispersion and time by law.
+        left_out: why a law is missing.
+        measured: v+ (n,) [m/s] beside which the laws are put, or None.
     """
 
     scene: Scene

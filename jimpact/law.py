@@ -342,14 +342,14 @@ class Law(Declared):
 
     @abc.abstractmethod
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses of the contacts, and the law's own status code."""
+        """Impulses of what `contact` shows, and the law's own status code."""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """What the law is shown of the scene; to override where it must see more."""
+        """What the law is shown of the scene at a velocity; to override where it must see more."""
         return contact_of(scene, velocity, self.stored, self.uses_gaps)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """To override: raise where the law does not fit the scene, or the precision."""
+        """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
     @property
     def fills_up(self) -> bool:

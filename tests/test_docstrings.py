@@ -102,10 +102,11 @@ def lacks_of_class(kind):
         found.append("an example")
     if issubclass(kind, ji.Law) and kind is not ji.Law and "Source:" not in doc:
         found.append("its source")
-    for name, method in inspect.getmembers(kind, inspect.isroutine):
-        ours = (getattr(method, "__module__", None) or "").startswith("jimpact")
-        if name.startswith("_") or not ours:
+    for name, method in vars(kind).items():
+        overrides = any(name in vars(base) for base in kind.__mro__[1:])  # and is described there
+        if name.startswith("_") or overrides or not callable(getattr(kind, name)):
             continue
+        method = getattr(kind, name)
         told = inspect.getdoc(method) or ""
         found += [
             f"`{p}` of `{name}`"

@@ -178,7 +178,7 @@ class SpatialDimer(Body):
         return jax.jacobian(ends)(q).T + jnp.concatenate([rolling, rolling], axis=1)
 
     def touching(self, angle: Any = 0.0, yaw: Any = 0.0) -> jax.Array:
-        """q (6,) at the origin with this pitch, at which the lower sphere (or both) touches."""
+        """q (6,) at the origin at this pitch `angle` and `yaw` [rad]: the lower sphere touches."""
         pitch, turn = number("angle", angle), number("yaw", yaw)
         check_values("angle", pitch, low=-0.5 * jnp.pi, high=0.5 * jnp.pi)
         zero = jnp.zeros_like(pitch)

@@ -107,7 +107,7 @@ class Fit(Generic[AnyLaw]):
         return self.problem.experiments
 
     def confidence_interval(self, level: float = 0.95) -> np.ndarray:
-        """Two-sided intervals (P, 2), linearized, cut at the bounds.
+        """Two-sided intervals (P, 2) at a level in (0, 1), linearized, cut at the bounds.
 
         Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
         freedom that are left, or of the normal law where `sigma` was given.
@@ -168,8 +168,9 @@ def fit(
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
-        starts: number of starts, the first from the law's values, the others random (`seed`); if
+        starts: number of starts, the first from the law's values, the others random; if
             more than one, further ones around the best follow as long as they improve it.
+        seed: of the random starts.
         max_steps: iterations per start.
         profiles: whether the report tells intervals by `profile`, not by standard errors.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.

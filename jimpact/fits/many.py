@@ -96,7 +96,7 @@ class Refits:
     predicted: np.ndarray
 
     def interval(self, level: float = 0.95) -> np.ndarray:
-        """Quantiles (P, 2) between which this share of the values lies."""
+        """Quantiles (P, 2) between which the share `level` of the values lies."""
         if not 0 < level < 1:
             raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
         return np.quantile(self.value, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0).T

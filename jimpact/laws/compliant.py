@@ -76,7 +76,7 @@ class Compliant(Law):
         check_rtol(self.rtol, dtype)
 
     def dynamics(self, contact: Contact) -> Dynamics:
-        """The dynamics of the whole encounter in units of their own."""
+        """The dynamics of the contact's whole encounter in units of their own."""
         gamma, force, viscous = contact.gap_velocity, self.force, None
         if isinstance(force, Bistiffness):
             k, e, exponent = force.stiffness, force.restitution, force.exponent

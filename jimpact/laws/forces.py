@@ -42,7 +42,7 @@ class Force(Declared):
         raise NotImplementedError
 
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """Sign of the force."""
+        """Sign of the force at x > 0 and rate x'."""
         return self.force(x, rate)
 
     def indentation_scale(self, energy: jax.Array) -> jax.Array:

@@ -151,7 +151,7 @@ class LZB(Law):
         return self.method == "time" and self.friction is None
 
     def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
-        """The impact dynamics in units of their own; `rtol` in place of the law's."""
+        """The dynamics of a contact in units of their own; `rtol` in place of the law's."""
         problem, units = dimensionless(
             contact.delassus,
             contact.gap_velocity,

@@ -114,7 +114,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
 
 
 class Crossover(eqx.Module):
-    """Outcomes (s, n) over `offset` (s,), the difference of two gaps in units of delta_c."""
+    """`velocity` (s, n) [m/s] and `status` (s,) over `offset` (s,), gap 1 - gap 2 over delta_c."""
 
     offset: jax.Array
     velocity: jax.Array
@@ -182,7 +182,7 @@ class GapSensitivity:
     sampled: MonteCarlo | None = None
 
     def covariance(self, gap_covariance: Any) -> np.ndarray:
-        """Linearized covariance (n, n) of the velocities, `J Sigma J^T`, of gaps with Sigma."""
+        """Linearized covariance (n, n) of velocities, `J Sigma J^T`, Sigma = `gap_covariance`."""
         sigma = np.asarray(gap_covariance, float)
         m = len(self.gaps)
         check_shape("gap_covariance", sigma, (m, m), "a row and a column per contact")

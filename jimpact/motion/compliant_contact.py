@@ -285,7 +285,7 @@ def turning_impact(
         gap_function: a `Body` (then `mass` is None), or q (n,) -> gaps (m,) [m].
         mass: M (n,) or (n, n), or a function q -> M(q).
         q: (n,) configuration before, with no penetration.
-        velocity: (n,).
+        velocity: (n,) [m/s, rad/s].
         force: as in `Compliant`.
         rtol: of q, q' and the indentations.
         max_steps: of the integrator.

@@ -70,6 +70,13 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
+
+    >>> import jimpact as ji
+    >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
+    >>> options = {"laws": {}, "batch": 4, "gradients": False}
+    >>> found = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
+    >>> len(ji.plot.work_precision(found).axes)
+    2
     """
     gradients = any(point.gradient is not None for row in found.points.values() for point in row)
     if gradients:
@@ -204,7 +211,11 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
-    Example: `ji.plot.stability_map(ji.stability_map(["default", "rk4"])).savefig("map.png")`.
+    >>> import jimpact as ji
+    >>> axes = {"restitution": [0.5, 1.0]}
+    >>> found = ji.stability_map(["verlet"], axes, {"balls": 2, "exponent": 1})
+    >>> len(ji.plot.stability_map(found).axes)
+    1
     """
     names = list(found.axes)
     columns = min(2, len(names))
@@ -238,6 +249,13 @@ def stability_pairs(found: StabilityMap, method: str, title: str = "") -> Figure
 
     Raises:
         ValueError: a map without pairs.
+
+    >>> import jimpact as ji
+    >>> axes = {"restitution": [0.5, 1.0], "setting": [0.0, 0.8]}
+    >>> options = {"base": {"balls": 2, "exponent": 1}, "slices": "pairs"}
+    >>> found = ji.stability_map(["verlet"], axes, **options)
+    >>> len(ji.plot.stability_pairs(found, "verlet").axes)
+    1
     """
     pairs = [each for each in found.slices[method] if len(each.axes) == 2]
     if not pairs:

@@ -141,7 +141,7 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     _laws_axis(outcome, names)
     outcome.axhline(0, color="black", lw=0.6)
     outcome.set_ylabel("velocity after the impact [m/s]")
-    outcome.set_xlabel("force law")
+    outcome.set_xlabel("force")
     outcome.set_title("all contacts together", loc="left", fontsize="medium")
     legend_within(outcome, max(1, bodies // 6))
     finish(loops, outcome)

@@ -120,9 +120,8 @@ def _mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
 
 
 def _write(axes: Axes, at: np.ndarray, text: str, **style: Any) -> None:
-    axes.annotate(
-        text, (at[0], at[1]), **{"ha": "center", "va": "center", "fontsize": SMALL} | style
-    )
+    centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
+    axes.annotate(text, (at[0], at[1]), **centred | style)
 
 
 def _legend(figure: Figure, axes: Axes, columns: int) -> None:

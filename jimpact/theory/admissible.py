@@ -69,9 +69,9 @@ class AdmissibleSet:
         return np.array([[low[i], high[i]] for i, (low, high) in enumerate(found)])
 
     def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
-        """Whether v+ (n,), or each of (k, n), is admissible up to `tolerance` times the impact.
+        """Whether a velocity v+ (n,), or each of (k, n), is admissible up to `tolerance` impacts.
 
-        None: the tolerance of `audit`. Size of the impact: `sqrt(2 (T- - T(center)))`, the
+        None: the tolerance of `audit`. The size of an impact: `sqrt(2 (T- - T(center)))`, the
         largest |u|.
         """
         v = np.asarray(as_float_array("velocity", velocity), float)

@@ -69,7 +69,7 @@ def restitution_inclusion(
         coupling: Gbar (n, c), see `contact_coupling`.
         metric: P (n, n), symmetric positive definite.
         restitution: Lambda, a scalar or (n, n).
-        velocity: v- (n,), quasi-velocities (`to_quasi_velocities`).
+        velocity: v- (n,), quasi-velocities [m/s times sqrt(kg)] (`to_quasi_velocities`).
         low: lower bounds of V, scalar or (c,); -inf for none.
         high: upper bounds.
 
@@ -127,7 +127,7 @@ class FrictionBounds(NamedTuple):
     `g_mu`, `k`, `m_bar` are the matrices G^mu, K and Mbar of (6.56) and (6.59) (all (m, m)).
     Prop. 6.6 (1): `g_mu_bound` < 1 makes G^mu positive definite for every slip direction;
     (3), sharpened: `restitution_bound` < 1 makes Mbar positive definite.
-    Theorem 6.2 (i): `m_bar_least > k_largest`, both eigenvalues; (ii): |qn-| / |qt-| at least
+    Theorem 6.2 (i): `m_bar_least` > `k_largest`, both eigenvalues; (ii): |qn-| / |qt-| at least
     `least_ratio`, which is infinite where (i) fails, and 0 where friction does not couple.
     """
 
@@ -146,7 +146,7 @@ class FrictionBounds(NamedTuple):
         return self.m_bar_least > self.k_largest
 
     def dissipates(self, scene: Scene, velocity: Any) -> bool:
-        """Whether Theorem 6.2 (sufficient) promises T+ <= T- for this v- (n,)."""
+        """Whether Theorem 6.2 (sufficient) promises T+ <= T- in a scene, at a velocity v- (n,)."""
         qn, qt = to_quasi_velocities(scene, velocity)
         return self.condition_i and bool(
             jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)

@@ -148,7 +148,7 @@ class MatrixAudit(NamedTuple):
     `worst_velocity` v- (n,) [m/s], loses least: it gains energy where the answer is "no" and
     conserves it where it is "boundary".
     `spectral_radius` and `spectral` (Prop. 6.4) are None unless E is self-adjoint.
-    `singular_value <= singular_value_bound` is Prop. 6.5, sufficient only.
+    `singular_value` <= `singular_value_bound` is Prop. 6.5, sufficient only.
     """
 
     kinematic: Sign
