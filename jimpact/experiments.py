@@ -1,5 +1,6 @@
 """Measured shots: velocities before and after, read from CSV; momentum and energy they defy."""
 
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -208,6 +209,25 @@ def _filled(rows: list[np.ndarray]) -> np.ndarray:
     return filled
 
 
+class _Same(NamedTuple):
+    """A scene that is equal to itself only."""
+
+    scene: Scene
+
+    def __hash__(self) -> int:
+        return id(self.scene)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.scene is other.scene
+
+
+def _remembered(function: Callable[[Scene], np.ndarray]) -> Callable[[Scene], np.ndarray]:
+    """The function, which need not compute again for the scenes it was called with last."""
+    last = functools.lru_cache(maxsize=4)(lambda same: function(same.scene))
+    return functools.wraps(function)(lambda scene: last(_Same(scene)))
+
+
+@_remembered
 def conserved_momenta(scene: Scene) -> np.ndarray:
     """`C^T M` (c, n): C spans the complement of all contact and constraint directions."""
     others = [x for x in (scene.tangents, scene.constraints) if x is not None]
@@ -349,6 +369,7 @@ def data_defects(
     return lines
 
 
+@_remembered
 def _closed_normals(scene: Scene) -> np.ndarray:
     """Normals (n, c) of the closed contacts."""
     return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]

@@ -103,10 +103,10 @@ class Scene(eqx.Module):
             return self._normals
         assert self.walls is not None
         left, _ = self.walls
-        body = jnp.arange(self.size)[:, None]
-        first = jnp.arange(self.contacts)[None, :] - int(left)  # body on the contact's left
-        ones = (body == first + 1).astype(self.mass.dtype)
-        return ones - (body == first).astype(self.mass.dtype)
+        body = np.arange(self.size)[:, None]
+        first = np.arange(self.contacts)[None, :] - int(left)  # body on the contact's left
+        signs = (body == first + 1).astype(int) - (body == first).astype(int)
+        return jnp.asarray(signs, self.mass.dtype)
 
     @property
     def closed(self) -> jax.Array:
@@ -195,6 +195,8 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
         ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
             coordinates or constraints.
     """
+    if len(scenes) == 1:
+        return list(scenes), 0
     layouts = {str((jax.tree.structure(s), jax.tree.map(jnp.shape, s))) for s in scenes}
     if len(layouts) == 1:
         return list(scenes), 0

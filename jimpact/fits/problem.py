@@ -199,7 +199,7 @@ class FitProblem:
             lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
         )
         filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
-        observe = Shots(_in(dtype, stacked), jnp.asarray(filled, dtype), n)
+        observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
         errors = experiments.natural_errors(scene) if sigma is None else sigma
         problem = _build(
@@ -311,7 +311,7 @@ class FitProblem:
         r = self.residuals
         weight = np.asarray(r.weight, float) * float(r.size) * factor
         size = float(r.unit) * np.linalg.norm(weight)
-        arrays = (jnp.asarray(weight / size, r.weight.dtype), jnp.asarray(size, r.size.dtype))
+        arrays = (np.asarray(weight / size, r.weight.dtype), np.asarray(size, r.size.dtype))
         kept = np.where(factor > 0, self.measured, np.nan)
         lost = int(np.isnan(kept).sum() - np.isnan(self.measured).sum())
         residuals = eqx.tree_at(lambda r: (r.weight, r.size), r, arrays)
@@ -332,8 +332,8 @@ def _dtype(*trees: Any) -> np.dtype:
 
 
 def _in(dtype: np.dtype, tree: Any) -> Any:
-    """The tree with all numbers of this type, in arrays."""
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
+    """The tree with all numbers of this type, in arrays on the host."""
+    return jax.tree.map(lambda x: np.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
 
 
 def _build(
@@ -368,13 +368,14 @@ def _build(
     arrays |= {"measured": np.nan_to_num(measured), "weight": weight / size}
     arrays |= {"size": size, "unit": unit}
     region = matrix_region(law, scenes, scale * offset, scale[:, None] * mix, ends)
+    host: dict[str, Any] = {name: np.asarray(array, dtype) for name, array in arrays.items()}
     residuals = Residuals(
         law=law,
-        region=region or Box(*(jnp.asarray(end, dtype) for end in ends)),
-        log=jnp.asarray(log),
+        region=region or Box(host["low"], host["high"]),
+        log=log,  # type: ignore[arg-type]
         observe=observe,
         fields=parameters.fields,
-        **{name: jnp.asarray(array, dtype) for name, array in arrays.items()},
+        **host,
     )
     count, domains = int(here.sum()), np.stack(limits, axis=1)
     return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count, free)

@@ -7,7 +7,7 @@ from .charts import (
     validity_map as validity_map,
     work_precision as work_precision,
 )
-from .fits import fit as fit
+from .fits import contour as contour, fit as fit
 from .laws import (
     comparison as comparison,
     forces as forces,
