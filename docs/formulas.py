@@ -11,7 +11,8 @@ GREEK = (
     *("Gamma", "Delta", "Theta", "Lambda", "Xi", "Sigma", "Phi", "Omega"),
 )
 FUNCTIONS = ["sin", "cos", "tan", "arccos", "exp", "ln", "log", "max", "min"]
-WORDS = {"grad": r"\nabla ", "in": r" \in ", "sum": r"\sum ", "pbar": r"\bar p"}
+WORDS = {"grad": r"\nabla ", "in": r" \in ", "sum": r"\sum ", "pbar": r"{\bar p}"}
+KNOWN = {*GREEK, *FUNCTIONS, *WORDS}
 SIGNS = [  # longer ones first
     ("_|_", r" \perp "), ("<=", r" \le "), (">=", r" \ge "), ("!=", r" \ne "), ("->", r" \to "),
     ("+/-", r" \pm "), ("+=", r" \mathrel{+}= "), ("{", r"\{"), ("}", r"\}"), ("~", r" \sim "),
@@ -90,7 +91,10 @@ def tex(text: str) -> str | None:
     >>> tex("ji.impact") is None
     True
     """
-    if re.search(r"\w\.[A-Za-z]|\b[a-z]{3,} [a-z]{3,}\b|[`\"\\%&#$]|__", text) or not re.search(
+    words = [x for x in re.findall(r"\b[a-z]{4,}\b", text) if x not in KNOWN]
+    if len(words) > 1:  # a sentence
+        return None
+    if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(
         r"[A-Za-z]", text
     ):
         return None
