@@ -48,7 +48,10 @@ def canned(shots, **change):
         "lost_starts": 0,
         "warnings": ("The data gain energy.",),
         "problem": ji.FitProblem.from_shots(
-            ji.LZB([0.6], [2.0]), ji.chain([1.0, 1.0]), ji.Experiments(pre, post), "restitution"
+            ji.LZB([0.6], [2.0], exponent=jnp.asarray(1.5)),
+            ji.chain([1.0, 1.0]),
+            ji.Experiments(pre, post),
+            ("restitution", "exponent"),
         ),
         "jacobian": np.stack([[-0.5, 0.5] * pre[:, :1], np.zeros_like(pre)], axis=2),
     }
@@ -103,7 +106,7 @@ def test_a_fit_in_one_sentence():
     flat = replace(open_end, name="stiffness[1]", intervals=((0.0, 1.0),))
     told = canned(4, profiles=(open_end, flat), standard_error=np.array([0.01, 1.0]))
     assert told.verdict == (
-        "restitution[1] is at least 0.97 (95 %); stiffness[1] cannot be told from these 4 shots."
+        "restitution[1] = 0.600 ± 0.010, at least 0.97 (95 %); stiffness[1] cannot be told from these 4 shots."
     )
 
 

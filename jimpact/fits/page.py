@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import jimpact
-from jimpact.fits.least_squares import Box
-from jimpact.fits.profiles import profile
+from jimpact.fits.profiles import can_be_profiled, in_words, profile
 from jimpact.fits.report import report_blocks
 from jimpact.status import STATUS
 
@@ -45,11 +44,6 @@ def write_page(fit: Any, path: Path, profiles: bool) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def can_be_profiled(fit: Any) -> bool:
-    """Least squares, in a box."""
-    return fit.loss == "squares" and isinstance(fit.problem.residuals.region, Box)
 
 
 def page(fit: Any) -> str:
@@ -93,17 +87,17 @@ def _listed(title: str, lines: Sequence[str]) -> str:
 
 
 def _parameters(fit: Any) -> tuple[list[str], list[list[str]]]:
-    heads = ["parameter", "value", "standard error", "95 %, linearized"]
+    kind = "profile" if fit.profiles else "linearized"
+    heads = ["parameter", "value", "standard error", f"95 % interval, {kind}", ""]
     rows = []
-    for i, (low, high) in enumerate(fit.confidence_interval()):
+    for i, pieces in enumerate(fit.intervals()):
         error = fit.standard_error[i]
         word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
-        interval = f"{low:.5g} to {high:.5g}" if np.isfinite(error) else "-"
-        rows.append([fit.names[i], f"{fit.value[i]:.6g}", word, interval])
-        if fit.profiles:
-            rows[-1].append(fit.profiles[i].words)
-        rows[-1].append("at its bound" if fit.at_bound[i] else "")
-    return [*heads, *(["95 %, profile"] if fit.profiles else []), ""], rows
+        told = np.isfinite(error) or bool(fit.profiles)
+        interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
+        note = "at its bound" if fit.at_bound[i] else ""
+        rows.append([fit.names[i], f"{fit.value[i]:.6g}", word, interval, note])
+    return heads, rows
 
 
 def _shots(fit: Any) -> tuple[list[str], list[list[str]]]:

@@ -1,7 +1,7 @@
 """Which law: every registered one on the same data, the simplest adequate one first."""
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jimpact.fits.many import leave_one_out
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.multistart import EXACT
 from jimpact.fits.problem import FEW
+from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.lzb import LZB
@@ -266,6 +267,7 @@ def fit_laws(
     candidates, left_out = _candidates(scenes, laws, dict(values), tuple(free))
     fits: dict[str, Fit] = {}
     options: dict[str, Any] = {"starts": starts, "seed": seed, "progress": False}
+    options["profiles"] = False
     with progress_bar(progress) as show:
         for i, (name, (law, chosen)) in enumerate(candidates.items()):
             show(f"fit_laws: {name}, law {i + 1} of {len(candidates)}", i, len(candidates))
@@ -280,11 +282,14 @@ def fit_laws(
             why = "; ".join(f"{name} {reason}" for name, reason in left_out.items())
             raise ValueError(f"Argument `laws` must hold a law that can be fitted, but: {why}")
         entries = _judged(fits)
+        best = next(iter(entries))
+        if needs_profiles(fits[best]):
+            fits[best] = replace(fits[best], profiles=profile(fits[best], progress=False))
+            entries[best] = replace(entries[best], fit=fits[best])
         test = None
         if speed:
-            first = next(iter(entries))
-            show(f"fit_laws: {first}, dependence on the speed", len(candidates), len(candidates))
-            test = _speed_test(fits[first], candidates[first], scene, data, options)
+            show(f"fit_laws: {best}, dependence on the speed", len(candidates), len(candidates))
+            test = _speed_test(fits[best], candidates[best], scene, data, options)
     return LawFits(entries, left_out, test)
 
 
