@@ -30,6 +30,7 @@ from .contact import (
     normalized_gap_velocity as normalized_gap_velocity,
 )
 from .experiments import Experiments as Experiments, read_experiments as read_experiments
+from .fits.contours import Contour as Contour, contour as contour
 from .fits.designs import Design as Design, design as design
 from .fits.fitting import Fit as Fit, fit as fit
 from .fits.many import (

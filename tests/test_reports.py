@@ -46,7 +46,10 @@ def canned(shots, **change):
         "lost_starts": 0,
         "warnings": ("The data gain energy.",),
         "problem": ji.FitProblem.from_shots(
-            ji.LZB([0.6], [2.0]), ji.chain([1.0, 1.0]), ji.Experiments(pre, post), "restitution"
+            ji.LZB([0.6], [2.0], exponent=jnp.asarray(1.5)),
+            ji.chain([1.0, 1.0]),
+            ji.Experiments(pre, post),
+            ("restitution", "exponent"),
         ),
     }
     return Fit(**(given | change))

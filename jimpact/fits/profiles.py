@@ -8,31 +8,31 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from jimpact.fits.least_squares import DEFAULT_STEPS, Box, SolverState
-from jimpact.fits.multistart import EXACT, START_SCALES, repeated, run
-from jimpact.fits.problem import Residuals, filled_up, from_scaled, to_scaled
+from jimpact.fits.multistart import EXACT, START_SCALES, run_held
+from jimpact.fits.problem import FEW, Residuals, filled_up, from_scaled, to_scaled
 from jimpact.progress import progress_bar
 
 if TYPE_CHECKING:
     from jimpact.fits.fitting import Fit
 
 NEAR = np.linspace(-4, 4, 17)  # standard errors around a minimum
+HARDLY_SEEN = 0.2  # relative error of a stiffness beyond which no parabola is believed
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
 _METHOD = "levenberg-marquardt"
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Deviance (G,) over the values (G,) of one parameter, and where it is below the limit.
+    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
 
     `deviance` is the sum of squares with the parameter held, less its least value, over the noise
-    variance. `intervals` are the pieces of the confidence interval, in order; an end at `domain` is
-    none: the data do not bound the parameter there. `better`: values of a minimum below that of the
-    fit, or None.
+    variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
+    `domain` is none: the data do not bound the parameter there. `better`: values of a minimum below
+    that of the fit, or None.
     """
 
     name: str
@@ -54,15 +54,7 @@ class Profile:
         >>> Profile(*given, ((0.25, 0.5), (0.75, 1.0)), (0.0, 1.0)).words
         '0.25 to 0.5 or at least 0.75'
         """
-        return " or ".join(self._piece(*ends) for ends in self.intervals)
-
-    def _piece(self, low: float, high: float) -> str:
-        open_low, open_high = low <= self.domain[0], high >= self.domain[1]
-        if open_low and open_high:
-            return "anything"
-        if open_low or open_high:
-            return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
-        return f"{low:.5g} to {high:.5g}"
+        return in_words(self.intervals, self.domain)
 
     def __str__(self) -> str:
         return f"{self.name}: {self.words} ({100 * self.level:g} %)"
@@ -93,6 +85,9 @@ def profile(
         points: held values across the domain, besides those near the minimum, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
 
+    Returns:
+        A `Profile` for each name; `print` says its interval.
+
     Raises:
         ValueError: level, points or names; a robust loss; a matrix that is kept admissible.
 
@@ -106,10 +101,7 @@ def profile(
         raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
     if points < 3:
         raise ValueError(f"Argument `points` must be at least 3, but has value {points}.")
-    if fit.loss != "squares" or not isinstance(fit.problem.residuals.region, Box):
-        raise ValueError(
-            "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."
-        )
+    check_profiled(fit)
     wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
     for name in wanted:
         if name not in fit.names:
@@ -123,36 +115,88 @@ def profile(
     return tuple(scans.profile(i, level) for i in scans.which)
 
 
-class _Scans:
-    """Held values of parameters and the minima with them, in scaled form, as far as known."""
+class Scaled:
+    """A fit in scaled parameters y."""
 
-    def __init__(self, fit: "Fit", which: Sequence[int], show: Any):
-        self.fit, self.which, self.show = fit, which, show
+    def __init__(self, fit: "Fit"):
         r, first = fit.problem.residuals, fit.problem.parameters.first
-        self.residuals: Residuals = filled_up(r)
         self.scale, self.log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
         self.low, self.high = np.asarray(r.low, float), np.asarray(r.high, float)
         self.size = float(r.size)
-        self.best = np.zeros(len(self.low))
-        self.best[: len(first)] = to_scaled(fit.value, self.scale, self.log)
+        exact = EXACT[str(r.offset.dtype)] * self.size**2
+        stated = np.isfinite(fit.noise) and fit.noise > 0
+        # of the weighted residuals; where nothing tells it, what is exact up to rounding
+        self.variance = float(fit.noise**2) if stated else exact
+        self.best = self.point(fit.value)
+
+    def point(self, value: np.ndarray) -> np.ndarray:
+        """y (Q,) of values (P,)."""
+        y = np.zeros(len(self.low))
+        y[: len(value)] = to_scaled(value, self.scale, self.log)
+        return y
+
+    def real(self, i: int, y: np.ndarray) -> np.ndarray:
+        """Values of the i-th parameter."""
+        return np.asarray(from_scaled(y, self.scale[i], np.broadcast_to(self.log[i], y.shape)))
+
+    def reach(
+        self, i: int, pieces: Sequence[tuple[float, float]] | None = None
+    ) -> tuple[float, float]:
+        """The bounds of the i-th parameter or the outer ends of pieces, scaled.
+
+        What has no end is cut at so many natural scales as starts reach.
+        """
+        low, high = self.low[i], self.high[i]
+        if pieces is not None:
+            outer = np.array([pieces[0][0], pieces[-1][1]])
+            outer = to_scaled(outer, self.scale[i], np.broadcast_to(self.log[i], 2))
+            low, high = max(low, outer[0]), min(high, outer[1])
+        low = low if np.isfinite(low) else self.best[i] - START_SCALES
+        high = high if np.isfinite(high) else self.best[i] + START_SCALES
+        return float(low), float(high)
+
+
+def _can_be_profiled(fit: "Fit") -> bool:
+    return fit.loss == "squares" and isinstance(fit.problem.residuals.region, Box)
+
+
+def check_profiled(fit: "Fit") -> None:
+    """Raise a ValueError unless parameters of this fit can be held."""
+    if not _can_be_profiled(fit):
+        raise ValueError(
+            "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."
+        )
+
+
+class _Scans(Scaled):
+    """Held values of parameters and the minima with them, in scaled form, as far as known."""
+
+    def __init__(self, fit: "Fit", which: Sequence[int], show: Any):
+        super().__init__(fit)
+        self.fit, self.which, self.show = fit, which, show
+        self.residuals: Residuals = filled_up(fit.problem.residuals)
         self.least = fit.starts[0].sum_of_squares
         # of each parameter: held value -> (sum of squares, y)
         self.found: dict[int, dict[float, tuple[float, np.ndarray]]] = {
             i: {float(self.best[i]): (self.least, self.best)} for i in which
         }
+        for start in fit.starts[1:]:
+            y = self.point(start.value)
+            for i in which:
+                self.found[i].setdefault(float(y[i]), (start.sum_of_squares, y))
         self.lower: np.ndarray | None = None
 
     def grid(self, i: int, points: int) -> np.ndarray:
-        """Values to hold: across the domain, and near the minimum."""
-        low = max(self.low[i], self.best[i] - START_SCALES) if not self.log[i] else self.low[i]
-        high = min(self.high[i], self.best[i] + START_SCALES) if not self.log[i] else self.high[i]
-        low = self.low[i] if np.isfinite(self.low[i]) else low
-        high = self.high[i] if np.isfinite(self.high[i]) else high
-        return np.r_[np.linspace(low, high, points), self._near(i, self.best, self._error(i))]
-
-    def _error(self, i: int) -> float:
-        step = self.fit.value[i] if self.log[i] else self.scale[i]
-        return float(self.fit.standard_error[i] / step)
+        """Values to hold: across the domain, and near the minima."""
+        values, fit = [np.linspace(*self.reach(i), points)], self.fit
+        for value, errors in (
+            (fit.value, fit.standard_error),
+            *((start.value, start.standard_error) for start in fit.starts[1:]),
+        ):
+            if errors is not None:
+                step = value[i] if self.log[i] else self.scale[i]
+                values.append(self._near(i, self.point(value), float(errors[i] / step)))
+        return np.concatenate(values)
 
     def _near(self, i: int, y: np.ndarray, error: float) -> np.ndarray:
         if not np.isfinite(error):
@@ -161,16 +205,8 @@ class _Scans:
 
     def _solve(self, held: Sequence[tuple[int | None, np.ndarray]]) -> SolverState:
         """Minima from y (Q,), with the i-th entry held, None: nothing."""
-        starts = np.array([y for _, y in held])
-        low, high = (np.tile(end, (len(held), 1)) for end in (self.low, self.high))
-        for k, (i, y) in enumerate(held):
-            if i is not None:
-                low[k, i] = high[k, i] = y[i]
-        dtype = self.residuals.offset.dtype
-        box: Any = Box(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
-        many = repeated(self.residuals, len(held))
-        many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
-        return run(many, starts, _METHOD, DEFAULT_STEPS[_METHOD], self.show, rivals=False)
+        which = [(() if i is None else (i,), y) for i, y in held]
+        return run_held(self.residuals, which, DEFAULT_STEPS[_METHOD], self.show)
 
     def _take(self, held: Sequence[tuple[int, np.ndarray]]) -> None:
         """Solve, and keep what is better than what was known."""
@@ -213,19 +249,11 @@ class _Scans:
         """Held values and their deviances."""
         values = np.array(sorted(self.found[i]))
         squares = np.array([self.found[i][y][0] for y in values])
-        return values, np.maximum(squares - self.least, 0.0) / self._variance()
-
-    def _variance(self) -> float:
-        noise = self.fit.noise
-        if np.isfinite(noise) and noise > 0:
-            return float(noise**2)
-        return EXACT[str(self.residuals.offset.dtype)] * self.size**2
+        return values, np.maximum(squares - self.least, 0.0) / self.variance
 
     def limit(self, level: float) -> float:
         """Deviance at the ends of an interval."""
-        freedom, tail = self.fit.degrees_of_freedom, 0.5 + 0.5 * level
-        known = self.fit.problem.sigma is not None or freedom < 1
-        return float(ndtri(tail) if known else stdtrit(freedom, tail)) ** 2
+        return quantile(self.fit, level) ** 2
 
     def follow_valleys(self, level: float) -> None:
         """Held values around the minima that further valleys of the scans lead to."""
@@ -241,10 +269,10 @@ class _Scans:
         for k, (i, _) in enumerate(starts):
             jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
             inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
-            error = np.sqrt(self._variance() * inverse[i, i])
+            error = np.sqrt(self.variance * inverse[i, i])
             y = np.asarray(states.y[k], float)
             squares = 2 * float(states.cost[k]) * self.size**2
-            if (squares - self.least) / self._variance() <= self.limit(level):
+            if (squares - self.least) / self.variance <= self.limit(level):
                 self.found[i].setdefault(float(y[i]), (squares, y))
                 more += [(i, float(x)) for x in self._near(i, y, float(error))]
         self.add(more)
@@ -270,7 +298,7 @@ class _Scans:
     def profile(self, i: int, level: float) -> Profile:
         """What is known of a parameter."""
         values, d = self.deviance(i)
-        limit, real = self.limit(level), self._real(i, values)
+        limit, real = self.limit(level), self.real(i, values)
         below = np.flatnonzero(d <= limit)
         pieces = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         intervals = []
@@ -284,7 +312,7 @@ class _Scans:
                 p, q = np.sqrt(d[k]), np.sqrt(d[beyond])
                 share = (np.sqrt(limit) - p) / (q - p)
                 y = values[k] + share * (values[beyond] - values[k])
-                ends.append(float(self._real(i, np.array([y]))[0]))
+                ends.append(float(self.real(i, np.array([y]))[0]))
             intervals.append((float(ends[0]), float(ends[1])))
         low, high = self.fit.problem.domains[i]
         better = None
@@ -293,8 +321,87 @@ class _Scans:
         given = (self.fit.names[i], real, d, limit, level, tuple(intervals))
         return Profile(*given, (float(low), float(high)), better)
 
-    def _real(self, i: int, y: np.ndarray) -> np.ndarray:
-        return np.asarray(from_scaled(y, self.scale[i], np.broadcast_to(self.log[i], y.shape)))
+
+def quantile(fit: "Fit", level: float) -> float:
+    """Standard errors to either side that an interval reaches."""
+    if not 0 < level < 1:
+        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+    freedom, tail = fit.degrees_of_freedom, 0.5 + 0.5 * level
+    known = fit.problem.sigma is not None or freedom < 1
+    return float(ndtri(tail) if known else stdtrit(freedom, tail))
+
+
+def linearized(fit: "Fit", i: int, q: float) -> tuple[tuple[float, float], ...]:
+    """Where parabolas at all minima let the i-th parameter lie within q standard errors."""
+    low, high = fit.bounds[0][i], fit.bounds[1][i]
+    log = np.asarray(fit.problem.residuals.log)[fit.problem.parameters.first][i]
+    minima = [(fit.value[i], fit.standard_error[i], 0.0)]
+    for start in fit.starts[1:]:
+        if start.standard_error is not None:
+            more = start.sum_of_squares - fit.starts[0].sum_of_squares
+            minima.append((start.value[i], start.standard_error[i], more))
+    pieces: list[tuple[float, float]] = []
+    for value, error, more in minima:
+        if pieces and not more < (q * fit.noise) ** 2:
+            continue
+        half = error * np.sqrt(q**2 - (more / fit.noise**2 if more else 0.0))
+        if log:
+            ends = value * np.exp(np.array([-half, half]) / value)
+        else:
+            ends = np.array([value - half, value + half])
+        pieces.append(tuple(np.clip(ends, low, high)))
+    return joined(pieces)
+
+
+def needs_profiles(fit: "Fit") -> bool:
+    """Whether parabolas may mislead, and profiles cost little."""
+    problem = fit.problem
+    few = fit.experiments is not None and len(fit.predicted) <= FEW
+    if not few or not _can_be_profiled(fit) or not fit.converged:
+        return False
+    if fit.rank < len(fit.names):
+        return True
+    if not np.isfinite(fit.noise):
+        return False  # nothing tells how far a value may be off
+    log = np.asarray(problem.residuals.log)[problem.parameters.first]
+    q = quantile(fit, 0.95)
+    for i in range(len(fit.names)):
+        pieces = linearized(fit, i, q)
+        at_end = pieces[0][0] <= fit.bounds[0][i] or pieces[-1][1] >= fit.bounds[1][i]
+        wide = log[i] and fit.standard_error[i] > HARDLY_SEEN * fit.value[i]
+        if len(pieces) > 1 or at_end or wide:
+            return True
+    return False
+
+
+def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """The same set in pieces apart from each other, in order.
+
+    >>> from jimpact.fits.profiles import joined
+    >>> joined([(3.0, 4.0), (0.0, 1.0), (0.5, 2.0)])
+    ((0.0, 2.0), (3.0, 4.0))
+    """
+    found: list[tuple[float, float]] = []
+    for low, high in sorted(pieces):
+        if found and low <= found[-1][1]:
+            found[-1] = (found[-1][0], max(high, found[-1][1]))
+        else:
+            found.append((float(low), float(high)))
+    return tuple(found)
+
+
+def in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
+    """Pieces of an interval; an end at the domain is none."""
+    return " or ".join(_piece(*ends, domain) for ends in pieces)
+
+
+def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
+    open_low, open_high = low <= domain[0], high >= domain[1]
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+    return f"{low:.5g} to {high:.5g}"
 
 
 def _first(entry: tuple[float, Any]) -> float:

@@ -10,6 +10,7 @@ from jimpact.fits.adequacy import adequacy
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.problem import FitProblem
+from jimpact.fits.profiles import in_words
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.records import as_data
@@ -50,13 +51,13 @@ def _headline(fit: Any) -> str:
 
 def _parameters(fit: Any) -> list[str]:
     width = max(9, *(len(name) for name in fit.names))
-    lines = [f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   95 % interval"]
-    for i, (low, high) in enumerate(fit.confidence_interval()):
+    head = "95 % interval" + " (profile)" * bool(fit.profiles)
+    lines = [f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   {head}"]
+    for i, pieces in enumerate(fit.intervals()):
         error = fit.standard_error[i]
         word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
-        interval = f"{low:.5g} to {high:.5g}" if np.isfinite(error) else "-"
-        if fit.profiles:
-            interval = fit.profiles[i].words
+        told = np.isfinite(error) or bool(fit.profiles)
+        interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
         note = "   at its bound" if fit.at_bound[i] else ""
         lines.append(f"{fit.names[i]:{width}s} {fit.value[i]:12.6g} {word:>12s}   {interval}{note}")
     return lines
@@ -238,4 +239,4 @@ def _equally_good(problem: FitProblem, found: Search, spread: Uncertainty) -> in
     size, dtype = float(problem.residuals.size), str(problem.residuals.offset.dtype)
     noise = spread.noise / size if np.isfinite(spread.noise) else 0.0
     more = max(EQUALLY_GOOD * noise**2, EXACT[dtype])
-    return sum(cost <= found.minima[0][0] + more for cost, _, _ in found.minima)
+    return sum(end.squares <= found.minima[0].squares + more for end in found.minima)
