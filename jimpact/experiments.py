@@ -35,6 +35,7 @@ class Experiments(eqx.Module):
         scenes: one `Scene` a shot, with the same coordinates, but any number of contacts; a law's
             entry j belongs to contact j of each. None: `fit` gets the scene.
         shots: K labels for tables and pictures; None: 1, 2, ...
+        lost_freedom: independent values that a correction has removed.
         units: of each velocity, n times 'm/s' or 'rad/s'; None: all m/s. Without sigma, velocities
             of different units weigh as much as others of the same kinetic energy.
 
@@ -116,7 +117,7 @@ class Experiments(eqx.Module):
         return own
 
     def largest_scene(self, scene: Scene | None) -> Scene:
-        """The first of the scenes with the most contacts."""
+        """The first of the scenes (or the given common scene) with the most contacts."""
         scenes = [self.scene_of(scene, k) for k in range(len(self.shots))]
         return max(scenes, key=lambda own: own.contacts)
 
@@ -125,7 +126,7 @@ class Experiments(eqx.Module):
 
         Equation: `C^T M (v+ - v-)`, columns of C spanning the complement of range(N), each
         scaled to a largest entry of 1. A chain without walls has c = 1, C = (1, ..., 1): its
-        total momentum. NaN for shots with missing values.
+        total momentum. NaN for shots with missing values. `scene`: where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -135,7 +136,7 @@ class Experiments(eqx.Module):
         return _filled([m @ (post - pre) for m, pre, post in self.balances(scene)])
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """Conserved momentum after over before, (K, c); inf or NaN where there was none before."""
+        """Conserved momentum after over before in a scene (K, c); inf or NaN where none was."""
         rows = []
         for m, pre, post in self.balances(scene):
             before, rounding = m @ pre, 1e-12 * np.abs(m) @ np.abs(pre)
@@ -144,7 +145,7 @@ class Experiments(eqx.Module):
         return _filled(rows)
 
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """`T+ / T-` of every shot (K,); NaN for shots with missing values."""
+        """`T+ / T-` of every shot (K,) in a scene; NaN for shots with missing values."""
         ratios = []
         masses = self.each(scene, dense_mass)
         for mass, pre, post in zip(masses, np.asarray(self.pre), np.asarray(self.post)):
@@ -157,7 +158,7 @@ class Experiments(eqx.Module):
 
         Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
         (sigma = 1 where unknown). For equal masses in a chain: the mean excess is taken from each
-        component. Shots with missing values stay as they are.
+        component. Shots with missing values stay as they are. `scene`: where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -178,7 +179,7 @@ class Experiments(eqx.Module):
         return Experiments(*given)
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """What one m/s of error is worth in each velocity (n,): 1, in rad/s by kinetic energy.
+        """What one m/s of error is worth in each velocity (n,) of a scene: 1, in rad/s by energy.
 
         Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
         """
@@ -189,7 +190,7 @@ class Experiments(eqx.Module):
         return np.where(turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0)
 
     def balances(self, scene: Scene | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Of every shot: C^T M (c, n), v-, v+."""
+        """Of every shot in its scene: C^T M (c, n), v-, v+."""
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
         return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
 
@@ -287,6 +288,12 @@ def read_experiments(path: str | Path) -> Experiments:
     (standard errors of `post`) and `shot` (a label). Units: m/s, cm/s, mm/s, km/h, in/s, ft/s,
     converted to m/s; rad/s, deg/s, converted to rad/s. An empty `post` cell is a value that was
     not measured.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        `Experiments` of K shots, all in m/s and rad/s.
 
     Raises:
         FileNotFoundError: no such file.

@@ -153,7 +153,9 @@ def parameter(
     `monte_carlo`, studies and the command line all read this declaration.
 
     Args:
-        low, high: the closed interval of its values; `open_low`: without `low` itself.
+        low: smallest value.
+        high: largest value.
+        open_low: without `low` itself.
         log: only its logarithm has a natural scale (a stiffness): fitted there.
         static_numbers: a Python number or tuple is compiled in, an array is a parameter.
         matrix: may be a square matrix, which is not bounded.
@@ -161,6 +163,13 @@ def parameter(
         high_unless: name of an option that, where true, lifts `high`.
         default: value of a law that is not given one; may be None (no such effect).
         kw_only: it is given by keyword only.
+
+    Returns:
+        What a class body assigns to the field.
+
+    Raises:
+        ValueError: by the law's constructor, where a value is out of the domain or of a wrong
+            shape.
 
     >>> import jimpact as ji
     >>> class Lossy(ji.Newton):
@@ -191,6 +200,21 @@ def option(
     """A static field of a `Law` that says how it is solved: one of `choices`, or in an interval.
 
     `converter` takes the place of these checks.
+
+    Args:
+        default: of an instance that is not given one.
+        choices: what it may be; None: a number from `low` to `high`.
+        low: None: `converter` decides.
+        high: the other end, included.
+        open_low: without `low` itself.
+        converter: value -> what is kept, or a ValueError; takes the place of these checks.
+        kw_only: it is given by keyword only.
+
+    Returns:
+        What a class body assigns to the field.
+
+    Raises:
+        ValueError: by the law's constructor, where the value is not allowed.
 
     >>> import jimpact as ji
     >>> ji.LZB(0.9, method="euler")
@@ -269,7 +293,17 @@ def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
 
 
 class Impulses(NamedTuple):
-    """What a law answers: p (m,) [N s], p_t (t,) [N s] or None for none, its status code ()."""
+    """What a law answers.
+
+    Args:
+        normal: p (m,) [N s], >= 0 pushes.
+        tangential: p_t (t,) [N s], along the scene's tangents; None: none.
+        status: code () of `jimpact.STATUS`; 0: ok.
+
+    >>> import jimpact as ji
+    >>> ji.Impulses([1.0, 0.5]).tangential is None
+    True
+    """
 
     normal: jax.Array
     tangential: jax.Array | None = None
@@ -308,14 +342,14 @@ class Law(Declared):
 
     @abc.abstractmethod
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses of the contacts, and the law's own status code."""
+        """Impulses of what `contact` shows, and the law's own status code."""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """What the law is shown of the scene; to override where it must see more."""
+        """What the law is shown of the scene at a velocity; to override where it must see more."""
         return contact_of(scene, velocity, self.stored, self.uses_gaps)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """To override: raise where the law does not fit the scene, or the precision."""
+        """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
     @property
     def fills_up(self) -> bool:

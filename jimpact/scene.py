@@ -127,6 +127,9 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
         wall: False; True or 'right': last contact; 'left': first contact; 'both'.
         gaps: (m,) >= 0 [m], None: all closed.
 
+    Returns:
+        `Scene` of n coordinates; m = n - 1 contacts, and one for each wall.
+
     Raises:
         ValueError: masses or gaps out of range or of wrong shape, unknown wall, no contact.
 
@@ -159,6 +162,16 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
 
 def column(masses: Any, gaps: Any = None) -> Scene:
     """A column of bodies above a floor: `chain(masses, wall='right')`, +x down, body 1 on top.
+
+    Args:
+        masses: (n,) > 0 [kg], from the top.
+        gaps: (n,) >= 0 [m], that of the floor last; None: all closed.
+
+    Returns:
+        `Scene` of n coordinates and n contacts.
+
+    Raises:
+        ValueError: as of `chain`.
 
     >>> import jimpact as ji
     >>> ji.column([1.0, 1.0]).contacts
@@ -282,6 +295,13 @@ def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
 def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     """Gap velocities `gamma = N^T v` (m,) [m/s] of velocities (n,); negative on approach.
 
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        gamma (m,) [m/s].
+
     Raises:
         ValueError: not one velocity per coordinate.
 
@@ -301,6 +321,13 @@ def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
 def momentum(scene: Scene, velocity: Any) -> jax.Array:
     """Generalized momenta `M v` (n,); for a chain without walls their sum is conserved.
 
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        M v (n,) [kg m/s] (of angles [kg m^2/s]).
+
     Raises:
         ValueError: not one velocity per coordinate.
 
@@ -314,6 +341,13 @@ def momentum(scene: Scene, velocity: Any) -> jax.Array:
 
 def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
     """Kinetic energy `T = v^T M v / 2` [J] of velocities (n,).
+
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        T () [J].
 
     Raises:
         ValueError: not one velocity per coordinate.
@@ -353,6 +387,9 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
         scene: n coordinates, m contacts.
         impulse: p (m,) [N s].
         tangential: p_t, one per tangent of the scene [N s]; None: 0.
+
+    Returns:
+        The change of v (n,) [m/s].
 
     Raises:
         ValueError: not one impulse per contact, or per tangent.

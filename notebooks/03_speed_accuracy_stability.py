@@ -14,6 +14,12 @@
 # %% [markdown]
 # # Speed, accuracy, stability: no more model than a scene needs
 #
+# *Course, part 3. Before: [Monte Carlo over gaps](02_monte_carlo_gaps.ipynb). Next:
+# [the rocking block](04_rocking_block.ipynb).*
+#
+# You will learn to ask for the simplest law that will do, to read a chart of error against time, and
+# to see where a method of integration fails before it fails you.
+#
 # LZB is right for touching contacts with known stiffness ratios, and the costliest of the
 # instantaneous laws. Which scenes need it? And where they do: what does accuracy cost, and where
 # do methods of integration fail?
@@ -29,6 +35,7 @@ import numpy as np
 import jimpact as ji
 
 balls, v = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
+ji.plot.system(balls, v, "Three equal balls")
 
 # %% [markdown]
 # ## The simplest law that will do
@@ -113,3 +120,6 @@ print(stable)
 
 # %%
 ji.plot.stability_map(stable)
+
+# %% [markdown]
+# *Next: [a block that rocks](04_rocking_block.ipynb).*

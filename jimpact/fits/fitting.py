@@ -53,12 +53,37 @@ class Start:
 class Fit(Generic[AnyLaw]):
     """What `fit` found. `print(fit)` is a report.
 
-    P free parameters `names`, contacts numbered from 1; `predicted` and `residual` are shaped like
-    what was measured, (K, n) for K shots of n velocities.
-    `standard_error` is inf where the data cannot see a parameter, NaN where no degree of freedom
-    is left to estimate the noise from. `rank` < P: see `identifiability`. `starts`: the distinct
-    minima, best first. `noise`: estimated standard error of one value, NaN where no degree of
-    freedom is left, 1 where `sigma` was given. `problem`: what was solved.
+    P free parameters, K shots of n velocities.
+
+    Attributes:
+        law: with the parameters found.
+        method: of minimizing, see `fit`.
+        names: of the parameters, contacts numbered from 1.
+        value: (P,) in the units of each parameter, as the next two.
+        standard_error: (P,); inf where the data cannot see a parameter, NaN where no degree of
+            freedom is left to estimate the noise from.
+        covariance: (P, P).
+        correlation: (P, P), in [-1, 1].
+        bounds: lowest and highest values (P,), (P,).
+        at_bound: (P,) boolean.
+        predicted: shaped like what was measured, (K, n) [m/s].
+        residual: measured less predicted (K, n) [m/s]; NaN where nothing was measured.
+        rms: of the residual.
+        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
+            where `sigma` was given.
+        degrees_of_freedom: independent measured values less `rank`.
+        rank: of the Jacobian; below P: see `identifiability`.
+        singular_values: (P,) of the scaled Jacobian.
+        identifiability: in words, what the data cannot tell apart.
+        starts: the distinct minima, best first.
+        status: (K,) codes of `jimpact.STATUS` at the minimum.
+        converged: whether the best start did.
+        steps: iterations of the best start.
+        lost_starts: how many did not converge.
+        warnings: what is wrong with data or fit, in words.
+        problem: what was solved.
+        loss: see `fit`.
+        profiles: where `fit` was asked for them.
     """
 
     law: AnyLaw
@@ -156,13 +181,17 @@ def fit(
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
-        starts: number of starts, the first from the law's values, the others random (`seed`); if
+        starts: number of starts, the first from the law's values, the others random; if
             more than one, further ones around the best follow as long as they improve it.
+        seed: of the random starts.
         max_steps: iterations per start.
         profiles: whether intervals are those of `profile`; None: of up to 64 shots, where standard
             errors cannot be trusted: at a bound, in a valley, with several minima, or where the
             data hardly see a parameter.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
+
+    Returns:
+        `Fit`; `print` gives its report, `ji.plot.fit` a picture.
 
     Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
     absurd, are left out, and `Fit.warnings` names them. There is told, too, whether the law fits

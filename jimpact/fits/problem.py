@@ -140,7 +140,10 @@ class FitProblem:
     (P, 2) and `names` say where to begin, how far x may go, and what it means. `fit(problem)` does
     all that `fit` does.
 
-    Make one with `from_shots` or `from_observable`.
+    Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where nothing
+    was), `sigma`, `experiments` and `scene` or None, what is `free`, how many independent `values`
+    were measured; in words, `notes` on what was held instead of fitted, and shots `left_out`; and
+    for the solvers `residuals` and `parameters`.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -172,7 +175,15 @@ class FitProblem:
         free: Any = DEFAULT_FREE,
         bounds: Mapping[str, Any] | None = None,
     ) -> "FitProblem":
-        """The problem of measured shots; arguments and errors as of `fit`."""
+        """The problem of measured shots; errors as of `fit`.
+
+        Args:
+            law: start values.
+            scene: of all shots; None: they carry their own.
+            experiments: measured shots.
+            free: as in `fit`.
+            bounds: as in `fit`.
+        """
         check_kind("law", law, Law)
         check_kind("experiments", experiments, Experiments)
         own = experiments.each(scene, lambda s: s)
@@ -215,7 +226,8 @@ class FitProblem:
                 residual is an observable of which zeros were measured.
             measured: what was measured of it, of the same shape; NaN where nothing was.
             sigma: standard errors, scalar or of the same shape; None: one common, unknown.
-            free, bounds: as in `fit`.
+            free: as in `fit`.
+            bounds: as in `fit`.
 
         Raises:
             ValueError: nothing measured, sigma <= 0, an observable of another shape, and as `fit`.
@@ -274,16 +286,16 @@ class FitProblem:
         return self.residuals.law_at(self._scaled(x))
 
     def residual(self, x: Any) -> jax.Array:
-        """(R,) `(observed - measured) / sigma`; a large number where the law fails."""
+        """(R,) `(observed - measured) / sigma` at x (P,); a large number where the law fails."""
         residual, _ = self.residuals.residual(self._scaled(x))
         return self.residuals.size * residual[np.flatnonzero(~np.isnan(self.measured))]
 
     def jacobian(self, x: Any) -> jax.Array:
-        """(R, P) derivatives of `residual`, by forward mode."""
+        """(R, P) derivatives of `residual` at x (P,), by forward mode."""
         return jax.jacfwd(self.residual)(jnp.asarray(x, self.residuals.offset.dtype))
 
     def log_density(self, x: Any) -> jax.Array:
-        """Logarithm () of the probability density of the data, normally distributed.
+        """Logarithm () of the probability density of the data at x (P,), normally distributed.
 
         Equation: `-|r|^2 / 2 - sum log(sigma sqrt(2 pi))`; where sigma is unknown, it is integrated
         over `d sigma / sigma`: `-R log |r|`, up to a constant.

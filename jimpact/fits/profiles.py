@@ -32,12 +32,12 @@ _METHOD = "levenberg-marquardt"
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Deviance (G,) over the values (G,) of one parameter, and where it is below the limit.
+    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
 
     `deviance` is the sum of squares with the parameter held, less its least value, over the noise
-    variance. `intervals` are the pieces of the confidence interval, in order; an end at `domain` is
-    none: the data do not bound the parameter there. `better`: values of a minimum below that of the
-    fit, or None.
+    variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
+    `domain` is none: the data do not bound the parameter there. `better`: values of a minimum below
+    that of the fit, or None.
     """
 
     name: str
@@ -89,6 +89,9 @@ def profile(
         level: of the confidence intervals, in (0, 1).
         points: held values across the domain, besides those near the minimum, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
+
+    Returns:
+        A `Profile` for each name; `print` says its interval.
 
     Raises:
         ValueError: level, points or names; a robust loss; a matrix that is kept admissible.

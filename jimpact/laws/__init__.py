@@ -84,7 +84,7 @@ register(
     right_when="gaps near the indentation, viscous contacts, known absolute stiffness",
     fails_when="stiffness and damping unknown in SI units; geometry that turns during contact",
     promises={"impulse_sign", "gap_velocity_sign", "energy"},
-    source="Brogliato (2016), (6.14)-(6.16); forces as cited in `rheology.py`",
+    source="Brogliato (2016), (6.14)-(6.16); forces as cited in `jimpact.laws.forces`",
     bibtex=_BIBTEX["brogliato2016"],
     make=make_compliant,
 )

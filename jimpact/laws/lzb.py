@@ -54,6 +54,9 @@ def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
         Row j, column i: Gamma_ji; NaN or inf in columns with E_i = 0 (0/0 at the first touch:
         why the law is integrated in time form, see `LZB`).
 
+    Raises:
+        ValueError: energy < 0, stiffness <= 0, exponent < 1.
+
     Source: Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.70).
 
     >>> import jimpact as ji
@@ -148,7 +151,7 @@ class LZB(Law):
         return self.method == "time" and self.friction is None
 
     def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
-        """The impact dynamics in units of their own; `rtol` in place of the law's."""
+        """The dynamics of a contact in units of their own; `rtol` in place of the law's."""
         problem, units = dimensionless(
             contact.delassus,
             contact.gap_velocity,

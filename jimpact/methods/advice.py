@@ -155,7 +155,8 @@ def advise(
         stiffness_range: low and high factor on every stiffness ratio (k_j over that of the first
             contact of its block; on every k_j where not only ratios count); default: (0.1, 10)
             where no stiffness is given, else (1, 1).
-        samples: number of log-uniform samples; seed: of them.
+        samples: number of log-uniform samples.
+        seed: of the samples.
         timing: measure the cost of every law (some seconds of compilation).
         progress: bar on stderr; None: on a terminal, for long runs.
 

@@ -71,8 +71,12 @@ def fit_motion(
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
         bounds: field -> (low, high).
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
-        starts, max_steps: as in `fit`.
+        starts: as in `fit`.
+        max_steps: of each start.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
+
+    Returns:
+        `Fit`; `print` gives its report.
 
     Raises:
         ValueError: shapes, unknown parameters, nothing measured.

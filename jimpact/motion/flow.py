@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 
 from jimpact.bodies.base import Body
 from jimpact.events import stepper
+from jimpact.events.batches import any_lane
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
@@ -97,7 +98,10 @@ def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales)
         return normal
     cone = (mu * found.normal - jnp.abs(found.tangential)) * w[m:] + slack
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
-    lasts = regularity(given, mu, modes) - least_regularity(w.dtype)
+    slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
+    lasts = jax.lax.cond(
+        slides, lambda: regularity(given, mu, modes), lambda: jnp.ones((), w.dtype)
+    ) - least_regularity(w.dtype)
     slip = modes.sign * given.tangent.rate
     slip = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
     side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)

@@ -8,9 +8,15 @@ from .charts import (
     work_precision as work_precision,
 )
 from .fits import contour as contour, fit as fit
-from .laws import comparison as comparison, forces as forces, rheologies as rheologies
+from .laws import (
+    comparison as comparison,
+    forces as forces,
+    history as history,
+    rheologies as rheologies,
+)
 from .montecarlo import monte_carlo as monte_carlo
 from .motions import animation as animation, motion as motion, phase_portrait as phase_portrait
+from .systems import system as system
 from .theory import (
     admissible_set as admissible_set,
     rocking_dispersion as rocking_dispersion,

@@ -13,7 +13,7 @@ from jimpact._checks import check_kind
 from jimpact.experiments import Experiments
 from jimpact.fits.contours import Contour
 from jimpact.fits.fitting import Fit
-from jimpact.plot.style import COLOURS, GREY, SPREAD
+from jimpact.plot.style import COLOURS, GREY, SPREAD, finish, legend_below, new_figure
 
 _LABELLED = 16  # shots up to which every one gets its label
 
@@ -23,6 +23,17 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
     fits of the same data, by label, drawn in grey.
+
+    Args:
+        fit: of shots.
+        others: label -> another fit of the same data.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: a fit of something else than shots.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.3, 0.7])
@@ -36,8 +47,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
-    figure = Figure(figsize=(float(np.clip(4 + 0.35 * shots * bodies, 6.4, 12)), 6.0))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(6.0)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
     error = _error_bars(fit)
     measured = np.asarray(fit.problem.measured, float)
@@ -57,9 +67,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
     top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g} m/s", loc="left")
-    for axes in (top, bottom):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", lw=0.4, alpha=0.5)
+    finish(top, bottom, grid="y")
     return figure
 
 
@@ -135,10 +143,4 @@ def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool)
             handles.append(
                 Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
             )
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        frameon=False,
-        fontsize="small",
-        ncols=min(len(handles), 5),
-    )
+    legend_below(figure, handles, 4)
