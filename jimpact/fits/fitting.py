@@ -335,7 +335,7 @@ def as_fit(
         singular_values=spread.singular_values,
         identifiability=(*problem.notes, *spread.unseen),
         starts=tuple(
-            Start(size**2 * end.squares, end.value, end.count, _error(problem, found, end, spread))
+            Start(size**2 * end.squares, end.value, end.starts, _error(problem, found, end, spread))
             for end in found.minima
         ),
         status=found.status,

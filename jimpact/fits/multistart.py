@@ -71,7 +71,7 @@ class Minimum(NamedTuple):
 
     squares: float  # |r|^2
     value: np.ndarray  # of the parameters (P,)
-    count: int  # of starts
+    starts: int  # how many
     jacobian: np.ndarray  # (R, P), of the scaled parameters
 
 
@@ -156,11 +156,9 @@ def run(
     most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
     lanes = most if few else min(len(points), most)
     points = points.astype(problems.offset.dtype)
-    limit, passes = (
-        (np.asarray(max_steps), np.asarray(PASSES))  # one program serves all limits
-        if method == "levenberg-marquardt"
-        else (max_steps, PASSES)
-    )
+    limit: Any = max_steps
+    if method == "levenberg-marquardt":
+        limit = np.asarray(max_steps)  # one program serves all limits
     begun = [
         begin_all(_rows(problems, rows), points[rows], method, limit)
         for rows in _batches(list(range(len(points))), lanes)
@@ -170,7 +168,7 @@ def run(
     before, since = states.cost.copy(), states.steps.copy()
     while active:
         for rows in _batches(active, lanes):
-            some = advance_all(_rows(problems, rows), _rows(states, rows), method, limit, passes)
+            some = advance_all(_rows(problems, rows), _rows(states, rows), method, limit, PASSES)
             states = jax.tree.map(partial(_with_rows, rows), states, jax.device_get(some))
             ready, steps = len(points) - len(active), int(states.steps.max())
             counts = f"{ready} of {len(points)} starts done, step {steps} of at most {max_steps}"
@@ -333,7 +331,7 @@ def _valleys(
     held = []
     for i in np.flatnonzero(log | ~np.isfinite(low) | ~np.isfinite(high)):
         ends = np.clip(center[i] + reach[i] * np.array([-1, 1]), low[i], high[i])
-        for value in np.linspace(*ends, SCANNED):
+        for value in np.linspace(ends[0], ends[1], SCANNED):
             held.append((int(i), np.array(states.y[best], float)))
             held[-1][1][i] = value
     if not held:

@@ -203,7 +203,7 @@ class _Scans(Scaled):
     def minima(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """y (Q,) of the minima that fit well enough, and scaled standard errors (P,)."""
         fit = self.fit
-        found = [(fit.value, fit.standard_error)]
+        found: list[tuple[np.ndarray, np.ndarray | None]] = [(fit.value, fit.standard_error)]
         if fit.rank == len(fit.names):  # else they are ends in one valley
             found += [(end.value, end.standard_error) for end in fit.starts[1:]]
         return [
@@ -221,7 +221,8 @@ class _Scans(Scaled):
 
     def scan(self, points: int, level: float, far: float) -> None:
         """Deviances across the domains, as far as they are at most `far` times the limit."""
-        values, fronts = {}, []
+        values: dict[int, np.ndarray] = {}
+        fronts: list[_Front] = []
         for i in self.which:
             parts = [np.linspace(*self.reach(i), points)]
             for y, error in self.minima():
@@ -260,7 +261,7 @@ class _Scans(Scaled):
         squares = 2 * np.asarray(states.cost, float) * self.size**2
         ends = []
         for k, (i, y) in enumerate(held):
-            end = _with(states.y[k], i, y[i])
+            end = _with(np.asarray(states.y[k]), i, y[i])
             ends.append((float(squares[k]), end))
             if not squares[k] >= self.found[i].get(float(y[i]), (np.inf, y))[0]:
                 self.found[i][float(y[i])] = ends[-1]
@@ -293,7 +294,8 @@ class _Scans(Scaled):
         if not starts:
             return
         states = self._solve([(None, y) for _, y in starts])
-        fronts, near = [], {}
+        fronts: list[_Front] = []
+        near: dict[int, np.ndarray] = {}
         for k, (i, _) in enumerate(starts):
             jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
             inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
