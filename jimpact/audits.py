@@ -17,7 +17,18 @@ CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
 
 
 class Audit(eqx.Module):
-    """Four answers and the numbers behind them (`worst_*`: scaled by the impact's own size)."""
+    """Four answers, and the numbers behind them, scaled by the impact's own size.
+
+    Attributes:
+        kinematic: whether gamma+ >= 0 at closed contacts ().
+        kinetic: whether p >= 0 ().
+        energetic: whether no energy is gained ().
+        momentum: whether contact impulses explain the change ().
+        worst_gap_velocity: the least gamma+ ().
+        worst_impulse: the least p ().
+        energy_gain: T+ - T- less what was stored ().
+        momentum_residual: largest entry of M (v+ - v-) - N p ().
+    """
 
     kinematic: jax.Array
     kinetic: jax.Array
@@ -49,6 +60,12 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
         scene: the scene of the impact.
         velocity: v- (n,) [m/s].
         out: what `impact` returned, or an `Impact` filled by hand from measurements.
+
+    Returns:
+        `Audit`: a boolean () for each of the four, `consistent` for all; `print` says it in words.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
 
     Source: Brogliato (2016), section 6.2.4.
 
@@ -107,6 +124,17 @@ def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
 
 def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     """A printable account of one impact (or, for a batch, of its status codes).
+
+    Args:
+        out: what `impact` returned, one or a batch.
+        scene: of the impact.
+        velocity: v- (n,) [m/s].
+
+    Returns:
+        Text of several lines: status, energy, audit, velocities and impulses of all contacts.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
 
     >>> import jimpact as ji
     >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]

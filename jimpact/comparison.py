@@ -25,6 +25,17 @@ _REPEATS = 20  # of the timing; its median is told
 def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:
     """Kinetic-energy ratio `T+ / T-`; 1 conserves, NaN where nothing moves before.
 
+    Args:
+        scene: n coordinates, m contacts.
+        before: v- (n,) [m/s].
+        after: v+ (n,) [m/s].
+
+    Returns:
+        Ratio ().
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
     >>> import jimpact as ji
     >>> float(ji.energy_ratio(ji.chain([1.0, 1.0]), [1.0, 0.0], [0.5, 0.5]))
     0.5
@@ -39,6 +50,16 @@ def dispersion_index(scene: Scene, velocity: Any) -> jax.Array:
     mean) of the shares `T_i = v_i (M v)_i / 2`, whose largest value is `sqrt(n - 1)`. For equal
     balls with v- = (1, 0, 0) and no loss: 0 at (0, 0, 1), 2/3 at (-1/3, 2/3, 2/3).
     NaN at rest, and for one coordinate. Not differentiable at equal shares.
+
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        Index () in [0, 1], at most 1 where all shares are >= 0.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
 
     >>> import jimpact as ji
     >>> round(float(ji.dispersion_index(ji.chain([1.0, 1.0, 1.0]), [-1 / 3, 2 / 3, 2 / 3])), 6)
@@ -84,9 +105,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found: `entries[name]`; `left_out[name]` says why; `print` gives a table.
+    """What `compare` found; `print` gives a table.
 
-    `measured` (n,), where it is known, is v+ beside which the laws are put.
+    Attributes:
+        scene: as asked for.
+        velocity: v- (n,) [m/s].
+        entries: outcome, audit, energy ratio, dispersion and time by law.
+        left_out: why a law is missing.
+        measured: v+ (n,) [m/s] beside which the laws are put, or None.
     """
 
     scene: Scene
@@ -151,6 +177,12 @@ def compare(
         values: parameters by name, `restitution=0.9, stiffness=..., exponent=..., matrix=...`
             (laws that need others are left out, see `left_out`); restitution is 1 where nothing
             is said.
+
+    Returns:
+        `Comparison`: an entry for each law, `print` gives a table, `ji.plot.comparison` a picture.
+
+    Raises:
+        ValueError: velocities of another size or NaN; both `laws` and values.
 
     >>> import jimpact as ji
     >>> table = ji.compare(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0], restitution=1.0)

@@ -159,21 +159,21 @@ class Contact(eqx.Module):
         return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
 
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
-        """gamma+ (m,) [m/s] of impulses p (m,) and p_t (t,)."""
+        """gamma+ (m,) [m/s] of impulses, normal p (m,) and tangential p_t (t,)."""
         after = self.gap_velocity + self.delassus @ normal
         return (
             after if self.cross is None or tangential is None else after + self.cross @ tangential
         )
 
     def slip_after(self, normal: jax.Array, tangential: jax.Array) -> jax.Array:
-        """u+ (t,) [m/s] of impulses p (m,) and p_t (t,), where the scene has tangents."""
+        """u+ (t,) [m/s] of impulses, normal (m,) and tangential (t,), where there are tangents."""
         assert self.cross is not None
         assert self.slip is not None
         assert self.tangential is not None
         return self.slip + self.cross.T @ normal + self.tangential @ tangential
 
     def energy_change(self, normal: jax.Array, tangential: jax.Array | None = None) -> jax.Array:
-        """T+ - T- () [J] of impulses: their work at the mean of the velocities before and after."""
+        """T+ - T- () [J] of normal and tangential impulses: their work at the mean velocities."""
         mean = 0.5 * (self.gap_velocity + self.gap_velocity_after(normal, tangential))
         if tangential is None or self.slip is None:
             return mean @ normal
@@ -185,7 +185,7 @@ class Contact(eqx.Module):
         return _angles(self.delassus)
 
     def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
-        """Rounding (m,) of gamma+: terms of W p may be large and cancel, as beside a light ball."""
+        """Rounding (m,) of gamma+ after normal and tangential impulses: terms of W p may cancel."""
         w = self.delassus
         if isinstance(w, Tridiagonal):
             size = Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(normal)
@@ -268,6 +268,12 @@ def _closed_block(
 def delassus_matrix(scene: Scene) -> Symmetric:
     """`W = N^T M^-1 N` [1/kg]: (m, m), or `Tridiagonal` for a chain.
 
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        W (m, m) [1/kg], symmetric; indexed like an array where it is `Tridiagonal`.
+
     Source: Brogliato (2016), (6.35) where bilateral constraints are present.
 
     >>> import jimpact as ji
@@ -305,6 +311,12 @@ def normalized_delassus(scene: Scene) -> Symmetric:
 
     Bilateral constraints distort it, its diagonal included: Brogliato (2016), (6.35).
 
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        G (m, m), or `Tridiagonal` for a chain.
+
     >>> import jimpact as ji
     >>> ji.normalized_delassus(ji.chain([1.0, 1.0, 1.0])).off_diagonal.round(3).tolist()
     [-0.5]
@@ -314,6 +326,16 @@ def normalized_delassus(scene: Scene) -> Symmetric:
 
 def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     """`gamma_j / |grad f_j|` (m,) [sqrt(J)], the normal quasi-velocities.
+
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        qn (m,) [sqrt(J)], < 0 on approach.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
 
     Source: Brogliato (2016), (6.24).
 
@@ -326,6 +348,12 @@ def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
 
 def kinetic_angles(scene: Scene) -> jax.Array:
     """Angles `theta_ij = pi - arccos(G_ij)` (m, m) [rad] between contacts; pi/2: decoupled.
+
+    Args:
+        scene: n coordinates, m contacts.
+
+    Returns:
+        Angles (m, m) [rad], pi on the diagonal.
 
     Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
     Source: Brogliato (2016), (6.66).

@@ -1,5 +1,6 @@
 """Measured shots: velocities before and after, read from CSV; momentum and energy they defy."""
 
+import functools
 import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -37,6 +38,7 @@ class Experiments(eqx.Module):
         scenes: one `Scene` a shot, with the same coordinates, but any number of contacts; a law's
             entry j belongs to contact j of each. None: `fit` gets the scene.
         shots: K labels for tables and pictures; None: 1, 2, ...
+        lost_freedom: independent values that a correction has removed.
         units: of each velocity, n times 'm/s' or 'rad/s'; None: all m/s. Without sigma, velocities
             of different units weigh as much as others of the same kinetic energy.
         sigma_pre: standard error of each `pre` value, (K, n) or a scalar, >= 0 [m/s]; with it goes
@@ -139,7 +141,7 @@ class Experiments(eqx.Module):
         return own
 
     def largest_scene(self, scene: Scene | None) -> Scene:
-        """The first of the scenes with the most contacts."""
+        """The first of the scenes (or the given common scene) with the most contacts."""
         scenes = [self.scene_of(scene, k) for k in range(len(self.shots))]
         return max(scenes, key=lambda own: own.contacts)
 
@@ -148,7 +150,7 @@ class Experiments(eqx.Module):
 
         Equation: `C^T M (v+ - v-)`, columns of C spanning the complement of range(N), each
         scaled to a largest entry of 1. A chain without walls has c = 1, C = (1, ..., 1): its
-        total momentum. NaN for shots with missing values.
+        total momentum. NaN for shots with missing values. `scene`: where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -158,7 +160,7 @@ class Experiments(eqx.Module):
         return _filled([m @ (post - pre) for m, pre, post in self.balances(scene)])
 
     def momentum_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """Conserved momentum after over before, (K, c); inf or NaN where there was none before."""
+        """Conserved momentum after over before in a scene (K, c); inf or NaN where none was."""
         rows = []
         for m, pre, post in self.balances(scene):
             before, rounding = m @ pre, 1e-12 * np.abs(m) @ np.abs(pre)
@@ -167,7 +169,7 @@ class Experiments(eqx.Module):
         return _filled(rows)
 
     def energy_ratio(self, scene: Scene | None = None) -> np.ndarray:
-        """`T+ / T-` of every shot (K,); NaN for shots with missing values."""
+        """`T+ / T-` of every shot (K,) in a scene; NaN for shots with missing values."""
         ratios = []
         masses = self.each(scene, dense_mass)
         for mass, pre, post in zip(masses, np.asarray(self.pre), np.asarray(self.post)):
@@ -180,7 +182,7 @@ class Experiments(eqx.Module):
 
         Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
         (sigma = 1 where unknown). For equal masses in a chain: the mean excess is taken from each
-        component. Shots with missing values stay as they are.
+        component. Shots with missing values stay as they are. `scene`: where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -229,8 +231,20 @@ class Experiments(eqx.Module):
         """Number of contacts of every shot (K,) whose scenes are its own."""
         return np.array(self.each(None, lambda scene: scene.contacts))
 
+    def approach_speed(self, scene: Scene | None = None) -> np.ndarray:
+        """Speed (K,) of the fastest approach at a closed contact before every shot [m/s].
+
+        >>> import jimpact as ji
+        >>> data = ji.Experiments(pre=[1.0, 0.25], post=[0.2, 0.9])
+        >>> float(data.approach_speed(ji.chain([1.0, 1.0]))[0])
+        0.75
+        """
+        normals = self.each(scene, _closed_normals)
+        rates = [n.T @ v for n, v in zip(normals, np.asarray(self.pre, float))]
+        return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
+
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """What one m/s of error is worth in each velocity (n,): 1, in rad/s by kinetic energy.
+        """What one m/s of error is worth in each velocity (n,) of a scene: 1, in rad/s by energy.
 
         Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
         """
@@ -241,7 +255,7 @@ class Experiments(eqx.Module):
         return np.where(turns, np.sqrt(masses[~turns].mean() / masses[turns].mean()), 1.0)
 
     def balances(self, scene: Scene | None) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Of every shot: C^T M (c, n), v-, v+."""
+        """Of every shot in its scene: C^T M (c, n), v-, v+."""
         pre, post = np.asarray(self.pre, float), np.asarray(self.post, float)
         return [(rows, a, b) for rows, a, b in zip(self.each(scene, conserved_momenta), pre, post)]
 
@@ -260,6 +274,25 @@ def _filled(rows: list[np.ndarray]) -> np.ndarray:
     return filled
 
 
+class _Same(NamedTuple):
+    """A scene that is equal to itself only."""
+
+    scene: Scene
+
+    def __hash__(self) -> int:
+        return id(self.scene)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.scene is other.scene
+
+
+def _remembered(function: Callable[[Scene], np.ndarray]) -> Callable[[Scene], np.ndarray]:
+    """The function, which need not compute again for the scenes it was called with last."""
+    last = functools.lru_cache(maxsize=4)(lambda same: function(same.scene))
+    return functools.wraps(function)(lambda scene: last(_Same(scene)))
+
+
+@_remembered
 def conserved_momenta(scene: Scene) -> np.ndarray:
     """`C^T M` (c, n): C spans the complement of all contact and constraint directions."""
     others = [x for x in (scene.tangents, scene.constraints) if x is not None]
@@ -333,6 +366,9 @@ def read_experiments(
             a `Body`, which they place. The shots then have scenes of their own.
         near: of a body's contacts, those up to so far above the lowest one are closed, the others
             are left out (see `Body.scenes`) [m].
+
+    Returns:
+        `Experiments` of K shots, all in m/s and rad/s.
 
     Raises:
         FileNotFoundError: no such file.
@@ -443,6 +479,7 @@ def data_defects(
     return lines
 
 
+@_remembered
 def _closed_normals(scene: Scene) -> np.ndarray:
     """Normals (n, c) of the closed contacts."""
     return np.asarray(scene.normals, float)[:, np.asarray(scene.closed)]

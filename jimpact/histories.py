@@ -58,6 +58,9 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
         velocity: v- (n,) [m/s].
         samples: number of rows, first before and last after the impact.
 
+    Returns:
+        `History`: rows are samples; `status` () as of `impact`.
+
     Differentiable in both modes: `duration` and `maximum_force` too.
 
     Raises:

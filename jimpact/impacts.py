@@ -256,6 +256,15 @@ def raise_on_failure(out: Impact) -> Impact:
 
     Codes that only inform (`plastic_limit`, `ill_conditioned`, `order_dependent`, ..) pass.
 
+    Args:
+        out: what `impact` returned, one or a batch.
+
+    Returns:
+        `out` itself.
+
+    Raises:
+        RuntimeError: a status that is a failure; with the places in the batch.
+
     >>> import jimpact as ji
     >>> apart = ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 1.0])
     >>> ji.raise_on_failure(apart)

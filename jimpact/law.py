@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import operator
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, overload
 
@@ -21,6 +22,10 @@ from jimpact._checks import (
 from jimpact.contact import Contact, contact_of
 from jimpact.scene import Scene
 from jimpact.status import CODE
+
+# Exponent of a contact force up to which a fit looks: a cone has 2, rough surfaces about 3. Beyond,
+# a contact is hard almost at once and no velocity tells its exponent.
+LARGEST_EXPONENT = 5.0
 
 _KEY = "jimpact"  # of what a field declares, in its metadata
 
@@ -74,6 +79,7 @@ class Domain:
     matrix: bool = False
     per_contact: bool = True
     high_unless: str | None = None
+    searched_high: float = np.inf
     name: str = "parameter"  # until the class that holds it is made
 
     def __call__(self, value: Any) -> Any:
@@ -144,6 +150,7 @@ def parameter(
     matrix: bool = False,
     per_contact: bool = True,
     high_unless: str | None = None,
+    searched_high: float = np.inf,
     default: Any = dataclasses.MISSING,
     kw_only: bool = False,
 ) -> Any:
@@ -153,14 +160,25 @@ def parameter(
     `monte_carlo`, studies and the command line all read this declaration.
 
     Args:
-        low, high: the closed interval of its values; `open_low`: without `low` itself.
+        low: smallest value.
+        high: largest value.
+        open_low: without `low` itself.
         log: only its logarithm has a natural scale (a stiffness): fitted there.
         static_numbers: a Python number or tuple is compiled in, an array is a parameter.
         matrix: may be a square matrix, which is not bounded.
         per_contact: a scalar or one value per contact (m,), checked against the scene.
         high_unless: name of an option that, where true, lifts `high`.
+        searched_high: a fit goes no further unless it starts beyond, or `bounds` say so: larger
+            values are allowed, but mean nothing that a measurement could tell.
         default: value of a law that is not given one; may be None (no such effect).
         kw_only: it is given by keyword only.
+
+    Returns:
+        What a class body assigns to the field.
+
+    Raises:
+        ValueError: by the law's constructor, where a value is out of the domain or of a wrong
+            shape.
 
     >>> import jimpact as ji
     >>> class Lossy(ji.Newton):
@@ -174,7 +192,9 @@ def parameter(
         ...
     ValueError: Argument `loss` must lie in [0, 1], but has value 1.5.
     """
-    declared = Domain(low, high, open_low, log, static_numbers, matrix, per_contact, high_unless)
+    declared = Domain(
+        low, high, open_low, log, static_numbers, matrix, per_contact, high_unless, searched_high
+    )
     return _field(declared, default, kw_only, False)
 
 
@@ -191,6 +211,21 @@ def option(
     """A static field of a `Law` that says how it is solved: one of `choices`, or in an interval.
 
     `converter` takes the place of these checks.
+
+    Args:
+        default: of an instance that is not given one.
+        choices: what it may be; None: a number from `low` to `high`.
+        low: None: `converter` decides.
+        high: the other end, included.
+        open_low: without `low` itself.
+        converter: value -> what is kept, or a ValueError; takes the place of these checks.
+        kw_only: it is given by keyword only.
+
+    Returns:
+        What a class body assigns to the field.
+
+    Raises:
+        ValueError: by the law's constructor, where the value is not allowed.
 
     >>> import jimpact as ji
     >>> ji.LZB(0.9, method="euler")
@@ -256,6 +291,11 @@ def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
     return {k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)}
 
 
+def with_parameter(module: Any, name: str, value: Any) -> Any:
+    """The law with another value of a parameter, of its own or of one of its parts."""
+    return eqx.tree_at(operator.attrgetter(parameters_of(module)[name].path), module, value)
+
+
 def within_domains(law: eqx.Module) -> jax.Array:
     """Whether () all parameters are finite and in their domains, on the device."""
     every = free_parameters_of(law).values()
@@ -269,7 +309,17 @@ def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
 
 
 class Impulses(NamedTuple):
-    """What a law answers: p (m,) [N s], p_t (t,) [N s] or None for none, its status code ()."""
+    """What a law answers.
+
+    Args:
+        normal: p (m,) [N s], >= 0 pushes.
+        tangential: p_t (t,) [N s], along the scene's tangents; None: none.
+        status: code () of `jimpact.STATUS`; 0: ok.
+
+    >>> import jimpact as ji
+    >>> ji.Impulses([1.0, 0.5]).tangential is None
+    True
+    """
 
     normal: jax.Array
     tangential: jax.Array | None = None
@@ -308,14 +358,14 @@ class Law(Declared):
 
     @abc.abstractmethod
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses of the contacts, and the law's own status code."""
+        """Impulses of what `contact` shows, and the law's own status code."""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """What the law is shown of the scene; to override where it must see more."""
+        """What the law is shown of the scene at a velocity; to override where it must see more."""
         return contact_of(scene, velocity, self.stored, self.uses_gaps)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """To override: raise where the law does not fit the scene, or the precision."""
+        """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
     @property
     def fills_up(self) -> bool:

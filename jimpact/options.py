@@ -17,6 +17,7 @@ from jimpact import starting, study_file
 from jimpact._checks import check_choice
 
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
+EVERY_LAW = "all"  # in the place of a law's name
 PICTURES = (".png", ".pdf", ".svg")
 StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
 
@@ -122,23 +123,31 @@ class FitCommand(DrawingCommand):
     """Study file, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
     bead_column.toml, ...); also the study of a motion with [data]."""
     law: str | None = None
-    """Law in the place of the study's (see `jimpact laws`)."""
+    """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
     method: Method | None = None
     """Solver; default: the study's, or levenberg-marquardt."""
     starts: int | None = None
     """Number of starts; default: the study's, or 8."""
     seed: int | None = None
     """Seed of the random starts."""
+    report: Path | None = None
+    """One page (.html) with all of the fit: intervals, profiles, pictures, versions."""
 
     def check(self) -> None:
-        """Also the study, which must have data."""
+        """Also the study, which must have data, and the report's kind."""
         super().check()
+        if self.report is not None and self.report.suffix not in (".html", ".htm"):
+            raise ValueError(f"--report must end in .html, but is '{self.report}'.")
+        law = None if self.law == EVERY_LAW else self.law
         if study_file.is_motion(self.study):
-            if self.method is not None:
-                raise ValueError("--method must be left out for a motion.")
-            fitted = study_file.check_motion_study(self.study, self.law)
+            if self.method is not None or self.law == EVERY_LAW:
+                raise ValueError("--method and --law all must be left out for a motion.")
+            fitted = study_file.check_motion_study(self.study, law)
         else:
-            fitted = study_file.check_study(self.study, self.law).fitted
+            found = study_file.check_study(self.study, law)
+            fitted = found.fitted
+            if self.law == EVERY_LAW and not found.shots:
+                raise ValueError("--law all must be left out where no shots are fitted.")
         if not fitted:
             raise ValueError(study_file.NO_DATA)
 

@@ -103,10 +103,10 @@ class Scene(eqx.Module):
             return self._normals
         assert self.walls is not None
         left, _ = self.walls
-        body = jnp.arange(self.size)[:, None]
-        first = jnp.arange(self.contacts)[None, :] - int(left)  # body on the contact's left
-        ones = (body == first + 1).astype(self.mass.dtype)
-        return ones - (body == first).astype(self.mass.dtype)
+        body = np.arange(self.size)[:, None]
+        first = np.arange(self.contacts)[None, :] - int(left)  # body on the contact's left
+        signs = (body == first + 1).astype(int) - (body == first).astype(int)
+        return jnp.asarray(signs, self.mass.dtype)
 
     @property
     def closed(self) -> jax.Array:
@@ -126,6 +126,9 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
         masses: (n,) > 0 [kg].
         wall: False; True or 'right': last contact; 'left': first contact; 'both'.
         gaps: (m,) >= 0 [m], None: all closed.
+
+    Returns:
+        `Scene` of n coordinates; m = n - 1 contacts, and one for each wall.
 
     Raises:
         ValueError: masses or gaps out of range or of wrong shape, unknown wall, no contact.
@@ -160,6 +163,16 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
 def column(masses: Any, gaps: Any = None) -> Scene:
     """A column of bodies above a floor: `chain(masses, wall='right')`, +x down, body 1 on top.
 
+    Args:
+        masses: (n,) > 0 [kg], from the top.
+        gaps: (n,) >= 0 [m], that of the floor last; None: all closed.
+
+    Returns:
+        `Scene` of n coordinates and n contacts.
+
+    Raises:
+        ValueError: as of `chain`.
+
     >>> import jimpact as ji
     >>> ji.column([1.0, 1.0]).contacts
     2
@@ -182,6 +195,8 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
         ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
             coordinates or constraints.
     """
+    if len(scenes) == 1:
+        return list(scenes), 0
     flat = [jax.tree.flatten(s) for s in scenes]
     layouts = {(tree, tuple(map(np.shape, leaves))) for leaves, tree in flat}
     if len(layouts) == 1:
@@ -281,6 +296,13 @@ def as_velocity(scene: Scene, velocity: Any) -> jax.Array:
 def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     """Gap velocities `gamma = N^T v` (m,) [m/s] of velocities (n,); negative on approach.
 
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        gamma (m,) [m/s].
+
     Raises:
         ValueError: not one velocity per coordinate.
 
@@ -300,6 +322,13 @@ def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
 def momentum(scene: Scene, velocity: Any) -> jax.Array:
     """Generalized momenta `M v` (n,); for a chain without walls their sum is conserved.
 
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        M v (n,) [kg m/s] (of angles [kg m^2/s]).
+
     Raises:
         ValueError: not one velocity per coordinate.
 
@@ -313,6 +342,13 @@ def momentum(scene: Scene, velocity: Any) -> jax.Array:
 
 def kinetic_energy(scene: Scene, velocity: Any) -> jax.Array:
     """Kinetic energy `T = v^T M v / 2` [J] of velocities (n,).
+
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        T () [J].
 
     Raises:
         ValueError: not one velocity per coordinate.
@@ -352,6 +388,9 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
         scene: n coordinates, m contacts.
         impulse: p (m,) [N s].
         tangential: p_t, one per tangent of the scene [N s]; None: 0.
+
+    Returns:
+        The change of v (n,) [m/s].
 
     Raises:
         ValueError: not one impulse per contact, or per tangent.

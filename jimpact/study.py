@@ -24,7 +24,7 @@ from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.observables import Measured, observations
-from jimpact.fits.parameters import default_free
+from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FitProblem
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
@@ -139,7 +139,8 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
     values = with_exponent(values, free)
     law = row.build(**values)
     known = free_parameters_of(law)
-    free = free or dict.fromkeys({"restitution"} & set(known) or default_free(known), True)
+    bounce = [name for name in ("restitution", *OF_SPEED) if name in known]
+    free = free or dict.fromkeys(bounce or default_free(known), True)
     experiments = _experiments(tables["data"], path, body or scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
     sampled = _sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}

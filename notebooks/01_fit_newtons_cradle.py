@@ -14,10 +14,15 @@
 # %% [markdown]
 # # Fit a law to a measured Newton's cradle
 #
+# *Course, part 1. Before: [five minutes](00_five_minutes.ipynb). Next:
+# [Monte Carlo over gaps](02_monte_carlo_gaps.ipynb).*
+#
+# You will learn to fit a law, to read what its report says of the data, to see what one shot cannot
+# tell, and to check whether the errors that a fit states are true.
+#
 # Three equal hard balls, two of them touching at rest, the first strikes them. The velocities
 # after the impact were measured once and are quoted by Brogliato, *Nonsmooth Mechanics* (2016),
-# section 6.1.2. We look at the data, fit two laws, ask what one shot can and cannot tell, and
-# check the stated errors on simulated shots.
+# section 6.1.2.
 
 # %%
 # %matplotlib inline
@@ -37,6 +42,7 @@ began = time.perf_counter()
 balls = ji.chain([1.0, 1.0, 1.0])
 measured = ji.read_experiments(files("jimpact") / "data" / "three_balls.csv")
 print("before", measured.pre[0], "\nafter ", measured.post[0], "m/s")
+ji.plot.system(balls, measured.pre[0], "Before the impact")
 
 # %% [markdown]
 # ## What is wrong with the data
@@ -188,3 +194,6 @@ figure
 
 # %%
 print(f"run time {time.perf_counter() - began:.0f} s")
+
+# %% [markdown]
+# *Next: [gaps of micrometres that decide](02_monte_carlo_gaps.ipynb).*

@@ -14,6 +14,12 @@
 # %% [markdown]
 # # Monte Carlo over initial gaps
 #
+# *Course, part 2. Before: [fit a law](01_fit_newtons_cradle.ipynb). Next:
+# [speed, accuracy, stability](03_speed_accuracy_stability.ipynb).*
+#
+# You will learn how large a gap must be to matter, to draw gaps at random and read the statistics, and
+# where a linearization is enough.
+#
 # Two small balls strike a large one from both sides. Rigid-body theory has the outcome jump with
 # the order of the two collisions. Real contacts are compliant: the jump is a smooth crossover,
 # about two indentations wide. Here is how wide that is for steel, what it does to the
@@ -38,6 +44,7 @@ v = jnp.array([1.0, 0.0, -1.0])
 law = ji.Compliant(ji.Hertz(1.06e10))  # N/m^1.5
 scale = ji.gap_scale(balls, law, v)
 print(scale)
+ji.plot.system(ji.chain([small, large, small], gaps=[1e-5, 1e-5]), v, "Gaps not to scale")
 
 # %% [markdown]
 # ## The crossover
@@ -107,3 +114,6 @@ for spread in (0.01, 0.1, 1.0):
         "linear",
         linear.round(4),
     )
+
+# %% [markdown]
+# *Next: [which law, which method, how exact](03_speed_accuracy_stability.ipynb).*

@@ -14,6 +14,12 @@
 # %% [markdown]
 # # Speed, accuracy, stability: no more model than a scene needs
 #
+# *Course, part 3. Before: [Monte Carlo over gaps](02_monte_carlo_gaps.ipynb). Next:
+# [the rocking block](04_rocking_block.ipynb).*
+#
+# You will learn to ask for the simplest law that will do, to read a chart of error against time, and
+# to see where a method of integration fails before it fails you.
+#
 # LZB is right for touching contacts with known stiffness ratios, and the costliest of the
 # instantaneous laws. Which scenes need it? And where they do: what does accuracy cost, and where
 # do methods of integration fail?
@@ -29,6 +35,7 @@ import numpy as np
 import jimpact as ji
 
 balls, v = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
+ji.plot.system(balls, v, "Three equal balls")
 
 # %% [markdown]
 # ## The simplest law that will do
@@ -38,7 +45,7 @@ balls, v = ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]
 # be measured.
 
 # %%
-cradle = ji.advise(balls, v, 0.01)
+cradle = ji.advise(balls, v, 0.01, timing=False)
 print(cradle)
 
 # %%
@@ -71,12 +78,12 @@ for scene, velocity, options in (
 # %% [markdown]
 # ## Where the stiffness ratio may be left out
 #
-# How evenly LZB spreads the energy of three balls, against k2/k1 and for four exponents. To the
+# How evenly LZB spreads the energy of three balls, against k2/k1 and for three exponents. To the
 # left lies the binary outcome (one ball takes all), to the right Moreau's. The larger the
 # exponent, the further right the change; and Moreau's law is approached in waves.
 
 # %%
-valid = ji.validity_map(balls, v)
+valid = ji.validity_map(balls, v, exponents=(1.0, 1.5, 3.0))
 print(valid)
 ji.plot.validity_map(valid)
 
@@ -90,9 +97,8 @@ ji.plot.validity_map(valid)
 law = ji.LZB(0.9, [1.0, 1.0], 1.5)
 ladder = {"dop853": [1e-4, 1e-6, 1e-8], "rk4": [0.1, 0.03, 0.01]}
 laws = {"moreau": ji.Moreau(0.9), "binary": ji.Binary(0.9)}
-chart = ji.work_precision(
-    balls, v, law, list(ladder), ladder, laws, batch=64, repeats=3, gradients=False
-)
+options = {"batch": 64, "repeats": 3, "gradients": False, "durations": False}
+chart = ji.work_precision(balls, v, law, list(ladder), ladder, laws, **options)
 print(chart)
 
 # %%
@@ -113,3 +119,6 @@ print(stable)
 
 # %%
 ji.plot.stability_map(stable)
+
+# %% [markdown]
+# *Next: [a block that rocks](04_rocking_block.ipynb).*

@@ -14,6 +14,12 @@
 # %% [markdown]
 # # The rocking block
 #
+# *Course, part 4. Before: [speed, accuracy, stability](03_speed_accuracy_stability.ipynb). Next:
+# [whole motions](05_whole_motions.ipynb).*
+#
+# You will learn how the shape of a block decides what follows a hit, what a kinetic angle is, and how
+# Housner's value fits into a restitution matrix.
+#
 # A block turns about its left corner A and hits the ground with its right corner B. What happens next
 # is a multiple impact: both corners touch. Does it go on about B (rocking), turn back about A
 # (half-rocking), or leave the ground (free)?
@@ -27,6 +33,9 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 
 import jimpact as ji
+
+block = ji.Block(width=1.0, height=2.0)
+ji.plot.system(block, block.touching(0.1), "Rocking about A, the left corner; B comes down")
 
 # %% [markdown]
 # ## Dispersion is a V over the kinetic angle
@@ -156,4 +165,7 @@ top = {e_n: np.nanmax(-np.asarray(m.q[:, 2])) for e_n, m in motions.items()}
 print("largest angle on the other side, e = 0 and 0.1:", np.degrees(list(top.values())), "degrees")
 
 # %%
-ji.plot.phase_portrait(motions[0.0], 2, "LZB, e = 0, mu = 0.8: free rocking, angle")
+ji.plot.phase_portrait(motions[0.0], 2, "LZB, e = 0, mu = 0.8: free rocking", system=system)
+
+# %% [markdown]
+# *Next: [the motion between and through impacts](05_whole_motions.ipynb).*

@@ -80,7 +80,7 @@ def test_readme_runs():
     assert len(README.splitlines()) <= 150
 
 
-LONG_PAGES = ("fitting", "motions", "speed_accuracy")
+LONG_PAGES = ("embedding", "fitting", "motions", "speed_accuracy")
 
 
 def code_of(path):

@@ -74,7 +74,7 @@ class Body(eqx.Module):
     range_in_words: ClassVar[str] = "see its `valid`"
 
     def valid(self, q: jax.Array) -> jax.Array:
-        """Margin () that is >= 0 where the gap function holds; here it always does."""
+        """Margin () that is >= 0 where the gap function holds at q; here it always does."""
         return jnp.ones((), q.dtype)
 
     def moved(self, q: jax.Array, u: jax.Array) -> jax.Array:
@@ -91,15 +91,15 @@ class Body(eqx.Module):
         raise NotImplementedError(f"{type(self).__name__} must define `mass`.")
 
     def tangent_function(self, q: jax.Array) -> jax.Array | None:
-        """Displacements (m,) [m] along the contact planes; their rates are the sliding speeds."""
+        """Displacements (m,) [m] along the contact planes at q; their rates are sliding speeds."""
         return None
 
     def normals(self, q: jax.Array) -> jax.Array:
-        """N (n, m): gap velocities are `N^T v`."""
+        """N (n, m) at q: gap velocities are `N^T v`."""
         return self._gradient(self.gap_function, q)
 
     def tangents(self, q: jax.Array) -> jax.Array | None:
-        """H_t (n, m), planar, or (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
+        """H_t (n, m) at q, in space (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
         if self.tangent_function(q) is None:
             return None
         return self._gradient(self.tangent_function, q)
@@ -110,7 +110,7 @@ class Body(eqx.Module):
         return jnp.asarray(mass(q) if callable(mass) else mass)
 
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
-        """What constant velocities take (n,): `M v' = F + inertial_force`, Coriolis and gyroscopic.
+        """What constant velocities take (n,) at q: `M v' = F + inertial_force`, Coriolis terms.
 
         Equation: `grad(v^T M v) / 2 - M' v`, 0 for a constant M.
         """
@@ -146,7 +146,7 @@ class Body(eqx.Module):
         return None
 
     def outlines(self, q: np.ndarray, point: float) -> Sequence[np.ndarray]:
-        """Curves (k, 2) of points (x, y) [m] that show it; mass points get the radius `point`."""
+        """Curves (k, 2) of (x, y) [m] that show it at q; mass points get the radius `point`."""
         raise TypeError(f"{type(self).__name__} has no outlines: give `outlines` yourself.")
 
     @property
@@ -306,6 +306,9 @@ def scene_from_gaps(
         mass: M (n,) or (n, n), or a function q -> M(q).
         q: (n,) configuration.
         closed_below: gaps with |f| up to this count as closed [m].
+
+    Returns:
+        `Scene` of n coordinates and m contacts, without tangents.
 
     Raises:
         ValueError: penetration (f < -closed_below), or what `Scene` refuses.

@@ -97,6 +97,9 @@ def rocking_block(
         angle: theta [rad], counter-clockwise: > 0 lifts the right corner.
         inertia: I about the centre [kg m^2]; None: homogeneous.
 
+    Returns:
+        `Scene` of 3 coordinates and 2 contacts, with tangents.
+
     Raises:
         ValueError: sizes, mass or inertia not positive, an angle that is not finite.
 

@@ -178,7 +178,7 @@ class SpatialDimer(Body):
         return jax.jacobian(ends)(q).T + jnp.concatenate([rolling, rolling], axis=1)
 
     def touching(self, angle: Any = 0.0, yaw: Any = 0.0) -> jax.Array:
-        """q (6,) at the origin with this pitch, at which the lower sphere (or both) touches."""
+        """q (6,) at the origin at this pitch `angle` and `yaw` [rad]: the lower sphere touches."""
         pitch, turn = number("angle", angle), number("yaw", yaw)
         check_values("angle", pitch, low=-0.5 * jnp.pi, high=0.5 * jnp.pi)
         zero = jnp.zeros_like(pitch)
@@ -220,6 +220,9 @@ def dimer(
         rod_mass: of the thin rod, >= 0 [kg].
         angle: theta [rad]: > 0 lifts the right sphere, contact 1.
 
+    Returns:
+        `Scene` of 3 coordinates and 2 contacts, with tangents.
+
     Raises:
         ValueError: sizes or masses out of range, an angle that is not finite.
 
@@ -252,6 +255,9 @@ def dimer_3d(
         rod_mass: of the thin rod, >= 0 [kg].
         angle: pitch in (-pi/2, pi/2) [rad]: > 0 lifts sphere 1.
         yaw: of the rod about the vertical [rad].
+
+    Returns:
+        `Scene` of 6 coordinates and 2 contacts, with two tangents each.
 
     Raises:
         ValueError: sizes or masses out of range, an upright rod.

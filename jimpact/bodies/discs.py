@@ -115,6 +115,9 @@ def disk_balls(
         ball_radius: scalar or (m,) > 0 [m].
         gaps: (m,) >= 0 [m]; None: all touch.
 
+    Returns:
+        `Scene` of 3 (m + 1) coordinates and m contacts, with tangents.
+
     Raises:
         ValueError: sizes or masses out of range, wrong shapes. Whether balls overlap each other
             is not checked: they have no contacts among them.

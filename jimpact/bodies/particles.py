@@ -149,6 +149,9 @@ def corner(angle: Any, mass: Any = 1.0) -> Scene:
         angle: between the walls, in (0, pi) [rad].
         mass: > 0 [kg].
 
+    Returns:
+        `Scene` of 2 coordinates and 2 contacts, with tangents.
+
     Raises:
         ValueError: angle or mass out of range.
 

@@ -126,6 +126,9 @@ def pendulum_cradle(
         gaps: >= 0 at rest, scalar or (n - 1,) [m].
         angles: q of the strings [rad], scalar or (n,): to the right > 0.
 
+    Returns:
+        `Scene` of n angles and n - 1 contacts; velocities are angular ones [rad/s].
+
     Raises:
         ValueError: numbers out of range, wrong shapes, balls that overlap at these angles.
 

@@ -39,7 +39,9 @@ class Solid(Body):
     a sphere of radius r about the point c_i of the body: `f_i = n . (x + R c_i) - r`, its lowest
     point slides at `t . (x' + R (omega x d_i))`, `d_i = c_i - r R^T n`, along two directions t,
     the first one that of x, both in the plane. Turning is exact: `moved` keeps the length of e.
-    A body of this kind gives `points` (m, 3) and, unless it is 0, `rim`.
+    A body of this kind gives `points` (m, 3) and, unless it is 0, `rim`; it holds `total_mass`
+    [kg], `inertia` (3,) or (3, 3) [kg m^2], the `middle` of its shape from the centre of mass (3,)
+    [m], and the `normal` of the plane (3,).
 
     Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2 and 4.
     """
@@ -130,13 +132,13 @@ class Solid(Body):
         return jnp.concatenate([still, turn], axis=2).reshape(-1, 6).T
 
     def at(self, position: Any, quaternion: Any = _UPRIGHT) -> jax.Array:
-        """q (7,) with the middle of its shape, not its centre of mass, at `position` (3,) [m]."""
+        """q (7,), the middle of its shape at `position` (3,) [m], turned by `quaternion` (4,)."""
         place, e = _vector("position", position), _unit(quaternion)
         away = jnp.concatenate([place, e])
         return away.at[:3].add(-rotation(away) @ self.middle)
 
     def touching(self, quaternion: Any = _UPRIGHT) -> jax.Array:
-        """q (7,), turned like this, at which its lowest contacts touch the plane at the origin."""
+        """q (7,), turned by `quaternion` (4,), at which its lowest contacts touch the plane."""
         q = jnp.concatenate([jnp.zeros(3, self.mass.dtype), _unit(quaternion)])
         return q.at[:3].set(-jnp.min(self.gap_function(q)) * self.normal)
 

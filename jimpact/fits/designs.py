@@ -21,7 +21,10 @@ _RIDGE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Shots to do next, in order, and the standard errors (count, P) after each of them."""
+    """Shots to do next, in order: their labels `shots` and places `index` among the candidates.
+
+    `standard_error` (count, P) of the parameters `names` after each of them.
+    """
 
     shots: tuple[str, ...]
     index: np.ndarray
@@ -57,6 +60,9 @@ def design(
         scene: of the candidates; None: that of the fit.
         count: how many to choose; one may be chosen several times.
         target: name of the parameter that is wanted; None: all.
+
+    Returns:
+        `Design`; `print` lists the shots and the errors after each.
 
     Raises:
         ValueError: no shots or no known noise, count, target, scenes that do not fit.

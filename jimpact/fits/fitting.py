@@ -2,23 +2,32 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Generic, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_choice
 from jimpact.experiments import Experiments
-from jimpact.fits.adequacy import unusable
+from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.least_squares import Method, check_method, default_steps
-from jimpact.fits.multistart import Search, search, search_near
+from jimpact.fits.multistart import Minimum, Search, search, search_near
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.profiles import Profile, profile
-from jimpact.fits.report import fit_warnings, report, to_json
-from jimpact.fits.uncertainty import RANK_TOLERANCE, uncertainty
+from jimpact.fits.profiles import (
+    Profile,
+    linearized,
+    needs_profiles,
+    profile,
+    quantile,
+    quick_profiles,
+)
+from jimpact.fits.report import fit_warnings, report, to_json, verdict
+from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.scene import Scene
+
+HARDLY_WORSE = 10.0  # standard errors: intervals of all levels end before
 
 LISTED = 10  # shots that were left out, named one by one
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
@@ -31,23 +40,56 @@ SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many."""
+    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
+
+    `standard_error` is None where it fits so much worse that it does not matter.
+    """
 
     sum_of_squares: float
     value: np.ndarray
     count: int
+    standard_error: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Fit(Generic[AnyLaw]):
     """What `fit` found. `print(fit)` is a report.
 
-    P free parameters `names`, contacts numbered from 1; `predicted` and `residual` are shaped like
-    what was measured, (K, n) for K shots of n velocities.
-    `standard_error` is inf where the data cannot see a parameter, NaN where no degree of freedom
-    is left to estimate the noise from. `rank` < P: see `identifiability`. `starts`: the distinct
-    minima, best first. `noise`: estimated standard error of one value, NaN where no degree of
-    freedom is left, 1 where `sigma` was given. `problem`: what was solved.
+    P free parameters, K shots of n velocities.
+
+    Attributes:
+        law: with the parameters found.
+        method: of minimizing, see `fit`.
+        names: of the parameters, contacts numbered from 1.
+        value: (P,) in the units of each parameter, as the next two.
+        standard_error: (P,); inf where the data cannot see a parameter, NaN where no degree of
+            freedom is left to estimate the noise from.
+        covariance: (P, P).
+        correlation: (P, P), in [-1, 1].
+        bounds: lowest and highest values (P,), (P,).
+        at_bound: (P,) boolean.
+        predicted: shaped like what was measured, (K, n) [m/s].
+        residual: measured less predicted (K, n) [m/s]; NaN where nothing was measured.
+        rms: of the residual.
+        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
+            where `sigma` was given, or, where chi^2 says that it is too small, by how much:
+            the standard errors are stretched by that.
+        degrees_of_freedom: independent measured values less `rank`.
+        rank: of the Jacobian; below P: see `identifiability`.
+        singular_values: (P,) of the scaled Jacobian.
+        identifiability: in words, what the data cannot tell apart.
+        starts: the distinct minima, best first.
+        status: (K,) codes of `jimpact.STATUS` at the minimum.
+        converged: whether the best start did.
+        steps: iterations of the best start.
+        lost_starts: how many did not converge.
+        warnings: what is wrong with data or fit, in words.
+        problem: what was solved.
+        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where nothing
+            was measured.
+        loss: see `fit`.
+        seed: of the random starts.
+        profiles: where `fit` was asked for them.
     """
 
     law: AnyLaw
@@ -74,7 +116,9 @@ class Fit(Generic[AnyLaw]):
     lost_starts: int
     warnings: tuple[str, ...]
     problem: FitProblem
+    jacobian: np.ndarray
     loss: str = "squares"
+    seed: int = 0
     profiles: tuple[Profile, ...] = ()
 
     @property
@@ -82,27 +126,62 @@ class Fit(Generic[AnyLaw]):
         """The shots; None where something else was fitted."""
         return self.problem.experiments
 
-    def confidence_interval(self, level: float = 0.95) -> np.ndarray:
-        """Two-sided intervals (P, 2), linearized, cut at the bounds.
+    def intervals(self, level: float = 0.95) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The pieces, in order, of the confidence interval of each of the P parameters.
+
+        Those of `profiles`, if there are some of this level. Else linearized, cut at the bounds, a
+        piece for every minimum that fits well enough.
 
         Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
-        freedom that are left, or of the normal law where `sigma` was given.
+        freedom that are left, or of the normal law where `sigma` was given; of what is fitted in
+        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum of squares
+        is higher by d, q^2 - d / noise^2 in place of q^2.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
-        tail = 0.5 + 0.5 * level
-        known = self.problem.sigma is not None or self.degrees_of_freedom < 1
-        quantile = ndtri(tail) if known else stdtrit(self.degrees_of_freedom, tail)
-        half = quantile * self.standard_error
-        return np.clip(
-            np.stack([self.value - half, self.value + half], axis=1),
-            self.bounds[0][:, None],
-            self.bounds[1][:, None],
-        )
+        if self.profiles and self.profiles[0].level == level:
+            return tuple(scan.intervals for scan in self.profiles)
+        return tuple(linearized(self, i, quantile(self, level)) for i in range(len(self.names)))
+
+    def confidence_interval(self, level: float = 0.95) -> np.ndarray:
+        """The outermost ends (P, 2) of `intervals`."""
+        return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
 
     def to_dict(self) -> dict[str, Any]:
         """Everything a JSON file can hold; numbers that are not finite become None."""
         return to_json(self)
+
+    @property
+    def verdict(self) -> str:
+        """What was found, in one sentence: the last one of `print(fit)`."""
+        return verdict(self)
+
+    def report(self, path: str | Path, profiles: bool = True) -> Path:
+        """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
+
+        Parameters and intervals, profiles, correlations, residuals, what the data cannot see, what
+        is wrong with them, versions and seed.
+
+        Args:
+            path: the file, ending in .html; what is there is replaced.
+            profiles: find the profile likelihoods, too, unless the fit has them; some seconds.
+
+        Returns:
+            The path.
+        """
+        from jimpact.fits.page import write_page
+
+        return write_page(self, Path(path), profiles)
+
+    def to_pandas(self) -> Any:
+        """The parameters as a `pandas.DataFrame`, which must be installed."""
+        from jimpact.fits.tables import parameters_frame
+
+        return parameters_frame(self)
+
+    def to_xarray(self) -> Any:
+        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
+        from jimpact.fits.tables import dataset
+
+        return dataset(self)
 
     def __str__(self) -> str:
         return report(self)
@@ -120,7 +199,7 @@ def fit(
     starts: int = 8,
     seed: int = 0,
     max_steps: int | None = None,
-    profiles: bool = False,
+    profiles: bool | None = None,
     progress: float | None = None,
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
@@ -144,11 +223,17 @@ def fit(
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
-        starts: number of starts, the first from the law's values, the others random (`seed`); if
+        starts: number of starts, the first from the law's values, the others random; if
             more than one, further ones around the best follow as long as they improve it.
+        seed: of the random starts.
         max_steps: iterations per start.
-        profiles: whether the report tells intervals by `profile`, not by standard errors.
+        profiles: whether intervals are those of `profile`; None: of up to 64 shots, where standard
+            errors cannot be trusted: at a bound, in a valley, with several minima, or where the
+            data hardly see a parameter.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
+
+    Returns:
+        `Fit`; `print` gives its report, `ji.plot.fit` a picture.
 
     Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
     absurd, are left out, and `Fit.warnings` names them. There is told, too, whether the law fits
@@ -181,8 +266,12 @@ def fit(
     if problem.residuals.mixing is not None:
         problem, found = _errors_before(problem, found, method, steps)
     robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
-    end = replace(as_fit(problem, found, method, robust), loss=loss)
-    return replace(end, profiles=profile(end, progress=progress)) if profiles else end
+    end = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
+    if profiles:
+        return replace(end, profiles=profile(end, progress=progress))
+    if profiles is None and needs_profiles(end):
+        return replace(end, profiles=quick_profiles(end, progress))
+    return end
 
 
 def _errors_before(
@@ -279,7 +368,6 @@ def as_fit(
         weight = np.asarray(r.weight, float)
         left = weight * (np.nan_to_num(problem.measured) - found.seen)
         squares = float(np.sum(np.asarray(r.mixed(left)) ** 2))
-        minima = [(squares, found.value, 1)]
         jacobian = back * found.jacobian
         if r.mixing is not None:  # which comes after the factors
             mixing, each = np.asarray(r.mixing, float), factor[..., None]
@@ -287,20 +375,14 @@ def as_fit(
                 mixing, (jacobian * factor.reshape(-1, 1)).reshape(*each.shape[:-1], -1)
             )
             jacobian = (mixing @ (alone / each)).reshape(jacobian.shape)
+        minima = [Minimum(squares, found.value, 1, jacobian)]
         found = found._replace(jacobian=jacobian, minima=minima)
     residuals, names = problem.residuals, problem.names
     size = float(residuals.size)
-    spread = uncertainty(
-        names=names,
-        jacobian=size * found.jacobian,
-        scale=found.scale,
-        log=found.log,
-        sum_of_squares=size**2 * found.minima[0][0],
-        values=problem.values,
-        noise=robust.noise if robust else None if problem.sigma is None else 1.0,
-        rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
-        value_name=problem.value_name,
-    )
+    spread = _spread(problem, found, found.minima[0], robust.noise if robust else None)
+    if robust is None and problem.sigma is not None:
+        times = stretch(problem, weighted(problem, found), spread.rank)
+        spread = _spread(problem, found, found.minima[0], times) if times > 1 else spread
     residual = np.asarray(problem.measured, float) - found.seen
     return Fit(
         law=with_entries(problem.law, residuals.fields, jnp.asarray(found.entries)),
@@ -320,11 +402,55 @@ def as_fit(
         rank=spread.rank,
         singular_values=spread.singular_values,
         identifiability=(*problem.notes, *spread.unseen),
-        starts=tuple(Start(size**2 * cost, value, count) for cost, value, count in found.minima),
+        starts=tuple(
+            Start(size**2 * end.squares, end.value, end.starts, _error(problem, found, end, spread))
+            for end in found.minima
+        ),
         status=found.status,
         converged=found.converged,
         steps=found.steps,
         lost_starts=found.lost,
         warnings=tuple(fit_warnings(problem, found, spread)),
         problem=problem,
+        jacobian=_slopes(problem, found),
     )
+
+
+def _slopes(problem: FitProblem, found: Search) -> np.ndarray:
+    """Derivatives of what was measured in the parameters themselves; NaN where nothing was."""
+    weight = np.broadcast_to(np.asarray(problem.residuals.weight, float), problem.measured.shape)
+    slope = found.jacobian.reshape(*problem.measured.shape, len(problem.names)) / found.scale
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(weight[..., None] > 0, slope / weight[..., None], np.nan)
+
+
+def _spread(
+    problem: FitProblem, found: Search, end: Minimum, noise: float | None = None
+) -> Uncertainty:
+    """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
+    residuals = problem.residuals
+    size = float(residuals.size)
+    return uncertainty(
+        names=problem.names,
+        jacobian=size * end.jacobian,
+        scale=np.where(found.log, end.value, found.scale),
+        log=found.log,
+        sum_of_squares=size**2 * end.squares,
+        values=problem.values,
+        noise=noise if noise is not None else None if problem.sigma is None else 1.0,
+        rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
+        value_name=problem.value_name,
+    )
+
+
+def _error(
+    problem: FitProblem, found: Search, end: Minimum, spread: Uncertainty
+) -> np.ndarray | None:
+    """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
+    if end is found.minima[0]:
+        return spread.standard_error
+    noise, size = spread.noise, float(problem.residuals.size)
+    more = size**2 * (end.squares - found.minima[0].squares)
+    if not more <= (HARDLY_WORSE * noise) ** 2:
+        return None
+    return _spread(problem, found, end, noise).standard_error

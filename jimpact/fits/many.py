@@ -38,6 +38,23 @@ def fit_many(
     Data sets of up to 4, 16, 64, 128, ... shots share a program. Arguments and errors as of `fit`;
     `starts` are those of each data set.
 
+    Args:
+        law: start values of all.
+        scene: of all shots; None: each of `many` carries its own.
+        many: the data sets.
+        free: as of `fit`.
+        bounds: as of `fit`.
+        starts: of each data set.
+        seed: of the random starts.
+        max_steps: iterations per start.
+        progress: a bar on stderr; None: on a terminal.
+
+    Returns:
+        A `Fit` for each data set, in their order.
+
+    Raises:
+        ValueError: as of `fit`.
+
     >>> import jimpact as ji
     >>> sets = [ji.Experiments([1.0, 0.0], [0.5 - 0.5 * e, 0.5 + 0.5 * e]) for e in (0.4, 0.8)]
     >>> found = ji.fit_many(ji.Newton(0.9), ji.chain([1.0, 1.0]), sets)
@@ -69,14 +86,17 @@ def fit_many(
 
 @dataclass(frozen=True, eq=False)
 class Refits:
-    """Parameters `value` (B, P) of fits to changed data, and what each predicts, (B, ...)."""
+    """Parameters `value` (B, P), by `names`, of fits to changed data.
+
+    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s].
+    """
 
     names: tuple[str, ...]
     value: np.ndarray
     predicted: np.ndarray
 
     def interval(self, level: float = 0.95) -> np.ndarray:
-        """Quantiles (P, 2) between which this share of the values lies."""
+        """Quantiles (P, 2) between which the share `level` of the values lies."""
         if not 0 < level < 1:
             raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
         return np.quantile(self.value, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0).T
@@ -92,7 +112,11 @@ def bootstrap(
     Args:
         fit: with a known noise.
         samples: data sets B.
-        seed: of z. progress: a bar on stderr; None: on a terminal.
+        seed: of z.
+        progress: a bar on stderr; None: on a terminal.
+
+    Returns:
+        `Refits` with `value` (B, P).
 
     Raises:
         ValueError: samples < 1; a noise that is not known.
@@ -128,6 +152,13 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
 
     `measured - predicted` is an honest error of prediction: laws with different numbers of
     parameters may be compared by it.
+
+    Args:
+        fit: of K >= 2 shots.
+        progress: a bar on stderr; None: on a terminal.
+
+    Returns:
+        `Refits` with `value` (K, P).
 
     Raises:
         ValueError: a fit to something else than at least two shots.

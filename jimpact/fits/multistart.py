@@ -1,6 +1,6 @@
 """Many starts at once, and the distinct minima they end in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,11 +8,12 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jimpact.fits.least_squares import Method, SolverState
+from jimpact.fits.least_squares import Box, Method, SolverState
 from jimpact.fits.problem import (
     FEW,
     FitProblem,
     Residuals,
+    Shots,
     advance_all,
     begin_all,
     filled_up,
@@ -21,11 +22,13 @@ from jimpact.fits.problem import (
 )
 from jimpact.progress import progress_bar
 
-LANES = 4  # starts that run together; those that are done make room
-PASSES = 10  # between two looks at the progress
+Show = Callable[[str, float, float], None]  # of the progress: text, how far, of how much
+
+LANES, DEAR_LANES = 8, 4  # starts that run together: of shots, and of what may take longer
+PASSES = 4  # until starts that are done make room
 # A Levenberg-Marquardt start that gains less than this share in so many passes sits on a kink of
 # the law (a change in the sequence of contacts), where steps zigzag: it is given up.
-SLOW = 1e-3
+SLOW, SLOW_PASSES = 1e-3, 12
 # One whose sum of squares is this far above the best must gain this share to go on.
 BEHIND, SLOW_BEHIND = 10.0, 0.1
 
@@ -43,6 +46,14 @@ ROUNDS = 5
 NEAR_SPREAD = 2.0  # standard errors
 NEAR_RCOND = 1e-10  # directions the data cannot see are not searched
 
+# Impacts map a stiffness ratio many to one: three balls of ratio 40 come apart as those of up to
+# nine other ratios do. So each such parameter is scanned, at so many values within this factor of
+# the user's own, the others following for so many passes, and its best valleys are followed.
+SCANNED, SCAN_FACTOR, SCAN_PASSES, FOLLOWED = 64, 300.0, 2, 16
+DEEP = 0.5  # share of the ridges on both sides above which a valley is none
+WITHIN = 8  # points of the scan's cubics between two of its values
+FLAT = 1e-6  # singular values below this share: a valley, where there is nothing to scan
+
 # Relative sums of squares, and values in natural scales, closer than this are one minimum: a
 # hundred times what solvers leave, and far below what a measurement resolves.
 SAME_COST = 1e-6
@@ -53,6 +64,15 @@ EXACT = {"float64": 1e-14, "float32": 1e-8}
 # A start has converged when a full Gauss-Newton step would lower the sum of squares by less than
 # this share: it is then a thousandth of a standard error away from the minimum.
 CONVERGED = 1e-6
+
+
+class Minimum(NamedTuple):
+    """A point that starts ended in (weighted as in `Residuals`)."""
+
+    squares: float  # |r|^2
+    value: np.ndarray  # of the parameters (P,)
+    starts: int  # how many
+    jacobian: np.ndarray  # (R, P), of the scaled parameters
 
 
 class Search(NamedTuple):
@@ -69,7 +89,7 @@ class Search(NamedTuple):
     converged: bool
     at_bound: np.ndarray
     steps: int
-    minima: list[tuple[float, np.ndarray, int]]  # |r|^2, values, how many starts
+    minima: list[Minimum]
     lost: int  # starts that did not converge
 
 
@@ -96,6 +116,12 @@ def search(
             states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
             if np.nanmin(more.cost) > (1 - SLOW) * least:
                 break
+        if starts > 1 and method == "levenberg-marquardt":
+            points = _valleys(problem, residuals, states, show)
+            if len(points):
+                more = run(repeated(residuals, len(points)), points, method, max_steps, show)
+                kept = _converged(more)
+                states = jax.tree.map(lambda a, b: np.concatenate([a, b[kept]]), states, more)
     return ends(problem, states)
 
 
@@ -119,28 +145,30 @@ def run(
     points: np.ndarray,
     method: Method,
     max_steps: int,
-    show: Callable[[str, float, float], None],
+    show: Show,
     rivals: bool = True,
 ) -> SolverState:
     """Solve S problems from points (S, Q), a few at a time; the states come back to the host.
 
     Rivals are starts of one problem: those far behind the best are given up sooner.
     """
-    few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for LANES
-    lanes = LANES if few else min(len(points), LANES)
+    few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
+    most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
+    lanes = most if few else min(len(points), most)
     points = points.astype(problems.offset.dtype)
+    limit: Any = max_steps
+    if method == "levenberg-marquardt":
+        limit = np.asarray(max_steps)  # one program serves all limits
     begun = [
-        begin_all(_rows(problems, rows), points[rows], method, max_steps)
+        begin_all(_rows(problems, rows), points[rows], method, limit)
         for rows in _batches(list(range(len(points))), lanes)
     ]
     states = jax.tree.map(lambda *x: np.concatenate(x)[: len(points)], *begun)
     active = list(range(len(points)))
+    before, since = states.cost.copy(), states.steps.copy()
     while active:
-        before = states.cost.copy()
         for rows in _batches(active, lanes):
-            some = advance_all(
-                _rows(problems, rows), _rows(states, rows), method, max_steps, PASSES
-            )
+            some = advance_all(_rows(problems, rows), _rows(states, rows), method, limit, PASSES)
             states = jax.tree.map(partial(_with_rows, rows), states, jax.device_get(some))
             ready, steps = len(points) - len(active), int(states.steps.max())
             counts = f"{ready} of {len(points)} starts done, step {steps} of at most {max_steps}"
@@ -149,9 +177,33 @@ def run(
         if method == "levenberg-marquardt":
             behind = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
             share = np.where(behind, SLOW_BEHIND, SLOW)
-            ended |= (before - states.cost <= share * before) & np.isfinite(before)
+            due = states.steps >= since + SLOW_PASSES
+            ended |= due & (before - states.cost <= share * before) & np.isfinite(before)
+            before = np.where(due, states.cost, before)
+            since = np.where(due, states.steps, since)
         active = [i for i in active if not ended[i]]
     return states
+
+
+def run_held(
+    residuals: Residuals,
+    held: Sequence[tuple[Sequence[int] | int, np.ndarray]],
+    max_steps: int,
+    show: Show,
+) -> SolverState:
+    """Minima from y (Q,) of each, while its entries of these numbers are held."""
+    points = np.array([y for _, y in held])
+    low, high = (
+        np.tile(np.asarray(end, float), (len(held), 1)) for end in (residuals.low, residuals.high)
+    )
+    for k, (which, y) in enumerate(held):
+        at = np.array(which, int)
+        low[k, at] = high[k, at] = y[at]
+    dtype = residuals.offset.dtype
+    box: Any = Box(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
+    many = repeated(residuals, len(held))
+    many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
+    return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False)
 
 
 def _batches(every: list[int], lanes: int) -> list[list[int]]:
@@ -178,13 +230,17 @@ def ends(problem: FitProblem, states: SolverState) -> Search:
     squares = 2 * np.asarray(states.cost, float)
     values = from_scaled(np.asarray(y, float), scale, log)
     exact = EXACT[str(y.dtype)]
-    converged = (2 * np.asarray(states.gain) <= CONVERGED * squares) | (squares <= exact)
+    converged = _converged(states)
     groups = _groups(squares, y, converged, exact)
     best = groups[0][0]
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
     # starts that did not converge have no minimum to tell, unless they are the best there is
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
     seen, status = states.kept
+
+    def slopes(i: int) -> np.ndarray:
+        return np.asarray(states.jacobian[i][: problem.measured.size, :count], float)
+
     rows = len(problem.measured) if problem.measured.ndim else None  # without what filled up
     return Search(
         value=values[best],
@@ -192,15 +248,24 @@ def ends(problem: FitProblem, states: SolverState) -> Search:
         entries=_all_entries(r, np.asarray(states.y)[best]),
         scale=np.where(log, values[best], scale),
         log=log,
-        jacobian=np.asarray(states.jacobian[best][: problem.measured.size, :count], float),
+        jacobian=slopes(best),
         seen=np.asarray(seen[best][:rows] if rows else seen[best], float),
         status=status[best][:rows],
         converged=bool(converged[best]),
         at_bound=(y[best] <= low) | (y[best] >= high),
         steps=int(np.max(states.steps)),
-        minima=[(float(squares[g[0]]), values[g[0]], len(g)) for g in ends if g],
+        minima=[
+            Minimum(float(squares[g[0]]), values[g[0]], len(g), slopes(g[0])) for g in ends if g
+        ],
         lost=len(y) - sum(len(g) for g in ends),
     )
+
+
+def _converged(states: SolverState) -> np.ndarray:
+    """Which of the states (S,) are at a minimum."""
+    squares = 2 * np.asarray(states.cost, float)
+    exact = squares <= EXACT[str(states.y.dtype)]
+    return np.asarray((2 * np.asarray(states.gain) <= CONVERGED * squares) | exact)
 
 
 def _all_entries(residuals: Residuals, y: np.ndarray) -> np.ndarray:
@@ -244,12 +309,80 @@ def _near(
     return np.clip(points, np.asarray(problem.low), np.asarray(problem.high))
 
 
+def _valleys(
+    problem: FitProblem, residuals: Residuals, states: SolverState, show: Show
+) -> np.ndarray:
+    """Points (., Q) in the valleys of scans through the best end.
+
+    A parameter that is fitted in its logarithm, or that two bounds do not hold, is held at many
+    values while the others follow. Between two values the residuals are taken for cubic, with the
+    slopes that the Jacobian gives: two turns between two of them are seen.
+    """
+    best, count = int(np.nanargmin(states.cost)), len(problem.names)
+    known = np.asarray(states.jacobian[best], float)[:, :count]
+    singular = np.linalg.svd(known, compute_uv=False)
+    alone = isinstance(residuals.observe, Shots) and len(residuals.measured) <= FEW
+    if not alone or not isinstance(residuals.region, Box) or singular[-1] <= FLAT * singular[0]:
+        return np.zeros((0, states.y.shape[1]))
+    low, high = (np.asarray(end, float)[:count] for end in (residuals.low, residuals.high))
+    log = np.asarray(residuals.log)[problem.parameters.first]
+    center = _own(problem)
+    reach = np.where(log, np.log(SCAN_FACTOR), START_SCALES)
+    held = []
+    for i in np.flatnonzero(log | ~np.isfinite(low) | ~np.isfinite(high)):
+        ends = np.clip(center[i] + reach[i] * np.array([-1, 1]), low[i], high[i])
+        for value in np.linspace(ends[0], ends[1], SCANNED):
+            held.append((int(i), np.array(states.y[best], float)))
+            held[-1][1][i] = value
+    if not held:
+        return np.zeros((0, states.y.shape[1]))
+    passes = 1 if count == 1 else SCAN_PASSES
+    scan = run_held(residuals, held, passes, show)
+    found = []
+    for k in range(0, len(held), SCANNED):
+        rows = slice(k, k + SCANNED)
+        part = jax.tree.map(lambda x, rows=rows: x[rows], scan)
+        found += _turns(held[k][0], count, part, np.asarray(states.y[best], float))
+    found.sort(key=lambda valley: valley[0])
+    return np.array([y for _, y in found[:FOLLOWED]]).reshape(-1, states.y.shape[1])
+
+
+def _turns(
+    i: int, count: int, scan: SolverState, best: np.ndarray
+) -> list[tuple[float, np.ndarray]]:
+    """Sums of squares in the valleys of a scan of the i-th parameter, and where; not the best."""
+    y, r = np.asarray(scan.y, float), np.asarray(scan.residual, float)
+    jacobian = np.asarray(scan.jacobian, float)[:, :, :count]
+    others = np.delete(jacobian, i, axis=2)
+    slope = jacobian[:, :, i]
+    follow = np.einsum("kor,kr->ko", np.linalg.pinv(others, rcond=FLAT), slope)
+    slope = slope - np.einsum("kro,ko->kr", others, follow)
+    h = np.diff(y[:, i])[:, None, None]
+    t = (np.arange(WITHIN) / WITHIN)[None, :, None]
+    a, b, p, q = r[:-1, None], r[1:, None], h * slope[:-1, None], h * slope[1:, None]
+    cubic = a + t * p + t**2 * (3 * (b - a) - 2 * p - q) + t**3 * (2 * (a - b) + p + q)
+    where = y[:-1, None] + t * np.diff(y, axis=0)[:, None]
+    squares = np.append(np.sum(cubic**2, axis=2).ravel(), np.sum(r[-1] ** 2))
+    where = np.vstack([where.reshape(-1, y.shape[1]), y[-1:]])
+    padded = np.pad(squares, 1, constant_values=np.inf)
+    left, right = np.maximum.accumulate(squares), np.maximum.accumulate(squares[::-1])[::-1]
+    least = (squares < padded[:-2]) & (squares <= padded[2:])
+    deep = squares <= DEEP * np.minimum(left, right)
+    new = np.abs(where[:, i] - best[i]) > 0.5 * h.max()
+    return [(float(squares[k]), where[k]) for k in np.flatnonzero(least & deep & new)]
+
+
+def _own(problem: FitProblem) -> np.ndarray:
+    """The law's own values (P,), scaled."""
+    first, r = problem.parameters.first, problem.residuals
+    return to_scaled(problem.start, np.asarray(r.scale, float)[first], np.asarray(r.log)[first])
+
+
 def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
     parameters, r = problem.parameters, problem.residuals
-    first = parameters.first
-    scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
-    own = to_scaled(problem.start, scale, log)
+    first, own = parameters.first, _own(problem)
+    log = np.asarray(r.log)[first]
     low, high = (np.array(end, float)[: len(own)] for end in (r.low, r.high))
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
     low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)

@@ -156,7 +156,10 @@ class FitProblem:
     `C = diag(sigma^2) + J S J^T`, and its residual is multiplied by the inverse of the Cholesky
     factor of C (J of the start; `fit` takes J of the law it finds).
 
-    Make one with `from_shots` or `from_observable`.
+    Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where nothing
+    was), `sigma`, `experiments` and `scene` or None, what is `free`, how many independent `values`
+    were measured; in words, `notes` on what was held instead of fitted, and shots `left_out`; and
+    for the solvers `residuals` and `parameters`.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -188,7 +191,15 @@ class FitProblem:
         free: Any = DEFAULT_FREE,
         bounds: Mapping[str, Any] | None = None,
     ) -> "FitProblem":
-        """The problem of measured shots; arguments and errors as of `fit`."""
+        """The problem of measured shots; errors as of `fit`.
+
+        Args:
+            law: start values.
+            scene: of all shots; None: they carry their own.
+            experiments: measured shots.
+            free: as in `fit`.
+            bounds: as in `fit`.
+        """
         check_kind("law", law, Law)
         check_kind("experiments", experiments, Experiments)
         own = experiments.each(scene, lambda s: s)
@@ -204,7 +215,7 @@ class FitProblem:
             lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
         )
         filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
-        observe = Shots(_in(dtype, stacked), jnp.asarray(filled, dtype), n)
+        observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
         errors = experiments.natural_errors(scene) if sigma is None else sigma
         problem = _build(
@@ -261,7 +272,8 @@ class FitProblem:
                 residual is an observable of which zeros were measured.
             measured: what was measured of it, of the same shape; NaN where nothing was.
             sigma: standard errors, scalar or of the same shape; None: one common, unknown.
-            free, bounds: as in `fit`.
+            free: as in `fit`.
+            bounds: as in `fit`.
 
         Raises:
             ValueError: nothing measured, sigma <= 0, an observable of another shape, and as `fit`.
@@ -330,16 +342,16 @@ class FitProblem:
         return self.residuals.law_at(self._scaled(x))
 
     def residual(self, x: Any) -> jax.Array:
-        """(R,) `(observed - measured) / sigma`; a large number where the law fails."""
+        """(R,) `(observed - measured) / sigma` at x (P,); a large number where the law fails."""
         residual, _ = self.residuals.residual(self._scaled(x))
         return self.residuals.size * residual[np.flatnonzero(~np.isnan(self.measured))]
 
     def jacobian(self, x: Any) -> jax.Array:
-        """(R, P) derivatives of `residual`, by forward mode."""
+        """(R, P) derivatives of `residual` at x (P,), by forward mode."""
         return jax.jacfwd(self.residual)(jnp.asarray(x, self.residuals.offset.dtype))
 
     def log_density(self, x: Any) -> jax.Array:
-        """Logarithm () of the probability density of the data, normally distributed.
+        """Logarithm () of the probability density of the data at x (P,), normally distributed.
 
         Equation: `-|r|^2 / 2 - sum log(sigma sqrt(2 pi))`; where sigma is unknown, it is integrated
         over `d sigma / sigma`: `-R log |r|`, up to a constant.
@@ -357,7 +369,7 @@ class FitProblem:
         r = self.residuals
         weight = np.asarray(r.weight, float) * float(r.size) * factor
         size = float(r.unit) * np.linalg.norm(weight)
-        arrays = (jnp.asarray(weight / size, r.weight.dtype), jnp.asarray(size, r.size.dtype))
+        arrays = (np.asarray(weight / size, r.weight.dtype), np.asarray(size, r.size.dtype))
         kept = np.where(factor > 0, self.measured, np.nan)
         lost = int(np.isnan(kept).sum() - np.isnan(self.measured).sum())
         residuals = eqx.tree_at(lambda r: (r.weight, r.size), r, arrays)
@@ -378,8 +390,8 @@ def _dtype(*trees: Any) -> np.dtype:
 
 
 def _in(dtype: np.dtype, tree: Any) -> Any:
-    """The tree with all numbers of this type, in arrays."""
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
+    """The tree with all numbers of this type, in arrays on the host."""
+    return jax.tree.map(lambda x: np.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
 
 
 def _build(
@@ -415,13 +427,14 @@ def _build(
     arrays |= {"measured": np.nan_to_num(measured), "weight": weight / size}
     arrays |= {"size": size, "unit": unit}
     region = matrix_region(law, scenes, scale * offset, scale[:, None] * mix, ends)
+    host: dict[str, Any] = {name: np.asarray(array, dtype) for name, array in arrays.items()}
     residuals = Residuals(
         law=law,
-        region=region or Box(*(jnp.asarray(end, dtype) for end in ends)),
-        log=jnp.asarray(log),
+        region=region or Box(host["low"], host["high"]),
+        log=log,  # type: ignore[arg-type]
         observe=observe,
         fields=parameters.fields,
-        **{name: jnp.asarray(array, dtype) for name, array in arrays.items()},
+        **host,
     )
     count, domains = int(here.sum()), np.stack(limits, axis=1)
     return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count, free)

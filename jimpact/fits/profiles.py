@@ -4,35 +4,40 @@ A standard error is half the width of a parabola. Where the sum of squares is no
 valley, several minima), the profile is the interval: one-sided, or of several pieces.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from jimpact.fits.least_squares import DEFAULT_STEPS, Box, SolverState
-from jimpact.fits.multistart import EXACT, START_SCALES, repeated, run
-from jimpact.fits.problem import Residuals, filled_up, from_scaled, to_scaled
+from jimpact.fits.multistart import EXACT, START_SCALES, run_held
+from jimpact.fits.problem import FEW, Residuals, filled_up, from_scaled, to_scaled
 from jimpact.progress import progress_bar
 
 if TYPE_CHECKING:
     from jimpact.fits.fitting import Fit
 
-NEAR = np.linspace(-4, 4, 17)  # standard errors around a minimum
+NEAR = np.array([-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2])  # half-widths of the interval of a parabola
+SAME = 1e-6  # relative sums of squares that are equal
+END = 1e-3  # of the root of the limit: how near to it an end is searched for
+# What `fit` profiles of itself: so many values across the domain, up to so many times the limit.
+QUICK_POINTS, QUICK_LEVEL, FAR = 17, 0.95, 1.0
+HARDLY_SEEN = 0.2  # relative error of a stiffness beyond which no parabola is believed
+LONGEST = 2.0  # steps by which a scan is extrapolated
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
 _METHOD = "levenberg-marquardt"
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """Deviance (G,) over the values (G,) of one parameter, and where it is below the limit.
+    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
 
     `deviance` is the sum of squares with the parameter held, less its least value, over the noise
-    variance. `intervals` are the pieces of the confidence interval, in order; an end at `domain` is
-    none: the data do not bound the parameter there. `better`: values of a minimum below that of the
-    fit, or None.
+    variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
+    `domain` is none: the data do not bound the parameter there. `better`: values of a minimum below
+    that of the fit, or None.
     """
 
     name: str
@@ -54,15 +59,7 @@ class Profile:
         >>> Profile(*given, ((0.25, 0.5), (0.75, 1.0)), (0.0, 1.0)).words
         '0.25 to 0.5 or at least 0.75'
         """
-        return " or ".join(self._piece(*ends) for ends in self.intervals)
-
-    def _piece(self, low: float, high: float) -> str:
-        open_low, open_high = low <= self.domain[0], high >= self.domain[1]
-        if open_low and open_high:
-            return "anything"
-        if open_low or open_high:
-            return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
-        return f"{low:.5g} to {high:.5g}"
+        return in_words(self.intervals, self.domain)
 
     def __str__(self) -> str:
         return f"{self.name}: {self.words} ({100 * self.level:g} %)"
@@ -81,10 +78,10 @@ def profile(
     Equation: `D(x_i) = (min over the others of |r|^2 - least |r|^2) / s^2 <= q^2`, q the quantile
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
 
-    Held values cover the whole domain and the neighbourhood of the minimum; all are solved side by
-    side, from the fit and once more from their better neighbours. Where a scan finds a further
-    valley, it is followed to its minimum. Without sigma and with no degree of freedom left, the
-    interval is that of the values which reproduce the data exactly.
+    Held values cover the whole domain and the neighbourhood of the minima; from each minimum they
+    are reached one after the other in both directions, all parameters side by side. Where a scan
+    finds a further valley, it is followed to its minimum. Without sigma and with no degree of
+    freedom left, the interval is that of the values which reproduce the data exactly.
 
     Args:
         fit: by least squares.
@@ -92,6 +89,9 @@ def profile(
         level: of the confidence intervals, in (0, 1).
         points: held values across the domain, besides those near the minimum, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
+
+    Returns:
+        A `Profile` for each name; `print` says its interval.
 
     Raises:
         ValueError: level, points or names; a robust loss; a matrix that is kept admissible.
@@ -106,10 +106,7 @@ def profile(
         raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
     if points < 3:
         raise ValueError(f"Argument `points` must be at least 3, but has value {points}.")
-    if fit.loss != "squares" or not isinstance(fit.problem.residuals.region, Box):
-        raise ValueError(
-            "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."
-        )
+    check_profiled(fit)
     wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
     for name in wanted:
         if name not in fit.names:
@@ -117,94 +114,163 @@ def profile(
             raise ValueError(f"Argument `names` must be among {known}, but has {name!r}.")
     with progress_bar(progress) as show:
         scans = _Scans(fit, [fit.names.index(name) for name in wanted], show)
-        scans.add([(i, y) for i in scans.which for y in scans.grid(i, points)])
+        scans.scan(points, level, np.inf)
         scans.follow_valleys(level)
         scans.find_ends(level)
     return tuple(scans.profile(i, level) for i in scans.which)
 
 
-class _Scans:
-    """Held values of parameters and the minima with them, in scaled form, as far as known."""
+def quick_profiles(fit: "Fit", progress: float | None) -> tuple[Profile, ...]:
+    """Profiles of all parameters around the minima that are known, no farther than is needed."""
+    with progress_bar(progress) as show:
+        scans = _Scans(fit, range(len(fit.names)), show)
+        scans.scan(QUICK_POINTS, QUICK_LEVEL, FAR)
+        scans.find_ends(QUICK_LEVEL)
+    return tuple(scans.profile(i, QUICK_LEVEL) for i in scans.which)
 
-    def __init__(self, fit: "Fit", which: Sequence[int], show: Any):
-        self.fit, self.which, self.show = fit, which, show
+
+class Scaled:
+    """A fit in scaled parameters y."""
+
+    def __init__(self, fit: "Fit"):
         r, first = fit.problem.residuals, fit.problem.parameters.first
-        self.residuals: Residuals = filled_up(r)
         self.scale, self.log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
         self.low, self.high = np.asarray(r.low, float), np.asarray(r.high, float)
         self.size = float(r.size)
-        self.best = np.zeros(len(self.low))
-        self.best[: len(first)] = to_scaled(fit.value, self.scale, self.log)
+        exact = EXACT[str(r.offset.dtype)] * self.size**2
+        stated = np.isfinite(fit.noise) and fit.noise > 0
+        # of the weighted residuals; where nothing tells it, what is exact up to rounding
+        self.variance = float(fit.noise**2) if stated else exact
+        self.best = self.point(fit.value)
+
+    def point(self, value: np.ndarray) -> np.ndarray:
+        """y (Q,) of values (P,)."""
+        y = np.zeros(len(self.low))
+        y[: len(value)] = to_scaled(value, self.scale, self.log)
+        return y
+
+    def real(self, i: int, y: np.ndarray) -> np.ndarray:
+        """Values of the i-th parameter."""
+        return np.asarray(from_scaled(y, self.scale[i], np.broadcast_to(self.log[i], y.shape)))
+
+    def reach(
+        self, i: int, pieces: Sequence[tuple[float, float]] | None = None
+    ) -> tuple[float, float]:
+        """The bounds of the i-th parameter or the outer ends of pieces, scaled.
+
+        What has no end is cut at so many natural scales as starts reach.
+        """
+        low, high = self.low[i], self.high[i]
+        if pieces is not None:
+            outer = np.array([pieces[0][0], pieces[-1][1]])
+            outer = to_scaled(outer, self.scale[i], np.broadcast_to(self.log[i], 2))
+            low, high = max(low, outer[0]), min(high, outer[1])
+        low = low if np.isfinite(low) else self.best[i] - START_SCALES
+        high = high if np.isfinite(high) else self.best[i] + START_SCALES
+        return float(low), float(high)
+
+
+def can_be_profiled(fit: "Fit") -> bool:
+    """Least squares, in a box."""
+    return fit.loss == "squares" and isinstance(fit.problem.residuals.region, Box)
+
+
+def check_profiled(fit: "Fit") -> None:
+    """Raise a ValueError unless parameters of this fit can be held."""
+    if not can_be_profiled(fit):
+        raise ValueError(
+            "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."
+        )
+
+
+class _Scans(Scaled):
+    """Held values of parameters and the minima with them, in scaled form, as far as known."""
+
+    def __init__(self, fit: "Fit", which: Sequence[int], show: Any):
+        super().__init__(fit)
+        self.fit, self.which, self.show = fit, which, show
+        self.residuals: Residuals = filled_up(fit.problem.residuals)
         self.least = fit.starts[0].sum_of_squares
         # of each parameter: held value -> (sum of squares, y)
         self.found: dict[int, dict[float, tuple[float, np.ndarray]]] = {
             i: {float(self.best[i]): (self.least, self.best)} for i in which
         }
+        for start in fit.starts[1:]:
+            y = self.point(start.value)
+            for i in which:
+                self.found[i].setdefault(float(y[i]), (start.sum_of_squares, y))
         self.lower: np.ndarray | None = None
 
-    def grid(self, i: int, points: int) -> np.ndarray:
-        """Values to hold: across the domain, and near the minimum."""
-        low = max(self.low[i], self.best[i] - START_SCALES) if not self.log[i] else self.low[i]
-        high = min(self.high[i], self.best[i] + START_SCALES) if not self.log[i] else self.high[i]
-        low = self.low[i] if np.isfinite(self.low[i]) else low
-        high = self.high[i] if np.isfinite(self.high[i]) else high
-        return np.r_[np.linspace(low, high, points), self._near(i, self.best, self._error(i))]
+    def minima(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """y (Q,) of the minima that fit well enough, and scaled standard errors (P,)."""
+        fit = self.fit
+        found: list[tuple[np.ndarray, np.ndarray | None]] = [(fit.value, fit.standard_error)]
+        if fit.rank == len(fit.names):  # else they are ends in one valley
+            found += [(end.value, end.standard_error) for end in fit.starts[1:]]
+        return [
+            (self.point(value), error / np.where(self.log, value, self.scale))
+            for value, error in found
+            if error is not None
+        ]
 
-    def _error(self, i: int) -> float:
-        step = self.fit.value[i] if self.log[i] else self.scale[i]
-        return float(self.fit.standard_error[i] / step)
-
-    def _near(self, i: int, y: np.ndarray, error: float) -> np.ndarray:
+    def near(self, i: int, y: np.ndarray, error: float, level: float) -> np.ndarray:
+        """Values to hold near a minimum."""
         if not np.isfinite(error):
             return np.zeros(0)
-        return np.clip(y[i] + error * NEAR, self.low[i], self.high[i])
+        reach = error * np.sqrt(self.limit(level))
+        return np.clip(y[i] + reach * NEAR, self.low[i], self.high[i])
+
+    def scan(self, points: int, level: float, far: float) -> None:
+        """Deviances across the domains, as far as they are at most `far` times the limit."""
+        values: dict[int, np.ndarray] = {}
+        fronts: list[_Front] = []
+        for i in self.which:
+            parts = [np.linspace(*self.reach(i), points)]
+            for y, error in self.minima():
+                parts.append(self.near(i, y, float(error[i]), level))
+                fronts += [_Front(i, step, y) for step in (-1, 1)]
+            values[i] = np.unique(np.concatenate(parts))
+        if len(self.fit.names) == 1 and far == np.inf:  # nothing is left to be solved for
+            self._take([(0, _with(self.best, 0, x)) for x in values[0]])
+        else:
+            self.advance(fronts, values, far * self.limit(level))
+
+    def advance(self, fronts: list["_Front"], values: Mapping[int, np.ndarray], far: float) -> None:
+        """From value to value, each from the minimum beside it, until others have been there."""
+        while True:
+            ahead = [(f, f.next(values[f.i], self.low, self.high)) for f in fronts]
+            moving = [(f, y) for f, y in ahead if y is not None]
+            if not moving:
+                return
+            known = [self.found[f.i].get(float(y[f.i]), (np.inf, y))[0] for f, y in moving]
+            ends = self._take([(f.i, y) for f, y in moving])
+            fronts = []
+            for (f, _), before, end in zip(moving, known, ends):
+                squares, y = end
+                first = squares < (1 - SAME) * before and self.found[f.i][float(y[f.i])] is end
+                if first and (squares - self.least) / self.variance <= far:
+                    fronts.append(_Front(f.i, f.step, y, f.last))
 
     def _solve(self, held: Sequence[tuple[int | None, np.ndarray]]) -> SolverState:
         """Minima from y (Q,), with the i-th entry held, None: nothing."""
-        starts = np.array([y for _, y in held])
-        low, high = (np.tile(end, (len(held), 1)) for end in (self.low, self.high))
-        for k, (i, y) in enumerate(held):
-            if i is not None:
-                low[k, i] = high[k, i] = y[i]
-        dtype = self.residuals.offset.dtype
-        box: Any = Box(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
-        many = repeated(self.residuals, len(held))
-        many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
-        return run(many, starts, _METHOD, DEFAULT_STEPS[_METHOD], self.show, rivals=False)
+        which = [(() if i is None else (i,), y) for i, y in held]
+        return run_held(self.residuals, which, DEFAULT_STEPS[_METHOD], self.show)
 
-    def _take(self, held: Sequence[tuple[int, np.ndarray]]) -> None:
+    def _take(self, held: Sequence[tuple[int, np.ndarray]]) -> list[tuple[float, np.ndarray]]:
         """Solve, and keep what is better than what was known."""
-        if not held:
-            return
         states = self._solve(held)
         squares = 2 * np.asarray(states.cost, float) * self.size**2
+        ends = []
         for k, (i, y) in enumerate(held):
-            known = self.found[i].get(float(y[i]), (np.inf, y))
-            if squares[k] < known[0]:
-                end = np.array(states.y[k], float)
-                end[i] = y[i]
-                self.found[i][float(y[i])] = (float(squares[k]), end)
+            end = _with(np.asarray(states.y[k]), i, y[i])
+            ends.append((float(squares[k]), end))
+            if not squares[k] >= self.found[i].get(float(y[i]), (np.inf, y))[0]:
+                self.found[i][float(y[i])] = ends[-1]
         best = min((entry for found in self.found.values() for entry in found.values()), key=_first)
         exact = EXACT[str(self.residuals.offset.dtype)] * self.size**2
         if best[0] < self.least * (1 - 1e-6) - exact:
             self.least, self.lower = best
-
-    def add(self, held: Sequence[tuple[int, float]]) -> None:
-        """New held values: from the nearest known minimum, then from their better neighbour."""
-        self._take([(i, _with(self._nearest(i, y), i, y)) for i, y in held])
-        if len(self.fit.names) == 1:
-            return
-        again = []
-        for i, y in held:
-            values = sorted(self.found[i])
-            k = values.index(float(y))
-            beside = [
-                self.found[i][x] for x in (*values[max(k - 1, 0) : k], *values[k + 1 : k + 2])
-            ]
-            squares, start = min(beside, key=_first)
-            if squares < self.found[i][float(y)][0]:
-                again.append((i, _with(start, i, y)))
-        self._take(again)
+        return ends
 
     def _nearest(self, i: int, y: float) -> np.ndarray:
         return self.found[i][min(self.found[i], key=lambda known: abs(known - y))][1]
@@ -213,19 +279,11 @@ class _Scans:
         """Held values and their deviances."""
         values = np.array(sorted(self.found[i]))
         squares = np.array([self.found[i][y][0] for y in values])
-        return values, np.maximum(squares - self.least, 0.0) / self._variance()
-
-    def _variance(self) -> float:
-        noise = self.fit.noise
-        if np.isfinite(noise) and noise > 0:
-            return float(noise**2)
-        return EXACT[str(self.residuals.offset.dtype)] * self.size**2
+        return values, np.maximum(squares - self.least, 0.0) / self.variance
 
     def limit(self, level: float) -> float:
         """Deviance at the ends of an interval."""
-        freedom, tail = self.fit.degrees_of_freedom, 0.5 + 0.5 * level
-        known = self.fit.problem.sigma is not None or freedom < 1
-        return float(ndtri(tail) if known else stdtrit(freedom, tail)) ** 2
+        return quantile(self.fit, level) ** 2
 
     def follow_valleys(self, level: float) -> None:
         """Held values around the minima that further valleys of the scans lead to."""
@@ -237,17 +295,20 @@ class _Scans:
         if not starts:
             return
         states = self._solve([(None, y) for _, y in starts])
-        more = []
+        fronts: list[_Front] = []
+        near: dict[int, np.ndarray] = {}
         for k, (i, _) in enumerate(starts):
             jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
             inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
-            error = np.sqrt(self._variance() * inverse[i, i])
+            error = np.sqrt(self.variance * inverse[i, i])
             y = np.asarray(states.y[k], float)
             squares = 2 * float(states.cost[k]) * self.size**2
-            if (squares - self.least) / self._variance() <= self.limit(level):
+            if (squares - self.least) / self.variance <= self.limit(level):
                 self.found[i].setdefault(float(y[i]), (squares, y))
-                more += [(i, float(x)) for x in self._near(i, y, float(error))]
-        self.add(more)
+                more = self.near(i, y, float(error), level)
+                near[i] = np.unique(np.concatenate([near.get(i, np.zeros(0)), more]))
+                fronts += [_Front(i, step, y) for step in (-1, 1)]
+        self.advance(fronts, near, np.inf)
 
     def find_ends(self, level: float) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
@@ -259,6 +320,8 @@ class _Scans:
                 height = np.sqrt(d) - limit
                 for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
                     a, b, p, q = values[k], values[k + 1], height[k], height[k + 1]
+                    if min(abs(p), abs(q)) <= END * limit:
+                        continue
                     share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
                     y = a + np.clip(share, 0.02, 0.98) * (b - a)
                     if a < y < b and abs(b - a) > 1e-6 * max(1.0, abs(a)):
@@ -270,7 +333,7 @@ class _Scans:
     def profile(self, i: int, level: float) -> Profile:
         """What is known of a parameter."""
         values, d = self.deviance(i)
-        limit, real = self.limit(level), self._real(i, values)
+        limit, real = self.limit(level), self.real(i, values)
         below = np.flatnonzero(d <= limit)
         pieces = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         intervals = []
@@ -284,7 +347,7 @@ class _Scans:
                 p, q = np.sqrt(d[k]), np.sqrt(d[beyond])
                 share = (np.sqrt(limit) - p) / (q - p)
                 y = values[k] + share * (values[beyond] - values[k])
-                ends.append(float(self._real(i, np.array([y]))[0]))
+                ends.append(float(self.real(i, np.array([y]))[0]))
             intervals.append((float(ends[0]), float(ends[1])))
         low, high = self.fit.problem.domains[i]
         better = None
@@ -293,8 +356,109 @@ class _Scans:
         given = (self.fit.names[i], real, d, limit, level, tuple(intervals))
         return Profile(*given, (float(low), float(high)), better)
 
-    def _real(self, i: int, y: np.ndarray) -> np.ndarray:
-        return np.asarray(from_scaled(y, self.scale[i], np.broadcast_to(self.log[i], y.shape)))
+
+class _Front(NamedTuple):
+    """How far the scan of the i-th parameter has come in one direction."""
+
+    i: int
+    step: int  # -1 or 1
+    last: np.ndarray
+    before: np.ndarray | None = None
+
+    def next(self, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+        """Where to start at the next of the values: on a straight line; None at the end."""
+        i, last = self.i, self.last
+        ahead = values[(values - last[i]) * self.step > 0]
+        if len(ahead) == 0:
+            return None
+        value = ahead[0] if self.step > 0 else ahead[-1]
+        y = last
+        if self.before is not None:
+            share = (value - last[i]) / (last[i] - self.before[i])
+            y = np.clip(last + min(share, LONGEST) * (last - self.before), low, high)
+        return _with(y, i, value)
+
+
+def quantile(fit: "Fit", level: float) -> float:
+    """Standard errors to either side that an interval reaches."""
+    if not 0 < level < 1:
+        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+    freedom, tail = fit.degrees_of_freedom, 0.5 + 0.5 * level
+    known = fit.problem.sigma is not None or freedom < 1
+    return float(ndtri(tail) if known else stdtrit(freedom, tail))
+
+
+def linearized(fit: "Fit", i: int, q: float) -> tuple[tuple[float, float], ...]:
+    """Where parabolas at all minima let the i-th parameter lie within q standard errors."""
+    low, high = fit.bounds[0][i], fit.bounds[1][i]
+    log = np.asarray(fit.problem.residuals.log)[fit.problem.parameters.first][i]
+    minima = [(fit.value[i], fit.standard_error[i], 0.0)]
+    for start in fit.starts[1:]:
+        if start.standard_error is not None:
+            more = start.sum_of_squares - fit.starts[0].sum_of_squares
+            minima.append((start.value[i], start.standard_error[i], more))
+    pieces: list[tuple[float, float]] = []
+    for value, error, more in minima:
+        if pieces and not more < (q * fit.noise) ** 2:
+            continue
+        half = error * np.sqrt(q**2 - (more / fit.noise**2 if more else 0.0))
+        if log:
+            ends = value * np.exp(np.array([-half, half]) / value)
+        else:
+            ends = np.array([value - half, value + half])
+        pieces.append(tuple(np.clip(ends, low, high)))
+    return joined(pieces)
+
+
+def needs_profiles(fit: "Fit") -> bool:
+    """Whether parabolas may mislead, and profiles cost little."""
+    problem = fit.problem
+    few = fit.experiments is not None and len(fit.predicted) <= FEW
+    if not few or not can_be_profiled(fit) or not fit.converged:
+        return False
+    if fit.rank < len(fit.names):
+        return True
+    if not np.isfinite(fit.noise):
+        return False  # nothing tells how far a value may be off
+    log = np.asarray(problem.residuals.log)[problem.parameters.first]
+    q = quantile(fit, 0.95)
+    for i in range(len(fit.names)):
+        pieces = linearized(fit, i, q)
+        at_end = pieces[0][0] <= fit.bounds[0][i] or pieces[-1][1] >= fit.bounds[1][i]
+        wide = log[i] and fit.standard_error[i] > HARDLY_SEEN * fit.value[i]
+        if len(pieces) > 1 or at_end or wide:
+            return True
+    return False
+
+
+def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """The same set in pieces apart from each other, in order.
+
+    >>> from jimpact.fits.profiles import joined
+    >>> joined([(3.0, 4.0), (0.0, 1.0), (0.5, 2.0)])
+    ((0.0, 2.0), (3.0, 4.0))
+    """
+    found: list[tuple[float, float]] = []
+    for low, high in sorted(pieces):
+        if found and low <= found[-1][1]:
+            found[-1] = (found[-1][0], max(high, found[-1][1]))
+        else:
+            found.append((float(low), float(high)))
+    return tuple(found)
+
+
+def in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
+    """Pieces of an interval; an end at the domain is none."""
+    return " or ".join(_piece(*ends, domain) for ends in pieces)
+
+
+def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
+    open_low, open_high = low <= domain[0], high >= domain[1]
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+    return f"{low:.5g} to {high:.5g}"
 
 
 def _first(entry: tuple[float, Any]) -> float:

@@ -159,7 +159,7 @@ class Binary(Law):
         )
 
     def collisions(self, scene: Scene, velocity: Any) -> jax.Array:
-        """Number of collisions () int32 until the end; -1: without end; jit, vmap.
+        """Number of collisions () int32 of a scene and velocity v- (n,) [m/s]; -1: endless.
 
         `max_collisions` where the law gave up. Approaches slower than rounding do not count.
 
@@ -177,6 +177,11 @@ class Binary(Law):
         self, scene: Scene, velocity: Any, limit: int = 100
     ) -> list[tuple[int, float | None, np.ndarray]]:
         """The first `limit` collisions: contact, time [s] ('earliest', else None), velocities.
+
+        Args:
+            scene: n coordinates, m contacts.
+            velocity: v- (n,) [m/s].
+            limit: the most that are told.
 
         A host function, for looking at; it does not stop at a plastic limit.
 

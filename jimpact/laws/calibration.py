@@ -33,12 +33,15 @@ def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
     Equation: `m x'' = -F(x, x')`, `x(0) = 0`, `x'(0) = v`, until the force ends; `e = -x'/v`.
 
     Args:
-        force: of `rheology.py`; parameters broadcast with `mass` and `speed`.
+        force: a contact force; its parameters broadcast with `mass` and `speed`.
         mass: reduced mass m > 0 [kg]: `m1 m2 / (m1 + m2)`, or `1 / W_jj` of a contact.
         speed: approach v > 0 [m/s].
 
     Returns:
         e, of the common shape; NaN where the impact has no end.
+
+    Raises:
+        ValueError: mass or speed not positive.
 
     >>> import jimpact as ji
     >>> round(float(ji.measured_restitution(ji.KelvinVoigt(1.0, 0.2), mass=1.0, speed=1.0)), 5)
@@ -67,7 +70,11 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
         force: `KelvinVoigt`, `HuntCrossley`, `KuwabaraKono` or `Bistiffness`; its own damping does
             not matter.
         restitution: e in [0.05, 1], scalar or one per contact.
-        mass: reduced mass > 0 [kg]. speed: of approach > 0 [m/s]; at another speed e differs.
+        mass: reduced mass > 0 [kg].
+        speed: of approach > 0 [m/s]; at another speed e differs.
+
+    Returns:
+        A force of the same kind.
 
     Raises:
         TypeError: a force without a damping (a user's own). ValueError: e out of range.
@@ -105,6 +112,12 @@ def compare_rheologies(
         velocity: v- (n,) [m/s]; something must approach.
         restitution: e in [0.05, 1], scalar or (m,).
         stiffness: Hertz k, scalar or (m,) [N / m^1.5].
+
+    Returns:
+        `Comparison` with an entry for each force; `ji.plot.rheologies` draws it.
+
+    Raises:
+        ValueError: nothing approaches, restitution or stiffness out of range.
 
     >>> import jimpact as ji
     >>> found = ji.compare_rheologies(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0], 0.9)

@@ -26,7 +26,7 @@ class Compliant(Law):
     that gaps of any size cost nothing. Geometry (M and N) is frozen.
 
     Args:
-        force: of `rheology.py`: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
+        force: a contact force: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
             `Bistiffness(k, eta, e)`, `KelvinVoigt(k, c)`, `HuntCrossley(k, d, eta)`,
             `KuwabaraKono(k, A)`, `UserForce(function, parameters)`.
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
@@ -76,7 +76,7 @@ class Compliant(Law):
         check_rtol(self.rtol, dtype)
 
     def dynamics(self, contact: Contact) -> Dynamics:
-        """The dynamics of the whole encounter in units of their own."""
+        """The dynamics of the contact's whole encounter in units of their own."""
         gamma, force, viscous = contact.gap_velocity, self.force, None
         if isinstance(force, Bistiffness):
             k, e, exponent = force.stiffness, force.restitution, force.exponent

@@ -13,14 +13,27 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array
-from jimpact.law import Declared, StaticOrValues, Values, parameter
+from jimpact.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
 
 _SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
 _BISECTIONS = 50  # of them, to about 1e-13 decades
 
 
 class Force(Declared):
-    """A contact force; `force` and, where it may slacken, `onset` (of the same sign, smooth)."""
+    """A contact force; `force` and, where it may slacken, `onset` (of the same sign, smooth).
+
+    A force of your own with declared parameters inherits it; `UserForce` takes a function.
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> class Stiffening(ji.Force):
+    ...     stiffness: float = ji.parameter(low=0, open_low=True)
+    ...
+    ...     def force(self, x, rate):
+    ...         return self.stiffness * x * (1 + x)
+    >>> float(Stiffening(2.0).force(jnp.array(1.0), jnp.array(0.0)))
+    4.0
+    """
 
     slackens: ClassVar[bool] = False
 
@@ -29,7 +42,7 @@ class Force(Declared):
         raise NotImplementedError
 
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
-        """Sign of the force."""
+        """Sign of the force at x > 0 and rate x'."""
         return self.force(x, rate)
 
     def indentation_scale(self, energy: jax.Array) -> jax.Array:
@@ -63,10 +76,17 @@ class Bistiffness(Force):
         restitution: e in [0, 1].
 
     Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.1, (6.67).
+
+    >>> import jimpact as ji
+    >>> force = ji.Bistiffness(1.0, exponent=1.5, restitution=0.8)
+    >>> round(float(ji.measured_restitution(force, mass=1.0, speed=1.0)), 9)
+    0.8
     """
 
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
-    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    exponent: StaticOrValues = parameter(
+        low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
+    )
     restitution: Values = parameter(low=0.0, high=1.0, default=1.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
@@ -79,6 +99,16 @@ class Bistiffness(Force):
 def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:
     """Elastic contact `F = k x^eta`.
 
+    Args:
+        stiffness: k > 0, scalar or (m,) [N / m^eta].
+        exponent: eta >= 1; a float or a tuple is static, an array is differentiable.
+
+    Returns:
+        `Bistiffness` with restitution 1.
+
+    Raises:
+        ValueError: a stiffness that is not positive, an exponent below 1.
+
     >>> import jimpact as ji
     >>> import jax.numpy as jnp
     >>> float(ji.PowerLaw(2.0, 1.5).force(jnp.array(4.0), jnp.array(0.0)))
@@ -90,6 +120,15 @@ def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:
 def Hertz(stiffness: Any) -> Bistiffness:
     """Hertz contact `F = k x^1.5`, k in [N / m^1.5] (see `hertz_stiffness`).
 
+    Args:
+        stiffness: k > 0, scalar or (m,) [N / m^1.5].
+
+    Returns:
+        `Bistiffness` with exponent 1.5 and restitution 1.
+
+    Raises:
+        ValueError: a stiffness that is not positive.
+
     >>> import jimpact as ji
     >>> float(ji.Hertz(2.0).exponent)
     1.5
@@ -99,6 +138,15 @@ def Hertz(stiffness: Any) -> Bistiffness:
 
 def LinearSpring(stiffness: Any) -> Bistiffness:
     """Linear spring `F = k x`, k in [N/m].
+
+    Args:
+        stiffness: k > 0, scalar or (m,) [N/m].
+
+    Returns:
+        `Bistiffness` with exponent 1 and restitution 1.
+
+    Raises:
+        ValueError: a stiffness that is not positive.
 
     >>> import jimpact as ji
     >>> float(ji.LinearSpring(2.0).exponent)
@@ -115,6 +163,11 @@ class KelvinVoigt(Force):
         damping: c >= 0 [N s/m].
 
     Its force jumps to c x' when the contact closes.
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> float(ji.KelvinVoigt(2.0, 0.5).force(jnp.array(1.0), jnp.array(-1.0)))
+    1.5
     """
 
     slackens: ClassVar[bool] = True
@@ -136,11 +189,18 @@ class HuntCrossley(Force):
         exponent: eta >= 1, a float.
 
     Source: Hunt and Crossley (1975).
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> float(ji.HuntCrossley(2.0, 0.5).force(jnp.array(1.0), jnp.array(0.1)))
+    2.1
     """
 
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
     damping: Values = parameter(low=0.0)
-    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    exponent: StaticOrValues = parameter(
+        low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
+    )
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x^eta (1 + d x')`."""
@@ -158,6 +218,11 @@ class KuwabaraKono(Force):
         damping: A >= 0 [s], the dissipative time.
 
     Source: Kuwabara and Kono (1987); Brilliantov, Spahn, Hertzsch and Poeschel (1996).
+
+    >>> import jax.numpy as jnp
+    >>> import jimpact as ji
+    >>> float(ji.KuwabaraKono(2.0, 0.5).force(jnp.array(1.0), jnp.array(1.0)))
+    3.5
     """
 
     slackens: ClassVar[bool] = True

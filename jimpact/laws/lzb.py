@@ -9,6 +9,7 @@ from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
 from jimpact.events.impact_dynamics import METHODS, Dynamics, dimensionless, sides_of, solve
 from jimpact.law import (
+    LARGEST_EXPONENT,
     Impulses,
     Law,
     OptionalValues,
@@ -53,6 +54,9 @@ def distributing_rule(energy: Any, stiffness: Any, exponent: Any) -> jax.Array:
     Returns:
         Row j, column i: Gamma_ji; NaN or inf in columns with E_i = 0 (0/0 at the first touch:
         why the law is integrated in time form, see `LZB`).
+
+    Raises:
+        ValueError: energy < 0, stiffness <= 0, exponent < 1.
 
     Source: Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.70).
 
@@ -120,7 +124,9 @@ class LZB(Law):
 
     restitution: Values = parameter(low=0.0, high=1.0)
     stiffness: Values = parameter(low=0.0, open_low=True, log=True, default=1.0)
-    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    exponent: StaticOrValues = parameter(
+        low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
+    )
     initial_energy: Values = parameter(low=0.0, default=0.0)
     friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
@@ -148,7 +154,7 @@ class LZB(Law):
         return self.method == "time" and self.friction is None
 
     def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
-        """The impact dynamics in units of their own; `rtol` in place of the law's."""
+        """The dynamics of a contact in units of their own; `rtol` in place of the law's."""
         problem, units = dimensionless(
             contact.delassus,
             contact.gap_velocity,

@@ -25,11 +25,15 @@ def hertz_stiffness(
         modulus: Young's modulus E1 > 0 [Pa].
         poisson: Poisson ratio nu1 in [-1, 0.5].
         radius: R1 > 0 [m].
-        modulus2, poisson2: of the other body; None: the same material; `inf`: rigid.
+        modulus2: of the other body [Pa]; None: the same material; `inf`: rigid.
+        poisson2: of the other body; None: the same material.
         radius2: R2 [m]; None: an equal sphere; `inf`: a plane.
 
     Returns:
         k [N / m^1.5], of the common shape. Good for x small beside R and no plastic flow.
+
+    Raises:
+        ValueError: modulus or radius not positive, Poisson ratio out of range.
 
     Source: Hertz (1882); Johnson, Contact Mechanics (1985), (4.22)-(4.23).
 
@@ -61,6 +65,16 @@ def hertz_stiffness(
 
 def sphere_mass(density: Any, radius: Any) -> jax.Array:
     """Mass of a sphere [kg] from its density [kg/m^3] and radius [m].
+
+    Args:
+        density: rho > 0 [kg/m^3].
+        radius: R > 0 [m].
+
+    Returns:
+        `4/3 pi rho R^3` [kg], of the common shape.
+
+    Raises:
+        ValueError: density or radius not positive.
 
     >>> import jimpact as ji
     >>> round(float(ji.sphere_mass(7650.0, 4e-3)), 7)

@@ -16,6 +16,7 @@ from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
 from jimpact.law import Law
+from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
@@ -155,7 +156,8 @@ def advise(
         stiffness_range: low and high factor on every stiffness ratio (k_j over that of the first
             contact of its block; on every k_j where not only ratios count); default: (0.1, 10)
             where no stiffness is given, else (1, 1).
-        samples: number of log-uniform samples; seed: of them.
+        samples: number of log-uniform samples.
+        seed: of the samples.
         timing: measure the cost of every law (some seconds of compilation).
         progress: bar on stderr; None: on a terminal, for long runs.
 
@@ -388,7 +390,7 @@ def trials(at: Situation, restitution: Any, stiffness: np.ndarray, eta: Any) -> 
     if gapped:
         found["binary"] = found["binary"]._replace(scene=at.scene)
         found["compliant"] = Trial(Compliant(Bistiffness(k, eta, e)), at.scene)
-    return found
+    return {name: found[name] for name in SIMPLEST_FIRST if name in found}
 
 
 def outcomes(

@@ -96,9 +96,19 @@ class Candidate:
 class Advice:
     """What `advise` found; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
 
-    `within`: the law keeps the tolerance; `reason` in words; `candidates[name]` the evidence, from
-    the simplest law to the `reference`; `unknown`: the stiffnesses not known and what they do;
-    `rows`: how many stiffnesses were tried; `gap_ratio`: gaps at work in units of delta_c.
+    Attributes:
+        name: of the simplest law; `reason` says why, in words.
+        tolerance: as asked for.
+        within: whether that law keeps it.
+        reference: name of the law that all are compared with.
+        velocity: v- (n,) [m/s].
+        gap_velocity: gamma- (m,) [m/s].
+        candidates: the evidence by law, from the simplest to the reference.
+        blocks: contacts that feel each other.
+        stiffness: nominal ones (m,).
+        unknown: the stiffnesses that are not known and what they do.
+        rows: how many stiffnesses were tried.
+        gap_ratio: gaps at work in units of delta_c (m,), or None.
     """
 
     name: str

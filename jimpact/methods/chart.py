@@ -87,8 +87,17 @@ class Reference:
 class WorkPrecision:
     """Error against time and work; `print` gives a table, `ji.plot.work_precision` a picture.
 
-    `points[name]` from coarse to fine; `compile_time[name]` [s] by program ('single', 'batched',
-    'gradient'), traced and compiled; `left_out[name]`: why a method is missing.
+    Attributes:
+        velocity: v- (n,) [m/s].
+        points: by method, from coarse to fine.
+        reference: what errors are measured from.
+        compile_time: [s] by method and program ('single', 'batched', 'gradient').
+        left_out: why a method is missing.
+        without_gradient: why a method has none.
+        batch: impacts in a batch.
+        sample: impacts on which errors are measured.
+        spread: factor within which their stiffnesses lie.
+        repeats: of every time.
     """
 
     velocity: np.ndarray
@@ -168,9 +177,14 @@ def work_precision(
         reference: method that errors are measured from, at rtol 1e-14; None: the
             event-aligned order 8. Its uncertainty is its distance from
             a second solution: order 8 at 1e-12.
-        batch: impacts in a batch. repeats: of every time. gradients, durations: measure them, too
-            (each asks for programs of its own).
+        batch: impacts in a batch.
+        repeats: of every time.
+        gradients: measure those, too (with programs of their own).
+        durations: likewise.
         progress: bar on stderr; None: on a terminal.
+
+    Returns:
+        `WorkPrecision`; `print` gives a table, `ji.plot.work_precision` the chart.
 
     Raises:
         ValueError: a method unknown or unable (the reason is told), nothing approaches, single

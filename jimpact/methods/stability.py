@@ -122,7 +122,8 @@ class StabilityMap:
 
     Attributes:
         methods: the names.
-        axes, base: values along every axis; the base point of the slices.
+        axes: values along every axis.
+        base: the point that the slices go through.
         slices: by method, first those over one axis, then pairs.
         samples: Latin-hypercube points (S, 6), columns `jimpact.methods.stability.AXES`.
         sampled: by method, a `Slice` over the samples.
@@ -140,12 +141,12 @@ class StabilityMap:
     max_steps: int
 
     def counts(self, method: str) -> dict[str, int]:
-        """Points of each class, over all slices and samples."""
+        """Points of each class of a method, over all slices and samples."""
         codes = np.concatenate([s.codes.ravel() for s in self._all_slices(method)])
         return dict(zip(CLASSES, np.bincount(codes, minlength=len(CLASSES)).tolist()))
 
     def causes(self, method: str) -> dict[str, int]:
-        """Points that are not right, by cause."""
+        """Points of a method that are not right, by cause."""
         found = np.concatenate([s.cause.ravel() for s in self._all_slices(method)])
         counts = np.bincount(found[found >= 0], minlength=len(CAUSES)).tolist()
         return {cause: count for cause, count in zip(CAUSES, counts) if count}

@@ -26,8 +26,9 @@ RATIOS = (1e-3, 1e3, 121)  # of a map where none are given: from, to, how many
 class ValidityMap:
     """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), beside laws without them.
 
-    `velocity` (x, r, n), `dispersion` and `status` (x, r); `laws[name]` holds v+ (n,) of Moreau's
-    law and of binary collisions, `law_dispersion[name]` its index.
+    `scene` and v- `before` (n,) [m/s] as asked for; `velocity` (x, r, n) [m/s], `dispersion` and
+    `status` (x, r) over `exponents` (x,) and `ratios` (r,); `laws` holds v+ (n,) of Moreau's law
+    and of binary collisions, `law_dispersion` their indices.
     """
 
     scene: Scene
@@ -41,7 +42,7 @@ class ValidityMap:
     law_dispersion: dict[str, float]
 
     def error(self, law: str) -> np.ndarray:
-        """Error of v+ of 'moreau' or 'binary' against LZB (x, r), relative to max |v-|."""
+        """Error of v+ of a law, 'moreau' or 'binary', against LZB (x, r), relative to max |v-|."""
         check_choice("law", law, self.laws)
         scale = np.abs(self.before).max()
         return np.abs(self.velocity - self.laws[law]).max(axis=-1) / scale
@@ -94,6 +95,9 @@ def validity_map(
 
     Returns:
         `ValidityMap`; `ji.plot.validity_map` draws it, `print` tells where which law holds.
+
+    Raises:
+        ValueError: shapes or ranges, at rest, one contact, gaps, ratios that do not rise.
 
     Source: the kind of Brogliato, Nonsmooth Mechanics (2016), figure 6.9.
 

@@ -41,7 +41,14 @@ class Distribution(eqx.Module):
 
 
 class Uniform(Distribution):
-    """Independent and uniform between `low` and `high`, scalars or one per entry (m,).
+    """Independent and uniform between `low` and `high`.
+
+    Args:
+        low: scalar or one per entry (m,), in the unit of what is drawn.
+        high: likewise, >= low.
+
+    Raises:
+        ValueError: not finite, high < low.
 
     >>> import jimpact as ji
     >>> ji.Uniform(0.0, [1e-6, 2e-6])
@@ -73,10 +80,17 @@ class Uniform(Distribution):
 
 
 class Normal(Distribution):
-    """Independent and normal, `mean` and `std` > 0 scalars or one per entry (m,).
+    """Independent and normal.
 
     As a distribution of gaps it is truncated at 0 (drawn again, not clipped), so the gaps have a
     larger mean and a smaller spread than `mean` and `std` say where these are comparable.
+
+    Args:
+        mean: scalar or one per entry (m,), in the unit of what is drawn.
+        std: standard deviation > 0, likewise.
+
+    Raises:
+        ValueError: not finite, std <= 0.
 
     >>> import jimpact as ji
     >>> ji.Normal(1e-5, 1e-6)

@@ -114,7 +114,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
 
 
 class Crossover(eqx.Module):
-    """Outcomes (s, n) over `offset` (s,), the difference of two gaps in units of delta_c."""
+    """`velocity` (s, n) [m/s] and `status` (s,) over `offset` (s,), gap 1 - gap 2 over delta_c."""
 
     offset: jax.Array
     velocity: jax.Array
@@ -132,6 +132,12 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
         law: a `Compliant`.
         velocity: v- (n,) [m/s].
         offset: (s,) values of `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
+
+    Returns:
+        `Crossover`: `gaps` (s, 2) [m], `velocity` (s, n) [m/s], `status` (s,), a row an offset.
+
+    Raises:
+        ValueError: not two contacts, offsets of another shape. TypeError: another law.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.1.1: balls of mass (m/4, m, m/4).
 
@@ -176,7 +182,7 @@ class GapSensitivity:
     sampled: MonteCarlo | None = None
 
     def covariance(self, gap_covariance: Any) -> np.ndarray:
-        """Linearized covariance (n, n) of the velocities, `J Sigma J^T`, of gaps with Sigma."""
+        """Linearized covariance (n, n) of velocities, `J Sigma J^T`, Sigma = `gap_covariance`."""
         sigma = np.asarray(gap_covariance, float)
         m = len(self.gaps)
         check_shape("gap_covariance", sigma, (m, m), "a row and a column per contact")
@@ -235,10 +241,17 @@ def gap_sensitivity(
     sizes of gaps too.
 
     Args:
-        law, scene: as in `impact`.
+        law: as in `impact`.
+        scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
         gaps: (m,) >= 0 [m], where to linearize: often `sampled.gap_mean`.
         sampled: a run of `monte_carlo` with random gaps to compare with.
+
+    Returns:
+        `GapSensitivity`; `print` puts the linearized beside the sampled spread.
+
+    Raises:
+        ValueError: not one gap per contact, gaps < 0; what `impact` refuses.
 
     >>> import jimpact as ji
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25])

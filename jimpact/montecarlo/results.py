@@ -41,18 +41,25 @@ class MonteCarlo:
     """Statistics of the velocities after an impact; `print` gives a report.
 
     Attributes:
-        samples, count: how many were drawn, and how many of them did not fail: only these enter.
-        mean, covariance: (n,) [m/s], (n, n) of the velocities after.
-        minimum, maximum: (n,) [m/s].
-        gap_mean, gap_covariance, cross_covariance: (m,), (m, m), (n, m) of the random gaps, and of
-            velocities with gaps; m = 0 where gaps are not random.
-        edges, counts: histograms (n, bins + 1), (n, bins + 2); the first and the last count are
-            the samples outside the edges.
+        samples: how many were drawn.
+        count: how many of them did not fail: only these enter.
+        mean: of the velocities after (n,) [m/s].
+        covariance: likewise (n, n) [m^2/s^2].
+        minimum: (n,) [m/s].
+        maximum: (n,) [m/s].
+        gap_mean: of the random gaps (m,) [m]; m = 0 where gaps are not random.
+        gap_covariance: (m, m) [m^2].
+        cross_covariance: of velocities with gaps (n, m) [m^2/s].
+        edges: of the histograms (n, bins + 1) [m/s].
+        counts: (n, bins + 2); the first and the last are the samples outside the edges.
         statuses: number of samples by status.
         bad: the first failed samples; `replay(sample.index)` gives one to run again.
         first: the first samples, for pictures: gaps, velocity_before, velocity, status.
         gap_scale: delta_c (m,) [m], where the law has one.
-        rate: samples computed a second [1/s]; resumed: samples that were read from the folder.
+        rate: samples computed a second [1/s].
+        resumed: samples that were read from the folder.
+        description: law, scene and distributions, in words.
+        run: what was asked for; `replay` needs it.
     """
 
     samples: int

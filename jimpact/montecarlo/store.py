@@ -165,6 +165,9 @@ class Store:
 def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
     """The raw samples that `monte_carlo(..., folder=..., keep_samples=True)` kept, by chunk.
 
+    Args:
+        folder: of the run.
+
     Yields:
         `gaps` (C, m), `velocity_before` (C, n) (no columns where they are constant), `velocity`
         (C, n) after the impact, `status` (C,); in the order of the samples.

@@ -285,7 +285,7 @@ def turning_impact(
         gap_function: a `Body` (then `mass` is None), or q (n,) -> gaps (m,) [m].
         mass: M (n,) or (n, n), or a function q -> M(q).
         q: (n,) configuration before, with no penetration.
-        velocity: (n,).
+        velocity: (n,) [m/s, rad/s].
         force: as in `Compliant`.
         rtol: of q, q' and the indentations.
         max_steps: of the integrator.
@@ -293,6 +293,9 @@ def turning_impact(
     Returns:
         `TurningImpact`; `ended` False where it went on for 200 contact times or `max_steps`.
         Forward derivatives (motions by contact forces have no reverse ones).
+
+    Raises:
+        ValueError: sizes, NaN, penetration, a mass that is not positive. TypeError: no `Force`.
 
     >>> import jimpact as ji
     >>> block, q, v = ji.Block(1.0, 1.0), [0.0, 0.5, 0.0], [0.0, -0.5, -1.0]

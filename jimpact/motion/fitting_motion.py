@@ -78,6 +78,9 @@ def fit_motion(
         loss, starts, seed, max_steps, profiles, progress: as in `fit`.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
 
+    Returns:
+        `Fit`; `print` gives its report.
+
     Raises:
         ValueError: shapes, unknown parameters, nothing measured.
 

@@ -124,6 +124,20 @@ class Motion(eqx.Module):
 
     Samples that were not reached are NaN. The ledger
     `T + V - (T + V)(t_0) = force_work + base_work + sum contact_work` holds at every sample.
+
+    Attributes:
+        time: (S,) [s].
+        q: (S, n), see the body.
+        velocity: (S, n).
+        kinetic_energy: T (S,) [J].
+        potential_energy: V (S,) [J].
+        force_work: of `force` since the start (S,) [J].
+        base_work: of the moving base (S,) [J].
+        contact_work: of each contact, normal and tangential (S, 2, m) [J]; <= 0 dissipates.
+        gaps: (S, m) [m].
+        events: a table of all impacts, liftoffs, .., as `print(motion)` lists them.
+        steps: () of the integrator.
+        status: () code, 0 = ok; see `raise_on_failed_motion`.
     """
 
     time: jax.Array  # (S,)
@@ -219,6 +233,15 @@ def _said(motion: Motion, row: Status, lanes: np.ndarray) -> str:
 
 def raise_on_failed_motion(motion: Motion) -> Motion:
     """Raise a RuntimeError naming every failed motion (batched or not); else return it.
+
+    Args:
+        motion: what `simulate` returned, one or a batch.
+
+    Returns:
+        `motion` itself.
+
+    Raises:
+        RuntimeError: a status that is a failure; with the places in the batch.
 
     >>> import jimpact as ji
     >>> system = ji.ball_system()

@@ -91,7 +91,8 @@ def simulate(
         max_events: one more ends the motion with the status `max_events` (in time stepping it is
             not written). None: 500; with method 'events' outside jit, vmap and derivatives 100 000,
             found by the program for 500 in as many runs as needed.
-        rtol, atol: tolerances of the flights.
+        rtol: relative tolerance of the flights.
+        atol: absolute tolerance of the flights [m, m/s, rad, ..].
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed; contacts that share

@@ -122,6 +122,12 @@ def gravity(mass_along_up: Any, acceleration: Any = STANDARD_GRAVITY) -> Potenti
             horizontal ones and angles, negative where the coordinate points down.
         acceleration: g [m/s^2].
 
+    Returns:
+        Potential q -> V () [J].
+
+    Raises:
+        ValueError: numbers that are not finite.
+
     >>> import jimpact as ji
     >>> ji.gravity([0.0, 2.0], acceleration=10.0).weights.tolist()
     [0.0, 20.0]
@@ -198,6 +204,12 @@ def column_system(
         acceleration: of gravity [m/s^2].
         base: t -> height of the plate () [m].
 
+    Returns:
+        `System` of n heights [m] and n contacts, the floor first.
+
+    Raises:
+        ValueError: masses not positive, radii negative.
+
     >>> import jimpact as ji
     >>> ji.column_system([1.0, 2.0], 0.1).mass.tolist()
     [1.0, 2.0]
@@ -211,6 +223,17 @@ def ball_system(
     base: Base | None = None,
 ) -> System:
     """A ball (a point at height q) above a floor or a vibrating plate: a `Column` of one.
+
+    Args:
+        mass: > 0 [kg].
+        acceleration: of gravity [m/s^2].
+        base: t -> height of the plate () [m]; None: it stands still.
+
+    Returns:
+        `System` of one coordinate, q (1,) [m], and one contact.
+
+    Raises:
+        ValueError: a mass that is not positive.
 
     >>> import jimpact as ji
     >>> motion = ji.simulate(ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
@@ -237,6 +260,12 @@ def cradle_system(
         diameter: d [m].
         gap: distance between hanging balls [m].
         acceleration: of gravity [m/s^2].
+
+    Returns:
+        `System` of n angles [rad] and n - 1 contacts.
+
+    Raises:
+        ValueError: sizes or masses not positive, a negative gap.
 
     >>> import jimpact as ji, jax.numpy as jnp
     >>> float(ji.cradle_system([1.0, 1.0]).gap_function(jnp.zeros(2))[0])
@@ -265,6 +294,12 @@ def block_system(
         base: t -> (x_b, y_b) [m], how the plane moves.
         corners: 'all' four make contact; 'base': the lower two, as long as it does not overturn.
 
+    Returns:
+        `System` of 3 coordinates; 4 contacts, or 2.
+
+    Raises:
+        ValueError: sizes or mass not positive, unknown corners.
+
     >>> import jimpact as ji, jax.numpy as jnp
     >>> ji.block_system(1.0, 2.0).gap_function(jnp.array([0.0, 1.0, 0.0])).tolist()
     [0.0, 0.0, 2.0, 2.0]
@@ -289,6 +324,12 @@ def dimer_system(
         rod_mass: of the rod [kg], 0 for a massless one.
         acceleration: of gravity [m/s^2].
         base: t -> (x_b, y_b) [m], how the plate moves.
+
+    Returns:
+        `System` of 3 coordinates and 2 contacts.
+
+    Raises:
+        ValueError: sizes or masses out of range.
 
     >>> import jimpact as ji, jax.numpy as jnp
     >>> ji.dimer_system(0.1, 1.0).gap_function(jnp.array([0.0, 0.1, 0.0])).tolist()

@@ -7,10 +7,17 @@ from .charts import (
     validity_map as validity_map,
     work_precision as work_precision,
 )
-from .fits import fit as fit
-from .laws import comparison as comparison, forces as forces, rheologies as rheologies
+from .fits import contour as contour, fit as fit
+from .inference import correlation as correlation, profiles as profiles, residuals as residuals
+from .laws import (
+    comparison as comparison,
+    forces as forces,
+    history as history,
+    rheologies as rheologies,
+)
 from .montecarlo import monte_carlo as monte_carlo
 from .motions import animation as animation, motion as motion, phase_portrait as phase_portrait
+from .systems import system as system
 from .theory import (
     admissible_set as admissible_set,
     rocking_dispersion as rocking_dispersion,

@@ -13,7 +13,19 @@ from jimpact.methods.advice_report import Advice, as_code, share
 from jimpact.methods.chart import Point, Timing, WorkPrecision
 from jimpact.methods.stability import CLASSES, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
-from jimpact.plot.style import COLOURS, GREY, SPREAD
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    SMALL,
+    SPREAD,
+    finish,
+    heading,
+    legend_below,
+    legend_within,
+    logarithmic,
+    new_figure,
+    wrapped,
+)
 from jimpact.status import CODE, STATUS
 
 _MARKERS = "osD^vP"
@@ -33,7 +45,7 @@ CLASS_COLOURS = (
     "#EEEEEE",
 )
 _LABELS = {
-    "setting": "setting, coarse to fine",
+    "setting": "setting, 1 finest",
     "stiffness_ratio": "stiffness ratio",
     "exponent": "exponent",
     "restitution": "restitution e",
@@ -51,17 +63,28 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker is
     a failure by status; laws are stars at their model error; below the grey band's edge the
     reference is no better.
+
+    Args:
+        found: what `ji.work_precision` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    >>> import jimpact as ji
+    >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
+    >>> options = {"laws": {}, "batch": 4, "gradients": False}
+    >>> found = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
+    >>> len(ji.plot.work_precision(found).axes)
+    2
     """
-    figure = Figure(figsize=(11.5, 8.5))
-    figure.set_layout_engine("constrained")
     gradients = any(point.gradient is not None for row in found.points.values() for point in row)
     if gradients:
+        figure = new_figure(7.2)
         (left, right), (below, corner) = figure.subplots(2, 2)
     else:
-        below = None
-        (left, right), (corner, other) = figure.subplots(2, 2)
-        other.remove()
-        corner.set_subplotspec(corner.get_gridspec()[1, :])
+        figure, below, corner = new_figure(4.6), None, None
+        left, right = figure.subplots(1, 2)
     handles: dict[str, Any] = {}
     for number, (name, row) in enumerate(found.points.items()):
         style = _style(name, number, row)
@@ -83,16 +106,15 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     for axes, quantity, x, y in labels:
         if axes is not None:
             _finish(axes, found.reference.uncertainty[quantity], x, y)
-    corner.axis("off")
-    corner.legend(
-        handles.values(),
-        handles.keys(),
-        loc="upper center",
-        frameon=False,
-        fontsize="small",
-    )
-    corner.text(0.5, 0.02, _note(found), ha="center", fontsize="small", color=GREY)
-    left.set_title(title, loc="left")
+    for label, drawn in handles.items():
+        drawn.set_label(label)
+    if corner is None:
+        legend_below(figure, list(handles.values()), 2, _note(found))
+    else:  # beside the three panels
+        corner.axis("off")
+        options: dict[str, Any] = {"title": _note(found), "title_fontsize": SMALL, "loc": "center"}
+        corner.legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)
+    heading(figure, title)
     return figure
 
 
@@ -166,16 +188,16 @@ def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
         low = min(low, 0.3 * uncertainty)
         axes.axhspan(low, uncertainty, color=GREY, alpha=0.25, lw=0)
     axes.set_ylim(low, high)
-    axes.grid(lw=0.4, alpha=0.5)
-    axes.spines[["top", "right"]].set_visible(False)
+    logarithmic(axes, "x")
+    logarithmic(axes, "y")
+    finish(axes)
 
 
 def _note(found: WorkPrecision) -> str:
     return (
-        f"errors: largest of {found.sample} impacts, stiffness spread over a factor "
-        f"{found.spread:g}\ntimes: median and quartiles of {found.repeats}, batch of "
-        f"{found.batch}\ngrey: uncertainty of the reference "
-        "· hollow: failed by status"
+        f"errors: largest of {found.sample} impacts, stiffness\nspread over a factor "
+        f"{found.spread:g}; times: median\nand quartiles of {found.repeats}, batch of "
+        f"{found.batch};\ngrey: uncertainty of the reference;\nhollow: failed by status"
     )
 
 
@@ -186,14 +208,19 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
         found: what `stability_map` returned.
         title: above the panels.
 
-    Example: `ji.plot.stability_map(ji.stability_map(["default", "rk4"])).savefig("map.png")`.
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    >>> import jimpact as ji
+    >>> axes = {"restitution": [0.5, 1.0]}
+    >>> found = ji.stability_map(["verlet"], axes, {"balls": 2, "exponent": 1})
+    >>> len(ji.plot.stability_map(found).axes)
+    1
     """
     names = list(found.axes)
-    columns = min(3, len(names))
+    columns = min(2, len(names))
     rows = -(-len(names) // columns)
-    height = 0.9 + rows * (0.9 + 0.27 * len(found.methods))
-    figure = Figure(figsize=(2.2 + 2.9 * columns, height))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(1.2 + rows * (0.8 + 0.3 * len(found.methods)))
     grid = figure.subplots(rows, columns, squeeze=False)
     for i, axes in enumerate(grid.flat):
         if i >= len(names):
@@ -203,7 +230,7 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
         _draw_classes(axes, np.array(codes))
         _ticks(axes, "x", names[i], found.axes[names[i]])
         labels = found.methods if i % columns == 0 else [""] * len(found.methods)
-        axes.set_yticks(range(len(found.methods)), labels, fontsize="small")
+        axes.set_yticks(range(len(found.methods)), labels, fontsize=SMALL)
         _base_mark(axes, found, names[i])
     _finish_map(figure, found, title)
     return figure
@@ -212,16 +239,30 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
 def stability_pairs(found: StabilityMap, method: str, title: str = "") -> Figure:
     """One panel for every pair of axes, for one method; a ring marks the base point.
 
+    Args:
+        found: what `ji.stability_map(slices='pairs')` returned.
+        method: one of its methods.
+        title: above the picture; default: the method's name.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     Raises:
         ValueError: a map without pairs.
+
+    >>> import jimpact as ji
+    >>> axes = {"restitution": [0.5, 1.0], "setting": [0.0, 0.8]}
+    >>> options = {"base": {"balls": 2, "exponent": 1}, "slices": "pairs"}
+    >>> found = ji.stability_map(["verlet"], axes, **options)
+    >>> len(ji.plot.stability_pairs(found, "verlet").axes)
+    1
     """
     pairs = [each for each in found.slices[method] if len(each.axes) == 2]
     if not pairs:
         raise ValueError("Argument `found` must be a map with slices='pairs', but has none.")
     names = list(found.axes)
     size = len(names) - 1
-    figure = Figure(figsize=(1.6 + 2.1 * size, 1.4 + 1.9 * size))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(1.6 + 1.5 * size)
     grid = figure.add_gridspec(size, size)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
@@ -235,7 +276,7 @@ def _pair(axes: Axes, found: StabilityMap, each: Slice, bottom: bool, left: bool
     _draw_classes(axes, each.codes.T)
     axes.invert_yaxis()
     for which, name, labelled in (("x", each.axes[0], bottom), ("y", each.axes[1], left)):
-        _ticks(axes, which, name, found.axes[name], labelled)
+        _ticks(axes, which, name, found.axes[name], labelled, 3)
     x, y = (_place(found.axes[name], found.base[name]) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
@@ -253,16 +294,23 @@ def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
     axes.spines[:].set_visible(False)
 
 
-def _ticks(axes: Axes, which: str, name: str, values: np.ndarray, labelled: bool = True) -> None:
-    step = -(-len(values) // _TICKS)
+def _ticks(
+    axes: Axes,
+    which: str,
+    name: str,
+    values: np.ndarray,
+    labelled: bool = True,
+    most: int = _TICKS,
+) -> None:
+    step = -(-len(values) // most)
     at = range(0, len(values), step)
     labels = [_number(values[i]) if labelled else "" for i in at]
     if which == "x":
-        axes.set_xticks(at, labels, fontsize="x-small")
-        axes.set_xlabel(_LABELS[name] if labelled else "", fontsize="small")
+        axes.set_xticks(at, labels, fontsize=SMALL)
+        axes.set_xlabel(_LABELS[name] if labelled else "", fontsize=SMALL)
     else:
-        axes.set_yticks(at, labels, fontsize="x-small")
-        axes.set_ylabel(_LABELS[name] if labelled else "", fontsize="small")
+        axes.set_yticks(at, labels, fontsize=SMALL)
+        axes.set_ylabel(_LABELS[name] if labelled else "", fontsize=SMALL)
 
 
 def _number(value: float) -> str:
@@ -292,10 +340,8 @@ def _finish_map(figure: Figure, found: StabilityMap, title: str) -> None:
         for code in np.unique(each.codes)
     }
     handles = [Patch(color=CLASS_COLOURS[code], label=CLASSES[code]) for code in sorted(seen)]
-    figure.legend(
-        handles=handles, loc="outside lower center", frameon=False, fontsize="small", ncols=8
-    )
-    figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
+    legend_below(figure, handles, 4)
+    heading(figure, title)
 
 
 def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
@@ -304,12 +350,20 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     Above one curve an exponent, between the levels of binary collisions and Moreau's law; below
     how far off they are, with the tolerance.
 
+    Args:
+        found: what `ji.validity_map` returned.
+        tolerance: of v+, relative to max |v-|; a line.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     >>> import jimpact as ji
     >>> found = ji.validity_map(ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0])
     >>> len(ji.plot.validity_map(found).axes)
     2
     """
-    figure = Figure(figsize=(7.5, 7.0), layout="constrained")
+    figure = new_figure(6.8)
     top, bottom = figure.subplots(2, 1, sharex=True)
     for i, eta in enumerate(found.exponents):
         colour = COLOURS[i % len(COLOURS)]
@@ -325,19 +379,26 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     bottom.set_ylabel("error of v+, relative to max |v-|")
     bottom.set_yscale("log")
     bottom.set_ylim(bottom=1e-5)
-    bottom.set_xscale("log")
+    logarithmic(bottom, "y")
+    logarithmic(bottom, "x")
     two = found.scene.contacts == 2
     bottom.set_xlabel("stiffness ratio k2/k1" if two else "stiffness ratio of neighbours")
     top.set_title(title or "Where the stiffness ratio may be left out", loc="left")
-    for axes in (top, bottom):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(lw=0.4, alpha=0.5)
-        axes.legend(frameon=False, fontsize="small")
+    finish(top, bottom)
+    legend_within(top)
+    legend_within(bottom)
     return figure
 
 
 def advice(found: Advice, title: str = "") -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
+
+    Args:
+        found: what `ji.advise` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> found = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
@@ -347,7 +408,7 @@ def advice(found: Advice, title: str = "") -> Figure:
     names, rows = list(found.candidates), list(found.candidates.values())
     bodies, x = len(found.velocity), np.arange(len(names))
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
-    figure = Figure(figsize=(7.5, 6.5), layout="constrained")
+    figure = new_figure(6.5)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for i in range(bodies):
         colour = COLOURS[i % len(COLOURS)]
@@ -362,16 +423,15 @@ def advice(found: Advice, title: str = "") -> Figure:
     bottom.axhline(found.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set_yscale("log")
     bottom.set_ylim(found.tolerance / 1000, 30)  # room above for the legend
+    logarithmic(bottom, "y")
     bottom.set_ylabel("error of v+ / max |v-|")
     top.set_ylabel("velocity after the impact [m/s]")
-    unusable = [name if c.usable else f"{name}\n({c.status})" for name, c in zip(names, rows)]
-    bottom.set_xticks(x, unusable)
+    named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(names, rows)]
+    bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)
+    bottom.set_xlabel("law")
     verdict = "within" if found.within else "not within"
     top.set_title(f"{title}\n{as_code(found.law)}: {verdict} {share(found.tolerance)}", loc="left")
-    for axes in (top, bottom):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", lw=0.4, alpha=0.5)
-    if bodies <= len(COLOURS):
-        top.legend(frameon=False, fontsize="small")
-    bottom.legend(frameon=False, fontsize="small", ncols=3, loc="upper right")
+    finish(top, bottom, grid="y")
+    handles = top.get_legend_handles_labels()[0] if bodies <= len(COLOURS) else []
+    legend_below(figure, [*handles, *bottom.get_legend_handles_labels()[0]], 6)
     return figure

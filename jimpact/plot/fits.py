@@ -7,10 +7,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from jimpact._checks import check_kind
+from jimpact.fits.contours import Contour
 from jimpact.fits.fitting import Fit
-from jimpact.plot.style import COLOURS, GREY, SPREAD
+from jimpact.plot.style import COLOURS, GREY, SPREAD, finish, legend_below, new_figure
 
 _LABELLED = 16  # shots up to which every one gets its label
 
@@ -20,6 +22,17 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
     fits of the same data, by label, drawn in grey.
+
+    Args:
+        fit: of shots, of a motion, or of what else was measured.
+        others: label -> another fit of the same data.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: something else than a fit.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.3, 0.7])
@@ -36,8 +49,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
-    figure = Figure(figsize=(float(np.clip(4 + 0.35 * shots * bodies, 6.4, 12)), 6.0))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(6.0)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
     error = _error_bars(fit)
     for i in range(bodies):
@@ -57,9 +69,43 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     _legend(figure, fit, others or {}, error is not None)
     unit = "" if data is None else " m/s"
     top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{unit}", loc="left")
-    for axes in (top, bottom):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", lw=0.4, alpha=0.5)
+    finish(top, bottom, grid="y")
+    return figure
+
+
+def contour(found: Contour, title: str = "") -> Figure:
+    """The confidence region of two parameters, and how the deviance rises around the fit.
+
+    >>> import numpy as np
+    >>> import jimpact as ji
+    >>> x = np.linspace(0.4, 0.6, 5)
+    >>> d = ((x - 0.5) / 0.03)[:, None] ** 2 + ((x - 0.5) / 0.02) ** 2
+    >>> given = ("e[1]", "e[2]"), x, x, d, 5.99, 0.95, (0.5, 0.5), (False, False)
+    >>> ji.plot.contour(ji.Contour(*given)).axes[0].get_xlabel()
+    'e[1]'
+    """
+    figure = Figure(figsize=(6.0, 5.0))
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots()
+    d, limit = found.deviance.T, found.limit
+    axes.contourf(found.x, found.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
+    axes.contour(found.x, found.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
+    axes.contour(
+        found.x, found.y, d, [limit / 4, 2 * limit, 4 * limit], colors=GREY, linewidths=0.7
+    )
+    axes.plot(*found.best, "+", color="black", ms=9)
+    for scale, log in ((axes.set_xscale, found.log[0]), (axes.set_yscale, found.log[1])):
+        if log:
+            scale("log")
+    axes.set_xlabel(found.names[0])
+    axes.set_ylabel(found.names[1])
+    handles = [
+        Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * found.level:g} % region"),
+        Line2D([], [], marker="+", ls="none", color="black", label="fit"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", frameon=False, ncols=2)
+    axes.set_title(title, loc="left")
+    axes.spines[["top", "right"]].set_visible(False)
     return figure
 
 
@@ -106,10 +152,4 @@ def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool)
             handles.append(
                 Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
             )
-    figure.legend(
-        handles=handles,
-        loc="outside lower center",
-        frameon=False,
-        fontsize="small",
-        ncols=min(len(handles), 5),
-    )
+    legend_below(figure, handles, 4)

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
@@ -13,17 +14,38 @@ from jimpact.contact import delassus_matrix
 from jimpact.histories import History
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Force
-from jimpact.plot.style import COLOURS, SPREAD
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    SMALL,
+    SPREAD,
+    finish,
+    heading,
+    legend_below,
+    legend_within,
+    new_figure,
+    unit_of_time,
+    wrapped,
+)
 from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
 _SAMPLES = 120  # points of a force-indentation loop
+_UPRIGHT = 8  # names that stand side by side, at most
 
 
 def comparison(found: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
     """Velocities after the impact by law, above the energy kept and how evenly it is spread.
 
     Measured velocities are horizontal lines; a law whose outcome fails the audit is crossed.
+
+    Args:
+        found: what `ji.compare` returned.
+        measured: v+ (n,) [m/s], or None.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
@@ -34,8 +56,7 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     bodies = len(found.velocity)
     what, unit = ("body", "m/s") if found.scene.walls is not None else ("coordinate", "m/s, rad/s")
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / max(bodies, 1)
-    figure = Figure(figsize=(float(np.clip(1.5 + 1.1 * len(names), 6.4, 14)), 6.0))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(6.0)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
     x = np.arange(len(names))
     velocity = np.array([np.asarray(entry.outcome.velocity) for entry in entries])
@@ -52,17 +73,25 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
         top.plot([], [], color="black", lw=1, ls="--", label="measured")
     top.axhline(0, color="black", lw=0.6)
     top.set_ylabel(f"velocity after the impact [{unit}]")
-    top.set_title(title, loc="left")
+    heading(figure, title)
     kept = [entry.energy_ratio for entry in entries]
     spread = [entry.dispersion_index for entry in entries]
-    bottom.bar(x - 0.18, kept, 0.32, color="#777777", label="energy kept T+/T-")
-    bottom.bar(x + 0.18, spread, 0.32, color="#56B4E9", label="dispersion index")
-    bottom.set_xticks(x, names, rotation=30 if len(names) > 6 else 0)
-    for axes in (top, bottom):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", lw=0.4, alpha=0.5)
-    figure.legend(loc="outside lower center", frameon=False, fontsize="small", ncols=5)
+    bottom.bar(x - 0.18, kept, 0.32, color=GREY, label="energy kept T+/T-")
+    bottom.bar(x + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
+    bottom.set_ylabel("share of 1")
+    _laws_axis(bottom, names)
+    finish(top, bottom, grid="y")
+    handles = [x for axes in (top, bottom) for x in axes.get_legend_handles_labels()[0]]
+    legend_below(figure, handles, 4)
     return figure
+
+
+def _laws_axis(axes: Axes, names: list[str]) -> None:
+    """Laws by name; many stand upright."""
+    many = len(names) > _UPRIGHT
+    labels = names if many else [wrapped(name) for name in names]
+    axes.set_xticks(np.arange(len(names)), labels, fontsize=SMALL, rotation=90 if many else 0)
+    axes.set_xlabel("law")
 
 
 def rheologies(found: Comparison, title: str = "") -> Figure:
@@ -70,6 +99,13 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
 
     Args:
         found: of `compare_rheologies`, or of `compare` with `Compliant` laws.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: a law that is not `Compliant`.
 
     >>> import jimpact as ji
     >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
@@ -84,17 +120,17 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
         raise TypeError("Argument `found` must hold `Compliant` laws only.")
     mass = 1 / float(diagonal(delassus_matrix(found.scene))[0])
     speed = float(np.max(-np.asarray(gap_velocity(found.scene, found.velocity))))
-    figure = Figure(figsize=(10, 4.4))
-    figure.set_layout_engine("constrained")
-    loops, outcome = figure.subplots(1, 2)
+    figure = new_figure(6.8)
+    loops, outcome = figure.subplots(2, 1)
     for (name, force), colour in zip(forces.items(), COLOURS):
         first = jax.tree.map(lambda leaf: leaf.ravel()[0], force)
         x, f = _loop(first, mass, speed)
         loops.plot(x, f, color=colour, label=name, lw=1.4)
     loops.set_xlabel("indentation [m]")
     loops.set_ylabel("force [N]")
-    loops.set_title(title or "contact 1 alone", loc="left")
-    loops.legend(frameon=False, fontsize="small")
+    loops.set_title("contact 1 alone", loc="left", fontsize="medium")
+    legend_within(loops)
+    heading(figure, title)
     names = list(found.entries)
     values = np.array([np.asarray(e.outcome.velocity) for e in found.entries.values()])
     bodies = values.shape[1]
@@ -102,40 +138,85 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     for i in range(bodies):
         at = np.arange(len(names)) + dodge[i]
         outcome.plot(at, values[:, i], "o", color=COLOURS[i % len(COLOURS)], label=f"body {i + 1}")
-    outcome.set_xticks(np.arange(len(names)), [name.replace(", ", ",\n") for name in names])
-    outcome.tick_params(axis="x", labelsize="small", rotation=20)
+    _laws_axis(outcome, names)
     outcome.axhline(0, color="black", lw=0.6)
     outcome.set_ylabel("velocity after the impact [m/s]")
-    outcome.set_title("all contacts together", loc="left")
-    outcome.legend(frameon=False, fontsize="small", ncols=max(1, bodies // 6))
-    for axes in (loops, outcome):
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(lw=0.4, alpha=0.5)
+    outcome.set_xlabel("force")
+    outcome.set_title("all contacts together", loc="left", fontsize="medium")
+    legend_within(outcome, max(1, bodies // 6))
+    finish(loops, outcome)
     return figure
 
 
 def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """Force at one contact over impact time, one line a history.
 
+    Args:
+        histories: label -> what `ji.history` returned.
+        contact: counted from 0; -1: the last one.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     >>> import jimpact as ji
     >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])
     >>> len(ji.plot.forces({"one ball": h}).axes[0].lines)
     1
     """
-    figure = Figure(figsize=(6.4, 4.2))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(4.2)
     axes = figure.subplots()
+    unit, size = unit_of_time(max(float(h.duration) for h in histories.values()))
     for j, (name, h) in enumerate(histories.items()):
-        colour = COLOURS[j % len(COLOURS)]
-        axes.plot(
-            1e6 * np.asarray(h.time), np.asarray(h.force[:, contact]), color=colour, label=name
-        )
-    axes.set_xlabel("impact time [us]")
+        time, force = np.asarray(h.time) / size, np.asarray(h.force[:, contact])
+        axes.plot(time, force, color=COLOURS[j % len(COLOURS)], label=name)
+    axes.set_xlabel(f"impact time [{unit}]")
     axes.set_ylabel("force [N]")
     axes.set_ylim(bottom=0)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(lw=0.4, alpha=0.5)
-    axes.legend(frameon=False, fontsize="small")
+    finish(axes)
+    legend_within(axes)
+    return figure
+
+
+def history(found: History, title: str = "") -> Figure:
+    """One impact over its time: forces, gap velocities and stored energy of every contact.
+
+    Args:
+        found: what `ji.history` returned, of one impact.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        ValueError: a batch of impacts.
+
+    >>> import jimpact as ji
+    >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])
+    >>> [axes.get_ylabel() for axes in ji.plot.history(h).axes]
+    ['force [N]', 'gap velocity [m/s]', 'stored energy [J]']
+    """
+    if np.ndim(found.status):
+        raise ValueError("Argument `found` must be of one impact, but is a batch: pick one of it.")
+    unit, size = unit_of_time(float(found.duration))
+    time, rows = np.asarray(found.time) / size, [found.force, found.gap_velocity, found.energy]
+    figure = new_figure(6.8)
+    panels = figure.subplots(3, 1, sharex=True)
+    words = ("force [N]", "gap velocity [m/s]", "stored energy [J]")
+    for axes, values, label in zip(panels, rows, words, strict=True):
+        for j, y in enumerate(np.asarray(values).T):
+            axes.plot(time, y, color=COLOURS[j % len(COLOURS)], label=f"contact {j + 1}")
+        axes.set_ylabel(label)
+    friction = np.asarray(found.tangential_force)
+    each = friction.shape[1] // found.force.shape[1]
+    for j, y in enumerate(friction.T):
+        colour = COLOURS[j // each % len(COLOURS)]
+        panels[0].plot(time, y, "--", color=colour, label="along the contact" if j == 0 else None)
+    panels[1].axhline(0, color=GREY, lw=0.8)
+    panels[-1].set_xlabel(f"impact time [{unit}]")
+    finish(*panels)
+    handles = panels[0].get_legend_handles_labels()[0]
+    legend_below(figure, handles[: len(COLOURS)], 5)
+    heading(figure, title)
     return figure
 
 

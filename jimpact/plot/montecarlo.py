@@ -1,5 +1,7 @@
 """Picture: distributions of the velocities, and a map of the outcome over two gaps."""
 
+import textwrap
+
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
@@ -7,11 +9,12 @@ from matplotlib.figure import Figure
 
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
-from jimpact.plot.style import COLOURS
+from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
 
 _BARS = 100  # of a histogram in the picture
 _BODIES = 6  # with a histogram of their own; of more only the most scattered are shown
-_DOT = 9.0  # area of a sample in the map [points^2]
+_DOT = 4.0  # area of a sample in the map [points^2]
+_TITLE = 80  # letters of a line of the title
 
 
 def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
@@ -19,6 +22,13 @@ def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
 
     The map shows the two gaps that vary most and the most scattered velocity; with one random
     gap, that velocity against it; without, no map.
+
+    Args:
+        found: what `ji.monte_carlo` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([1.0, 1.0, 1.0])
@@ -30,8 +40,7 @@ def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     scattered = np.argsort(-found.std, kind="stable")
     bodies = sorted(scattered[:_BODIES].tolist())
     mapped = found.first["gaps"].shape[1] > 0
-    figure = Figure(figsize=(11.0 if mapped else 6.4, max(4.8, 1.5 * len(bodies))))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(max(4.8, 1.5 * len(bodies)))
     grid = figure.add_gridspec(len(bodies), 2 if mapped else 1)
     shared: Axes | None = None
     for row, body in enumerate(bodies):
@@ -39,8 +48,8 @@ def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
         shared = shared or axes
         _histogram(axes, found, body)
         axes.tick_params(labelbottom=row == len(bodies) - 1)
-    axes.set_xlabel("velocity after the impact [m/s] (line: mean, dotted: 5 % and 95 %)")
-    figure.suptitle(title or found.description, x=0.01, ha="left")
+    axes.set_xlabel("velocity after the impact [m/s]\n(line: mean, dotted: 5 % and 95 %)")
+    heading(figure, title or textwrap.fill(found.description, _TITLE))
     if mapped:
         _map(figure.add_subplot(grid[:, 1]), found, int(scattered[0]))
     return figure
@@ -60,11 +69,9 @@ def _histogram(axes: Axes, found: MonteCarlo, body: int) -> None:
     for limit in found.quantile([0.05, 0.95])[:, body]:
         axes.axvline(limit, color="black", lw=0.8, ls=":")
     label = f"body {body + 1}: {found.mean[body]:.3f} ± {found.std[body]:.3f} m/s"
-    axes.set_title(label, loc="left", fontsize="medium", color=colour)
+    axes.set_title(label, loc="left", fontsize=SMALL, color=colour)
     axes.set_ylabel("samples [%]")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y", lw=0.4, alpha=0.5)
-    axes.set_axisbelow(True)
+    finish(axes, grid="y")
 
 
 def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
@@ -75,7 +82,7 @@ def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
     gaps = sorted(vary.tolist())
     x = [_in_units(found, first["gaps"][fine, gap], gap) for gap in gaps]
     axes.set_xlabel(x[0][1])
-    axes.set_title(f"{fine.sum():,} samples", loc="left", fontsize="medium")
+    axes.set_title(f"{fine.sum():,} samples", loc="left", fontsize=SMALL)
     axes.spines[["top", "right"]].set_visible(False)
     label = f"velocity of body {body + 1} [m/s]"
     if len(gaps) == 1:

@@ -12,11 +12,11 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jimpact.bodies.base import projected, rate_of, split_name
+from jimpact.bodies.base import Body, projected, rate_of, split_name
 from jimpact.motion.dynamics import kinetic, potential, seen_from_base
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
-from jimpact.plot.style import COLOURS, GREY
+from jimpact.plot.style import COLOURS, GREY, finish, heading, legend_within, new_figure
 from jimpact.progress import counting_bar
 
 # q (n,) -> curves (k, 2) of points (x, y) in metres
@@ -50,6 +50,12 @@ def motion(
         system: that moved: its body names the coordinates, and its base is shown; without it and
             without names they are q1, q2, ...
 
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        ValueError: a batch of motions, or names of another number.
+
     >>> import jimpact as ji
     >>> ball = ji.ball_system()
     >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
@@ -61,7 +67,7 @@ def motion(
     course = _course(motion)
     columns = [_by_unit(labels), _by_unit(rates)]
     rows = max(map(len, columns)) + 1
-    figure = Figure(figsize=(11.0, 2.5 * rows), layout="constrained")
+    figure = new_figure(2.5 * rows)
     every = figure.subplots(rows, 2, sharex=True, squeeze=False)
     for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
         for axes, (unit, which) in zip(every[:, j], units.items(), strict=False):
@@ -76,14 +82,13 @@ def motion(
             axes.remove()
     _gaps(every[-1, 0], motion)
     _ledger(every[-1, 1], motion, course, system)
-    every[0, 0].set_title(title, loc="left")
+    heading(figure, title)
     for axes in figure.axes:
         if axes is not every[-1, 1]:
             _event_lines(axes, motion)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.grid(axis="y", lw=0.4, alpha=0.5)
+        finish(axes, grid="y")
         if len(axes.get_legend_handles_labels()[0]) > 1:
-            axes.legend(frameon=False, fontsize="small", ncols=3, loc="best")
+            legend_within(axes, 2)
     for axes in every[-1]:
         axes.set_xlabel("time [s]")
     return figure
@@ -231,6 +236,12 @@ def phase_portrait(
         names: of the coordinates, as in `motion`.
         system: that moved, as in `motion`; needed where velocities are not the rates of q.
 
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        ValueError: a batch, no such coordinate, velocities that are not rates of q.
+
     >>> import jimpact as ji
     >>> dimer = ji.dimer_system(0.1, 1.0)
     >>> motion = ji.simulate(dimer, ji.Newton(0.5), [0.0, 0.3, 0.1], [0.0] * 3, 0.3, samples=21)
@@ -254,7 +265,7 @@ def phase_portrait(
             f"Argument `coordinate` must lie in [{min(pairs)}, {max(pairs)}], but is {coordinate}."
         )
     rate = pairs[coordinate]
-    figure = Figure(figsize=(6.0, 5.0), layout="constrained")
+    figure = new_figure(5.0)
     axes = figure.subplots()
     position, speed = course.q[:, coordinate], course.v[:, rate]
     cut = np.flatnonzero(course.after)
@@ -263,9 +274,8 @@ def phase_portrait(
     axes.plot(position[jumps], speed[jumps], "--", color=COLOURS[1], lw=0.8, zorder=0)
     axes.set_xlabel(labels[coordinate])
     axes.set_ylabel(rates[rate])
-    axes.set_title(title, loc="left")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(lw=0.4, alpha=0.5)
+    heading(figure, title)
+    finish(axes)
     return figure
 
 
@@ -298,6 +308,9 @@ def animation(
         title: of the picture; the time stands below it.
         progress: a bar on stderr; None: on a terminal, where it takes long.
 
+    Returns:
+        The path of the file that was written.
+
     Raises:
         ValueError: another ending, a batch, no sample; TypeError: a body without outlines.
 
@@ -328,15 +341,12 @@ def animation(
     ]
     drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in floors]
     view = np.array([axes.get_xlim(), axes.get_ylim()])
-    middle, reach = view.mean(axis=1), np.ptp(view[0])
 
     def draw(k: int) -> list[Any]:
         for line, points in zip(lines, curves[k], strict=True):
             line.set_data(points[:, 0], points[:, 1])
         for line, (n, offset) in zip(drawn, floors, strict=True):
-            along = np.array([n[1], -n[0]])
-            foot = middle - (n @ (middle - ground[k]) - offset) * n
-            line.set_data(*(foot[:, None] + reach * np.array([-1, 1]) * along[:, None]))
+            line.set_data(*_stretch(n, offset, view, ground[k]))
         axes.set_title(f"{title}\n{time[k]:.2f} s" if title else f"{time[k]:.2f} s", loc="left")
         return [*lines, *drawn]
 
@@ -346,6 +356,27 @@ def animation(
         writer = PillowWriter(fps=round(frames_per_second))
         shown.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
     return path
+
+
+def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
+    """A body at q, with what it stands on."""
+    curves = [body.outlines(q, _POINT * (np.ptp(q) or 1.0))]
+    floors, ground = [_plane(*floor) for floor in body.floors], np.zeros((1, 2))
+    _limits(axes, curves, ground, floors)
+    for i, points in enumerate(curves[0]):
+        axes.plot(*points.T, color=COLOURS[i // 2 % len(COLOURS)])
+    view = np.array([axes.get_xlim(), axes.get_ylim()])
+    for n, offset in floors:
+        axes.plot(*_stretch(n, offset, view, ground[0]), color=GREY, lw=2)
+    axes.set_xlim(view[0])
+    axes.set_ylim(view[1])
+
+
+def _stretch(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
+    """A piece (2, 2) of a plane that reaches across the view."""
+    middle, reach = view.mean(axis=1), np.ptp(view[0])
+    foot = middle - (n @ (middle - ground) - offset) * n
+    return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
 
 
 def _curves(

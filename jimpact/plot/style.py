@@ -1,6 +1,93 @@
-"""What the pictures share: colours and distances."""
+"""What the pictures share: sizes, colours, frames, legends, logarithmic axes."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 # Okabe and Ito's palette without yellow: told apart with every common colour blindness.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
 GREY = "#777777"
 SPREAD = 0.6  # width that the bodies of one group take, of the distance between groups
+
+# Width of every picture [in] and its smallest font: read at half a page's width, too.
+WIDTH = 7.2
+SMALL = 8.5  # points
+
+_DECADES = 100.0  # an axis that spans less is labelled within its decades, too
+_PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
+_TIMES = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
+
+
+def new_figure(height: float) -> Figure:
+    """A figure of the common width, `height` [in] high."""
+    return Figure(figsize=(WIDTH, height), layout="constrained")
+
+
+def finish(*panels: Axes, grid: Any = "both") -> None:
+    """The frame of panels: two spines, a thin grid along `grid`."""
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.grid(axis=grid, lw=0.4, alpha=0.5)
+        axes.set_axisbelow(True)
+
+
+def heading(figure: Figure, title: str) -> None:
+    """The title of a figure, on its left; none where it is empty."""
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", fontsize="large")
+
+
+def legend_below(figure: Figure, handles: Sequence[Any], columns: int, note: str = "") -> None:
+    """One legend for all panels, below them, with a note on how to read them."""
+    figure.legend(
+        handles=list(handles),
+        loc="outside lower center",
+        frameon=False,
+        fontsize=SMALL,
+        ncols=max(min(columns, len(handles)), 1),
+        title=note or None,
+        title_fontsize=SMALL,
+    )
+
+
+def legend_within(axes: Axes, columns: int = 1) -> None:
+    """The legend of one panel, where it hides least."""
+    axes.legend(frameon=False, fontsize=SMALL, ncols=columns, handlelength=1.4, columnspacing=1.0)
+
+
+def logarithmic(axes: Axes, which: str) -> None:
+    """Axis 'x' or 'y' by powers of ten; labels never stand closer than they are long."""
+    getattr(axes, f"set_{which}scale")("log")
+    axis = getattr(axes, f"{which}axis")
+    low, high = sorted(axis.get_view_interval())
+    if high / low < 5:
+        axis.set_major_locator(MaxNLocator(4))
+    else:
+        few = high / low < _DECADES
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=7))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: in_words(x)))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def in_words(x: float) -> str:
+    """A number for an axis; powers of ten as such."""
+    if x == 0 or _PLAIN[0] <= abs(x) < _PLAIN[1]:
+        return f"{x:g}"
+    power = int(np.floor(np.log10(abs(x)) + 1e-9))
+    factor = x / 10.0**power
+    head = "" if abs(factor - 1) < 1e-6 else f"{factor:.3g}\\cdot"
+    return f"${head}10^{{{power}}}$"
+
+
+def unit_of_time(longest: float) -> tuple[str, float]:
+    """The unit that a duration [s] is read best in, and how long it is [s]."""
+    return next((row for row in _TIMES if longest >= row[1]), _TIMES[-1])
+
+
+def wrapped(name: str) -> str:
+    """A label in lines, for a narrow place."""
+    return name.replace(", ", ",\n").replace("_", "\n")

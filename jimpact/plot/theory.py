@@ -11,13 +11,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from jimpact.contact import kinetic_norm
-from jimpact.plot.style import COLOURS, GREY
+from jimpact.plot.style import COLOURS, GREY, SMALL, finish, heading, legend_below, new_figure
 from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
 from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
 
 _FILL = "#DCE9F3"
 _MARKERS = "osD^vP*X"
+_COLUMNS = 2  # of panels
 _MOST_CONTACTS = 4  # beyond two contacts: projections onto pairs of the first so many
 _SAMPLES = 2000
 _SHORTEST = 0.5  # a side shorter than this part of the radius is not drawn: its name would not fit
@@ -41,6 +42,9 @@ def admissible_set(
             are not admissible (hollow).
         title: empty for a default one.
 
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     Raises:
         ValueError: an outcome of another size.
 
@@ -62,14 +66,14 @@ def admissible_set(
     plane = found.dimension == 2 and len(closed) == 2
     closed = closed if len(closed) else np.arange(found.scene.contacts)
     figure = _plane(found, marked, closed) if plane else _projections(found, marked, closed)
-    default = "Admissible outcomes: unilateral contact, pushing impulses, no energy gained"
-    figure.suptitle(title or default, x=0.01, ha="left", fontsize="medium")
+    default = "Admissible: unilateral contact, pushing impulses, no energy gained"
+    heading(figure, title or default)
     return figure
 
 
 def _plane(found: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray) -> Figure:
     frame = _Frame(found, closed)
-    figure = Figure(figsize=(6.4, 7.0), layout="constrained")
+    figure = new_figure(7.6)
     axes = figure.subplots()
     circle = np.linspace(0, 2 * np.pi, 400)
     r = frame.radius
@@ -102,7 +106,7 @@ def _plane(found: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.nd
 
 def _mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
     """Outcome number i, hollow unless admissible; later ones smaller, so that equal ones show."""
-    colour = GREY if i < 0 else _colour(i)
+    colour = GREY if i < 0 else COLOURS[i % len(COLOURS)]
     axes.plot(
         *point,
         "s" if i < 0 else _MARKERS[i % len(_MARKERS)],
@@ -116,22 +120,14 @@ def _mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
 
 
 def _write(axes: Axes, at: np.ndarray, text: str, **style: Any) -> None:
-    axes.annotate(
-        text, (at[0], at[1]), **{"ha": "center", "va": "center", "fontsize": "small"} | style
-    )
+    centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
+    axes.annotate(text, (at[0], at[1]), **centred | style)
 
 
 def _legend(figure: Figure, axes: Axes, columns: int) -> None:
-    handles, labels = axes.get_legend_handles_labels()
+    handles = axes.get_legend_handles_labels()[0]
     if handles:
-        figure.legend(
-            handles,
-            labels,
-            loc="outside lower center",
-            frameon=False,
-            fontsize="small",
-            ncols=min(columns, len(handles)),
-        )
+        legend_below(figure, handles, columns)
 
 
 class _Frame:
@@ -184,12 +180,12 @@ def _projections(
     unit = np.asarray(found.scene.normals / kinetic_norm(found.scene)[None, :], float)[:, shown]
     cloud, kept = samples @ unit, _energy_kept(found, samples)
     pairs = list(combinations(range(len(shown)), 2)) or [(0, 0)]
-    columns = min(3, len(pairs))
+    columns = min(2, len(pairs))
     rows = -(-len(pairs) // columns)
-    figure = Figure(figsize=(3.4 * columns + 2.6, 3.1 * rows + 0.8), layout="constrained")
+    figure = new_figure(3.1 * rows + 0.8)
     grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
     for spare in grid[len(pairs) :]:
-        spare.set_visible(False)
+        spare.remove()
     for axes, (i, j) in zip(grid, pairs):
         single = i == j
         y = kept if single else cloud[:, j]
@@ -198,9 +194,10 @@ def _projections(
             point = v @ unit
             height = _energy_kept(found, v) if single else point[j]
             _mark(axes, (point[i], height), name, k, bool(found.contains(v)))
-        axes.set_xlabel(_gap_label(shown[i]))
-        axes.set_ylabel("$T^+ / T^-$" if single else _gap_label(shown[j]))
-        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_xlabel(_gap_label(shown[i]), fontsize=SMALL)
+        energy = "energy kept $T^+ / T^-$"
+        axes.set_ylabel(energy if single else _gap_label(shown[j]), fontsize=SMALL)
+        finish(axes)
     figure.colorbar(dots, ax=grid[: len(pairs)].tolist(), label="energy kept $T^+ / T^-$")
     _legend(figure, grid[0], 4)
     return figure
@@ -217,16 +214,17 @@ def _gap_label(contact: int) -> str:
     return f"normalized gap velocity {contact + 1} after [√J]"
 
 
-def _colour(i: int) -> str:
-    from jimpact.plot.style import COLOURS  # here: the module also loads the fit
-
-    return COLOURS[i % len(COLOURS)]
-
-
 def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
     """|y_A'+ / y_B'-| against the kinetic angle: a panel for each mu, a line for each e.
 
     The dotted line is `critical_kinetic_angle`.
+
+    Args:
+        found: what `ji.theory.rocking_dispersion` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> import numpy as np
@@ -236,20 +234,17 @@ def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
     >>> len(ji.plot.rocking_dispersion(d).axes)
     1
     """
-    figure, panels = _panels(found, title, 3.0)
+    figure, panels = _panels(found, title, 2.8)
     theta, size = np.degrees(found.kinetic_angle), np.abs(found.dispersion)
     for j, axes in enumerate(panels):
         for k, e in enumerate(np.asarray(found.restitution)):
             colour = COLOURS[k % len(COLOURS)]
             axes.plot(theta, size[:, j, k], color=colour, lw=1.6, label=f"e = {e:g}")
         axes.axvline(_critical(found, j), color="black", ls=":", lw=1)
-        axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
-        axes.grid(lw=0.4, alpha=0.5)
-        axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
-    panels[0].set_ylabel(r"$|\dot y_A^+ / \dot y_B^-|$")
-    handles = panels[0].get_legend_handles_labels()[0]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    finish(*panels)
+    _angle_axes(panels, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
+    legend_below(figure, panels[0].get_legend_handles_labels()[0], 6)
     return figure
 
 
@@ -257,6 +252,14 @@ def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = S
     """Rest, rocking, half-rocking, free over the kinetic angle and e: a panel for each mu.
 
     The dotted line is `critical_kinetic_angle`; `stays` as in `RockingDispersion.outcomes`.
+
+    Args:
+        found: what `ji.theory.rocking_dispersion` returned.
+        title: above the picture.
+        stays: largest speed, over |gamma_B-|, of a corner that stays.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import jimpact as ji
     >>> import numpy as np
@@ -266,7 +269,7 @@ def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = S
     >>> len(ji.plot.rocking_outcomes(d).axes)
     1
     """
-    figure, panels = _panels(found, title, 3.2)
+    figure, panels = _panels(found, title, 2.8)
     codes = found.outcomes(stays)
     colours = ListedColormap(_OUTCOME_COLOURS)
     norm = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES))
@@ -274,24 +277,33 @@ def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = S
     for j, axes in enumerate(panels):
         axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
         axes.axvline(_critical(found, j), color="black", ls=":", lw=1)
-        axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
-    panels[0].set_ylabel("restitution e")
+    _angle_axes(panels, "restitution e")
     shown = np.unique(codes)
-    handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in shown]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    legend_below(figure, [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in shown], 5)
     return figure
 
 
 def _panels(found: RockingDispersion, title: str, height: float) -> tuple:
-    count = len(found.friction)
-    figure = Figure(figsize=(1.2 + 2.9 * count, height + 0.5))
-    figure.set_layout_engine("constrained")
-    panels = figure.subplots(1, count, sharey=True, squeeze=False)[0]
-    for axes, mu in zip(panels, np.asarray(found.friction)):
+    count, columns = len(found.friction), min(_COLUMNS, len(found.friction))
+    rows = -(-count // columns)
+    figure = new_figure(0.6 + height * rows)
+    every = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for spare in every[count:]:
+        spare.remove()
+    for axes, mu in zip(every, np.asarray(found.friction)):
         axes.set_title(f"mu = {mu:g}", loc="left", fontsize="medium")
-    if title:
-        figure.suptitle(title, x=0.02, ha="left")
-    return figure, panels
+    heading(figure, title)
+    return figure, every[:count]
+
+
+def _angle_axes(panels: np.ndarray, label: str) -> None:
+    """Labels on the left, and below the last panel of each column."""
+    columns = min(_COLUMNS, len(panels))
+    for axes in panels[::columns]:
+        axes.set_ylabel(label)
+    for axes in panels[-columns:]:
+        axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
+        axes.tick_params(labelbottom=True)
 
 
 def _critical(found: RockingDispersion, j: int) -> float:

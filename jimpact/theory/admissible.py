@@ -27,9 +27,10 @@ _ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
 class AdmissibleSet:
     """The outcomes v+ of `admissible_set`; `print(found)` describes them.
 
-    Every outcome is `center + axes u` with u (d,) in a convex set `coordinates`, and has the
+    Every outcome is v = `center` + `axes` u, u (d,) in a convex set `coordinates`, and has the
     energy `T(center) + |u|^2 / 2`: u are kinetic coordinates [sqrt(J)]. `dimension` d is 0 where
     only one outcome is possible. `plastic` v+ (n,) has the `least_energy` [J]; `energy` is T-.
+    `scene` and `velocity` v- (n,) [m/s] are those asked for, `tolerance` that of `contains`.
     """
 
     scene: Scene
@@ -68,9 +69,9 @@ class AdmissibleSet:
         return np.array([[low[i], high[i]] for i, (low, high) in enumerate(found)])
 
     def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
-        """Whether v+ (n,), or each of (k, n), is admissible up to `tolerance` times the impact.
+        """Whether a velocity v+ (n,), or each of (k, n), is admissible up to `tolerance` impacts.
 
-        None: the tolerance of `audit`. Size of the impact: `sqrt(2 (T- - T(center)))`, the
+        None: the tolerance of `audit`. The size of an impact: `sqrt(2 (T- - T(center)))`, the
         largest |u|.
         """
         v = np.asarray(as_float_array("velocity", velocity), float)

@@ -16,7 +16,11 @@ from jimpact.theory.quasi_velocities import quasi_basis, to_quasi_velocities
 
 
 class InclusionOutcome(NamedTuple):
-    """Quasi-velocities v+ (n,), percussions (c,) along the columns of the coupling, status ()."""
+    """What `restitution_inclusion` found.
+
+    `velocity`: quasi-velocities v+ (n,) [sqrt(J)]; `percussion` (c,) along the columns of the
+    coupling; `status` (), a code of `jimpact.STATUS`.
+    """
 
     velocity: jax.Array
     percussion: jax.Array
@@ -25,6 +29,15 @@ class InclusionOutcome(NamedTuple):
 
 def contact_coupling(scene: Scene) -> jax.Array:
     """`Gbar = [[G, n_q^T H], [0, t_q^T H]]` (n, m + t): what (pbar, p_t) do to (qn, qt).
+
+    Args:
+        scene: n coordinates, m contacts, t tangents.
+
+    Returns:
+        Gbar (n, m + t).
+
+    Raises:
+        ValueError: redundant contacts, no tangents.
 
     Source: Brogliato (2016), (6.53), (6.64).
 
@@ -56,12 +69,15 @@ def restitution_inclusion(
         coupling: Gbar (n, c), see `contact_coupling`.
         metric: P (n, n), symmetric positive definite.
         restitution: Lambda, a scalar or (n, n).
-        velocity: v- (n,), quasi-velocities (`to_quasi_velocities`).
+        velocity: v- (n,), quasi-velocities [m/s times sqrt(kg)] (`to_quasi_velocities`).
         low: lower bounds of V, scalar or (c,); -inf for none.
         high: upper bounds.
 
     Returns:
         `InclusionOutcome`; `status` is `infeasible` where V cannot be met.
+
+    Raises:
+        ValueError: shapes that do not fit, NaN.
 
     Derivatives are one-sided where a percussion sets in.
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.63)-(6.65).
@@ -111,7 +127,7 @@ class FrictionBounds(NamedTuple):
     `g_mu`, `k`, `m_bar` are the matrices G^mu, K and Mbar of (6.56) and (6.59) (all (m, m)).
     Prop. 6.6 (1): `g_mu_bound` < 1 makes G^mu positive definite for every slip direction;
     (3), sharpened: `restitution_bound` < 1 makes Mbar positive definite.
-    Theorem 6.2 (i): `m_bar_least > k_largest`, both eigenvalues; (ii): |qn-| / |qt-| at least
+    Theorem 6.2 (i): `m_bar_least` > `k_largest`, both eigenvalues; (ii): |qn-| / |qt-| at least
     `least_ratio`, which is infinite where (i) fails, and 0 where friction does not couple.
     """
 
@@ -130,7 +146,7 @@ class FrictionBounds(NamedTuple):
         return self.m_bar_least > self.k_largest
 
     def dissipates(self, scene: Scene, velocity: Any) -> bool:
-        """Whether Theorem 6.2 (sufficient) promises T+ <= T- for this v- (n,)."""
+        """Whether Theorem 6.2 (sufficient) promises T+ <= T- in a scene, at a velocity v- (n,)."""
         qn, qt = to_quasi_velocities(scene, velocity)
         return self.condition_i and bool(
             jnp.linalg.norm(qn) >= self.least_ratio * jnp.linalg.norm(qt)
@@ -182,6 +198,9 @@ def friction_bounds(scene: Scene, matrix: Any, friction: Any, slip: Any = 1.0) -
         matrix: E (m, m).
         friction: mu >= 0, scalar or (m,).
         slip: xi in [-1, 1], scalar or (m,): the sign of sliding along H_t, inside it sticking.
+
+    Returns:
+        `FrictionBounds`; `print` says them in words.
 
     Raises:
         ValueError: shapes, ranges; no tangents, spatial ones, an open contact, redundant ones;
@@ -236,6 +255,19 @@ def friction_impulses(
     Equation: `pbar = -(G^mu)^-1 (I + E) qn-`, `p_t = -[mubar][xi] pbar`, `p = pbar / |grad f|`.
     The slip is taken as given: whether it agrees with the sliding after it is the caller's.
 
+    Args:
+        scene: n coordinates, m closed contacts, planar tangents.
+        matrix: E (m, m).
+        friction: mu >= 0, scalar or (m,).
+        slip: xi in [-1, 1], scalar or (m,).
+        velocity: v- (n,) [m/s].
+
+    Returns:
+        p (m,) and p_t (m,) [N s].
+
+    Raises:
+        ValueError: as of `friction_bounds`; not one velocity per coordinate.
+
     Source: Brogliato (2016), (6.54)-(6.56).
 
     >>> import jimpact as ji
@@ -261,7 +293,14 @@ def friction_energy_change(
     Args:
         scene: m contacts, planar tangents.
         velocity: v- (n,) [m/s].
-        impulse: p (m,) [N s]; tangential_impulse: p_t (m,) [N s].
+        impulse: p (m,) [N s].
+        tangential_impulse: p_t (m,) [N s].
+
+    Returns:
+        T+ - T- () [J].
+
+    Raises:
+        ValueError: not one impulse per contact, no planar tangents, redundant contacts.
 
     Source: Brogliato (2016), (6.58) with G^-1 in place of G.
 

@@ -28,6 +28,9 @@ def bilateral_motion(
     Returns:
         x (n,) [m] and x' (n,) [m/s].
 
+    Raises:
+        ValueError: stiffness < 0, sizes, more than one instant.
+
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.14)-(6.15).
 
     >>> import jimpact as ji
@@ -64,6 +67,12 @@ def newby_ratio(n: int) -> float:
 
     Args:
         n: whole number >= 2.
+
+    Returns:
+        The ratio, a float.
+
+    Raises:
+        ValueError: n is no whole number of at least 2.
 
     Source: Newby, Am. J. Phys. 52 (1984) 745; Brogliato (2016), after (6.16).
 

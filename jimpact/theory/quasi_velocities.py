@@ -29,7 +29,7 @@ _REDUNDANT = (
 
 
 class ContactPower(eqx.Module):
-    """Power of contact forces [W]: the terms of (6.40) and their sum."""
+    """Power of contact forces () [W]: `normal`, `coupling`, `tangential` of (6.40), `total`."""
 
     normal: jax.Array
     coupling: jax.Array
@@ -47,6 +47,9 @@ def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
     (in the kinetic metric) in the tangent space are projected onto it and orthonormalized in
     their order; each column forms an acute angle with what is left of its coordinate. A chain
     without walls: `(1, ..., 1) / sqrt(sum m)`.
+
+    Args:
+        scene: n coordinates, m contacts, b bilateral constraints.
 
     Returns:
         n_q [1 / sqrt(kg)], t_q [1 / sqrt(kg)].
@@ -119,6 +122,9 @@ def from_quasi_velocities(scene: Scene, normal: Any, tangential: Any) -> jax.Arr
         normal: qn (m,) [sqrt(kg) m/s].
         tangential: qt (n - m - b,) [sqrt(kg) m/s].
 
+    Returns:
+        v (n,) [m/s].
+
     Raises:
         ValueError: redundant contacts; wrong sizes.
 
@@ -141,6 +147,16 @@ def kinetic_energy_split(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Ar
     """Normal and tangential kinetic energy [J]; their sum is the kinetic energy.
 
     Equation: `T_n = qn^T G^-1 qn / 2`, `T_t = qt^T qt / 2`. Frictionless impacts change T_n only.
+
+    Args:
+        scene: n coordinates, m contacts, b bilateral constraints.
+        velocity: (n,) [m/s]; it satisfies the bilateral constraints.
+
+    Returns:
+        T_n () and T_t () [J].
+
+    Raises:
+        ValueError: redundant contacts; not one velocity per coordinate.
 
     Source: Brogliato (2016), (6.33)-(6.35).
 
@@ -169,6 +185,9 @@ def contact_power(
         velocity: (n,) [m/s]; it satisfies the bilateral constraints.
         force: normal forces lambda (m,) [N], or impulses for a work.
         tangential_force: lambda_t, one per column of the tangents [N]; None: 0.
+
+    Returns:
+        `ContactPower`, each term () [W].
 
     Raises:
         ValueError: redundant contacts, wrong sizes, tangential forces without tangents.

@@ -21,7 +21,7 @@ _SINGULAR = 100.0
 
 
 class Copositivity(NamedTuple):
-    """The answer, the margin `min x^T Q x` over `x >= 0`, `|x| = 1`, and its minimizer."""
+    """The `answer`, the `margin` min x^T Q x over `x >= 0`, `|x| = 1`, and where, `witness`."""
 
     answer: Literal["yes", "no", "boundary"]
     margin: float
@@ -85,8 +85,13 @@ def copositivity(
         tolerance: "boundary" where `|margin| <= tolerance * scale`; None: by its precision.
         scale: None: the largest |Q_ij|. Give it where Q is a difference of larger matrices.
 
+    Returns:
+        `Copositivity`: answer, margin, and the x (m,) that decides.
+
     Raises:
         ValueError: not square, m > 12, not finite, negative tolerance or scale.
+
+    Source: all 2^m - 1 supports of x enumerated; Brogliato (2016), Prop. 6.3 asks for it.
 
     >>> copositivity([[1.0, -1.0], [-1.0, 1.0]]).answer
     'boundary'
@@ -143,7 +148,7 @@ class MatrixAudit(NamedTuple):
     `worst_velocity` v- (n,) [m/s], loses least: it gains energy where the answer is "no" and
     conserves it where it is "boundary".
     `spectral_radius` and `spectral` (Prop. 6.4) are None unless E is self-adjoint.
-    `singular_value <= singular_value_bound` is Prop. 6.5, sufficient only.
+    `singular_value` <= `singular_value_bound` is Prop. 6.5, sufficient only.
     """
 
     kinematic: Sign
@@ -173,6 +178,15 @@ class MatrixAudit(NamedTuple):
 def dissipation_matrix(delassus: jax.Array, matrix: jax.Array) -> jax.Array:
     """`Q = G^-1 - E^T G^-1 E` (m, m): the law qn+ = -E qn- loses the energy qn-^T Q qn- / 2.
 
+    Args:
+        delassus: G (m, m), see `ji.normalized_delassus`.
+        matrix: E (m, m).
+
+    Returns:
+        Q (m, m), symmetric; not finite where G is singular.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), Prop. 6.3.
+
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
     >>> ji.theory.dissipation_matrix(jnp.eye(2), jnp.diag(jnp.array([0.5, 1.0]))).tolist()
@@ -193,6 +207,9 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
         scene: m contacts; open ones are left out, with their rows and columns of E.
         matrix: E (m, m), dimensionless, between normalized gap velocities.
         tolerance: relative size of what counts as zero; None: by the precision of the scene.
+
+    Returns:
+        `MatrixAudit`; `print` says it in words.
 
     Raises:
         ValueError: E not (m, m) or not finite; more than 12 closed contacts, or none;
@@ -246,6 +263,12 @@ def carnot_energy_loss(scene: Scene, jump: Any, restitution: Any = 0.0) -> jax.A
         scene: the scene of the impact.
         jump: v+ - v- (n,) [m/s].
         restitution: e in [0, 1], one for all contacts.
+
+    Returns:
+        T- - T+ () [J].
+
+    Raises:
+        ValueError: not one velocity per coordinate, e out of range or one a contact.
 
     Source: Brogliato (2016), Theorem 6.1 (e = 0), generalized by (6.46).
 

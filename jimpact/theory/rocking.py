@@ -23,7 +23,10 @@ _ZOOMS, _POINTS = 6, 41  # grids of the search, each twenty times finer than the
 
 
 class RockingRatio(NamedTuple):
-    """A measured restitution of angular velocity, as a multiple of Housner's rigid value."""
+    """A measured restitution of angular velocity, `measured_over_housner` times the rigid value.
+
+    `aspect` = height / width; `material` of the interface.
+    """
 
     aspect: float
     material: str
@@ -44,6 +47,12 @@ def housner_restitution(aspect: Any) -> jax.Array:
     Args:
         aspect: a = height / width > 0; scalar or array. Below `1 / sqrt(2)` the value is
             negative: such a block does not rock.
+
+    Returns:
+        e_theta, of the shape of `aspect`.
+
+    Raises:
+        ValueError: an aspect that is not positive.
 
     Source: Housner, Bull. Seism. Soc. Am. 53 (1963) 403-417.
 
@@ -69,6 +78,9 @@ def rocking_matrix(restitution: Any) -> jax.Array:
     Returns:
         E for `RestitutionMatrix`, on a planar scene of one block with its two corners.
 
+    Raises:
+        ValueError: e_theta out of range, or more than one.
+
     Status: an impact with less than Housner's value (`housner_restitution`) is `negative_impulse`:
     the corner that is left behind would have to be pulled down. Exactly there its impulse is 0, and
     derivatives are one-sided.
@@ -92,6 +104,9 @@ def rocking_ratios() -> list[RockingRatio]:
     Times Housner's value they give e_theta, and with `rocking_matrix` a restitution matrix:
     a conversion of published numbers, not a fit.
 
+    Returns:
+        A `RockingRatio` a row.
+
     Source: ElGawady et al., as quoted in public abstracts; see data/README.md.
 
     >>> import jimpact as ji
@@ -109,7 +124,7 @@ def rocking_ratios() -> list[RockingRatio]:
 class RockingDispersion(eqx.Module):
     """Impacts of a block that rocks about A and hits with B; arrays (aspects, mu, e, ...).
 
-    Args:
+    Attributes:
         aspect: a = height / width (A,).
         friction: mu (B,).
         restitution: energetic e (C,).
@@ -173,6 +188,15 @@ def rocking_kinetic_angle(aspect: Any) -> jax.Array:
 
     Equation: `cos(theta_12) = -(a^2 - 2) / (a^2 + 4)`, a = height / width: pi / 3 flat, pi slender.
 
+    Args:
+        aspect: a = height / width > 0, scalar or array.
+
+    Returns:
+        Angle [rad], of the shape of `aspect`.
+
+    Raises:
+        ValueError: an aspect that is not positive.
+
     Source: Brogliato (2016), section 6.3.2.2.
 
     >>> import jimpact as ji
@@ -195,6 +219,14 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
 
     Args:
         friction: mu >= 0, scalar or array.
+
+    Returns:
+        Angle [rad], of the shape of `friction`.
+
+    Raises:
+        ValueError: friction < 0.
+
+    Source: own derivation; Brogliato (2016), section 6.3.2.2 has mu = 0.
 
     >>> import jimpact as ji
     >>> [round(float(ji.theory.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
@@ -291,6 +323,20 @@ def search_critical_angle(
 
     Grids over 0.5 <= a <= 2, each around the best of the one before; to about 1e-7 where e > 0
     (at e = 0 there is no V to search). Arguments as in `rocking_dispersion`.
+
+    Args:
+        friction: mu >= 0, scalar or (B,).
+        restitution: e in (0, 1], scalar or (C,).
+        stiffness: of the corners, scalar or (2,) for B and A.
+        exponent: 1 linear, 1.5 Hertz.
+
+    Returns:
+        Angles (B, C) [rad].
+
+    Raises:
+        ValueError: arguments out of range or with more than one axis.
+
+    Source: own; checks `critical_kinetic_angle`.
 
     >>> import jimpact as ji
     >>> ji.theory.search_critical_angle(0.1, -0.5)

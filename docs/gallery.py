@@ -1,0 +1,212 @@
+"""The pictures of the docs, each a function: `python docs/gallery.py [NAME ...]` draws them anew.
+
+Run by hand, from a clone; `chart_three_balls` takes minutes. A docstring is the caption.
+"""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+
+import jimpact as ji
+from jimpact.plot.style import COLOURS
+
+PICTURES = Path(__file__).parent / "pictures"
+DRAWN: dict[str, Callable] = {}
+CRADLE = ji.chain([1.0, 1.0, 1.0])
+STRIKER = jnp.array([1.0, 0.0, 0.0])  # one ball strikes two that touch [m/s]
+
+
+def picture(function: Callable) -> Callable:
+    """Enter a function that returns a figure, or writes the file it is given."""
+    DRAWN[function.__name__] = function
+    return function
+
+
+def three_balls(make: Callable, values: np.ndarray, label: str, log: bool = False) -> Figure:
+    """Velocities of three equal balls in a row after the first struck, against a parameter.
+
+    `make` takes the parameter, and returns the law, or law, scene and velocity. Grey: the status
+    says that the outcome is none to use.
+    """
+
+    def outcome(x):
+        made = make(x)
+        made = made if isinstance(made, tuple) else (made, CRADLE, STRIKER)
+        out = ji.impact(*made)
+        return out.velocity, out.status
+
+    velocity, status = jax.jit(jax.vmap(outcome))(jnp.asarray(values))
+    failed = np.array([ji.STATUS[int(code)].failure for code in status])
+    figure = Figure(figsize=(5.6, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for i in range(3):
+        style = {"color": COLOURS[i], "lw": 2, "ls": "--" if i == 2 else "-"}  # where they coincide
+        axes.plot(values, velocity[:, i], label=f"ball {i + 1}", **style)
+    if failed.any():
+        axes.fill_between(values, 0, 1, where=failed, transform=axes.get_xaxis_transform(),
+                          color="#dddddd", lw=0, label="flagged")  # fmt: skip
+    axes.set_xscale("log" if log else "linear")
+    axes.set_xlim(values[0], values[-1])
+    axes.set_xlabel(label)
+    axes.set_ylabel("velocity after [m/s]")
+    axes.axhline(0, color="black", lw=0.6)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(lw=0.4, alpha=0.5)
+    figure.legend(loc="outside upper center", frameon=False, ncols=4, fontsize="small")
+    return figure
+
+
+# ------------------------------------------------------------------------------- one for each law
+
+
+@picture
+def law_lzb():
+    """Three touching Hertz balls, e = 0.9: the stiffness ratio decides who takes the velocity."""
+    return three_balls(
+        lambda ratio: ji.LZB(0.9, jnp.stack([1.0, ratio])),
+        np.geomspace(0.1, 10, 121),
+        "stiffness ratio k2/k1",
+        log=True,
+    )
+
+
+def running(law: ji.Law) -> Figure:
+    """Ball 1 strikes with 1 m/s while ball 3 approaches (< 0) or runs away (> 0)."""
+    return three_balls(
+        lambda v: (law, CRADLE, jnp.stack([1.0, 0.0, v])),
+        np.linspace(-1, 1, 101),
+        "velocity of ball 3 before [m/s]",
+    )
+
+
+@picture
+def law_newton():
+    """Newton's law, e = 0.5: where ball 3 runs away (> 0), it is pulled back, and flagged."""
+    return running(ji.Newton(0.5))
+
+
+@picture
+def law_moreau():
+    """Moreau's law, e = 0.5: Newton's, until contact 2 would pull; then it takes no impulse."""
+    return running(ji.Moreau(0.5))
+
+
+@picture
+def law_poisson():
+    """Poisson's law, e1 = 0.4: only e2 > e1 parts the two targets."""
+    return three_balls(
+        lambda e: ji.Poisson(jnp.stack([0.4, e])), np.linspace(0, 1, 101), "restitution e2"
+    )
+
+
+@picture
+def law_binary():
+    """Pair collisions: for small e the targets are struck again and again, and move together."""
+    return three_balls(ji.Binary, np.linspace(0, 1, 201), "restitution e")
+
+
+@picture
+def law_restitution_matrix():
+    """A matrix with e = 0.5 on its diagonal: the entry E21 shares out the velocity."""
+    return three_balls(
+        lambda x: ji.RestitutionMatrix(jnp.array([[0.5, 0.0], [0.0, 0.5]]).at[1, 0].set(x)),
+        np.linspace(-1, 2, 151),
+        "matrix entry E21",
+    )
+
+
+@picture
+def law_compliant():
+    """A heavy ball, struck from both sides: a gap of a tenth of its scale is as good as closed."""
+    law, before = ji.Compliant(ji.Hertz(1e9)), jnp.array([1.0, 0.0, -1.0])
+    masses = [0.25, 1.0, 0.25]
+    scale = ji.gap_scale(ji.chain(masses), law, before).delta[1]
+    return three_balls(
+        lambda gap: (law, ji.chain(masses, gaps=jnp.stack([0.0, gap * scale])), before),
+        np.geomspace(0.01, 10, 121),
+        "gap 2 / gap scale",
+        log=True,
+    )
+
+
+# ------------------------------------------------------------------------------------- and others
+
+
+@picture
+def compare_three_balls(path):
+    """All laws with one coefficient of restitution on a measured shot of three balls."""
+    subprocess.run(["jimpact", "compare", "--out", str(path)], check=True)
+
+
+@picture
+def force_histories():
+    """The force between the last two of five touching balls, three restitutions of LZB."""
+    balls, k = ji.chain([0.0667] * 5), 1.2e10  # steel balls of one inch
+    rows = {f"e = {e}": ji.history(ji.LZB(e, k), balls, [1.0, 0, 0, 0, 0]) for e in (1.0, 0.9, 0.7)}
+    return ji.plot.forces(rows)
+
+
+@picture
+def outcomes_and_laws():
+    """Outcomes that mechanics allows for three balls, and where laws put theirs."""
+    laws = {"Newton": ji.Newton(0.9), "Binary": ji.Binary(0.9), "LZB": ji.LZB(0.9)}
+    marked = {name: ji.impact(law, CRADLE, STRIKER).velocity for name, law in laws.items()}
+    return ji.plot.admissible_set(ji.theory.admissible_set(CRADLE, STRIKER), marked)
+
+
+@picture
+def gaps_decide():
+    """Three steel balls, the outer ones strike: gaps of up to 0.1 mm decide the outcome."""
+    law, balls = ji.Compliant(ji.Hertz(1.06e10)), ji.chain([0.0167, 0.0669, 0.0167])
+    before, gaps = [1.0, 0.0, -1.0], ji.Uniform(0.0, 100e-6)
+    return ji.plot.monte_carlo(ji.monte_carlo(law, balls, before, gaps=gaps, samples=20_000))
+
+
+@picture
+def motion_cradle():
+    """Newton's cradle with three balls: angles, velocities, gaps and the energy ledger."""
+    system = ji.cradle_system([0.1, 0.1, 0.1], length=0.15, diameter=0.025)
+    motion = ji.simulate(system, ji.LZB(0.95), [-0.5, 0, 0], [0.0, 0.0, 0.0], 8.0)
+    return ji.plot.motion(motion, system=system)
+
+
+@picture
+def rocking_dispersion():
+    """A rocking block: how much of the impact reaches the far corner, against the kinetic angle."""
+    mu, e = [0.0, 0.1, 0.3, 0.8], [0.1, 0.3, 0.5, 0.7, 0.9, 1.0]
+    found = ji.theory.rocking_dispersion(np.linspace(0.35, 4.5, 60), mu, e)
+    return ji.plot.rocking_dispersion(found)
+
+
+@picture
+def chart_three_balls(path):
+    """Error against time and work: ways to integrate one impact of three balls."""
+    subprocess.run(["jimpact", "chart", "--full", "--out", str(path)], check=True)
+
+
+@picture
+def stability(path):
+    """Where methods of integration fail, one axis of the map at a time."""
+    subprocess.run(["jimpact", "stability", "--out", str(path)], check=True)
+
+
+def main(names: list[str]) -> None:
+    """Draw these, or all."""
+    jax.config.update("jax_enable_x64", True)
+    for name in names or DRAWN:
+        path, draw = PICTURES / f"{name}.png", DRAWN[name]
+        if draw.__code__.co_argcount:
+            draw(path)
+        else:
+            draw().savefig(path, dpi=150)
+        print(path)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,86 @@
+"""Picture of a system before anything happens: a row of bodies, or a body at a configuration."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
+
+from jimpact.bodies.base import Body
+from jimpact.motion.system import System
+from jimpact.plot.motions import draw_body
+from jimpact.plot.style import COLOURS, GREY, SMALL, finish, heading, new_figure
+from jimpact.scene import Scene, as_velocity
+
+_GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
+_LEAST = 0.35  # radius of a small body, likewise
+_ARROW = 2.2  # length of the fastest velocity, likewise
+
+
+def system(shown: Scene | Body | System, state: Any, title: str = "") -> Figure:
+    """A system as it is before an impact or a motion.
+
+    A chain is a row of circles, their areas about as the masses, with arrows for the velocities;
+    open contacts are drawn apart, not to scale. A body is drawn to scale, on what it stands on.
+
+    Args:
+        shown: a chain (`ji.chain`), a body such as `ji.Block`, or a `System` of one.
+        state: of a chain v- (n,) [m/s]; of a body its configuration q.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: a scene that is no chain. ValueError: not one velocity per body.
+
+    >>> import jimpact as ji
+    >>> len(ji.plot.system(ji.chain([1.0, 2.0]), [1.0, 0.0]).axes[0].patches)
+    2
+    """
+    if isinstance(shown, Scene):
+        if shown.walls is None:
+            raise TypeError("Argument `shown` must be a chain, a body or a system; draw the body.")
+        figure = new_figure(2.4)
+        axes = figure.subplots()
+        _row(axes, shown, np.asarray(as_velocity(shown, state)))
+    else:
+        body = shown.body if isinstance(shown, System) else shown
+        figure = new_figure(3.6)
+        axes = figure.subplots()
+        draw_body(axes, body, np.asarray(state, float))
+        axes.set_xlabel("x [m]")
+        axes.set_ylabel("height [m]")
+        finish(axes)
+    heading(figure, title)
+    return figure
+
+
+def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
+    mass = np.asarray(scene.mass, float)
+    radius = np.maximum((mass / mass.max()) ** 0.5, _LEAST)
+    left, right = scene.walls or (False, False)
+    apart = np.where(np.asarray(scene.closed), 0.0, _GAP)
+    before = np.concatenate([apart[:1] if left else [0.0], apart[left : len(mass) - 1 + left]])
+    centre = np.cumsum(before + np.concatenate([radius[:1], radius[:-1] + radius[1:]]))
+    end = centre[-1] + radius[-1]
+    fastest = np.abs(velocity).max() or 1.0
+    for i, (x, r, v) in enumerate(zip(centre, radius, velocity, strict=True)):
+        colour = COLOURS[i % len(COLOURS)]
+        axes.add_patch(Circle((x, 0.0), r, fc=colour, alpha=0.35, ec=colour))
+        axes.text(x, 0.0, f"{i + 1}", ha="center", va="center")
+        axes.text(x, -1.35, f"{mass[i]:.3g} kg", ha="center", va="center", fontsize=SMALL)
+        axes.text(x, 1.75, f"{v:.3g} m/s", ha="center", va="center", fontsize=SMALL)
+        if v:
+            tip = x + _ARROW * v / fastest / 2
+            arrow = {"arrowstyle": "-|>", "color": colour, "lw": 2}
+            axes.annotate("", (tip, 1.3), (2 * x - tip, 1.3), arrowprops=arrow)
+    for there, x in ((left, -0.3), (right, end + (apart[-1] if right else 0.0))):
+        if there:
+            axes.add_patch(Rectangle((x, -1.1), 0.3, 2.2, color=GREY, alpha=0.5, lw=0))
+    room = max(1.2, (12.0 - end) / 2)  # a single body is not as wide as the picture
+    axes.set_xlim(-room, end + room)
+    axes.set_ylim(-1.7, 2.1)
+    axes.set_aspect("equal")
+    axes.axis("off")

@@ -1,0 +1,263 @@
+"""Pictures of every kind, on small records made by hand: nothing overlaps, every axis is labelled.
+
+Nothing is simulated here, so that the layout of all pictures costs seconds.
+"""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+from test_reports import canned, rocked
+
+import jimpact as ji
+from jimpact.audits import Audit
+from jimpact.comparison import Comparison, Entry
+from jimpact.histories import History
+from jimpact.methods.advice_report import Advice, Candidate
+from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
+from jimpact.methods.stability import Confirmation, Slice, StabilityMap
+from jimpact.methods.validity import ValidityMap
+from jimpact.plot.style import SMALL, WIDTH
+
+BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), np.array([1.0, 0.0, 0.0])
+AFTER = np.array([-0.1, 0.2, 0.9])
+HERTZ = ji.Compliant(ji.Hertz(1e9))
+DIMENSIONLESS = (  # quantities that have no unit
+    "ratio", "restitution", "exponent", "setting", "error", "evaluations", "dispersion",
+    "energy kept", "share", "method", "balls N",
+)  # fmt: skip
+COUNTED = ("law", "force", "body", "shot")  # names stand along the axis
+
+
+def outcome(velocity, status=0):
+    zero = np.zeros(2)
+    return ji.Impact(jnp.asarray(velocity), zero, zero[:0], np.float64(-0.1), 0.0, np.int32(status))
+
+
+def entry(law, fine=True):
+    yes, no = np.bool_(True), np.bool_(fine)
+    audit = Audit(yes, yes, no, yes, *([np.float64(0.0)] * (len(dataclasses.fields(Audit)) - 4)))
+    return Entry(law, outcome(AFTER), audit, 0.9, 0.4, 1e-5, 1.0)
+
+
+def comparison():
+    names = ["lzb", "newton", "moreau", "poisson", "binary", "restitution_matrix", "compliant"]
+    entries = {name: entry(ji.Newton(0.5), name != "newton") for name in names}
+    return ji.plot.comparison(Comparison(BALLS, STRIKE, entries), AFTER, "three balls")
+
+
+def rheologies():
+    names = ("Hertz, bistiffness", "linear, bistiffness", "Kelvin-Voigt", "Hunt-Crossley")
+    return ji.plot.rheologies(Comparison(BALLS, STRIKE, {x: entry(HERTZ) for x in names}), "forces")
+
+
+def impact_history():
+    t = np.linspace(0, 1, 9)[:, None]
+    rows = np.sin(np.pi * t) * np.array([1.0, 0.5])
+    none = np.zeros((9, 0))
+    return History(
+        *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, np.zeros((9, 3))),
+        *(none, none, none, np.float64(37e-6), rows.max(axis=0), np.int32(0)),
+    )
+
+
+def chart(gradients):
+    time, far = Timing(1.2e-5, 1e-5, 2e-5), Timing(3.4e-5, 3e-5, 6e-5)
+    points = {}
+    for k, name in enumerate(("dop853", "rk4", "verlet", "impulse_euler", "scipy_lsoda")):
+        points[name] = tuple(
+            Point(
+                f"method number {k} with a long name (default)",
+                setting,
+                {"velocity": error / (k + 1), "gradient": 10 * error},
+                100.0 / setting**0.2,
+                "ok" if k else "max_steps",
+                time,
+                each,
+                time if gradients else None,
+            )
+            for setting, error, each in ((1e-2, 1e-5, time), (1e-4, 1e-9, far))
+        )
+    law = {"velocity": 0.5, "gradient": np.nan}
+    points["binary"] = (Point("law: binary", None, law, np.nan, "ok", time, time),)
+    uncertain = {"velocity": 1e-13, "gradient": 1e-12}
+    reference = Reference("order 8", uncertain, AFTER, np.zeros(2), 1.0)
+    return ji.plot.work_precision(
+        WorkPrecision(STRIKE, points, reference, {}, {}, {}, 64, 16, 10.0, 3), "three balls"
+    )
+
+
+AXES = {
+    "setting": np.linspace(0, 1, 5),
+    "stiffness_ratio": np.logspace(-6, 6, 7),
+    "exponent": np.array([1.0, 1.5, 5.0]),
+    "restitution": np.array([0.0, 1e-3, 0.05, 0.3, 0.9, 1.0]),
+    "mass_ratio": np.logspace(-6, 6, 7),
+    "balls": np.array([2.0, 3, 10, 30, 100]),
+}
+
+
+def stability():
+    base = {name: float(values[1]) for name, values in AXES.items()}
+    methods = ("default", "rk4", "impulse_euler")
+
+    def piece(names):
+        shape = tuple(len(AXES[name]) for name in names)
+        codes = np.arange(np.prod(shape)).reshape(shape) % 8
+        return Slice(names, codes, codes * 1.0, codes)
+
+    names = [(name,) for name in AXES] + list(itertools.combinations(AXES, 2))
+    slices = {method: tuple(piece(x) for x in names) for method in methods}
+    confirmation = Confirmation(1, 1, 1, 0.0)
+    return StabilityMap(methods, AXES, base, slices, np.zeros((0, 6)), {}, confirmation, 100)
+
+
+def validity():
+    ratios, eta = np.logspace(-3, 3, 9), np.array([1.0, 1.5, 2.0, 3.0])
+    share = 1 / (1 + 1 / ratios)[None, :] ** eta[:, None]
+    velocity = AFTER + 0.3 * share[..., None]
+    ends = {"moreau": AFTER + 0.3, "binary": AFTER}
+    level = {"moreau": 0.6, "binary": 0.0}
+    return ji.plot.validity_map(
+        ValidityMap(BALLS, STRIKE, ratios, eta, velocity, 0.6 * share, share * 0, ends, level)
+    )
+
+
+def advice():
+    names = ("newton", "moreau", "poisson", "binary", "restitution_matrix", "lzb")
+    rows = {
+        name: Candidate(
+            ji.Newton(0.5), BALLS, AFTER, AFTER - 0.1, AFTER + 0.1, 1e-2, 0.3, "negative_impulse"
+        )
+        for name in names
+    }
+    none = np.zeros(2)
+    found = Advice("lzb", 0.01, False, "lzb", STRIKE, none, rows, (), none, (), 8, None)
+    return ji.plot.advice(found, "Three balls, stiffness unknown")
+
+
+def samples(gaps):
+    law, options = ji.Newton(0.5), {"samples": 64, "chunk": 64}
+    if not gaps:  # two equal balls of which one is struck with a random speed
+        pair, speeds = ji.chain([1.0, 1.0]), ji.Uniform([1.0, 0.0], [2.0, 0.0])
+        return ji.plot.monte_carlo(ji.monte_carlo(law, pair, speeds, **options))
+    found = ji.monte_carlo(law, BALLS, STRIKE, gaps=ji.Uniform(0.0, 1e-5), **options)
+    return ji.plot.monte_carlo(found, "gaps of micrometres")
+
+
+def rocking():
+    a, mu, e = np.linspace(0.5, 4, 6), np.array([0.0, 0.1, 0.3]), np.array([0.1, 0.5, 0.9])
+    shape = (6, 3, 3)
+    gamma = np.linspace(0, 1.5, 6)[:, None, None, None] * np.ones((*shape, 2))
+    one = np.ones(shape)
+    return ji.theory.RockingDispersion(a, mu, e, gamma, one, one, one, one)
+
+
+def motion(kind):
+    system, found = rocked()
+    return getattr(ji.plot, kind)(found, title="dimer", system=system)
+
+
+def outcomes(masses, wall):
+    scene = ji.chain(masses, wall=wall)
+    v = np.zeros(len(masses))
+    v[0] = 1.0
+    found = ji.theory.admissible_set(scene, v)
+    return ji.plot.admissible_set(found, {"Newton's cradle": found.plastic, "at rest": 0 * v})
+
+
+BLOCK = ji.Block(width=0.2, height=0.6)
+PICTURES = {
+    "advice": advice,
+    "comparison": comparison,
+    "fit of a shot": lambda: ji.plot.fit(canned(1), {"the same": canned(1)}, "one shot"),
+    "fit of many shots": lambda: ji.plot.fit(canned(50)),
+    "forces": lambda: ji.plot.forces({"soft": impact_history(), "hard": impact_history()}),
+    "history": lambda: ji.plot.history(impact_history(), "three balls"),
+    "rheologies": rheologies,
+    "stability_map": lambda: ji.plot.stability_map(stability(), "where methods fail"),
+    "stability_pairs": lambda: ji.plot.stability_pairs(stability(), "rk4"),
+    "validity_map": validity,
+    "work_precision": lambda: chart(False),
+    "work_precision with gradients": lambda: chart(True),
+    "monte_carlo over gaps": lambda: samples(True),
+    "monte_carlo over speeds": lambda: samples(False),
+    "motion": lambda: motion("motion"),
+    "phase_portrait": lambda: motion("phase_portrait"),
+    "rocking_dispersion": lambda: ji.plot.rocking_dispersion(rocking(), "by LZB"),
+    "rocking_outcomes": lambda: ji.plot.rocking_outcomes(rocking()),
+    "admissible_set": lambda: outcomes([1.0, 1.0, 1.0], False),
+    "admissible_set of three contacts": lambda: outcomes([1.0, 1.0, 1.0], True),
+    "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),
+    "system, a block": lambda: ji.plot.system(BLOCK, BLOCK.touching(0.2), "a block"),
+}  # fmt: skip
+
+
+def texts(figure):
+    """What is written in a figure, and where [pixels]."""
+    renderer, ticks, drawn = figure.canvas.get_renderer(), set(), set()
+    for axes in figure.axes:
+        sides = (axes.xaxis, axes.viewLim.intervalx), (axes.yaxis, axes.viewLim.intervaly)
+        for axis, view in sides:
+            low, high = sorted(view)
+            for tick in (*axis.get_major_ticks(), *axis.get_minor_ticks()):
+                labels = {tick.label1, tick.label2}
+                ticks |= labels
+                if axes.axison and low <= tick.get_loc() <= high:
+                    drawn |= {label for label in labels if label.get_visible()}
+    every = figure.findobj(lambda x: isinstance(x, Text) and x.get_visible())
+    written = [x for x in every if x.get_text().strip() and (x not in ticks or x in drawn)]
+    return [(x, x.get_window_extent(renderer)) for x in written]
+
+
+def labelled(label):
+    """Whether an axis label names a quantity, and its unit if it has one."""
+    has_unit = label.rstrip(")").endswith("]") or "[" in label
+    return has_unit or label in COUNTED or any(word in label for word in DIMENSIONLESS)
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_layout(name):
+    figure = PICTURES[name]()
+    FigureCanvasAgg(figure).draw()
+    whole = figure.bbox
+    assert figure.get_figwidth() == WIDTH  # read at half a page's width
+    places = texts(figure)
+    for text, place in places:
+        inside = place.x0 >= -1 and place.y0 >= -1
+        inside = inside and place.x1 <= whole.x1 + 1 and place.y1 <= whole.y1 + 1
+        assert inside, f"{text.get_text()!r} is cut off"
+        assert text.get_fontsize() >= SMALL - 0.2, f"{text.get_text()!r} is small"
+    for (one, a), (two, b) in itertools.combinations(places, 2):
+        over = min(a.x1, b.x1) - max(a.x0, b.x0) > 1 and min(a.y1, b.y1) - max(a.y0, b.y0) > 1
+        turned = one.get_rotation() % 90 or two.get_rotation() % 90
+        assert turned or not over, f"{one.get_text()!r} and {two.get_text()!r} overlap"
+    for axes in figure.axes:
+        drawn = [*axes.lines, *axes.collections, *axes.patches, *axes.images]
+        assert drawn or axes.get_legend() is not None, "empty axes"
+        if not axes.axison or axes.get_label() == "<colorbar>":
+            continue
+        beside = axes.get_subplotspec()
+        for label, axis in ((axes.get_xlabel(), "x"), (axes.get_ylabel(), "y")):
+            ticks = getattr(axes, f"get_{axis}ticklabels")()
+            silent = not any(tick.get_text() and tick.get_visible() for tick in ticks)
+            categories = axis == "y" and name == "stability_map"
+            assert silent or categories or labelled(label), (axis, label, beside)
+
+
+def test_every_kind_of_picture_is_here():
+    known = {name.split(" ")[0].rstrip(",") for name in PICTURES}
+    assert known | {"animation"} == set(ji.plot.__all__)
+
+
+def test_a_history_must_be_one():
+    batch = jax.tree.map(lambda x: np.stack([x, x]), impact_history())
+    with pytest.raises(ValueError, match="`found` must be of one impact, but is a batch"):
+        ji.plot.history(batch)
+    with pytest.raises(TypeError, match="`shown` must be a chain"):
+        ji.plot.system(ji.Scene([1.0], [[1.0]]), [1.0])

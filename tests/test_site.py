@@ -1,0 +1,221 @@
+"""The site that `sphinx-build` makes, in files and in a browser, without a network.
+
+JIMPACT_SITE names a built site, as in CI: then nothing is skipped. Else it is built here.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from functools import partial
+from html.parser import HTMLParser
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+
+import jimpact as ji
+
+ROOT = Path(__file__).parent.parent
+SITE = os.environ.get("JIMPACT_SITE")
+PHONE = 390  # CSS pixels
+OPTIONS = [
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--hide-scrollbars",
+]
+
+pytestmark = pytest.mark.slow
+
+
+def lacking(what):
+    """Skip, with a word; in CI fail."""
+    if SITE:
+        pytest.fail(f"{what} is missing")
+    pytest.skip(f"no {what} here")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    if SITE:
+        return Path(SITE)
+    try:
+        import myst_nb  # noqa: F401
+        import sphinx  # noqa: F401
+    except ImportError:
+        lacking("Sphinx (pip install '.[docs]')")
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", ROOT / "docs", out]
+    done = subprocess.run([str(x) for x in command], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return out
+
+
+class Page(HTMLParser):
+    """What a page links to, loads, and can be linked at."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.links, self.loads, self.anchors, self.without_words = [], [], {"", "top"}, []
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        self.anchors |= {given[x] for x in ("id", "name") if given.get(x)}
+        if tag == "a" and given.get("href"):
+            self.links.append(given["href"])
+        elif tag == "link" and given.get("rel") in ("stylesheet", "icon", "preload"):
+            self.loads.append(given["href"])
+        elif tag in ("script", "img", "source", "iframe") and given.get("src"):
+            self.loads.append(given["src"])
+        if tag == "img" and not given.get("alt"):
+            self.without_words.append(given.get("src", "")[:80])
+
+
+def test_links_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site):
+    pages = {path: Page(path) for path in site.rglob("*.html")}
+    assert len(pages) > 30
+    wrong = []
+    for path, page in pages.items():
+        name = path.relative_to(site)
+        for target in page.links + page.loads:
+            parts = urlsplit(target)
+            if parts.scheme in ("data", "mailto") or (target in page.links and parts.netloc):
+                continue
+            if parts.netloc:
+                wrong.append(f"{name} loads {target}")
+                continue
+            to = (path.parent / unquote(parts.path)).resolve() if parts.path else path
+            if not to.exists():
+                wrong.append(f"{name} -> {target}: no such file")
+            elif to in pages and unquote(parts.fragment) not in pages[to].anchors:
+                wrong.append(f"{name} -> {target}: no such anchor")
+        wrong += [f"{name}: {picture} without words" for picture in page.without_words
+                  if "notebooks" not in str(name)]  # fmt: skip
+    assert not wrong, "\n".join(wrong[:30])
+
+
+def test_what_is_public_is_in_the_site(site):
+    """Every public name in the API or on its law's page; every law has a page and a picture."""
+    anchors = set().union(*(Page(x).anchors for x in (site / "generated").rglob("*.html")))
+    inner = ("plot", "theory", "__version__")
+    missing = [x for x in ji.__all__ if x not in inner and f"jimpact.{x}" not in anchors]
+    missing += [f"{part.__name__}.{x}" for part in (ji.plot, ji.theory) for x in part.__all__
+                if f"{part.__name__}.{x}" not in anchors]  # fmt: skip
+    assert not missing
+    for name, row in ji.REGISTRY.items():
+        page = (site / "generated" / "laws" / f"{name}.html").read_text(encoding="utf-8")
+        assert row.law.__name__ in page
+        assert f"law_{name}.png" in page
+        assert "<math" in page
+
+
+def test_every_picture_of_the_docs_has_its_code():
+    code = (ROOT / "docs" / "gallery.py").read_text(encoding="utf-8")
+    made = set(re.findall(r"@picture\ndef (\w+)", code))
+    assert made == {path.stem for path in (ROOT / "docs" / "pictures").glob("*.png")}
+
+
+# ----------------------------------------------------------------------------------- in a browser
+
+
+@pytest.fixture(scope="module")
+def address(site):
+    """The site, served on this machine alone."""
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    try:
+        from selenium import webdriver
+    except ImportError:
+        lacking("selenium (pip install '.[docs]')")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if not chromium or not driver:
+        lacking("Chromium with its driver (Debian: chromium, chromium-driver)")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    profile = tmp_path_factory.mktemp("profile")
+    for option in [*OPTIONS, f"--user-data-dir={profile}", "--window-size=1280,900"]:
+        options.add_argument(option)
+    # whatever a page asks of the network fails, and is an error of the page
+    options.add_argument("--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1")
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    started = webdriver.Chrome(options, webdriver.ChromeService(driver))
+    started.set_page_load_timeout(30)
+    yield started
+    started.quit()
+
+
+def width(browser, pixels):
+    """As a phone's screen: windows of a headless browser do not become that narrow."""
+    size = {"width": pixels, "height": 844, "deviceScaleFactor": 1, "mobile": pixels <= PHONE}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+
+
+ERRORS = "SEVERE", "WARNING"
+BROKEN = """return [...document.images].filter(i => !(i.complete && i.naturalWidth)
+    && i.loading !== 'lazy').map(i => i.src.slice(0, 100))"""
+# what reaches beyond the screen, unless it scrolls within something: the theme would cut it off
+TOO_WIDE = """const edge = document.documentElement.clientWidth + 1;
+    const scrolls = x => x.tagName != 'ARTICLE' && (/auto|scroll/.test(getComputedStyle(x).overflowX)
+        || scrolls(x.parentElement));
+    return [...document.querySelectorAll('article *')].filter(x => !scrolls(x)
+        && x.getBoundingClientRect().right > edge && x.getBoundingClientRect().width)
+        .slice(0, 3).map(x => x.outerHTML.slice(0, 120))"""
+FORMULAS = """return [...document.querySelectorAll('math')].filter(m => m.offsetParent !== null)
+    .filter(m => { const b = m.getBoundingClientRect(); return b.width < 2 || b.height < 4 }).length"""
+
+
+def test_pages_open_without_errors_wide_and_narrow(address, site, browser):
+    wrong = []
+    for path in sorted(site.rglob("*.html")):
+        name = path.relative_to(site)
+        width(browser, 1280)
+        browser.get(f"{address}/{name}")
+        said = [x["message"] for x in browser.get_log("browser") if x["level"] in ERRORS]
+        wrong += [f"{name}: {x}" for x in [*said, *browser.execute_script(BROKEN)]]
+        for pixels in (1280, PHONE):
+            width(browser, pixels)
+            flat = browser.execute_script(FORMULAS)
+            wrong += [
+                f"{name} at {pixels}: too wide: {x}" for x in browser.execute_script(TOO_WIDE)
+            ]
+            wrong += [f"{name} at {pixels}: {flat} formulas do not show"] if flat else []
+        assert browser.title, name
+    assert not wrong, "\n".join(wrong[:30])
+
+
+def test_search_finds_a_law(address, browser):
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    width(browser, 1280)
+    browser.get(f"{address}/search.html?q=bistiffness")
+    found = WebDriverWait(browser, 20).until(
+        lambda x: x.find_elements(By.CSS_SELECTOR, "ul.search a[href*='laws/lzb']")
+    )
+    browser.get(found[0].get_attribute("href"))
+    assert "LZB" in browser.find_element(By.TAG_NAME, "h1").text
+    picture = browser.find_element(By.CSS_SELECTOR, "figure img")
+    assert int(picture.get_attribute("naturalWidth")) > 300
+    picture.click()  # to its code
+    assert "gallery" in browser.current_url
+    assert "def law_lzb" in browser.find_element(By.TAG_NAME, "article").text
