@@ -15,7 +15,14 @@ from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Minimum, Search, search, search_near
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.profiles import Profile, linearized, needs_profiles, profile, quantile
+from jimpact.fits.profiles import (
+    Profile,
+    linearized,
+    needs_profiles,
+    profile,
+    quantile,
+    quick_profiles,
+)
 from jimpact.fits.report import fit_warnings, report, to_json, verdict
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.scene import Scene
@@ -257,8 +264,11 @@ def fit(
         found = search(problem, method, starts, seed, steps, progress)
     robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
     end = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
-    wanted = needs_profiles(end) if profiles is None else profiles
-    return replace(end, profiles=profile(end, progress=progress)) if wanted else end
+    if profiles:
+        return replace(end, profiles=profile(end, progress=progress))
+    if profiles is None and needs_profiles(end):
+        return replace(end, profiles=quick_profiles(end, progress))
+    return end
 
 
 def _rms(problem: FitProblem, residual: np.ndarray) -> float:
@@ -369,7 +379,7 @@ def as_fit(
         singular_values=spread.singular_values,
         identifiability=(*problem.notes, *spread.unseen),
         starts=tuple(
-            Start(size**2 * end.squares, end.value, end.count, _error(problem, found, end, spread))
+            Start(size**2 * end.squares, end.value, end.starts, _error(problem, found, end, spread))
             for end in found.minima
         ),
         status=found.status,
