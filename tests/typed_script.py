@@ -2,7 +2,6 @@
 
 An ignored error is one that they have to find: an ignore without an error is an error, too.
 """
-# pyright: reportUnnecessaryTypeIgnoreComment=true
 
 from typing import assert_type
 

@@ -5,7 +5,6 @@ from math import comb
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq, linprog
 
 # All computations are scaled to r = 1; LP solvers are right to 1e-7.
 _FLAT = 1e-6  # a row whose slack stays below this everywhere is an equality
@@ -43,6 +42,8 @@ class CappedPolyhedron(NamedTuple):
 
     def lowest(self, direction: np.ndarray) -> np.ndarray:
         """A point where `direction . w` is least."""
+        from scipy.optimize import brentq  # late: slow to import
+
         length = np.linalg.norm(direction)
         if length == 0 or self.radius == 0:
             return self.project(np.zeros_like(direction))
@@ -67,6 +68,8 @@ class CappedPolyhedron(NamedTuple):
 
     def interior(self) -> np.ndarray:
         """A point well inside."""
+        from scipy.optimize import linprog  # late: slow to import
+
         dimension = self.rows.shape[1]
         box = [(-self.radius, self.radius)] * dimension + [(0.0, self.radius)]
         slack = np.hstack([-self.rows, np.ones((len(self.rows), 1))])
@@ -145,6 +148,8 @@ def capped_polyhedron(
 
     Rows that can only be equalities become part of the affine hull; `|w|^2 = |center|^2 + |u|^2`.
     """
+    from scipy.optimize import linprog  # late: slow to import
+
     length = np.linalg.norm(rows, axis=1)
     rows, offset = rows[length > 0] / length[length > 0, None], offset[length > 0]
     offset = offset / length[length > 0]

@@ -10,12 +10,14 @@ continued.
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
+
+if TYPE_CHECKING:
+    import optax  # which takes long to import
 
 # y (P,) -> residual (R,), Jacobian (R, P), anything else to keep of the best point
 Evaluate = Callable[[jax.Array], tuple[jax.Array, jax.Array, Any]]
@@ -101,7 +103,11 @@ class SolverState(eqx.Module):
 
 def check_method(method: Any) -> None:
     """Raise a ValueError unless `method` is a known name or an optax transformation."""
-    if not isinstance(method, optax.GradientTransformation) and method not in DEFAULT_STEPS:
+    if isinstance(method, str) and method in DEFAULT_STEPS:
+        return
+    import optax
+
+    if not isinstance(method, optax.GradientTransformation):
         raise ValueError(
             f"Argument `method` must be one of {', '.join(map(repr, DEFAULT_STEPS))} or an "
             f"optax.GradientTransformation, but has value {method!r}."
@@ -188,7 +194,9 @@ def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
     return cost(y)
 
 
-def _transformation(method: Method, max_steps: int) -> optax.GradientTransformationExtraArgs:
+def _transformation(method: Method, max_steps: int) -> "optax.GradientTransformationExtraArgs":
+    import optax
+
     if method == "adam":
         method = optax.adam(optax.cosine_decay_schedule(_ADAM_RATE, max_steps))
     elif method == "sgd":

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import linprog
 
 from jimpact.compiling import quick_jit
 from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
@@ -283,6 +282,8 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
     >>> admissible_start([ji.chain([1.0, 1.0, 1.0])]).tolist()
     [[0.5, 0.0], [0.0, 0.5]]
     """
+    from scipy.optimize import linprog  # late: slow to import
+
     m = scenes[0].contacts
     dtype = scenes[0].mass.dtype
     inverse, closed = _inverses(scenes)
@@ -392,6 +393,8 @@ def _center(
     region: AdmissibleMatrices, slack: np.ndarray, rows: np.ndarray, moving: np.ndarray
 ) -> jax.Array:
     """A point strictly inside: from the start, in the direction that all conditions like best."""
+    from scipy.optimize import linprog  # late: slow to import
+
     start = np.asarray(region.center, float)
     used = np.any(rows[moving] != 0, axis=0)
     found = linprog(
