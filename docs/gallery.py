@@ -28,18 +28,20 @@ def picture(function: Callable) -> Callable:
     return function
 
 
-def three_balls(make: Callable, values: np.ndarray, label: str, log: bool = False) -> Figure:
+def three_balls(
+    make: Callable, values: np.ndarray, label: str, log: bool = False, shares: bool = False
+) -> Figure:
     """Velocities of three equal balls in a row after the first struck, against a parameter.
 
     `make` takes the parameter, and returns the law, or law, scene and velocity. Grey: the status
-    says that the outcome is none to use.
+    says that the outcome is none to use. `shares`: velocities over the striker's.
     """
 
     def outcome(x):
         made = make(x)
         made = made if isinstance(made, tuple) else (made, CRADLE, STRIKER)
         out = ji.impact(*made)
-        return out.velocity, out.status
+        return out.velocity / (made[2][0] if shares else 1.0), out.status
 
     velocity, status = jax.jit(jax.vmap(outcome))(jnp.asarray(values))
     failed = np.array([ji.STATUS[int(code)].failure for code in status])
@@ -55,7 +57,7 @@ def three_balls(make: Callable, values: np.ndarray, label: str, log: bool = Fals
     axes.axhline(0, color="black", lw=0.6)
     axes.set_xlim(values[0], values[-1])
     axes.set_xlabel(label)
-    axes.set_ylabel("velocity after [m/s]")
+    axes.set_ylabel("velocity after / before" if shares else "velocity after [m/s]")
     if log:
         logarithmic(axes, "x")
     finish(axes)
@@ -133,6 +135,19 @@ def law_compliant():
         np.geomspace(0.01, 10, 121),
         "gap 2 / gap scale",
         log=True,
+    )
+
+
+@picture
+def law_velocity_dependent():
+    """LZB with an e that falls with the speed: slow shots lose nothing, fast ones much."""
+    law = ji.VelocityDependent(ji.LZB(0.8), speed_exponent=0.25, yield_speed=0.05)
+    return three_balls(
+        lambda speed: (law, CRADLE, speed * STRIKER),
+        np.geomspace(0.01, 100, 121),
+        "velocity of the striker before [m/s]",
+        log=True,
+        shares=True,
     )
 
 
