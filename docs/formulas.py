@@ -94,9 +94,7 @@ def tex(text: str) -> str | None:
     words = [x for x in re.findall(r"\b[a-z]{4,}\b", text) if x not in KNOWN]
     if len(words) > 1:  # a sentence
         return None
-    if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(
-        r"[A-Za-z]", text
-    ):
+    if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(r"[A-Za-z]", text):
         return None
     try:
         found = _translate(text)

@@ -18,6 +18,7 @@ from jimpact.plot.style import COLOURS
 
 PICTURES = Path(__file__).parent / "pictures"
 DRAWN: dict[str, Callable] = {}
+CRADLE = ji.chain([1.0, 1.0, 1.0])
 STRIKER = jnp.array([1.0, 0.0, 0.0])  # one ball strikes two that touch [m/s]
 
 
@@ -30,14 +31,14 @@ def picture(function: Callable) -> Callable:
 def three_balls(make: Callable, values: np.ndarray, label: str, log: bool = False) -> Figure:
     """Velocities of three equal balls in a row after the first struck, against a parameter.
 
-    `make` takes the parameter, and returns the law, or the law and the scene. Grey: the status
+    `make` takes the parameter, and returns the law, or law, scene and velocity. Grey: the status
     says that the outcome is none to use.
     """
 
     def outcome(x):
         made = make(x)
-        law, scene = made if isinstance(made, tuple) else (made, ji.chain([1.0, 1.0, 1.0]))
-        out = ji.impact(law, scene, STRIKER)
+        made = made if isinstance(made, tuple) else (made, CRADLE, STRIKER)
+        out = ji.impact(*made)
         return out.velocity, out.status
 
     velocity, status = jax.jit(jax.vmap(outcome))(jnp.asarray(values))
@@ -45,10 +46,11 @@ def three_balls(make: Callable, values: np.ndarray, label: str, log: bool = Fals
     figure = Figure(figsize=(5.6, 3.2), layout="constrained")
     axes = figure.subplots()
     for i in range(3):
-        axes.plot(values, velocity[:, i], color=COLOURS[i], lw=2, label=f"ball {i + 1}")
+        style = {"color": COLOURS[i], "lw": 2, "ls": "--" if i == 2 else "-"}  # where they coincide
+        axes.plot(values, velocity[:, i], label=f"ball {i + 1}", **style)
     if failed.any():
         axes.fill_between(values, 0, 1, where=failed, transform=axes.get_xaxis_transform(),
-                          color="#dddddd", lw=0, label="flagged: not admissible")  # fmt: skip
+                          color="#dddddd", lw=0, label="flagged")  # fmt: skip
     axes.set_xscale("log" if log else "linear")
     axes.set_xlim(values[0], values[-1])
     axes.set_xlabel(label)
@@ -74,16 +76,25 @@ def law_lzb():
     )
 
 
+def running(law: ji.Law) -> Figure:
+    """Ball 1 strikes with 1 m/s while ball 3 approaches (< 0) or runs away (> 0)."""
+    return three_balls(
+        lambda v: (law, CRADLE, jnp.stack([1.0, 0.0, v])),
+        np.linspace(-1, 1, 101),
+        "velocity of ball 3 before [m/s]",
+    )
+
+
 @picture
 def law_newton():
-    """Newton's law on three touching balls: both targets leave together, whatever e."""
-    return three_balls(ji.Newton, np.linspace(0, 1, 51), "restitution e")
+    """Newton's law, e = 0.5: where ball 3 runs away (> 0), it is pulled back, and flagged."""
+    return running(ji.Newton(0.5))
 
 
 @picture
 def law_moreau():
-    """Moreau's law on three touching balls: it is Newton's where that is admissible, as here."""
-    return three_balls(ji.Moreau, np.linspace(0, 1, 51), "restitution e")
+    """Moreau's law, e = 0.5: Newton's, until contact 2 would pull; then it takes no impulse."""
+    return running(ji.Moreau(0.5))
 
 
 @picture
@@ -112,11 +123,12 @@ def law_restitution_matrix():
 
 @picture
 def law_compliant():
-    """Hertz contacts, a gap before ball 3: below a tenth of the gap scale it counts as closed."""
-    law = ji.Compliant(ji.Hertz(1e9))
-    scale = float(ji.gap_scale(ji.chain([1.0, 1.0, 1.0]), law, STRIKER).delta[0])
+    """A heavy ball, struck from both sides: a gap of a tenth of its scale is as good as closed."""
+    law, before = ji.Compliant(ji.Hertz(1e9)), jnp.array([1.0, 0.0, -1.0])
+    masses = [0.25, 1.0, 0.25]
+    scale = ji.gap_scale(ji.chain(masses), law, before).delta[1]
     return three_balls(
-        lambda gap: (law, ji.chain([1.0, 1.0, 1.0], gaps=jnp.stack([0.0, gap * scale]))),
+        lambda gap: (law, ji.chain(masses, gaps=jnp.stack([0.0, gap * scale])), before),
         np.geomspace(0.01, 10, 121),
         "gap 2 / gap scale",
         log=True,
@@ -143,18 +155,17 @@ def force_histories():
 @picture
 def outcomes_and_laws():
     """Outcomes that mechanics allows for three balls, and where laws put theirs."""
-    balls = ji.chain([1.0, 1.0, 1.0])
     laws = {"Newton": ji.Newton(0.9), "Binary": ji.Binary(0.9), "LZB": ji.LZB(0.9)}
-    marked = {name: ji.impact(law, balls, STRIKER).velocity for name, law in laws.items()}
-    return ji.plot.admissible_set(ji.theory.admissible_set(balls, STRIKER), marked)
+    marked = {name: ji.impact(law, CRADLE, STRIKER).velocity for name, law in laws.items()}
+    return ji.plot.admissible_set(ji.theory.admissible_set(CRADLE, STRIKER), marked)
 
 
 @picture
 def gaps_decide():
-    """Gaps of 0 to 20 micrometres between three steel balls: the distribution of the outcome."""
-    law, balls = ji.Compliant(ji.Hertz(1.2e10)), ji.chain([0.0667] * 3)
-    gaps = ji.Uniform(0.0, 20e-6)
-    return ji.plot.monte_carlo(ji.monte_carlo(law, balls, STRIKER, gaps=gaps, samples=20_000))
+    """Three steel balls, the outer ones strike: gaps of up to 0.1 mm decide the outcome."""
+    law, balls = ji.Compliant(ji.Hertz(1.06e10)), ji.chain([0.0167, 0.0669, 0.0167])
+    before, gaps = [1.0, 0.0, -1.0], ji.Uniform(0.0, 100e-6)
+    return ji.plot.monte_carlo(ji.monte_carlo(law, balls, before, gaps=gaps, samples=20_000))
 
 
 @picture

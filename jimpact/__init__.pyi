@@ -39,8 +39,16 @@ from .fits.many import (
     fit_many as fit_many,
     leave_one_out as leave_one_out,
 )
+from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import Profile as Profile, profile as profile
+from .fits.scatter import Scatter as Scatter, scatter as scatter
+from .fits.selection import (
+    LawFits as LawFits,
+    NestedTest as NestedTest,
+    fit_laws as fit_laws,
+    nested_test as nested_test,
+)
 from .histories import history as history
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .law import (
@@ -76,6 +84,7 @@ from .laws.kinematic import (
 from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
 from .laws.poisson import Poisson as Poisson
+from .laws.velocity_dependent import VelocityDependent as VelocityDependent
 from .methods.advice import advise as advise
 from .methods.chart import work_precision as work_precision
 from .methods.stability import stability_map as stability_map

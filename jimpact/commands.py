@@ -96,15 +96,18 @@ def _titled(study: Study, before: np.ndarray) -> str:
 
 # -------------------------------------------------------------------------------------------- fit
 
+OF_FRICTION = ("friction", "tangential_restitution")
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
 def fit(given: options.FitCommand, steps: Steps) -> Answer:
-    """The study's fit and its yardsticks."""
+    """The study's fit and its yardsticks; or every law, side by side."""
+    if given.law == options.EVERY_LAW:
+        return _every_law(given, steps)
     path = given.picture()
     study = read_study(given.study, given.law)
-    options = {"method": given.method, "starts": given.starts, "seed": given.seed}
-    fits = _all_fits(study, options | {"progress": TOLD}, steps)
+    chosen = {"method": given.method, "starts": given.starts, "seed": given.seed}
+    fits = _all_fits(study, chosen | {"progress": TOLD}, steps)
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     picture = ji.plot.fit(fits[RAW], others, study.title)
     text = "\n".join([*_summary(fits), "", str(fits[RAW]), ""])
@@ -114,7 +117,40 @@ def fit(given: options.FitCommand, steps: Steps) -> Answer:
         for what, x in fits.items()
         for i, name in enumerate(x.names)
     ]
-    return Answer(study.title, as_data({"fits": fits}), text, {path: picture}, table=(heads, rows))
+    pictures = {path: picture} | _page(fits[RAW], given.report)
+    return Answer(study.title, as_data({"fits": fits}), text, pictures, table=(heads, rows))
+
+
+def _page(found: Fit, path: Path | None) -> dict[Path, Any]:
+    return {} if path is None else {path: found.report}
+
+
+def _every_law(given: options.FitCommand, steps: Steps) -> Answer:
+    """All laws on the study's data; picture and page are those of the first one."""
+    path, study = given.picture(), read_study(given.study)
+    found = _laws_fitted(study, steps, given.starts, given.seed)
+    picture = ji.plot.fit(found.best.fit, None, f"{study.title}: {found.best.name}")
+    pictures = {path: picture} | _page(found.best.fit, given.report)
+    return Answer(study.title, found.to_dict(), str(found), pictures, table=found.rows())
+
+
+def _laws_fitted(
+    study: Study, steps: Steps, starts: int | None = None, seed: int | None = None
+) -> ji.LawFits:
+    """Every law on the study's data, and whether e depends on the speed."""
+    assert study.experiments is not None  # `FitCommand.check`
+    kept = {key: x for key, x in study.parameters.items() if key != "restitution"}
+    given = {"starts": starts, "seed": seed}
+    chosen = {key: study.options.get(key) if x is None else x for key, x in given.items()}
+    chosen = {key: x for key, x in chosen.items() if x is not None}
+
+    def done(name: str, fit: Fit) -> None:
+        steps(_in_words(name, fit))
+
+    also = [name for name in study.free if name in OF_FRICTION]
+    return ji.fit_laws(
+        study.scene, study.experiments, free=also, speed=True, done=done, **(kept | chosen)
+    )
 
 
 def _all_fits(study: Study, options: dict[str, Any], steps: Steps) -> dict[str, Fit]:
@@ -208,11 +244,11 @@ def compare(given: options.CompareCommand, steps: Steps) -> Answer:
         found = ji.compare(study.scene, before, laws)
     steps(f"{len(laws)} laws compared")
     found = replace(found, left_out=left_out, measured=measured)
-    fits = _fits_of_all(study, steps) if given.fit else {}
+    fits = _laws_fitted(study, steps) if given.fit and study.experiments is not None else None
     values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     lines = [
         str(found),
-        *(_fit_table(fits) if fits else []),
+        *([] if fits is None else ["", "Fitted to all shots:", str(fits), ""]),
         f"Parameters: {values}.",
         "Dispersion: 0 all energy in one body, 1 equal shares. Time: one compiled call, its "
         "argument checks included.",
@@ -225,28 +261,6 @@ def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     rows = [[name, *np.asarray(x.outcome.velocity), *told(x)] for name, x in found.entries.items()]
     text = "\n".join(lines)
     return Answer(_titled(study, before), as_data(data), text, {path: picture}, table=(heads, rows))
-
-
-def _fits_of_all(study: Study, steps: Steps) -> dict[str, Fit]:
-    """Every law with restitution coefficients at its best, one for all contacts and one each."""
-    start = {**study.parameters, "restitution": 0.9}
-    each = {**start, "restitution": np.full(study.scene.contacts, 0.9)}
-    fits = {}
-    for label, values in (("one e", start), ("e per contact", each)):
-        for name, law in registered_laws(values)[0].items():
-            if hasattr(law, "restitution") and (label == "one e" or study.scene.contacts > 1):
-                own = replace(study, law=law, free={"restitution": True}, bounds={})
-                fits[f"{name}, {label}"] = own.run(progress=TOLD)
-                steps(_in_words(f"{name}, {label}", fits[f"{name}, {label}"]))
-    return fits
-
-
-def _fit_table(fits: dict[str, Fit]) -> list[str]:
-    rows = [
-        [name, ", ".join(f"{x:.4f}" for x in found.value), f"{found.rms:.4f}"]
-        for name, found in fits.items()
-    ]
-    return table(["fitted law", "restitution", "rms [m/s]"], rows, left=["restitution"])
 
 
 # ------------------------------------------------------------------------------------- montecarlo

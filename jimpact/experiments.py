@@ -178,6 +178,18 @@ class Experiments(eqx.Module):
         given = (self.pre, post, self.sigma, self.scenes, self.shots, lost, self.units)
         return Experiments(*given)
 
+    def approach_speed(self, scene: Scene | None = None) -> np.ndarray:
+        """Speed (K,) of the fastest approach at a closed contact before every shot [m/s].
+
+        >>> import jimpact as ji
+        >>> data = ji.Experiments(pre=[1.0, 0.25], post=[0.2, 0.9])
+        >>> float(data.approach_speed(ji.chain([1.0, 1.0]))[0])
+        0.75
+        """
+        normals = self.each(scene, _closed_normals)
+        rates = [n.T @ v for n, v in zip(normals, np.asarray(self.pre, float))]
+        return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
+
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
         """What one m/s of error is worth in each velocity (n,) of a scene: 1, in rad/s by energy.
 

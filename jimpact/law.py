@@ -2,6 +2,7 @@
 
 import abc
 import dataclasses
+import operator
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, overload
 
@@ -21,6 +22,10 @@ from jimpact._checks import (
 from jimpact.contact import Contact, contact_of
 from jimpact.scene import Scene
 from jimpact.status import CODE
+
+# Exponent of a contact force up to which a fit looks: a cone has 2, rough surfaces about 3. Beyond,
+# a contact is hard almost at once and no velocity tells its exponent.
+LARGEST_EXPONENT = 5.0
 
 _KEY = "jimpact"  # of what a field declares, in its metadata
 
@@ -74,6 +79,7 @@ class Domain:
     matrix: bool = False
     per_contact: bool = True
     high_unless: str | None = None
+    searched_high: float = np.inf
     name: str = "parameter"  # until the class that holds it is made
 
     def __call__(self, value: Any) -> Any:
@@ -144,6 +150,7 @@ def parameter(
     matrix: bool = False,
     per_contact: bool = True,
     high_unless: str | None = None,
+    searched_high: float = np.inf,
     default: Any = dataclasses.MISSING,
     kw_only: bool = False,
 ) -> Any:
@@ -161,6 +168,8 @@ def parameter(
         matrix: may be a square matrix, which is not bounded.
         per_contact: a scalar or one value per contact (m,), checked against the scene.
         high_unless: name of an option that, where true, lifts `high`.
+        searched_high: a fit goes no further unless it starts beyond, or `bounds` say so: larger
+            values are allowed, but mean nothing that a measurement could tell.
         default: value of a law that is not given one; may be None (no such effect).
         kw_only: it is given by keyword only.
 
@@ -183,7 +192,9 @@ def parameter(
         ...
     ValueError: Argument `loss` must lie in [0, 1], but has value 1.5.
     """
-    declared = Domain(low, high, open_low, log, static_numbers, matrix, per_contact, high_unless)
+    declared = Domain(
+        low, high, open_low, log, static_numbers, matrix, per_contact, high_unless, searched_high
+    )
     return _field(declared, default, kw_only, False)
 
 
@@ -278,6 +289,11 @@ def parameters_of(module: eqx.Module) -> dict[str, Parameter]:
 def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
     """Those that are arrays, not None or static numbers: they can be fitted and drawn."""
     return {k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)}
+
+
+def with_parameter(module: Any, name: str, value: Any) -> Any:
+    """The law with another value of a parameter, of its own or of one of its parts."""
+    return eqx.tree_at(operator.attrgetter(parameters_of(module)[name].path), module, value)
 
 
 def within_domains(law: eqx.Module) -> jax.Array:

@@ -17,6 +17,7 @@ from jimpact import starting, study_file
 from jimpact._checks import check_choice
 
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
+EVERY_LAW = "all"  # in the place of a law's name
 PICTURES = (".png", ".pdf", ".svg")
 StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
 
@@ -121,18 +122,23 @@ class FitCommand(DrawingCommand):
     study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one (three_balls.toml, air_track.toml)."""
     law: str | None = None
-    """Law in the place of the study's (see `jimpact laws`)."""
+    """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
     method: Method | None = None
     """Solver; default: the study's, or levenberg-marquardt."""
     starts: int | None = None
     """Number of starts; default: the study's, or 8."""
     seed: int | None = None
     """Seed of the random starts."""
+    report: Path | None = None
+    """One page (.html) with all of the fit: intervals, profiles, pictures, versions."""
 
     def check(self) -> None:
-        """Also the study, which must have data."""
+        """Also the study, which must have data, and the report's kind."""
         super().check()
-        if not study_file.check_study(self.study, self.law).shots:
+        if self.report is not None and self.report.suffix not in (".html", ".htm"):
+            raise ValueError(f"--report must end in .html, but is '{self.report}'.")
+        law = None if self.law == EVERY_LAW else self.law
+        if not study_file.check_study(self.study, law).shots:
             raise ValueError(study_file.NO_DATA)
 
 

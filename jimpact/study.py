@@ -22,7 +22,7 @@ from jimpact.bodies.solids import Box, Sphere
 from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrix_fit import admissible_start
-from jimpact.fits.parameters import default_free
+from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -128,7 +128,8 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
         values["exponent"] = np.asarray(given, float) if "exponent" in free else fixed
     law = row.build(**values)
     known = free_parameters_of(law)
-    free = free or dict.fromkeys({"restitution"} & set(known) or default_free(known), True)
+    bounce = [name for name in ("restitution", *OF_SPEED) if name in known]
+    free = free or dict.fromkeys(bounce or default_free(known), True)
     experiments = _experiments(tables["data"], path, scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
     sampled = _sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}

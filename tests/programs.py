@@ -43,6 +43,12 @@ LAWS = {
     "matrix": Row(
         "restitution_matrix", lambda e, k, eta, stored: ji.RestitutionMatrix(jnp.diag(e))
     ),
+    "velocity": Row(
+        "velocity_dependent",
+        lambda e, k, eta, stored: ji.VelocityDependent(
+            ji.Moreau(e), speed_exponent=0.25, yield_speed=0.0, reference_speed=1.5
+        ),
+    ),
     "binary": Row("binary", lambda e, k, eta, stored: ji.Binary(e)),
     "binary-earliest": Row("binary", lambda e, k, eta, stored: ji.Binary(e, order="earliest")),
     "binary-left": Row(

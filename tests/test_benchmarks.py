@@ -10,7 +10,7 @@ import pytest
 FOLDER = Path(__file__).parent / "benchmarks"
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_three_balls_run(tmp_path):
     """The one that all others are measured against; `all.py --quick` runs the others, too."""
     command = [sys.executable, str(FOLDER / "three_balls.py"), "--quick", "--out", str(tmp_path)]

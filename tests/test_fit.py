@@ -369,7 +369,7 @@ def test_a_contact_that_is_never_loaded_is_named():
 
 
 @pytest.mark.long_run
-@pytest.mark.slow
+@pytest.mark.release
 def test_nine_parameters_of_a_chain_before_a_wall():
     scene = ji.chain([1.0, 2.0, 1.5, 3.0, 1.0], wall=True)
     truth = ji.LZB(np.linspace(0.95, 0.8, 5), np.linspace(1.0, 3.0, 5))

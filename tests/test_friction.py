@@ -469,7 +469,7 @@ SLOPES = {"planar": (1, 4), "planar, both ways": (1, 4), "space": (2, 6)}
         ("moreau", "planar, both ways"),
         pytest.param("newton", "planar", marks=pytest.mark.slow),
         pytest.param("binary", "planar", marks=pytest.mark.slow),
-        pytest.param("lzb", "planar, both ways", marks=pytest.mark.slow),
+        pytest.param("lzb", "planar, both ways", marks=pytest.mark.release),
         pytest.param("moreau", "space", marks=pytest.mark.slow),
         pytest.param("lzb", "space", marks=pytest.mark.slow),
     ],

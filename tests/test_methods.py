@@ -78,7 +78,7 @@ def test_chart_in_words_and_picture(chart):
     assert all(axes.lines for axes in figure.axes[:-1])
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_gradients_and_the_other_methods():
     linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
     others = ("verlet", "impulse_rk4", "tsit5", "scipy_lsoda")  # and one of each kind
@@ -172,8 +172,16 @@ def test_right_or_flagged():
 
 
 @pytest.mark.long_run
-@pytest.mark.slow
-@pytest.mark.parametrize(("n", "share"), [(2, 0.99), (3, 0.7), (6, 0.6), (20, 0.15), (100, 0.0)])
+@pytest.mark.parametrize(
+    ("n", "share"),
+    [
+        pytest.param(2, 0.99, marks=pytest.mark.slow),
+        pytest.param(3, 0.7, marks=pytest.mark.slow),
+        pytest.param(6, 0.6, marks=pytest.mark.slow),
+        pytest.param(20, 0.15, marks=pytest.mark.release),
+        pytest.param(100, 0.0, marks=pytest.mark.release),
+    ],
+)
 def test_right_or_flagged_with_more_steps(n, share):
     assert check_hypercube(n, MANY_STEPS) >= share
 
@@ -253,8 +261,14 @@ def _random_chains(bodies, wall, count, seed):
 
 
 @pytest.mark.long_run
-@pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-6, 1e-8, 1e-10])
+@pytest.mark.parametrize(
+    "rtol",
+    [
+        pytest.param(1e-6, marks=pytest.mark.slow),
+        pytest.param(1e-8, marks=pytest.mark.release),
+        pytest.param(1e-10, marks=pytest.mark.slow),
+    ],
+)
 def test_honest_tolerance_over_random_scenes(rtol):
     """99 % within 10 rtol; the worst within 100 rtol or flagged."""
     errors = []
@@ -540,7 +554,7 @@ def test_dispersion_index_and_energy_ratio():
 
 
 @pytest.mark.long_run
-@pytest.mark.slow
+@pytest.mark.release
 def test_docs_hold_the_chooser_table():
     import chooser
 

@@ -222,7 +222,7 @@ def test_derivatives_in_what_functions_close_over():
     np.testing.assert_allclose(jax.jvp(second, (0.1,), (1.0,))[1], exact, rtol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_motion_of_more_steps_than_a_plan_has_rows_has_no_derivative(monkeypatch):
     monkeypatch.setattr(event_driven, "ROWS_MORE", 16)
     monkeypatch.setattr(event_driven, "ROWS_PER_EVENT", 0)
@@ -379,7 +379,7 @@ def test_stick_and_slip_on_a_slope(slides):
     np.testing.assert_allclose(slips.ledger_residual, 0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_of_a_block_that_comes_to_stick():
     """Where it stops, when, and what friction took, in both modes."""
 
@@ -522,7 +522,7 @@ def discs_in_a_box(n, columns, duration, step, samples):
     ("n", "columns", "duration"),
     [
         (30, 6, 1.0),
-        pytest.param(150, 12, 1.5, marks=[pytest.mark.slow, pytest.mark.long_run]),
+        pytest.param(150, 12, 1.5, marks=[pytest.mark.release, pytest.mark.long_run]),
     ],
 )
 def test_discs_fall_into_a_box_and_come_to_rest(n, columns, duration):

@@ -241,12 +241,12 @@ def shaken(x):
     return system, ji.Newton(x[2]), [0.2], [0.0], 1.0, None
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("given", "at", "events", "step", "allowed"),
     [
-        (collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8),
-        (shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7),  # the plate of 2 cm: differences see no more
+        pytest.param(collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8, marks=pytest.mark.release),
+        # the plate of 2 cm: differences see no more
+        pytest.param(shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7, marks=pytest.mark.slow),
     ],
 )
 def test_derivatives_of_a_motion_against_differences(given, at, events, step, allowed):
@@ -273,7 +273,7 @@ def test_derivatives_of_a_motion_against_differences(given, at, events, step, al
     np.testing.assert_allclose(forward, differences.T, rtol=allowed, atol=allowed / 10)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_fit_through_a_simulated_motion():
     """Restitutions and stiffness ratio of a cradle, from angles with (simulated) noise."""
     system = ji.cradle_system([0.1] * 3, length=0.15, diameter=0.025)

@@ -1,6 +1,8 @@
 """Reports and pictures of canned results: no impact is computed."""
 
 import json
+import sys
+from dataclasses import replace
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,6 +53,7 @@ def canned(shots, **change):
             ji.Experiments(pre, post),
             ("restitution", "exponent"),
         ),
+        "jacobian": np.stack([[-0.5, 0.5] * pre[:, :1], np.zeros_like(pre)], axis=2),
     }
     return Fit(**(given | change))
 
@@ -80,6 +83,55 @@ def test_report_of_a_fit():
     assert "The data gain energy." in text
     assert "NOT converged" in str(canned(4, converged=False))
     assert max(map(len, text.splitlines())) < 200
+
+
+def test_a_fit_in_one_sentence():
+    seen = {"names": ("restitution",), "value": np.array([0.9912]), "warnings": ()}
+    seen |= {"standard_error": np.array([0.0042]), "at_bound": np.array([False]), "rank": 1}
+    assert canned(4, **seen).verdict == "restitution = 0.991 ± 0.004."
+    assert str(canned(4)).endswith(f"\n\n{canned(4).verdict}")
+    both = canned(1)
+    assert both.verdict == (
+        "restitution[1] = 0.600 ± 0.010; stiffness[1] cannot be told from this shot."
+    )
+    held = replace(both.problem, notes=("stiffness[1] is held at its start.",))
+    ratio = canned(1, problem=held, names=("restitution[1]", "stiffness[2]"))
+    assert "the stiffness ratio stiffness[2] / stiffness[1] cannot be told" in ratio.verdict
+    assert canned(4, converged=False).verdict.startswith("No answer")
+    bad = canned(4, warnings=("Lack of fit: the residuals are large.",))
+    assert bad.verdict.startswith("LZB does not fit these 4 shots, nearest is it with restitution")
+    open_end = ji.Profile(
+        "restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.97, 1.0),), (0.0, 1.0)
+    )
+    flat = replace(open_end, name="stiffness[1]", intervals=((0.0, 1.0),))
+    told = canned(4, profiles=(open_end, flat), standard_error=np.array([0.01, 1.0]))
+    assert told.verdict == (
+        "restitution[1] = 0.600 ± 0.010, at least 0.97 (95 %); stiffness[1] cannot be told from these 4 shots."
+    )
+
+
+def test_page_of_a_fit(tmp_path):
+    """One file: nothing is loaded from elsewhere."""
+    found = canned(4)
+    text = found.report(tmp_path / "fit.html", profiles=False).read_text(encoding="utf-8")
+    for words in ("The data gain energy.", "unseen", "seed 0", "jimpact", "cannot be told"):
+        assert words in text, words
+    assert text.count("<img") == text.count('src="data:image/') == 3
+    for tag in ("<script", "<link", "@import", 'src="http'):
+        assert tag not in text, tag
+    with pytest.raises(ValueError, match=r"`path` must end in \.html"):
+        found.report(tmp_path / "fit.pdf")
+
+
+def test_tables_of_a_fit(monkeypatch):
+    found = canned(4)
+    pytest.importorskip("pandas")
+    pytest.importorskip("xarray")
+    assert found.to_pandas().loc["restitution[1]", "standard_error"] == 0.01
+    assert found.to_xarray()["residual"].dims == ("shot", "velocity")
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pandas must be installed"):
+        found.to_pandas()
 
 
 def test_json_of_a_fit():

@@ -67,18 +67,35 @@ def adequacy(problem: FitProblem, found: Search, rank: int) -> list[str]:
         return []
     lines = []
     if problem.sigma is not None:
-        if chdtrc(freedom, squares) < LEVEL:
-            times = np.sqrt(squares / freedom)
+        if (times := stretch(problem, data, rank)) > 1:
             lines.append(
                 f"Lack of fit: the residuals are {times:.2g} times what sigma allows (chi^2 = "
                 f"{squares:.4g} with {freedom} degrees of freedom): the law or the stated errors "
-                "are wrong, and the standard errors too small."
+                "are wrong, or the parameters scatter; the standard errors are stretched by that."
             )
     elif problem.experiments is not None:
         lines += _beyond_noise(problem, data, freedom) or _pattern(problem, data, freedom)
     if problem.experiments is not None:
         lines += _suspicious(problem, data, freedom)
     return lines
+
+
+def stretch(problem: FitProblem, data: Weighted, rank: int) -> float:
+    """By how much errors are larger than stated, 1 where chi^2 does not reject them.
+
+    Equation: `sqrt(chi^2 / freedom)`, of all residuals, or of those that are no momentum if that is
+    more: what a law or its parameters get wrong is in these.
+    """
+    squares, freedom = float(data.residual @ data.residual), problem.values - rank
+    found = [(squares, freedom)]
+    if problem.experiments is not None and not problem.experiments.lost_freedom:
+        for k, basis in enumerate(_conserved(problem)):
+            if basis.shape[1]:
+                squares -= float(np.sum((basis.T @ data.residual[data.shot == k]) ** 2))
+                freedom -= basis.shape[1]
+        found.append((max(squares, 0.0), freedom))
+    rejected = [s / f for s, f in found if f > 0 and chdtrc(f, s) < LEVEL]
+    return float(np.sqrt(max(rejected, default=1.0)))
 
 
 def _beyond_noise(problem: FitProblem, data: Weighted, freedom: int) -> list[str]:

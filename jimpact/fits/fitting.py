@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Generic, NamedTuple
 
 import jax.numpy as jnp
@@ -9,13 +10,20 @@ import numpy as np
 
 from jimpact._checks import check_choice
 from jimpact.experiments import Experiments
-from jimpact.fits.adequacy import unusable
+from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Minimum, Search, search, search_near
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.profiles import Profile, linearized, needs_profiles, profile, quantile
-from jimpact.fits.report import fit_warnings, report, to_json
+from jimpact.fits.profiles import (
+    Profile,
+    linearized,
+    needs_profiles,
+    profile,
+    quantile,
+    quick_profiles,
+)
+from jimpact.fits.report import fit_warnings, report, to_json, verdict
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.scene import Scene
 
@@ -63,7 +71,8 @@ class Fit(Generic[AnyLaw]):
         residual: measured less predicted (K, n) [m/s]; NaN where nothing was measured.
         rms: of the residual.
         noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
-            where `sigma` was given.
+            where `sigma` was given, or, where chi^2 says that it is too small, by how much:
+            the standard errors are stretched by that.
         degrees_of_freedom: independent measured values less `rank`.
         rank: of the Jacobian; below P: see `identifiability`.
         singular_values: (P,) of the scaled Jacobian.
@@ -75,7 +84,10 @@ class Fit(Generic[AnyLaw]):
         lost_starts: how many did not converge.
         warnings: what is wrong with data or fit, in words.
         problem: what was solved.
+        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where nothing
+            was measured.
         loss: see `fit`.
+        seed: of the random starts.
         profiles: where `fit` was asked for them.
     """
 
@@ -103,7 +115,9 @@ class Fit(Generic[AnyLaw]):
     lost_starts: int
     warnings: tuple[str, ...]
     problem: FitProblem
+    jacobian: np.ndarray
     loss: str = "squares"
+    seed: int = 0
     profiles: tuple[Profile, ...] = ()
 
     @property
@@ -133,6 +147,40 @@ class Fit(Generic[AnyLaw]):
     def to_dict(self) -> dict[str, Any]:
         """Everything a JSON file can hold; numbers that are not finite become None."""
         return to_json(self)
+
+    @property
+    def verdict(self) -> str:
+        """What was found, in one sentence: the last one of `print(fit)`."""
+        return verdict(self)
+
+    def report(self, path: str | Path, profiles: bool = True) -> Path:
+        """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
+
+        Parameters and intervals, profiles, correlations, residuals, what the data cannot see, what
+        is wrong with them, versions and seed.
+
+        Args:
+            path: the file, ending in .html; what is there is replaced.
+            profiles: find the profile likelihoods, too, unless the fit has them; some seconds.
+
+        Returns:
+            The path.
+        """
+        from jimpact.fits.page import write_page
+
+        return write_page(self, Path(path), profiles)
+
+    def to_pandas(self) -> Any:
+        """The parameters as a `pandas.DataFrame`, which must be installed."""
+        from jimpact.fits.tables import parameters_frame
+
+        return parameters_frame(self)
+
+    def to_xarray(self) -> Any:
+        """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
+        from jimpact.fits.tables import dataset
+
+        return dataset(self)
 
     def __str__(self) -> str:
         return report(self)
@@ -215,9 +263,12 @@ def fit(
         problem = _without(problem, lost)
         found = search(problem, method, starts, seed, steps, progress)
     robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
-    end = replace(as_fit(problem, found, method, robust), loss=loss)
-    wanted = needs_profiles(end) if profiles is None else profiles
-    return replace(end, profiles=profile(end, progress=progress)) if wanted else end
+    end = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
+    if profiles:
+        return replace(end, profiles=profile(end, progress=progress))
+    if profiles is None and needs_profiles(end):
+        return replace(end, profiles=quick_profiles(end, progress))
+    return end
 
 
 def _rms(problem: FitProblem, residual: np.ndarray) -> float:
@@ -305,6 +356,9 @@ def as_fit(
     residuals, names = problem.residuals, problem.names
     size = float(residuals.size)
     spread = _spread(problem, found, found.minima[0], robust.noise if robust else None)
+    if robust is None and problem.sigma is not None:
+        times = stretch(problem, weighted(problem, found), spread.rank)
+        spread = _spread(problem, found, found.minima[0], times) if times > 1 else spread
     residual = np.asarray(problem.measured, float) - found.seen
     return Fit(
         law=with_entries(problem.law, residuals.fields, jnp.asarray(found.entries)),
@@ -325,7 +379,7 @@ def as_fit(
         singular_values=spread.singular_values,
         identifiability=(*problem.notes, *spread.unseen),
         starts=tuple(
-            Start(size**2 * end.squares, end.value, end.count, _error(problem, found, end, spread))
+            Start(size**2 * end.squares, end.value, end.starts, _error(problem, found, end, spread))
             for end in found.minima
         ),
         status=found.status,
@@ -334,7 +388,16 @@ def as_fit(
         lost_starts=found.lost,
         warnings=tuple(fit_warnings(problem, found, spread)),
         problem=problem,
+        jacobian=_slopes(problem, found),
     )
+
+
+def _slopes(problem: FitProblem, found: Search) -> np.ndarray:
+    """Derivatives of what was measured in the parameters themselves; NaN where nothing was."""
+    weight = np.broadcast_to(np.asarray(problem.residuals.weight, float), problem.measured.shape)
+    slope = found.jacobian.reshape(*problem.measured.shape, len(problem.names)) / found.scale
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(weight[..., None] > 0, slope / weight[..., None], np.nan)
 
 
 def _spread(

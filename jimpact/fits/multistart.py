@@ -24,11 +24,11 @@ from jimpact.progress import progress_bar
 
 Show = Callable[[str, float, float], None]  # of the progress: text, how far, of how much
 
-LANES = 4  # starts that run together; those that are done make room
-PASSES = 10  # between two looks at the progress
+LANES, DEAR_LANES = 8, 4  # starts that run together: of shots, and of what may take longer
+PASSES = 4  # until starts that are done make room
 # A Levenberg-Marquardt start that gains less than this share in so many passes sits on a kink of
 # the law (a change in the sequence of contacts), where steps zigzag: it is given up.
-SLOW = 1e-3
+SLOW, SLOW_PASSES = 1e-3, 12
 # One whose sum of squares is this far above the best must gain this share to go on.
 BEHIND, SLOW_BEHIND = 10.0, 0.1
 
@@ -49,7 +49,8 @@ NEAR_RCOND = 1e-10  # directions the data cannot see are not searched
 # Impacts map a stiffness ratio many to one: three balls of ratio 40 come apart as those of up to
 # nine other ratios do. So each such parameter is scanned, at so many values within this factor of
 # the user's own, the others following for so many passes, and its best valleys are followed.
-SCANNED, SCAN_FACTOR, SCAN_PASSES, FOLLOWED = 64, 1e3, 3, 16
+SCANNED, SCAN_FACTOR, SCAN_PASSES, FOLLOWED = 64, 300.0, 2, 16
+DEEP = 0.5  # share of the ridges on both sides above which a valley is none
 WITHIN = 8  # points of the scan's cubics between two of its values
 FLAT = 1e-6  # singular values below this share: a valley, where there is nothing to scan
 
@@ -70,7 +71,7 @@ class Minimum(NamedTuple):
 
     squares: float  # |r|^2
     value: np.ndarray  # of the parameters (P,)
-    count: int  # of starts
+    starts: int  # how many
     jacobian: np.ndarray  # (R, P), of the scaled parameters
 
 
@@ -151,24 +152,23 @@ def run(
 
     Rivals are starts of one problem: those far behind the best are given up sooner.
     """
-    few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for LANES
-    lanes = LANES if few else min(len(points), LANES)
+    few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
+    most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
+    lanes = most if few else min(len(points), most)
     points = points.astype(problems.offset.dtype)
-    limit, passes = (
-        (np.asarray(max_steps), np.asarray(PASSES))  # one program serves all limits
-        if method == "levenberg-marquardt"
-        else (max_steps, PASSES)
-    )
+    limit: Any = max_steps
+    if method == "levenberg-marquardt":
+        limit = np.asarray(max_steps)  # one program serves all limits
     begun = [
         begin_all(_rows(problems, rows), points[rows], method, limit)
         for rows in _batches(list(range(len(points))), lanes)
     ]
     states = jax.tree.map(lambda *x: np.concatenate(x)[: len(points)], *begun)
     active = list(range(len(points)))
+    before, since = states.cost.copy(), states.steps.copy()
     while active:
-        before = states.cost.copy()
         for rows in _batches(active, lanes):
-            some = advance_all(_rows(problems, rows), _rows(states, rows), method, limit, passes)
+            some = advance_all(_rows(problems, rows), _rows(states, rows), method, limit, PASSES)
             states = jax.tree.map(partial(_with_rows, rows), states, jax.device_get(some))
             ready, steps = len(points) - len(active), int(states.steps.max())
             counts = f"{ready} of {len(points)} starts done, step {steps} of at most {max_steps}"
@@ -177,7 +177,10 @@ def run(
         if method == "levenberg-marquardt":
             behind = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
             share = np.where(behind, SLOW_BEHIND, SLOW)
-            ended |= (before - states.cost <= share * before) & np.isfinite(before)
+            due = states.steps >= since + SLOW_PASSES
+            ended |= due & (before - states.cost <= share * before) & np.isfinite(before)
+            before = np.where(due, states.cost, before)
+            since = np.where(due, states.steps, since)
         active = [i for i in active if not ended[i]]
     return states
 
@@ -328,7 +331,7 @@ def _valleys(
     held = []
     for i in np.flatnonzero(log | ~np.isfinite(low) | ~np.isfinite(high)):
         ends = np.clip(center[i] + reach[i] * np.array([-1, 1]), low[i], high[i])
-        for value in np.linspace(*ends, SCANNED):
+        for value in np.linspace(ends[0], ends[1], SCANNED):
             held.append((int(i), np.array(states.y[best], float)))
             held[-1][1][i] = value
     if not held:
@@ -338,13 +341,16 @@ def _valleys(
     found = []
     for k in range(0, len(held), SCANNED):
         rows = slice(k, k + SCANNED)
-        found += _turns(held[k][0], count, jax.tree.map(lambda x, rows=rows: x[rows], scan))
+        part = jax.tree.map(lambda x, rows=rows: x[rows], scan)
+        found += _turns(held[k][0], count, part, np.asarray(states.y[best], float))
     found.sort(key=lambda valley: valley[0])
     return np.array([y for _, y in found[:FOLLOWED]]).reshape(-1, states.y.shape[1])
 
 
-def _turns(i: int, count: int, scan: SolverState) -> list[tuple[float, np.ndarray]]:
-    """Least sums of squares along a scan of the i-th parameter, and where."""
+def _turns(
+    i: int, count: int, scan: SolverState, best: np.ndarray
+) -> list[tuple[float, np.ndarray]]:
+    """Sums of squares in the valleys of a scan of the i-th parameter, and where; not the best."""
     y, r = np.asarray(scan.y, float), np.asarray(scan.residual, float)
     jacobian = np.asarray(scan.jacobian, float)[:, :, :count]
     others = np.delete(jacobian, i, axis=2)
@@ -359,8 +365,11 @@ def _turns(i: int, count: int, scan: SolverState) -> list[tuple[float, np.ndarra
     squares = np.append(np.sum(cubic**2, axis=2).ravel(), np.sum(r[-1] ** 2))
     where = np.vstack([where.reshape(-1, y.shape[1]), y[-1:]])
     padded = np.pad(squares, 1, constant_values=np.inf)
-    least = np.flatnonzero((squares < padded[:-2]) & (squares <= padded[2:]))
-    return [(float(squares[k]), where[k]) for k in least]
+    left, right = np.maximum.accumulate(squares), np.maximum.accumulate(squares[::-1])[::-1]
+    least = (squares < padded[:-2]) & (squares <= padded[2:])
+    deep = squares <= DEEP * np.minimum(left, right)
+    new = np.abs(where[:, i] - best[i]) > 0.5 * h.max()
+    return [(float(squares[k]), where[k]) for k in np.flatnonzero(least & deep & new)]
 
 
 def _own(problem: FitProblem) -> np.ndarray:

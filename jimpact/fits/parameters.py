@@ -1,19 +1,19 @@
 """Which entries of a law are free, their names, bounds and natural scales."""
 
 import dataclasses
-import operator
 from collections.abc import Collection, Mapping
 from typing import Any, TypeVar
 
-import equinox as eqx
 import jax
 import numpy as np
 
-from jimpact.law import Law, free_parameters_of, parameters_of
+from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
 from jimpact.laws.lzb import LZB
+from jimpact.laws.velocity_dependent import VelocityDependent
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
+OF_SPEED = ("speed_exponent", "yield_speed")  # where a law has them, they were asked for
 
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
 # beyond, the softer contact has no further influence that a measurement could see.
@@ -61,7 +61,7 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: jax.Array) -> Any
     for field in fields:
         old = value_of(law, field)
         new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
-        law = eqx.tree_at(operator.attrgetter(parameters_of(law)[field].path), law, new)
+        law = with_parameter(law, field, new)
         start += old.size
     return law
 
@@ -119,7 +119,7 @@ def _as_mapping(free: Any, known: list[str]) -> dict[str, Any]:
 
 def default_free(known: Collection[str]) -> tuple[str, ...]:
     """What is fitted of a law with these parameters where nobody says: how its contacts bounce."""
-    bounce = tuple(name for name in (*DEFAULT_FREE, "matrix") if name in known)
+    bounce = tuple(name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in known)
     return bounce or tuple(known)
 
 
@@ -158,6 +158,7 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
     """Whether a common factor of all stiffnesses is invisible: LZB with equal exponents."""
+    law = law.law if isinstance(law, VelocityDependent) else law
     if not isinstance(law, LZB):
         return False
     exponents = np.unique(np.asarray(law.exponent, dtype=float))
@@ -186,7 +187,10 @@ def bounds_of(
         elif parameters_of(law)[field].domain.log:
             ends[:, inside] = values[inside] / LOG_RANGE, values[inside] * LOG_RANGE
         else:
-            ends[:, inside] = np.array(parameters_of(law)[field].domain.bounds)[:, None]
+            domain = parameters_of(law)[field].domain
+            ends[:, inside] = np.array(domain.bounds)[:, None]
+            searched = np.maximum(values[inside], domain.searched_high)
+            ends[1, inside] = np.minimum(ends[1, inside], searched)
     low = np.array([ends[0, list(group)].max() for group in parameters.groups])
     high = np.array([ends[1, list(group)].min() for group in parameters.groups])
     for name, start, a, b in zip(parameters.names, values[parameters.first], low, high):

@@ -4,9 +4,9 @@ A standard error is half the width of a parabola. Where the sum of squares is no
 valley, several minima), the profile is the interval: one-sided, or of several pieces.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
@@ -19,8 +19,13 @@ from jimpact.progress import progress_bar
 if TYPE_CHECKING:
     from jimpact.fits.fitting import Fit
 
-NEAR = np.linspace(-4, 4, 17)  # standard errors around a minimum
+NEAR = np.array([-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2])  # half-widths of the interval of a parabola
+SAME = 1e-6  # relative sums of squares that are equal
+END = 1e-3  # of the root of the limit: how near to it an end is searched for
+# What `fit` profiles of itself: so many values across the domain, up to so many times the limit.
+QUICK_POINTS, QUICK_LEVEL, FAR = 17, 0.95, 1.0
 HARDLY_SEEN = 0.2  # relative error of a stiffness beyond which no parabola is believed
+LONGEST = 2.0  # steps by which a scan is extrapolated
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
 _METHOD = "levenberg-marquardt"
 
@@ -73,10 +78,10 @@ def profile(
     Equation: `D(x_i) = (min over the others of |r|^2 - least |r|^2) / s^2 <= q^2`, q the quantile
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
 
-    Held values cover the whole domain and the neighbourhood of the minimum; all are solved side by
-    side, from the fit and once more from their better neighbours. Where a scan finds a further
-    valley, it is followed to its minimum. Without sigma and with no degree of freedom left, the
-    interval is that of the values which reproduce the data exactly.
+    Held values cover the whole domain and the neighbourhood of the minima; from each minimum they
+    are reached one after the other in both directions, all parameters side by side. Where a scan
+    finds a further valley, it is followed to its minimum. Without sigma and with no degree of
+    freedom left, the interval is that of the values which reproduce the data exactly.
 
     Args:
         fit: by least squares.
@@ -109,10 +114,19 @@ def profile(
             raise ValueError(f"Argument `names` must be among {known}, but has {name!r}.")
     with progress_bar(progress) as show:
         scans = _Scans(fit, [fit.names.index(name) for name in wanted], show)
-        scans.add([(i, y) for i in scans.which for y in scans.grid(i, points)])
+        scans.scan(points, level, np.inf)
         scans.follow_valleys(level)
         scans.find_ends(level)
     return tuple(scans.profile(i, level) for i in scans.which)
+
+
+def quick_profiles(fit: "Fit", progress: float | None) -> tuple[Profile, ...]:
+    """Profiles of all parameters around the minima that are known, no farther than is needed."""
+    with progress_bar(progress) as show:
+        scans = _Scans(fit, range(len(fit.names)), show)
+        scans.scan(QUICK_POINTS, QUICK_LEVEL, FAR)
+        scans.find_ends(QUICK_LEVEL)
+    return tuple(scans.profile(i, QUICK_LEVEL) for i in scans.which)
 
 
 class Scaled:
@@ -156,13 +170,14 @@ class Scaled:
         return float(low), float(high)
 
 
-def _can_be_profiled(fit: "Fit") -> bool:
+def can_be_profiled(fit: "Fit") -> bool:
+    """Least squares, in a box."""
     return fit.loss == "squares" and isinstance(fit.problem.residuals.region, Box)
 
 
 def check_profiled(fit: "Fit") -> None:
     """Raise a ValueError unless parameters of this fit can be held."""
-    if not _can_be_profiled(fit):
+    if not can_be_profiled(fit):
         raise ValueError(
             "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."
         )
@@ -186,61 +201,76 @@ class _Scans(Scaled):
                 self.found[i].setdefault(float(y[i]), (start.sum_of_squares, y))
         self.lower: np.ndarray | None = None
 
-    def grid(self, i: int, points: int) -> np.ndarray:
-        """Values to hold: across the domain, and near the minima."""
-        values, fit = [np.linspace(*self.reach(i), points)], self.fit
-        for value, errors in (
-            (fit.value, fit.standard_error),
-            *((start.value, start.standard_error) for start in fit.starts[1:]),
-        ):
-            if errors is not None:
-                step = value[i] if self.log[i] else self.scale[i]
-                values.append(self._near(i, self.point(value), float(errors[i] / step)))
-        return np.concatenate(values)
+    def minima(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """y (Q,) of the minima that fit well enough, and scaled standard errors (P,)."""
+        fit = self.fit
+        found: list[tuple[np.ndarray, np.ndarray | None]] = [(fit.value, fit.standard_error)]
+        if fit.rank == len(fit.names):  # else they are ends in one valley
+            found += [(end.value, end.standard_error) for end in fit.starts[1:]]
+        return [
+            (self.point(value), error / np.where(self.log, value, self.scale))
+            for value, error in found
+            if error is not None
+        ]
 
-    def _near(self, i: int, y: np.ndarray, error: float) -> np.ndarray:
+    def near(self, i: int, y: np.ndarray, error: float, level: float) -> np.ndarray:
+        """Values to hold near a minimum."""
         if not np.isfinite(error):
             return np.zeros(0)
-        return np.clip(y[i] + error * NEAR, self.low[i], self.high[i])
+        reach = error * np.sqrt(self.limit(level))
+        return np.clip(y[i] + reach * NEAR, self.low[i], self.high[i])
+
+    def scan(self, points: int, level: float, far: float) -> None:
+        """Deviances across the domains, as far as they are at most `far` times the limit."""
+        values: dict[int, np.ndarray] = {}
+        fronts: list[_Front] = []
+        for i in self.which:
+            parts = [np.linspace(*self.reach(i), points)]
+            for y, error in self.minima():
+                parts.append(self.near(i, y, float(error[i]), level))
+                fronts += [_Front(i, step, y) for step in (-1, 1)]
+            values[i] = np.unique(np.concatenate(parts))
+        if len(self.fit.names) == 1 and far == np.inf:  # nothing is left to be solved for
+            self._take([(0, _with(self.best, 0, x)) for x in values[0]])
+        else:
+            self.advance(fronts, values, far * self.limit(level))
+
+    def advance(self, fronts: list["_Front"], values: Mapping[int, np.ndarray], far: float) -> None:
+        """From value to value, each from the minimum beside it, until others have been there."""
+        while True:
+            ahead = [(f, f.next(values[f.i], self.low, self.high)) for f in fronts]
+            moving = [(f, y) for f, y in ahead if y is not None]
+            if not moving:
+                return
+            known = [self.found[f.i].get(float(y[f.i]), (np.inf, y))[0] for f, y in moving]
+            ends = self._take([(f.i, y) for f, y in moving])
+            fronts = []
+            for (f, _), before, end in zip(moving, known, ends):
+                squares, y = end
+                first = squares < (1 - SAME) * before and self.found[f.i][float(y[f.i])] is end
+                if first and (squares - self.least) / self.variance <= far:
+                    fronts.append(_Front(f.i, f.step, y, f.last))
 
     def _solve(self, held: Sequence[tuple[int | None, np.ndarray]]) -> SolverState:
         """Minima from y (Q,), with the i-th entry held, None: nothing."""
         which = [(() if i is None else (i,), y) for i, y in held]
         return run_held(self.residuals, which, DEFAULT_STEPS[_METHOD], self.show)
 
-    def _take(self, held: Sequence[tuple[int, np.ndarray]]) -> None:
+    def _take(self, held: Sequence[tuple[int, np.ndarray]]) -> list[tuple[float, np.ndarray]]:
         """Solve, and keep what is better than what was known."""
-        if not held:
-            return
         states = self._solve(held)
         squares = 2 * np.asarray(states.cost, float) * self.size**2
+        ends = []
         for k, (i, y) in enumerate(held):
-            known = self.found[i].get(float(y[i]), (np.inf, y))
-            if squares[k] < known[0]:
-                end = np.array(states.y[k], float)
-                end[i] = y[i]
-                self.found[i][float(y[i])] = (float(squares[k]), end)
+            end = _with(np.asarray(states.y[k]), i, y[i])
+            ends.append((float(squares[k]), end))
+            if not squares[k] >= self.found[i].get(float(y[i]), (np.inf, y))[0]:
+                self.found[i][float(y[i])] = ends[-1]
         best = min((entry for found in self.found.values() for entry in found.values()), key=_first)
         exact = EXACT[str(self.residuals.offset.dtype)] * self.size**2
         if best[0] < self.least * (1 - 1e-6) - exact:
             self.least, self.lower = best
-
-    def add(self, held: Sequence[tuple[int, float]]) -> None:
-        """New held values: from the nearest known minimum, then from their better neighbour."""
-        self._take([(i, _with(self._nearest(i, y), i, y)) for i, y in held])
-        if len(self.fit.names) == 1:
-            return
-        again = []
-        for i, y in held:
-            values = sorted(self.found[i])
-            k = values.index(float(y))
-            beside = [
-                self.found[i][x] for x in (*values[max(k - 1, 0) : k], *values[k + 1 : k + 2])
-            ]
-            squares, start = min(beside, key=_first)
-            if squares < self.found[i][float(y)][0]:
-                again.append((i, _with(start, i, y)))
-        self._take(again)
+        return ends
 
     def _nearest(self, i: int, y: float) -> np.ndarray:
         return self.found[i][min(self.found[i], key=lambda known: abs(known - y))][1]
@@ -265,7 +295,8 @@ class _Scans(Scaled):
         if not starts:
             return
         states = self._solve([(None, y) for _, y in starts])
-        more = []
+        fronts: list[_Front] = []
+        near: dict[int, np.ndarray] = {}
         for k, (i, _) in enumerate(starts):
             jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
             inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
@@ -274,8 +305,10 @@ class _Scans(Scaled):
             squares = 2 * float(states.cost[k]) * self.size**2
             if (squares - self.least) / self.variance <= self.limit(level):
                 self.found[i].setdefault(float(y[i]), (squares, y))
-                more += [(i, float(x)) for x in self._near(i, y, float(error))]
-        self.add(more)
+                more = self.near(i, y, float(error), level)
+                near[i] = np.unique(np.concatenate([near.get(i, np.zeros(0)), more]))
+                fronts += [_Front(i, step, y) for step in (-1, 1)]
+        self.advance(fronts, near, np.inf)
 
     def find_ends(self, level: float) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
@@ -287,6 +320,8 @@ class _Scans(Scaled):
                 height = np.sqrt(d) - limit
                 for k in np.flatnonzero((height[:-1] <= 0) != (height[1:] <= 0)):
                     a, b, p, q = values[k], values[k + 1], height[k], height[k + 1]
+                    if min(abs(p), abs(q)) <= END * limit:
+                        continue
                     share = p / (p - q) if turn % 3 < 2 and np.isfinite(q - p) else 0.5
                     y = a + np.clip(share, 0.02, 0.98) * (b - a)
                     if a < y < b and abs(b - a) > 1e-6 * max(1.0, abs(a)):
@@ -320,6 +355,28 @@ class _Scans(Scaled):
             better = from_scaled(self.lower[: len(self.scale)], self.scale, self.log)
         given = (self.fit.names[i], real, d, limit, level, tuple(intervals))
         return Profile(*given, (float(low), float(high)), better)
+
+
+class _Front(NamedTuple):
+    """How far the scan of the i-th parameter has come in one direction."""
+
+    i: int
+    step: int  # -1 or 1
+    last: np.ndarray
+    before: np.ndarray | None = None
+
+    def next(self, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+        """Where to start at the next of the values: on a straight line; None at the end."""
+        i, last = self.i, self.last
+        ahead = values[(values - last[i]) * self.step > 0]
+        if len(ahead) == 0:
+            return None
+        value = ahead[0] if self.step > 0 else ahead[-1]
+        y = last
+        if self.before is not None:
+            share = (value - last[i]) / (last[i] - self.before[i])
+            y = np.clip(last + min(share, LONGEST) * (last - self.before), low, high)
+        return _with(y, i, value)
 
 
 def quantile(fit: "Fit", level: float) -> float:
@@ -357,7 +414,7 @@ def needs_profiles(fit: "Fit") -> bool:
     """Whether parabolas may mislead, and profiles cost little."""
     problem = fit.problem
     few = fit.experiments is not None and len(fit.predicted) <= FEW
-    if not few or not _can_be_profiled(fit) or not fit.converged:
+    if not few or not can_be_profiled(fit) or not fit.converged:
         return False
     if fit.rank < len(fit.names):
         return True

@@ -11,6 +11,7 @@ from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.profiles import in_words
+from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.records import as_data
@@ -18,6 +19,7 @@ from jimpact.status import STATUS
 
 _VELOCITIES_SHOWN = 24
 _MINIMA_SHOWN = 5
+_PARAMETERS_TOLD = 6  # in one sentence
 
 # Minima whose sums of squares differ by less than this many noise variances fit equally well:
 # the difference is what moving by one standard error costs.
@@ -25,17 +27,96 @@ EQUALLY_GOOD = 1.0
 
 
 def report(fit: Any) -> str:
-    """Parameters with errors, quality, what stays unseen, minima, warnings, shots."""
-    blocks = [
-        [_headline(fit)],
-        _parameters(fit),
-        _quality(fit),
-        _section("What the data cannot see", fit.identifiability),
-        _minima(fit),
-        _section("Warnings", fit.warnings),
-        _shots(fit),
-    ]
-    return "\n\n".join("\n".join(block) for block in blocks if block)
+    """Parameters with errors, quality, what stays unseen, minima, warnings, shots, the verdict."""
+    return "\n\n".join("\n".join(block) for block in report_blocks(fit).values() if block)
+
+
+def report_blocks(fit: Any) -> dict[str, list[str]]:
+    """The lines of the report, block by block."""
+    return {
+        "headline": [_headline(fit)],
+        "parameters": _parameters(fit),
+        "quality": _quality(fit),
+        "unseen": _section("What the data cannot see", fit.identifiability),
+        "minima": _minima(fit),
+        "scatter": _scatter(fit),
+        "warnings": _section("Warnings", fit.warnings),
+        "shots": _shots(fit),
+        "verdict": [verdict(fit)],
+    }
+
+
+def verdict(fit: Any) -> str:
+    """One sentence: the values with their errors, what cannot be told, whether to believe it."""
+    law, data = type(fit.law).__name__, _these(fit)
+    if not fit.converged:
+        return f"No answer: the search for the parameters of {law} has not converged."
+    known = [i for i in range(len(fit.names)) if _is_told(fit, i)]
+    unseen = [_called(fit, i) for i in range(len(fit.names)) if i not in known]
+    parts = [_told(fit, i) for i in known]
+    if len(known) > _PARAMETERS_TOLD:
+        relative = np.nan_to_num(fit.standard_error[known])
+        worst = known[int(np.argmax(relative))]
+        parts = [f"{len(known)} parameters are found, the least certain {_told(fit, worst)}"]
+    if unseen:
+        parts.append(f"{' and '.join(unseen)} cannot be told from {data}")
+    if any("different minima fit equally well" in line for line in fit.warnings):
+        parts.append("other values fit equally well")
+    told = "; ".join(parts)
+    scattering = shown_scatter(fit)
+    if scattering is not None and scattering.explains:
+        return f"{law} fits {data} if {scattering}"
+    if any(line.startswith("Lack of fit") for line in fit.warnings):
+        return f"{law} does not fit {data}, nearest is it with {told}."
+    if any(line.startswith("The fitted law fails") for line in fit.warnings):
+        return f"{law} fails in some of these shots, nearest is it with {told}."
+    return f"{told}."
+
+
+def _is_told(fit: Any, i: int) -> bool:
+    anything = bool(fit.profiles) and fit.profiles[i].words == "anything"
+    return not (np.isinf(fit.standard_error[i]) or anything)
+
+
+def _these(fit: Any) -> str:
+    if fit.experiments is None:
+        return "these data"
+    shots = int(np.isfinite(fit.problem.measured).any(axis=1).sum())
+    return "this shot" if shots == 1 else f"these {shots} shots"
+
+
+def _called(fit: Any, i: int) -> str:
+    """The name of a parameter; a stiffness is one over that of a contact which is held."""
+    name = fit.names[i]
+    held = any(note.startswith("stiffness[1] is held") for note in fit.problem.notes)
+    return f"the stiffness ratio {name} / stiffness[1]" if "stiffness" in name and held else name
+
+
+def _told(fit: Any, i: int) -> str:
+    """A parameter with its error, and the interval where that is one-sided or of several pieces."""
+    value, error, name = fit.value[i], fit.standard_error[i], _called(fit, i)
+    if np.isnan(error):
+        return f"{name} = {value:.5g}, its error unknown"
+    told = f"{value:g}" if fit.at_bound[i] else with_error(value, error)
+    if fit.profiles:
+        words = fit.profiles[i].words
+        if words.startswith("at ") or " or " in words:
+            return f"{name} = {told}, {words} ({100 * fit.profiles[i].level:g} %)"
+    return f"{name} = {told}{', the end of what is allowed' if fit.at_bound[i] else ''}"
+
+
+def with_error(value: float, error: float) -> str:
+    """A value and its standard error, to the digits that count.
+
+    >>> from jimpact.fits.report import with_error
+    >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
+    ('0.991 ± 0.004', '132 ± 18', '0.4 ± 0')
+    """
+    if not 1e-9 * abs(value) < error < np.inf:
+        return f"{value:.6g} ± {error:.2g}"
+    power = int(np.floor(np.log10(error)))
+    digits = max(0, -power + (error < 2 * 10.0**power))  # two digits of an error that begins with 1
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _headline(fit: Any) -> str:
@@ -69,6 +150,10 @@ def _quality(fit: Any) -> list[str]:
     if fit.problem.sigma is not None:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
         lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
+        if fit.noise > 1:
+            lines.append(
+                f"errors         stretched by {fit.noise:.3g}, the root of chi^2 over that"
+            )
     elif np.isfinite(fit.noise):
         lines.append(
             f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
@@ -81,6 +166,21 @@ def _quality(fit: Any) -> list[str]:
 
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:
     return [title, *(f"  - {line}" for line in lines)] if lines else []
+
+
+def _scatter(fit: Any) -> list[str]:
+    found = shown_scatter(fit)
+    if found is None:
+        return []
+    lines = ["Scatter from shot to shot", f"  - {found}"]
+    speed = fit.experiments.approach_speed(fit.problem.scene)
+    chance = found.trend(np.log(np.where(speed > 0, speed, 1.0)))
+    if chance < SURE:
+        lines.append(
+            f"  - It depends on the speed (chance without that {chance:.1g}): see "
+            "`ji.VelocityDependent`."
+        )
+    return lines
 
 
 def _minima(fit: Any) -> list[str]:
@@ -151,6 +251,8 @@ def to_json(fit: Any) -> dict[str, Any]:
         "rank": fit.rank,
         "identifiability": list(fit.identifiability),
         "warnings": list(fit.warnings),
+        "verdict": verdict(fit),
+        "seed": fit.seed,
         "converged": fit.converged,
         "covariance": as_data(fit.covariance),
         "correlation": as_data(fit.correlation),

@@ -7,9 +7,13 @@ from jimpact.laws.compliant import Compliant, make_compliant
 from jimpact.laws.kinematic import Moreau, Newton, RestitutionMatrix
 from jimpact.laws.lzb import LZB
 from jimpact.laws.poisson import Poisson
+from jimpact.laws.velocity_dependent import VelocityDependent, make_velocity_dependent
 from jimpact.registry import EVERY_PROPERTY, REGISTRY, Row, register
 
-__all__ = ["REGISTRY", "Row", "register"]
+__all__ = ["REGISTRY", "SIMPLEST_FIRST", "Row", "register"]
+
+# Laws in the order of what they must know of the contacts: of two that do, the first is enough.
+SIMPLEST_FIRST = ("newton", "moreau", "poisson", "binary", "lzb", "compliant")
 
 # entries by key: each begins @kind{key,
 _BIBTEX = {
@@ -87,4 +91,16 @@ register(
     source="Brogliato (2016), (6.14)-(6.16); forces as cited in `jimpact.laws.forces`",
     bibtex=_BIBTEX["brogliato2016"],
     make=make_compliant,
+)
+
+register(
+    "velocity_dependent",
+    VelocityDependent,
+    summary="a law by name (`base`) whose e falls with the speed, and is 1 below the yield speed",
+    right_when="shots of very different speeds, metals above their yield",
+    fails_when="all shots equally fast: e and its exponent cannot be told apart",
+    promises=(),  # those of its base, but scaling with the velocity
+    source="Brogliato, Nonsmooth Mechanics (2016), 6.3.1; Johnson, Contact Mechanics (1985), 11.5",
+    bibtex=_BIBTEX["johnson1985"],
+    make=make_velocity_dependent,
 )

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array
-from jimpact.law import Declared, StaticOrValues, Values, parameter
+from jimpact.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
 
 _SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
 _BISECTIONS = 50  # of them, to about 1e-13 decades
@@ -84,7 +84,9 @@ class Bistiffness(Force):
     """
 
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
-    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    exponent: StaticOrValues = parameter(
+        low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
+    )
     restitution: Values = parameter(low=0.0, high=1.0, default=1.0)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
@@ -196,7 +198,9 @@ class HuntCrossley(Force):
 
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
     damping: Values = parameter(low=0.0)
-    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    exponent: StaticOrValues = parameter(
+        low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
+    )
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x^eta (1 + d x')`."""

@@ -9,6 +9,7 @@ from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
 from jimpact.events.impact_dynamics import METHODS, Dynamics, dimensionless, sides_of, solve
 from jimpact.law import (
+    LARGEST_EXPONENT,
     Impulses,
     Law,
     OptionalValues,
@@ -123,7 +124,9 @@ class LZB(Law):
 
     restitution: Values = parameter(low=0.0, high=1.0)
     stiffness: Values = parameter(low=0.0, open_low=True, log=True, default=1.0)
-    exponent: StaticOrValues = parameter(low=1.0, static_numbers=True, default=1.5)
+    exponent: StaticOrValues = parameter(
+        low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
+    )
     initial_energy: Values = parameter(low=0.0, default=0.0)
     friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)

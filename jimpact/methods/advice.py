@@ -16,6 +16,7 @@ from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
 from jimpact.law import Law
+from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
@@ -389,7 +390,7 @@ def trials(at: Situation, restitution: Any, stiffness: np.ndarray, eta: Any) -> 
     if gapped:
         found["binary"] = found["binary"]._replace(scene=at.scene)
         found["compliant"] = Trial(Compliant(Bistiffness(k, eta, e)), at.scene)
-    return found
+    return {name: found[name] for name in SIMPLEST_FIRST if name in found}
 
 
 def outcomes(

@@ -99,10 +99,9 @@ def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales)
     cone = (mu * found.normal - jnp.abs(found.tangential)) * w[m:] + slack
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
-    regular = jax.lax.cond(
-        slides, lambda: regularity(given, mu, modes), lambda: jnp.ones_like(w[0])
-    )
-    lasts = regular - least_regularity(w.dtype)
+    lasts = jax.lax.cond(
+        slides, lambda: regularity(given, mu, modes), lambda: jnp.ones((), w.dtype)
+    ) - least_regularity(w.dtype)
     slip = modes.sign * given.tangent.rate
     slip = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
     side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)

@@ -8,6 +8,7 @@ from .charts import (
     work_precision as work_precision,
 )
 from .fits import contour as contour, fit as fit
+from .inference import correlation as correlation, profiles as profiles, residuals as residuals
 from .laws import (
     comparison as comparison,
     forces as forces,

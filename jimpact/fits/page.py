@@ -1,0 +1,160 @@
+"""A fit as one self-contained page: text, tables and pictures in a single HTML file."""
+
+import platform
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from html import escape
+from importlib.metadata import PackageNotFoundError, version
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import jimpact
+from jimpact.fits.profiles import can_be_profiled, in_words, profile
+from jimpact.fits.report import report_blocks
+from jimpact.status import STATUS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_VECTORS = 400  # values up to which a picture is drawn in vectors; beyond, points outweigh pixels
+_DPI = 110
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+.verdict { font-size: 1.2rem; border-left: .3rem solid #0072B2; padding-left: .8rem; }
+table { border-collapse: collapse; margin: .5rem 0; }
+td, th { padding: .15rem .8rem .15rem 0; text-align: right; border-bottom: 1px solid #ddd; }
+td:first-child, th:first-child { text-align: left; }
+img { max-width: 100%; }
+.small { color: #555; font-size: .85rem; }
+""".strip()
+_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
+
+
+def write_page(fit: Any, path: Path, profiles: bool) -> Path:
+    """Write `Fit.report`."""
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"Argument `path` must end in .html, but is '{path}'.")
+    if profiles and not fit.profiles and can_be_profiled(fit):
+        fit = replace(fit, profiles=profile(fit))
+    text = page(fit)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def page(fit: Any) -> str:
+    """The page as text."""
+    blocks = report_blocks(fit)
+    title = escape(blocks["headline"][0])
+    parts = [
+        f"<h1>{title}</h1>",
+        f'<p class="verdict">{escape(fit.verdict)}</p>',
+        "<h2>Parameters</h2>",
+        _table(*_parameters(fit)),
+        _listed("What the data cannot see", fit.identifiability),
+        _listed("Defects of the data, warnings", fit.warnings or ("None.",)),
+        _listed("Scatter from shot to shot", [x.strip(" -") for x in blocks["scatter"][1:]]),
+        _listed("Quality", [*blocks["quality"], *blocks["minima"]]),
+        "<h2>Pictures</h2>",
+        *_pictures(fit),
+    ]
+    if fit.experiments is not None:
+        parts += ["<h2>Shots</h2>", _table(*_shots(fit))]
+    parts += ["<h2>How</h2>", _table(("", ""), _made_by(fit))]
+    body = "\n".join(part for part in parts if part)
+    head = f'<meta charset="utf-8">\n<title>{title}</title>\n<style>{_STYLE}</style>'
+    whole = f"<head>\n{head}\n</head>\n<body>\n{body}\n</body>"
+    return f'<!DOCTYPE html>\n<html lang="en">\n{whole}\n</html>\n'
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["<table>"]
+    if any(heads):
+        lines.append(f"<tr>{''.join(f'<th>{escape(x)}</th>' for x in heads)}</tr>")
+    lines += [f"<tr>{''.join(f'<td>{escape(x)}</td>' for x in row)}</tr>" for row in rows]
+    return "\n".join([*lines, "</table>"])
+
+
+def _listed(title: str, lines: Sequence[str]) -> str:
+    if not lines:
+        return ""
+    items = "\n".join(f"<li>{escape(' '.join(line.split()))}</li>" for line in lines)
+    return f"<h2>{escape(title)}</h2>\n<ul>\n{items}\n</ul>"
+
+
+def _parameters(fit: Any) -> tuple[list[str], list[list[str]]]:
+    kind = "profile" if fit.profiles else "linearized"
+    heads = ["parameter", "value", "standard error", f"95 % interval, {kind}", ""]
+    rows = []
+    for i, pieces in enumerate(fit.intervals()):
+        error = fit.standard_error[i]
+        word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
+        told = np.isfinite(error) or bool(fit.profiles)
+        interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
+        note = "at its bound" if fit.at_bound[i] else ""
+        rows.append([fit.names[i], f"{fit.value[i]:.6g}", word, interval, note])
+    return heads, rows
+
+
+def _shots(fit: Any) -> tuple[list[str], list[list[str]]]:
+    data = fit.experiments
+    before, measured = np.asarray(data.pre, float), np.asarray(fit.problem.measured, float)
+    rows = []
+    for k, i in np.ndindex(*before.shape):
+        code = int(fit.status[k])
+        seen = "-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"
+        residual = "-" if np.isnan(measured[k, i]) else f"{fit.residual[k, i]:.3g}"
+        values = [f"{before[k, i]:.6g}", seen, f"{fit.predicted[k, i]:.6g}", residual]
+        told = "" if code == 0 or i else STATUS[code].name
+        rows.append([data.shots[k] if i == 0 else "", str(i + 1), *values, data.units[i], told])
+    return ["shot", "velocity", "before", "measured", "fitted", "residual", "unit", "status"], rows
+
+
+def _pictures(fit: Any) -> list[str]:
+    from jimpact import plot
+
+    drawn = []
+    if fit.experiments is not None:
+        drawn.append(("Measured and fitted velocities", plot.fit(fit)))
+    drawn.append(("Residuals", plot.residuals(fit)))
+    if fit.profiles:
+        drawn.append(
+            ("Profile likelihoods: shaded is the 95 % interval", plot.profiles(fit.profiles))
+        )
+    if len(fit.names) > 1:
+        drawn.append(("Correlations of the errors", plot.correlation(fit)))
+    few = np.size(fit.problem.measured) <= _VECTORS
+    return [_inline(title, figure, few) for title, figure in drawn]
+
+
+def _inline(title: str, figure: "Figure", vectors: bool) -> str:
+    whole = BytesIO()
+    if vectors:
+        figure.savefig(whole, format="svg", metadata={"Date": None})
+    else:
+        figure.savefig(whole, format="png", dpi=_DPI)
+    kind = "svg+xml" if vectors else "png"
+    data = b64encode(whole.getvalue()).decode()
+    return (
+        f'<p>{escape(title)}</p>\n<img alt="{escape(title)}" src="data:image/{kind};base64,{data}">'
+    )
+
+
+def _made_by(fit: Any) -> list[list[str]]:
+    starts = sum(start.count for start in fit.starts) + fit.lost_starts
+    rows = [
+        ["law", repr(fit.law)],
+        ["solver", f"{fit.method}, loss {fit.loss}, {starts} starts, seed {fit.seed}"],
+        ["precision", str(fit.problem.residuals.offset.dtype)],
+        ["jimpact", jimpact.__version__],
+    ]
+    for name in _PACKAGES:
+        try:
+            rows.append([name, version(name)])
+        except PackageNotFoundError:  # installed in a way that leaves no record
+            continue
+    return [*rows, ["Python", f"{platform.python_version()}, {platform.system()}"]]

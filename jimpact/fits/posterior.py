@@ -1,0 +1,182 @@
+"""The posterior of a fit's parameters, sampled by numpyro's NUTS (extra `bayes`)."""
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_whole, check_kind
+from jimpact.fits.fitting import Fit
+from jimpact.fits.least_squares import Box
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.tables import needed
+from jimpact.montecarlo.distributions import Normal, Uniform
+
+HOW = 'pip install "jimpact[bayes]"'
+# Chains begin inside: at the end of a domain the sampler's own coordinate is infinite.
+_INSIDE = 1e-3  # of the domain's width, or of the value where it has no end
+MIXED = 1.05  # r-hat above which chains disagree about where the posterior is
+
+
+def posterior(
+    fit: Fit | FitProblem,
+    priors: Mapping[str, Any] | None = None,
+    *,
+    samples: int = 1000,
+    warmup: int = 1000,
+    chains: int = 4,
+    seed: int = 0,
+) -> Any:
+    """Draws from the posterior density of the parameters, by NUTS.
+
+    Equation: `p(x | data) ~ exp(problem.log_density(x)) prior(x)`; where sigma is not known it is
+    integrated over `d sigma / sigma`. Chains start at the fit. Derivatives are by forward mode.
+
+    Args:
+        fit: a fit by least squares, or a problem.
+        priors: by name of a parameter, or of a field for all its entries: `ji.Uniform(low, high)`,
+            `ji.Normal(mean, std)` (truncated to the domain), or a numpyro distribution of a scalar.
+            Others are flat over the parameter's domain; of what is fitted in its logarithm (a
+            stiffness), flat in that.
+        samples, warmup: of each chain.
+        chains: side by side in one program.
+        seed: of the sampler.
+
+    Returns:
+        `arviz.InferenceData` whose variables are called like the parameters.
+
+    Raises:
+        ImportError: numpyro or arviz is missing; the extra is named.
+        ValueError: unknown names, priors outside the domain, a robust loss, a matrix that is kept
+            admissible.
+
+    Warns of chains that disagree, and of divergences: the draws are then not to be trusted.
+    """
+    numpyro, arviz = needed("numpyro", HOW), needed("arviz", HOW)
+    check_kind("fit", fit.problem if isinstance(fit, Fit) else fit, FitProblem)
+    if isinstance(fit, Fit) and fit.loss != "squares":
+        raise ValueError(f"Argument `fit` must be by least squares, but has loss {fit.loss!r}.")
+    problem = fit.problem if isinstance(fit, Fit) else fit
+    start = fit.value if isinstance(fit, Fit) else problem.start
+    if not isinstance(problem.residuals.region, Box):
+        raise ValueError("Argument `fit` must not be of a matrix that is kept admissible.")
+    for name, count in (("samples", samples), ("warmup", warmup), ("chains", chains)):
+        as_whole(name, count, 1)
+    each = _priors(problem, dict(priors or {}), numpyro.distributions)
+
+    def model() -> None:
+        x = jnp.stack([numpyro.sample(name, prior) for name, prior in each.items()])
+        numpyro.factor("data", problem.log_density(x))
+
+    first = dict(zip(problem.names, _inside(start, problem.domains)))
+    kernel = numpyro.infer.NUTS(
+        model,
+        forward_mode_differentiation=True,
+        dense_mass=len(each) > 1,
+        init_strategy=numpyro.infer.init_to_value(values=first),
+    )
+    sampler = numpyro.infer.MCMC(
+        kernel,
+        num_warmup=warmup,
+        num_samples=samples,
+        num_chains=chains,
+        chain_method="vectorized",
+        progress_bar=False,
+    )
+    sampler.run(jax.random.PRNGKey(seed))
+    found = arviz.from_numpyro(sampler, log_likelihood=False)
+    _warn(found, arviz)
+    return found
+
+
+def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
+    low, high = domains.T
+    width = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0))
+    return np.clip(start, low + _INSIDE * width, high - _INSIDE * width)
+
+
+def _priors(problem: FitProblem, given: dict[str, Any], kinds: Any) -> dict[str, Any]:
+    """A distribution of numpyro a parameter."""
+    parameters, found = problem.parameters, {}
+    for i, name in enumerate(problem.names):
+        field = parameters.field_of(i)
+        chosen = given.get(name, given.get(field))
+        log = bool(parameters.log[parameters.first[i]])
+        low, high = (float(end) for end in problem.domains[i])
+        found[name] = _prior(name, chosen, low, high, log, kinds)
+    known = {*problem.names, *(parameters.field_of(i) for i in range(len(problem.names)))}
+    for name in given:
+        if name not in known:
+            raise ValueError(
+                f"Argument `priors` must name parameters, {', '.join(sorted(known))}, "
+                f"but has {name!r}."
+            )
+    return found
+
+
+def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: Any) -> Any:
+    if chosen is None:
+        if np.isfinite([low, high]).all():
+            return kinds.LogUniform(low, high) if log else kinds.Uniform(low, high)
+        real, c = (low, high), kinds.constraints
+        if np.isinf(real).all():
+            return kinds.ImproperUniform(c.real, (), ())
+        end = c.greater_than(low) if np.isfinite(low) else c.less_than(high)
+        return kinds.ImproperUniform(end, (), ())
+    if isinstance(chosen, Uniform):
+        a, b = float(chosen.low), float(chosen.high)
+        if not low <= a < b <= high:
+            raise ValueError(
+                f"Argument `priors` must lie in [{low:g}, {high:g}] for `{name}`, but has "
+                f"{chosen!r}."
+            )
+        return kinds.Uniform(a, b)
+    if isinstance(chosen, Normal):
+        ends = {"low": low, "high": high}
+        ends = {key: end for key, end in ends.items() if np.isfinite(end)}
+        mean, std = float(chosen.mean), float(chosen.std)
+        if not low <= mean <= high:
+            raise ValueError(
+                f"Argument `priors` must have its mean in [{low:g}, {high:g}] for `{name}`, but "
+                f"has {chosen!r}."
+            )
+        return kinds.TruncatedNormal(mean, std, **ends) if ends else kinds.Normal(mean, std)
+    if not isinstance(chosen, kinds.Distribution) or chosen.shape() != ():
+        raise ValueError(
+            f"Argument `priors` must map `{name}` to a ji.Uniform, a ji.Normal or a numpyro "
+            f"distribution of one number, but has {chosen!r}."
+        )
+    _check_support(name, chosen, low, high)
+    return chosen
+
+
+def _check_support(name: str, prior: Any, low: float, high: float) -> None:
+    """What a numpyro distribution can yield must lie in the domain: seen on a sample."""
+    drawn = np.asarray(prior.sample(jax.random.PRNGKey(0), (1000,)))
+    if (drawn < low).any() or (drawn > high).any():
+        raise ValueError(
+            f"Argument `priors` must lie in [{low:g}, {high:g}] for `{name}`, but draws reach "
+            f"from {drawn.min():.3g} to {drawn.max():.3g}."
+        )
+
+
+def _warn(found: Any, arviz: Any) -> None:
+    """Say where the draws are not to be trusted."""
+    diverging = int(np.asarray(found.sample_stats["diverging"]).sum())
+    if diverging:
+        warnings.warn(
+            f"{diverging} transitions diverged: the posterior has an edge or a kink that the "
+            "sampler did not resolve; its draws near there are too few.",
+            stacklevel=3,
+        )
+    if found.posterior.sizes["chain"] > 1:
+        spread = arviz.rhat(found).to_array()
+        if float(spread.max()) > MIXED:
+            warnings.warn(
+                f"The chains disagree (r-hat up to {float(spread.max()):.3g}): draw more, or there "
+                "are several minima.",
+                stacklevel=3,
+            )

@@ -1,0 +1,547 @@
+"""Which law: every registered one on the same data, the simplest adequate one first."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import chdtrc, fdtrc, stdtr
+
+from jimpact._checks import check_choice, check_kind
+from jimpact.comparison import registered_laws
+from jimpact.experiments import Experiments
+from jimpact.fits.fitting import Fit, fit
+from jimpact.fits.many import leave_one_out
+from jimpact.fits.matrix_fit import admissible_start
+from jimpact.fits.multistart import EXACT
+from jimpact.fits.problem import FEW
+from jimpact.fits.profiles import needs_profiles, profile
+from jimpact.law import Law, free_parameters_of, with_parameter
+from jimpact.laws import SIMPLEST_FIRST
+from jimpact.laws.lzb import LZB
+from jimpact.laws.velocity_dependent import VelocityDependent
+from jimpact.progress import progress_bar
+from jimpact.records import as_data, number, table
+from jimpact.scene import Scene
+from jimpact.status import STATUS
+
+RESTITUTION = 0.8  # start of what nobody gives
+SPEED_EXPONENT = 0.1  # start of a dependence on the speed
+WORSE = 0.01  # chance at which a law counts as a worse predictor than the best
+WORSE_OF_FEW = 0.05  # the same by the residuals, of fewer shots
+SAME = 1e-5  # share by which squares of the same law differ, as solvers leave them
+_LEAST = 4  # shots from which predictions of two laws are compared
+_TIERS = ("fits", "lack of fit", "worse", "fails")
+
+
+@dataclass(frozen=True, eq=False)
+class LawFit:
+    """A law at its best: its `fit`, how it predicts shots left out, and what is against it.
+
+    `left_out_error` is the root mean square error of shots predicted from the others [m/s], NaN of
+    fewer than two shots; `aicc` is NaN where it means nothing (see `fit_laws`); `verdict` is
+    'fits', or why not.
+    """
+
+    name: str
+    fit: Fit
+    left_out_error: float
+    aicc: float
+    verdict: str
+    tier: str
+
+    @property
+    def adequate(self) -> bool:
+        """Whether nothing is against it."""
+        return self.tier == "fits"
+
+    @property
+    def parameters(self) -> int:
+        """How many are fitted."""
+        return len(self.fit.names)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a JSON file can hold."""
+        told = {
+            "parameters": self.parameters,
+            "rms": self.fit.rms,
+            "left_out_error": self.left_out_error,
+            "aicc": self.aicc,
+            "adequate": self.adequate,
+            "verdict": self.verdict,
+        }
+        return as_data(told) | {"fit": self.fit.to_dict()}
+
+
+@dataclass(frozen=True, eq=False)
+class LawFits:
+    """What `fit_laws` found: `entries` by name, the simplest adequate law first; `print` says all.
+
+    `left_out[name]` says why a law was not tried; `speed` whether the first law's e depends on the
+    speed, where that was asked for.
+    """
+
+    entries: dict[str, LawFit]
+    left_out: dict[str, str] = field(default_factory=dict)
+    speed: "NestedTest | None" = None
+
+    @property
+    def best(self) -> LawFit:
+        """The first one."""
+        return next(iter(self.entries.values()))
+
+    @property
+    def verdict(self) -> str:
+        """Which law, in one sentence."""
+        best = self.best
+        if best.adequate:
+            return f"The simplest law that fits is {best.name}: {best.fit.verdict}"
+        if best.tier == "lack of fit":
+            return (
+                f"No law fits; the simplest that predicts as well as any is {best.name}: "
+                f"{best.fit.verdict}"
+            )
+        return f"No law fits; the nearest is {best.name} ({best.verdict}): {best.fit.verdict}"
+
+    def rows(self) -> tuple[list[str], list[list[Any]]]:
+        """Heads and rows of the table, a row a law."""
+        heads = ["law", "parameters", "rms_m_per_s", "left_out_m_per_s", "aicc", "verdict"]
+        rows = [
+            [name, x.parameters, x.fit.rms, x.left_out_error, x.aicc, x.verdict]
+            for name, x in self.entries.items()
+        ]
+        return heads, [[None if x != x else x for x in row] for row in rows]
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a JSON file can hold."""
+        told = {"best": self.best.name, "verdict": self.verdict, "left_out": self.left_out}
+        return told | as_data({"laws": self.entries, "speed": self.speed})
+
+    def __str__(self) -> str:
+        heads = ["law", "free", "rms", "left out", "AICc", "verdict", "values"]
+        rows = []
+        for name, x in self.entries.items():
+            values = ", ".join(f"{v:.4g}" for v in x.fit.value)
+            numbers = [number(x.fit.rms, ".4g"), number(x.left_out_error, ".4g")]
+            aicc = number(x.aicc, ".1f")
+            rows.append([name, str(x.parameters), *numbers, aicc, x.verdict, values])
+        lines = table(heads, rows, left=["verdict", "values"])
+        lines.append("rms and error of shots left out in m/s; simplest adequate law first.")
+        lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
+        if self.speed is not None:
+            lines.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
+        return "\n".join([*lines, self.verdict])
+
+
+class NestedTest(NamedTuple):
+    """Whether further parameters are needed: F, or chi^2 where sigma is known and fits."""
+
+    statistic: float
+    more: int
+    degrees_of_freedom: int | None
+    chance: float
+    names: tuple[str, ...]
+
+    @property
+    def needed(self) -> bool:
+        """Whether data of the simpler law would show this less than once in a hundred times."""
+        return self.chance < WORSE
+
+    def __str__(self) -> str:
+        word = "needed" if self.needed else "not needed"
+        kind = "chi^2" if self.degrees_of_freedom is None else "F"
+        rest = "" if self.degrees_of_freedom is None else f" and {self.degrees_of_freedom}"
+        return (
+            f"{', '.join(self.names)} {word}: {kind} = {self.statistic:.3g} with {self.more}{rest} "
+            f"degrees of freedom, chance {self.chance:.2g}."
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """What a JSON file can hold."""
+        return as_data(self._asdict() | {"needed": self.needed, "words": str(self)})
+
+
+def nested_test(simple: Fit, full: Fit) -> NestedTest:
+    """Whether the data need the parameters that one fit has beyond another one.
+
+    Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further parameters seen, f
+    degrees of freedom of the full fit; with sigma, unless the full fit contradicts it, `S - S_full`
+    is chi^2 with q degrees of freedom. Where the simple law is at the end of a domain of the full
+    one (a yield speed of 0), the chance told is up to twice too large.
+
+    Args:
+        simple, full: fits by least squares of the same data; the law of `simple` is a special case.
+
+    Raises:
+        ValueError: other data, a robust loss, no more parameters.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments(
+    ...     pre=[[1.0, 0.0], [2.0, 0.0], [4.0, 0.0], [8.0, 0.0]],
+    ...     post=[[0.1, 0.9], [0.26, 1.74], [0.63, 3.37], [1.48, 6.52]], sigma=0.005,
+    ... )
+    >>> law, pair = ji.Newton(0.7), ji.chain([1.0, 1.0])
+    >>> constant = ji.fit(law, pair, data)
+    >>> falling = ji.fit(ji.VelocityDependent(law, speed_exponent=0.1), pair, data)
+    >>> ji.nested_test(constant, falling).needed
+    True
+    """
+    for name, each in (("simple", simple), ("full", full)):
+        check_kind(name, each, Fit)
+        if each.loss != "squares":
+            raise ValueError(f"Argument `{name}` must be by least squares, but is {each.loss!r}.")
+    same = np.array_equal(simple.problem.measured, full.problem.measured, equal_nan=True)
+    if not same:
+        raise ValueError("Arguments `simple` and `full` must be fits of the same data.")
+    more = full.rank - simple.rank
+    if more < 1:
+        raise ValueError(
+            "Argument `full` must have more parameters that the data see than `simple`, "
+            f"but has {full.rank} and {simple.rank}."
+        )
+    names = tuple(x for x in full.names if x not in simple.names) or full.names
+    left, rest = full.starts[0].sum_of_squares, full.degrees_of_freedom
+    gain = max(simple.starts[0].sum_of_squares - left, 0.0)
+    if full.problem.sigma is not None and full.noise <= 1:
+        return NestedTest(gain, more, None, float(chdtrc(more, gain)), names)
+    if rest < 1:
+        return NestedTest(np.nan, more, rest, 1.0, names)
+    least = EXACT[str(full.problem.residuals.offset.dtype)]
+    floor = least * float(full.problem.residuals.size) ** 2  # of what is reproduced exactly
+    ratio = gain / more / (max(left, floor) / rest)
+    return NestedTest(ratio, more, rest, float(fdtrc(more, rest, ratio)), names)
+
+
+def fit_laws(
+    scene: Scene | None,
+    data: Experiments,
+    laws: Iterable[str] | Mapping[str, Law] | None = None,
+    *,
+    free: Iterable[str] = (),
+    speed: bool = False,
+    starts: int = 8,
+    seed: int = 0,
+    progress: float | None = None,
+    done: Callable[[str, Fit], None] | None = None,
+    **values: Any,
+) -> LawFits:
+    """Every law on the same data: which is the simplest that is adequate?
+
+    Each law is fitted with one e for all contacts, with one each, and, where it has stiffnesses,
+    with and without free ratios of them; a `RestitutionMatrix` from an admissible one. A law is
+    adequate if its fit converges, shows no lack of fit (see `fit`), fails in no shot, and predicts
+    shots left out no worse than the best law does: a paired t test over shots at 1 %, of more than
+    64 shots linearized; of fewer than 4 an F test of the residuals at 5 %. Adequate laws come
+    first, those with fewer parameters before others, and of these the one that needs to know less
+    of the contacts, in the order of `advise`. AICc is told where it means something: rank full,
+    nothing at a bound, no shot left out, degrees of freedom left.
+
+    Args:
+        scene: of all shots; not used where the data carry one a shot.
+        data: measured shots.
+        laws: names of the registry, or laws by a name of your own (each with its default free
+            parameters); None: all of the registry that these values make.
+        free: further parameters, such as 'friction', fitted in every law that has them.
+        speed: test whether e of the first law depends on the speed (`VelocityDependent`).
+        starts, seed, progress: as of `fit`, of every law.
+        done: called with name and fit after every law.
+        values: parameters by name, `friction=0.2, stiffness=..., exponent=...`: starts of what is
+            fitted, held otherwise; restitution starts at 0.8. Without a stiffness, laws that need
+            it in SI units are left out.
+
+    Raises:
+        ValueError: unknown laws, no law that can be fitted.
+
+    >>> import numpy as np
+    >>> import jimpact as ji
+    >>> before = np.stack([np.linspace(1, 2, 6), np.zeros(6)], axis=1)
+    >>> after = before @ [[0.2, 0.8], [0.8, 0.2]]
+    >>> after += 0.01 * np.random.default_rng(1).normal(size=after.shape)
+    >>> found = ji.fit_laws(ji.chain([1.0, 1.0]), ji.Experiments(before, after), ["newton"])
+    >>> found.best.name, found.best.adequate
+    ('newton', True)
+    """
+    check_kind("data", data, Experiments)
+    scenes = [data.scene_of(scene, k) for k in range(len(data.shots))]
+    candidates, left_out = _candidates(scenes, laws, dict(values), tuple(free))
+    fits: dict[str, Fit] = {}
+    options: dict[str, Any] = {"starts": starts, "seed": seed, "progress": False}
+    options["profiles"] = False
+    with progress_bar(progress) as show:
+        for i, (name, (law, chosen)) in enumerate(candidates.items()):
+            show(f"fit_laws: {name}, law {i + 1} of {len(candidates)}", i, len(candidates))
+            try:
+                fits[name] = fit(law, scene, data, chosen, **options)
+            except ValueError as error:
+                left_out[name] = f"cannot be fitted: {error}"
+                continue
+            if done is not None:
+                done(name, fits[name])
+        if not fits:
+            why = "; ".join(f"{name} {reason}" for name, reason in left_out.items())
+            raise ValueError(f"Argument `laws` must hold a law that can be fitted, but: {why}")
+        entries = _judged(fits)
+        best = next(iter(entries))
+        if needs_profiles(fits[best]):
+            fits[best] = replace(fits[best], profiles=profile(fits[best], progress=False))
+            entries[best] = replace(entries[best], fit=fits[best])
+        test = None
+        if speed:
+            show(f"fit_laws: {best}, dependence on the speed", len(candidates), len(candidates))
+            test = _speed_test(fits[best], candidates[best], scene, data, options)
+    return LawFits(entries, left_out, test)
+
+
+Candidate = tuple[Law, Any]  # and what is free in it
+
+
+def _candidates(
+    scenes: list[Scene],
+    laws: Iterable[str] | Mapping[str, Law] | None,
+    values: dict[str, Any],
+    more: tuple[str, ...],
+) -> tuple[dict[str, Candidate], dict[str, str]]:
+    """Laws to fit by name, and why others are not tried."""
+    if isinstance(laws, Mapping):
+        for name, law in laws.items():
+            check_kind(f"laws[{name!r}]", law, Law)
+        return {name: (law, _default(law, more)) for name, law in laws.items()}, {}
+    contacts = max(scene.contacts for scene in scenes)
+    alike = len({scene.contacts for scene in scenes}) == 1
+    values = {"restitution": RESTITUTION} | values
+    left_out: dict[str, str] = {}
+    if "matrix" not in values and contacts > 1:
+        try:
+            values["matrix"] = admissible_start(scenes)
+        except ValueError as error:
+            left_out["restitution_matrix"] = f"has no start: {error}"
+    built, missing = registered_laws(values)
+    left_out = missing | left_out
+    if "compliant" in built and all(bool(np.all(scene.closed)) for scene in scenes):
+        left_out["compliant"] = "is lzb where no contact has a gap"
+    if "base" not in values:
+        left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
+    built = {name: law for name, law in built.items() if name not in left_out}
+    if laws is not None:
+        from jimpact.laws import REGISTRY
+
+        wanted = tuple(laws)
+        for name in wanted:
+            check_choice("laws", name, tuple(REGISTRY))
+        built = {name: law for name, law in built.items() if name in wanted}
+        left_out = {name: why for name, why in left_out.items() if name in wanted}
+    found: dict[str, Candidate] = {}
+    for name, law in built.items():
+        for label, candidate in _variants(law, contacts, alike, more).items():
+            found[f"{name}{label}"] = candidate
+    return found, left_out
+
+
+def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
+    """What is free in a caller's law: as by default, and further parameters that it has."""
+    from jimpact.fits.parameters import default_free
+
+    known = free_parameters_of(law)
+    return dict.fromkeys((*default_free(known), *(name for name in more if name in known)), True)
+
+
+def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> dict[str, Candidate]:
+    """One e for all contacts or one each, stiffness ratios held or free; one program serves all."""
+    known = free_parameters_of(law)
+    if "restitution" not in known or np.ndim(known["restitution"].value) > 1:
+        return {"": (law, _default(law, more))}
+    fields = [name for name in ("restitution", "stiffness") if name in known]
+    others = {name: True for name in more if name in known and name not in fields}
+    if contacts == 1:  # the same program as a plain fit
+        return {"": (law, dict.fromkeys(("restitution", *others), True))}
+    for name in fields:
+        each = jnp.broadcast_to(known[name].value, (contacts,))
+        law = with_parameter(law, name, each)
+    one, each_own = np.ones(contacts, int), np.arange(1, contacts + 1)
+    coefficients = {"": one} | ({", e per contact": each_own} if alike else {})
+    ratios: dict[str, Any] = {"": np.zeros(contacts, int)}
+    if alike and isinstance(law, LZB):  # of others the stiffness is one in SI units
+        ratios[", free stiffness ratios"] = each_own
+    return {
+        f"{a}{b}": (
+            law,
+            {"restitution": e} | ({"stiffness": k} if "stiffness" in known else {}) | others,
+        )
+        for a, e in coefficients.items()
+        for b, k in ratios.items()
+    }
+
+
+# ------------------------------------------------------------------------------- the evidence
+
+
+def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
+    """The laws with their verdicts, in order."""
+    errors = {name: _errors_left_out(found) for name, found in fits.items()}
+    against = {name: _against(found) for name, found in fits.items()}
+    squares = {name: _per_shot(fits[name], errors[name]) for name in fits}
+    usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
+    many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
+    least = {name: _total(squares[name]) if many else _variance(fits[name]) for name in usable}
+    best = min(usable, key=lambda name: (least[name], len(fits[name].names)))
+    found = []
+    for name, each in fits.items():
+        tier, verdict = against[name]
+        if many:
+            chance, level, worse = _chance(squares[name], squares[best]), WORSE, "predicts worse"
+        else:
+            chance, level, worse = _by_residuals(each, fits[best]), WORSE_OF_FEW, "fits worse"
+        if tier != "fails" and chance < level:
+            worse = f"{worse} than {best} (chance {chance:.1g})"
+            tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
+        error = _left_out_rms(each, errors[name])
+        found.append(LawFit(name, each, error, _aicc(each), verdict, tier))
+    return {x.name: x for x in sorted(found, key=_order)}
+
+
+def _order(entry: LawFit) -> tuple[Any, ...]:
+    """Adequate first, by parameters, then in the order of `advise`; the rest by error."""
+    tier = _TIERS.index(entry.tier)
+    base = entry.name.split(",")[0]
+    place = SIMPLEST_FIRST.index(base) if base in SIMPLEST_FIRST else len(SIMPLEST_FIRST)
+    error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
+    return (tier, entry.parameters, place) if tier < 2 else (tier, error, place)
+
+
+def _against(found: Fit) -> tuple[str, str]:
+    """What is against a law by itself: (tier, in words)."""
+    codes = [code for code in found.status if STATUS[code].failure]
+    if codes:
+        names = ", ".join(dict.fromkeys(STATUS[code].name for code in codes))
+        return "fails", f"fails in {len(codes)} of {len(found.status)} shots: {names}"
+    if not found.converged:
+        return "fails", "does not converge"
+    if any(line.startswith("Lack of fit") for line in found.warnings):
+        return "lack of fit", "lack of fit"
+    unseen = found.rank < len(found.names)
+    return "fits", f"fits, {found.rank} of {len(found.names)} seen" if unseen else "fits"
+
+
+def _errors_left_out(found: Fit) -> np.ndarray:
+    """Of every shot what the others predict wrongly, (K, n); NaN where there is none."""
+    shots = int(np.isfinite(found.problem.measured).any(axis=1).sum())
+    if shots < 2:
+        return np.full(found.residual.shape, np.nan)
+    if len(found.residual) <= FEW:
+        return found.problem.measured - leave_one_out(found, progress=False).predicted
+    return _linearized(found)
+
+
+def _linearized(found: Fit) -> np.ndarray:
+    """The same by one Gauss-Newton step: `(I - J_k (J^T J)^-1 J_k^T)^-1 r_k`."""
+    here = ~np.isnan(found.problem.measured)
+    weight = _weights(found)
+    jacobian = np.nan_to_num(found.jacobian) * weight[..., None]
+    residual = np.nan_to_num(found.residual) * weight
+    flat = jacobian.reshape(-1, jacobian.shape[-1])
+    inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
+    hat = jacobian @ inverse @ np.swapaxes(jacobian, 1, 2)
+    rest = np.eye(hat.shape[-1]) - hat
+    error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(rest, residual)])
+    return np.where(here, error / np.where(weight > 0, weight, 1.0), np.nan)
+
+
+def _weights(found: Fit) -> np.ndarray:
+    r = found.problem.residuals
+    weight = np.asarray(r.weight, float) * float(r.size)
+    return np.broadcast_to(weight, found.residual.shape)
+
+
+def _per_shot(found: Fit, error: np.ndarray) -> np.ndarray:
+    """Weighted squares (K,) of these errors; NaN where a shot has none."""
+    squares = (_weights(found) * error) ** 2
+    here = ~np.isnan(squares)
+    return np.where(here.any(axis=1), np.where(here, squares, 0.0).sum(axis=1), np.nan)
+
+
+def _total(squares: np.ndarray) -> float:
+    return float(np.nansum(squares)) if np.isfinite(squares).any() else 0.0
+
+
+def _chance(squares: np.ndarray, best: np.ndarray) -> float:
+    """That a law predicting as well as the best shows such errors: paired t tests over shots.
+
+    Of the squares, and of their logarithms, which a few large ones do not drown.
+    """
+    both = np.isfinite(squares) & np.isfinite(best)
+    some = both & (squares > 0) & (best > 0)
+    logs = np.log(squares[some]) - np.log(best[some])
+    gain = _above_zero(squares[both] - best[both], best[both])
+    return min(gain, _above_zero(logs, 1.0))
+
+
+def _above_zero(more: np.ndarray, size: Any) -> float:
+    """Chance of values of mean 0 that lie as far above it."""
+    more = np.where(np.abs(more) > SAME * np.abs(size), more, 0.0)
+    if len(more) < _LEAST or not more.any():
+        return 1.0
+    error = more.std(ddof=1) / np.sqrt(len(more))
+    if error == 0:
+        return float(more[0] < 0)
+    return float(stdtr(len(more) - 1, -more.mean() / error))
+
+
+def _variance(found: Fit) -> float:
+    """Of the residuals; infinite where no degree of freedom is left to tell it."""
+    freedom = found.degrees_of_freedom
+    return found.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
+
+
+def _by_residuals(found: Fit, best: Fit) -> float:
+    """Chance of residuals so much larger, as if the better law had one parameter more at least."""
+    more = max(best.rank - found.rank, 1)
+    variance = _variance(best)
+    gain = (found.starts[0].sum_of_squares - best.starts[0].sum_of_squares) / more
+    if not np.isfinite(variance) or gain <= 0:
+        return 1.0
+    exact = EXACT[str(best.problem.residuals.offset.dtype)]
+    least = exact * float(best.problem.residuals.size) ** 2  # of what is reproduced exactly
+    return float(fdtrc(more, best.degrees_of_freedom, gain / max(variance, least)))
+
+
+def _left_out_rms(found: Fit, error: np.ndarray) -> float:
+    data = found.problem.experiments
+    assert data is not None
+    if np.isnan(error).all():
+        return np.nan
+    return float(np.sqrt(np.nanmean((error / data.natural_errors(found.problem.scene)) ** 2)))
+
+
+def _aicc(found: Fit) -> float:
+    """Akaike's criterion; with unknown noise corrected for few data; NaN where it means nothing."""
+    n, count = found.problem.values, len(found.names)
+    squares = found.starts[0].sum_of_squares
+    whole = found.rank == count and not found.at_bound.any() and not found.problem.left_out
+    if not whole or not found.converged:
+        return np.nan
+    if found.problem.sigma is not None:
+        return squares + 2 * count
+    k = count + 1  # and the noise
+    exact = EXACT[str(found.problem.residuals.offset.dtype)]
+    if n - k - 1 < 1 or squares <= exact * float(found.problem.residuals.size) ** 2:
+        return np.nan
+    return float(n * np.log(squares / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
+
+
+def _speed_test(
+    constant: Fit, candidate: Candidate, scene: Scene | None, data: Experiments, options: Any
+) -> NestedTest | None:
+    """Whether e depends on the speed; None of a law without e, or of shots equally fast."""
+    law, free = candidate
+    speeds = data.approach_speed(scene)
+    speeds = speeds[speeds > 0]
+    known = free_parameters_of(law)
+    if "restitution" not in known or isinstance(law, VelocityDependent):
+        return None
+    if len(speeds) < 2 or np.ptp(speeds) == 0:
+        return None
+    typical = float(np.exp(np.mean(np.log(speeds))))
+    falling = VelocityDependent(law, speed_exponent=SPEED_EXPONENT, reference_speed=typical)
+    full = fit(falling, scene, data, {**free, "speed_exponent": True}, **options)
+    return nested_test(constant, full) if full.rank > constant.rank else None

@@ -1,0 +1,202 @@
+"""Restitution that depends on the speed of the approach: an option of every law that has an e."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_kind
+from jimpact.contact import Contact
+from jimpact.law import (
+    Impulses,
+    Law,
+    OptionalValues,
+    Values,
+    free_parameters_of,
+    parameter,
+    with_parameter,
+)
+from jimpact.registry import REGISTRY
+from jimpact.scene import Scene
+from jimpact.solvers.tridiagonal import as_matrix, diagonal
+
+# |cos(kinetic angle)| below so many roundings is 0: contacts then do not feel each other
+DECOUPLED_IN_EPS = 64
+
+
+class VelocityDependent(Law):
+    """A law whose restitution falls with the speed of the approach, and is 1 below the yield speed.
+
+    Equation: `e_j(v)^2 = y^2 + (1 - y^2) f^2`, `f = min(1, e_j (v / v_ref)^-k)`,
+    `y = min(1, v_y / v)`, and the law acts with these e_j. With k = 0 the energy up to that of the
+    yield speed comes back whole, and e_j^2 of what exceeds it; with v_y = 0 it is a power law (k
+    about 1/4 for metals well above their yield, 1/5 of 1 - e for viscoelastic spheres). v is the
+    fastest approach of all contacts that contact j is coupled with: one at rest, which an impact
+    elsewhere loads, is as lossy as the others.
+
+    Args:
+        law: with `restitution` e_j, scalar or (m,): its value at `reference_speed`.
+        speed_exponent: k in [-1, 1], scalar or (m,); None: no power law.
+        yield_speed: v_y >= 0, scalar or (m,) [m/s]; None: no yield.
+        reference_speed: v_ref > 0 [m/s], where e_j holds; to fit it beside e_j and k is impossible.
+
+    Status: that of the law. Derivatives: forward and reverse; one-sided where e reaches 1 and where
+    two contacts approach equally fast. In `yield_speed` at 0 the slope is 0: start a fit above.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.3.1 (impacts below the speed of
+    plastification lose nothing); Johnson, Contact Mechanics (1985), 11.5 (k = 1/4).
+
+    >>> import jimpact as ji
+    >>> law = ji.VelocityDependent(ji.Newton(0.5), speed_exponent=0.25, yield_speed=0.01)
+    >>> [round(float(e), 4) for e in law.restitution_at([0.005, 1.0, 16.0])]
+    [1.0, 0.5001, 0.25]
+    >>> pair = ji.chain([1.0, 1.0])
+    >>> [round(float(ji.impact(law, pair, [v, 0.0]).velocity[1] / v), 4) for v in (0.005, 16.0)]
+    [1.0, 0.625]
+    """
+
+    law: Law
+    speed_exponent: OptionalValues = parameter(low=-1.0, high=1.0, default=None, kw_only=True)
+    yield_speed: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
+    reference_speed: Values = parameter(low=0.0, open_low=True, default=1.0, kw_only=True)
+
+    def __check_init__(self) -> None:
+        check_kind("law", self.law, Law)
+        if isinstance(self.law, VelocityDependent):
+            raise TypeError("Argument `law` must not depend on the velocity already.")
+        found = free_parameters_of(self.law).get("restitution")
+        if found is None or np.ndim(found.value) > 1:
+            raise TypeError(
+                "Argument `law` must have `restitution`, one number or one per contact, but is "
+                f"{type(self.law).__name__}."
+            )
+
+    @property
+    def uses_gaps(self) -> bool:  # type: ignore[override]
+        """As the law."""
+        return self.law.uses_gaps
+
+    @property
+    def pulls(self) -> bool:  # type: ignore[override]
+        """As the law."""
+        return self.law.pulls
+
+    @property
+    def separable(self) -> bool:  # type: ignore[override]
+        """As the law."""
+        return self.law.separable
+
+    @property
+    def fills_up(self) -> bool:
+        """As the law."""
+        return self.law.fills_up
+
+    @property
+    def stored(self) -> jax.Array:
+        """As the law."""
+        return self.law.stored
+
+    @property
+    def friction(self) -> jax.Array | None:
+        """As the law."""
+        return getattr(self.law, "friction", None)
+
+    def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
+        """As the law."""
+        return self.law.contact(scene, velocity)
+
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
+        """As the law."""
+        self.law.check(scene, dtype)
+
+    def restitution_at(self, speed: Any) -> jax.Array:
+        """e at approach speeds [m/s], of their shape; an entry each contact where e is (m,)."""
+        return self._at(as_float_array("speed", speed))
+
+    def _at(self, v: jax.Array) -> jax.Array:
+        e = free_parameters_of(self.law)["restitution"].value
+        moving = v > 0
+        safe = jnp.where(moving, v, self.reference_speed)  # at rest e is that of the law
+        power = e * jnp.ones_like(v)
+        if self.speed_exponent is not None:
+            falling = e * (safe / self.reference_speed) ** -self.speed_exponent
+            power = jnp.minimum(falling, jnp.maximum(e, 1.0))
+        if self.yield_speed is None:
+            return power
+        y = jnp.where(moving, jnp.minimum(self.yield_speed / safe, 1.0), 0.0)
+        square = y**2 + (1 - y**2) * power**2
+        some = square > 0  # the root has no slope at 0
+        return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Those of the law with e at this speed."""
+        e = self._at(approach_speed(contact))
+        return self.law_with(e).impulses(contact)
+
+    def law_with(self, restitution: jax.Array) -> Law:
+        """The law with these e (m,)."""
+        return with_parameter(self.law, "restitution", restitution)
+
+
+def approach_speed(contact: Contact) -> jax.Array:
+    """Of each contact (m,) the fastest approach [m/s] among those it is coupled with.
+
+    Differentiable in the speeds: which contact is the fastest is found first, on constants.
+
+    >>> import jimpact as ji
+    >>> from jimpact.laws.velocity_dependent import approach_speed
+    >>> approach_speed(ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-0.5, 0.0])).tolist()
+    [0.5, 0.5]
+    """
+    speed = jnp.maximum(-contact.gap_velocity, 0.0)
+    w = as_matrix(contact.delassus)
+    root = jnp.sqrt(diagonal(contact.delassus))
+    least = DECOUPLED_IN_EPS * jnp.finfo(speed.dtype).eps
+    joined, known = jax.lax.stop_gradient(
+        (jnp.abs(w) > least * root[:, None] * root[None, :], speed)
+    )
+
+    def passed_on(state: tuple[jax.Array, Any]) -> tuple[jax.Array, jax.Array]:
+        leader, _ = state
+        around = jnp.where(joined, known[leader][None, :], -1.0)
+        other = leader[jnp.argmax(around, axis=1)]
+        faster = known[other] > known[leader]
+        return jnp.where(faster, other, leader), jnp.any(faster)
+
+    first = jnp.arange(len(speed)), jnp.asarray(True)
+    leader, _ = jax.lax.while_loop(lambda state: state[1], passed_on, first)
+    return speed[leader]
+
+
+def make_velocity_dependent(
+    base: str,
+    restitution: Any,
+    speed_exponent: Any = None,
+    yield_speed: Any = None,
+    reference_speed: Any = 1.0,
+    stiffness: Any = None,
+    exponent: Any = None,
+    friction: Any = None,
+) -> VelocityDependent:
+    """`VelocityDependent` from plain parameters, as a study gives them; `base` is a law's name."""
+    if base not in REGISTRY or "restitution" not in REGISTRY[base].arguments:
+        known = ", ".join(name for name, row in REGISTRY.items() if "restitution" in row.arguments)
+        raise ValueError(f"Argument `base` must be one of {known}, but has value {base!r}.")
+    row = REGISTRY[base]
+    given = {
+        "restitution": restitution,
+        "stiffness": stiffness,
+        "exponent": exponent,
+        "friction": friction,
+    }
+    own = {name: value for name, value in given.items() if value is not None}
+    for name in own:
+        if name not in row.arguments:
+            raise ValueError(f"Argument `{name}` must not be given: {base} has none.")
+    return VelocityDependent(
+        row.build(**own),
+        speed_exponent=speed_exponent,
+        yield_speed=yield_speed,
+        reference_speed=reference_speed,
+    )

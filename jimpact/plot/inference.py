@@ -1,0 +1,134 @@
+"""Pictures of what a fit knows: profiles, correlations, residuals."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.special import ndtri
+
+from jimpact._checks import check_kind
+from jimpact.fits.fitting import Fit
+from jimpact.fits.profiles import Profile
+from jimpact.plot.style import COLOURS, GREY
+
+_IN_A_ROW = 3
+_TOP = 3.0  # of a profile's axis, in limits: beyond, the curve says nothing more
+_TWO_SIDED = 1.96  # standard errors with 95 % between
+
+
+def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
+    """Deviance over each parameter, with the limit and the interval below it.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> fit = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    >>> len(ji.plot.profiles(ji.profile(fit)).axes)
+    1
+    """
+    for each in found:
+        check_kind("found", each, Profile)
+    rows = -(-len(found) // _IN_A_ROW)
+    columns = min(len(found), _IN_A_ROW)
+    figure = Figure(figsize=(3.4 * columns, 2.8 * rows), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for axes, each in zip(grid, found):
+        axes.plot(each.value, each.deviance, ".-", color=COLOURS[0], ms=3, lw=1)
+        axes.axhline(each.limit, color=GREY, lw=0.8, ls="--")
+        for low, high in each.intervals:
+            axes.axvspan(low, high, color=COLOURS[4], alpha=0.25, lw=0)
+        near = each.value[each.deviance <= _TOP * each.limit]
+        if np.ptp(near) > 0:
+            edge = 0.15 * np.ptp(near)
+            axes.set_xlim(near.min() - edge, near.max() + edge)
+        axes.set_ylim(0, _TOP * each.limit)
+        axes.set_xlabel(each.name)
+        axes.set_title(f"{each.words} ({100 * each.level:g} %)", loc="left", fontsize="small")
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in grid[len(found) :]:
+        axes.set_axis_off()
+    grid[0].set_ylabel("deviance")
+    return figure
+
+
+def correlation(fit: Fit) -> Figure:
+    """Correlations of the parameters' errors; empty where the data cannot see one of them.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.97], sigma=0.02)
+    >>> found = ji.fit(ji.LZB(0.9, [1.0, 2.0]), ji.chain([1.0, 1.0, 1.0]), data, starts=1)
+    >>> len(ji.plot.correlation(found).axes)
+    2
+    """
+    check_kind("fit", fit, Fit)
+    count = len(fit.names)
+    side = float(np.clip(1.8 + 0.5 * count, 3.0, 9.0))
+    figure = Figure(figsize=(side + 1.0, side), layout="constrained")
+    axes = figure.subplots()
+    shown: Any = np.ma.masked_invalid(fit.correlation)
+    image = axes.imshow(shown, vmin=-1, vmax=1, cmap="RdBu_r")
+    axes.set_xticks(range(count), fit.names, rotation=90)
+    axes.set_yticks(range(count), fit.names)
+    if count <= 8:
+        for i, j in np.argwhere(np.isfinite(fit.correlation)):
+            dark = abs(fit.correlation[i, j]) > 0.6
+            text = f"{fit.correlation[i, j]:.2f}"
+            axes.text(
+                j, i, text, ha="center", va="center", color="white" if dark else "black", size=8
+            )
+    figure.colorbar(image, ax=axes, shrink=0.8, label="correlation")
+    return figure
+
+
+def residuals(fit: Fit) -> Figure:
+    """Measured against fitted; residuals in standard errors over the speed, and their quantiles.
+
+    Without sigma the standard error is the estimated noise. What the law explains leaves no trend
+    over the speed, and normal noise lies on the straight line.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.5]])
+    >>> found = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    >>> len(ji.plot.residuals(found).axes)
+    3
+    """
+    check_kind("fit", fit, Fit)
+    problem = fit.problem
+    measured = np.asarray(problem.measured, float)
+    here = ~np.isnan(measured)
+    sigma = fit.noise if problem.sigma is None else np.asarray(problem.sigma, float)
+    noise = np.broadcast_to(sigma, measured.shape)[here]
+    known = np.isfinite(noise).all() and (noise > 0).all()
+    scaled = fit.residual[here] / (noise if known else 1.0)
+    unit = "standard errors" if known else "as measured"
+    figure = Figure(figsize=(10.2, 3.4), layout="constrained")
+    first, second, third = figure.subplots(1, 3)
+    style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
+    first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
+    first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
+    first.set_xlabel("fitted")
+    first.set_ylabel("measured")
+    over, label = _over(fit)
+    second.axhline(0, color=GREY, lw=0.8)
+    second.plot(np.broadcast_to(over, here.shape)[here], scaled, color=COLOURS[0], **style)
+    second.set_xlabel(label)
+    second.set_ylabel(f"residual [{unit}]")
+    ordered = np.sort(scaled)
+    normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
+    third.plot(normal, ordered, color=COLOURS[0], **style)
+    third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
+    third.set_xlabel("normal quantile")
+    third.set_ylabel(f"residual [{unit}]")
+    if known:
+        for y in (-_TWO_SIDED, _TWO_SIDED):
+            second.axhline(y, color=GREY, lw=0.6, ls="--")
+    for axes in (first, second, third):
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _over(fit: Fit) -> tuple[np.ndarray, str]:
+    """What residuals are put over: of shots the fastest approach (K, 1), else the fitted values."""
+    data, scene = fit.experiments, fit.problem.scene
+    if data is None:
+        return np.asarray(fit.predicted), "fitted"
+    return data.approach_speed(scene)[:, None], "fastest approach [m/s]"

@@ -1,0 +1,313 @@
+"""Which law, restitution by speed, scatter between shots, the posterior."""
+
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import chdtrc
+
+import jimpact as ji
+from jimpact.laws import SIMPLEST_FIRST
+from jimpact.laws.velocity_dependent import approach_speed
+
+PAIR = ji.chain([1.0, 2.0])
+SPEED = np.linspace(0.5, 4.0, 12)
+PRE = np.stack([SPEED, 0 * SPEED], axis=1)
+
+
+def after(e, noise=0.0, seed=0):
+    """What a pair with these restitution coefficients does, and an error of measurement."""
+    v = SPEED[:, None] * np.stack([(1 - 2 * e) / 3, (1 + e) / 3], axis=1)
+    return v + noise * np.random.default_rng(seed).normal(size=v.shape)
+
+
+# ------------------------------------------------------------------------------- which law
+
+
+@pytest.fixture(scope="module")
+def every():
+    data = ji.Experiments(PRE, after(np.full(12, 0.8), 0.01), sigma=0.01)
+    return ji.fit_laws(PAIR, data, ["moreau", "newton", "restitution_matrix"], speed=True)
+
+
+def test_laws_that_agree_are_listed_by_what_they_must_know(every):
+    assert list(every.entries) == ["newton", "moreau"]
+    newton, moreau = every.entries.values()
+    assert newton.adequate
+    assert moreau.adequate
+    assert newton.left_out_error == pytest.approx(moreau.left_out_error, rel=1e-5)
+    assert newton.aicc == pytest.approx(newton.fit.starts[0].sum_of_squares + 2)
+    assert every.left_out == {"restitution_matrix": "needs `matrix`"}
+    assert not every.speed.needed
+    assert every.verdict.startswith("The simplest law that fits is newton: restitution = 0.8")
+    assert "predict" not in str(every)
+    told = json.loads(json.dumps(every.to_dict(), allow_nan=False))
+    assert told["best"] == "newton"
+    assert len(told["laws"]["moreau"]["fit"]["shots"]) == 12
+    heads, rows = every.rows()
+    assert len(heads) == len(rows[0])
+    assert [row[0] for row in rows] == ["newton", "moreau"]
+
+
+def test_a_law_that_fails_is_named_and_comes_last():
+    """Newton pulls at a contact that separates."""
+    balls = ji.chain([1.0, 1.0, 1.0])
+    data = ji.Experiments([[1.0, 0.0, 1.0], [2.0, 0.0, 1.5]], [[0.1, 0.9, 1.0], [0.2, 1.8, 1.9]])
+    told = []
+    found = ji.fit_laws(
+        balls,
+        data,
+        {"newton": ji.Newton(0.5), "moreau": ji.Moreau(0.5)},
+        starts=1,
+        done=lambda name, fit: told.append(name),
+    )
+    assert list(found.entries) == ["moreau", "newton"] == told[::-1]
+    assert found.entries["newton"].verdict.startswith("fails in ")
+
+
+def test_simplest_first_is_the_order_of_advise():
+    from jimpact.methods.advice import situation, trials
+
+    at = situation(PAIR, np.array([1.0, 0.0]))
+    assert tuple(trials(at, 0.8, np.ones(1), 1.5)) == SIMPLEST_FIRST[:5]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"laws": ["aristotle"]}, "`laws` must be one of"),
+        ({"laws": ["compliant"]}, "needs `stiffness`"),
+        ({"laws": {"mine": 3}}, "mine"),
+    ],
+)
+def test_bad_laws(change, message):
+    data = ji.Experiments(PRE, after(np.full(12, 0.8)))
+    with pytest.raises((ValueError, TypeError), match=message):
+        ji.fit_laws(PAIR, data, **change)
+
+
+@pytest.mark.slow
+def test_the_law_that_made_the_data_is_found():
+    """Of three balls: dispersion that only LZB has; the simpler laws predict worse."""
+    balls, rng = ji.chain([1.0, 1.0, 1.0]), np.random.default_rng(2)
+    pre = np.zeros((8, 3))
+    pre[:, 0], pre[:4, 2] = rng.uniform(1, 2, 8), -rng.uniform(0.2, 1, 4)
+    truth = ji.LZB(0.9, [1.0, 2.0])
+    post = np.array([ji.impact(truth, balls, v).velocity for v in pre])
+    post += 0.004 * rng.normal(size=post.shape)
+    laws = ["newton", "moreau", "lzb"]
+    found = ji.fit_laws(balls, ji.Experiments(pre, post), laws, starts=2)
+    assert found.best.name == "lzb, free stiffness ratios"
+    assert not found.entries["moreau"].adequate
+    assert "worse than lzb" in found.entries["newton, e per contact"].verdict
+
+
+# ---------------------------------------------------------------------- restitution by speed
+
+
+def test_restitution_by_speed_is_what_it_says():
+    law = ji.VelocityDependent(
+        ji.Newton(0.5), speed_exponent=0.25, yield_speed=0.1, reference_speed=2.0
+    )
+    speed = np.array([1e-3, 0.05, 0.1, 0.1 + 1e-12, 0.5, 2.0, 32.0])
+    power = np.minimum(0.5 * (speed / 2.0) ** -0.25, 1.0)
+    y = np.minimum(0.1 / speed, 1.0)
+    e = np.asarray(law.restitution_at(speed))
+    np.testing.assert_allclose(e, np.sqrt(y**2 + (1 - y**2) * power**2), rtol=1e-12)
+    assert (e[:3] == 1.0).all()
+    assert (np.diff(e) <= 0).all()
+    assert float(law.restitution_at(0.0)) == 0.5
+    plastic = ji.VelocityDependent(ji.Newton(0.0), yield_speed=0.0)
+    assert float(plastic.restitution_at(1.0)) == 0.0
+    none = ji.VelocityDependent(ji.Newton(0.3))
+    assert float(none.restitution_at(7.0)) == 0.3
+
+
+def test_contacts_that_feel_each_other_share_a_speed():
+    w = np.diag([2.0, 2.0, 2.0, 1.0, 1.0])
+    w[0, 1] = w[1, 0] = w[1, 2] = w[2, 1] = -1.0  # a chain of three, and two apart
+    speed = approach_speed(ji.Contact(w, [0.0, -0.2, 0.3, -2.0, 1.0]))
+    assert speed.tolist() == [0.2, 0.2, 0.2, 2.0, 0.0]
+
+
+@pytest.mark.parametrize("base", [ji.Newton, ji.Moreau, ji.Poisson, ji.Binary])
+def test_every_law_takes_the_option(base):
+    """It acts as with the e of that speed; a study knows it by name."""
+    law = ji.VelocityDependent(base(0.5), speed_exponent=0.25, yield_speed=0.1)
+    out = ji.impact(law, PAIR, [3.0, 0.5])
+    e = law.restitution_at(2.5)
+    np.testing.assert_allclose(out.velocity, ji.impact(base(e), PAIR, [3.0, 0.5]).velocity)
+    slow = ji.impact(law, PAIR, [0.05, 0.0])
+    assert abs(float(slow.energy_change)) < 1e-15
+
+
+@pytest.mark.slow
+def test_lzb_and_compliant_take_the_option():
+    balls, v = ji.chain([1.0, 1.0, 1.0]), [2.0, 0.0, 0.0]
+    for base in (ji.LZB(0.5, [1.0, 2.0]), ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.5))):
+        law = ji.VelocityDependent(base, speed_exponent=0.25, yield_speed=0.01)
+        e = law.restitution_at(jnp.full(2, 2.0))
+        expected = ji.impact(law.law_with(e), balls, v).velocity
+        np.testing.assert_allclose(ji.impact(law, balls, v).velocity, expected, atol=1e-9)
+        slow = ji.impact(law, balls, [0.01, 0.0, 0.0])
+        assert abs(float(slow.energy_change)) < 1e-10
+    made = ji.REGISTRY["velocity_dependent"].build(base="lzb", restitution=0.9, yield_speed=0.1)
+    assert isinstance(made.law, ji.LZB)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ji.VelocityDependent(ji.RestitutionMatrix(np.eye(2))), "`law` must have `rest"),
+        (lambda: ji.VelocityDependent(ji.VelocityDependent(ji.Newton(0.5))), "already"),
+        (lambda: ji.VelocityDependent(ji.Newton(0.5), speed_exponent=3.0), r"lie in \[-1, 1\]"),
+        (lambda: ji.VelocityDependent(ji.Newton(0.5), yield_speed=-1.0), "`yield_speed`"),
+        (
+            lambda: ji.REGISTRY["velocity_dependent"].build(base="magic", restitution=0.9),
+            "`base` must be one of",
+        ),
+        (
+            lambda: ji.REGISTRY["velocity_dependent"].build(
+                base="newton", restitution=0.9, stiffness=1.0
+            ),
+            "newton has none",
+        ),
+    ],
+)
+def test_bad_dependence_on_speed(make, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        make()
+
+
+def test_the_need_of_a_dependence_on_speed_is_tested():
+    falling = 0.8 * SPEED**-0.2
+    law = ji.VelocityDependent(ji.Newton(0.7), speed_exponent=0.1)
+    for sigma in (0.01, None):
+        for e, needed in ((falling, True), (np.full(12, 0.7), False)):
+            data = ji.Experiments(PRE, after(e, 0.01), sigma)
+            constant, full = ji.fit(ji.Newton(0.7), PAIR, data), ji.fit(law, PAIR, data)
+            assert full.names == ("restitution", "speed_exponent")
+            test = ji.nested_test(constant, full)
+            assert test.needed is needed, str(test)
+            gain = constant.starts[0].sum_of_squares - full.starts[0].sum_of_squares
+            if sigma is None:
+                assert test.statistic == pytest.approx(gain / full.noise**2)
+            elif full.noise == 1:
+                assert test.chance == pytest.approx(chdtrc(1, gain))
+    with pytest.raises(ValueError, match="more parameters"):
+        ji.nested_test(full, constant)
+
+
+def test_exponents_are_sought_where_they_mean_something():
+    law = ji.LZB(0.9, [1.0, 2.0], exponent=jnp.asarray([1.5, 7.0]))
+    balls = ji.chain([1.0, 1.0, 1.0])
+    data = ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.96])
+    problem = ji.FitProblem.from_shots(law, balls, data, "exponent")
+    assert problem.domains.tolist() == [[1.0, 5.0], [1.0, 7.0]]
+
+
+# ------------------------------------------------------------------- scatter between shots
+
+
+def test_scatter_between_shots():
+    """Its size, and the mean's error, which is that of so many draws."""
+    rng = np.random.default_rng(3)
+    e = 0.7 + 0.05 * rng.normal(size=12)
+    found = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(e, 0.002), sigma=0.002))
+    told = ji.scatter(found)
+    assert told.explains
+    assert told.value == pytest.approx(e.std(ddof=1), rel=0.05)
+    assert told.standard_error[0] == pytest.approx(told.value / np.sqrt(12), rel=0.05)
+    np.testing.assert_allclose(told.each, e, atol=0.02)
+    assert "if restitution scatters by 0.0" in found.verdict
+    assert "Scatter from shot to shot" in str(found)
+    assert found.noise > 5  # the errors of the plain fit are stretched
+    falling = ji.Experiments(PRE, after(0.8 * SPEED**-0.2, 0.002), sigma=0.002)
+    assert "It depends on the speed" in str(ji.fit(ji.Newton(0.5), PAIR, falling))
+
+
+def test_no_scatter_is_said():
+    data = ji.Experiments(PRE, after(np.full(12, 0.7), 0.01))
+    found = ji.fit(ji.Newton(0.5), PAIR, data)
+    told = ji.scatter(found)
+    assert told.chance > 0.01
+    assert "shows no scatter" in str(told)
+    assert told.mean[0] == pytest.approx(found.value[0], abs=0.5 * found.standard_error[0])
+    with pytest.raises(ValueError, match="`name` must be among restitution"):
+        ji.scatter(found, "friction")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma", [0.01, None])
+def test_errors_of_the_mean_are_true(sigma):
+    """Over many sets of shots whose e scatters: the spread of what is found is what is told."""
+    rng, sets = np.random.default_rng(5), 150
+    many = []
+    for k in range(sets):
+        e = np.clip(0.6 + 0.06 * rng.normal(size=12), 0, 1)
+        many.append(ji.Experiments(PRE, after(e, 0.01, seed=k), sigma))
+    found = [ji.scatter(fit) for fit in ji.fit_many(ji.Newton(0.5), PAIR, many)]
+    mean = np.array([x.mean[0] for x in found])
+    error = np.array([x.standard_error[0] for x in found])
+    assert mean.std() == pytest.approx(np.sqrt(np.mean(error**2)), rel=0.15)
+    inside = np.abs(mean - 0.6) < 2.2 * error  # Student's t of 11 degrees of freedom, 95 %
+    assert inside.mean() > 0.9
+    assert np.median([x.value for x in found]) == pytest.approx(0.06, rel=0.15)
+
+
+# --------------------------------------------------------------------------- the posterior
+
+
+@pytest.fixture(scope="module")
+def found():
+    return ji.fit(
+        ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01)
+    )
+
+
+@pytest.fixture
+def lenient():
+    """The sampler mixes types and ranks, which the suite's flags forbid."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("lenient")
+def test_posterior_is_the_linearized_one_where_it_is_gaussian(found):
+    pytest.importorskip("numpyro")
+    pytest.importorskip("arviz")
+    flat = ji.posterior(found, samples=4000, warmup=500, chains=2)
+    x = np.asarray(flat.posterior["restitution"])
+    assert x.shape == (2, 4000)
+    assert x.mean() == pytest.approx(found.value[0], abs=0.1 * found.standard_error[0])
+    assert x.std() == pytest.approx(found.standard_error[0], rel=0.05)
+    narrow = ji.Normal(float(found.value[0]), float(found.standard_error[0]))
+    half = ji.posterior(found.problem, {"restitution": narrow}, samples=4000, warmup=500, chains=2)
+    told = float(np.asarray(half.posterior["restitution"]).std())
+    assert told == pytest.approx(found.standard_error[0] / np.sqrt(2), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("priors", "message"),
+    [
+        ({"restitution": ji.Uniform(0.5, 1.5)}, r"`priors` must lie in \[0, 1\]"),
+        ({"restitution": ji.Normal(2.0, 0.1)}, "`priors` must have its mean in"),
+        ({"restitution": 0.5}, "`priors` must map `restitution`"),
+        ({"stiffness": ji.Uniform(0.5, 1.5)}, "`priors` must name parameters, restitution"),
+    ],
+)
+def test_bad_priors(found, priors, message):
+    pytest.importorskip("numpyro")
+    pytest.importorskip("arviz")
+    with pytest.raises(ValueError, match=message):
+        ji.posterior(found, priors)
+
+
+def test_the_extra_is_named_where_it_is_missing(found, monkeypatch):
+    monkeypatch.setitem(sys.modules, "numpyro", None)
+    with pytest.raises(ImportError, match=r"jimpact\[bayes\]"):
+        ji.posterior(found)
