@@ -170,7 +170,8 @@ def _all_fits(study: Study, options: dict[str, Any], steps: Steps) -> dict[str, 
     fits: dict[str, Fit] = {}
 
     def run(name: str, study: Study) -> None:
-        fits[name] = study.run(**options)
+        profiles = None if name == RAW else False  # which only the report of this one tells
+        fits[name] = study.run(**options, profiles=profiles)
         steps(_in_words(name, fits[name]))
 
     run(RAW, own)

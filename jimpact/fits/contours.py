@@ -18,10 +18,10 @@ _SWEEPS = 4  # of minima handed on to neighbours that have found a worse one
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """Deviance (A, B) over values x (A,) of one parameter and y (B,) of another.
+    """`deviance` (A, B) over values `x` (A,) of one parameter and `y` (B,) of another, by `names`.
 
-    The confidence region is where it is at most `limit`. `best`: the values of the fit. `log`:
-    which of the two is fitted in its logarithm.
+    The confidence region at `level` is where it is at most `limit`. `best`: the values of the fit.
+    `log`: which of the two is fitted in its logarithm.
     """
 
     names: tuple[str, str]
@@ -59,6 +59,9 @@ def contour(
         level: of the region, in (0, 1).
         points: values of each, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
+
+    Returns:
+        `Contour` with `deviance` (points, points).
 
     Raises:
         ValueError: level, points or names; a robust loss; a matrix that is kept admissible.
