@@ -102,12 +102,10 @@ def contour(found: Contour, title: str = "") -> Figure:
     """
     figure = new_figure(5.0)
     axes = figure.subplots()
-    d, limit = found.deviance.T, found.limit
+    d, limit = np.where(np.isfinite(found.deviance), found.deviance, np.nan).T, found.limit
     axes.contourf(found.x, found.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
     axes.contour(found.x, found.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
-    axes.contour(
-        found.x, found.y, d, [limit / 4, 2 * limit, 4 * limit], colors=GREY, linewidths=0.7
-    )
+    axes.contour(found.x, found.y, d, [limit / 4], colors=GREY, linewidths=0.7)
     axes.plot(*found.best, "+", color="black", ms=9)
     for which, log in zip("xy", found.log, strict=True):
         if log:
