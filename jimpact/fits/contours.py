@@ -97,11 +97,11 @@ def contour(
     )
     values = (x, y)
     ends: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
-    ahead = {}
+    ahead: dict[tuple[int, int], np.ndarray] = {}
     for value in (fit.value, *(start.value for start in fit.starts[1:])):
         point = scaled.point(value)
-        cell = tuple(int(np.argmin(np.abs(v - point[i]))) for v, i in zip(values, pair))
-        ahead[cell] = point
+        row, column = (int(np.argmin(np.abs(v - point[i]))) for v, i in zip(values, pair))
+        ahead[row, column] = point
     residuals, least = filled_up(fit.problem.residuals), fit.starts[0].sum_of_squares
     with progress_bar(progress) as show:
         while ahead:
