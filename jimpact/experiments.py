@@ -232,7 +232,7 @@ class Experiments(eqx.Module):
         return np.array(self.each(None, lambda scene: scene.contacts))
 
     def approach_speed(self, scene: Scene | None = None) -> np.ndarray:
-        """Speed (K,) of the fastest approach at a closed contact before every shot [m/s].
+        """Speed (K,) of the fastest approach at a closed contact of its scene before a shot [m/s].
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.25], post=[0.2, 0.9])

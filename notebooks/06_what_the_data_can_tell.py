@@ -90,14 +90,15 @@ print(found)
 
 # %%
 def picture(profiles, truths):
-    figure = Figure(figsize=(4 * len(profiles), 3), layout="constrained")
+    figure = Figure(figsize=(2.4 + 2.8 * len(profiles), 3), layout="constrained")
     for axes, p, truth in zip(np.ravel(figure.subplots(1, len(profiles))), profiles, truths):
         axes.plot(p.value, np.minimum(p.deviance, 4 * p.limit), ".-", color="#0072B2")
         axes.axhline(p.limit, color="black", lw=0.8, ls="--")
         axes.axvline(truth, color="#D55E00", lw=1)
         for low, high in p.intervals:
             axes.axvspan(low, high, color="#009E73", alpha=0.2, lw=0)
-        axes.set(xlabel=p.name, ylabel="deviance", title=p.words, ylim=(0, 4 * p.limit))
+        axes.set(xlabel=p.name, ylabel="deviance", ylim=(0, 4 * p.limit))
+        axes.set_title(p.words, fontsize="small")
         if p.name.startswith("stiffness"):
             axes.set_xscale("log")
     return figure

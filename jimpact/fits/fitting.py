@@ -142,7 +142,7 @@ class Fit(Generic[AnyLaw]):
         return tuple(linearized(self, i, quantile(self, level)) for i in range(len(self.names)))
 
     def confidence_interval(self, level: float = 0.95) -> np.ndarray:
-        """The outermost ends (P, 2) of `intervals`."""
+        """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
         return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
 
     def to_dict(self) -> dict[str, Any]:

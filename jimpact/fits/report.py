@@ -66,10 +66,12 @@ def verdict(fit: Any) -> str:
     scattering = shown_scatter(fit)
     if scattering is not None and scattering.explains:
         return f"{law} fits {data} if {scattering}"
+    if scattering is not None:
+        told += f"; {scattering.name} scatters by {scattering.value:.2g} from shot to shot"
     if any(line.startswith("Lack of fit") for line in fit.warnings):
-        return f"{law} does not fit {data}, nearest is it with {told}."
+        return f"{law} does not fit {data}; it comes nearest with {told}."
     if any(line.startswith("The fitted law fails") for line in fit.warnings):
-        return f"{law} fails in some of these shots, nearest is it with {told}."
+        return f"{law} fails in some of these shots; it comes nearest with {told}."
     return f"{told}."
 
 

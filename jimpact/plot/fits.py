@@ -12,7 +12,16 @@ from matplotlib.patches import Patch
 from jimpact._checks import check_kind
 from jimpact.fits.contours import Contour
 from jimpact.fits.fitting import Fit
-from jimpact.plot.style import COLOURS, GREY, SPREAD, finish, legend_below, new_figure
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    SPREAD,
+    finish,
+    heading,
+    legend_below,
+    logarithmic,
+    new_figure,
+)
 
 _LABELLED = 16  # shots up to which every one gets its label
 
@@ -76,6 +85,13 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
 def contour(found: Contour, title: str = "") -> Figure:
     """The confidence region of two parameters, and how the deviance rises around the fit.
 
+    Args:
+        found: what `ji.contour` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
     >>> import numpy as np
     >>> import jimpact as ji
     >>> x = np.linspace(0.4, 0.6, 5)
@@ -84,28 +100,25 @@ def contour(found: Contour, title: str = "") -> Figure:
     >>> ji.plot.contour(ji.Contour(*given)).axes[0].get_xlabel()
     'e[1]'
     """
-    figure = Figure(figsize=(6.0, 5.0))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(5.0)
     axes = figure.subplots()
-    d, limit = found.deviance.T, found.limit
+    d, limit = np.where(np.isfinite(found.deviance), found.deviance, np.nan).T, found.limit
     axes.contourf(found.x, found.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
     axes.contour(found.x, found.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
-    axes.contour(
-        found.x, found.y, d, [limit / 4, 2 * limit, 4 * limit], colors=GREY, linewidths=0.7
-    )
+    axes.contour(found.x, found.y, d, [limit / 4], colors=GREY, linewidths=0.7)
     axes.plot(*found.best, "+", color="black", ms=9)
-    for scale, log in ((axes.set_xscale, found.log[0]), (axes.set_yscale, found.log[1])):
+    for which, log in zip("xy", found.log, strict=True):
         if log:
-            scale("log")
+            logarithmic(axes, which)
     axes.set_xlabel(found.names[0])
     axes.set_ylabel(found.names[1])
     handles = [
         Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * found.level:g} % region"),
         Line2D([], [], marker="+", ls="none", color="black", label="fit"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", frameon=False, ncols=2)
-    axes.set_title(title, loc="left")
-    axes.spines[["top", "right"]].set_visible(False)
+    legend_below(figure, handles, 2)
+    heading(figure, title)
+    finish(axes)
     return figure
 
 
