@@ -14,6 +14,9 @@
 # %% [markdown]
 # # What the data can tell
 #
+# *Course, part 6. Before: [whole motions](05_whole_motions.ipynb). Next:
+# [a restitution matrix](07_restitution_matrix.ipynb).*
+#
 # One ball strikes two others. Their velocities afterwards depend on the restitution and on the
 # ratio of the two stiffnesses: how well does a shot determine them, and what should be shot next?
 # You will read **profile likelihoods**, meet a shot with several **preimages** (stiffness ratios

@@ -14,6 +14,8 @@
 # %% [markdown]
 # # A tossed cube
 #
+# *Course, part 8. Before: [a restitution matrix](07_restitution_matrix.ipynb).*
+#
 # An acrylic cube of 10 cm was tossed on a board 456 times and filmed 148 times a second
 # (ContactNets, Pfrommer, Halm and Posa, 2020). 400 of its impacts, on one, two or four corners, with
 # friction, are clean enough to say what the velocities were before and after, each with its error.
