@@ -104,10 +104,10 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     start values, a number for all contacts or a list with one each (a `restitution_matrix` without
     its `matrix` starts from an admissible one), module (a file or module that
     registers the law, see `ji.register`), and `[law.bounds]`; `[fit]` free (a
-    list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
-    to the study), momentum_corrected; of shots with scenes of their own also near_m and contacts
-    (only shots with so many), see `read_experiments`; without data a study can be compared, not
-    fitted; `[[observe]]` in its place (any number of them): quantity (peak_force [N],
+    list of names, or a table of masks), method, loss, starts, seed, max_steps, profiles; `[data]`
+    file (relative to the study), momentum_corrected; of shots with scenes of their own also near_m
+    and contacts (only shots with so many), see `read_experiments`; without data a study can be
+    compared, not fitted; `[[observe]]` in its place (any number of them): quantity (peak_force [N],
     arrival_time [s], of a contact; duration [s] of a contact or of all; energy_ratio;
     bounce_height [m] of a body), contact or body (from 1), value and sigma, numbers or lists, with
     relative = true those over the first one; velocity_m_per_s, one a body, or drop_height_m, and
