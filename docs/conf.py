@@ -81,7 +81,7 @@ API = {  # a page, and the modules whose public names it holds
     "Laws": ("law", "registry", "laws.lzb", "laws.kinematic", "laws.poisson", "laws.binary",
              "laws.compliant", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration", "laws.materials"),
-    "Shots and fits": ("experiments", "fits"),
+    "Shots and fits": ("experiments", "fits", "study"),
     "Monte Carlo": ("montecarlo",),
     "Motions": ("motion",),
     "Methods": ("methods",),
@@ -106,6 +106,8 @@ def public_names() -> dict[str, list[str]]:
             module = package or line.module
             fits = [(len(x), title) for title, all_x in API.items() for x in all_x
                     if module == x or module.startswith(x + ".")]  # fmt: skip
+            if not fits:
+                raise ValueError(f"API must have a page for {module}: see docs/conf.py")
             found[max(fits)[1]] += [prefix + name.name for name in line.names]
     return found
 
