@@ -98,7 +98,7 @@ for name, found in fits.items():
 
 # %% [markdown]
 # An error of a prediction is measured by its kinetic energy, over that of the velocity jump:
-# $\\|v^+_{law} - v^+\\|_M / \\|v^+ - v^-\\|_M$.
+# $\|v^+_{law} - v^+\|_M / \|v^+ - v^-\|_M$.
 
 
 # %%
