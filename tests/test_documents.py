@@ -200,4 +200,5 @@ def test_notebooks_are_one_course():
         if k + 1 < len(NOTEBOOKS):
             assert NOTEBOOKS[k + 1].name in script.cells[-1].source, path.stem
         code = "\n".join(cell.source for cell in script.cells if cell.cell_type == "code")
-        assert not re.search(r"^(from|import) jimpact\.", code, re.M), "ji.* is all that one needs"
+        own = set(re.findall(r"^(?:from|import) (jimpact\.\S+)", code, re.M))
+        assert own <= {"jimpact.study"}, "`ji` is all that one needs, but to read a study"
