@@ -111,8 +111,11 @@ def test_fit_as_a_user_runs_it(tmp_path):
 
 def test_fit_of_a_study(tmp_path, capsys):
     picture = tmp_path / "deep" / "a.svg"
-    code, said = call(capsys, "fit", written(tmp_path), "--out", picture, "--seed", "1")
+    page = tmp_path / "fit.html"
+    options = ["--out", picture, "--seed", "1", "--report", page]
+    code, said = call(capsys, "fit", written(tmp_path), *options)
     assert code == 0
+    assert "seed 1" in page.read_text(encoding="utf-8")
     for words in ("study", "as measured", "corrected ", "restitution", "Warnings", "Picture: "):
         assert words in said.out
     assert picture.read_text().startswith("<?xml")
@@ -121,6 +124,21 @@ def test_fit_of_a_study(tmp_path, capsys):
     told = json.loads(said.out)["fits"]["as measured"]
     assert (code, told["method"]) == (0, "adam")
     np.testing.assert_allclose(told["parameters"][0]["value"], 0.604, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_every_law_is_fitted(tmp_path, capsys):
+    study = written(tmp_path)
+    code, said = call(capsys, "fit", study, "--law", "all", "--starts", "1", "--out", tmp_path)
+    assert code == 0
+    for words in ("newton", "lzb", "left out", "verdict", "The simplest law that fits is newton"):
+        assert words in said.out
+    code, said = call(
+        capsys, "fit", study, "--law", "all", "--starts", "1", "--csv", "--out", tmp_path
+    )
+    lines = said.out.splitlines()
+    assert lines[0] == "law,parameters,rms_m_per_s,left_out_m_per_s,aicc,verdict"
+    assert lines[1].startswith("newton,1,")
 
 
 REFUSED = [
@@ -554,6 +572,7 @@ def test_laws(capsys, tmp_path, monkeypatch):
     [
         (["fit", "nowhere.toml"], "Study 'nowhere.toml' does not exist"),
         (["fit", "--out", "fit.docx"], "--out must end in .png, .pdf or .svg"),
+        (["fit", "--report", "fit.pdf"], "--report must end in .html"),
         (["fit", "--json", "--csv"], "--json and --csv must not both be given"),
         (["fit", "--law", "aristotle"], "the law must be one of"),
         (["compare", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),

@@ -99,7 +99,7 @@ def test_a_fit_in_one_sentence():
     assert "the stiffness ratio stiffness[2] / stiffness[1] cannot be told" in ratio.verdict
     assert canned(4, converged=False).verdict.startswith("No answer")
     bad = canned(4, warnings=("Lack of fit: the residuals are large.",))
-    assert bad.verdict.startswith("LZB does not fit these 4 shots, nearest is it with restitution")
+    assert bad.verdict.startswith("LZB does not fit these 4 shots; it comes nearest with restit")
     open_end = ji.Profile(
         "restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.97, 1.0),), (0.0, 1.0)
     )

@@ -12,6 +12,7 @@ from scipy.special import chdtrc
 import jimpact as ji
 from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.velocity_dependent import approach_speed
+from jimpact.study import read_study
 
 PAIR = ji.chain([1.0, 2.0])
 SPEED = np.linspace(0.5, 4.0, 12)
@@ -154,8 +155,26 @@ def test_lzb_and_compliant_take_the_option():
         np.testing.assert_allclose(ji.impact(law, balls, v).velocity, expected, atol=1e-9)
         slow = ji.impact(law, balls, [0.01, 0.0, 0.0])
         assert abs(float(slow.energy_change)) < 1e-10
-    made = ji.REGISTRY["velocity_dependent"].build(base="lzb", restitution=0.9, yield_speed=0.1)
-    assert isinstance(made.law, ji.LZB)
+
+
+def test_a_study_names_the_option(tmp_path):
+    (tmp_path / "study.toml").write_text(
+        "[scene]\nmasses_kg = [1.0, 2.0]\n[law]\nname = 'velocity_dependent'\nbase = 'lzb'\n"
+        "restitution = 0.9\nstiffness = 2.0\nyield_speed = 0.1\nreference_speed = 2.0\n"
+    )
+    study = read_study(tmp_path / "study.toml")
+    assert isinstance(study.law.law, ji.LZB)
+    assert float(study.law.yield_speed) == 0.1
+    assert study.free == {"restitution": True, "yield_speed": True}
+
+
+def test_a_page_of_something_else_than_shots(tmp_path):
+    problem = ji.FitProblem.from_observable(
+        ji.Newton(0.9), lambda law: law.restitution ** jnp.array([2.0, 4.0]), [0.49, 0.25], 0.01
+    )
+    text = ji.fit(problem).report(tmp_path / "fit.html").read_text(encoding="utf-8")
+    assert "restitution = 0.70" in text
+    assert text.count("<img") == 2
 
 
 @pytest.mark.parametrize(

@@ -54,6 +54,11 @@ def posterior(
             admissible.
 
     Warns of chains that disagree, and of divergences: the draws are then not to be trusted.
+
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> found = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    >>> draws = ji.posterior(found, {"restitution": ji.Normal(0.5, 0.1)})  # doctest: +SKIP
     """
     numpyro, arviz = needed("numpyro", HOW), needed("arviz", HOW)
     check_kind("fit", fit.problem if isinstance(fit, Fit) else fit, FitProblem)
