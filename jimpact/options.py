@@ -157,7 +157,7 @@ class CompareCommand(ShotCommand):
     """Every law on one scene, side by side: velocities, energy, dispersion, audit, time."""
 
     fit: bool = False
-    """Fit every law to the data too, with one coefficient and with one per contact."""
+    """Fit every law to the data too, as `jimpact fit --law all` does."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -299,13 +299,14 @@ def lenient():
 def test_posterior_is_the_linearized_one_where_it_is_gaussian(found):
     pytest.importorskip("numpyro")
     pytest.importorskip("arviz")
-    flat = ji.posterior(found, samples=4000, warmup=500, chains=2)
+    size = {"samples": 2500, "warmup": 200, "chains": 2}
+    flat = ji.posterior(found, **size)
     x = np.asarray(flat.posterior["restitution"])
-    assert x.shape == (2, 4000)
+    assert x.shape == (2, 2500)
     assert x.mean() == pytest.approx(found.value[0], abs=0.1 * found.standard_error[0])
     assert x.std() == pytest.approx(found.standard_error[0], rel=0.05)
     narrow = ji.Normal(float(found.value[0]), float(found.standard_error[0]))
-    half = ji.posterior(found.problem, {"restitution": narrow}, samples=4000, warmup=500, chains=2)
+    half = ji.posterior(found.problem, {"restitution": narrow}, **size)
     told = float(np.asarray(half.posterior["restitution"]).std())
     assert told == pytest.approx(found.standard_error[0] / np.sqrt(2), rel=0.05)
 
