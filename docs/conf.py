@@ -180,9 +180,11 @@ def pictures() -> dict[str, str]:
 
 
 def picture_of(name: str) -> list[str]:
-    """A picture that links to its code in the gallery."""
-    return [f":::{{figure}} ../../pictures/{name}.png", f":target: ../gallery.html#{anchor(name)}",
-            f":alt: {pictures()[name]}", "", f"{pictures()[name]}", ":::", ""]  # fmt: skip
+    """A picture that links to its code in the gallery; nothing where there is none."""
+    caption = pictures().get(name)
+    return [] if caption is None else [
+        f":::{{figure}} ../../pictures/{name}.png", f":target: ../gallery.html#{anchor(name)}",
+        f":alt: {caption}", "", caption, ":::", ""]  # fmt: skip
 
 
 def anchor(name: str) -> str:

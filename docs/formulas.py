@@ -97,7 +97,7 @@ def tex(text: str) -> str | None:
     if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(r"[A-Za-z]", text):
         return None
     try:
-        found = _translate(text)
+        found = _translate(text).strip()
         tex2mathml(found)
     except (ValueError, MathError):
         return None

@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jimpact as ji
-from jimpact.plot.style import COLOURS
+from jimpact.plot.style import COLOURS, finish, legend_below, logarithmic, new_figure
 
 PICTURES = Path(__file__).parent / "pictures"
 DRAWN: dict[str, Callable] = {}
@@ -28,37 +28,40 @@ def picture(function: Callable) -> Callable:
     return function
 
 
-def three_balls(make: Callable, values: np.ndarray, label: str, log: bool = False) -> Figure:
+def three_balls(
+    make: Callable, values: np.ndarray, label: str, log: bool = False, shares: bool = False
+) -> Figure:
     """Velocities of three equal balls in a row after the first struck, against a parameter.
 
     `make` takes the parameter, and returns the law, or law, scene and velocity. Grey: the status
-    says that the outcome is none to use.
+    says that the outcome is none to use. `shares`: velocities over the striker's.
     """
 
     def outcome(x):
         made = make(x)
         made = made if isinstance(made, tuple) else (made, CRADLE, STRIKER)
         out = ji.impact(*made)
-        return out.velocity, out.status
+        return out.velocity / (made[2][0] if shares else 1.0), out.status
 
     velocity, status = jax.jit(jax.vmap(outcome))(jnp.asarray(values))
     failed = np.array([ji.STATUS[int(code)].failure for code in status])
-    figure = Figure(figsize=(5.6, 3.2), layout="constrained")
+    figure = new_figure(3.4)
     axes = figure.subplots()
     for i in range(3):
         style = {"color": COLOURS[i], "lw": 2, "ls": "--" if i == 2 else "-"}  # where they coincide
         axes.plot(values, velocity[:, i], label=f"ball {i + 1}", **style)
     if failed.any():
-        axes.fill_between(values, 0, 1, where=failed, transform=axes.get_xaxis_transform(),
-                          color="#dddddd", lw=0, label="flagged")  # fmt: skip
-    axes.set_xscale("log" if log else "linear")
+        across = axes.get_xaxis_transform()
+        grey = {"color": "#dddddd", "lw": 0, "label": "flagged"}
+        axes.fill_between(values, 0, 1, where=failed, transform=across, **grey)
+    axes.axhline(0, color="black", lw=0.6)
     axes.set_xlim(values[0], values[-1])
     axes.set_xlabel(label)
-    axes.set_ylabel("velocity after [m/s]")
-    axes.axhline(0, color="black", lw=0.6)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(lw=0.4, alpha=0.5)
-    figure.legend(loc="outside upper center", frameon=False, ncols=4, fontsize="small")
+    axes.set_ylabel("velocity after / before" if shares else "velocity after [m/s]")
+    if log:
+        logarithmic(axes, "x")
+    finish(axes)
+    legend_below(figure, axes.get_legend_handles_labels()[0], 4)
     return figure
 
 
@@ -135,6 +138,19 @@ def law_compliant():
     )
 
 
+@picture
+def law_velocity_dependent():
+    """LZB with an e that falls with the speed: slow shots lose nothing, fast ones much."""
+    law = ji.VelocityDependent(ji.LZB(0.8), speed_exponent=0.25, yield_speed=0.05)
+    return three_balls(
+        lambda speed: (law, CRADLE, speed * STRIKER),
+        np.geomspace(0.01, 100, 121),
+        "velocity of the striker before [m/s]",
+        log=True,
+        shares=True,
+    )
+
+
 # ------------------------------------------------------------------------------------- and others
 
 
@@ -150,6 +166,21 @@ def force_histories():
     balls, k = ji.chain([0.0667] * 5), 1.2e10  # steel balls of one inch
     rows = {f"e = {e}": ji.history(ji.LZB(e, k), balls, [1.0, 0, 0, 0, 0]) for e in (1.0, 0.9, 0.7)}
     return ji.plot.forces(rows)
+
+
+@picture
+def impact_history():
+    """Inside an impact by LZB: forces, gap velocities and stored energy of three steel balls."""
+    law = ji.LZB(0.9, 1.2e10)
+    return ji.plot.history(ji.history(law, ji.chain([0.0667] * 3), STRIKER))
+
+
+@picture
+def unseen_combination():
+    """One shot of three balls tells of restitution and stiffness ratio a region, not a point."""
+    shots = ji.Experiments(pre=[STRIKER], post=[[-0.07, 0.14, 0.93]], sigma=0.02)
+    fit = ji.fit(ji.LZB(0.95, [1.0, 1.0]), CRADLE, shots)
+    return ji.plot.contour(ji.contour(fit, "restitution", "stiffness[2]"))
 
 
 @picture

@@ -122,6 +122,7 @@ from .scene import (
     velocity_change as velocity_change,
 )
 from .status import STATUS as STATUS
+from .study import cube_impacts as cube_impacts
 from .theory.han_gilmore_tree import han_gilmore as han_gilmore
 
 __version__: str

@@ -25,9 +25,12 @@ from jimpact.progress import LONG, Steps, waiting
 from jimpact.records import as_data, table
 from jimpact.starting import as_csv, fitting
 from jimpact.study import Study, import_laws, read_study
+from jimpact.study_file import is_motion
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
+
+    from jimpact.motion.study_motion import MotionStudy
 
 DPI = 150
 TOLD = LONG  # seconds after which work is told, also where no one looks at a terminal
@@ -105,9 +108,17 @@ def fit(given: options.FitCommand, steps: Steps) -> Answer:
     if given.law == options.EVERY_LAW:
         return _every_law(given, steps)
     path = given.picture()
-    study = read_study(given.study, given.law)
-    chosen = {"method": given.method, "starts": given.starts, "seed": given.seed}
-    fits = _all_fits(study, chosen | {"progress": TOLD}, steps)
+    chosen = {"starts": given.starts, "seed": given.seed, "progress": TOLD}
+    study: Study | MotionStudy
+    if is_motion(given.study):
+        from jimpact.motion.study_motion import read_motion_study
+
+        study = read_motion_study(given.study, given.law)
+        fits = {RAW: study.fit(**chosen)}
+        steps(_in_words(RAW, fits[RAW]))
+    else:
+        study = read_study(given.study, given.law)
+        fits = _all_fits(study, chosen | {"method": given.method}, steps)
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     picture = ji.plot.fit(fits[RAW], others, study.title)
     text = "\n".join([*_summary(fits), "", str(fits[RAW]), ""])
@@ -159,16 +170,22 @@ def _all_fits(study: Study, options: dict[str, Any], steps: Steps) -> dict[str, 
     fits: dict[str, Fit] = {}
 
     def run(name: str, study: Study) -> None:
-        fits[name] = study.run(**options)
+        profiles = None if name == RAW else False  # which only the report of this one tells
+        fits[name] = study.run(**options, profiles=profiles)
         steps(_in_words(name, fits[name]))
 
     run(RAW, own)
+    if study.measured is not None:  # other laws know no forces, and no times
+        return fits
     if any("break momentum" in line for line in fits[RAW].warnings):
         assert study.experiments is not None  # it was fitted
         data = study.experiments.momentum_corrected(study.scene)
         run(CORRECTED, replace(own, experiments=data))
     if not isinstance(study.law, ji.Newton):
-        newton = replace(study, law=ji.Newton(0.5), free={"restitution": True}, bounds={})
+        friction = getattr(study.law, "friction", None)
+        shared = [name for name in ("restitution", "friction") if name in study.free]
+        free: dict[str, Any] = dict.fromkeys(shared or ["restitution"], True)
+        newton = replace(study, law=ji.Newton(0.5, friction), free=free, bounds={})
         run(YARDSTICK, newton)
     if everything is not None:
         run(ALL_FREE, everything)
@@ -203,11 +220,16 @@ def _summary(fits: dict[str, Fit]) -> list[str]:
     rows = []
     for what, found in fits.items():
         data = "corrected" if what == CORRECTED else RAW
-        last = [f"{found.rms:.4f}", f"{found.rank} of {len(found.names)}"]
+        last = [
+            f"{found.rms:.4f}" if found.experiments is not None else f"{found.rms:.4g}",
+            f"{found.rank} of {len(found.names)}",
+        ]
         for i, name in enumerate(found.names):
             first = [type(found.law).__name__, data] if i == 0 else ["", ""]
             rows.append([*first, name, _value(found, i), *(last if i == 0 else ["", ""])])
-    heads = ["law", "data", "parameter", "value", "rms [m/s]", "rank"]
+    speeds = all(found.experiments is not None for found in fits.values())
+    rms = "rms [m/s]" if speeds else "rms"
+    heads = ["law", "data", "parameter", "value", rms, "rank"]
     lines = table(heads, rows, left=["data", "parameter", "value"])
     if CORRECTED in fits:
         lines.append("corrected: changed as little as possible so that momentum is conserved")
@@ -220,7 +242,8 @@ def _summary(fits: dict[str, Fit]) -> list[str]:
 
 def _in_words(name: str, found: Fit) -> str:
     values = ", ".join(f"{x} {_value(found, i)}" for i, x in enumerate(found.names))
-    return f"{name}: {values}, rms {found.rms:.4f} m/s"
+    unit = "" if found.experiments is None else " m/s"
+    return f"{name}: {values}, rms {found.rms:.4g}{unit}"
 
 
 def _value(found: Fit, i: int) -> str:

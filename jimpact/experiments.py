@@ -1,6 +1,7 @@
 """Measured shots: velocities before and after, read from CSV; momentum and energy they defy."""
 
 import functools
+import operator
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +13,8 @@ import numpy as np
 from scipy.special import ndtri, stdtr
 
 from jimpact._checks import as_float_array, check_values
-from jimpact.scene import Scene, dense_mass, stackable
+from jimpact.bodies.base import CLOSED_BELOW, Body
+from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 from jimpact.shots_file import ANGULAR, LINEAR, read_shots
 
 # Defects below this share of the momentum or energy before are no finding: a tenth of a percent
@@ -21,6 +23,7 @@ DEFECT_TOLERANCE = 1e-3
 DEFECT_SIGMAS = 3.0
 DEFECT_LEVEL = 0.02  # of the test by which shots show a defect, all of them together
 SEPARATION = 1e-9  # share of the velocities up to which an approach is rounding
+_RESOLUTION = operator.attrgetter("resolution")
 _LISTED = 6  # shots listed one by one; of more, the range is given
 
 
@@ -38,6 +41,10 @@ class Experiments(eqx.Module):
         lost_freedom: independent values that a correction has removed.
         units: of each velocity, n times 'm/s' or 'rad/s'; None: all m/s. Without sigma, velocities
             of different units weigh as much as others of the same kinetic energy.
+        sigma_pre: standard error of each `pre` value, (K, n) or a scalar, >= 0 [m/s]; with it goes
+            a `sigma`, or a `resolution`. `fit` passes it on to v+, see `FitProblem`.
+        resolution: steps in which `post` was read, (K, n) or a scalar, > 0 [m/s]: readings rounded
+            to q have the standard error q / sqrt(12), which is added to sigma (in squares).
 
     Raises:
         ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, nothing
@@ -56,6 +63,8 @@ class Experiments(eqx.Module):
     shots: tuple[str, ...] = eqx.field(static=True)
     lost_freedom: int = eqx.field(static=True)  # independent values that a correction removed
     units: tuple[str, ...] = eqx.field(static=True)
+    sigma_pre: jax.Array | None
+    resolution: jax.Array | None
 
     def __init__(
         self,
@@ -66,6 +75,8 @@ class Experiments(eqx.Module):
         shots: Sequence[str] | None = None,
         lost_freedom: int = 0,
         units: Sequence[str] | None = None,
+        sigma_pre: Any = None,
+        resolution: Any = None,
     ):
         self.pre = _as_rows("pre", pre)
         self.post = _as_rows("post", post)
@@ -79,7 +90,20 @@ class Experiments(eqx.Module):
         measured = ~np.isnan(np.asarray(self.post))
         if not measured.any():
             raise ValueError("Argument `post` must hold a measured value, but all are missing.")
-        self.sigma = None if sigma is None else _as_sigma(sigma, measured)
+        self.sigma = None if sigma is None else _as_sigma("sigma", sigma, measured)
+        self.resolution = None
+        if resolution is not None:
+            self.resolution = _as_sigma("resolution", resolution, measured)
+            rounding = self.resolution / np.sqrt(12)
+            self.sigma = rounding if self.sigma is None else jnp.hypot(self.sigma, rounding)
+        self.sigma_pre = None
+        if sigma_pre is not None:
+            self.sigma_pre = _as_sigma("sigma_pre", sigma_pre, measured | True, 0.0)
+            if self.sigma is None:
+                raise ValueError(
+                    "Argument `sigma` must be given where `sigma_pre` is, but is None: the errors "
+                    "before and after the impact weigh against each other."
+                )
         self.scenes = None if scenes is None else _as_scenes(scenes, self.pre.shape)
         labels = shots if shots is not None else range(1, len(measured) + 1)
         self.shots = tuple(str(label) for label in labels)
@@ -175,11 +199,40 @@ class Experiments(eqx.Module):
             weighted = variance[k][:, None] * m.T
             post[k] -= weighted @ np.linalg.solve(m @ weighted, m @ (row - pre))
             lost += len(m)
-        given = (self.pre, post, self.sigma, self.scenes, self.shots, lost, self.units)
-        return Experiments(*given)
+        return self._with(post=post, lost_freedom=lost)
+
+    def _with(self, **changed: Any) -> "Experiments":
+        """A copy with other fields."""
+        names = ("pre", "post", "sigma", "scenes", "shots", "lost_freedom", "units", "sigma_pre")
+        resolution = changed.pop("resolution", self.resolution)
+        copy = Experiments(**({name: getattr(self, name) for name in names} | changed))
+        # what it adds to sigma is there already
+        return eqx.tree_at(_RESOLUTION, copy, resolution, is_leaf=lambda x: x is None)
+
+    def only(self, which: Any) -> "Experiments":
+        """Some of the shots: their indices (from 0), or a boolean for each.
+
+        >>> import jimpact as ji
+        >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]])
+        >>> data.only([1]).shots
+        ('2',)
+        """
+        rows = np.arange(len(self.shots))[which]
+        own: dict[str, Any] = {"shots": [self.shots[k] for k in rows]}
+        for name in ("pre", "post", "sigma", "sigma_pre", "resolution"):
+            given = getattr(self, name)
+            own[name] = None if given is None else np.asarray(given)[rows]
+        if self.scenes is not None:
+            own["scenes"] = [self.scenes[k] for k in rows]
+        return self._with(**own)
+
+    @property
+    def contacts(self) -> np.ndarray:
+        """Number of contacts of every shot (K,) whose scenes are its own."""
+        return np.array(self.each(None, lambda scene: scene.contacts))
 
     def approach_speed(self, scene: Scene | None = None) -> np.ndarray:
-        """Speed (K,) of the fastest approach at a closed contact before every shot [m/s].
+        """Speed (K,) of the fastest approach at a closed contact of its scene before a shot [m/s].
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.25], post=[0.2, 0.9])
@@ -262,18 +315,19 @@ def _as_rows(name: str, value: Any) -> jax.Array:
     return array
 
 
-def _as_sigma(value: Any, measured: np.ndarray) -> jax.Array:
-    sigma = as_float_array("sigma", value)
+def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None = None) -> jax.Array:
+    sigma = as_float_array(name, value)
     if sigma.shape == measured.shape[1:] and len(measured) == 1:
         sigma = sigma[None, :]
     if sigma.shape not in ((), measured.shape):
         raise ValueError(
-            f"Argument `sigma` must be a scalar or have shape {measured.shape} like `post`, "
+            f"Argument `{name}` must be a scalar or have shape {measured.shape} like `post`, "
             f"but has shape {tuple(sigma.shape)}."
         )
     sigma = jnp.broadcast_to(sigma, measured.shape)
     # the error of a value that was not measured does not matter
-    check_values("sigma", np.where(measured, np.asarray(sigma), 1.0), low=0.0, open_low=True)
+    seen = np.where(measured, np.asarray(sigma), 1.0)
+    check_values(name, seen, low=0.0, open_low=least is None)
     return jnp.where(measured, sigma, jnp.nan)
 
 
@@ -293,16 +347,25 @@ def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, 
     return scenes
 
 
-def read_experiments(path: str | Path) -> Experiments:
+def read_experiments(
+    path: str | Path, scene: Scene | Body | None = None, near: float = CLOSED_BELOW
+) -> Experiments:
     """Read shots from a CSV file whose headers state the units.
 
     Columns: `pre_1[m/s]`, `post_1[m/s]` and so on for every body, optional `sigma_1[m/s]`, ...
-    (standard errors of `post`) and `shot` (a label). Units: m/s, cm/s, mm/s, km/h, in/s, ft/s,
+    (standard errors of `post`), `sigma_pre_1[m/s]` (of `pre`), `resolution_1[m/s]` (steps of the
+    readings, see `Experiments`) and `shot` (a label). Units: m/s, cm/s, mm/s, km/h, in/s, ft/s,
     converted to m/s; rad/s, deg/s, converted to rad/s. An empty `post` cell is a value that was
-    not measured.
+    not measured. Scenes that differ from shot to shot: `mass_1[kg]` (kg, g) of every body and
+    `gap_1[m]` (m, cm, mm, um) of every contact of a chain; `q_1[m]`, `q_2[rad]`, ... (lengths, rad,
+    deg, 1) are the configuration of a body.
 
     Args:
         path: of the file.
+        scene: what such columns complete: a chain, whose masses or gaps they take the place of, or
+            a `Body`, which they place. The shots then have scenes of their own.
+        near: of a body's contacts, those up to so far above the lowest one are closed, the others
+            are left out (see `Body.scenes`) [m].
 
     Returns:
         `Experiments` of K shots, all in m/s and rad/s.
@@ -319,7 +382,38 @@ def read_experiments(path: str | Path) -> Experiments:
     [-0.0605, 0.1049, 0.9978]
     """
     values, units, shots = read_shots(path)
-    return Experiments(values["pre"], values["post"], values.get("sigma"), shots=shots, units=units)
+    named: dict[str, Any] = {
+        k: values.get(k) for k in ("pre", "post", "sigma", "sigma_pre", "resolution")
+    }
+    scenes = _scenes_of(path, values, scene, near)
+    return Experiments(**named, scenes=scenes, shots=shots, units=units)
+
+
+def _scenes_of(
+    path: str | Path, values: dict[str, np.ndarray], given: Scene | Body | None, near: float
+) -> list[Scene] | None:
+    """The scenes of the shots of a file, None if they have none of their own."""
+    columns = [kind for kind in ("q", "mass", "gap") if kind in values]
+    if not columns:
+        return None
+    if "q" in values:
+        if columns != ["q"] or not isinstance(given, Body):
+            raise ValueError(
+                f"{path}: columns `q` must belong to a body, but are given "
+                f"{'with masses or gaps' if columns != ['q'] else f'for {type(given).__name__}'}."
+            )
+        return given.scenes(values["q"], near)
+    if not isinstance(given, Scene) or ("mass" in values and given.walls is None):
+        raise ValueError(
+            f"{path}: columns `{columns[0]}` must belong to a chain that is given as `scene`, but "
+            f"that is {type(given).__name__}."
+        )
+    count = len(values["pre"])
+    gaps = values.get("gap", [given.gaps] * count)
+    if "mass" not in values:
+        return [with_gaps(given, as_float_array("gaps", gap)) for gap in gaps]
+    wall: Any = next(name for name, sides in WALLS.items() if sides == given.walls)
+    return [chain(mass, wall, gap) for mass, gap in zip(values["mass"], gaps)]
 
 
 def data_defects(
@@ -353,14 +447,18 @@ def data_defects(
         if np.isnan(post).any():
             continue
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma[k], float)
+        if sigma is not None and experiments.sigma_pre is not None:
+            sigma = np.append(sigma, np.asarray(experiments.sigma_pre[k], float))
+        both = slice(None) if experiments.sigma_pre is not None else slice(len(post))
         for j, row in enumerate(rows):
             excess, scale = row @ (post - pre), np.abs(row) @ np.abs(pre)
             ratio = 1 + excess / scale if scale else np.inf
-            defect = _Defect(excess, scale, row, sigma, ratio)
+            defect = _Defect(excess, scale, np.append(row, -row)[both], sigma, ratio)
             momenta.setdefault(j, []).append((k, defect))
         t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
         gain = t_plus - t_minus - stored_energy
-        energies.append((k, _Defect(gain, t_minus, mass @ post, sigma, energy_ratios[k])))
+        slope = np.append(mass @ post, -mass @ pre)[both]
+        energies.append((k, _Defect(gain, t_minus, slope, sigma, energy_ratios[k])))
     momentum = {k: r for found in momenta.values() for k, r in _beyond_noise(found).items()}
     energy = _beyond_noise(energies, gains=True)
     lines = []
@@ -388,7 +486,7 @@ def _closed_normals(scene: Scene) -> np.ndarray:
 
 
 class _Defect(NamedTuple):
-    """By how much a balance fails, its scale, its derivatives in v+, their errors, and a ratio."""
+    """By how much a balance fails, its scale, derivatives in v+ (and v-), their errors, a ratio."""
 
     excess: float
     scale: float

@@ -117,10 +117,11 @@ class ShotCommand(DrawingCommand):
 
 @dataclasses.dataclass(frozen=True)
 class FitCommand(DrawingCommand):
-    """Fit a law to measured velocities; without a file: the bundled three balls."""
+    """Fit a law to measured velocities, forces, times or a motion; without a file: three balls."""
 
     study: StudyFile = Path("three_balls.toml")
-    """Study file, or the name of a bundled one (three_balls.toml, air_track.toml)."""
+    """Study file, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
+    bead_column.toml, ...); also the study of a motion with [data]."""
     law: str | None = None
     """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
     method: Method | None = None
@@ -138,7 +139,16 @@ class FitCommand(DrawingCommand):
         if self.report is not None and self.report.suffix not in (".html", ".htm"):
             raise ValueError(f"--report must end in .html, but is '{self.report}'.")
         law = None if self.law == EVERY_LAW else self.law
-        if not study_file.check_study(self.study, law).shots:
+        if study_file.is_motion(self.study):
+            if self.method is not None or self.law == EVERY_LAW:
+                raise ValueError("--method and --law all must be left out for a motion.")
+            fitted = study_file.check_motion_study(self.study, law)
+        else:
+            found = study_file.check_study(self.study, law)
+            fitted = found.fitted
+            if self.law == EVERY_LAW and not found.shots:
+                raise ValueError("--law all must be left out where no shots are fitted.")
+        if not fitted:
             raise ValueError(study_file.NO_DATA)
 
 

@@ -26,7 +26,7 @@ from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 _SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of M that rounding may cause in float32
 
 _CONSTRAINTS = operator.attrgetter("constraints")
-_WALLS = {
+WALLS = {
     False: (False, False),
     True: (False, True),
     "right": (False, True),
@@ -137,7 +137,7 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
     >>> ji.chain([1.0, 1.0, 1.0], wall=True).contacts
     3
     """
-    if wall not in _WALLS:
+    if wall not in WALLS:
         raise ValueError(
             f"Argument `wall` must be one of False, True, 'left', 'right', 'both', "
             f"but has value {wall!r}."
@@ -146,7 +146,7 @@ def chain(masses: Any, wall: bool | str = False, gaps: Any = None) -> Scene:
     if mass.ndim != 1:
         raise ValueError(f"Argument `masses` must have shape (n,), but has shape {mass.shape}.")
     check_values("masses", mass, low=0.0, open_low=True)
-    left, right = _WALLS[wall]
+    left, right = WALLS[wall]
     contacts = mass.shape[0] - 1 + left + right
     if contacts < 1:
         raise ValueError(
@@ -197,7 +197,8 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
     """
     if len(scenes) == 1:
         return list(scenes), 0
-    layouts = {str((jax.tree.structure(s), jax.tree.map(jnp.shape, s))) for s in scenes}
+    flat = [jax.tree.flatten(s) for s in scenes]
+    layouts = {(tree, tuple(map(np.shape, leaves))) for leaves, tree in flat}
     if len(layouts) == 1:
         return list(scenes), 0
     each = {0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes}

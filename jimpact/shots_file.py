@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-UNITS = {  # in m/s, and rad/s of bodies that turn
+UNITS = {  # of velocities, in m/s, and rad/s of bodies that turn
     "m/s": 1.0,
     "cm/s": 0.01,
     "mm/s": 0.001,
@@ -18,16 +18,99 @@ UNITS = {  # in m/s, and rad/s of bodies that turn
     "deg/s": np.pi / 180,
 }
 LINEAR, ANGULAR = "m/s", "rad/s"  # to which all are converted
-_KINDS = ("pre", "post", "sigma")
-_HEADER = re.compile(r"(pre|post|sigma)_([1-9][0-9]*)\s*(?:\[([^]]*)\])?")
-_ALLOWED = "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ..."
+_LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}
+_ANGLES = {"rad": 1.0, "deg": np.pi / 180}
+_KINDS = {  # of columns, and their units
+    **dict.fromkeys(("pre", "post", "sigma", "sigma_pre", "resolution"), UNITS),
+    "mass": {"kg": 1.0, "g": 0.001},
+    "gap": _LENGTHS,
+    "q": _LENGTHS | _ANGLES | {"1": 1.0},
+}
+_NEEDED = ("pre", "post")
+_ERRORS = ("sigma", "sigma_pre", "resolution")
+_OF_MOTIONS = {"t": {"s": 1.0, "ms": 0.001}, **dict.fromkeys(("q", "sigma_q"), _KINDS["q"])}
+_UNEVEN = 1e-3  # of a step: what rounding of times to a few digits does
+_HEADER = re.compile(r"(t|[a-z_]+(?=_))(?:_([1-9][0-9]*))?\s*(?:\[([^]]*)\])?")
+_ALLOWED = (
+    "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ... "
+    "(further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`)"
+)
+_ALLOWED_OF_MOTIONS = "`t[s]`, `q_1[unit]`, `sigma_q_1[unit]`, and so on for coordinates 2, 3, ..."
 
 
-def read_shots(path: str | Path) -> tuple[dict[str, np.ndarray], list[str], list[str] | None]:
-    """Velocities (K, n) by kind ('pre', 'post', 'sigma' if there is one), their units, labels.
+class Table(NamedTuple):
+    """What a file of shots holds, in SI units, by kind of column; (K, n) where n has no name."""
 
-    See `ji.read_experiments`.
+    values: dict[str, np.ndarray]
+    units: list[str]  # of the velocities
+    shots: list[str] | None  # labels
+
+
+def read_shots(path: str | Path) -> Table:
+    """Read and check a file of shots, see `ji.read_experiments`."""
+    where, columns, rows = _read(path, _KINDS, _ALLOWED, "shot")
+    counts = _check_columns(where, columns)
+    values = {kind: np.full((len(rows), n), np.nan) for kind, n in counts.items()}
+    shots = []
+    for k, (where, row) in enumerate(rows):
+        for column, cell in zip(columns, row):
+            if column.kind == "shot":
+                shots.append(cell or str(k + 1))
+            else:
+                number = _number(f"{where}, column `{column.header}`", column, cell)
+                values[column.kind][k, column.body - 1] = number
+        for column in columns:
+            if column.kind in _ERRORS:
+                measured = column.kind == "sigma_pre" or values["post"][k, column.body - 1]
+                error = values[column.kind][k, column.body - 1]
+                _check_error(where, column, not np.isnan(measured), error)
+    units = {column.body: column.unit for column in columns if column.kind == "pre"}
+    return Table(values, [units[i + 1] for i in range(len(units))], shots or None)
+
+
+class Positions(NamedTuple):
+    """A measured motion: times (S,) [s], positions (S, n), their errors or None; SI units."""
+
+    time: np.ndarray
+    q: np.ndarray
+    sigma: np.ndarray | None
+
+
+def read_positions(path: str | Path) -> Positions:
+    """Read and check a motion: columns `t[s]`, `q_1[m]`, ..., perhaps `sigma_q_1[m]`, ...
+
+    Times are equally spaced; an empty `q` cell was not measured.
     """
+    where, columns, rows = _read(path, _OF_MOTIONS, _ALLOWED_OF_MOTIONS, "sample")
+    found = [(c.kind, c.body) for c in columns]
+    size = max(body for _, body in found)
+    kinds = [kind for kind in ("q", "sigma_q") if kind == "q" or any(k == kind for k, _ in found)]
+    wanted = [("t", 1), *((kind, i + 1) for kind in kinds for i in range(size))]
+    if sorted(found) != sorted(wanted):
+        raise ValueError(
+            f"{where}: the columns must be {', '.join(f'`{k}_{i}`' for k, i in wanted[1:])} and "
+            f"`t`, each once, but are {', '.join(c.header for c in columns)}."
+        )
+    values = {kind: np.full((len(rows), size), np.nan) for kind in ("t", *kinds)}
+    for k, (where, row) in enumerate(rows):
+        for column, cell in zip(columns, row):
+            number = _number(f"{where}, column `{column.header}`", column, cell)
+            values[column.kind][k, column.body - 1] = number
+        for column in columns:
+            if column.kind == "sigma_q":
+                here = not np.isnan(values["q"][k, column.body - 1])
+                _check_error(where, column, here, values["sigma_q"][k, column.body - 1])
+    time = values["t"][:, 0]
+    steps = np.diff(time)
+    if len(time) < 2 or not (np.abs(steps - steps.mean()) <= _UNEVEN * steps.mean()).all():
+        raise ValueError(f"{path}: the times `t` must be two or more, rising in equal steps.")
+    return Positions(time, values["q"], values.get("sigma_q"))
+
+
+def _read(
+    path: str | Path, kinds: dict[str, dict[str, float]], allowed: str, what: str
+) -> tuple[str, list["Column"], list[tuple[str, list[str]]]]:
+    """Where the header is, its columns, and the lines below with where they are."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"Data file '{path}' does not exist or is no file.")
@@ -41,35 +124,20 @@ def read_shots(path: str | Path) -> tuple[dict[str, np.ndarray], list[str], list
     if not rows:
         raise ValueError(f"{path}: the file is empty; its first line must name the columns.")
     where, headers = rows[0]
-    columns = [_column(where, i, header) for i, header in enumerate(headers)]
-    bodies = _check_columns(where, columns)
+    columns = [_column(where, i, header, kinds, allowed) for i, header in enumerate(headers)]
     if len(rows) == 1:
-        raise ValueError(f"{path}: the file has no shots; each line below the header is one.")
-    values = {kind: np.full((len(rows) - 1, bodies), np.nan) for kind in _KINDS}
-    shots = []
-    for k, (where, row) in enumerate(rows[1:]):
+        raise ValueError(f"{path}: the file has no {what}s; each line below the header is one.")
+    for line, row in rows[1:]:
         if len(row) != len(columns):
             raise ValueError(
-                f"{where}: a shot must have {len(columns)} values, one per column, "
+                f"{line}: a {what} must have {len(columns)} values, one per column, "
                 f"but has {len(row)}."
             )
-        for column, cell in zip(columns, row):
-            if column.kind == "shot":
-                shots.append(cell or str(k + 1))
-            else:
-                number = _number(f"{where}, column `{column.header}`", column, cell)
-                values[column.kind][k, column.body - 1] = number
-        for column in columns:
-            if column.kind == "sigma":
-                _check_sigma(where, column, *(values[x][k, column.body - 1] for x in _KINDS[1:]))
-    if not any(column.kind == "sigma" for column in columns):
-        del values["sigma"]
-    units = {column.body: column.unit for column in columns if column.kind != "shot"}
-    return values, [units[i + 1] for i in range(bodies)], shots or None
+    return where, columns, rows[1:]
 
 
 class Column(NamedTuple):
-    """One column: what it holds, of which body (from 1), its unit in m/s or rad/s, and which."""
+    """One column: what it holds, of which body (from 1), its unit in SI units, and which."""
 
     header: str
     kind: str
@@ -78,58 +146,70 @@ class Column(NamedTuple):
     unit: str
 
 
-def _column(where: str, index: int, header: str) -> Column:
-    if header == "shot":
+def _column(
+    where: str, index: int, header: str, kinds: dict[str, dict[str, float]], allowed: str
+) -> Column:
+    if header == "shot" and kinds is _KINDS:
         return Column(header, "shot", 0, 1.0, "")
     match = _HEADER.fullmatch(header)
-    if match is None:
+    kind, body, unit = match.groups() if match else ("", None, "")
+    if kind not in kinds or (body is None) != (kind == "t"):
         hint = " (columns are separated by commas)" if ";" in header or "\t" in header else ""
         raise ValueError(
-            f"{where}: column {index + 1} must be one of {_ALLOWED}, but has name {header!r}{hint}."
+            f"{where}: column {index + 1} must be one of {allowed}, but has name {header!r}{hint}."
         )
-    kind, body, unit = match.groups()
+    units, name = kinds[kind], kind if body is None else f"{kind}_{body}"
     if not unit:
         raise ValueError(
-            f"{where}: column `{header}` must state its unit, as in `{kind}_{body}[m/s]`; "
-            f"allowed are {', '.join(UNITS)}."
+            f"{where}: column `{header}` must state its unit, as in "
+            f"`{name}[{next(iter(units))}]`; allowed are {', '.join(units)}."
         )
-    if unit.strip() not in UNITS:
+    if unit.strip() not in units:
         raise ValueError(
-            f"{where}: the unit of column `{header}` must be one of {', '.join(UNITS)}, "
+            f"{where}: the unit of column `{header}` must be one of {', '.join(units)}, "
             f"but is {unit!r}."
         )
     base = ANGULAR if unit.strip() in ("rad/s", "deg/s") else LINEAR
-    return Column(header, kind, int(body), UNITS[unit.strip()], base)
+    return Column(header, kind, int(body or 1), units[unit.strip()], base)
 
 
-def _check_columns(where: str, columns: list[Column]) -> int:
-    """Number of bodies; every body must have each kind of column once."""
+def _check_columns(where: str, columns: list[Column]) -> dict[str, int]:
+    """How many columns of each kind; every kind has each of its columns once."""
     found = [(c.kind, c.body) for c in columns]
+    velocities = [c for c in columns if c.kind in (*_NEEDED, *_ERRORS)]
     for column, key in zip(columns, found):
         if found.count(key) > 1:
             raise ValueError(f"{where}: column `{column.header}` must occur once, but is repeated.")
-        others = {c.unit for c in columns if c.body == column.body and c.kind != "shot"}
-        if len(others) > 1:
+        others = {c.unit for c in velocities if c.body == column.body}
+        if column in velocities and len(others) > 1:
             raise ValueError(
                 f"{where}: all columns of velocity {column.body} must be in m/s or all in rad/s, "
                 "but some are in each."
             )
-    bodies = max(1, *(body for _, body in found))
-    kinds = [kind for kind in _KINDS if kind != "sigma" or any(x == kind for x, _ in found)]
-    missing = [f"{k}_{i + 1}" for i in range(bodies) for k in kinds if (k, i + 1) not in found]
+    kinds = [kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in found)]
+    bodies = max(1, *(c.body for c in velocities)) if velocities else 1
+    counts = {
+        kind: bodies
+        if kind in (*_NEEDED, *_ERRORS, "mass")
+        else max(body for other, body in found if other == kind)
+        for kind in kinds
+    }
+    each = [(i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]]
+    missing = [f"{kind}_{i}" for i, kind in each if (kind, i) not in found]
     if missing:
         raise ValueError(
             f"{where}: column `{missing[0]}[unit]` is missing; every body from 1 to {bodies} needs "
-            f"{', '.join(f'`{kind}`' for kind in kinds)}."
+            f"{', '.join(f'`{kind}`' for kind in kinds if kind not in ('gap', 'q'))}."
         )
-    return bodies
+    return counts
 
 
 def _number(where: str, column: Column, cell: str) -> float:
     if cell == "" or cell.lower() == "nan":
-        if column.kind == "pre":
+        if column.kind in ("pre", "mass", "gap", "t"):
+            what = "a velocity before the impact" if column.kind == "pre" else "this"
             raise ValueError(
-                f"{where}: a velocity before the impact must be given, but the cell is "
+                f"{where}: {what} must be given, but the cell is "
                 f"{cell!r}; only `post` may be left empty (not measured)."
             )
         return np.nan
@@ -142,9 +222,10 @@ def _number(where: str, column: Column, cell: str) -> float:
     return number * column.factor
 
 
-def _check_sigma(where: str, column: Column, post: float, sigma: float) -> None:
-    if not np.isnan(post) and not sigma > 0:
-        given = "is empty" if np.isnan(sigma) else f"is {sigma / column.factor:g}"
+def _check_error(where: str, column: Column, measured: bool, error: float) -> None:
+    exact = column.kind == "sigma_pre" and error == 0  # as of what is at rest
+    if measured and not error > 0 and not exact:
+        given = "is empty" if np.isnan(error) else f"is {error / column.factor:g}"
         raise ValueError(
             f"{where}, column `{column.header}`: the error of a measured value must be > 0, "
             f"but {given}."

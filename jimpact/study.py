@@ -2,8 +2,9 @@
 
 import importlib.util
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,9 @@ from jimpact.bodies.solids import Box, Sphere
 from jimpact.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrix_fit import admissible_start
+from jimpact.fits.observables import Measured, observations
 from jimpact.fits.parameters import OF_SPEED, default_free
+from jimpact.fits.problem import FitProblem
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -33,9 +36,11 @@ from jimpact.study_file import (
     AT_KEYS,
     DATA_KEYS,
     NO_DATA,
+    STUDY_TABLES,
     body_keys,
     check_fit,
     check_keys,
+    check_observed,
     check_sampling,
     check_scene,
     check_tables,
@@ -72,20 +77,23 @@ class Study:
     parameters: dict[str, Any]
     options: dict[str, Any] = field(default_factory=dict)
     monte_carlo: dict[str, Any] = field(default_factory=dict)
+    measured: Measured | None = None
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options; keyword arguments that are not None go first."""
+        given = {key: value for key, value in options.items() if value is not None}
+        return fit(self.problem, **(self.options | given))
+
+    @property
+    def problem(self) -> FitProblem:
+        """What `run` solves: of the shots, or of the observables."""
+        parameters: dict[str, Any] = {"free": self.free, "bounds": self.bounds}
+        if self.measured is not None:
+            value, sigma, observe = self.measured
+            return FitProblem.from_observable(self.law, observe, value, sigma, **parameters)
         if self.experiments is None:
             raise ValueError(NO_DATA)
-        given = {key: value for key, value in options.items() if value is not None}
-        return fit(
-            self.law,
-            self.scene,
-            self.experiments,
-            self.free,
-            bounds=self.bounds,
-            **(self.options | given),
-        )
+        return FitProblem.from_shots(self.law, self.scene, self.experiments, **parameters)
 
 
 def read_study(path: str | Path, law: str | None = None) -> Study:
@@ -97,7 +105,13 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     its `matrix` starts from an admissible one), module (a file or module that
     registers the law, see `ji.register`), and `[law.bounds]`; `[fit]` free (a
     list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
-    to the study), momentum_corrected; without data a study can be compared, not fitted;
+    to the study), momentum_corrected; of shots with scenes of their own also near_m and contacts
+    (only shots with so many), see `read_experiments`; without data a study can be compared, not
+    fitted; `[[observe]]` in its place (any number of them): quantity (peak_force [N],
+    arrival_time [s], of a contact; duration [s] of a contact or of all; energy_ratio;
+    bounce_height [m] of a body), contact or body (from 1), value and sigma, numbers or lists, with
+    relative = true those over the first one; velocity_m_per_s, one a body, or drop_height_m, and
+    bodies (so many, those next to the wall), a number or one a value;
     `[monte_carlo]` velocity_m_per_s, gaps_m, law, samples, seed (see `jimpact.montecarlo`). A name
     of a bundled study is found where no such file is.
 
@@ -113,8 +127,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
 
 
 def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Study:
-    check_tables(tables, ("scene", "law"), ("fit", "data", "monte_carlo"))
-    scene = _scene(tables["scene"])
+    check_tables(tables, ("scene", "law"), STUDY_TABLES)
+    scene, body = _scene(tables["scene"])
     free = check_fit(tables.get("fit", {}))
     options = {key: x for key, x in tables.get("fit", {}).items() if key != "free"}
     row, values, bounds = law_table(tables["law"], other_law, path.parent)
@@ -122,26 +136,79 @@ def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Stud
         free = {name: mask for name, mask in free.items() if name in row.parameters}
     if row.law is RestitutionMatrix and "matrix" not in values:
         values["matrix"] = admissible_start([scene])
-    if "exponent" in values:  # fixed exponents are fast as numbers, free ones must be arrays
-        given = values["exponent"]
-        fixed = tuple(given) if isinstance(given, list) else given
-        values["exponent"] = np.asarray(given, float) if "exponent" in free else fixed
+    values = with_exponent(values, free)
     law = row.build(**values)
     known = free_parameters_of(law)
     bounce = [name for name in ("restitution", *OF_SPEED) if name in known]
     free = free or dict.fromkeys(bounce or default_free(known), True)
-    experiments = _experiments(tables["data"], path, scene) if "data" in tables else None
+    experiments = _experiments(tables["data"], path, body or scene) if "data" in tables else None
     title = str(tables.get("title", path.stem))
     sampled = _sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}
-    return Study(title, scene, law, free, bounds, experiments, values, options, sampled)
+    seen = tables.get("observe")
+    if seen is not None:
+        check_observed(seen, 0 if experiments is None else len(experiments.shots))
+    measured = None if seen is None else observations(scene, seen)
+    parts = (scene, law, free, bounds, experiments, values, options, sampled, measured)
+    return Study(title, *parts)
 
 
-def _experiments(table: Mapping[str, Any], path: Path, scene: Scene) -> Experiments:
+def with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, Any]:
+    """A law's values: fixed exponents are fast as numbers, free ones must be arrays."""
+    if "exponent" not in values:
+        return values
+    given = values["exponent"]
+    fixed = tuple(given) if isinstance(given, list) else given
+    return values | {"exponent": np.asarray(given, float) if "exponent" in free else fixed}
+
+
+def _experiments(table: Mapping[str, Any], path: Path, place: Scene | Body) -> Experiments:
+    """The shots of the table [data], with the scenes that they have of their own."""
     check_keys("[data]", table, DATA_KEYS, required=("file",))
-    experiments = read_experiments(path.parent / table["file"])
-    experiments.scene_of(scene, 0)
+    found = read_experiments(path.parent / table["file"], place, table.get("near_m", CLOSED_BELOW))
+    if found.scenes is None and isinstance(place, Scene):
+        found.scene_of(place, 0)
+    if "contacts" in table:
+        if found.scenes is None:
+            raise ValueError("`contacts` in [data] is for shots with scenes of their own.")
+        kept = np.isin(found.contacts, table["contacts"])
+        if not kept.any():
+            raise ValueError(
+                f"`contacts` in [data] must be one of {', '.join(map(str, set(found.contacts)))}, "
+                f"but is {table['contacts']}."
+            )
+        found = found.only(kept)
     corrected = table.get("momentum_corrected", False)
-    return experiments.momentum_corrected(scene) if corrected else experiments
+    scene = place if isinstance(place, Scene) else None
+    return found.momentum_corrected(scene) if corrected else found
+
+
+def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3) -> Experiments:
+    """400 measured impacts of a tossed acrylic cube on a board, each in the scene of its pose.
+
+    Velocities are those of the centre of mass (m/s, axes of the board) and the angular velocity
+    (rad/s, axes of the cube), before and after, with standard errors; a label is "toss:frame", the
+    frame being the last one before the impact. The cube is the `Box` of `tossed_cube.toml`.
+
+    Args:
+        contacts: only impacts on so many corners, one number or several; None: all.
+        near: corners up to so far above the lowest one touch, too (board and cube are flat to
+            1.4 mm) [m].
+
+    Source: ContactNets (Pfrommer, Halm and Posa, CoRL 2020), see `cube_NOTICE.txt` in `data`.
+
+    >>> import jimpact as ji
+    >>> two = ji.cube_impacts(contacts=2)
+    >>> two.pre.shape, two.scenes[0].contacts, two.units[5]
+    ((21, 6), 2, 'rad/s')
+    """
+    path = Path(str(files("jimpact") / "data" / "tossed_cube.toml"))
+
+    def read(tables: Mapping[str, Any], file: Path) -> Experiments:
+        table = {"file": tables["data"]["file"], "near_m": near}
+        own = {} if contacts is None else {"contacts": contacts}
+        return _experiments(table | own, file, body_of("[scene]", tables["scene"], AT_KEYS))
+
+    return from_file(path, "[scene]", read)
 
 
 def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) -> Body:
@@ -164,12 +231,13 @@ def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) 
     return _BODIES[kind](**given)
 
 
-def _scene(table: Mapping[str, Any]) -> Scene:
+def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
+    """The scene of a study, and the body whose scene it is."""
     check_scene(table)
     if "kind" in table:
         body = body_of("[scene]", table, AT_KEYS)
-        return body.scene(table["q"], table.get("closed_below_m", CLOSED_BELOW))
-    return chain(table["masses_kg"], table.get("wall", False), table.get("gaps_m"))
+        return body.scene(table["q"], table.get("closed_below_m", CLOSED_BELOW)), body
+    return chain(table["masses_kg"], table.get("wall", False), table.get("gaps_m")), None
 
 
 def law_table(

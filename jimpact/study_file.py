@@ -15,12 +15,16 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from jimpact._checks import check_choice, check_values
-from jimpact.shots_file import read_shots
+from jimpact.shots_file import read_positions, read_shots
 
+STUDY_TABLES = ("fit", "data", "observe", "monte_carlo")
 SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
 FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
-DATA_KEYS = ("file", "momentum_corrected")
+MOTION_FIT_KEYS = ("free", "starts", "seed", "max_steps")
+DATA_KEYS = ("file", "momentum_corrected", "near_m", "contacts")
+OBSERVE_KEYS = ("quantity", "value", "sigma", "relative", "contact", "body", "bodies")
+OBSERVE_SHOTS = ("velocity_m_per_s", "drop_height_m")  # one of them says what happens
 SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
 DISTRIBUTIONS = {("high", "low"): "Uniform", ("mean", "std"): "Normal"}
 FIT_METHODS = ("levenberg-marquardt", "adam", "sgd", "lbfgs")
@@ -52,7 +56,7 @@ _UNITS = {
     "inertia": "kg_m2",
     "angle": "rad",
 }
-NO_DATA = "a study must have a [data] table to be fitted, but has none."
+NO_DATA = "a study must have a [data] table or [[observe]] to be fitted, but has none."
 
 T = TypeVar("T")
 
@@ -114,17 +118,18 @@ def _located(path: Path, table: str) -> Path:
 
 
 class Found(NamedTuple):
-    """What a study holds: number of measured shots, whether something is sampled."""
+    """What a study holds: number of measured shots, whether it is for sampling, for fitting."""
 
     shots: int
     sampled: bool
+    fitted: bool
 
 
 def check_study(path: str | Path, law: str | None = None) -> Found:
     """Refuse a study whose tables, words or shots are wrong; see `read_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> Found:
-        check_tables(tables, ("scene", "law"), ("fit", "data", "monte_carlo"))
+        check_tables(tables, ("scene", "law"), STUDY_TABLES)
         check_scene(tables["scene"])
         own = _check_law(tables["law"], law)
         free = check_fit(tables.get("fit", {}))
@@ -133,23 +138,38 @@ def check_study(path: str | Path, law: str | None = None) -> Found:
         shots = 0
         if "data" in tables:
             check_keys("[data]", tables["data"], DATA_KEYS, required=("file",))
-            shots = len(read_shots(file.parent / tables["data"]["file"])[0]["pre"])
+            shots = len(read_shots(file.parent / tables["data"]["file"]).values["pre"])
+        if "observe" in tables:
+            check_observed(tables["observe"], shots)
         if "monte_carlo" in tables:
             check_sampling(tables["monte_carlo"])
-        return Found(shots, "monte_carlo" in tables)
+        return Found(shots, "monte_carlo" in tables, bool(shots) or "observe" in tables)
 
     return from_file(path, "[scene]", check)
 
 
-def check_motion_study(path: str | Path) -> None:
-    """Refuse the study of a motion whose tables or words are wrong; see `read_motion_study`."""
+def check_motion_study(path: str | Path, law: str | None = None) -> bool:
+    """Refuse the study of a motion whose tables or words are wrong; see `read_motion_study`.
 
-    def check(tables: dict[str, Any], file: Path) -> None:
+    And whether there is something to fit.
+    """
+
+    def check(tables: dict[str, Any], file: Path) -> bool:
         check_motion_tables(tables)
-        _check_law(tables["law"], None)
+        own = _check_law(tables["law"], law)
         body_keys("[system]", tables["system"], (GRAVITY,))
+        if own is not None:
+            _check_free(own, check_fit(tables.get("fit", {})) if law is None else None)
+        if "data" in tables:
+            read_positions(file.parent / tables["data"]["file"])
+        return "data" in tables
 
-    from_file(path, "[system]", check)
+    return from_file(path, "[system]", check)
+
+
+def is_motion(path: str | Path) -> bool:
+    """Whether a study is of a motion."""
+    return from_file(path, "[law]", lambda tables, _: "motion" in tables)
 
 
 # ------------------------------------------------------------------------------------ single tables
@@ -157,11 +177,15 @@ def check_motion_study(path: str | Path) -> None:
 
 def check_motion_tables(tables: Mapping[str, Any]) -> None:
     """Those that do not depend on law and body."""
-    check_tables(tables, ("system", "law", "motion"), ("base",))
+    check_tables(tables, ("system", "law", "motion"), ("base", "fit", "data"))
     check_keys("[motion]", tables["motion"], tuple(MOTION_KEYS), ("q0", "v0", "t_end_s"))
     if "base" in tables:
         keys = (*BASE_KEYS, "direction")
         check_keys("[base]", tables["base"], keys, ("amplitude_m", "frequency_hz"))
+    if "fit" in tables:
+        check_fit(tables["fit"], MOTION_FIT_KEYS)
+    if "data" in tables:
+        check_keys("[data]", tables["data"], ("file",), required=("file",))
 
 
 def check_scene(table: Mapping[str, Any]) -> None:
@@ -234,9 +258,9 @@ def _check_law(table: Mapping[str, Any], other: str | None) -> str | None:
     return name
 
 
-def check_fit(table: Mapping[str, Any]) -> dict[str, Any]:
+def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dict[str, Any]:
     """What is free, by name, nothing where nobody says; the table's words are checked."""
-    check_keys("[fit]", table, FIT_KEYS)
+    check_keys("[fit]", table, keys)
     free = table.get("free", [])
     if isinstance(free, dict):
         return free
@@ -252,6 +276,21 @@ def _check_free(law: str, free: Mapping[str, Any] | None) -> None:
             raise ValueError(
                 f"`free` in [fit] must name parameters of {law}, {', '.join(known)}, "
                 f"but has {name!r}."
+            )
+
+
+def check_observed(tables: list[Any], shots: int) -> None:
+    """The tables [[observe]] of a study with so many shots in a file."""
+    if shots:
+        raise ValueError("a study must have [data] or [[observe]], but has both.")
+    for number, table in enumerate(tables):
+        where = f"[[observe]] {number + 1}"
+        check_keys(where, table, (*OBSERVE_KEYS, *OBSERVE_SHOTS), ("quantity", "value"))
+        given = [key for key in OBSERVE_SHOTS if key in table]
+        if len(given) != 1:
+            told = " and ".join(given) or "none"
+            raise ValueError(
+                f"{where} must have one of {', '.join(OBSERVE_SHOTS)}, but has {told}."
             )
 
 
@@ -300,5 +339,8 @@ def check_tables(
     """Raise a ValueError unless a study has these tables, and besides them a title at most."""
     check_keys("the study", study, ("title", *required, *others), required)
     for name in (*required, *others):
-        if not isinstance(study.get(name, {}), dict):
-            raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")
+        given = study.get(name, [] if name == "observe" else {})
+        if name == "observe" and not isinstance(given, list):
+            raise ValueError("`observe` must be tables, each headed by [[observe]].")
+        if name != "observe" and not isinstance(given, dict):
+            raise ValueError(f"`{name}` must be a table, but is {given!r}.")

@@ -46,7 +46,7 @@ print(ji.summary(out, balls, before))
 
 # %% [markdown]
 # What happened meanwhile? With stiffnesses in SI units the history has a time scale: two hard balls of
-# 1 kg touch for a quarter of a millisecond, and the second contact lets go long after the first.
+# 1 kg touch for a quarter of a millisecond, and the second contact lets go a tenth later.
 
 # %%
 hard = ji.LZB(restitution=0.95, stiffness=[1e10, 1e10], exponent=1.5)  # N / m^1.5

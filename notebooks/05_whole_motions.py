@@ -14,8 +14,7 @@
 # %% [markdown]
 # # Whole motions: between impacts, through them, and to rest
 #
-# *Course, part 5. Before: [the rocking block](04_rocking_block.ipynb). Next:
-# [what the data can tell](06_what_the_data_can_tell.ipynb).*
+# *Course, part 5. Before: [the rocking block](04_rocking_block.ipynb).*
 #
 # An impact law is one instant of a motion. `simulate` puts it back in: flights, impacts at located
 # times, contacts that stay closed, and a ledger of the energy. You will learn to simulate bodies from
@@ -160,6 +159,3 @@ given = ([1.0], [0.0], 1.5)
 seen = np.asarray(ji.simulate(ball, ji.Newton(0.8), *given, samples=76).q)
 noisy = seen + 2e-3 * np.random.default_rng(0).normal(size=seen.shape)
 print(ji.fit_motion(ball, ji.Newton(0.75), noisy, *given, sigma=2e-3))
-
-# %% [markdown]
-# *Next: [how much such data can tell](06_what_the_data_can_tell.ipynb).*

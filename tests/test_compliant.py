@@ -401,7 +401,7 @@ def test_history_across_gaps():
     np.testing.assert_allclose(np.asarray(h.velocity).sum(axis=1), 1.0, atol=1e-12)
     data = tomllib.loads((files("jimpact") / "data" / "bead_column.toml").read_text("utf-8"))
     assert ji.plot.forces({"balls": h}).axes[0].get_ylabel() == "force [N]"
-    assert data["bead_mass"] == 2.05e-3
+    assert data["scene"]["masses_kg"] == [2.05e-3] * 12
 
 
 # ------------------------------------------------------------------------------ gap scales

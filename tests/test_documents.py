@@ -183,3 +183,21 @@ def test_every_script_has_its_notebook():
     scripts = sorted((ROOT / "notebooks").glob("*.py"))
     assert [path.stem for path in NOTEBOOKS] == [path.stem for path in scripts]
     assert NOTEBOOKS
+
+
+def test_notebooks_are_one_course():
+    """Each opens with what one will learn and a drawing of the system, and leads to the next."""
+    scripts = [jupytext.read(path.with_suffix(".py")) for path in NOTEBOOKS]
+    for k, (path, script) in enumerate(zip(NOTEBOOKS, scripts, strict=True)):
+        head, drawing = script.cells[0].source, nbformat.read(path, as_version=4).cells[1]
+        assert f"*Course, part {k}." in head
+        assert "You will" in head
+        assert any("image/png" in output.get("data", {}) for output in drawing.outputs), path.stem
+        links = re.findall(r"\]\((\d\w+\.ipynb)\)", "".join(cell.source for cell in script.cells))
+        assert links
+        for link in links:
+            assert (ROOT / "notebooks" / link).exists(), (path.stem, link)
+        if k + 1 < len(NOTEBOOKS):
+            assert NOTEBOOKS[k + 1].name in script.cells[-1].source, path.stem
+        code = "\n".join(cell.source for cell in script.cells if cell.cell_type == "code")
+        assert not re.search(r"^(from|import) jimpact\.", code, re.M), "ji.* is all that one needs"

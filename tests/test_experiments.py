@@ -212,3 +212,92 @@ def test_a_scene_is_needed():
         data.momentum_excess()
     own = ji.Experiments([1.0, 0.0], [0.0, 1.1], scenes=[ji.chain([1.0, 1.0])])
     np.testing.assert_allclose(own.momentum_excess(), [[0.1]], atol=1e-15)
+
+
+# ------------------------------------------------------- scenes and errors that a file gives
+
+MORE = "mass_1[g],mass_2[kg],gap_1[mm],pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]"
+
+
+def test_masses_and_gaps_of_each_shot(tmp_path):
+    path = written(tmp_path, f"{MORE}\n100,1,0,1,0,0,1\n200,1,2,1,0,0,1\n")
+    data = ji.read_experiments(path, ji.chain([1.0, 1.0]))
+    np.testing.assert_allclose([s.mass for s in data.scenes], [[0.1, 1.0], [0.2, 1.0]])
+    np.testing.assert_allclose([s.gaps for s in data.scenes], [[0.0], [0.002]])
+    assert data.contacts.tolist() == [1, 1]
+    assert data.only([1]).shots == ("2",)
+    with pytest.raises(ValueError, match=r"columns `mass` must belong to a chain"):
+        ji.read_experiments(path)
+
+
+def test_a_body_where_each_shot_found_it(tmp_path):
+    head = "q_1[m],q_2[cm],q_3[deg]," + ",".join(
+        f"{k}_{i}[{u}]" for k in ("pre", "post") for i, u in ((1, "m/s"), (2, "m/s"), (3, "rad/s"))
+    )
+    path = written(tmp_path, f"{head}\n0,100,0,0,-1,0,0,0.5,0\n0,100,30,0,-1,0,0,0.5,0\n")
+    data = ji.read_experiments(path, ji.Block(width=1.0, height=2.0), near=1e-3)
+    assert data.contacts.tolist() == [2, 1]  # its base, its corner
+    assert data.units == ("m/s", "m/s", "rad/s")
+    with pytest.raises(ValueError, match=r"columns `q` must belong to a body, but are given for"):
+        ji.read_experiments(path, CHAIN)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("pre_1[m/s],post_1[m/s],mass_1[m]\n1,1,1\n", r"the unit of column `mass_1\[m\]` must be one of kg, g"),
+        ("pre_1[m/s],post_1[m/s],gap_1[mm]\n1,1,\n", r"column `gap_1\[mm\]`: this must be given"),
+        ("pre_1[m/s],post_1[m/s],sigma_1[m/s],sigma_pre_1[m/s]\n1,1,1,-1\n", r"must be > 0, but is -1"),
+        ("pre_1[m/s],post_1[m/s],sigma_pre_1[m/s]\n1,1,1\n", r"`sigma` must be given where `sigma_pre` is"),
+        ("pre_1[m/s],post_1[m/s],q_2[m]\n1,1,1\n", r"column `q_1\[unit\]` is missing"),
+        ("pre_1[m/s],post_1[m/s],resolution_1[m/s]\n1,1,0\n", r"must be > 0, but is 0"),
+    ],
+)  # fmt: skip
+def test_bad_further_columns(tmp_path, text, message):
+    with pytest.raises(ValueError, match=message):
+        ji.read_experiments(written(tmp_path, text), CHAIN)
+
+
+def test_readings_in_steps_have_the_error_of_their_rounding():
+    data = ji.Experiments([1.0, 0.0], [0.2, 0.8], resolution=0.1)
+    np.testing.assert_allclose(data.sigma, 0.1 / np.sqrt(12))
+    both = ji.Experiments([1.0, 0.0], [0.2, 0.8], sigma=0.03, resolution=0.1)
+    np.testing.assert_allclose(both.only([0]).sigma, np.hypot(0.03, 0.1 / np.sqrt(12)))
+    rounded = np.random.default_rng(0).uniform(-1, 1, 4000)
+    np.testing.assert_allclose((rounded - rounded.round(1)).std(), 0.1 / np.sqrt(12), rtol=0.02)
+
+
+def test_errors_before_the_impact_are_passed_on():
+    """Newton's law is linear in v-: the covariance, and the minimum, in closed form."""
+    scene, e = ji.chain([1.0, 2.0]), 0.5
+    pre, post, before = [[1.0, 0.0], [2.0, -1.0]], [[0.1, 0.5], [-0.9, np.nan]], [0.05, 0.0]
+    data = ji.Experiments(pre, post, 0.02, sigma_pre=np.tile(before, (2, 1)))
+    problem = ji.FitProblem.from_shots(ji.Newton(e), scene, data)
+    m1, m2 = 1.0, 2.0
+    jacobian = np.array([[m1 - e * m2, (1 + e) * m2], [(1 + e) * m1, m2 - e * m1]]) / (m1 + m2)
+    covariance = 0.02**2 * np.eye(2) + jacobian @ np.diag(np.square(before)) @ jacobian.T
+    r = jacobian @ pre[0] - post[0]
+    second = (jacobian @ pre[1])[0] - post[1][0]
+    expected = [r @ np.linalg.solve(covariance, r), second**2 / covariance[0, 0]]
+    residual = np.asarray(problem.residual([e]))
+    np.testing.assert_allclose(
+        [residual[:2] @ residual[:2], residual[2] ** 2], expected, rtol=1e-12
+    )
+    density = -0.5 * sum(expected) - 0.5 * np.log(np.linalg.det(2 * np.pi * covariance))
+    density -= 0.5 * np.log(2 * np.pi * covariance[0, 0])
+    np.testing.assert_allclose(problem.log_density([e]), density, rtol=1e-12)
+    excess = ji.Experiments([1.0, 0.0], [0.1, 0.98], 0.01, sigma_pre=np.array([[0.05, 0.0]]))
+    assert data_defects(excess, ji.chain([1.0, 1.0])) == []
+
+
+def test_the_cube():
+    data = ji.cube_impacts()
+    assert [int((data.contacts == m).sum()) for m in (1, 2, 4)] == [377, 21, 2]
+    assert data.units == ("m/s",) * 3 + ("rad/s",) * 3
+    assert 0 < np.median(data.energy_ratio()) < 1
+    heavy = data.scenes[0]
+    np.testing.assert_allclose(np.asarray(heavy.normals)[:3, 0], [0, 0, 1], atol=1e-12)
+    with pytest.raises(
+        ValueError, match=r"`contacts` in \[data\] must be one of 1, 2, 4, but is 3"
+    ):
+        ji.cube_impacts(3)

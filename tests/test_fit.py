@@ -1,6 +1,7 @@
 """Fits with a closed form, recovery of known parameters, honesty about what cannot be known."""
 
 import json
+from dataclasses import replace
 from importlib.resources import files
 
 import jax
@@ -309,6 +310,35 @@ def test_the_unseen_combination_is_really_unseen(rank_2_of_3):
     assert np.abs(change).max() < 0.05 * np.abs(seen).max()
 
 
+def test_the_interval_of_a_valley_is_told(rank_2_of_3):
+    """Whatever e1 is in its interval, others reproduce the shot as well; no lower end of k2."""
+    found = rank_2_of_3
+    assert "at least" in str(found)
+    assert "unseen" in str(found)
+    for pieces, domain in zip(found.intervals(), np.transpose(found.bounds)):
+        assert len(pieces) == 1
+        assert (pieces[0][0] <= domain[0]) != (pieces[0][1] >= domain[1])
+    np.testing.assert_array_equal(found.confidence_interval(), [p[0] for p in found.intervals()])
+
+
+def test_all_stiffness_ratios_that_fit_are_found():
+    """Three of them come apart alike; the first is not the true one."""
+    truth = ji.LZB([0.95, 0.95], [1.0, 40.0])
+    data = ji.Experiments([1.0, 0, 0], simulated(truth, BALLS, [[1.0, 0, 0]])[0], sigma=1e-3)
+    free = {"restitution": [1, 1], "stiffness": [False, True]}
+    found = ji.fit(ji.LZB([0.9, 0.9], [1.0, 1.0]), BALLS, data, free)
+    ratios = sorted(start.value[1] for start in found.starts)
+    np.testing.assert_allclose(ratios, [11.531, 31.732, 40.0], rtol=1e-3)
+    for told in (found, replace(found, profiles=())):  # by profiles, by parabolas
+        pieces = told.intervals()[1]
+        assert len(pieces) in (2, 3)
+        assert any(low <= 40.0 <= high for low, high in pieces)
+        assert not any(low <= 20.0 <= high for low, high in pieces)
+        assert told.confidence_interval()[1, 0] < 12
+    assert " or " in str(found)
+    assert "3 different minima fit equally well" in " ".join(found.warnings)
+
+
 @pytest.mark.slow
 def test_known_parameters_are_recovered_from_varied_shots():
     truth = ji.LZB([0.9, 0.7], [1.0, 2.0])
@@ -513,6 +543,9 @@ def test_profile_ends_at_a_bound_on_one_side():
     (scan,) = ji.profile(found, "restitution", level=0.9)
     assert scan.intervals[0][1] == 1.0
     assert scan.words.startswith("at least 0.9")
+    assert "at least 0.9" in str(found)  # a fit at a bound profiles of itself
+    (told,) = ji.fit(ji.Newton(0.9), PAIR, found.experiments, profiles=False).intervals(0.9)
+    np.testing.assert_allclose(told, scan.intervals, rtol=1e-6)
 
 
 def test_profile_of_two_minima_is_a_union():
@@ -534,6 +567,45 @@ def test_profile_of_a_valley_is_what_the_bounds_leave_of_it():
         assert scan.intervals[0][1] == 1.0
         np.testing.assert_allclose(scan.intervals[0][0], 0.5, atol=3 * width)
         assert scan.intervals[0][0] < 0.5
+
+
+def test_contours_of_linear_problems_are_ellipses():
+    """The other two entries follow: the deviance is a quadratic form in the inverse covariance."""
+    truth = Coupled(jnp.array([[0.6, 0.1], [0.05, 0.4]]))
+    post = simulated(truth, BALLS, PRE_3, noise=0.01)
+    names = ["matrix[1,1]", "matrix[2,2]"]
+    for sigma in (0.01, None):
+        found = ji.fit(truth, BALLS, ji.Experiments(PRE_3, post, sigma), "matrix", starts=1)
+        region = ji.contour(found, *names, points=5)
+        freedom = found.degrees_of_freedom
+        limit = stats.chi2.ppf(0.95, 2) if sigma else 2 * stats.f.ppf(0.95, 2, freedom)
+        np.testing.assert_allclose(region.limit, limit)
+        at = [found.names.index(name) for name in names]
+        inverse = np.linalg.inv(found.covariance[np.ix_(at, at)])
+        away = np.stack(np.meshgrid(region.x, region.y, indexing="ij"), axis=-1) - found.value[at]
+        expected = np.einsum("abi,ij,abj->ab", away, inverse, away)
+        seen = np.isfinite(region.deviance)
+        np.testing.assert_allclose(region.deviance[seen], expected[seen], rtol=1e-5, atol=1e-6)
+        assert (expected[~seen] > limit).all()
+        assert region.deviance[0, 2] > limit  # the picture holds the region
+        assert len(ji.plot.contour(region).axes) == 1
+
+
+def test_contour_of_a_valley_is_its_length():
+    post = simulated(ji.Newton(0.5), PAIR, SHOTS[:1])
+    found = ji.fit(Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-3), ("one", "other"))
+    region = ji.contour(found, "one", "other")
+    slope = simulated(ji.Newton(1.0), PAIR, SHOTS[:1]) - simulated(ji.Newton(0.0), PAIR, SHOTS[:1])
+    expected = np.sum(slope**2) * ((region.x[:, None] * region.y - 0.5) / 1e-3) ** 2
+    seen = np.isfinite(region.deviance)
+    np.testing.assert_allclose(region.deviance[seen], expected[seen], rtol=1e-6, atol=1e-4)
+    assert (expected[~seen] > region.limit).all()
+    for names, message in (
+        (("one", "one"), "must differ"),
+        (("one", "e"), "must be of one, other"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ji.contour(found, *names)
 
 
 @pytest.mark.parametrize(

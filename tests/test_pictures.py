@@ -29,7 +29,7 @@ AFTER = np.array([-0.1, 0.2, 0.9])
 HERTZ = ji.Compliant(ji.Hertz(1e9))
 DIMENSIONLESS = (  # quantities that have no unit
     "ratio", "restitution", "exponent", "setting", "error", "evaluations", "dispersion",
-    "energy kept", "share", "method", "balls N",
+    "energy kept", "share", "method", "balls N", "deviance", "stiffness",
 )  # fmt: skip
 COUNTED = ("law", "force", "body", "shot")  # names stand along the axis
 
@@ -171,12 +171,29 @@ def outcomes(masses, wall):
     return ji.plot.admissible_set(found, {"Newton's cradle": found.plastic, "at rest": 0 * v})
 
 
+def region():
+    x, k = np.linspace(0.4, 0.6, 5), np.geomspace(0.5, 3.0, 5)
+    deviance = ((x - 0.5) / 0.03)[:, None] ** 2 + np.log(k) ** 2 / 0.04
+    names = ("restitution[1]", "stiffness[2]")
+    return ji.Contour(names, x, k, deviance, 5.99, 0.95, (0.5, 1.0), (False, True))
+
+
+def valley(name):
+    x = np.linspace(0.0, 1.0, 9)
+    pieces = ((0.25, 0.5), (0.75, 1.0))
+    return ji.Profile(name, x, 40 * (x - 0.5) ** 2, 3.84, 0.95, pieces, (0.0, 1.0))
+
+
 BLOCK = ji.Block(width=0.2, height=0.6)
 PICTURES = {
     "advice": advice,
     "comparison": comparison,
     "fit of a shot": lambda: ji.plot.fit(canned(1), {"the same": canned(1)}, "one shot"),
     "fit of many shots": lambda: ji.plot.fit(canned(50)),
+    "contour": lambda: ji.plot.contour(region(), "two parameters"),
+    "correlation": lambda: ji.plot.correlation(canned(4)),
+    "profiles": lambda: ji.plot.profiles([valley("restitution[1]"), valley("stiffness[2]")] * 2),
+    "residuals": lambda: ji.plot.residuals(canned(50)),
     "forces": lambda: ji.plot.forces({"soft": impact_history(), "hard": impact_history()}),
     "history": lambda: ji.plot.history(impact_history(), "three balls"),
     "rheologies": rheologies,
@@ -246,7 +263,7 @@ def test_layout(name):
         for label, axis in ((axes.get_xlabel(), "x"), (axes.get_ylabel(), "y")):
             ticks = getattr(axes, f"get_{axis}ticklabels")()
             silent = not any(tick.get_text() and tick.get_visible() for tick in ticks)
-            categories = axis == "y" and name == "stability_map"
+            categories = name == "correlation" or (axis == "y" and name == "stability_map")
             assert silent or categories or labelled(label), (axis, label, beside)
 
 

@@ -3,6 +3,7 @@
 JIMPACT_SITE names a built site, as in CI: then nothing is skipped. Else it is built here.
 """
 
+import doctest
 import os
 import re
 import shutil
@@ -122,6 +123,26 @@ def test_every_picture_of_the_docs_has_its_code():
     code = (ROOT / "docs" / "gallery.py").read_text(encoding="utf-8")
     made = set(re.findall(r"@picture\ndef (\w+)", code))
     assert made == {path.stem for path in (ROOT / "docs" / "pictures").glob("*.png")}
+
+
+def test_paper_cites_what_it_lists():
+    paper, listed = (
+        (ROOT / "docs" / x).read_text(encoding="utf-8") for x in ("paper.md", "paper.bib")
+    )
+    cited = set(re.findall(r"@([a-z]+\d{4})", paper))
+    assert cited == set(re.findall(r"@\w+\{(\w+),", listed))
+
+
+def test_formulas_of_docstrings_become_formulas(monkeypatch):
+    pytest.importorskip("docutils")
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import formulas
+
+    assert doctest.testmod(formulas).failed == 0
+    lines = ["Equation: `gamma+ = -e gamma-`, by `ji.impact`", "and `W p`.", "", "`W p`"]
+    formulas.typeset(lines)
+    assert lines[0].count(":math:") == 2
+    assert lines[-1] == "`W p`"
 
 
 # ----------------------------------------------------------------------------------- in a browser

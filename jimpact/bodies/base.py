@@ -199,6 +199,41 @@ class Body(eqx.Module):
         parts = (mass, normals, tangents, gaps)
         return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), parts))
 
+    def scenes(self, q: Any, near: float = CLOSED_BELOW) -> list[Scene]:
+        """Scenes at measured configurations q (K, d): the contacts that touch, no others.
+
+        A measured height is hardly as good as a gap, so gaps count from the least one: contacts
+        up to `near` [m] above it are closed, the others are left out.
+
+        Raises:
+            ValueError: q of another shape, not finite, out of the range of the gap function.
+
+        >>> import jimpact as ji
+        >>> edge = ji.Block(width=1.0, height=2.0).scenes([[0.0, 1.01, 0.0]])
+        >>> edge[0].contacts
+        2
+        """
+        q = as_float_array("q", q)
+        d = self.coordinates or jax.eval_shape(self.mass_matrix, q[0]).shape[0]
+        check_shape("q", q, (len(q), d), "a configuration a row")
+        check_values("q", q)
+        check_values("near", near, low=0.0)
+        each = jax.tree.map(np.asarray, _many_parts(self, q))
+        masses, normals, tangents, gaps, margins = each
+        if not (margins >= 0).all():
+            k = int(np.argmin(margins >= 0))
+            raise ValueError(
+                f"Argument `q` must be in the range of the gap function ({self.range_in_words}), "
+                f"but its margin `valid(q)` has value {margins[k]:g} in row {k + 1}."
+            )
+        scenes, count = [], gaps.shape[1]
+        for k, on in enumerate(gaps <= gaps.min(axis=1, keepdims=True) + near):
+            sides = tangents
+            if tangents is not None:
+                sides = tangents[k][:, np.repeat(on, tangents.shape[2] // count)]
+            scenes.append(Scene(masses[k], normals[k][:, on], sides))
+        return scenes
+
     def _parts(self, q: jax.Array) -> "_Parts":
         return _compiled_parts(self, q)
 
@@ -214,6 +249,7 @@ def _parts(body: Body, q: jax.Array) -> _Parts:
 
 
 _compiled_parts = eqx.filter_jit(_parts)
+_many_parts = eqx.filter_jit(jax.vmap(_parts, in_axes=(None, 0)))
 
 
 class GivenBody(Body):

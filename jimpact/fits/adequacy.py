@@ -52,7 +52,7 @@ def weighted(problem: FitProblem, found: Search) -> Weighted:
     rows = np.arange(len(here)) if here.ndim else np.zeros(1, int)
     shot = np.broadcast_to(rows.reshape(-1, *(1,) * (here.ndim - 1)), here.shape)
     return Weighted(
-        (size * np.asarray(r.weight, float) * error)[here],
+        (size * np.asarray(r.mixed(np.asarray(r.weight, float) * error)))[here],
         size * found.jacobian[here.ravel()],
         shot[here],
     )
@@ -145,10 +145,13 @@ def _conserved(problem: FitProblem) -> list[np.ndarray]:
     """Of every shot the directions (n, c) in which residuals are momentum: orthonormal columns."""
     assert problem.experiments is not None
     weight = np.asarray(problem.residuals.weight, float) * float(problem.residuals.size)
-    found = []
-    for (rows, _, _), w in zip(problem.experiments.balances(problem.scene), weight):
+    found, mixing = [], problem.residuals.mixing
+    for k, ((rows, _, _), w) in enumerate(zip(problem.experiments.balances(problem.scene), weight)):
         whole = (w > 0).all() and len(rows)
-        found.append(np.linalg.qr((rows / w).T)[0] if whole else np.zeros((len(w), 0)))
+        back = (rows / w).T if whole else np.zeros((len(w), 0))
+        if whole and mixing is not None:
+            back = np.linalg.solve(np.asarray(mixing[k], float).T, back)
+        found.append(np.linalg.qr(back)[0])
     return found
 
 

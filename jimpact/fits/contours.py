@@ -13,15 +13,15 @@ from jimpact.fits.profiles import Scaled, check_profiled, linearized
 from jimpact.progress import progress_bar
 
 _BEYOND = 1.3  # how far the picture goes, in half-widths of the region of a parabola
-_SWEEPS = 4  # of minima handed on to neighbours that have found a worse one
 
 
 @dataclass(frozen=True, eq=False)
 class Contour:
-    """Deviance (A, B) over values x (A,) of one parameter and y (B,) of another.
+    """`deviance` (A, B) over values `x` (A,) of one parameter and `y` (B,) of another, by `names`.
 
-    The confidence region is where it is at most `limit`. `best`: the values of the fit. `log`:
-    which of the two is fitted in its logarithm.
+    The confidence region at `level` is where it is at most `limit`; inf where no neighbour is
+    inside, which was not computed. `best`: the values of the fit. `log`: which of the two is fitted
+    in its logarithm.
     """
 
     names: tuple[str, str]
@@ -50,8 +50,8 @@ def contour(
     twice that of F with 2 and the degrees of freedom that are left.
 
     The values cover somewhat more than the region of a parabola, cut at the bounds; the whole
-    domain of what the data cannot see. All are solved side by side, from the minima of the fit and
-    then from their better neighbours. `ji.plot.contour` draws it.
+    domain of what the data cannot see. The region is filled from the minima of the fit outwards,
+    from neighbour to neighbour, many side by side. `ji.plot.contour` draws it.
 
     Args:
         fit: by least squares.
@@ -59,6 +59,9 @@ def contour(
         level: of the region, in (0, 1).
         points: values of each, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
+
+    Returns:
+        `Contour` with `deviance` (points, points).
 
     Raises:
         ValueError: level, points or names; a robust loss; a matrix that is kept admissible.
@@ -92,45 +95,41 @@ def contour(
         np.linspace(*scaled.reach(i, linearized(fit, i, _BEYOND * np.sqrt(limit))), points)
         for i in pair
     )
-    minima = [scaled.point(fit.value), *(scaled.point(start.value) for start in fit.starts[1:])]
-    held = []
-    for a in x:
-        for b in y:
-            near = min(minima, key=lambda y: (y[pair[0]] - a) ** 2 + (y[pair[1]] - b) ** 2)
-            point = near.copy()
-            point[list(pair)] = a, b
-            held.append((pair, point))
-    shape = (points, points)
-    residuals = filled_up(fit.problem.residuals)
-    alone = len(fit.names) == 2  # nothing is left to be solved for
+    values = (x, y)
+    ends: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
+    ahead: dict[tuple[int, int], np.ndarray] = {}
+    for value in (fit.value, *(start.value for start in fit.starts[1:])):
+        point = scaled.point(value)
+        row, column = (int(np.argmin(np.abs(v - point[i]))) for v, i in zip(values, pair))
+        ahead[row, column] = point
+    residuals, least = filled_up(fit.problem.residuals), fit.starts[0].sum_of_squares
     with progress_bar(progress) as show:
-        steps = 1 if alone else DEFAULT_STEPS["levenberg-marquardt"]
-        states = run_held(residuals, held, steps, show)
-        squares = 2 * np.asarray(states.cost, float)
-        ends = np.asarray(states.y, float)
-        for _ in range(0 if alone else _SWEEPS):
-            tried = _better_neighbours(squares.reshape(shape))
-            if not tried:
-                break
-            again = []
-            for k, other in tried:
-                point = ends[other].copy()
-                point[list(pair)] = held[k][1][list(pair)]
-                again.append((pair, point))
-            more = run_held(residuals, again, steps, show)
-            cost = 2 * np.asarray(more.cost, float)
-            better = [i for i, (k, _) in enumerate(tried) if cost[i] < (1 - 1e-6) * squares[k]]
-            for i in better:
-                squares[tried[i][0]], ends[tried[i][0]] = cost[i], more.y[i]
-            if not better:
-                break
-    least = min(fit.starts[0].sum_of_squares, float(squares.min()) * scaled.size**2)
-    deviance = (squares * scaled.size**2 - least) / scaled.variance
+        while ahead:
+            held = []
+            for cell, near in ahead.items():
+                point = near.copy()
+                point[list(pair)] = [v[k] for v, k in zip(values, cell)]
+                held.append((pair, point))
+            states = run_held(residuals, held, DEFAULT_STEPS["levenberg-marquardt"], show)
+            squares = 2 * np.asarray(states.cost, float) * scaled.size**2
+            for k, cell in enumerate(ahead):
+                ends[cell] = float(squares[k]), np.asarray(states.y[k], float)
+            least = min(least, float(squares.min()))
+            ahead = {
+                beside: ends[cell][1]
+                for cell in ahead
+                if ends[cell][0] - least <= limit * scaled.variance
+                for beside in _around(cell, points)
+                if beside not in ends
+            }
+    deviance = np.full((points, points), np.inf)
+    for cell, (total, _) in ends.items():
+        deviance[cell] = max(total - least, 0.0) / scaled.variance
     return Contour(
         names=(first, second),
         x=scaled.real(pair[0], x),
         y=scaled.real(pair[1], y),
-        deviance=np.maximum(deviance, 0.0).reshape(shape),
+        deviance=deviance,
         limit=float(limit),
         level=level,
         best=(float(fit.value[pair[0]]), float(fit.value[pair[1]])),
@@ -138,18 +137,7 @@ def contour(
     )
 
 
-def _better_neighbours(squares: np.ndarray) -> list[tuple[int, int]]:
-    """Points of a grid, numbered through, each with its best neighbour, if that is better."""
-    rows, columns = squares.shape
-    found = []
-    for k in range(rows * columns):
-        i, j = divmod(k, columns)
-        beside = [
-            (a, b)
-            for a, b in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1))
-            if 0 <= a < rows and 0 <= b < columns
-        ]
-        a, b = min(beside, key=lambda at: squares[at])
-        if squares[a, b] < squares[i, j]:
-            found.append((k, a * columns + b))
-    return found
+def _around(cell: tuple[int, int], points: int) -> list[tuple[int, int]]:
+    """Cells of a square grid beside one, corners too."""
+    near = [(cell[0] + i, cell[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    return [(i, j) for i, j in near if 0 <= i < points and 0 <= j < points]

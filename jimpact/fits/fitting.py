@@ -34,6 +34,7 @@ HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the effic
 STUDENT = 4.0  # degrees of freedom of the tails
 MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 ROUNDS = 50  # of weights
+SETTLED = 1e-5  # the same, where errors of v- are passed on: far below any standard error
 SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 
 
@@ -141,7 +142,7 @@ class Fit(Generic[AnyLaw]):
         return tuple(linearized(self, i, quantile(self, level)) for i in range(len(self.names)))
 
     def confidence_interval(self, level: float = 0.95) -> np.ndarray:
-        """The outermost ends (P, 2) of `intervals`."""
+        """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
         return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
 
     def to_dict(self) -> dict[str, Any]:
@@ -262,6 +263,8 @@ def fit(
     while (lost := unusable(problem, found)).any() and not lost.all():
         problem = _without(problem, lost)
         found = search(problem, method, starts, seed, steps, progress)
+    if problem.residuals.mixing is not None:
+        problem, found = _errors_before(problem, found, method, steps)
     robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
     end = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
     if profiles:
@@ -269,6 +272,20 @@ def fit(
     if profiles is None and needs_profiles(end):
         return replace(end, profiles=quick_profiles(end, progress))
     return end
+
+
+def _errors_before(
+    problem: FitProblem, found: Search, method: Method, max_steps: int
+) -> tuple[FitProblem, Search]:
+    """Errors of v- passed on as the law that is found does, until both agree."""
+    for _ in range(ROUNDS):
+        before = found.y
+        law = with_entries(problem.law, problem.residuals.fields, jnp.asarray(found.entries))
+        problem = problem.with_errors_before(law)
+        found = search_near(problem, found.y, method, max_steps)
+        if np.abs(found.y - before).max() <= SETTLED:
+            break
+    return problem, found
 
 
 def _rms(problem: FitProblem, residual: np.ndarray) -> float:
@@ -349,8 +366,15 @@ def as_fit(
         r, weighed = problem.residuals, problem.weighed(factor).residuals
         back = float(weighed.size) / float(r.size) / factor.reshape(-1, 1)
         weight = np.asarray(r.weight, float)
-        squares = float(np.sum((weight * (np.nan_to_num(problem.measured) - found.seen)) ** 2))
+        left = weight * (np.nan_to_num(problem.measured) - found.seen)
+        squares = float(np.sum(np.asarray(r.mixed(left)) ** 2))
         jacobian = back * found.jacobian
+        if r.mixing is not None:  # which comes after the factors
+            mixing, each = np.asarray(r.mixing, float), factor[..., None]
+            alone = np.linalg.solve(
+                mixing, (jacobian * factor.reshape(-1, 1)).reshape(*each.shape[:-1], -1)
+            )
+            jacobian = (mixing @ (alone / each)).reshape(jacobian.shape)
         minima = [Minimum(squares, found.value, 1, jacobian)]
         found = found._replace(jacobian=jacobian, minima=minima)
     residuals, names = problem.residuals, problem.names

@@ -66,15 +66,19 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: jax.Array) -> Any
     return law
 
 
-def free_parameters(law: Law, free: Any) -> tuple[Parameters, list[str]]:
-    """The parameters that `free` names, and notes on what was held instead."""
+def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parameters, list[str]]:
+    """The parameters that `free` names, and notes on what was held instead.
+
+    `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
+    """
     known = list(free_parameters_of(law))
     labels, notes = {}, []
     for field, choice in _as_mapping(free, known).items():
         if field not in known:
             raise ValueError(_unknown_field(law, field, known))
         labels[field] = _as_labels(field, choice, np.shape(value_of(law, field)))
-    if "stiffness" in labels and labels["stiffness"].all() and _only_ratios(law, labels):
+    ratios = not absolute and _only_ratios(law, labels)
+    if ratios and "stiffness" in labels and labels["stiffness"].all():
         held = labels["stiffness"] == labels["stiffness"].flat[0]
         if held.all():
             raise ValueError(

@@ -61,9 +61,14 @@ class Shots(eqx.Module):
     def __call__(self, law: Law) -> Seen:
         """Velocities after every shot, and the status of its impact."""
         out = jax.vmap(impact, in_axes=(None, 0, 0))(law, self.scenes, self.pre)
-        codes = jnp.asarray([CODE[name] for name in UNUSABLE], out.status.dtype)
-        bad = jnp.any(out.status[:, None] == codes[None, :], axis=1)
+        bad = means_nothing(out.status)
         return Seen(out.velocity[:, : self.bodies], bad[:, None], out.status)
+
+
+def means_nothing(status: jax.Array) -> jax.Array:
+    """Whether velocities with these codes (K,) mean nothing."""
+    codes = jnp.asarray([CODE[name] for name in UNUSABLE], status.dtype)
+    return jnp.any(status[:, None] == codes[None, :], axis=1)
 
 
 class Observed(eqx.Module):
@@ -102,6 +107,7 @@ class Residuals(eqx.Module):
     size: jax.Array  # () size r is (seen - measured) / sigma, with sigma = 1 where unknown
     unit: jax.Array  # () the largest measured value
     fields: tuple[str, ...] = eqx.field(static=True)
+    mixing: jax.Array | None = None  # (K, n, n): makes correlated errors of a shot independent
 
     def law_at(self, y: jax.Array) -> Law:
         """The law of scaled parameters y."""
@@ -116,7 +122,13 @@ class Residuals(eqx.Module):
         bad = jnp.broadcast_to(seen.bad, self.measured.shape)
         harmless = jnp.where(bad, self.measured, seen.value)
         error = jnp.where(bad, PENALTY * self.unit, harmless - self.measured)
-        return (error * self.weight).reshape(-1), seen
+        return self.mixed(error * self.weight).reshape(-1), seen
+
+    def mixed(self, weighted: Any) -> Any:
+        """Weighted errors, shaped like what was measured, as independent ones."""
+        if self.mixing is None:
+            return weighted
+        return (self.mixing @ weighted[..., None])[..., 0]
 
     def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         """Weighted residual (R,), its Jacobian (R, Q), and (values seen, status)."""
@@ -139,6 +151,10 @@ class FitProblem:
     functions of x for jit, vmap and grad, and so for any solver or sampler; `start` (P,), `domains`
     (P, 2) and `names` say where to begin, how far x may go, and what it means. `fit(problem)` does
     all that `fit` does.
+
+    Errors S of v- are passed on: with `J = dv+/dv-` of the law, those of a shot have the covariance
+    `C = diag(sigma^2) + J S J^T`, and its residual is multiplied by the inverse of the Cholesky
+    factor of C (J of the start; `fit` takes J of the law it finds).
 
     Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where nothing
     was), `sigma`, `experiments` and `scene` or None, what is `free`, how many independent `values`
@@ -206,7 +222,37 @@ class FitProblem:
             law, observe, post, sigma, errors, free, bounds, dtype, unit, energy, alike
         )
         values = problem.values - experiments.lost_freedom
-        return replace(problem, values=values, experiments=experiments, scene=scene)
+        problem = replace(problem, values=values, experiments=experiments, scene=scene)
+        return problem if experiments.sigma_pre is None else problem.with_errors_before(law)
+
+    def with_errors_before(self, law: Law) -> "FitProblem":
+        """With the errors of v- passed on to v+ as this law does."""
+        data, r = self.experiments, self.residuals
+        assert data is not None
+        assert data.sigma_pre is not None
+        count, n = self.measured.shape
+        slope = slopes_before(law, filled_up(r).observe)[:count]
+        slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
+        here = ~np.isnan(self.measured)
+        before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
+        own = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
+        both = np.where(here[:, :, None] & here[:, None, :], before @ before.swapaxes(1, 2), 0.0)
+        covariance = both + own[:, :, None] * np.eye(n)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
+        # factors that a weight already has (shots left out, robust ones) stay
+        old = np.where(here, np.asarray(self.sigma, float), 1.0)
+        weight = np.asarray(r.weight, float) * float(r.size) * old / sigma
+        size = float(r.unit) * np.linalg.norm(weight)
+        mixing = jnp.asarray(np.linalg.inv(factor), r.weight.dtype)
+        arrays = (jnp.asarray(weight / size, r.weight.dtype), jnp.asarray(size, r.size.dtype))
+        residuals = eqx.tree_at(
+            lambda r: (r.weight, r.size, r.mixing),
+            r,
+            (*arrays, mixing),
+            is_leaf=lambda x: x is None,
+        )
+        return replace(self, residuals=residuals, sigma=np.where(here, sigma, np.nan))
 
     @classmethod
     def from_observable(
@@ -272,6 +318,16 @@ class FitProblem:
         return "value" if self.experiments is None else "velocity"
 
     @property
+    def labels(self) -> tuple[str, ...]:
+        """Of the shots, or of the rows of what was measured."""
+        if self.experiments is not None:
+            return self.experiments.shots
+        rows = self.measured.shape[0] if self.measured.ndim else 1
+        return getattr(self.residuals.observe, "labels", None) or tuple(
+            str(k + 1) for k in range(rows)
+        )
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of the parameters x; contacts are numbered from 1."""
         return self.parameters.names
@@ -304,7 +360,9 @@ class FitProblem:
         if self.sigma is None:
             return -0.5 * self.values * jnp.log(squares)
         seen = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
-        return -0.5 * squares - float(np.sum(np.log(seen * math.sqrt(2 * math.pi))))
+        mixing = self.residuals.mixing
+        other = 0.0 if mixing is None else np.log(np.diagonal(mixing, axis1=1, axis2=2)).sum()
+        return -0.5 * squares - float(np.sum(np.log(seen * math.sqrt(2 * math.pi))) - other)
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """With weights 1 / sigma times a factor, shaped like `measured`; 0 leaves a value out."""
@@ -350,7 +408,8 @@ def _build(
     scenes: list[Scene],
 ) -> FitProblem:
     """Arrays, weights and natural scales of a fit."""
-    parameters, notes = free_parameters(law, free)
+    absolute = getattr(observe, "absolute", False)
+    parameters, notes = free_parameters(law, free, absolute)
     limits = bounds_of(parameters, law, bounds)
     law = _in(dtype, law)
     here = ~np.isnan(measured)
@@ -412,12 +471,29 @@ def filled_up(residuals: Residuals) -> Residuals:
         goal *= 4 if goal < FEW else 2
 
     last = np.minimum(np.arange(goal), count - 1)
-    parts = (residuals.observe, residuals.measured, residuals.weight)
-    observe, measured, weight = jax.tree.map(lambda x: np.asarray(x)[last], parts)
+    parts = (residuals.observe, residuals.measured, residuals.weight, residuals.mixing)
+    observe, measured, weight, mixing = jax.tree.map(lambda x: np.asarray(x)[last], parts)
     weight[count:] = 0.0
     return eqx.tree_at(
-        lambda r: (r.observe, r.measured, r.weight), residuals, (observe, measured, weight)
+        lambda r: (r.observe, r.measured, r.weight, r.mixing),
+        residuals,
+        (observe, measured, weight, mixing),
+        is_leaf=lambda x: x is None,
     )
+
+
+@quick_jit
+def _slopes_before(law: Law, shots: Shots) -> jax.Array:
+    def after(v: jax.Array, scene: Scene) -> jax.Array:
+        return impact(law, scene, v).velocity
+
+    return jax.vmap(jax.jacfwd(after))(shots.pre, shots.scenes)
+
+
+def slopes_before(law: Law, shots: Any) -> np.ndarray:
+    """`dv+/dv-` (K, n, n) of every shot."""
+    n = shots.bodies
+    return np.asarray(_slopes_before(_in(_dtype(shots), law), shots), float)[:, :n, :n]
 
 
 @quick_jit

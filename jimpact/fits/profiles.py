@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 NEAR = np.array([-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2])  # half-widths of the interval of a parabola
 SAME = 1e-6  # relative sums of squares that are equal
 END = 1e-3  # of the root of the limit: how near to it an end is searched for
-# What `fit` profiles of itself: so many values across the domain, up to so many times the limit.
-QUICK_POINTS, QUICK_LEVEL, FAR = 17, 0.95, 1.0
+FAR, ROUGH = 2.0, 2  # times the limit from which only so many passes are spent
+QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # what `fit` profiles of itself: values across the domain
 HARDLY_SEEN = 0.2  # relative error of a stiffness beyond which no parabola is believed
 LONGEST = 2.0  # steps by which a scan is extrapolated
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
@@ -79,9 +79,10 @@ def profile(
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
 
     Held values cover the whole domain and the neighbourhood of the minima; from each minimum they
-    are reached one after the other in both directions, all parameters side by side. Where a scan
-    finds a further valley, it is followed to its minimum. Without sigma and with no degree of
-    freedom left, the interval is that of the values which reproduce the data exactly.
+    are reached one after the other in both directions, all parameters side by side; far above the
+    limit they are told only roughly. Where a scan finds a further valley, it is followed to its
+    minimum. Without sigma and with no degree of freedom left, the interval is that of the values
+    which reproduce the data exactly.
 
     Args:
         fit: by least squares.
@@ -113,20 +114,20 @@ def profile(
             known = ", ".join(fit.names)
             raise ValueError(f"Argument `names` must be among {known}, but has {name!r}.")
     with progress_bar(progress) as show:
-        scans = _Scans(fit, [fit.names.index(name) for name in wanted], show)
-        scans.scan(points, level, np.inf)
-        scans.follow_valleys(level)
-        scans.find_ends(level)
-    return tuple(scans.profile(i, level) for i in scans.which)
+        scans = _Scans(fit, [fit.names.index(name) for name in wanted], level, show)
+        scans.scan(points, FAR, whole=True)
+        scans.follow_valleys()
+        scans.find_ends()
+    return tuple(scans.profile(i) for i in scans.which)
 
 
 def quick_profiles(fit: "Fit", progress: float | None) -> tuple[Profile, ...]:
     """Profiles of all parameters around the minima that are known, no farther than is needed."""
     with progress_bar(progress) as show:
-        scans = _Scans(fit, range(len(fit.names)), show)
-        scans.scan(QUICK_POINTS, QUICK_LEVEL, FAR)
-        scans.find_ends(QUICK_LEVEL)
-    return tuple(scans.profile(i, QUICK_LEVEL) for i in scans.which)
+        scans = _Scans(fit, range(len(fit.names)), QUICK_LEVEL, show)
+        scans.scan(QUICK_POINTS, 1.0)
+        scans.find_ends()
+    return tuple(scans.profile(i) for i in scans.which)
 
 
 class Scaled:
@@ -186,9 +187,9 @@ def check_profiled(fit: "Fit") -> None:
 class _Scans(Scaled):
     """Held values of parameters and the minima with them, in scaled form, as far as known."""
 
-    def __init__(self, fit: "Fit", which: Sequence[int], show: Any):
+    def __init__(self, fit: "Fit", which: Sequence[int], level: float, show: Any):
         super().__init__(fit)
-        self.fit, self.which, self.show = fit, which, show
+        self.fit, self.which, self.level, self.show = fit, which, level, show
         self.residuals: Residuals = filled_up(fit.problem.residuals)
         self.least = fit.starts[0].sum_of_squares
         # of each parameter: held value -> (sum of squares, y)
@@ -200,6 +201,7 @@ class _Scans(Scaled):
             for i in which:
                 self.found[i].setdefault(float(y[i]), (start.sum_of_squares, y))
         self.lower: np.ndarray | None = None
+        self.rough: set[tuple[int, float]] = set()  # what was not solved to its end
 
     def minima(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """y (Q,) of the minima that fit well enough, and scaled standard errors (P,)."""
@@ -213,27 +215,34 @@ class _Scans(Scaled):
             if error is not None
         ]
 
-    def near(self, i: int, y: np.ndarray, error: float, level: float) -> np.ndarray:
+    def near(self, i: int, y: np.ndarray, error: float) -> np.ndarray:
         """Values to hold near a minimum."""
         if not np.isfinite(error):
             return np.zeros(0)
-        reach = error * np.sqrt(self.limit(level))
+        reach = error * np.sqrt(self.limit())
         return np.clip(y[i] + reach * NEAR, self.low[i], self.high[i])
 
-    def scan(self, points: int, level: float, far: float) -> None:
-        """Deviances across the domains, as far as they are at most `far` times the limit."""
+    def scan(self, points: int, far: float, whole: bool = False) -> None:
+        """Deviances across the domains, as far as they are at most `far` times the limit.
+
+        The whole domain: beyond, too, but only roughly: enough to see other valleys.
+        """
         values: dict[int, np.ndarray] = {}
         fronts: list[_Front] = []
         for i in self.which:
             parts = [np.linspace(*self.reach(i), points)]
             for y, error in self.minima():
-                parts.append(self.near(i, y, float(error[i]), level))
+                parts.append(self.near(i, y, float(error[i])))
                 fronts += [_Front(i, step, y) for step in (-1, 1)]
             values[i] = np.unique(np.concatenate(parts))
-        if len(self.fit.names) == 1 and far == np.inf:  # nothing is left to be solved for
-            self._take([(0, _with(self.best, 0, x)) for x in values[0]])
-        else:
-            self.advance(fronts, values, far * self.limit(level))
+        alone = len(self.fit.names) == 1  # nothing is left to be solved for
+        if not (whole and alone):
+            self.advance(fronts, values, far * self.limit())
+        if whole:
+            left = [(i, x) for i in self.which for x in values[i] if x not in self.found[i]]
+            rough = [(i, _with(self._nearest(i, x), i, x)) for i, x in left]
+            self._take(rough, None if alone else ROUGH)
+            self.rough = set() if alone else {(i, float(x)) for i, x in left}
 
     def advance(self, fronts: list["_Front"], values: Mapping[int, np.ndarray], far: float) -> None:
         """From value to value, each from the minimum beside it, until others have been there."""
@@ -244,21 +253,38 @@ class _Scans(Scaled):
                 return
             known = [self.found[f.i].get(float(y[f.i]), (np.inf, y))[0] for f, y in moving]
             ends = self._take([(f.i, y) for f, y in moving])
+            # where a scan leaves the interval it may be on a ridge: once more from the fit
+            limit = self.limit()
+            leaving = [
+                k
+                for k, ((f, _), (squares, _)) in enumerate(zip(moving, ends))
+                if self._above(squares) > limit >= self._above(self._squares(f))
+            ]
+            again = [(moving[k][0].i, moving[k][1]) for k in leaving]
+            again = [(i, _with(self.best, i, y[i])) for i, y in again]
+            for k, end in zip(leaving, self._take(again)):
+                ends[k] = min(ends[k], end, key=_first)
             fronts = []
             for (f, _), before, end in zip(moving, known, ends):
                 squares, y = end
                 first = squares < (1 - SAME) * before and self.found[f.i][float(y[f.i])] is end
-                if first and (squares - self.least) / self.variance <= far:
+                if first and self._above(squares) <= far:
                     fronts.append(_Front(f.i, f.step, y, f.last))
 
-    def _solve(self, held: Sequence[tuple[int | None, np.ndarray]]) -> SolverState:
+    def _solve(
+        self, held: Sequence[tuple[int | None, np.ndarray]], steps: int | None = None
+    ) -> SolverState:
         """Minima from y (Q,), with the i-th entry held, None: nothing."""
         which = [(() if i is None else (i,), y) for i, y in held]
-        return run_held(self.residuals, which, DEFAULT_STEPS[_METHOD], self.show)
+        return run_held(self.residuals, which, steps or DEFAULT_STEPS[_METHOD], self.show)
 
-    def _take(self, held: Sequence[tuple[int, np.ndarray]]) -> list[tuple[float, np.ndarray]]:
+    def _take(
+        self, held: Sequence[tuple[int, np.ndarray]], steps: int | None = None
+    ) -> list[tuple[float, np.ndarray]]:
         """Solve, and keep what is better than what was known."""
-        states = self._solve(held)
+        if not held:
+            return []
+        states = self._solve(held, steps)
         squares = 2 * np.asarray(states.cost, float) * self.size**2
         ends = []
         for k, (i, y) in enumerate(held):
@@ -281,17 +307,30 @@ class _Scans(Scaled):
         squares = np.array([self.found[i][y][0] for y in values])
         return values, np.maximum(squares - self.least, 0.0) / self.variance
 
-    def limit(self, level: float) -> float:
+    def limit(self) -> float:
         """Deviance at the ends of an interval."""
-        return quantile(self.fit, level) ** 2
+        return quantile(self.fit, self.level) ** 2
 
-    def follow_valleys(self, level: float) -> None:
+    def _above(self, squares: float) -> float:
+        """The deviance of a sum of squares."""
+        return (squares - self.least) / self.variance
+
+    def _squares(self, front: "_Front") -> float:
+        """The least known where a front has come to."""
+        known = self.found[front.i].get(float(front.last[front.i]))
+        return self.least if known is None else known[0]
+
+    def follow_valleys(self) -> None:
         """Held values around the minima that further valleys of the scans lead to."""
         starts = []
         for i in self.which:
             values, d = self.deviance(i)
             inside = np.flatnonzero((d[1:-1] < d[:-2]) & (d[1:-1] <= d[2:])) + 1
-            starts += [(i, self.found[i][values[k]][1]) for k in inside if d[k] > self.limit(level)]
+            starts += [
+                (i, self.found[i][values[k]][1])
+                for k in inside
+                if d[k] > self.limit() or (i, values[k]) in self.rough
+            ]
         if not starts:
             return
         states = self._solve([(None, y) for _, y in starts])
@@ -303,16 +342,16 @@ class _Scans(Scaled):
             error = np.sqrt(self.variance * inverse[i, i])
             y = np.asarray(states.y[k], float)
             squares = 2 * float(states.cost[k]) * self.size**2
-            if (squares - self.least) / self.variance <= self.limit(level):
+            if self._above(squares) <= self.limit():
                 self.found[i].setdefault(float(y[i]), (squares, y))
-                more = self.near(i, y, float(error), level)
+                more = self.near(i, y, float(error))
                 near[i] = np.unique(np.concatenate([near.get(i, np.zeros(0)), more]))
                 fronts += [_Front(i, step, y) for step in (-1, 1)]
         self.advance(fronts, near, np.inf)
 
-    def find_ends(self, level: float) -> None:
+    def find_ends(self) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
-        limit = np.sqrt(self.limit(level))
+        limit = np.sqrt(self.limit())
         for turn in range(ROUNDS):
             trials = []
             for i in self.which:
@@ -330,10 +369,10 @@ class _Scans(Scaled):
                 return
             self._take(trials)
 
-    def profile(self, i: int, level: float) -> Profile:
+    def profile(self, i: int) -> Profile:
         """What is known of a parameter."""
         values, d = self.deviance(i)
-        limit, real = self.limit(level), self.real(i, values)
+        limit, real = self.limit(), self.real(i, values)
         below = np.flatnonzero(d <= limit)
         pieces = np.split(below, np.flatnonzero(np.diff(below) > 1) + 1)
         intervals = []
@@ -353,7 +392,7 @@ class _Scans(Scaled):
         better = None
         if self.lower is not None:
             better = from_scaled(self.lower[: len(self.scale)], self.scale, self.log)
-        given = (self.fit.names[i], real, d, limit, level, tuple(intervals))
+        given = (self.fit.names[i], real, d, limit, self.level, tuple(intervals))
         return Profile(*given, (float(low), float(high)), better)
 
 

@@ -152,6 +152,7 @@ def _quality(fit: Any) -> list[str]:
     if fit.problem.sigma is not None:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
         lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
+        lines += _said_of_sigma(fit.experiments)
         if fit.noise > 1:
             lines.append(
                 f"errors         stretched by {fit.noise:.3g}, the root of chi^2 over that"
@@ -164,6 +165,20 @@ def _quality(fit: Any) -> list[str]:
     lines.append(f"rank           {fit.rank} of {len(fit.names)} parameters")
     state = "converged" if fit.converged else "NOT converged"
     return [*lines, f"solver         {state}, at most {fit.steps} steps a start"]
+
+
+def _said_of_sigma(data: Any) -> list[str]:
+    """What went into the stated errors."""
+    if data is None:
+        return []
+    lines = []
+    if data.resolution is not None:
+        steps = np.unique(np.asarray(data.resolution)[data.measured])
+        told = f"{steps[0]:.3g}" if len(steps) == 1 else f"{steps[0]:.3g} to {steps[-1]:.3g}"
+        lines.append(f"               with that of readings in steps of {told}: step / sqrt(12)")
+    if data.sigma_pre is not None:
+        lines.append("               with those of the velocities before, passed on by the law")
+    return lines
 
 
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:

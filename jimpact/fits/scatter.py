@@ -20,7 +20,7 @@ _NO_CHANCE = 1e-15
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Scatter `value` of one parameter between shots, and the fit with it.
+    """Scatter `value` of the parameter `name` between shots, and the fit with it.
 
     `chance` that shots without scatter show so much; `mean` (P,) and `standard_error` (P,) of all
     parameters `names`, `squares` and `degrees_of_freedom` of what is left; `each` (K,) the value
@@ -90,6 +90,9 @@ def scatter(fit: "Fit", name: str | None = None) -> Scatter:
     Args:
         fit: of at least 4 shots.
         name: of the parameter; None: the restitution, or else the first.
+
+    Returns:
+        `Scatter`; `print` says it in words.
 
     Raises:
         ValueError: too few shots, an unknown name, or one that the data cannot see.

@@ -78,8 +78,8 @@ class LawFit:
 class LawFits:
     """What `fit_laws` found: `entries` by name, the simplest adequate law first; `print` says all.
 
-    `left_out[name]` says why a law was not tried; `speed` whether the first law's e depends on the
-    speed, where that was asked for.
+    `left_out` says by name why a law was not tried; `speed` whether the first law's e depends on
+    the speed, where that was asked for.
     """
 
     entries: dict[str, LawFit]
@@ -135,7 +135,11 @@ class LawFits:
 
 
 class NestedTest(NamedTuple):
-    """Whether further parameters are needed: F, or chi^2 where sigma is known and fits."""
+    """Whether further parameters are needed: F, or chi^2 where sigma is known and fits.
+
+    `statistic` of `more` parameters, and of the `degrees_of_freedom` left (None: chi^2); the
+    `chance` that data of the simpler law show as much; `names` of the further parameters.
+    """
 
     statistic: float
     more: int
@@ -172,6 +176,9 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
 
     Args:
         simple, full: fits by least squares of the same data; the law of `simple` is a special case.
+
+    Returns:
+        `NestedTest`; `print` says it in words.
 
     Raises:
         ValueError: other data, a robust loss, no more parameters.
@@ -249,6 +256,9 @@ def fit_laws(
         values: parameters by name, `friction=0.2, stiffness=..., exponent=...`: starts of what is
             fitted, held otherwise; restitution starts at 0.8. Without a stiffness, laws that need
             it in SI units are left out.
+
+    Returns:
+        `LawFits`; `print` gives a table and why each law is adequate or not.
 
     Raises:
         ValueError: unknown laws, no law that can be fitted.

@@ -111,7 +111,7 @@ class VelocityDependent(Law):
         self.law.check(scene, dtype)
 
     def restitution_at(self, speed: Any) -> jax.Array:
-        """e at approach speeds [m/s], of their shape; an entry each contact where e is (m,)."""
+        """e at a `speed` of approach [m/s], of its shape; an entry each contact where e is (m,)."""
         return self._at(as_float_array("speed", speed))
 
     def _at(self, v: jax.Array) -> jax.Array:
@@ -135,7 +135,7 @@ class VelocityDependent(Law):
         return self.law_with(e).impulses(contact)
 
     def law_with(self, restitution: jax.Array) -> Law:
-        """The law with these e (m,)."""
+        """The law with this restitution e (m,)."""
         return with_parameter(self.law, "restitution", restitution)
 
 

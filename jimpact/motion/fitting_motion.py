@@ -48,8 +48,12 @@ def fit_motion(
     sigma: Any = None,
     bounds: Mapping[str, Any] | None = None,
     observe: Observe | None = None,
+    loss: str = "squares",
     starts: int = 1,
+    seed: int = 0,
     max_steps: int = MAX_PASSES,
+    profiles: bool = False,
+    progress: float | None = None,
     **options: Any,
 ) -> Fit:
     """The parameters of `law` with which `simulate` comes nearest to a measured motion.
@@ -71,8 +75,7 @@ def fit_motion(
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
         bounds: field -> (low, high).
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
-        starts: as in `fit`.
-        max_steps: of each start.
+        loss, starts, seed, max_steps, profiles, progress: as in `fit`.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
 
     Returns:
@@ -98,7 +101,15 @@ def fit_motion(
         options = {"samples": record.shape[0]} | options
     seen = Record(system, {"q0": q0, "v0": v0, "t_end": t_end} | options, observe or _positions)
     problem = FitProblem.from_observable(law, seen, measured, sigma, free, bounds)
-    return fit(problem, starts=starts, max_steps=max_steps)
+    return fit(
+        problem,
+        loss=loss,
+        starts=starts,
+        seed=seed,
+        max_steps=max_steps,
+        profiles=profiles,
+        progress=progress,
+    )
 
 
 def _positions(motion: Motion) -> jax.Array:

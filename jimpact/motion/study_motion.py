@@ -1,20 +1,27 @@
 """A motion from a TOML study: system, base, law, initial state."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from jimpact.bodies.base import STANDARD_GRAVITY
-from jimpact.law import Law
+from jimpact.fits.fitting import Fit
+from jimpact.fits.parameters import default_free
+from jimpact.law import Law, free_parameters_of
+from jimpact.motion.fitting_motion import fit_motion
 from jimpact.motion.record import Motion
 from jimpact.motion.simulate import simulate
 from jimpact.motion.system import HarmonicBase, System, gravity
-from jimpact.study import body_of, law_table
+from jimpact.shots_file import Positions, read_positions
+from jimpact.study import body_of, law_table, with_exponent
 from jimpact.study_file import (
     BASE_KEYS,
     GRAVITY,
+    MOTION_FIT_KEYS,
     MOTION_KEYS,
+    NO_DATA,
+    check_fit,
     check_motion_tables,
     from_file,
 )
@@ -31,6 +38,29 @@ class MotionStudy:
     system: System
     law: Law
     arguments: dict[str, Any]
+    measured: Positions | None = None
+    free: dict[str, Any] = field(default_factory=dict)
+    bounds: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+
+    def fit(self, **options: Any) -> Fit:
+        """`fit_motion` with the study's data and options; those not None here go first."""
+        if self.measured is None:
+            raise ValueError(NO_DATA)
+        given = {key: value for key, value in options.items() if value is not None}
+        start = float(self.arguments.get("t_start", 0.0))
+        times, q, sigma = self.measured
+        if abs(times[0] - start) > 1e-3 * (times[1] - times[0]):
+            raise ValueError(f"`t` in [data] must begin at {start:g} s, but does at {times[0]:g}.")
+        arguments = {key: x for key, x in self.arguments.items() if key != "samples"}
+        arguments["t_end"] = float(times[-1])
+        # `fit` and `simulate` both know limits of steps
+        if "max_steps" in arguments:
+            raise ValueError("`max_steps` in [motion] must be left out where a motion is fitted.")
+        both = arguments | self.options | given
+        return fit_motion(
+            self.system, self.law, q, free=self.free, sigma=sigma, bounds=self.bounds, **both
+        )
 
     def run(self, **options: Any) -> Motion:
         """`simulate` with the study's arguments; options that are not None go first."""
@@ -38,13 +68,15 @@ class MotionStudy:
         return simulate(self.system, self.law, **(self.arguments | given))
 
 
-def read_motion_study(path: str | Path) -> MotionStudy:
-    """Read the study of a motion.
+def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
+    """Read the study of a motion; `law` puts another law in the place of the study's.
 
     Tables: `[system]` a body (see `jimpact.study.body_of`) and gravity_m_per_s2, 0 for none;
     `[base]` amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
     horizontal, in space x or y); `[law]` as in other studies; `[motion]` q0, v0, t_end_s and the
-    options of `simulate`.
+    options of `simulate`. `[data]` file, a CSV file with columns t[s] in equal steps, q_1[m],
+    q_2[rad], ... and perhaps sigma_q_1[m], ..., and `[fit]` free, starts, seed, max_steps make it
+    one for `jimpact fit`.
 
     Raises:
         FileNotFoundError: no such study; ValueError: no TOML, unknown or missing keys, and what
@@ -54,17 +86,23 @@ def read_motion_study(path: str | Path) -> MotionStudy:
     >>> read_motion_study("cradle_motion.toml").title
     "Newton's cradle, three balls"
     """
-    return from_file(path, "[system]", _study)
+    return from_file(path, "[system]", lambda tables, file: _study(tables, file, law))
 
 
-def _study(tables: Mapping[str, Any], path: Path) -> MotionStudy:
+def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> MotionStudy:
     check_motion_tables(tables)
-    row, values, _ = law_table(tables["law"], None, path.parent)
-    if isinstance(values.get("exponent"), list):
-        values["exponent"] = tuple(values["exponent"])
+    row, values, bounds = law_table(tables["law"], other_law, path.parent)
+    free = check_fit(tables.get("fit", {}), MOTION_FIT_KEYS)
+    if other_law is not None:
+        free = {name: mask for name, mask in free.items() if name in row.parameters}
+    law = row.build(**with_exponent(values, free))
+    free = free or dict.fromkeys(default_free(free_parameters_of(law))[:1], True)
     arguments = {MOTION_KEYS[key]: value for key, value in tables["motion"].items()}
     system = _system(tables["system"], tables.get("base"))
-    return MotionStudy(str(tables.get("title", path.stem)), system, row.build(**values), arguments)
+    seen = read_positions(path.parent / tables["data"]["file"]) if "data" in tables else None
+    options = {key: x for key, x in tables.get("fit", {}).items() if key != "free"}
+    title = str(tables.get("title", path.stem))
+    return MotionStudy(title, system, law, arguments, seen, free, bounds, options)
 
 
 def _system(table: Mapping[str, Any], base: Mapping[str, Any] | None) -> System:

@@ -10,22 +10,30 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jimpact._checks import check_kind
-from jimpact.experiments import Experiments
 from jimpact.fits.contours import Contour
 from jimpact.fits.fitting import Fit
-from jimpact.plot.style import COLOURS, GREY, SPREAD, finish, legend_below, new_figure
+from jimpact.plot.style import (
+    COLOURS,
+    GREY,
+    SPREAD,
+    finish,
+    heading,
+    legend_below,
+    logarithmic,
+    new_figure,
+)
 
 _LABELLED = 16  # shots up to which every one gets its label
 
 
 def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
-    """Velocities after every shot, measured and fitted, above their residuals.
+    """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
     fits of the same data, by label, drawn in grey.
 
     Args:
-        fit: of shots.
+        fit: of shots, of a motion, or of what else was measured.
         others: label -> another fit of the same data.
         title: above the picture.
 
@@ -33,7 +41,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: a fit of something else than shots.
+        TypeError: something else than a fit.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.3, 0.7])
@@ -41,38 +49,48 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     >>> len(figure.axes)
     2
     """
-    check_kind("fit: its experiments", fit.experiments, Experiments)
-    assert fit.experiments is not None
-    shots, bodies = fit.predicted.shape
+    check_kind("fit", fit, Fit)
+    data, measured, predicted = (
+        fit.experiments,
+        *map(_in_rows, (fit.problem.measured, fit.predicted)),
+    )
+    shots, bodies = predicted.shape
     dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
     figure = new_figure(6.0)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
     error = _error_bars(fit)
-    measured = np.asarray(fit.problem.measured, float)
     for i in range(bodies):
         colour = COLOURS[i % len(COLOURS)]
         bars = None if error is None else error[:, i]
         style: dict[str, Any] = {"fmt": "o", "mfc": "none", "color": colour, "ms": size, "lw": 1}
         top.errorbar(x[:, i], measured[:, i], bars, **style)
-        top.plot(x[:, i], fit.predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
-        bottom.errorbar(x[:, i], fit.residual[:, i], bars, **style)
+        top.plot(x[:, i], predicted[:, i], "_", color=colour, ms=2.2 * size, mew=2)
+        bottom.errorbar(x[:, i], (measured - predicted)[:, i], bars, **style)
     for j, other in enumerate((others or {}).values()):
-        top.plot(x, other.predicted, "x+*"[j % 3], color=GREY, ms=0.8 * size)
-    units = ", ".join(dict.fromkeys(fit.experiments.units))
-    top.set_ylabel(f"velocity after the impact [{units}]")
-    bottom.set_ylabel(f"measured − fitted [{units}]")
+        top.plot(x, _in_rows(other.predicted), "x+*"[j % 3], color=GREY, ms=0.8 * size)
+    units = "" if data is None else f" [{', '.join(dict.fromkeys(data.units))}]"
+    top.set_ylabel(f"{'measured value' if data is None else 'velocity after the impact'}{units}")
+    bottom.set_ylabel(f"measured − fitted{units}")
     bottom.axhline(0, color=GREY, lw=0.8)
     _shot_axis(bottom, fit, dodge)
     _legend(figure, fit, others or {}, error is not None)
-    top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g} m/s", loc="left")
+    unit = "" if data is None else " m/s"
+    top.set_title(title or f"{type(fit.law).__name__}, rms {fit.rms:.3g}{unit}", loc="left")
     finish(top, bottom, grid="y")
     return figure
 
 
 def contour(found: Contour, title: str = "") -> Figure:
     """The confidence region of two parameters, and how the deviance rises around the fit.
+
+    Args:
+        found: what `ji.contour` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
 
     >>> import numpy as np
     >>> import jimpact as ji
@@ -82,42 +100,45 @@ def contour(found: Contour, title: str = "") -> Figure:
     >>> ji.plot.contour(ji.Contour(*given)).axes[0].get_xlabel()
     'e[1]'
     """
-    figure = Figure(figsize=(6.0, 5.0))
-    figure.set_layout_engine("constrained")
+    figure = new_figure(5.0)
     axes = figure.subplots()
-    d, limit = found.deviance.T, found.limit
+    d, limit = np.where(np.isfinite(found.deviance), found.deviance, np.nan).T, found.limit
     axes.contourf(found.x, found.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
     axes.contour(found.x, found.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
-    axes.contour(
-        found.x, found.y, d, [limit / 4, 2 * limit, 4 * limit], colors=GREY, linewidths=0.7
-    )
+    axes.contour(found.x, found.y, d, [limit / 4], colors=GREY, linewidths=0.7)
     axes.plot(*found.best, "+", color="black", ms=9)
-    for scale, log in ((axes.set_xscale, found.log[0]), (axes.set_yscale, found.log[1])):
+    for which, log in zip("xy", found.log, strict=True):
         if log:
-            scale("log")
+            logarithmic(axes, which)
     axes.set_xlabel(found.names[0])
     axes.set_ylabel(found.names[1])
     handles = [
         Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * found.level:g} % region"),
         Line2D([], [], marker="+", ls="none", color="black", label="fit"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", frameon=False, ncols=2)
-    axes.set_title(title, loc="left")
-    axes.spines[["top", "right"]].set_visible(False)
+    legend_below(figure, handles, 2)
+    heading(figure, title)
+    finish(axes)
     return figure
 
 
+def _in_rows(values: np.ndarray) -> np.ndarray:
+    """A row a shot, a sample of a motion, or a value."""
+    values = np.asarray(values, float)
+    return values.reshape(len(values) if values.ndim else 1, -1)
+
+
 def _error_bars(fit: Fit) -> np.ndarray | None:
+    shape = fit.predicted.shape
     if fit.problem.sigma is not None:
-        return np.broadcast_to(np.asarray(fit.problem.sigma, float), fit.predicted.shape)
-    return np.full(fit.predicted.shape, fit.noise) if np.isfinite(fit.noise) else None
+        return _in_rows(np.broadcast_to(np.asarray(fit.problem.sigma, float), shape))
+    return _in_rows(np.full(shape, fit.noise)) if np.isfinite(fit.noise) else None
 
 
 def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
-    assert fit.experiments is not None  # checked
-    labels = fit.experiments.shots
-    if len(labels) == 1:
+    data, labels = fit.experiments, fit.problem.labels
+    if data is not None and len(labels) == 1:
         axes.set_xticks(dodge, [f"{i + 1}" for i in range(len(dodge))])
         axes.set_xlabel("body")
         axes.set_xlim(-SPREAD * 0.5, SPREAD * 0.5)
@@ -125,7 +146,7 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     ticks = range(0, len(labels), -(-len(labels) // _LABELLED))
     longest = max(len(labels[k]) for k in ticks)
     axes.set_xticks(list(ticks), [labels[k] for k in ticks], rotation=90 if longest > 4 else 0)
-    axes.set_xlabel("shot")
+    axes.set_xlabel("shot" if data is not None else "value")
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
@@ -138,8 +159,9 @@ def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool)
     ]
     for j, label in enumerate(others):
         handles.append(Line2D([], [], marker="x+*"[j % 3], ls="none", color=GREY, label=label))
-    if fit.predicted.shape[0] > 1:  # of a single shot the axis names the bodies
-        for i in range(min(fit.predicted.shape[1], len(COLOURS))):
+    shots, bodies = _in_rows(fit.predicted).shape
+    if shots > 1 and bodies > 1:  # of a single shot the axis names the bodies
+        for i in range(min(bodies, len(COLOURS))):
             handles.append(
                 Line2D([], [], marker="s", ls="none", color=COLOURS[i], label=f"body {i + 1}")
             )

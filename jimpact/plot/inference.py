@@ -1,5 +1,6 @@
 """Pictures of what a fit knows: profiles, correlations, residuals."""
 
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -9,15 +10,25 @@ from scipy.special import ndtri
 from jimpact._checks import check_kind
 from jimpact.fits.fitting import Fit
 from jimpact.fits.profiles import Profile
-from jimpact.plot.style import COLOURS, GREY
+from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure
 
-_IN_A_ROW = 3
+_IN_A_ROW = 2
+_TITLE = 45  # letters of a line of a panel's title
 _TOP = 3.0  # of a profile's axis, in limits: beyond, the curve says nothing more
 _TWO_SIDED = 1.96  # standard errors with 95 % between
 
 
 def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
     """Deviance over each parameter, with the limit and the interval below it.
+
+    Args:
+        found: what `ji.profile` returned.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: something else than profiles.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
@@ -29,7 +40,7 @@ def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
         check_kind("found", each, Profile)
     rows = -(-len(found) // _IN_A_ROW)
     columns = min(len(found), _IN_A_ROW)
-    figure = Figure(figsize=(3.4 * columns, 2.8 * rows), layout="constrained")
+    figure = new_figure(2.8 * rows)
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes, each in zip(grid, found):
         axes.plot(each.value, each.deviance, ".-", color=COLOURS[0], ms=3, lw=1)
@@ -42,16 +53,26 @@ def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
             axes.set_xlim(near.min() - edge, near.max() + edge)
         axes.set_ylim(0, _TOP * each.limit)
         axes.set_xlabel(each.name)
-        axes.set_title(f"{each.words} ({100 * each.level:g} %)", loc="left", fontsize="small")
-        axes.spines[["top", "right"]].set_visible(False)
+        words = f"{each.words} ({100 * each.level:g} %)"
+        axes.set_title(fill(words, _TITLE), loc="left", fontsize=SMALL)
+        axes.set_ylabel("deviance")
+        finish(axes)
     for axes in grid[len(found) :]:
-        axes.set_axis_off()
-    grid[0].set_ylabel("deviance")
+        axes.remove()
     return figure
 
 
 def correlation(fit: Fit) -> Figure:
     """Correlations of the parameters' errors; empty where the data cannot see one of them.
+
+    Args:
+        fit: of several parameters.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: no fit.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.97], sigma=0.02)
@@ -61,8 +82,7 @@ def correlation(fit: Fit) -> Figure:
     """
     check_kind("fit", fit, Fit)
     count = len(fit.names)
-    side = float(np.clip(1.8 + 0.5 * count, 3.0, 9.0))
-    figure = Figure(figsize=(side + 1.0, side), layout="constrained")
+    figure = new_figure(float(np.clip(1.8 + 0.5 * count, 3.0, 7.2)))
     axes = figure.subplots()
     shown: Any = np.ma.masked_invalid(fit.correlation)
     image = axes.imshow(shown, vmin=-1, vmax=1, cmap="RdBu_r")
@@ -72,9 +92,8 @@ def correlation(fit: Fit) -> Figure:
         for i, j in np.argwhere(np.isfinite(fit.correlation)):
             dark = abs(fit.correlation[i, j]) > 0.6
             text = f"{fit.correlation[i, j]:.2f}"
-            axes.text(
-                j, i, text, ha="center", va="center", color="white" if dark else "black", size=8
-            )
+            colour = "white" if dark else "black"
+            axes.text(j, i, text, ha="center", va="center", color=colour, size=SMALL)
     figure.colorbar(image, ax=axes, shrink=0.8, label="correlation")
     return figure
 
@@ -84,6 +103,15 @@ def residuals(fit: Fit) -> Figure:
 
     Without sigma the standard error is the estimated noise. What the law explains leaves no trend
     over the speed, and normal noise lies on the straight line.
+
+    Args:
+        fit: of shots, or of anything else that was measured.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: no fit.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.5]])
@@ -100,13 +128,17 @@ def residuals(fit: Fit) -> Figure:
     known = np.isfinite(noise).all() and (noise > 0).all()
     scaled = fit.residual[here] / (noise if known else 1.0)
     unit = "standard errors" if known else "as measured"
-    figure = Figure(figsize=(10.2, 3.4), layout="constrained")
-    first, second, third = figure.subplots(1, 3)
+    figure = new_figure(6.0)
+    (first, second), (third, spare) = figure.subplots(2, 2)
+    spare.remove()
+    values = (
+        "" if fit.experiments is None else f" [{', '.join(dict.fromkeys(fit.experiments.units))}]"
+    )
     style: dict[str, Any] = {"ls": "none", "marker": "o", "mfc": "none", "ms": 4}
     first.axline((float(measured[here].mean()),) * 2, slope=1.0, color=GREY, lw=0.8)
     first.plot(fit.predicted[here], measured[here], color=COLOURS[0], **style)
-    first.set_xlabel("fitted")
-    first.set_ylabel("measured")
+    first.set_xlabel(f"fitted{values}")
+    first.set_ylabel(f"measured{values}")
     over, label = _over(fit)
     second.axhline(0, color=GREY, lw=0.8)
     second.plot(np.broadcast_to(over, here.shape)[here], scaled, color=COLOURS[0], **style)
@@ -116,13 +148,12 @@ def residuals(fit: Fit) -> Figure:
     normal = ndtri((np.arange(len(ordered)) + 0.5) / len(ordered))
     third.plot(normal, ordered, color=COLOURS[0], **style)
     third.axline((0.0, 0.0), slope=1.0 if known else float(np.std(scaled)) or 1.0, color=GREY)
-    third.set_xlabel("normal quantile")
+    third.set_xlabel("normal quantile [standard errors]")
     third.set_ylabel(f"residual [{unit}]")
     if known:
         for y in (-_TWO_SIDED, _TWO_SIDED):
             second.axhline(y, color=GREY, lw=0.6, ls="--")
-    for axes in (first, second, third):
-        axes.spines[["top", "right"]].set_visible(False)
+    finish(first, second, third)
     return figure
 
 

@@ -4,9 +4,10 @@
 """
 
 import sys
+import zlib
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -43,11 +44,10 @@ class Row:
     spoiled: Callable[[np.ndarray], np.ndarray] = lambda post: post
     swapped: bool = False
     expected: str = ""  # the warning that should come
-    also: tuple[str, ...] = field(default=())  # warnings that are then no false alarms
 
-    def data(self, count, seed=0):
+    def data(self, count):
         """So many data sets."""
-        rng, n = np.random.default_rng(seed), self.scene.size
+        rng, n = np.random.default_rng(zlib.crc32(self.what.encode())), self.scene.size
         impact = jax.jit(jax.vmap(lambda v: ji.impact(self.truth, self.scene, v).velocity))
         pre = rng.uniform(-0.3, 0.3, (count, self.shots, n))
         pre[..., 0] = rng.uniform(0.5, 1.5, (count, self.shots))
@@ -107,12 +107,12 @@ SPOILED = (
         N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 24, spoiled=misread, expected="Suspicious",
     ),
     Row(
-        "velocities 5 % too large",
-        N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 12, spoiled=lambda v: 1.05 * v,
+        "the last ball read 5 % too fast",
+        N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 12, spoiled=lambda v: v * [1.0, 1.0, 1.05],
         expected="The data break momentum",
     ),
     Row(
-        "velocities 10 % too large, e = .99",
+        "all velocities 10 % too large, e = .99",
         N([0.99, 0.99]), N([0.9, 0.9]), WALLED, 12, spoiled=lambda v: 1.1 * v,
         expected="The data gain energy",
     ),

@@ -1,0 +1,164 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3 (ipykernel)
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # What the data can tell
+#
+# One ball strikes two others. Their velocities afterwards depend on the restitution and on the
+# ratio of the two stiffnesses: how well does a shot determine them, and what should be shot next?
+# You will read **profile likelihoods**, meet a shot with several **preimages** (stiffness ratios
+# that no measurement of it can tell apart), and let the fit **design** the next experiment.
+
+# %%
+# %matplotlib inline
+import time
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+import jimpact as ji
+
+began = time.perf_counter()
+
+
+def drawing(velocities, title):
+    figure = Figure(figsize=(6, 1.6), layout="constrained")
+    axes = figure.subplots()
+    for i, v in enumerate(velocities):
+        x = 2 * i - (0.8 if i == 0 and v else 0)
+        axes.add_patch(Circle((x, 0), 1, fc="#56B4E9", ec="black"))
+        axes.text(x, 0, f"{i + 1}", ha="center", va="center")
+        if v:
+            axes.annotate("", (x + 1.6 * v, 1.3), (x, 1.3), arrowprops={"arrowstyle": "->"})
+    for j in range(len(velocities) - 1):
+        axes.text(2 * j + 1, -1.5, f"$k_{j + 1}, e_{j + 1}$", ha="center", va="top")
+    axes.set(xlim=(-2.2, 5.4), ylim=(-2.4, 1.7), aspect="equal", title=title)
+    axes.set_axis_off()
+    return figure
+
+
+drawing([1.0, 0.0, 0.0], "a striker, two balls at rest that touch")
+
+# %% [markdown]
+# ## A profile is the interval
+#
+# All shots here are **simulated**, with an error of 0.01 m/s, so that we know the truth:
+# $e = 0.95$ at both contacts, $k_2/k_1 = 3$. The fit takes one $e$ for both and the ratio.
+
+# %%
+balls, sigma = ji.chain([1.0, 1.0, 1.0]), 0.01
+both = {"restitution": [1, 1], "stiffness": [0, 1]}  # one e; the ratio
+
+
+def law(e, ratio):
+    return ji.LZB([e, e], [1.0, ratio])
+
+
+def shots(law, pre, seed=0):
+    """Simulated velocities after these."""
+    pre = np.atleast_2d(pre)
+    exact = np.array([ji.impact(law, balls, v).velocity for v in pre])
+    noise = np.random.default_rng(seed).normal(size=exact.shape)
+    return ji.Experiments(pre, exact + sigma * noise, sigma)
+
+
+one = shots(law(0.95, 3.0), [1.0, 0.0, 0.0])
+found = ji.fit(law(0.9, 1.0), balls, one, both)
+print(found)
+
+# %% [markdown]
+# The standard errors take the sum of squares for a parabola. A profile does not: it holds one
+# parameter, frees the other, and asks how much worse the fit becomes. What lies below the line is
+# the 95 % interval.
+
+
+# %%
+def picture(profiles, truths):
+    figure = Figure(figsize=(4 * len(profiles), 3), layout="constrained")
+    for axes, p, truth in zip(np.ravel(figure.subplots(1, len(profiles))), profiles, truths):
+        axes.plot(p.value, np.minimum(p.deviance, 4 * p.limit), ".-", color="#0072B2")
+        axes.axhline(p.limit, color="black", lw=0.8, ls="--")
+        axes.axvline(truth, color="#D55E00", lw=1)
+        for low, high in p.intervals:
+            axes.axvspan(low, high, color="#009E73", alpha=0.2, lw=0)
+        axes.set(xlabel=p.name, ylabel="deviance", title=p.words, ylim=(0, 4 * p.limit))
+        if p.name.startswith("stiffness"):
+            axes.set_xscale("log")
+    return figure
+
+
+profiles = ji.profile(found)
+picture(profiles, [0.95, 3.0])
+
+# %% [markdown]
+# ## Several preimages
+#
+# What the third ball gets is no monotonic function of the stiffness ratio: where the second
+# contact is stiffer, the balls strike each other again and again. With $e = 1$ known, draw the
+# velocity of the middle ball over the ratio, and hold a measured one against it.
+
+# %%
+ratios = np.geomspace(0.3, 60, 400)
+v_plus = np.array([ji.impact(law(1.0, r), balls, [1.0, 0.0, 0.0]).velocity for r in ratios])
+truth = 8.0
+hidden = shots(law(1.0, truth), [1.0, 0.0, 0.0], seed=3)
+figure = Figure(figsize=(6, 3), layout="constrained")
+axes = figure.subplots()
+for i, colour in enumerate(("#0072B2", "#D55E00", "#009E73")):
+    axes.semilogx(ratios, v_plus[:, i], color=colour, label=f"ball {i + 1}")
+    axes.axhspan(*(hidden.post[0, i] + np.array([-2, 2]) * sigma), color=colour, alpha=0.2, lw=0)
+axes.set(xlabel="stiffness ratio $k_2/k_1$", ylabel="velocity after [m/s]")
+axes.legend(frameon=False)
+figure
+
+# %%
+ratio_only = {"restitution": [0, 0], "stiffness": [0, 1]}
+hidden_fit = ji.fit(law(1.0, 1.0), balls, hidden, ratio_only)
+low, high = hidden_fit.confidence_interval()[0]
+(union,) = ji.profile(hidden_fit)
+print(f"standard error: {low:.2f} to {high:.2f};  profile: {union.words};  truth {truth}")
+assert any(low <= truth <= high for low, high in union.intervals)
+picture([union], [truth])
+
+# %% [markdown]
+# Every piece is a ratio that reproduces the shot within its error. More shots of the same kind
+# would narrow the pieces, but not remove one.
+#
+# ## The next experiment
+#
+# Which shot would tell most? Try 64 of them, at most 1 m/s, in one program: the one that leaves the
+# smallest error of the ratio, then the best second one.
+
+# %%
+rng = np.random.default_rng(1)
+candidates = rng.uniform(-1, 1, (64, 3)).round(2)
+candidates[np.argsort(-candidates, axis=1)[:, 0] == 2] *= -1  # the last must not run away
+pool = ji.Experiments(candidates, np.zeros_like(candidates), sigma)
+plan = ji.design(found, pool, count=2, target="stiffness[2]")
+print(f"now: stiffness[2] +- {found.standard_error[1]:.2g}\n{plan}")
+
+# %%
+more = np.concatenate([one.pre, candidates[plan.index]])
+after = ji.fit(found.law, balls, shots(law(0.95, 3.0), more, seed=1), both)
+print(f"shot 1 alone {found.standard_error}, with the two planned ones {after.standard_error}")
+print("values", after.value, "truth", [0.95, 3.0])
+assert after.standard_error[1] < 0.7 * found.standard_error[1]
+drawing(candidates[plan.index[0]], "the shot to do next")
+
+# %%
+print(f"run time {time.perf_counter() - began:.0f} s")
