@@ -309,6 +309,7 @@ def test_posterior_is_the_linearized_one_where_it_is_gaussian(found):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("lenient")
 def test_priors_are_declared_like_domains(found):
     kinds = pytest.importorskip("numpyro.distributions")
     problem = found.problem
