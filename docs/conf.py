@@ -12,7 +12,9 @@ from operator import attrgetter
 from pathlib import Path
 
 from docutils import nodes
+from docutils.utils.math import MathError
 from docutils.utils.math.latex2mathml import tex2mathml
+from sphinx.util import logging
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -28,6 +30,8 @@ copyright = author
 version = release = ji.__version__
 
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.napoleon", "myst_nb", "sphinx_design"]
+nitpicky = True
+nitpick_ignore_regex = [("py:class", ".*")]  # types of fields: of other packages, mostly
 exclude_patterns = ["paper.md"]
 myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_inline"]
 myst_heading_anchors = 3
@@ -59,16 +63,26 @@ html_copy_source = False
 LONG = 30  # signs
 
 
+def mathml(node, block=False):
+    """MathML of a formula; one that is none is a warning that names it."""
+    try:
+        return tex2mathml(node.astext(), as_block=block)
+    except (MathError, AttributeError) as wrong:  # AttributeError: a new row outside of a table
+        logging.getLogger(__name__).warning(
+            "no formula: %s (%s)", node.astext(), wrong, location=node
+        )
+        return node.astext()
+
+
 def _inline(writer, node):
-    formula = tex2mathml(node.astext())
+    formula = mathml(node)
     signs = re.sub(r"\s|<[^>]*>", "", formula)  # a long one scrolls within itself on a phone
     writer.body.append(f'<span class="math">{formula}</span>' if len(signs) > LONG else formula)
     raise nodes.SkipNode
 
 
 def _block(writer, node):
-    formula = tex2mathml(node.astext(), as_block=True)
-    writer.body.append(f'<div class="math">{formula}</div>')
+    writer.body.append(f'<div class="math">{mathml(node, block=True)}</div>')
     raise nodes.SkipNode
 
 
@@ -81,7 +95,7 @@ API = {  # a page, and the modules whose public names it holds
     "Laws": ("law", "registry", "laws.lzb", "laws.kinematic", "laws.poisson", "laws.binary",
              "laws.compliant", "laws"),
     "Contact forces": ("laws.forces", "laws.calibration", "laws.materials"),
-    "Shots and fits": ("experiments", "fits"),
+    "Shots and fits": ("experiments", "fits", "study"),
     "Monte Carlo": ("montecarlo",),
     "Motions": ("motion",),
     "Methods": ("methods",),
@@ -106,6 +120,8 @@ def public_names() -> dict[str, list[str]]:
             module = package or line.module
             fits = [(len(x), title) for title, all_x in API.items() for x in all_x
                     if module == x or module.startswith(x + ".")]  # fmt: skip
+            if not fits:
+                raise ValueError(f"API must have a page for {module}: see docs/conf.py")
             found[max(fits)[1]] += [prefix + name.name for name in line.names]
     return found
 

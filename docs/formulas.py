@@ -15,7 +15,7 @@ WORDS = {"grad": r"\nabla ", "in": r" \in ", "sum": r"\sum ", "pbar": r"{\bar p}
 KNOWN = {*GREEK, *FUNCTIONS, *WORDS}
 SIGNS = [  # longer ones first
     ("_|_", r" \perp "), ("<=", r" \le "), (">=", r" \ge "), ("!=", r" \ne "), ("->", r" \to "),
-    ("+/-", r" \pm "), ("+=", r" \mathrel{+}= "), ("{", r"\{"), ("}", r"\}"), ("~", r" \sim "),
+    ("+/-", r" \pm "), ("+=", r" {+}{=} "), ("{", r"\{"), ("}", r"\}"), ("~", r" \sim "),
 ]  # fmt: skip
 # a name, its index, primes, and a sign that ends it: before (-) or after (+) the impact
 NAME = re.compile(r"([A-Za-z]+)(?:_([A-Za-z]+\d*|\d+[a-z]*|\{[^}]*\}))?('*)([+-](?![\w(.]))?")
@@ -91,8 +91,8 @@ def tex(text: str) -> str | None:
     >>> tex("ji.impact") is None
     True
     """
-    words = [x for x in re.findall(r"\b[a-z]{4,}\b", text) if x not in KNOWN]
-    if len(words) > 1:  # a sentence
+    words = [x for x in re.findall(r"\b[a-z]{3,}\b", text) if x not in KNOWN]
+    if len(words) > 1 or text in words:  # a sentence, a name
         return None
     if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(r"[A-Za-z]", text):
         return None

@@ -82,6 +82,17 @@ def run(given: options.Command, steps: Steps) -> str:
     return answer.failure
 
 
+def _of_shot(given: options.ShotCommand) -> Study:
+    """The study, in the scene of the shot that is asked for where shots have their own."""
+    study = read_study(given.study)
+    data = study.experiments
+    if given.velocity is not None or data is None:
+        return study
+    if given.shot > len(data.shots):
+        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
+    return replace(study, scene=data.scene_of(study.scene, given.shot - 1))
+
+
 def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
     """Velocities before the impact, and after it where they were measured."""
     if given.velocity is not None:
@@ -260,7 +271,7 @@ def _value(found: Fit, i: int) -> str:
 def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     """Every law on one scene."""
     path = given.picture()
-    study = read_study(given.study)
+    study = _of_shot(given)
     before, measured = _velocities(study, given)
     laws, left_out = registered_laws(study.parameters)
     with waiting("comparing laws", TOLD):
@@ -328,7 +339,7 @@ QUICK_LAWS = ("moreau", "binary")
 def chart(given: options.ChartCommand, steps: Steps) -> Answer:
     """Speed against accuracy on one scene."""
     path = given.picture()
-    study = read_study(given.study)
+    study = _of_shot(given)
     law = _lzb(study)
     before, _ = _velocities(study, given)
     found = ji.work_precision(
@@ -419,7 +430,7 @@ _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
     """The simplest law that a scene needs."""
     path = given.picture()
-    study = read_study(given.study)
+    study = _of_shot(given)
     before, _ = _velocities(study, given)
     found = ji.advise(
         study.scene,

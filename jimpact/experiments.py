@@ -210,7 +210,7 @@ class Experiments(eqx.Module):
         return eqx.tree_at(_RESOLUTION, copy, resolution, is_leaf=lambda x: x is None)
 
     def only(self, which: Any) -> "Experiments":
-        """Some of the shots: their indices (from 0), or a boolean for each.
+        """Some of the shots: `which`, by indices (from 0) or a boolean for each.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]])

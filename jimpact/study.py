@@ -104,10 +104,10 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     start values, a number for all contacts or a list with one each (a `restitution_matrix` without
     its `matrix` starts from an admissible one), module (a file or module that
     registers the law, see `ji.register`), and `[law.bounds]`; `[fit]` free (a
-    list of names, or a table of masks), method, starts, seed, max_steps; `[data]` file (relative
-    to the study), momentum_corrected; of shots with scenes of their own also near_m and contacts
-    (only shots with so many), see `read_experiments`; without data a study can be compared, not
-    fitted; `[[observe]]` in its place (any number of them): quantity (peak_force [N],
+    list of names, or a table of masks), method, loss, starts, seed, max_steps, profiles; `[data]`
+    file (relative to the study), momentum_corrected; of shots with scenes of their own also near_m
+    and contacts (only shots with so many), see `read_experiments`; without data a study can be
+    compared, not fitted; `[[observe]]` in its place (any number of them): quantity (peak_force [N],
     arrival_time [s], of a contact; duration [s] of a contact or of all; energy_ratio;
     bounce_height [m] of a body), contact or body (from 1), value and sigma, numbers or lists, with
     relative = true those over the first one; velocity_m_per_s, one a body, or drop_height_m, and
@@ -193,6 +193,9 @@ def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3
         contacts: only impacts on so many corners, one number or several; None: all.
         near: corners up to so far above the lowest one touch, too (board and cube are flat to
             1.4 mm) [m].
+
+    Returns:
+        `Experiments` of up to 400 shots of 6 velocities, with sigma and scenes.
 
     Source: ContactNets (Pfrommer, Halm and Posa, CoRL 2020), see `cube_NOTICE.txt` in `data`.
 

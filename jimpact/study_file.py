@@ -20,8 +20,8 @@ from jimpact.shots_file import read_positions, read_shots
 STUDY_TABLES = ("fit", "data", "observe", "monte_carlo")
 SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
-FIT_KEYS = ("free", "method", "starts", "seed", "max_steps")
-MOTION_FIT_KEYS = ("free", "starts", "seed", "max_steps")
+FIT_KEYS = ("free", "method", "loss", "starts", "seed", "max_steps", "profiles")
+MOTION_FIT_KEYS = tuple(key for key in FIT_KEYS if key != "method")
 DATA_KEYS = ("file", "momentum_corrected", "near_m", "contacts")
 OBSERVE_KEYS = ("quantity", "value", "sigma", "relative", "contact", "body", "bodies")
 OBSERVE_SHOTS = ("velocity_m_per_s", "drop_height_m")  # one of them says what happens

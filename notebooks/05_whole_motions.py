@@ -14,7 +14,8 @@
 # %% [markdown]
 # # Whole motions: between impacts, through them, and to rest
 #
-# *Course, part 5. Before: [the rocking block](04_rocking_block.ipynb).*
+# *Course, part 5. Before: [the rocking block](04_rocking_block.ipynb). Next:
+# [what the data can tell](06_what_the_data_can_tell.ipynb).*
 #
 # An impact law is one instant of a motion. `simulate` puts it back in: flights, impacts at located
 # times, contacts that stay closed, and a ledger of the energy. You will learn to simulate bodies from

@@ -14,6 +14,9 @@
 # %% [markdown]
 # # What the data can tell
 #
+# *Course, part 6. Before: [whole motions](05_whole_motions.ipynb). Next:
+# [a restitution matrix](07_restitution_matrix.ipynb).*
+#
 # One ball strikes two others. Their velocities afterwards depend on the restitution and on the
 # ratio of the two stiffnesses: how well does a shot determine them, and what should be shot next?
 # You will read **profile likelihoods**, meet a shot with several **preimages** (stiffness ratios
@@ -27,6 +30,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -66,7 +70,7 @@ both = {"restitution": [1, 1], "stiffness": [0, 1]}  # one e; the ratio
 
 
 def law(e, ratio):
-    return ji.LZB([e, e], [1.0, ratio])
+    return ji.LZB(e * np.ones(2), jnp.stack([1.0, ratio]))
 
 
 def shots(law, pre, seed=0):
@@ -89,14 +93,15 @@ print(found)
 
 # %%
 def picture(profiles, truths):
-    figure = Figure(figsize=(4 * len(profiles), 3), layout="constrained")
+    figure = Figure(figsize=(2.4 + 2.8 * len(profiles), 3), layout="constrained")
     for axes, p, truth in zip(np.ravel(figure.subplots(1, len(profiles))), profiles, truths):
         axes.plot(p.value, np.minimum(p.deviance, 4 * p.limit), ".-", color="#0072B2")
         axes.axhline(p.limit, color="black", lw=0.8, ls="--")
         axes.axvline(truth, color="#D55E00", lw=1)
         for low, high in p.intervals:
             axes.axvspan(low, high, color="#009E73", alpha=0.2, lw=0)
-        axes.set(xlabel=p.name, ylabel="deviance", title=p.words, ylim=(0, 4 * p.limit))
+        axes.set(xlabel=p.name, ylabel="deviance", ylim=(0, 4 * p.limit))
+        axes.set_title(p.words, fontsize="small")
         if p.name.startswith("stiffness"):
             axes.set_xscale("log")
     return figure
@@ -108,36 +113,39 @@ picture(profiles, [0.95, 3.0])
 # %% [markdown]
 # ## Several preimages
 #
-# What the third ball gets is no monotonic function of the stiffness ratio: where the second
-# contact is stiffer, the balls strike each other again and again. With $e = 1$ known, draw the
-# velocity of the middle ball over the ratio, and hold a measured one against it.
+# What a ball gets is no monotonic function of the stiffness ratio: where the second contact is much
+# stiffer, balls part and strike again, in another order. With $e = 1$ known, draw the velocities
+# over the ratio. Suppose a camera saw nothing but the ball in the middle (the band).
 
 # %%
-ratios = np.geomspace(0.3, 60, 400)
-v_plus = np.array([ji.impact(law(1.0, r), balls, [1.0, 0.0, 0.0]).velocity for r in ratios])
-truth = 8.0
-hidden = shots(law(1.0, truth), [1.0, 0.0, 0.0], seed=3)
+ratios = np.geomspace(0.5, 100, 256)
+strike = np.array([1.0, 0.0, 0.0])
+v_plus = jax.vmap(lambda r: ji.impact(law(1.0, r), balls, strike).velocity)(ratios)
+truth = 20.0
+seen = shots(law(1.0, truth), strike)
+hidden = ji.Experiments(seen.pre, [[np.nan, seen.post[0, 1], np.nan]], sigma)
 figure = Figure(figsize=(6, 3), layout="constrained")
 axes = figure.subplots()
 for i, colour in enumerate(("#0072B2", "#D55E00", "#009E73")):
     axes.semilogx(ratios, v_plus[:, i], color=colour, label=f"ball {i + 1}")
-    axes.axhspan(*(hidden.post[0, i] + np.array([-2, 2]) * sigma), color=colour, alpha=0.2, lw=0)
+axes.axhspan(*(hidden.post[0, 1] + np.array([-2, 2]) * sigma), color="#D55E00", alpha=0.2, lw=0)
 axes.set(xlabel="stiffness ratio $k_2/k_1$", ylabel="velocity after [m/s]")
 axes.legend(frameon=False)
 figure
 
 # %%
 ratio_only = {"restitution": [0, 0], "stiffness": [0, 1]}
-hidden_fit = ji.fit(law(1.0, 1.0), balls, hidden, ratio_only)
+limits = {"stiffness": (0.5, 100.0)}
+hidden_fit = ji.fit(law(1.0, 5.0), balls, hidden, ratio_only, bounds=limits)
 low, high = hidden_fit.confidence_interval()[0]
 (union,) = ji.profile(hidden_fit)
-print(f"standard error: {low:.2f} to {high:.2f};  profile: {union.words};  truth {truth}")
+print(f"standard error: {low:.1f} to {high:.1f};  profile: {union.words};  truth {truth}")
 assert any(low <= truth <= high for low, high in union.intervals)
 picture([union], [truth])
 
 # %% [markdown]
-# Every piece is a ratio that reproduces the shot within its error. More shots of the same kind
-# would narrow the pieces, but not remove one.
+# Every piece is made of ratios that reproduce the shot within its error. More shots of the same kind
+# would narrow the pieces, but not remove one; a camera for the other balls would.
 #
 # ## The next experiment
 #

@@ -14,7 +14,10 @@
 # %% [markdown]
 # # A restitution matrix
 #
-# Newton's law says $\\gamma^+ = -e\\gamma^-$ contact by contact; a **restitution matrix** $E$ lets
+# *Course, part 7. Before: [what the data can tell](06_what_the_data_can_tell.ipynb). Next:
+# [a tossed cube](08_a_tossed_cube.ipynb).*
+#
+# Newton's law says $\gamma^+ = -e\gamma^-$ contact by contact; a **restitution matrix** $E$ lets
 # every contact answer to every other, $q_n^+ = -E q_n^-$. It can describe any shot. You will fit
 # one to a measured shot, read what the shot leaves open, see what keeps $E$ from creating energy,
 # and find out for which other shots it is worth nothing.

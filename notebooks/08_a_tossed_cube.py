@@ -14,6 +14,8 @@
 # %% [markdown]
 # # A tossed cube
 #
+# *Course, part 8. Before: [a restitution matrix](07_restitution_matrix.ipynb).*
+#
 # An acrylic cube of 10 cm was tossed on a board 456 times and filmed 148 times a second
 # (ContactNets, Pfrommer, Halm and Posa, 2020). 400 of its impacts, on one, two or four corners, with
 # friction, are clean enough to say what the velocities were before and after, each with its error.
@@ -45,7 +47,7 @@ poses = {
 }
 for axes, (name, e) in zip(figure.subplots(1, 3), poses.items()):
     box, shadow = cube.outlines(np.asarray(cube.touching(np.array(e) / np.linalg.norm(e))), 0.0)
-    axes.fill(*shadow.T, color="0.85")
+    axes.plot(*shadow.T, color="0.85")
     axes.plot(*box.T, color="#0072B2")
     axes.set(aspect="equal", title=name)
     axes.set_axis_off()
@@ -96,7 +98,7 @@ for name, found in fits.items():
 
 # %% [markdown]
 # An error of a prediction is measured by its kinetic energy, over that of the velocity jump:
-# $\\|v^+_{law} - v^+\\|_M / \\|v^+ - v^-\\|_M$.
+# $\|v^+_{law} - v^+\|_M / \|v^+ - v^-\|_M$.
 
 
 # %%
@@ -146,10 +148,10 @@ for name, own in laws.items():
 # %% [markdown]
 # ## Is the law right?
 #
-# No: predictions are off by a few percent, and the measurements are better than that. `fit` says so.
-# The scatter from impact to impact is that of the cube and the board (and of 2 mm that decide
-# which corners touch), not of the camera: standard errors that take it for noise would be too small by
-# the factor named. Sixteen impacts of other tosses scatter as the four fits above do:
+# No: predictions are off by a few percent, and the measurements are better than that. `fit` says so,
+# and stretches the standard errors. The scatter from impact to impact is that of the cube and the
+# board (and of the 2 mm that decide which corners touch), not of the camera. Are the stretched
+# errors true? The four fits, to impacts of different tosses, should scatter as much:
 
 # %%
 lzb = fits["LZB"]

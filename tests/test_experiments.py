@@ -8,6 +8,7 @@ import pytest
 import jimpact as ji
 from jimpact.experiments import data_defects
 from jimpact.shots_file import UNITS
+from jimpact.study import read_study
 
 DATA = files("jimpact") / "data"
 CHAIN = ji.chain([1.0, 1.0, 1.0])
@@ -292,6 +293,7 @@ def test_errors_before_the_impact_are_passed_on():
 
 def test_the_cube():
     data = ji.cube_impacts()
+    assert read_study("tossed_cube.toml").experiments.shots == data.only(data.contacts == 1).shots
     assert [int((data.contacts == m).sum()) for m in (1, 2, 4)] == [377, 21, 2]
     assert data.units == ("m/s",) * 3 + ("rad/s",) * 3
     assert 0 < np.median(data.energy_ratio()) < 1

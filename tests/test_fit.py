@@ -593,10 +593,14 @@ def test_contours_of_linear_problems_are_ellipses():
 
 def test_contour_of_a_valley_is_its_length():
     post = simulated(ji.Newton(0.5), PAIR, SHOTS[:1])
-    found = ji.fit(Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-3), ("one", "other"))
+    thin = ji.fit(Shared(0.9, 0.9), PAIR, ji.Experiments(SHOTS[:1], post, 1e-4), ("one", "other"))
+    with pytest.raises(ValueError, match="falls between 4 values"):
+        ji.contour(thin, "one", "other", points=4)
+    data = ji.Experiments(SHOTS[:1], post, 0.05)
+    found = ji.fit(Shared(0.9, 0.9), PAIR, data, ("one", "other"), profiles=False)
     region = ji.contour(found, "one", "other")
     slope = simulated(ji.Newton(1.0), PAIR, SHOTS[:1]) - simulated(ji.Newton(0.0), PAIR, SHOTS[:1])
-    expected = np.sum(slope**2) * ((region.x[:, None] * region.y - 0.5) / 1e-3) ** 2
+    expected = np.sum(slope**2) * ((region.x[:, None] * region.y - 0.5) / 0.05) ** 2
     seen = np.isfinite(region.deviance)
     np.testing.assert_allclose(region.deviance[seen], expected[seen], rtol=1e-6, atol=1e-4)
     assert (expected[~seen] > region.limit).all()

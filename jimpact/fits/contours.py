@@ -64,7 +64,8 @@ def contour(
         `Contour` with `deviance` (points, points).
 
     Raises:
-        ValueError: level, points or names; a robust loss; a matrix that is kept admissible.
+        ValueError: level, points or names; a robust loss; a matrix that is kept admissible; a
+            region so thin that no held value lies inside.
 
     >>> import jimpact as ji
     >>> pre, post = [[1.0, 0.0, -1.0], [2.0, 0.0, 0.0]], [[-0.8, 0.1, 0.7], [0.1, 1.8, 0.1]]
@@ -122,6 +123,11 @@ def contour(
                 for beside in _around(cell, points)
                 if beside not in ends
             }
+    if min(ends.values(), key=lambda end: end[0])[0] - least > limit * scaled.variance:
+        raise ValueError(
+            f"Argument `points` must be larger: the region falls between {points} values of "
+            f"{first} and of {second} (or take `profile`, which needs no grid)."
+        )
     deviance = np.full((points, points), np.inf)
     for cell, (total, _) in ends.items():
         deviance[cell] = max(total - least, 0.0) / scaled.variance

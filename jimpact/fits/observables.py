@@ -33,6 +33,11 @@ class Observation(NamedTuple):
     shot: int
     first: int  # the value to which it is relative, -1: to none
 
+    @property
+    def sampled(self) -> bool:
+        """Whether it is read off the forces over time."""
+        return self.quantity == "arrival_time" or (self.quantity == "duration" and self.place >= 0)
+
 
 class Observations(eqx.Module):
     """The observable of forces, times, energies and bounces: values (R,) of a law, in SI units.
@@ -69,9 +74,10 @@ class Observations(eqx.Module):
     def __call__(self, law: Law) -> Seen:
         """What would be seen of this law."""
         if any(row.quantity in _OF_FORCES for row in self.rows):
+            samples = SAMPLES if any(row.sampled for row in self.rows) else 2
 
             def run(scene: Scene, v: jax.Array) -> tuple[jax.Array, jax.Array, History | None]:
-                h = history(law, scene, v, SAMPLES)
+                h = history(law, scene, v, samples)
                 return h.velocity[-1], h.status, h
 
         else:

@@ -75,8 +75,8 @@ def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
     `[base]` amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
     horizontal, in space x or y); `[law]` as in other studies; `[motion]` q0, v0, t_end_s and the
     options of `simulate`. `[data]` file, a CSV file with columns t[s] in equal steps, q_1[m],
-    q_2[rad], ... and perhaps sigma_q_1[m], ..., and `[fit]` free, starts, seed, max_steps make it
-    one for `jimpact fit`.
+    q_2[rad], ... and perhaps sigma_q_1[m], ..., and `[fit]` (without method) makes it one for
+    `jimpact fit`.
 
     Raises:
         FileNotFoundError: no such study; ValueError: no TOML, unknown or missing keys, and what
