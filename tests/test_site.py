@@ -117,6 +117,7 @@ def test_what_is_public_is_in_the_site(site):
         assert row.law.__name__ in page
         assert f"law_{name}.png" in page
         assert "<math" in page
+        assert "Derivatives" in page
 
 
 def test_every_picture_of_the_docs_has_its_code():

@@ -109,6 +109,9 @@ class Newton(_WithCoefficient):
     `impulse_not_unique` for redundant contacts, `infeasible` where they contradict each other;
     with friction as in `RestitutionMatrix`.
 
+    Derivatives, forward and reverse: v+ is linear in gamma- as long as a contact approaches. With
+    friction they are one-sided where a contact begins to stick or to slide.
+
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.41) with a diagonal E; (6.54)-(6.57).
 
     >>> import jimpact as ji
@@ -195,6 +198,9 @@ class RestitutionMatrix(Kinematic):
     Raises:
         ValueError: E not square, not finite, or not of a size that fits the scene; tangential
             blocks, or friction, for a scene without tangents; both together.
+
+    Derivatives, forward and reverse: v+ is linear in gamma- as long as a contact approaches. With
+    friction they are one-sided where a contact begins to stick or to slide.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.42)-(6.48), (6.53)-(6.57).
 
