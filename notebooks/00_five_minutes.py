@@ -105,5 +105,6 @@ print(fit)
 #
 # Your own data: `jimpact new fit` writes a study to start from. The course goes on with
 # [this fit in earnest](01_fit_newtons_cradle.ipynb), [random gaps](02_monte_carlo_gaps.ipynb),
-# [speed and accuracy](03_speed_accuracy_stability.ipynb), [a rocking block](04_rocking_block.ipynb) and
-# [whole motions](05_whole_motions.ipynb).
+# [speed and accuracy](03_speed_accuracy_stability.ipynb), [a rocking block](04_rocking_block.ipynb),
+# [whole motions](05_whole_motions.ipynb), [what data can tell](06_what_the_data_can_tell.ipynb),
+# [a restitution matrix](07_restitution_matrix.ipynb) and [a tossed cube](08_a_tossed_cube.ipynb).

@@ -160,3 +160,6 @@ given = ([1.0], [0.0], 1.5)
 seen = np.asarray(ji.simulate(ball, ji.Newton(0.8), *given, samples=76).q)
 noisy = seen + 2e-3 * np.random.default_rng(0).normal(size=seen.shape)
 print(ji.fit_motion(ball, ji.Newton(0.75), noisy, *given, sigma=2e-3))
+
+# %% [markdown]
+# *Next: [how much such data can tell](06_what_the_data_can_tell.ipynb).*

@@ -170,3 +170,6 @@ drawing(candidates[plan.index[0]], "the shot to do next")
 
 # %%
 print(f"run time {time.perf_counter() - began:.0f} s")
+
+# %% [markdown]
+# *Next: [a law that can describe any shot, and what it is worth](07_restitution_matrix.ipynb).*

@@ -134,3 +134,6 @@ assert found.rank == 2
 assert two_sides.rank == 4
 assert any("lack of fit" in line.lower() for line in all_kinds.warnings)
 print(f"run time {time.perf_counter() - began:.0f} s")
+
+# %% [markdown]
+# *Next: [400 measured impacts of a cube](08_a_tossed_cube.ipynb).*

@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.special import chdtrc
+from scipy.special import chdtrc, erf
 
 import jimpact as ji
+from jimpact.fits.posterior import _priors
 from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.velocity_dependent import approach_speed
 from jimpact.study import read_study
@@ -305,12 +306,31 @@ def test_posterior_is_the_linearized_one_where_it_is_gaussian(found):
     assert x.shape == (2, 2500)
     assert x.mean() == pytest.approx(found.value[0], abs=0.1 * found.standard_error[0])
     assert x.std() == pytest.approx(found.standard_error[0], rel=0.05)
-    narrow = ji.Normal(float(found.value[0]), float(found.standard_error[0]))
-    half = ji.posterior(found.problem, {"restitution": narrow}, **size)
-    told = float(np.asarray(half.posterior["restitution"]).std())
-    assert told == pytest.approx(found.standard_error[0] / np.sqrt(2), rel=0.05)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("lenient")
+def test_priors_are_declared_like_domains(found):
+    kinds = pytest.importorskip("numpyro.distributions")
+    problem = found.problem
+    for given, low, high in (({}, 0.0, 1.0), ({"restitution": ji.Uniform(0.2, 0.4)}, 0.2, 0.4)):
+        prior = _priors(problem, given, kinds)["restitution"]
+        assert (float(prior.low), float(prior.high)) == pytest.approx((low, high))
+    normal = _priors(problem, {"restitution": ji.Normal(0.9, 0.1)}, kinds)["restitution"]
+    inside = 0.5 * (1 + erf(1 / np.sqrt(2)))  # truncated at 1, one standard deviation above
+    top = np.exp(float(normal.log_prob(0.9)))
+    assert top == pytest.approx(1 / (0.1 * np.sqrt(2 * np.pi) * inside), rel=1e-6)
+    beta = kinds.Beta(2.0, 2.0)
+    assert _priors(problem, {"restitution": beta}, kinds)["restitution"] is beta
+    lzb = ji.FitProblem.from_shots(
+        ji.LZB(0.9, [1.0, 2.0]),
+        ji.chain([1.0, 1.0, 1.0]),
+        ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.96]),
+    )
+    assert type(_priors(lzb, {}, kinds)["stiffness[2]"]) is kinds.LogUniform
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("priors", "message"),
     [

@@ -69,7 +69,7 @@ def design(
 
     >>> import jimpact as ji
     >>> balls = ji.chain([1.0, 1.0, 1.0])
-    >>> data = ji.Experiments([[1.0, 0.0, 0.0]], [[0.1, 0.9, 0.0]], sigma=0.01)
+    >>> data = ji.Experiments([[1.0, 0.0, 0.0]], [[-0.2, 0.6, 0.6]], sigma=0.01)
     >>> found = ji.fit(ji.Newton([0.8, 0.8]), balls, data, starts=1)  # contact 2 is not seen
     >>> print(ji.design(found, ji.Experiments([[2.0, 0, 0], [0, 0, -1.0]], [[0.0] * 3] * 2)))
     shot 2: restitution[1] +- 0.012, restitution[2] +- 0.012

@@ -4,6 +4,7 @@ import re
 
 import page
 import pytest
+import simulated
 from rows import CASES
 
 TEXT = page.PAGE.read_text(encoding="utf-8") if page.PAGE.exists() else ""
@@ -54,3 +55,17 @@ def exponent(text):
 def test_page_has_nothing_else():
     assert re.findall(r"^## (.*)$", TEXT, re.M) == [case.title for case in CASES]
     assert TEXT.startswith(page.HEAD)
+
+
+@pytest.mark.slow
+def test_coverage_of_a_few_data_sets():
+    """The table is made; the rest of it was made with 500 data sets a row."""
+    honest = [row for row in simulated.HONEST if row.what.startswith("Newton, 2")]
+    spoiled = [row for row in simulated.SPOILED if row.expected == "No contact approaches"]
+    text = simulated.page(40, honest, spoiled, ratios=(), print=lambda *line: None)
+    inside = float(re.search(r"e = .8 \| ([\d.]+) \|", text).group(1))
+    assert 85 <= inside <= 100
+    assert "| No contact approaches | 100.0 |" in text
+    committed = simulated.PAGE.read_text(encoding="utf-8")
+    for row in (*simulated.HONEST, *simulated.SPOILED):
+        assert f"| {row.what} |" in committed
