@@ -303,3 +303,28 @@ def test_the_cube():
         ValueError, match=r"`contacts` in \[data\] must be one of 1, 2, 4, but is 3"
     ):
         ji.cube_impacts(3)
+
+
+def test_a_fit_passes_errors_on_by_the_law_it_finds():
+    """Generalized least squares with the covariance of the minimum itself; the start's is another."""
+    m1, m2, before = 1.0, 2.0, np.array([0.05, 0.02])
+
+    def jacobian(e):
+        return np.array([[m1 - e * m2, (1 + e) * m2], [(1 + e) * m1, m2 - e * m1]]) / (m1 + m2)
+
+    rng = np.random.default_rng(4)
+    exact = np.array([[1.0, 0.0], [2.0, -1.0], [1.5, 0.5]])
+    post = exact @ jacobian(0.6).T + 0.02 * rng.normal(size=(3, 2))
+    pre = exact + before * rng.normal(size=(3, 2))
+    data = ji.Experiments(pre, post, 0.02, sigma_pre=np.tile(before, (3, 1)))
+    found = ji.fit(ji.Newton(0.1), ji.chain([m1, m2]), data, starts=1)
+    (e,) = found.value
+    covariance = 0.02**2 * np.eye(2) + jacobian(e) @ np.diag(before**2) @ jacobian(e).T
+    slope, left = pre @ (jacobian(1.0) - jacobian(0.0)).T, pre @ jacobian(e).T - post
+    information = np.einsum("ki,ij,kj->", slope, np.linalg.inv(covariance), slope)
+    step = np.einsum("ki,ij,kj->", slope, np.linalg.inv(covariance), left) / information
+    assert abs(step) < 1e-6
+    np.testing.assert_allclose(
+        found.standard_error / max(found.noise, 1), information**-0.5, rtol=1e-4
+    )
+    assert "those of the velocities before, passed on by the law" in str(found)
