@@ -81,6 +81,19 @@ class BallAtWall(System):
         return -e * v
 
 
+class BySpeed(System):
+    """v1 - v2 = 3, the e of a speed of 1.5 falls like the fourth root: p as of `TwoBalls`."""
+
+    laws = ("velocity",)
+
+    def state(self):
+        return chain([1.0, 3.0], [2.5, -0.5], e=0.6)
+
+    def after(self, v, e, k, eta):
+        p = (1 + e[0] * ((v[0] - v[1]) / 1.5) ** -0.25) * (v[0] - v[1]) * 0.75
+        return np.stack([v[0] - p, v[1] + p / 3])
+
+
 class RightAngles(System):
     """Kinetic angle pi/2: W is diagonal, each contact is alone and Routh's, gamma+ = -e gamma-."""
 
@@ -298,6 +311,7 @@ class Reinsch(System):
 SYSTEMS = {
     **{f"two balls, e={e}": TwoBalls(e) for e in (0.3, 0.9)},
     "ball at a wall": BallAtWall(),
+    "e by speed": BySpeed(),
     "right angles": RightAngles(),
     "head on": HeadOn(),
     "plastic": Plastic(),
