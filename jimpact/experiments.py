@@ -419,7 +419,7 @@ def _scenes_of(
 def data_defects(
     experiments: Experiments, scene: Scene | None = None, stored_energy: float = 0.0
 ) -> list[str]:
-    """What the data break beyond their error: at most one line each for momentum, energy, approach.
+    """What the data break beyond their error, a line each: momentum, energy, approach; copies.
 
     Momentum is told as `1 + excess / sum |m v-|`: after over before where all bodies move one way.
     Without `sigma` the shots show their noise: a defect is one that they have in common (a t test),
@@ -475,6 +475,13 @@ def data_defects(
         lines.append(
             f"No contact approaches in {len(labels)} of {len(experiments.shots)} shots ({which}): "
             "are pre and post swapped, or is a sign wrong?"
+        )
+    every = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
+    copies = len(every) > 1 and experiments.sigma is None and (every == every[:1]).all()
+    if copies and experiments.scenes is None:
+        lines.append(
+            f"All {len(every)} shots read the same to the last digit: they say no more than one of "
+            "them, and nothing of the noise; the errors mean nothing without `sigma`."
         )
     return lines
 

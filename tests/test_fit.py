@@ -155,6 +155,15 @@ def test_swapped_velocities_are_told():
     )
 
 
+def test_copies_of_a_shot_are_told():
+    pre = np.tile([[1.0, 0.0]], (6, 1))
+    post = np.tile([[-0.2, 0.6]], (6, 1))
+    copies = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
+    assert "All 6 shots read the same" in told(copies)
+    post[1] += [0.01, -0.005]
+    assert "read the same" not in told(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post)))
+
+
 class Steep(ji.Newton):
     """The derivative of fast impacts is garbage."""
 
@@ -454,6 +463,16 @@ def test_a_users_own_observable():
 
     same = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), residual, np.zeros(2), 1.0))
     np.testing.assert_allclose(same.value, found.value, rtol=1e-7)
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_an_observable_that_is_no_number_is_told(lost):
+    factor = jnp.array([np.nan, 1.0 if lost == 1 else np.nan])
+    observe = lambda law: law.restitution * factor  # noqa: E731
+    found = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), observe, [0.5, 0.4], 0.01))
+    assert f"fails in {lost} of 2 values (1" in found.warnings[0]
+    assert found.verdict.startswith("Newton fails in some of these data")
+    assert np.isnan(found.rms) == (lost == 2)
 
 
 @pytest.mark.parametrize(

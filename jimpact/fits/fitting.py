@@ -292,7 +292,8 @@ def _rms(problem: FitProblem, residual: np.ndarray) -> float:
     """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
     data = problem.experiments
     worth = 1.0 if data is None else data.natural_errors(problem.scene)
-    return float(np.sqrt(np.nanmean((residual / worth) ** 2)))
+    known = (residual / worth)[np.isfinite(residual)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
 
 
 def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:

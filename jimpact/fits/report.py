@@ -68,10 +68,11 @@ def verdict(fit: Any) -> str:
         return f"{law} fits {data} if {scattering}"
     if scattering is not None:
         told += f"; {scattering.name} scatters by {scattering.value:.2g} from shot to shot"
+    nearest = f"it comes nearest with {told}" if known else told
     if any(line.startswith("Lack of fit") for line in fit.warnings):
-        return f"{law} does not fit {data}; it comes nearest with {told}."
+        return f"{law} does not fit {data}; {nearest}."
     if any(line.startswith("The fitted law fails") for line in fit.warnings):
-        return f"{law} fails in some of these shots; it comes nearest with {told}."
+        return f"{law} fails in some of these {'shots' if fit.experiments else 'data'}; {nearest}."
     return f"{told}."
 
 
@@ -296,6 +297,7 @@ def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> lis
     if data is not None:
         lines += _statuses(found.status, data.shots)
         lines += _matrix(problem, found, contacts)
+    lines += _no_numbers(problem, found)
     lines += adequacy(problem, found, spread.rank)
     if data is not None and problem.sigma is None and len(set(data.units)) > 1:
         lines.append(
@@ -336,6 +338,20 @@ def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
                 f"{STATUS[code].name}, {STATUS[code].message}."
             )
     return lines
+
+
+def _no_numbers(problem: FitProblem, found: Search) -> list[str]:
+    """Where what the user's own function gives is no number at the parameters found."""
+    if problem.experiments is not None:
+        return []
+    lost = np.flatnonzero(np.isfinite(problem.measured) & ~np.isfinite(found.seen))
+    if not len(lost):
+        return []
+    which = ", ".join(str(i + 1) for i in lost[:6]) + ", .." * (len(lost) > 6)
+    return [
+        f"The fitted law fails in {len(lost)} of {problem.values} values ({which}): what is "
+        "observed is no number there, and counts as a large error."
+    ]
 
 
 def _matrix(problem: FitProblem, found: Search, contacts: int) -> list[str]:
