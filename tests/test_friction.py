@@ -611,7 +611,7 @@ def test_lzb_of_a_real_cube(contacts):
     close(out.velocity, after, atol=5e-7)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_slopes_where_a_real_cube_comes_to_stick():
     """Derivatives in mu and e: once up to 1e223."""
     rows = cube_impacts()[cube_impacts()["contacts"] == 1]

@@ -264,7 +264,7 @@ def _random_chains(bodies, wall, count, seed):
 @pytest.mark.parametrize(
     "rtol",
     [
-        pytest.param(1e-6, marks=pytest.mark.slow),
+        pytest.param(1e-6, marks=pytest.mark.release),
         pytest.param(1e-8, marks=pytest.mark.release),
         pytest.param(1e-10, marks=pytest.mark.slow),
     ],
@@ -366,7 +366,12 @@ def test_unknown_ratio_decides(unknown):
 # known ratio, tolerance: law; at 1e3 the contacts act together, at 0.01 one after the other
 @pytest.mark.parametrize(
     ("ratio", "tolerance", "name"),
-    [(1e3, 0.02, "newton"), (50.0, 0.02, "lzb"), (1.0, 0.02, "lzb"), (0.01, 0.02, "binary")],
+    [
+        pytest.param(1e3, 0.02, "newton", marks=pytest.mark.slow),
+        (50.0, 0.02, "lzb"),
+        (1.0, 0.02, "lzb"),
+        (0.01, 0.02, "binary"),
+    ],
 )
 def test_known_ratio(ratio, tolerance, name):
     found = quick(BALLS, STRIKE, tolerance, stiffness=[1.0, ratio])
@@ -417,7 +422,7 @@ def test_gaps(gap, tolerance, name):
     assert np.abs(got - exact).max() <= tolerance
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_several_ratios():
     """Five unknown ratios: which of them matters."""
     found = quick(ji.chain(jnp.ones(7)), [1.0, 0, 0, 0, 0, 0, 0])

@@ -521,7 +521,7 @@ def discs_in_a_box(n, columns, duration, step, samples):
 @pytest.mark.parametrize(
     ("n", "columns", "duration"),
     [
-        (30, 6, 1.0),
+        pytest.param(30, 6, 1.0, marks=pytest.mark.slow),
         pytest.param(150, 12, 1.5, marks=[pytest.mark.release, pytest.mark.long_run]),
     ],
 )

@@ -94,7 +94,7 @@ def test_free_rocking_to_rest():
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_corner_hops_while_the_other_is_the_pivot():
     """Short hops of one corner, in the steps in which the other strikes: none is missed."""
     motion = ji.simulate(
@@ -174,7 +174,7 @@ def test_a_body_on_a_tilted_plane_slides():
     assert way == pytest.approx(0.5 * G * (np.sin(0.3) - 0.25 * np.cos(0.3)), rel=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_overturning_on_a_harmonic_base():
     """It stands still below a = g w / h, rocks above, and overturns on a stronger one."""
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(0.85))

@@ -136,7 +136,7 @@ def test_bad_input_of_the_angles():
         ji.theory.search_critical_angle(0.1, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_the_tip_is_found_by_impacts_alone():
     mu, e = [0.0, 0.3, 1.0], [0.3, 0.8, 1.0]
     angle = ji.theory.search_critical_angle(mu, e)
