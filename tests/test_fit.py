@@ -330,6 +330,7 @@ def test_the_interval_of_a_valley_is_told(rank_2_of_3):
     np.testing.assert_array_equal(found.confidence_interval(), [p[0] for p in found.intervals()])
 
 
+@pytest.mark.slow
 def test_all_stiffness_ratios_that_fit_are_found():
     """Three of them come apart alike; the first is not the true one."""
     truth = ji.LZB([0.95, 0.95], [1.0, 40.0])

@@ -418,6 +418,7 @@ def test_lzb_of_a_flat_block():
         close(out.velocity[i], found, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_lzb_in_space():
     """The frame of the tangents does not matter; a motion in a plane is planar."""
     rng = np.random.default_rng(3)

@@ -364,14 +364,10 @@ def test_unknown_ratio_decides(unknown):
 
 
 # known ratio, tolerance: law; at 1e3 the contacts act together, at 0.01 one after the other
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ratio", "tolerance", "name"),
-    [
-        pytest.param(1e3, 0.02, "newton", marks=pytest.mark.slow),
-        (50.0, 0.02, "lzb"),
-        (1.0, 0.02, "lzb"),
-        (0.01, 0.02, "binary"),
-    ],
+    [(1e3, 0.02, "newton"), (50.0, 0.02, "lzb"), (1.0, 0.02, "lzb"), (0.01, 0.02, "binary")],
 )
 def test_known_ratio(ratio, tolerance, name):
     found = quick(BALLS, STRIKE, tolerance, stiffness=[1.0, ratio])

@@ -131,6 +131,7 @@ def test_contacts_that_share_bodies_come_to_rest_together():
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_bodies_come_to_rest_on_each_other_while_they_fall():
     motion = stack(0.5, [50.0, 50.01, 50.03], [0.0, 1.0, 0.0], 3.0, between=5.0)
     assert kinds(motion)[-1] == "accumulation"

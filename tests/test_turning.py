@@ -18,10 +18,8 @@ MASS = jnp.array([1.0, 1.0, 1 / 6])
 FLAT, LANDING = jnp.array([0.0, 0.5, 0.0]), jnp.array([0.0, -0.5, -1.0])  # gap rates (-1, 0)
 
 
-@pytest.mark.parametrize(
-    ("force", "power"),
-    [(LinearSpring, 1 / 2), pytest.param(Hertz, 2 / 5, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("force", "power"), [(LinearSpring, 1 / 2), (Hertz, 2 / 5)])
 def test_frozen_geometry_is_the_stiff_limit(force, power):
     """The error of frozen geometry is of the order of indentation over size: k^(-1/(eta+1))."""
     moving = [turning_impact(GAPS, MASS, FLAT, LANDING, force(k)) for k in (1e6, 1e8, 1e10)]
