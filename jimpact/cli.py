@@ -93,12 +93,12 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
         given.check()
         if given.light:
             return given.run()
-        keep_programs(given.no_cache)
+        folder = keep_programs(given.no_cache)
         from jimpact.commands import run
         from jimpact.progress import Steps
 
         call.steps = Steps(call.name)
-        failure = run(given, call.steps)
+        failure = run(given, call.steps, folder)
         return call.refused(failure, FAILURE) if failure else 0
     except BrokenPipeError:
         raise
@@ -129,31 +129,35 @@ def parsed(arguments: list[str]) -> Any:
     )
 
 
-def keep_programs(no_cache: bool) -> None:
+def keep_programs(no_cache: bool) -> str | None:
     """Have JAX keep what it compiles, before it is imported; settings of the user's own stay.
 
-    In the folder `JIMPACT_CACHE` (empty: nowhere), else in the user's cache folder.
+    In the folder `JIMPACT_CACHE` (empty: nowhere), else in the user's cache folder. Returns the
+    folder for programs that are kept whole.
     """
     folder = os.environ.get("JIMPACT_CACHE")
     if no_cache:
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
-    elif folder != "":
-        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder or _folder_of_programs())
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", WORTH_KEEPING)
+    if no_cache or folder == "":
+        return None
+    import platformdirs
+
+    # One for each kind of processor: a home may be shared by machines that differ.
+    of_machine = f"programs-{_processor()}"
+    folder = folder or os.path.join(platformdirs.user_cache_dir("jimpact"), of_machine)
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", WORTH_KEEPING)
+    return os.path.join(folder, f"whole-{of_machine}")
 
 
-def _folder_of_programs() -> str:
-    """One for each kind of processor: a home may be shared by machines that differ."""
+def _processor() -> str:
     import hashlib
     import platform
-
-    import platformdirs
 
     kind = platform.machine() + platform.processor()
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as info:
         kind += next((line for line in info if line.startswith(("flags", "Features"))), "")
-    digest = hashlib.sha256(kind.encode()).hexdigest()[:8]
-    return os.path.join(platformdirs.user_cache_dir("jimpact"), f"programs-{digest}")
+    return hashlib.sha256(kind.encode()).hexdigest()[:8]
 
 
 def end_on_interrupt(farewell: Callable[[], str]) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 import jimpact as ji
 from jimpact import options
 from jimpact.comparison import registered_laws
+from jimpact.compiling import kept_in
 from jimpact.fits.fitting import Fit
 from jimpact.progress import LONG, Steps, waiting
 from jimpact.records import as_data, table
@@ -51,10 +52,14 @@ class Answer(NamedTuple):
     printed: bool = False  # the text is what was asked for, be it JSON
 
 
-def run(given: options.Command, steps: Steps) -> str:
-    """Do what a command says, and print it; what went wrong all the same, '' if nothing did."""
+def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
+    """Do what a command says, and print it; what went wrong all the same, '' if nothing did.
+
+    Programs are kept in the folder, if there is one.
+    """
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
-    answer = _COMMANDS[given.name()](given, steps)
+    with kept_in(folder):
+        answer = _COMMANDS[given.name()](given, steps)
     replaced = [path for path in answer.pictures if path.exists()]
     for path, picture in answer.pictures.items():
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,18 +1,35 @@
 """How the library compiles the programs that it owns: soon done, a few percent slower."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 
+from jimpact.kept import KeptPrograms
+
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
 # take twice as long to compile a program of many small loops.
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+_kept: ContextVar[KeptPrograms | None] = ContextVar("kept", default=None)
+
+
+@contextmanager
+def kept_in(folder: str | Path | None) -> Iterator[None]:
+    """Within, programs of their own are kept in this folder, and taken from it; None: nowhere."""
+    before = _kept.set(None if folder is None else KeptPrograms(Path(folder)))
+    try:
+        yield
+    finally:
+        _kept.reset(before)
 
 
 @functools.cache
@@ -49,7 +66,7 @@ def quick_jit(function: Function) -> Function:
     inside = eqx.filter_jit(function)
 
     @functools.cache
-    def own() -> Callable[..., Any]:
+    def own(whole: bool = False) -> Callable[..., Any]:
         def of_arrays(rest: Any, arrays: list[Any]) -> Any:
             tree, fixed = rest
             values = iter(arrays)
@@ -57,7 +74,8 @@ def quick_jit(function: Function) -> Function:
             args, given = jax.tree.unflatten(tree, leaves)
             return function(*args, **given)
 
-        of_arrays.__name__ = function.__name__
+        # JAX's cache goes by names, too, and must not hand out what is kept whole.
+        of_arrays.__name__ = f"whole_{function.__name__}" if whole else function.__name__
         return jax.jit(of_arrays, static_argnums=0, compiler_options=known_options())
 
     @functools.wraps(function)
@@ -65,7 +83,11 @@ def quick_jit(function: Function) -> Function:
         if not is_own((args, given)):
             return inside(*args, **given)
         leaves, tree = jax.tree.flatten((args, given))
-        fixed = tuple(None if eqx.is_array(x) else (x,) for x in leaves)
-        return own()((tree, fixed), [x for x in leaves if eqx.is_array(x)])
+        fixed = tree, tuple(None if eqx.is_array(x) else (x,) for x in leaves)
+        arrays = [x for x in leaves if eqx.is_array(x)]
+        kept = _kept.get()
+        if kept is None or any(isinstance(x, jax.core.Tracer) for x in arrays):
+            return own()(fixed, arrays)
+        return kept.run(own(whole=True), call, fixed, arrays)
 
     return call  # type: ignore[return-value]

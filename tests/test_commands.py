@@ -309,17 +309,17 @@ def test_programs_are_kept_where_nobody_says_otherwise(tmp_path, monkeypatch):
         monkeypatch.setenv(name, "")
         monkeypatch.delenv(name)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    keep_programs(no_cache=False)
+    assert str(tmp_path) in keep_programs(no_cache=False)
     assert "jimpact" in os.environ.pop(folder)
     monkeypatch.setenv("JIMPACT_CACHE", "")
-    keep_programs(no_cache=False)
+    assert keep_programs(no_cache=False) is None
     assert folder not in os.environ
     monkeypatch.setenv("JIMPACT_CACHE", "mine")
-    keep_programs(no_cache=False)
+    assert keep_programs(no_cache=False).startswith("mine")
     monkeypatch.setenv("JIMPACT_CACHE", "other")
     keep_programs(no_cache=False)  # what is set already stays
     assert (os.environ[folder], enabled in os.environ) == ("mine", False)
-    keep_programs(no_cache=True)
+    assert keep_programs(no_cache=True) is None
     assert os.environ[enabled] == "false"
 
 

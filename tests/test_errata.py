@@ -25,6 +25,69 @@ def collide(masses, velocity, restitution, order, end=False):
     return v, count
 
 
+def test_6_3_1_signs_and_ends_of_the_work_of_a_contact():
+    """A mass of 1 kg at 1 m/s on a spring of 1 N/m: indentation sin t, impulse 1 - cos t."""
+    t = np.linspace(0, np.pi, 20001)
+    indentation, rate, impulse = np.sin(t), np.cos(t), 1 - np.cos(t)
+    gamma = -rate
+    energy = np.concatenate([[0], np.cumsum(np.diff(impulse) * -(gamma[1:] + gamma[:-1]) / 2)])
+    np.testing.assert_allclose(energy, indentation**2 / 2, atol=1e-7)  # E' = -gamma = rate
+    assert (-energy[1:-1] < 0).all()  # of +gamma, as printed
+    # (6.71), (6.72): compression ends where the rate is 0, not where the indentation is
+    assert np.isclose(impulse[np.argmax(energy)], impulse[np.argmin(abs(rate))], rtol=1e-9)
+    assert np.isclose(energy[indentation.argmin()], 0, atol=1e-7)
+
+
+@pytest.mark.parametrize("e", [0.5, 0.9])
+def test_6_3_1_the_energy_is_gone_before_the_indentation(e):
+    """Bistiff spring: k while loaded by 1 kg at 1 m/s, k / e^2 down to the indentation that stays."""
+    k = 3.0
+    deepest = 1 / np.sqrt(k)
+    stays = deepest * (1 - e**2)
+    stiff = k / e**2
+    assert np.isclose(k * deepest, stiff * (deepest - stays), rtol=1e-14)  # the force has no jump
+    given_back = 0.5 * stiff * (deepest - stays) ** 2
+    assert np.isclose(np.sqrt(2 * given_back), e, rtol=1e-14)  # so E = 0 with gamma+ = e
+    assert stays > 0.1 * deepest
+
+
+@pytest.mark.parametrize("exponent", [1.0, 1.5, 3.0])
+def test_6_3_1_force_of_stored_energy(exponent):
+    k, depth = 7.0, 0.3
+    force = k * depth**exponent
+    energy = k * depth ** (exponent + 1) / (exponent + 1)  # the integral of the force
+    up = exponent + 1
+    assert np.isclose(force ** (up / exponent), up * k ** (1 / exponent) * energy, rtol=1e-14)
+    assert not np.isclose(force ** (up / exponent), up * k ** (1 / up) * energy, rtol=0.1)
+    share = (up * energy) ** (exponent / up)
+    assert np.isclose(force, k ** (1 / up) * share, rtol=1e-14)
+    assert not np.isclose(force, k ** (1 / exponent + 1) * share, rtol=0.1)
+
+
+def test_measured_shot_of_6_1_2():
+    after = np.array([-0.0605, 0.1049, 0.9978])  # of equal balls, the first at 1 m/s
+    assert np.isclose(after.sum(), 1.042, atol=5e-4)
+    assert np.isclose(after @ after, 1.010, atol=5e-4)
+
+
+def test_equation_6_79():
+    """Ball 1 at a wall without restitution, ball 2 on it with e = 1, both at -1: impulses 1 and 0.
+
+    `0 <= p_e - e p_c _|_ gamma >= 0` with gamma at the end of compression lets ball 1 into the wall.
+    """
+    e, N = np.array([0.0, 1.0]), np.array([[1.0, -1.0], [0.0, 1.0]])
+    compressed = np.zeros(2)
+    p_c = np.linalg.solve(N, compressed - np.array([-1.0, -1.0]))
+    np.testing.assert_allclose(p_c, [2, 1])
+    assert (N.T @ compressed == 0).all()  # so that the least p_e is allowed at t_c
+    printed = N.T @ (compressed + N @ (e * p_c))
+    assert printed.min() < -0.9
+    s = np.array([1.0, 0.0])
+    used = N.T @ (compressed + N @ (e * p_c + s))
+    np.testing.assert_allclose(used, [0, 1])
+    assert s @ used == 0
+
+
 def test_equation_6_13():
     m, (e1, e2) = (1.0, 2.0, 3.0), (0.9, 0.8)
     m21, m32 = m[1] / m[0], m[2] / m[1]
@@ -212,6 +275,24 @@ def test_equations_6_58_and_6_59():
     G_mu, coupling = np.linalg.inv(block.G_mu), block.nH * block.slip
     np.testing.assert_allclose(G_mu - inverse @ coupling @ G_mu, inverse, atol=1e-12)
     assert not np.allclose(G_mu - block.G @ coupling @ G_mu, inverse, rtol=0.05)
+
+
+def test_equation_6_61():
+    """The velocity that friction adds is as large as its impulse, which is G_mu^-1 (I + E) qn-."""
+    block = Block()
+    _, p, p_t = block.after()
+    size = np.linalg.norm(block.before[:2])
+    gain = np.linalg.norm(np.eye(2) + block.E, 2) * size
+    slip = np.linalg.norm(block.slip, np.inf)
+    heavier = np.linalg.norm(np.linalg.inv(block.G_mu), 2)
+    assert np.linalg.norm(p_t) <= slip * heavier * gain
+    # sharp where (I + E) qn- points along the weakest direction: there the printed bound is broken
+    weakest = np.linalg.svd(block.G_mu)[2][-1]
+    qn = np.linalg.solve(np.eye(2) + block.E, weakest)
+    p = np.linalg.solve(block.G_mu, (np.eye(2) + block.E) @ qn)
+    bound = np.linalg.norm(np.eye(2) + block.E, 2) * np.linalg.norm(qn)
+    assert np.linalg.norm(p) <= heavier * bound
+    assert np.linalg.norm(p) > 1.0 * bound
 
 
 def test_proposition_6_6_2():

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 from scipy.special import chdtrc, stdtr
 
 if TYPE_CHECKING:
@@ -105,6 +104,8 @@ def scatter(fit: "Fit", name: str | None = None) -> Scatter:
     >>> bool(0.035 < found.value < 0.065), found.chance < 1e-6
     (True, True)
     """
+    from scipy.optimize import minimize_scalar  # late: slow to import
+
     which = _which(fit, name)
     residual, jacobian, shot = _weighted(fit)
     shots = np.unique(shot)

@@ -37,7 +37,7 @@ from jimpact.progress import progress_bar, waiting
 from jimpact.scene import check_mass
 
 CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
-RTOL, ATOL = 1e-10, 1e-12  # of the flights
+TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
 SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
 MAX_STEPS = 100_000
 CHUNK = 500  # events of one run of the program
@@ -60,8 +60,8 @@ def simulate(
     step: float | None = None,
     friction: Any = None,
     max_events: int | None = None,
-    rtol: float = RTOL,
-    atol: float = ATOL,
+    rtol: float | None = None,
+    atol: float | None = None,
     closed_below: float = CLOSED_BELOW,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
@@ -91,8 +91,8 @@ def simulate(
         max_events: one more ends the motion with the status `max_events` (in time stepping it is
             not written). None: 500; with method 'events' outside jit, vmap and derivatives 100 000,
             found by the program for 500 in as many runs as needed.
-        rtol: relative tolerance of the flights.
-        atol: absolute tolerance of the flights [m, m/s, rad, ..].
+        rtol: relative tolerance of the flights; None: 1e-10, in single precision 1e-5.
+        atol: absolute one [m, m/s, rad, ..]; None: 1e-12, in single precision 1e-7.
         closed_below: contacts with smaller gaps [m] take part in an impact.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed; contacts that share
@@ -137,6 +137,8 @@ def simulate(
         as_whole("max_events", max_events, 1)
     rows = CHUNK if max_events is None else max_events
     as_whole("max_steps", max_steps, 1)
+    usual = TOLERANCES.get(str(dtype), TOLERANCES["float32"])
+    rtol, atol = (y if x is None else x for x, y in zip((rtol, atol), usual))
     for name, value in (("rtol", rtol), ("atol", atol), ("closed_below", closed_below)):
         check_values(name, value, low=0.0, open_low=True)
     check_values("slow", slow, low=0.0, high=1.0)
