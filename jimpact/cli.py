@@ -6,6 +6,7 @@ it compiles. What is done is told, and what is on the disk is kept.
 
 import contextlib
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -63,6 +64,8 @@ def program() -> int:
     """The entry point of the program `jimpact`; what `main` does, and ctrl-C ends it."""
     call = Call()
     end_on_interrupt(call.farewell)
+    # what is piped or kept in a file has no terminal to ask for its width
+    os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size((80, 24)).columns))
     try:
         code = main(call=call)
         sys.stdout.flush()
@@ -123,8 +126,7 @@ def parsed(arguments: list[str]) -> Any:
         functools.reduce(operator.or_, commands),
         prog="jimpact",
         config=(tyro.conf.FlagCreatePairsOff,),
-        description="Differentiable impact laws for several simultaneous contacts. "
-        "--version prints the version.",
+        description="Impact laws for several simultaneous contacts. --version: the version.",
         args=arguments,
     )
 

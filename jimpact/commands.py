@@ -91,7 +91,7 @@ def _of_shot(given: options.ShotCommand) -> Study:
     """The study, in the scene of the shot that is asked for where shots have their own."""
     study = read_study(given.study)
     data = study.experiments
-    if given.velocity is not None or data is None:
+    if given.velocity or data is None:
         return study
     if given.shot > len(data.shots):
         raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
@@ -100,7 +100,7 @@ def _of_shot(given: options.ShotCommand) -> Study:
 
 def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
     """Velocities before the impact, and after it where they were measured."""
-    if given.velocity is not None:
+    if given.velocity:
         return np.asarray(given.velocity, float), None
     data = study.experiments
     assert data is not None  # `ShotCommand.check`
@@ -416,7 +416,7 @@ def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
         size: dict[str, Any] = {"axes": chosen | {"exponent": axes["exponent"][1:]}}
     else:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
-    found = ji.stability_map(given.methods, **size, max_steps=STEPS, progress=TOLD)
+    found = ji.stability_map(given.methods or None, **size, max_steps=STEPS, progress=TOLD)
     pictures = {path: ji.plot.stability_map(found, TITLE)}
     for name in found.methods if given.full else ():
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")

@@ -6,6 +6,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from jimpact.starting import fitting
+
 LONG = 2.0  # seconds after which work counts as long
 LINE_EVERY = 10.0  # seconds between two lines about one step
 
@@ -56,12 +58,12 @@ def _bar(after: float) -> Iterator[Show]:
 
 @contextlib.contextmanager
 def _lines(after: float) -> Iterator[Show]:
-    """A line once the work is long, then now and then, and at its end."""
+    """A line once the work is long, then now and then; at its end where nobody waited for that."""
     begun, ended = time.monotonic(), threading.Event()
-    latest = ""
+    latest = "compiling"  # until there is something to show
 
     def tell() -> None:
-        print(f"{latest or 'working'}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
+        print(f"{latest}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
     def run() -> None:
         wait = after or LINE_EVERY
@@ -80,7 +82,7 @@ def _lines(after: float) -> Iterator[Show]:
     finally:
         ended.set()
         thread.join()
-        if time.monotonic() - begun >= after:
+        if not after:
             tell()
 
 
@@ -126,4 +128,4 @@ class Steps:
         self.done.append(step)
         seconds = time.monotonic() - self.begun
         if seconds > LONG:
-            print(f"{self.command}: {step} ({seconds:.0f} s)", file=sys.stderr)
+            print(fitting(f"{self.command}: {step} ({seconds:.0f} s)"), file=sys.stderr)

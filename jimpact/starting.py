@@ -32,9 +32,7 @@ jax.config.update("jax_enable_x64", True)  # double precision; jimpact never set
 import jimpact as ji
 """
 _READ = """\
-from jimpact.study import read_study
-
-study = read_study("study.toml")
+study = ji.read_study("study.toml")
 study.scene, study.law"""
 STARTS = {
     "fit": Start(
@@ -74,8 +72,7 @@ STARTS = {
         None,
         "A whole motion",
         (
-            "from jimpact.motion.study_motion import read_motion_study\n\n"
-            'study = read_motion_study("study.toml")\nstudy.law',
+            'study = ji.read_motion_study("study.toml")\nstudy.law',
             "motion = study.run()\nji.raise_on_failed_motion(motion)\nprint(motion)",
             "ji.plot.motion(motion, study.title, system=study.system)",
         ),
@@ -84,7 +81,8 @@ STARTS = {
 _HEAD = """\
 # A study of your own: change the numbers, then run
 #     jimpact {kind} study.toml
-# Every key carries its unit. All keys: `help(jimpact.study.read_study)`.
+# Every key carries its unit. All keys: `help(jimpact.read_study)`, of a motion
+# `help(jimpact.read_motion_study)`.
 """
 DATA = "shots.csv"
 
@@ -151,7 +149,9 @@ def fitting(text: str) -> str:
     """Text whose sentences are wrapped where a terminal is narrow; tables fit already."""
     width = shutil.get_terminal_size((len(text), 0)).columns
     return "\n".join(
-        textwrap.fill(line, width) if len(line) > width and "  " not in line.strip() else line
+        textwrap.fill(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip(" -"))))
+        if len(line) > width and "  " not in line.strip()
+        else line
         for line in text.splitlines()
     )
 

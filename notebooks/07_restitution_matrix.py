@@ -35,7 +35,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 import jimpact as ji
-from jimpact.study import read_study
 
 began = time.perf_counter()
 np.set_printoptions(precision=3, suppress=True)
@@ -66,7 +65,7 @@ drawing([1.0, 0.0, 0.0], "three equal balls, measured once")
 # The command `jimpact fit restitution_matrix.toml` does the same.
 
 # %%
-study = read_study("restitution_matrix.toml")
+study = ji.read_study("restitution_matrix.toml")
 print("start\n", study.law.matrix)
 found = study.run()
 print(found)
