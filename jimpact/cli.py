@@ -31,7 +31,7 @@ jimpact: differentiable laws for impacts with several contacts.
   jimpact laws         what the laws say, and when they are right
 
 Your own data: `jimpact new fit` writes a study, a CSV file and a notebook to
-start from; then `jimpact fit my_fit/study.toml`.
+start from; then `jimpact fit my_fit`.
 
 `jimpact COMMAND --help` tells all options, `jimpact --version` the version.
 """

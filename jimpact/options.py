@@ -83,7 +83,7 @@ class DrawingCommand(Command):
         if self.out.suffix:
             return checked_picture(self.out)
         study, default = (getattr(x, "study", None) for x in (self, type(self)))
-        named = "" if study is None or study == default else f"-{study.stem}"
+        named = "" if study is None or study == default else f"-{study.absolute().stem}"
         return self.out / f"jimpact-{self.name()}{named}.png"
 
 
@@ -349,7 +349,7 @@ class NewCommand:
         folder = self.folder or Path(f"my_{self.kind}")
         for path in starting.begin(self.kind, folder):
             print(f"written: {path}")
-        print(f"Next: jimpact {self.kind} {folder / 'study.toml'}")
+        print(f"Next: jimpact {self.kind} {folder}")
         return 0
 
 
