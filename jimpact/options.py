@@ -330,6 +330,9 @@ class NewCommand:
     folder: Annotated[Path | None, tyro.conf.Positional, _own("[DIR]")] = None
     """Where it is written; default: ./my_<kind>. What is there is never replaced."""
 
+    like: Annotated[str | None, _own("STUDY.toml", str)] = None
+    """A study to begin with, as rocking_block.toml; default: three balls, or a cradle."""
+
     light: ClassVar[bool] = True
 
     @classmethod
@@ -347,7 +350,7 @@ class NewCommand:
     def run(self) -> int:
         """Write the files, and say what comes next."""
         folder = self.folder or Path(f"my_{self.kind}")
-        for path in starting.begin(self.kind, folder):
+        for path in starting.begin(self.kind, folder, self.like):
             print(f"written: {path}")
         print(f"Next: jimpact {self.kind} {folder}")
         return 0

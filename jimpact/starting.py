@@ -5,19 +5,21 @@ import io
 import json
 import shutil
 import textwrap
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from jimpact.study_file import STUDY, located
 
 WIDEST = 100  # characters; longer lines of text are hard to read
 
 
 class Start(NamedTuple):
-    """What a study of one's own begins with: a bundled study, its data, cells of a notebook."""
+    """What a study of one's own begins with: a bundled study, cells of a notebook."""
 
     study: str
-    data: str | None
+    table: str  # which studies of this kind have
     title: str
     cells: tuple[str, ...]
 
@@ -37,7 +39,7 @@ study.scene, study.law"""
 STARTS = {
     "fit": Start(
         "three_balls.toml",
-        "three_balls.csv",
+        "[scene]",
         "Fit a law to measured velocities",
         (
             _READ,
@@ -48,7 +50,7 @@ STARTS = {
     ),
     "compare": Start(
         "three_balls.toml",
-        "three_balls.csv",
+        "[scene]",
         "Every law on one impact",
         (
             _READ,
@@ -59,7 +61,7 @@ STARTS = {
     ),
     "montecarlo": Start(
         "three_balls_gaps.toml",
-        None,
+        "[monte_carlo]",
         "Velocities after an impact whose gaps are random",
         (
             _READ,
@@ -69,7 +71,7 @@ STARTS = {
     ),
     "simulate": Start(
         "cradle_motion.toml",
-        None,
+        "[system]",
         "A whole motion",
         (
             'study = ji.read_motion_study("study.toml")\nstudy.law',
@@ -87,18 +89,21 @@ _HEAD = """\
 DATA = "shots.csv"
 
 
-def begin(kind: str, folder: Path) -> list[Path]:
-    """Write study, data and notebook; the files.
+def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
+    """Write study, data and notebook, as in the study `like`; the files.
 
     Raises:
-        ValueError: one of them is there already.
+        FileNotFoundError: there is no such study. ValueError: a file is there already.
     """
-    start, bundled = STARTS[kind], files("jimpact") / "data"
-    study = _HEAD.format(kind=kind) + "\n" + (bundled / start.study).read_text(encoding="utf-8")
-    texts = {folder / "study.toml": study}
-    if start.data is not None:
-        texts[folder / "study.toml"] = study.replace(start.data, DATA)
-        texts[folder / DATA] = (bundled / start.data).read_text(encoding="utf-8")
+    start = STARTS[kind]
+    path = located(Path(like or start.study), start.table)
+    study = path.read_text(encoding="utf-8")
+    data = tomllib.loads(study).get("data", {}).get("file")
+    texts = {}
+    if data is not None:
+        study = study.replace(data, DATA)
+        texts[folder / DATA] = (path.parent / data).read_text(encoding="utf-8")
+    texts[folder / STUDY] = _HEAD.format(kind=kind) + "\n" + study
     texts[folder / "study.ipynb"] = _notebook(start)
     there = [str(path) for path in texts if path.exists()]
     if there:

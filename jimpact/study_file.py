@@ -14,7 +14,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jimpact._checks import check_choice, check_values
+from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # of a folder that `jimpact new` has made
@@ -92,7 +92,7 @@ def callers_laws() -> set[str]:
 
 def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Path], T]) -> T:
     """What `build` makes of a study file's tables; studies of a kind have this `table`."""
-    path = _located(Path(path), table)
+    path = located(Path(path), table)
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -103,7 +103,7 @@ def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Pat
         raise ValueError(f"{path}: {error}") from None
 
 
-def _located(path: Path, table: str) -> Path:
+def located(path: Path, table: str) -> Path:
     """The file, that of a folder (`jimpact new`), or the bundled study of this name."""
     if path.is_file() or (path / STUDY).is_file():
         return path if path.is_file() else path / STUDY
@@ -263,6 +263,9 @@ def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dic
     """What is free, by name, nothing where nobody says; the table's words are checked."""
     check_keys("[fit]", table, keys)
     _check_flag("[fit]", table, "profiles")
+    for key, low in (("starts", 1), ("seed", 0), ("max_steps", 1)):
+        as_whole(key, table.get(key, low), low)
+    check_choice("method", table.get("method", FIT_METHODS[0]), FIT_METHODS)
     free = table.get("free", [])
     if isinstance(free, dict):
         return free
