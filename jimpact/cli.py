@@ -7,6 +7,7 @@ it compiles. What is done is told, and what is on the disk is kept.
 import contextlib
 import gc
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -32,7 +33,7 @@ jimpact: differentiable laws for impacts with several contacts.
   jimpact laws         what the laws say, and when they are right
 
 Your own data: `jimpact new fit` writes a study, a CSV file and a notebook to
-start from; then `jimpact fit my_fit/study.toml`.
+start from; then `jimpact fit my_fit`.
 
 `jimpact COMMAND --help` tells all options, `jimpact --version` the version.
 """
@@ -66,6 +67,8 @@ def program() -> int:
     gc.set_threshold(RARELY)
     call = Call()
     end_on_interrupt(call.farewell)
+    # what is piped or kept in a file has no terminal to ask for its width
+    os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size((80, 24)).columns))
     try:
         code = main(call=call)
         sys.stdout.flush()
@@ -126,8 +129,7 @@ def parsed(arguments: list[str]) -> Any:
         functools.reduce(operator.or_, commands),
         prog="jimpact",
         config=(tyro.conf.FlagCreatePairsOff,),
-        description="Differentiable impact laws for several simultaneous contacts. "
-        "--version prints the version.",
+        description="Impact laws for several simultaneous contacts. --version: the version.",
         args=arguments,
     )
 
