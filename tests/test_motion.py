@@ -1,6 +1,7 @@
 """Whole motions against closed forms: events, derivatives, batches, contact, ledger."""
 
 import functools
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -11,6 +12,8 @@ from programs import OPTIMIZED, both_ways
 
 import jimpact as ji
 from jimpact.motion import event_driven
+from jimpact.motion.flow import status_at_start
+from jimpact.motion.record import MOTION_STATUS
 from jimpact.motion.simulate import CHUNK
 
 G = 9.80665
@@ -177,6 +180,24 @@ def test_a_bad_motion_ends_alone(balls):
     assert str(balls[0]) == "5 motions: 2 ok, 1 max_events, 1 penetration, 1 not_finite"
     np.testing.assert_allclose(lane(balls[0], 4).events.time[0], np.sqrt(1 / G), atol=1e-12)
     assert np.isnan(np.asarray(lane(balls[0], 3).q)[-1]).all()
+
+
+def test_a_law_with_friction_may_be_made_outside_of_jit():
+    block, law = ji.block_system(0.2, 0.4), ji.LZB(0.5, friction=0.3)
+
+    def run(q):
+        return ji.simulate(block, law, q, jnp.zeros(3), 1.0, samples=2, max_events=5).q
+
+    assert jax.eval_shape(run, jnp.array([0.0, 0.3, 0.1])).shape == (2, 3)
+
+
+def test_a_motion_back_in_time_is_told():
+    ball, start = (
+        ji.ball_system(),
+        SimpleNamespace(q=jnp.ones(1), v=jnp.ones(1), t=jnp.asarray(1.0)),
+    )
+    codes = [status_at_start(ball, start, jnp.asarray(end), 1e-9) for end in (2.0, 0.0)]
+    assert [MOTION_STATUS[int(code)].name for code in codes] == ["ok", "backward"]
 
 
 def test_ledger_closes(balls):
