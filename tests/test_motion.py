@@ -17,6 +17,7 @@ from jimpact.motion.record import MOTION_STATUS
 from jimpact.motion.simulate import CHUNK
 
 G = 9.80665
+LEGS = np.array([[0.3, 0.2], [0.3, -0.2], [-0.3, 0.2], [-0.3, -0.2]])
 
 
 def lane(batch, i):
@@ -152,6 +153,21 @@ def test_lengths_may_be_in_any_unit():
     times = (motion.events.time[:20] for motion in (metres, microns))
     np.testing.assert_allclose(next(times), next(times) / 1e3, rtol=1e-9)
     np.testing.assert_allclose(microns.q[-1] / 1e6, metres.q[-1], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_table_comes_to_rest_on_four_legs():
+    """Without friction nobody knows which leg carries what; it stands, wherever its middle is."""
+    for off in (0.0, 0.25):
+        table = ji.System(
+            lambda q, off=off: q[0] + LEGS @ q[1:] - off * q[1],
+            [1.0, 0.05, 0.05],
+            potential=ji.gravity([1.0, 0.0, 0.0]),
+        )
+        motion = ji.simulate(table, ji.Moreau(0.5), [0.1, 0.05, 0.1], np.zeros(3), 3.0, samples=5)
+        assert status(motion) == "ok"
+        np.testing.assert_allclose(motion.q[-1], 0, atol=1e-12)
+        np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
 
 
 def test_runs_of_the_program_follow_each_other():
