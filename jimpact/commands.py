@@ -351,7 +351,7 @@ def chart(given: options.ChartCommand, steps: Steps) -> Answer:
         study.scene,
         before,
         law,
-        given.methods or _able(law, study, given.full),
+        given.methods or (None if given.full else _quick_methods(law)),
         laws=None if given.full else _quick_laws(law),
         batch=given.batch,
         repeats=given.repeats,
@@ -387,15 +387,11 @@ def _quick_laws(law: ji.LZB) -> dict[str, ji.Law]:
     return {name: known[name] for name in QUICK_LAWS}
 
 
-def _able(law: ji.LZB, study: Study, full: bool) -> tuple[str, ...]:
-    """Methods that can solve the study's impact; without `full` those that compile soon."""
+def _quick_methods(law: ji.LZB) -> list[str]:
+    """Those that compile soon and can solve the impact."""
     from jimpact.methods.contenders import METHODS
 
-    return tuple(
-        name
-        for name, method in METHODS.items()
-        if (full or name in QUICK_METHODS) and method.supports(law, study.scene) is None
-    )
+    return [name for name in QUICK_METHODS if METHODS[name].supports(law) is None]
 
 
 # -------------------------------------------------------------------------------------- stability
@@ -408,12 +404,11 @@ TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at 
 def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
     """Maps of methods; the picture of single axes, and of pairs, one more beside it a method."""
     path = given.picture()
-    if not given.full:  # three balls and no exponent 1: a program a method
+    if not given.full:  # three balls: a program a method
         from jimpact.methods.stability import default_axes
 
-        axes = default_axes(QUICK_RESOLUTION)
-        chosen = {name: values for name, values in axes.items() if name != "balls"}
-        size: dict[str, Any] = {"axes": chosen | {"exponent": axes["exponent"][1:]}}
+        axes = default_axes(QUICK_RESOLUTION).items()
+        size: dict[str, Any] = {"axes": {name: x for name, x in axes if name != "balls"}}
     else:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
     found = ji.stability_map(given.methods, **size, max_steps=STEPS, progress=TOLD)

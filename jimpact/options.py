@@ -220,8 +220,8 @@ class StabilityCommand(DrawingCommand):
     methods: tuple[str, ...] | None = None
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: bool = False
-    """Also other numbers of balls and exponent 1, finer, all pairs of axes with a picture a method,
-    and 300 points over all axes besides."""
+    """Also other numbers of balls, finer, all pairs of axes with a picture a method, and 300 points
+    over all axes besides."""
 
     def check(self) -> None:
         """Also the methods' names."""

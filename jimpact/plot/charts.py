@@ -15,15 +15,17 @@ from jimpact.methods.stability import CLASSES, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
 from jimpact.plot.style import (
     COLOURS,
+    COLUMNS,
     GREY,
     SMALL,
-    SPREAD,
     finish,
     heading,
     legend_below,
     legend_within,
     logarithmic,
     new_figure,
+    new_panels,
+    side_by_side,
     wrapped,
 )
 from jimpact.status import CODE, STATUS
@@ -179,7 +181,6 @@ def _draw(
 
 
 def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
-    axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -218,20 +219,14 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
     1
     """
     names = list(found.axes)
-    columns = min(2, len(names))
-    rows = -(-len(names) // columns)
-    figure = new_figure(1.2 + rows * (0.8 + 0.3 * len(found.methods)))
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for i, axes in enumerate(grid.flat):
-        if i >= len(names):
-            axes.remove()
-            continue
-        codes = [found.slices[name][i].codes for name in found.methods]
-        _draw_classes(axes, np.array(codes))
-        _ticks(axes, "x", names[i], found.axes[names[i]])
-        labels = found.methods if i % columns == 0 else [""] * len(found.methods)
+    figure, grid = new_panels(len(names), 0.8 + 0.3 * len(found.methods), 1.2)
+    for i, (axes, name) in enumerate(zip(grid, names)):
+        _draw_classes(axes, np.array([found.slices[method][i].codes for method in found.methods]))
+        _ticks(axes, "x", name, found.axes[name])
+        labels = found.methods if i % COLUMNS == 0 else [""] * len(found.methods)
         axes.set_yticks(range(len(found.methods)), labels, fontsize=SMALL)
-        _base_mark(axes, found, names[i])
+        axes.plot(_place(found, name), -0.62, "v", color="black", ms=5, clip_on=False)
+        axes.set_ylim(len(found.methods) - 0.5, -0.5)
     _finish_map(figure, found, title)
     return figure
 
@@ -277,7 +272,7 @@ def _pair(axes: Axes, found: StabilityMap, each: Slice, bottom: bool, left: bool
     axes.invert_yaxis()
     for which, name, labelled in (("x", each.axes[0], bottom), ("y", each.axes[1], left)):
         _ticks(axes, which, name, found.axes[name], labelled, 3)
-    x, y = (_place(found.axes[name], found.base[name]) for name in each.axes)
+    x, y = (_place(found, name) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
 
@@ -321,15 +316,10 @@ def _number(value: float) -> str:
     return f"{value:.2g}" if value < 1 or value != round(value) else f"{value:g}"
 
 
-def _place(values: np.ndarray, value: float) -> float:
-    """Where a value lies among the columns."""
-    return float(np.interp(value, values, np.arange(len(values))))
-
-
-def _base_mark(axes: Axes, found: StabilityMap, name: str) -> None:
-    place = _place(found.axes[name], found.base[name])
-    axes.plot(place, -0.62, "v", color="black", ms=5, clip_on=False)
-    axes.set_ylim(len(found.methods) - 0.5, -0.5)
+def _place(found: StabilityMap, name: str) -> float:
+    """Where the base lies among the values of an axis."""
+    values = found.axes[name]
+    return float(np.interp(found.base[name], values, np.arange(len(values))))
 
 
 def _finish_map(figure: Figure, found: StabilityMap, title: str) -> None:
@@ -407,7 +397,7 @@ def advice(found: Advice, title: str = "") -> Figure:
     """
     names, rows = list(found.candidates), list(found.candidates.values())
     bodies, x = len(found.velocity), np.arange(len(names))
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
+    dodge = side_by_side(bodies)
     figure = new_figure(6.5)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for i in range(bodies):

@@ -18,12 +18,12 @@ from jimpact.plot.style import (
     COLOURS,
     GREY,
     SMALL,
-    SPREAD,
     finish,
     heading,
     legend_below,
     legend_within,
     new_figure,
+    side_by_side,
     unit_of_time,
     wrapped,
 )
@@ -55,7 +55,7 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     names, entries = list(found.entries), list(found.entries.values())
     bodies = len(found.velocity)
     what, unit = ("body", "m/s") if found.scene.walls is not None else ("coordinate", "m/s, rad/s")
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / max(bodies, 1)
+    dodge = side_by_side(bodies)
     figure = new_figure(6.0)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
     x = np.arange(len(names))
@@ -134,7 +134,7 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     names = list(found.entries)
     values = np.array([np.asarray(e.outcome.velocity) for e in found.entries.values()])
     bodies = values.shape[1]
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
+    dodge = side_by_side(bodies)
     for i in range(bodies):
         at = np.arange(len(names)) + dodge[i]
         outcome.plot(at, values[:, i], "o", color=COLOURS[i % len(COLOURS)], label=f"body {i + 1}")
