@@ -484,6 +484,7 @@ def valid():
     return ji.validity_map(BALLS, STRIKE, RATIOS, (1.0, 1.5, 2.0, 3.0))
 
 
+@pytest.mark.slow
 def test_validity_map(valid):
     """Closed form; k2/k1 -> 0: binary; -> inf: Moreau; the larger the exponent, the later."""
     assert not valid.status.any()
