@@ -27,7 +27,6 @@ OBSERVE_KEYS = ("quantity", "value", "sigma", "relative", "contact", "body", "bo
 OBSERVE_SHOTS = ("velocity_m_per_s", "drop_height_m")  # one of them says what happens
 SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
 DISTRIBUTIONS = {("high", "low"): "Uniform", ("mean", "std"): "Normal"}
-FIT_METHODS = ("levenberg-marquardt", "adam", "sgd", "lbfgs")
 GRAVITY = "gravity_m_per_s2"
 MOTION_KEYS = {  # and what `simulate` calls them
     "q0": "q0",

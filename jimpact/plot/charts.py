@@ -81,41 +81,22 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     2
     """
     gradients = any(point.gradient is not None for row in found.points.values() for point in row)
-    if gradients:
-        figure = new_figure(7.2)
-        (left, right), (below, corner) = figure.subplots(2, 2)
-    else:
-        figure, below, corner = new_figure(4.6), None, None
-        left, right = figure.subplots(1, 2)
+    figure, panels = new_panels(4, 3.6) if gradients else new_panels(2, 4.6)
     handles: dict[str, Any] = {}
-    for number, (name, row) in enumerate(found.points.items()):
-        style = _style(name, number, row)
-        for axes, quantity, place in (
-            (left, "velocity", lambda point: _times(point.batched)),
-            (right, "velocity", lambda point: (point.evaluations, None)),
-            (below, "gradient", lambda point: _times(point.gradient)),
-        ):
-            if axes is None:
-                continue
-            drawn = _draw(axes, row, quantity, place, style)
+    for axes, (quantity, place, x, y) in zip(panels, _PANELS):
+        for number, (name, row) in enumerate(found.points.items()):
+            drawn = _draw(axes, row, quantity, place, _style(name, number, row))
             if drawn is not None:
                 handles.setdefault(row[0].label, drawn)
-    labels = (
-        (left, "velocity", "time per impact in a batch [µs]", "error of v⁺, relative"),
-        (right, "velocity", "field evaluations per impact", "error of v⁺, relative"),
-        (below, "gradient", "time per impact with its gradient [µs]", "error of ∂v⁺/∂(ln k, e)"),
-    )
-    for axes, quantity, x, y in labels:
-        if axes is not None:
-            _finish(axes, found.reference.uncertainty[quantity], x, y)
+        _finish(axes, found.reference.uncertainty[quantity], x, y)
     for label, drawn in handles.items():
         drawn.set_label(label)
-    if corner is None:
+    if not gradients:
         legend_below(figure, list(handles.values()), 2, _note(found))
     else:  # beside the three panels
-        corner.axis("off")
+        panels[3].axis("off")
         options: dict[str, Any] = {"title": _note(found), "title_fontsize": SMALL, "loc": "center"}
-        corner.legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)
+        panels[3].legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)
     heading(figure, title)
     return figure
 
@@ -144,6 +125,28 @@ def _times(timing: Timing | None) -> tuple[float, tuple[float, float] | None]:
         1e6 * (timing.median - timing.low),
         1e6 * (timing.high - timing.median),
     )
+
+
+_PANELS: tuple[tuple[str, Callable[[Point], tuple[float, Any]], str, str], ...] = (
+    (
+        "velocity",
+        lambda point: _times(point.batched),
+        "time per impact in a batch [µs]",
+        "error of v⁺, relative",
+    ),
+    (
+        "velocity",
+        lambda point: (point.evaluations, None),
+        "field evaluations per impact",
+        "error of v⁺, relative",
+    ),
+    (
+        "gradient",
+        lambda point: _times(point.gradient),
+        "time per impact with its gradient [µs]",
+        "error of ∂v⁺/∂(ln k, e)",
+    ),
+)
 
 
 def _draw(
