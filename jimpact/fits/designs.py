@@ -11,7 +11,7 @@ from jimpact.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import Box
 from jimpact.fits.multistart import repeated, run
-from jimpact.fits.problem import FitProblem, filled_up, to_scaled
+from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
 
 # Information that is added to that of the data, in shares of their largest: where they cannot see a
@@ -112,10 +112,8 @@ def design(
 
 def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     """`J^T J / noise^2` (K, P, P) of every shot at the parameters of the fit, in scaled form."""
-    residuals, r, first = filled_up(problem.residuals), fit.problem.residuals, problem.parameters
-    y = np.zeros(len(r.offset))
-    log = np.asarray(r.log)[first.first]
-    y[: len(first.names)] = to_scaled(fit.value, np.asarray(r.scale, float)[first.first], log)
+    residuals, r = filled_up(problem.residuals), fit.problem.residuals
+    y = fit.problem.point(fit.value)
     ends: Any = Box(*np.broadcast_to(y.astype(r.offset.dtype), (2, len(y))))  # held there
     parts = (r.mix, r.offset, r.scale, ends.low, ends.high, ends)
     here = eqx.tree_at(
@@ -124,5 +122,5 @@ def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     states = run(repeated(here, 1), y[None], "levenberg-marquardt", 1, lambda *told: None)
     shape = (*problem.measured.shape, -1)
     slopes = np.asarray(states.jacobian[0][: problem.measured.size], float)
-    rows = slopes.reshape(shape)[..., : len(first.names)] * float(problem.residuals.size) / noise
+    rows = slopes.reshape(shape)[..., : len(fit.names)] * float(problem.residuals.size) / noise
     return np.einsum("kip,kiq->kpq", rows, rows)

@@ -135,6 +135,7 @@ class Scaled:
 
     def __init__(self, fit: "Fit"):
         r, first = fit.problem.residuals, fit.problem.parameters.first
+        self.point = fit.problem.point
         self.scale, self.log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
         self.low, self.high = np.asarray(r.low, float), np.asarray(r.high, float)
         self.size = float(r.size)
@@ -143,12 +144,6 @@ class Scaled:
         # of the weighted residuals; where nothing tells it, what is exact up to rounding
         self.variance = float(fit.noise**2) if stated else exact
         self.best = self.point(fit.value)
-
-    def point(self, value: np.ndarray) -> np.ndarray:
-        """y (Q,) of values (P,)."""
-        y = np.zeros(len(self.low))
-        y[: len(value)] = to_scaled(value, self.scale, self.log)
-        return y
 
     def real(self, i: int, y: np.ndarray) -> np.ndarray:
         """Values of the i-th parameter."""
@@ -391,7 +386,7 @@ class _Scans(Scaled):
         low, high = self.fit.problem.domains[i]
         better = None
         if self.lower is not None:
-            better = from_scaled(self.lower[: len(self.scale)], self.scale, self.log)
+            better = self.fit.problem.values_at(self.lower)
         given = (self.fit.names[i], real, d, limit, self.level, tuple(intervals))
         return Profile(*given, (float(low), float(high)), better)
 

@@ -154,7 +154,7 @@ def _quality(fit: Any) -> list[str]:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
         lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
         lines += _said_of_sigma(fit.experiments)
-        if fit.noise > 1:
+        if fit.noise > 1 and fit.loss == "squares":
             lines.append(
                 f"errors         stretched by {fit.noise:.3g}, the root of chi^2 over that"
             )
@@ -282,7 +282,9 @@ def to_json(fit: Any) -> dict[str, Any]:
     }
 
 
-def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> list[str]:
+def fit_warnings(
+    problem: FitProblem, found: Search, spread: Uncertainty, robust: bool
+) -> list[str]:
     """All warnings, those about the data first."""
     lines, data = list(problem.left_out), problem.experiments
     if data is not None:
@@ -298,7 +300,7 @@ def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> lis
         lines += _statuses(found.status, data.shots)
         lines += _matrix(problem, found, contacts)
     lines += _no_numbers(problem, found)
-    lines += adequacy(problem, found, spread.rank)
+    lines += adequacy(problem, found, spread.rank, robust)
     if data is not None and problem.sigma is None and len(set(data.units)) > 1:
         lines.append(
             "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
