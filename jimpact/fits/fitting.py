@@ -223,12 +223,14 @@ def fit(
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
         starts: number of starts, the first from the law's values, the others random; if
-            more than one, further ones around the best follow as long as they improve it.
+            more than one, further ones around the best follow as long as they improve it, and,
+            of up to 64 shots, scans for other minima of what is fitted in its logarithm.
         seed: of the random starts.
         max_steps: iterations per start.
-        profiles: whether intervals are those of `profile`; None: of up to 64 shots, where standard
-            errors cannot be trusted: at a bound, in a valley, with several minima, or where the
-            data hardly see a parameter.
+        profiles: whether intervals are those of `profile`; None: where standard errors cannot be
+            trusted (at a bound, in a valley, with several minima, or where the data hardly see a
+            parameter), of up to 256 shots, with a single start of up to 64; else the report says
+            how to get them.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 
     Returns:

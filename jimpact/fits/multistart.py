@@ -196,7 +196,7 @@ def run(
     """
     few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
     most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
-    lanes = most if few else min(len(points), most)
+    lanes = most if few or len(points) > 1 else 1  # not a program for each number of points
     points = points.astype(problems.offset.dtype)
     limit: Any = max_steps
     if method == "levenberg-marquardt":

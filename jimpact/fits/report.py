@@ -10,7 +10,7 @@ from jimpact.fits.adequacy import adequacy
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.profiles import in_words
+from jimpact.fits.profiles import in_words, misleads
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -144,7 +144,14 @@ def _parameters(fit: Any) -> list[str]:
         interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
         note = "   at its bound" if fit.at_bound[i] else ""
         lines.append(f"{fit.names[i]:{width}s} {fit.value[i]:12.6g} {word:>12s}   {interval}{note}")
-    return lines
+    return [*lines, *unprofiled(fit)]
+
+
+def unprofiled(fit: Any) -> list[str]:
+    """How to get intervals that are true, where these may not be."""
+    if not misleads(fit):
+        return []
+    return ["These intervals are of parabolas, which may mislead here: see `ji.profile(fit)`."]
 
 
 def _quality(fit: Any) -> list[str]:
