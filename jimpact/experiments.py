@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtr
 
-from jimpact._checks import as_float_array, check_values
+from jimpact._checks import as_float_array, check_concrete, check_values
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 from jimpact.shots_file import ANGULAR, LINEAR, read_shots
@@ -306,6 +306,7 @@ def conserved_momenta(scene: Scene) -> np.ndarray:
 
 def _as_rows(name: str, value: Any) -> jax.Array:
     array = as_float_array(name, value)
+    check_concrete(name, array)
     array = array[None, :] if array.ndim == 1 else array
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
@@ -317,6 +318,7 @@ def _as_rows(name: str, value: Any) -> jax.Array:
 
 def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None = None) -> jax.Array:
     sigma = as_float_array(name, value)
+    check_concrete(name, sigma)
     if sigma.shape == measured.shape[1:] and len(measured) == 1:
         sigma = sigma[None, :]
     if sigma.shape not in ((), measured.shape):

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_kind, check_values
+from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import quick_jit
 from jimpact.experiments import Experiments
 from jimpact.fits.least_squares import Box, Method, Region, SolverState, advance, begin
@@ -202,6 +202,8 @@ class FitProblem:
         """
         check_kind("law", law, Law)
         check_kind("experiments", experiments, Experiments)
+        check_concrete("law", law)
+        check_concrete("scene", scene)
         own = experiments.each(scene, lambda s: s)
         same = experiments.scenes is None
         alike, extra = stackable(own[:1] if same else own)
@@ -287,6 +289,8 @@ class FitProblem:
         0.7
         """
         check_kind("law", law, Law)
+        check_concrete("law", law)
+        check_concrete("measured", measured)
         post = np.asarray(as_float_array("measured", measured))
         check_values("measured", post, nan_allowed=True)
         if not np.isfinite(post).any():
