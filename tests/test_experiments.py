@@ -142,6 +142,7 @@ def test_momentum_of_the_measured_balls():
     corrected = data.momentum_corrected(CHAIN)
     np.testing.assert_allclose(corrected.post, data.post - 0.0422 / 3, atol=1e-15)
     assert corrected.lost_freedom == 1
+    assert [corrected.only(which).lost_freedom for which in ([0], [0, 0])] == [1, 2]
     assert data_defects(data, CHAIN) == [
         "The data break momentum (1 = conserved): shot 1: 1.0422; no law can reproduce that part "
         "(rms 0.0141 m/s).",

@@ -56,7 +56,7 @@ def design(
         fit: to shots, with a known noise.
         candidates: velocities before (K, n), scenes where they differ; of `post` it only counts
             what is measured (NaN: is not). Without sigma, the noise of the fit, or the median of
-            its sigma.
+            its sigma (stretched as the fit's errors are).
         scene: of the candidates; None: that of the fit.
         count: how many to choose; one may be chosen several times.
         target: name of the parameter that is wanted; None: all.
@@ -84,11 +84,10 @@ def design(
     own = fit.problem.scene if scene is None else scene
     problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.free)
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
-    noise = (
-        fit.noise
-        if fit.experiments.sigma is None
-        else float(np.nanmedian(np.asarray(fit.problem.sigma)))
-    )
+    noise = fit.noise
+    if fit.experiments.sigma is not None:  # which weigh candidates of other units as `fit` does
+        worth = fit.experiments.natural_errors(fit.problem.scene)
+        noise *= float(np.nanmedian(np.asarray(fit.problem.sigma) / worth))
     each = _information(problem, fit, 1.0 if candidates.sigma is not None else noise)
     known = known + _RIDGE * np.trace(known + each.sum(axis=0)) * np.eye(len(known))
     first = fit.problem.parameters.first

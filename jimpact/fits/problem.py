@@ -411,6 +411,9 @@ class FitProblem:
         arrays = (np.asarray(weight / size, r.weight.dtype), np.asarray(size, r.size.dtype), mixing)
         measured = np.where(kept, self.measured, np.nan)
         lost = int(np.isnan(measured).sum() - np.isnan(self.measured).sum())
+        if self.experiments is not None:  # whole shots are left out, with what a correction took
+            gone = np.isnan(measured).all(axis=1) & ~np.isnan(self.measured).all(axis=1)
+            lost -= int(np.array(self.experiments.lost)[gone].sum())
         residuals = eqx.tree_at(
             lambda r: (r.weight, r.size, r.mixing), r, arrays, is_leaf=lambda x: x is None
         )
