@@ -8,7 +8,7 @@ from typing import Any, Generic, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_choice
+from jimpact._checks import check_choice, check_kind
 from jimpact.experiments import Experiments
 from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.least_squares import Method, check_method, default_steps
@@ -279,6 +279,15 @@ def fit(
     return end
 
 
+def check_squares(name: str, found: Any) -> None:
+    """Raise an error unless this is a fit by least squares."""
+    check_kind(name, found, Fit)
+    if found.loss != "squares":
+        raise ValueError(
+            f"Argument `{name}` must be by least squares, but has loss {found.loss!r}."
+        )
+
+
 def _rms(problem: FitProblem, residual: np.ndarray) -> float:
     """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
     data = problem.experiments
@@ -342,6 +351,8 @@ def _robust(
         found = search_near(problem.weighed(factor), found.y, method, max_steps)
         if np.abs(found.y - before).max() <= SAME:
             break
+    else:
+        found = found._replace(converged=False)
     psi = (share * error / scale)[here]
     noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
     return problem, Robust(found, factor, float(noise))

@@ -2,7 +2,7 @@
 
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -12,9 +12,9 @@ import numpy as np
 from jimpact._checks import as_whole
 from jimpact.experiments import Experiments
 from jimpact.fits.adequacy import unusable
-from jimpact.fits.fitting import Fit, as_fit, fit
+from jimpact.fits.fitting import Fit, as_fit, check_squares, fit
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import Search, ends, repeated, run, settled, start_points
+from jimpact.fits.multistart import Search, at_minimum, ends, repeated, run, settled, start_points
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, Residuals, filled_up
 from jimpact.progress import progress_bar
@@ -38,7 +38,7 @@ def fit_many(
     """`fit` of one law to each of many data sets, side by side in one compiled program.
 
     Data sets of up to 4, 16, 64, 128, ... shots share a program. Arguments and errors as of `fit`;
-    `starts` are those of each data set.
+    `starts` are those of each data set; around the best, and in scans, none are added.
 
     Args:
         law: start values of all.
@@ -106,12 +106,14 @@ def _searches(problems: list[FitProblem], states: SolverState) -> list[Search]:
 class Refits:
     """Parameters `value` (B, P), by `names`, of fits to changed data.
 
-    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s].
+    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s]; `converged`
+    (B,) which of the fits have.
     """
 
     names: tuple[str, ...]
     value: np.ndarray
     predicted: np.ndarray
+    converged: np.ndarray
 
     def interval(self, level: float = 0.95) -> np.ndarray:
         """Quantiles (P, 2) between which the share `level` of the values lies."""
@@ -138,7 +140,7 @@ def bootstrap(
         `Refits` with `value` (B, P).
 
     Raises:
-        ValueError: samples < 1; a noise that is not known.
+        ValueError: samples < 1; a noise that is not known; a robust loss.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.11, 0.88], [0.2, 1.81]], sigma=0.02)
@@ -148,6 +150,7 @@ def bootstrap(
     True
     """
     as_whole("samples", samples, 1)
+    check_squares("fit", fit)
     if not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
     residuals, shape = filled_up(fit.problem.residuals), fit.predicted.shape
@@ -174,7 +177,7 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
         `Refits` with `value` (K, P).
 
     Raises:
-        ValueError: a fit to something else than at least two shots.
+        ValueError: a fit to something else than at least two shots; a robust loss.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.1, 0.9], [0.6, 1.4]])
@@ -182,6 +185,7 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     >>> ji.leave_one_out(found).value.round(6).tolist()
     [[0.4], [0.8]]
     """
+    check_squares("fit", fit)
     shots = 0 if fit.experiments is None else len(fit.predicted)
     if shots < 2:
         raise ValueError(f"Argument `fit` must be of at least 2 shots, but has {shots}.")
@@ -193,7 +197,7 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     problems = [fit.problem.weighed(1 - own) for own in each]
     found = _refits(fit, problems, many, progress)
     one_each = found.predicted[np.arange(shots), np.arange(shots)]
-    return Refits(found.names, found.value, one_each)
+    return replace(found, predicted=one_each)
 
 
 def _refits(
@@ -208,4 +212,5 @@ def _refits(
         _, states = settled(problems, points, _METHOD, limit, show, many)
     value = fit.problem.values_at(np.asarray(states.y, float))
     seen = np.asarray(states.kept[0], float)
-    return Refits(fit.names, value, seen[:, : len(fit.predicted)] if fit.predicted.ndim else seen)
+    seen = seen[:, : len(fit.predicted)] if fit.predicted.ndim else seen
+    return Refits(fit.names, value, seen, at_minimum(states))

@@ -44,7 +44,7 @@ START_RESTITUTION = 0.3
 # Starts around the best find lower ones; they repeat while they gain.
 ROUNDS = 5
 NEAR_SPREAD = 2.0  # standard errors
-SETTLED, SETTLING = 1e-5, 50  # change (natural scales) and rounds, where errors of v- are passed on
+SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 NEAR_RCOND = 1e-10  # directions the data cannot see are not searched
 
 # Impacts map a stiffness ratio many to one: three balls of ratio 40 come apart as those of up to
@@ -121,7 +121,7 @@ def search(
             points = _valleys(problem, residuals, states, show)
             if len(points):
                 more = run(repeated(residuals, len(points)), points, method, max_steps, show)
-                kept = _converged(more)
+                kept = at_minimum(more)
                 states = jax.tree.map(lambda a, b: np.concatenate([a, b[kept]]), states, more)
     return ends(problem, states)
 
@@ -162,11 +162,12 @@ def settled(
             many = eqx.tree_at(_weights, many, tuple(stacked))
         states = run(many, points, method, max_steps, show, rivals=False)
         before, points = points, np.asarray(states.y, float)
-        if many.mixing is None or np.abs(points - before).max() <= SETTLED:
-            break
+        moved = np.abs(points - before).max(axis=1) > SETTLED
+        if many.mixing is None or not moved.any():
+            return problems, states
         cost = states.cost.reshape(-1, each)
         best = np.arange(0, len(points), each) + np.nanargmin(cost, axis=1)
-    return problems, states
+    return problems, eqx.tree_at(lambda s: s.gain, states, np.where(moved, np.inf, states.gain))
 
 
 def _weights(residuals: Residuals) -> tuple[Any, ...]:
@@ -275,7 +276,7 @@ def ends(
     squares = 2 * np.asarray(states.cost, float)
     values = from_scaled(np.asarray(y, float), scale, log)
     exact = EXACT[str(y.dtype)]
-    converged = _converged(states)
+    converged = at_minimum(states)
     groups = _groups(squares, y, converged, exact)
     best = groups[0][0]
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
@@ -308,7 +309,7 @@ def ends(
     )
 
 
-def _converged(states: SolverState) -> np.ndarray:
+def at_minimum(states: SolverState) -> np.ndarray:
     """Which of the states (S,) are at a minimum."""
     squares = 2 * np.asarray(states.cost, float)
     exact = squares <= EXACT[str(states.y.dtype)]

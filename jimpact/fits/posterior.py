@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_kind
-from jimpact.fits.fitting import Fit
+from jimpact._checks import as_whole
+from jimpact.fits.fitting import Fit, check_squares
 from jimpact.fits.least_squares import Box
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.tables import needed
@@ -72,9 +72,8 @@ def posterior(
     0.40 +- 0.013
     """
     numpyro, arviz = needed("numpyro", HOW), needed("arviz", HOW)
-    check_kind("fit", fit.problem if isinstance(fit, Fit) else fit, FitProblem)
-    if isinstance(fit, Fit) and fit.loss != "squares":
-        raise ValueError(f"Argument `fit` must be by least squares, but has loss {fit.loss!r}.")
+    if not isinstance(fit, FitProblem):
+        check_squares("fit", fit)
     problem = fit.problem if isinstance(fit, Fit) else fit
     start = fit.value if isinstance(fit, Fit) else problem.start
     for name, count in (("samples", samples), ("warmup", warmup), ("chains", chains)):

@@ -151,7 +151,7 @@ def unprofiled(fit: Any) -> list[str]:
     """How to get intervals that are true, where these may not be."""
     if not misleads(fit):
         return []
-    return ["These intervals are of parabolas, which may mislead here: see `ji.profile(fit)`."]
+    return ["A parabola at the minimum may mislead here: `ji.profile(fit)` finds true intervals."]
 
 
 def _quality(fit: Any) -> list[str]:

@@ -11,7 +11,7 @@ from scipy.special import chdtrc, fdtrc, stdtr
 from jimpact._checks import check_choice, check_kind
 from jimpact.comparison import registered_laws
 from jimpact.experiments import Experiments
-from jimpact.fits.fitting import Fit, fit
+from jimpact.fits.fitting import Fit, check_squares, fit
 from jimpact.fits.many import leave_one_out
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.multistart import EXACT
@@ -195,9 +195,7 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     True
     """
     for name, each in (("simple", simple), ("full", full)):
-        check_kind(name, each, Fit)
-        if each.loss != "squares":
-            raise ValueError(f"Argument `{name}` must be by least squares, but is {each.loss!r}.")
+        check_squares(name, each)
     same = np.array_equal(simple.problem.measured, full.problem.measured, equal_nan=True)
     if not same:
         raise ValueError("Arguments `simple` and `full` must be fits of the same data.")
