@@ -93,6 +93,16 @@ def check_kind(name: str, value: Any, kind: type) -> None:
         raise TypeError(f"Argument `{name}` must be of type {kind.__name__}, but is {value!r}.")
 
 
+def check_concrete(name: str, value: Any) -> None:
+    """Raise a TypeError where `value` is traced: what a fit needs are numbers."""
+    if is_traced(value):
+        raise TypeError(
+            f"Argument `{name}` must hold numbers, but is traced: fits run on the host, not under "
+            "jit, vmap or grad. For these, `FitProblem.residual` and `jacobian` are pure functions "
+            "of the parameters."
+        )
+
+
 def check_shape(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> None:
     """Raise a ValueError unless `value` has exactly this shape."""
     if np.shape(value) != shape:
