@@ -5,6 +5,7 @@ it compiles. What is done is told, and what is on the disk is kept.
 """
 
 import contextlib
+import gc
 import os
 import shutil
 import signal
@@ -16,6 +17,7 @@ from typing import Any
 BAD_INPUT, FAILURE = 2, 1  # exit codes
 INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
 WORTH_KEEPING = "0"  # seconds of compiling: also single operations, of which there are many
+RARELY = 100_000  # new objects until garbage is collected: imports and tracing make many that stay
 SHOW_CURSOR = b"\r\n\x1b[?25h"  # which a progress bar had hidden
 
 WELCOME = """\
@@ -62,6 +64,7 @@ class Call:
 
 def program() -> int:
     """The entry point of the program `jimpact`; what `main` does, and ctrl-C ends it."""
+    gc.set_threshold(RARELY)
     call = Call()
     end_on_interrupt(call.farewell)
     # what is piped or kept in a file has no terminal to ask for its width
