@@ -297,8 +297,13 @@ def test_ctrl_c_keeps_finished_chunks(tmp_path):
 VERBS = ("fit", "compare", "montecarlo", "chart", "stability", "advise", "simulate")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(
+    "verb",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
+        for x in VERBS
+    ],
+)
 def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
     monkeypatch.setenv("JIMPACT_CACHE", "")

@@ -211,8 +211,8 @@ def test_stated_errors_that_are_too_small_are_noticed():
 @pytest.mark.parametrize(
     "method",
     [
-        "adam",
         "lbfgs",
+        pytest.param("adam", marks=pytest.mark.slow),
         pytest.param("sgd", marks=pytest.mark.slow),
         pytest.param(optax.rmsprop(0.01), marks=pytest.mark.slow),
     ],
