@@ -76,7 +76,7 @@ def _histogram(axes: Axes, found: MonteCarlo, body: int) -> None:
 
 def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
     first = found.first
-    fine = np.isfinite(first["velocity"]).all(axis=1) & _used(found)
+    fine = np.isfinite(first["velocity"]).all(axis=1) & ~FAILURE[first["status"]]
     velocity = first["velocity"][fine, body]
     vary = np.argsort(-np.diag(found.gap_covariance), kind="stable")[:2]
     gaps = sorted(vary.tolist())
@@ -94,11 +94,6 @@ def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
     dots = axes.scatter(x[0][0], x[1][0], s=_DOT, c=velocity, cmap=colours, lw=0, rasterized=True)
     axes.figure.colorbar(dots, ax=axes, label=label)
     axes.set_aspect("equal" if _alike(x[0][0], x[1][0]) else "auto")
-
-
-def _used(found: MonteCarlo) -> np.ndarray:
-    """Which of the first samples did not fail."""
-    return ~FAILURE[found.first["status"]]
 
 
 def _in_units(found: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.ndarray, str]:
