@@ -22,7 +22,7 @@ from jimpact import options
 from jimpact.comparison import registered_laws
 from jimpact.compiling import kept_in
 from jimpact.fits.fitting import Fit
-from jimpact.progress import LONG, Steps, waiting
+from jimpact.progress import Steps, waiting
 from jimpact.records import as_data, table
 from jimpact.starting import as_csv, fitting
 from jimpact.study import Study, import_laws, read_study
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from jimpact.motion.study_motion import MotionStudy
 
 DPI = 150
-TOLD = LONG  # seconds after which work is told, also where no one looks at a terminal
-
-
 Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 
 
@@ -90,7 +87,7 @@ def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
 def _shot(given: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndarray | None]:
     """The study, in the scene of the shot where shots have their own, v-, and v+ if measured."""
     study, shot = read_study(given.study), given.shot - 1
-    if given.velocity is not None:
+    if given.velocity:
         return study, np.asarray(given.velocity, float), None
     data = study.experiments
     assert data is not None  # `ShotCommand.check`
@@ -117,7 +114,7 @@ def fit(given: options.FitCommand, steps: Steps) -> Answer:
     if given.law == options.EVERY_LAW:
         return _every_law(given, steps)
     path = given.picture()
-    chosen = {"starts": given.starts, "seed": given.seed, "progress": TOLD}
+    chosen = {"starts": given.starts, "seed": given.seed, "progress": steps.patience}
     study: Study | MotionStudy
     if is_motion(given.study):
         from jimpact.motion.study_motion import read_motion_study
@@ -271,7 +268,7 @@ def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     path = given.picture()
     study, before, measured = _shot(given)
     laws, left_out = registered_laws(study.parameters)
-    with waiting("comparing laws", TOLD):
+    with waiting("comparing laws", steps.patience):
         found = ji.compare(study.scene, before, laws)
     steps(f"{len(laws)} laws compared")
     found = replace(found, left_out=left_out, measured=measured)
@@ -303,7 +300,7 @@ def montecarlo(given: options.MonteCarloCommand, steps: Steps) -> Answer:
     study = read_study(given.study)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = ji.monte_carlo(**_sampling(study, given), progress=TOLD)
+        found = ji.monte_carlo(**_sampling(study, given), progress=steps.patience)
     steps(f"{found.samples:,} samples")
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
@@ -349,7 +346,7 @@ def chart(given: options.ChartCommand, steps: Steps) -> Answer:
         repeats=given.repeats,
         gradients=given.full,
         durations=given.full,
-        progress=TOLD,
+        progress=steps.patience,
     )
     picture = ji.plot.work_precision(found, study.title)
     text = str(found) + ("" if given.full or given.methods else QUICK)
@@ -398,7 +395,9 @@ def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
         size: dict[str, Any] = {"axes": {name: x for name, x in axes if name != "balls"}}
     else:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
-    found = ji.stability_map(given.methods, **size, max_steps=STEPS, progress=TOLD)
+    found = ji.stability_map(
+        given.methods or None, **size, max_steps=STEPS, progress=steps.patience
+    )
     pictures = {path: ji.plot.stability_map(found, TITLE)}
     for name in found.methods if given.full else ():
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
@@ -425,7 +424,7 @@ def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
         stiffness_range=given.stiffness_range,
         samples=given.samples,
         seed=given.seed,
-        progress=TOLD,
+        progress=steps.patience,
         **_lzb_parameters(study),
     )
     picture = ji.plot.advice(found, study.title)
@@ -455,7 +454,7 @@ def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
     path, portrait = given.picture(), given.portrait
     study = read_motion_study(given.study)
     system, title = study.system, study.title
-    run = study.run(t_end=given.t_end, samples=given.samples, progress=TOLD)
+    run = study.run(t_end=given.t_end, samples=given.samples, progress=steps.patience)
     found = jax.block_until_ready(run)
     steps("motion computed")
     pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
@@ -463,7 +462,9 @@ def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
         which = None if given.coordinate is None else given.coordinate - 1
         pictures[portrait] = ji.plot.phase_portrait(found, which, title, system=system)
     if given.gif is not None:
-        pictures[given.gif] = partial(ji.plot.animation, system, found, title=title, progress=TOLD)
+        pictures[given.gif] = partial(
+            ji.plot.animation, system, found, title=title, progress=steps.patience
+        )
     heads = ["time [s]", *system.body.names, *system.body.velocity_names]
     table = heads, np.column_stack([found.time, found.q, found.velocity]).tolist()
     return Answer(title, found.to_dict(), str(found), pictures, _failure(found), table)

@@ -20,6 +20,7 @@ from jimpact.plot.style import (
     SMALL,
     finish,
     heading,
+    in_words,
     legend_below,
     legend_within,
     logarithmic,
@@ -302,21 +303,10 @@ def _ticks(
 ) -> None:
     step = -(-len(values) // most)
     at = range(0, len(values), step)
-    labels = [_number(values[i]) if labelled else "" for i in at]
-    if which == "x":
-        axes.set_xticks(at, labels, fontsize=SMALL)
-        axes.set_xlabel(_LABELS[name] if labelled else "", fontsize=SMALL)
-    else:
-        axes.set_yticks(at, labels, fontsize=SMALL)
-        axes.set_ylabel(_LABELS[name] if labelled else "", fontsize=SMALL)
-
-
-def _number(value: float) -> str:
-    """Short: powers of ten as such."""
-    power = np.log10(value) if value > 0 else np.nan
-    if abs(power) >= 2 and abs(power - round(power)) < 1e-9:
-        return f"$10^{{{round(power)}}}$"
-    return f"{value:.2g}" if value < 1 or value != round(value) else f"{value:g}"
+    labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_ticks(at, labels, fontsize=SMALL)
+    axis.set_label_text(_LABELS[name] if labelled else "", fontsize=SMALL)
 
 
 def _place(found: StabilityMap, name: str) -> float:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
+from jimpact.records import readable_unit
 
 _BARS = 100  # of a histogram in the picture
 _BODIES = 6  # with a histogram of their own; of more only the most scattered are shown
@@ -102,11 +103,8 @@ def _in_units(found: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.ndar
     if found.gap_scale is not None:
         scale = found.gap_scale[contact]
         return gap / scale, f"{name} / {scale * 1e6:.3g} µm (gap scale)"
-    largest = np.max(gap, initial=0.0)
-    for unit, size in (("m", 1.0), ("mm", 1e-3), ("µm", 1e-6)):
-        if largest >= size:
-            return gap / size, f"{name} [{unit}]"
-    return gap / 1e-9, f"{name} [nm]"
+    unit, size = readable_unit("m", np.max(gap, initial=0.0))
+    return gap / size, f"{name} [{unit}]"
 
 
 def _alike(x: np.ndarray, y: np.ndarray) -> bool:

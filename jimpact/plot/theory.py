@@ -176,7 +176,7 @@ def _line(
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
     angle = np.degrees(np.arctan2(direction[1], direction[0]))
     angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
-    share, side = (0.62, "top") if style == "-" else (0.3, "bottom")
+    share, side = (0.45, "top") if style == "-" else (0.3, "bottom")
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
     _write(axes, start + share * length * direction, text, color=GREY, **turned)
 
