@@ -171,7 +171,6 @@ def test_notebook_and_script_agree(path):
     assert not any(output.output_type == "error" for output in outputs)
 
 
-@pytest.mark.long_run
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(path, tmp_path):
