@@ -171,8 +171,21 @@ def test_notebook_and_script_agree(path):
     assert not any(output.output_type == "error" for output in outputs)
 
 
+COMPILING = ("03", "04", "05", "08")  # takes most of the time of these
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path,
+            id=path.stem,
+            marks=[] if path.stem.startswith(COMPILING) else [pytest.mark.long_run],
+        )
+        for path in NOTEBOOKS
+    ],
+)
 def test_notebook_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
     place = {"metadata": {"path": str(tmp_path)}}
