@@ -42,6 +42,16 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
     return array
 
 
+def as_axis(name: str, value: Any) -> "jax.Array":
+    """`value`, a scalar or with one axis, as a floating JAX array with one axis, not empty."""
+    array = as_float_array(name, value)
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(
+            f"Argument `{name}` must be a scalar or have one axis, but has shape {array.shape}."
+        )
+    return array.reshape(-1)
+
+
 def check_values(
     name: str,
     value: Any,

@@ -133,17 +133,27 @@ def _headline(fit: Any) -> str:
     )
 
 
-def _parameters(fit: Any) -> list[str]:
-    width = max(9, *(len(name) for name in fit.names))
-    head = "95 % interval" + " (profile)" * bool(fit.profiles)
-    lines = [f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   {head}"]
+def parameter_rows(fit: Any) -> list[list[str]]:
+    """Name, value, standard error, interval, and whether it is at its bound."""
+    rows = []
     for i, pieces in enumerate(fit.intervals()):
         error = fit.standard_error[i]
         word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
         told = np.isfinite(error) or bool(fit.profiles)
         interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
-        note = "   at its bound" if fit.at_bound[i] else ""
-        lines.append(f"{fit.names[i]:{width}s} {fit.value[i]:12.6g} {word:>12s}   {interval}{note}")
+        note = "at its bound" if fit.at_bound[i] else ""
+        rows.append([fit.names[i], f"{fit.value[i]:.6g}", word, interval, note])
+    return rows
+
+
+def _parameters(fit: Any) -> list[str]:
+    width = max(9, *(len(name) for name in fit.names))
+    head = "95 % interval" + " (profile)" * bool(fit.profiles)
+    rows = [["parameter", "value", "std. error", head, ""], *parameter_rows(fit)]
+    lines = [
+        f"{name:{width}s} {value:>12s} {error:>12s}   {interval}   {note}".rstrip()
+        for name, value, error, interval, note in rows
+    ]
     return [*lines, *unprofiled(fit)]
 
 
