@@ -284,6 +284,7 @@ def interrupted(arguments, folder, moment):
     return process.returncode, told
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_finished_chunks(tmp_path):
     path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
     run = tmp_path / "run"
@@ -297,8 +298,13 @@ def test_ctrl_c_keeps_finished_chunks(tmp_path):
 VERBS = ("fit", "compare", "montecarlo", "chart", "stability", "advise", "simulate")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(
+    "verb",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
+        for x in VERBS
+    ],
+)
 def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
     monkeypatch.setenv("JIMPACT_CACHE", "")

@@ -211,8 +211,8 @@ def test_stated_errors_that_are_too_small_are_noticed():
 @pytest.mark.parametrize(
     "method",
     [
-        "adam",
         "lbfgs",
+        pytest.param("adam", marks=pytest.mark.slow),
         pytest.param("sgd", marks=pytest.mark.slow),
         pytest.param(optax.rmsprop(0.01), marks=pytest.mark.slow),
     ],
@@ -650,6 +650,14 @@ def test_bad_profiles(options, message):
 
 
 # --------------------------------------------------------------------- many fits
+
+
+def test_fits_under_transformations_are_refused_in_words():
+    data = ji.Experiments(SHOTS, SHOTS)
+    with pytest.raises(TypeError, match="`law` must hold numbers, but is traced: fits run on"):
+        jax.grad(lambda e: ji.fit(ji.Newton(e), PAIR, data).rms)(0.5)
+    with pytest.raises(TypeError, match="`post` must hold numbers, but is traced"):
+        jax.vmap(lambda post: ji.Experiments(SHOTS, post).post)(jnp.ones((2, 4, 2)))
 
 
 def test_many_data_sets_are_fitted_as_one_by_one():

@@ -144,6 +144,7 @@ def test_bodies_come_to_rest_on_each_other_while_they_fall():
     np.testing.assert_allclose(motion.q[-1], 150.04 / 3 + 1.0 - 45.0, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_lengths_may_be_in_any_unit():
     """The same fall from heights and within times in which weights are the same number."""
     heights = np.array([0.1, 0.101, 0.102])
@@ -170,6 +171,7 @@ def test_a_table_comes_to_rest_on_four_legs():
         np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_runs_of_the_program_follow_each_other():
     dropped = 0.97, [0.1, 0.101, 0.102], [0.0] * 3, 5.0
     motion = stack(*dropped)
@@ -251,7 +253,7 @@ def test_derivatives_over_twenty_bounces_in_both_modes():
         np.testing.assert_allclose(slope, exact, rtol=1e-9, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_second_derivatives_over_twenty_bounces():
     x = jnp.array([0.8, 1.0, G])
     found = jax.jit(jax.hessian(lambda x: times_of(x)[19]))(x)
@@ -267,8 +269,8 @@ def test_derivatives_in_what_functions_close_over():
         return motion.events.time[1]
 
     exact = jax.grad(lambda h: 2.4 * jnp.sqrt(2 * (1 - h) / 9))(0.1)
-    np.testing.assert_allclose(jax.grad(second)(0.1), exact, rtol=1e-12)
-    np.testing.assert_allclose(jax.jvp(second, (0.1,), (1.0,))[1], exact, rtol=1e-12)
+    for slopes in both_ways(lambda x: second(x[0])[None])(jnp.array([0.1]))[1:]:
+        np.testing.assert_allclose(slopes, [[exact]], rtol=1e-12)
 
 
 @pytest.mark.release
@@ -492,9 +494,9 @@ def test_time_stepping_is_of_first_order():
         (ji.cradle_system([1.0] * 3), ji.LZB(0.9), [-0.5, 0, 0], [0.0] * 3, 0.3),
         (ji.column_system([1.0, 0.5], 0.05), ji.Moreau(0.6), [0.2, 0.45], [0.0] * 2, 0.35),
         # it falls on a corner, tips and strikes with the other one
-        (
+        pytest.param(
             ji.block_system(0.2, 0.4), ji.Moreau(0.0, friction=0.3),
-            [0.0, 0.25, 0.1], [0.5, 0.0, 0.0], 0.25,
+            [0.0, 0.25, 0.1], [0.5, 0.0, 0.0], 0.25, marks=pytest.mark.release,
         ),
     ],
 )  # fmt: skip
@@ -606,7 +608,9 @@ def test_discs_are_a_body_like_others():
             np.testing.assert_allclose(found[:3].reshape(-1), expected[:, column], atol=1e-15)
 
 
-@pytest.mark.parametrize("law", [ji.Moreau(0.5), ji.Newton(0.5)])
+@pytest.mark.parametrize(
+    "law", [ji.Moreau(0.5), pytest.param(ji.Newton(0.5), marks=pytest.mark.slow)]
+)
 def test_time_stepping_of_many_beads_comes_to_rest(law):
     n = 20
     q = 0.01 + 0.02 * np.arange(n) + 0.05
@@ -626,6 +630,7 @@ def test_time_stepping_of_many_beads_comes_to_rest(law):
     assert int(stays.events.count) == 0
 
 
+@pytest.mark.slow
 def test_time_stepping_tells_what_it_cannot_resolve():
     pile = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]], room=1)
     system, q = ji.System(pile, potential=ji.gravity(pile)), pile.at([[0.0, 0.1], [0.3, 0.1]])
@@ -660,9 +665,7 @@ def test_contacts_that_still_approach_have_another_impact_at_once():
     assert len(times) > 1
     assert (times[:2] == 0).all()
     assert (np.asarray(motion.gaps) > -1e-12).all()
-    pulls = ji.simulate(
-        ji.column_system([1.0, 1.0]), ji.Newton(0.5), [0.0] * 2, [0.0, 1.0], 0.01, samples=2
-    )
+    pulls = ji.simulate(system, ji.Newton(0.5), [0.0] * 3, [0.0, 0.0, 1.0], 0.01, samples=2)
     assert status(pulls) == "ok"
     assert int(pulls.events.count) == 0
     squeezed = ji.simulate(system, ji.Newton(0.9), [0.0] * 3, [-1.0, 5.0, 5.0], 0.01, samples=2)
