@@ -10,6 +10,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import numpy as np
 
 import jimpact
@@ -139,7 +140,7 @@ def _inline(title: str, figure: "Figure", vectors: bool) -> str:
 def _made_by(fit: Any) -> list[list[str]]:
     starts = sum(start.count for start in fit.starts) + fit.lost_starts
     rows = [
-        ["law", repr(fit.law)],
+        ["law", eqx.tree_pformat(fit.law, short_arrays=False)],
         ["solver", f"{fit.method}, loss {fit.loss}, {starts} starts, seed {fit.seed}"],
         ["precision", str(fit.problem.residuals.offset.dtype)],
         ["jimpact", jimpact.__version__],

@@ -10,7 +10,7 @@ from jimpact.fits.adequacy import adequacy
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.profiles import in_words
+from jimpact.fits.profiles import in_words, misleads
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -150,10 +150,18 @@ def _parameters(fit: Any) -> list[str]:
     width = max(9, *(len(name) for name in fit.names))
     head = "95 % interval" + " (profile)" * bool(fit.profiles)
     rows = [["parameter", "value", "std. error", head, ""], *parameter_rows(fit)]
-    return [
+    lines = [
         f"{name:{width}s} {value:>12s} {error:>12s}   {interval}   {note}".rstrip()
         for name, value, error, interval, note in rows
     ]
+    return [*lines, *unprofiled(fit)]
+
+
+def unprofiled(fit: Any) -> list[str]:
+    """How to get intervals that are true, where these may not be."""
+    if not misleads(fit):
+        return []
+    return ["A parabola at the minimum may mislead here: `ji.profile(fit)` finds true intervals."]
 
 
 def _quality(fit: Any) -> list[str]:
@@ -163,7 +171,7 @@ def _quality(fit: Any) -> list[str]:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
         lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
         lines += _said_of_sigma(fit.experiments)
-        if fit.noise > 1:
+        if fit.noise > 1 and fit.loss == "squares":
             lines.append(
                 f"errors         stretched by {fit.noise:.3g}, the root of chi^2 over that"
             )
@@ -291,7 +299,9 @@ def to_json(fit: Any) -> dict[str, Any]:
     }
 
 
-def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> list[str]:
+def fit_warnings(
+    problem: FitProblem, found: Search, spread: Uncertainty, robust: bool
+) -> list[str]:
     """All warnings, those about the data first."""
     lines, data = list(problem.left_out), problem.experiments
     if data is not None:
@@ -307,7 +317,7 @@ def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> lis
         lines += _statuses(found.status, data.shots)
         lines += _matrix(problem, found, contacts)
     lines += _no_numbers(problem, found)
-    lines += adequacy(problem, found, spread.rank)
+    lines += adequacy(problem, found, spread.rank, robust)
     if data is not None and problem.sigma is None and len(set(data.units)) > 1:
         lines.append(
             "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."

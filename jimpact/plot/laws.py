@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
+from jimpact._checks import check_kind
 from jimpact.comparison import Comparison
 from jimpact.contact import delassus_matrix
 from jimpact.histories import History
@@ -47,11 +48,15 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
+    Raises:
+        TypeError: something else.
+
     >>> import jimpact as ji
     >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
     >>> len(ji.plot.comparison(found).axes)
     2
     """
+    check_kind("found", found, Comparison)
     names, entries = list(found.entries), list(found.entries.values())
     bodies = len(found.velocity)
     what, unit = ("body", "m/s") if found.scene.walls is not None else ("coordinate", "m/s, rad/s")
@@ -190,13 +195,14 @@ def history(found: History, title: str = "") -> Figure:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        ValueError: a batch of impacts.
+        ValueError: a batch of impacts. TypeError: something else.
 
     >>> import jimpact as ji
     >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])
     >>> [axes.get_ylabel() for axes in ji.plot.history(h).axes]
     ['force [N]', 'gap velocity [m/s]', 'stored energy [J]']
     """
+    check_kind("found", found, History)
     if np.ndim(found.status):
         raise ValueError("Argument `found` must be of one impact, but is a batch: pick one of it.")
     unit, size = readable_unit("s", float(found.duration))
