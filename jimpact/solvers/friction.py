@@ -97,7 +97,8 @@ def solve(
         friction: mu (m,).
         complementary: contacts may part; otherwise they may pull (without friction).
         load: (m,) >= 0, normal impulses beside p that friction knows of: it is bounded by
-            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0.
+            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0. One below rounding counts
+            as one that begins: where p = 0 = r, derivatives are those of a contact that opens.
         sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
             already: s, an acceleration, does not decide), 0 where it is asked for. Not together
             with `load`.
@@ -387,6 +388,9 @@ def _at_rest(problem: _Problem, x: jax.Array, room: jax.Array) -> _Modes:
     rate = _rates(problem, x[..., None])
     room = (room * _size(x[..., None]))[None]
     taking = rate[:, 0] <= room if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
+    if problem.load is not None:
+        begins = (problem.load > 0) & (problem.load < float(jnp.finfo(x.dtype).eps))
+        taking = taking & ~(begins[:, None] & (x[:, :1] <= room))
     pushes = taking & (x[:, :1] >= -room)
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
