@@ -485,7 +485,7 @@ SLOPES = {"planar": (1, 4), "planar, both ways": (1, 4), "space": (2, 6)}
         pytest.param("binary", "planar", marks=pytest.mark.slow),
         pytest.param("lzb", "planar, both ways", marks=pytest.mark.release),
         pytest.param("moreau", "space", marks=pytest.mark.slow),
-        pytest.param("lzb", "space", marks=pytest.mark.slow),
+        pytest.param("lzb", "space", marks=pytest.mark.release),
     ],
 )
 def test_derivatives(name, kind):

@@ -246,7 +246,7 @@ def shaken(x):
     [
         pytest.param(collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8, marks=pytest.mark.release),
         # the plate of 2 cm: differences see no more
-        pytest.param(shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7, marks=pytest.mark.slow),
+        pytest.param(shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7, marks=pytest.mark.release),
     ],
 )
 def test_derivatives_of_a_motion_against_differences(given, at, events, step, allowed):
@@ -294,7 +294,7 @@ def test_fit_through_a_simulated_motion():
     assert "stiffness[2]" in str(found)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_friction_is_fitted_through_a_motion():
     """A dimer that is thrown; positions with (simulated) noise."""
     dimer, start = ji.dimer_system(0.01, 0.04), ([0.0, 0.1, 0.2], [0.5, 0.0, 0.0], 0.25)

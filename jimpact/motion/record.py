@@ -1,6 +1,7 @@
 """The record of a motion: samples, events, energy ledger, status."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.records import as_data, fields_as_data
-from jimpact.status import STATUS, Status
+from jimpact.status import STATUS, Status, raise_for
 
 # of these rows `failure` marks motions that end before t_end; the code is the row number
 MOTION_STATUS = (
@@ -28,7 +29,10 @@ MOTION_STATUS = (
     Status("out_of_range", "a gap function does not hold any more (`valid` of the body)", True),
     Status("not_finite", "the motion or its input is NaN or infinite", True),
     Status(
-        "coarse_step", "a contact is struck again within 3 steps: they are too long for it", False
+        "coarse_step",
+        "steps are too long: within 3 a contact is struck again, or in one a disc of a pile moves "
+        "by more than the least radius",
+        False,
     ),
     Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
     Status("room", "more contacts are closed than the body has `room` for", True),
@@ -249,14 +253,5 @@ def raise_on_failed_motion(motion: Motion) -> Motion:
     >>> ji.raise_on_failed_motion(motion) is motion
     True
     """
-    codes = np.atleast_1d(np.asarray(motion.status))
-    lines = []
-    for code in np.unique(codes):
-        row = MOTION_STATUS[code]
-        if row.failure:
-            at = np.flatnonzero(codes.ravel() == code)
-            where = f" at {', '.join(map(str, at[:5]))}" if codes.size > 1 else ""
-            lines.append(f"{row.name}: {row.message} ({len(at)}{where}){_said(motion, row, at)}")
-    if lines:
-        raise RuntimeError(f"Failed motions among {codes.size}:\n  " + "\n  ".join(lines))
+    raise_for(motion.status, MOTION_STATUS, "motions", partial(_said, motion))
     return motion
