@@ -109,8 +109,9 @@ def solve(
         space Newton's method looks for the directions of slip from 4 starts a contact, all
         combined: solutions that none of them reaches are missed. Above 3 contacts other modes are
         not looked for. It is told, too, where redundant contacts slide, so that how they share p
-        changes their slip (a spinning cube flat on four corners). `impulse_not_unique`: only the impulses differ. `infeasible`: no modes are
-        consistent; `max_steps`: none were found (in space, above 3 contacts).
+        changes their slip (a spinning cube flat on four corners). `impulse_not_unique`: only the
+        impulses differ. `infeasible`: no modes are consistent; `max_steps`: none were found (in
+        space, above 3 contacts).
 
     Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are
     about to change, and take a singular matrix to keep its rank; those of impulses that are not
