@@ -23,6 +23,7 @@ LAWS = [
     (lambda: ji.LZB(0.9, rtol=0.0), r"`rtol`"),
     (lambda: ji.LZB(0.9, method="euler"), r"`method` must be one of .*'euler'"),
     (lambda: ji.LZB("high"), r"`restitution` must be numeric"),
+    (lambda: ji.LZB(None), r"`restitution` must be numeric, but has value None"),
     (lambda: ji.Newton(-0.1), r"`restitution`"),
     (lambda: ji.Moreau(-0.1), r"`restitution` must lie in \[0, 1\], but has value -0\.1"),
     (lambda: ji.Moreau([[0.5, 0.1]]), r"`restitution` must be a square matrix.*\(1, 2\)"),
