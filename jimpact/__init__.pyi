@@ -102,6 +102,10 @@ from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
 from .motion.simulate import simulate as simulate
+from .motion.study_motion import (
+    MotionStudy as MotionStudy,
+    read_motion_study as read_motion_study,
+)
 from .motion.system import (
     HarmonicBase as HarmonicBase,
     System as System,
@@ -122,7 +126,7 @@ from .scene import (
     velocity_change as velocity_change,
 )
 from .status import STATUS as STATUS
-from .study import cube_impacts as cube_impacts
+from .study import Study as Study, cube_impacts as cube_impacts, read_study as read_study
 from .theory.han_gilmore_tree import han_gilmore as han_gilmore
 
 __version__: str

@@ -5,7 +5,9 @@ it compiles. What is done is told, and what is on the disk is kept.
 """
 
 import contextlib
+import gc
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -15,6 +17,7 @@ from typing import Any
 BAD_INPUT, FAILURE = 2, 1  # exit codes
 INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
 WORTH_KEEPING = "0"  # seconds of compiling: also single operations, of which there are many
+RARELY = 100_000  # new objects until garbage is collected: imports and tracing make many that stay
 SHOW_CURSOR = b"\r\n\x1b[?25h"  # which a progress bar had hidden
 
 WELCOME = """\
@@ -30,7 +33,7 @@ jimpact: differentiable laws for impacts with several contacts.
   jimpact laws         what the laws say, and when they are right
 
 Your own data: `jimpact new fit` writes a study, a CSV file and a notebook to
-start from; then `jimpact fit my_fit/study.toml`.
+start from; then `jimpact fit my_fit`.
 
 `jimpact COMMAND --help` tells all options, `jimpact --version` the version.
 """
@@ -61,8 +64,11 @@ class Call:
 
 def program() -> int:
     """The entry point of the program `jimpact`; what `main` does, and ctrl-C ends it."""
+    gc.set_threshold(RARELY)
     call = Call()
     end_on_interrupt(call.farewell)
+    # what is piped or kept in a file has no terminal to ask for its width
+    os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size((80, 24)).columns))
     try:
         code = main(call=call)
         sys.stdout.flush()
@@ -123,8 +129,7 @@ def parsed(arguments: list[str]) -> Any:
         functools.reduce(operator.or_, commands),
         prog="jimpact",
         config=(tyro.conf.FlagCreatePairsOff,),
-        description="Differentiable impact laws for several simultaneous contacts. "
-        "--version prints the version.",
+        description="Impact laws for several simultaneous contacts. --version: the version.",
         args=arguments,
     )
 

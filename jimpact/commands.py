@@ -22,7 +22,7 @@ from jimpact import options
 from jimpact.comparison import registered_laws
 from jimpact.compiling import kept_in
 from jimpact.fits.fitting import Fit
-from jimpact.progress import LONG, Steps, waiting
+from jimpact.progress import Steps, waiting
 from jimpact.records import as_data, table
 from jimpact.starting import as_csv, fitting
 from jimpact.study import Study, import_laws, read_study
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from jimpact.motion.study_motion import MotionStudy
 
 DPI = 150
-TOLD = LONG  # seconds after which work is told, also where no one looks at a terminal
-
-
 Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 
 
@@ -87,24 +84,17 @@ def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
     return answer.failure
 
 
-def _of_shot(given: options.ShotCommand) -> Study:
-    """The study, in the scene of the shot that is asked for where shots have their own."""
-    study = read_study(given.study)
-    data = study.experiments
-    if given.velocity is not None or data is None:
-        return study
-    if given.shot > len(data.shots):
-        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
-    return replace(study, scene=data.scene_of(study.scene, given.shot - 1))
-
-
-def _velocities(study: Study, given: options.ShotCommand) -> tuple[np.ndarray, np.ndarray | None]:
-    """Velocities before the impact, and after it where they were measured."""
-    if given.velocity is not None:
-        return np.asarray(given.velocity, float), None
+def _shot(given: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndarray | None]:
+    """The study, in the scene of the shot where shots have their own, v-, and v+ if measured."""
+    study, shot = read_study(given.study), given.shot - 1
+    if given.velocity:
+        return study, np.asarray(given.velocity, float), None
     data = study.experiments
     assert data is not None  # `ShotCommand.check`
-    return np.asarray(data.pre[given.shot - 1]), np.asarray(data.post[given.shot - 1])
+    if shot >= len(data.shots):
+        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
+    study = replace(study, scene=data.scene_of(study.scene, shot))
+    return study, np.asarray(data.pre[shot]), np.asarray(data.post[shot])
 
 
 def _titled(study: Study, before: np.ndarray) -> str:
@@ -124,7 +114,7 @@ def fit(given: options.FitCommand, steps: Steps) -> Answer:
     if given.law == options.EVERY_LAW:
         return _every_law(given, steps)
     path = given.picture()
-    chosen = {"starts": given.starts, "seed": given.seed, "progress": TOLD}
+    chosen = {"starts": given.starts, "seed": given.seed, "progress": steps.patience}
     study: Study | MotionStudy
     if is_motion(given.study):
         from jimpact.motion.study_motion import read_motion_study
@@ -276,10 +266,9 @@ def _value(found: Fit, i: int) -> str:
 def compare(given: options.CompareCommand, steps: Steps) -> Answer:
     """Every law on one scene."""
     path = given.picture()
-    study = _of_shot(given)
-    before, measured = _velocities(study, given)
+    study, before, measured = _shot(given)
     laws, left_out = registered_laws(study.parameters)
-    with waiting("comparing laws", TOLD):
+    with waiting("comparing laws", steps.patience):
         found = ji.compare(study.scene, before, laws)
     steps(f"{len(laws)} laws compared")
     found = replace(found, left_out=left_out, measured=measured)
@@ -311,7 +300,7 @@ def montecarlo(given: options.MonteCarloCommand, steps: Steps) -> Answer:
     study = read_study(given.study)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", UserWarning)
-        found = ji.monte_carlo(**_sampling(study, given), progress=TOLD)
+        found = ji.monte_carlo(**_sampling(study, given), progress=steps.patience)
     steps(f"{found.samples:,} samples")
     for warning in caught:
         print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
@@ -344,20 +333,20 @@ QUICK_LAWS = ("moreau", "binary")
 def chart(given: options.ChartCommand, steps: Steps) -> Answer:
     """Speed against accuracy on one scene."""
     path = given.picture()
-    study = _of_shot(given)
+    study, before, _ = _shot(given)
     law = _lzb(study)
-    before, _ = _velocities(study, given)
+    known, _ = registered_laws({"restitution": law.restitution})
     found = ji.work_precision(
         study.scene,
         before,
         law,
-        given.methods or _able(law, study, given.full),
-        laws=None if given.full else _quick_laws(law),
+        given.methods or (None if given.full else _quick_methods(law)),
+        laws=None if given.full else {x: known[x] for x in QUICK_LAWS},
         batch=given.batch,
         repeats=given.repeats,
         gradients=given.full,
         durations=given.full,
-        progress=TOLD,
+        progress=steps.patience,
     )
     picture = ji.plot.work_precision(found, study.title)
     text = str(found) + ("" if given.full or given.methods else QUICK)
@@ -382,20 +371,11 @@ def _lzb(study: Study) -> ji.LZB:
     return ji.LZB(**{key: known[key] for key in ji.REGISTRY["lzb"].parameters if key in known})
 
 
-def _quick_laws(law: ji.LZB) -> dict[str, ji.Law]:
-    known, _ = registered_laws({"restitution": law.restitution})
-    return {name: known[name] for name in QUICK_LAWS}
-
-
-def _able(law: ji.LZB, study: Study, full: bool) -> tuple[str, ...]:
-    """Methods that can solve the study's impact; without `full` those that compile soon."""
+def _quick_methods(law: ji.LZB) -> list[str]:
+    """Those that compile soon and can solve the impact."""
     from jimpact.methods.contenders import METHODS
 
-    return tuple(
-        name
-        for name, method in METHODS.items()
-        if (full or name in QUICK_METHODS) and method.supports(law, study.scene) is None
-    )
+    return [name for name in QUICK_METHODS if METHODS[name].supports(law) is None]
 
 
 # -------------------------------------------------------------------------------------- stability
@@ -408,15 +388,16 @@ TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at 
 def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
     """Maps of methods; the picture of single axes, and of pairs, one more beside it a method."""
     path = given.picture()
-    if not given.full:  # three balls and no exponent 1: a program a method
+    if not given.full:  # three balls: a program a method
         from jimpact.methods.stability import default_axes
 
-        axes = default_axes(QUICK_RESOLUTION)
-        chosen = {name: values for name, values in axes.items() if name != "balls"}
-        size: dict[str, Any] = {"axes": chosen | {"exponent": axes["exponent"][1:]}}
+        axes = default_axes(QUICK_RESOLUTION).items()
+        size: dict[str, Any] = {"axes": {name: x for name, x in axes if name != "balls"}}
     else:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
-    found = ji.stability_map(given.methods, **size, max_steps=STEPS, progress=TOLD)
+    found = ji.stability_map(
+        given.methods or None, **size, max_steps=STEPS, progress=steps.patience
+    )
     pictures = {path: ji.plot.stability_map(found, TITLE)}
     for name in found.methods if given.full else ():
         beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
@@ -435,8 +416,7 @@ _TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
 def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
     """The simplest law that a scene needs."""
     path = given.picture()
-    study = _of_shot(given)
-    before, _ = _velocities(study, given)
+    study, before, _ = _shot(given)
     found = ji.advise(
         study.scene,
         before,
@@ -444,7 +424,7 @@ def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
         stiffness_range=given.stiffness_range,
         samples=given.samples,
         seed=given.seed,
-        progress=TOLD,
+        progress=steps.patience,
         **_lzb_parameters(study),
     )
     picture = ji.plot.advice(found, study.title)
@@ -474,7 +454,7 @@ def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
     path, portrait = given.picture(), given.portrait
     study = read_motion_study(given.study)
     system, title = study.system, study.title
-    run = study.run(t_end=given.t_end, samples=given.samples, progress=TOLD)
+    run = study.run(t_end=given.t_end, samples=given.samples, progress=steps.patience)
     found = jax.block_until_ready(run)
     steps("motion computed")
     pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
@@ -482,7 +462,9 @@ def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
         which = None if given.coordinate is None else given.coordinate - 1
         pictures[portrait] = ji.plot.phase_portrait(found, which, title, system=system)
     if given.gif is not None:
-        pictures[given.gif] = partial(ji.plot.animation, system, found, title=title, progress=TOLD)
+        pictures[given.gif] = partial(
+            ji.plot.animation, system, found, title=title, progress=steps.patience
+        )
     heads = ["time [s]", *system.body.names, *system.body.velocity_names]
     table = heads, np.column_stack([found.time, found.q, found.velocity]).tolist()
     return Answer(title, found.to_dict(), str(found), pictures, _failure(found), table)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import check_values, in_common_dtype
+from jimpact._checks import as_whole, check_values, in_common_dtype
 from jimpact.compiling import quick_jit
 from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import Measured
@@ -78,8 +78,7 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
             "Bistiffness force (others have no impact dynamics that are sampled), "
             f"but is {law!r}."
         )
-    if samples < 2:
-        raise ValueError(f"Argument `samples` must be at least 2, but has value {samples}.")
+    as_whole("samples", samples, 2)
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
     law, scene, v = in_common_dtype(law, scene, v)

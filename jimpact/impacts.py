@@ -14,7 +14,7 @@ from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
 from jimpact.law import Impulses, Law, check_law, is_separable, of_contacts, within_domains
 from jimpact.scene import Scene, as_velocity, filled_up, momentum, velocity_change
 from jimpact.solvers.tridiagonal import diagonal
-from jimpact.status import CODE, STATUS, sign_tolerance
+from jimpact.status import CODE, STATUS, raise_for, sign_tolerance
 
 # Impulses up to this many times what would undo the noise of gamma- are rounding: up to twice the
 # noise is asked for, and contacts that feel each other pass it on a few times.
@@ -273,14 +273,5 @@ def raise_on_failure(out: Impact) -> Impact:
     RuntimeError: Failed impacts among 1:
       negative_impulse: a contact would have to pull (p < 0) (1)
     """
-    codes = np.atleast_1d(np.asarray(out.status))
-    lines = []
-    for code in np.unique(codes):
-        if STATUS[code].failure:
-            at = np.argwhere(codes == code)
-            first = ", ".join(str(tuple(map(int, i)) if len(i) > 1 else int(i[0])) for i in at[:5])
-            where = f" at {first}{', ...' if len(at) > 5 else ''}" if codes.size > 1 else ""
-            lines.append(f"{STATUS[code].name}: {STATUS[code].message} ({len(at)}{where})")
-    if lines:
-        raise RuntimeError(f"Failed impacts among {codes.size}:\n  " + "\n  ".join(lines))
+    raise_for(out.status, STATUS, "impacts", lambda row, at: "")
     return out

@@ -298,8 +298,8 @@ def with_parameter(module: Any, name: str, value: Any) -> Any:
 
 def within_domains(law: eqx.Module) -> jax.Array:
     """Whether () all parameters are finite and in their domains, on the device."""
-    every = free_parameters_of(law).values()
-    return jnp.all(jnp.stack([jnp.asarray(x.domain.holds(x.value)) for x in every]))
+    every = [x.domain.holds(x.value) for x in free_parameters_of(law).values()]
+    return jnp.all(jnp.asarray(every, bool))
 
 
 def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:

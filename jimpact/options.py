@@ -19,20 +19,30 @@ from jimpact._checks import check_choice
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
 EVERY_LAW = "all"  # in the place of a law's name
 PICTURES = (".png", ".pdf", ".svg")
-StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="STUDY.toml")]
+
+
+def _own(shown: str, kind: Any = None) -> Any:
+    """How an option is shown whose text tells its default, and what makes its value of text."""
+    return tyro.conf.arg(metavar=shown, constructor=kind, help_behavior_hint="")
+
+
+StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[STUDY.toml]")]
+Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
+File = Annotated[Path | None, _own("FILE", Path)]
+Count = Annotated[int | None, _own("N", int)]
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Options of every command."""
 
-    json: bool = False
+    json: Flag = False
     """Print JSON instead of text."""
-    csv: bool = False
+    csv: Flag = False
     """Print the table as CSV instead of text."""
-    no_cache: bool = False
-    """Compile anew. Else compiled programs are kept in the user's cache folder, or in the
-    folder that the environment variable JIMPACT_CACHE names (empty: nowhere)."""
+    # Compile anew. Else compiled programs are kept whole in the user's cache folder, or in the
+    # folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
+    no_cache: Flag = False
 
     @property
     def light(self) -> bool:
@@ -59,9 +69,9 @@ class Command:
 class DrawingCommand(Command):
     """Options of a command that draws a picture."""
 
-    out: Path = Path()
-    """Picture (.png, .pdf, .svg), or a directory for it; default: ./jimpact-<command>.png,
-    with a study named ./jimpact-<command>-<study>.png. What is there is replaced, and told."""
+    # Picture (.png, .pdf, .svg), or a folder for it; default: ./jimpact-<command>.png,
+    # with a study named ./jimpact-<command>-<study>.png. What is there is replaced, and told.
+    out: Annotated[Path, _own("FILE", Path)] = Path()
 
     def check(self) -> None:
         """Also the picture's kind."""
@@ -73,7 +83,7 @@ class DrawingCommand(Command):
         if self.out.suffix:
             return checked_picture(self.out)
         study, default = (getattr(x, "study", None) for x in (self, type(self)))
-        named = "" if study is None or study == default else f"-{study.stem}"
+        named = "" if study is None or study == default else f"-{study.absolute().stem}"
         return self.out / f"jimpact-{self.name()}{named}.png"
 
 
@@ -86,9 +96,9 @@ def checked_picture(path: Path, option: str = "--out") -> Path:
     return path
 
 
-def check_methods(methods: tuple[str, ...] | None, known: tuple[str, ...]) -> None:
+def check_methods(methods: tuple[str, ...], known: tuple[str, ...]) -> None:
     """Raise a ValueError unless all methods are known."""
-    for method in methods or ():
+    for method in methods:
         check_choice("methods", method, known)
 
 
@@ -98,7 +108,7 @@ class ShotCommand(DrawingCommand):
 
     study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one; its [data] may be missing."""
-    velocity: tuple[float, ...] | None = None
+    velocity: Annotated[tuple[float, ...], _own("V ...")] = ()
     """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
     shot: int = 1
     """Which measured shot, counted from 1."""
@@ -107,7 +117,7 @@ class ShotCommand(DrawingCommand):
         """Also the study, and whether it has velocities."""
         super().check()
         shots = study_file.check_study(self.study).shots
-        if self.velocity is not None:
+        if self.velocity:
             return
         if not shots:
             raise ValueError("--velocity must be given, because the study has no [data].")
@@ -117,20 +127,20 @@ class ShotCommand(DrawingCommand):
 
 @dataclasses.dataclass(frozen=True)
 class FitCommand(DrawingCommand):
-    """Fit a law to measured velocities, forces, times or a motion; without a file: three balls."""
+    """Fit a law to measured velocities, forces, times or a motion."""
 
+    # Study file, its folder, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
+    # bead_column.toml, ...); also the study of a motion with [data].
     study: StudyFile = Path("three_balls.toml")
-    """Study file, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
-    bead_column.toml, ...); also the study of a motion with [data]."""
-    law: str | None = None
+    law: Annotated[str | None, _own("NAME", str)] = None
     """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
-    method: Method | None = None
-    """Solver; default: the study's, or levenberg-marquardt."""
-    starts: int | None = None
+    method: Annotated[Method | None, _own("METHOD", Method)] = None
+    """levenberg-marquardt, adam, sgd or lbfgs; default: the study's, or the first."""
+    starts: Count = None
     """Number of starts; default: the study's, or 8."""
-    seed: int | None = None
+    seed: Count = None
     """Seed of the random starts."""
-    report: Path | None = None
+    report: File = None
     """One page (.html) with all of the fit: intervals, profiles, pictures, versions."""
 
     def check(self) -> None:
@@ -154,29 +164,29 @@ class FitCommand(DrawingCommand):
 
 @dataclasses.dataclass(frozen=True)
 class CompareCommand(ShotCommand):
-    """Every law on one scene, side by side: velocities, energy, dispersion, audit, time."""
+    """Every law on one scene, side by side: velocities, energy, audit, time."""
 
-    fit: bool = False
+    fit: Flag = False
     """Fit every law to the data too, as `jimpact fit --law all` does."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MonteCarloCommand(DrawingCommand):
-    """Velocities after an impact whose gaps are random: statistics, histograms, outcome map."""
+    """Velocities after an impact with random gaps: statistics, histograms, outcomes."""
 
     study: StudyFile = Path("three_balls_gaps.toml")
     """Study file with a [monte_carlo] table, or the name of a bundled one."""
-    samples: int | None = None
+    samples: Count = None
     """Number of samples; default: the study's, or 100000."""
-    seed: int | None = None
+    seed: Count = None
     """Seed; default: the study's, or 0."""
     executor: Literal["serial", "devices", "dask"] = "serial"
     """Where: one chunk after another, all devices of the process, or Dask workers."""
-    scheduler: str | None = None
+    scheduler: Annotated[str | None, _own("ADDRESS", str)] = None
     """Address of a Dask scheduler; default: workers on this machine."""
-    folder: Path | None = None
+    folder: Annotated[Path | None, _own("DIR", Path)] = None
     """Where finished chunks are kept; the same command again continues there."""
-    keep_samples: bool = False
+    keep_samples: Flag = False
     """Keep the raw samples in the folder, too."""
 
     def check(self) -> None:
@@ -198,9 +208,9 @@ class MonteCarloCommand(DrawingCommand):
 class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
-    methods: tuple[str, ...] | None = None
+    methods: Annotated[tuple[str, ...], _own("NAME ...")] = ()
     """Methods by name; default: three that compile soon, as far as the scene allows."""
-    full: bool = False
+    full: Flag = False
     """Every method and algebraic law, durations, and the errors of the derivatives."""
     batch: int = 256
     """Impacts solved side by side."""
@@ -217,11 +227,11 @@ class ChartCommand(ShotCommand):
 class StabilityCommand(DrawingCommand):
     """Where methods of integration are right, wrong, gain energy or do not end."""
 
-    methods: tuple[str, ...] | None = None
+    methods: Annotated[tuple[str, ...], _own("NAME ...")] = ()
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
-    full: bool = False
-    """Also other numbers of balls and exponent 1, finer, all pairs of axes with a picture a method,
-    and 300 points over all axes besides."""
+    full: Flag = False
+    """Also other numbers of balls, finer, all pairs of axes with a picture a method, and 300 points
+    over all axes besides."""
 
     def check(self) -> None:
         """Also the methods' names."""
@@ -236,7 +246,7 @@ class AdviseCommand(ShotCommand):
 
     tolerance: float = 1e-2
     """Model error that is allowed, over the largest velocity before."""
-    stiffness_range: tuple[float, float] | None = None
+    stiffness_range: Annotated[tuple[float, float] | None, _own("LOW HIGH")] = None
     """Factors by which each stiffness may be off; default 0.1 10."""
     samples: int = 128
     """Draws of the unknown stiffnesses."""
@@ -248,18 +258,18 @@ class AdviseCommand(ShotCommand):
 class SimulateCommand(DrawingCommand):
     """A whole motion: flights, impacts by any law, persistent contact, energy ledger."""
 
+    # Study with a [motion], its folder, or a bundled one (cradle_motion.toml, shaken_dimer.toml,
+    # rocking_block.toml, tossed_brick.toml, discs_in_a_box.toml).
     study: StudyFile = Path("cradle_motion.toml")
-    """Study with a [motion], or a bundled one (cradle_motion.toml, shaken_dimer.toml,
-    rocking_block.toml, tossed_brick.toml, discs_in_a_box.toml)."""
-    t_end: float | None = None
+    t_end: Annotated[float | None, _own("TIME", float)] = None
     """End of the motion [s]; default: the study's."""
-    samples: int | None = None
+    samples: Count = None
     """Instants in the record; default: the study's, or 201."""
-    gif: Path | None = None
+    gif: File = None
     """Animation (.gif), one frame a sample."""
-    portrait: Path | None = None
+    portrait: File = None
     """Phase portrait (.png, .pdf, .svg)."""
-    coordinate: int | None = None
+    coordinate: Count = None
     """Coordinate of the phase portrait, counted from 1; default: one that moves."""
 
     def check(self) -> None:
@@ -278,9 +288,9 @@ class SimulateCommand(DrawingCommand):
 class LawsCommand(Command):
     """List the laws: what they say, when they are right and when they fail."""
 
-    module: str | None = None
+    module: Annotated[str | None, _own("FILE", str)] = None
     """File (.py) or module that registers further laws, see `ji.register`."""
-    bibtex: bool = False
+    bibtex: Flag = False
     """Print the references as BibTeX."""
 
     @property
@@ -314,12 +324,15 @@ class LawsCommand(Command):
 
 @dataclasses.dataclass(frozen=True)
 class NewCommand:
-    """Begin a study of your own: a commented study file, data where it needs some, a notebook."""
+    """Begin a study of your own: a commented study file, data, a notebook."""
 
     kind: Annotated[Literal["fit", "compare", "montecarlo", "simulate"], tyro.conf.Positional]
     """What the study is for."""
-    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="[DIR]")] = None
+    folder: Annotated[Path | None, tyro.conf.Positional, _own("[DIR]")] = None
     """Where it is written; default: ./my_<kind>. What is there is never replaced."""
+
+    like: Annotated[str | None, _own("STUDY.toml", str)] = None
+    """A study to begin with, as rocking_block.toml; default: three balls, or a cradle."""
 
     light: ClassVar[bool] = True
 
@@ -338,9 +351,9 @@ class NewCommand:
     def run(self) -> int:
         """Write the files, and say what comes next."""
         folder = self.folder or Path(f"my_{self.kind}")
-        for path in starting.begin(self.kind, folder):
+        for path in starting.begin(self.kind, folder, self.like):
             print(f"written: {path}")
-        print(f"Next: jimpact {self.kind} {folder / 'study.toml'}")
+        print(f"Next: jimpact {self.kind} {folder}")
         return 0
 
 

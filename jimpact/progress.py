@@ -6,10 +6,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from jimpact.starting import fitting
+
 LONG = 2.0  # seconds after which work counts as long
 LINE_EVERY = 10.0  # seconds between two lines about one step
 
+FIRST = "compiling"  # what is told until there is something to show
+
 Show = Callable[[str, float, float | None], None]
+
+
+class Patience(float):
+    """Seconds after which work is told; lines about it count time from when this was made."""
+
+    def __init__(self, seconds: float) -> None:
+        self.begun = time.monotonic()
 
 
 @contextlib.contextmanager
@@ -41,7 +52,7 @@ def _bar(after: float) -> Iterator[Show]:
 
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), Remaining()
     bar = Progress(*columns, console=Console(stderr=True), transient=True)
-    task = bar.add_task("", total=None)
+    task = bar.add_task(FIRST, total=None)
     timer = threading.Timer(after, bar.start)
     timer.daemon = True
     timer.start()
@@ -56,12 +67,12 @@ def _bar(after: float) -> Iterator[Show]:
 
 @contextlib.contextmanager
 def _lines(after: float) -> Iterator[Show]:
-    """A line once the work is long, then now and then, and at its end."""
-    begun, ended = time.monotonic(), threading.Event()
-    latest = ""
+    """A line once the work is long, then now and then; at its end where nobody waited for that."""
+    begun, ended = getattr(after, "begun", time.monotonic()), threading.Event()
+    latest = FIRST
 
     def tell() -> None:
-        print(f"{latest or 'working'}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
+        print(f"{latest}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
     def run() -> None:
         wait = after or LINE_EVERY
@@ -80,7 +91,7 @@ def _lines(after: float) -> Iterator[Show]:
     finally:
         ended.set()
         thread.join()
-        if time.monotonic() - begun >= after:
+        if not after:
             tell()
 
 
@@ -100,17 +111,13 @@ def counting_bar(
     begin, new = time.perf_counter(), 0
     with progress_bar(progress) as show:
 
-        def tell() -> None:
+        def advance(more: int) -> None:
+            nonlocal new
+            new += more
             rate = new / max(time.perf_counter() - begin, 1e-9)
             fast = f", {rate:,.0f}/s" if rate >= 10 else ""
             show(f"{done + new:,} of {total:,} {unit}{fast}", done + new, total)
 
-        def advance(more: int) -> None:
-            nonlocal new
-            new += more
-            tell()
-
-        tell()
         yield advance
 
 
@@ -118,12 +125,12 @@ class Steps:
     """The steps that a command has done: each is told on stderr, once the command is long."""
 
     def __init__(self, command: str):
-        self.command, self.begun = command, time.monotonic()
+        self.command, self.patience = command, Patience(LONG)
         self.done: list[str] = []
 
     def __call__(self, step: str) -> None:
         """A step is done."""
         self.done.append(step)
-        seconds = time.monotonic() - self.begun
+        seconds = time.monotonic() - self.patience.begun
         if seconds > LONG:
-            print(f"{self.command}: {step} ({seconds:.0f} s)", file=sys.stderr)
+            print(fitting(f"{self.command}: {step} ({seconds:.0f} s)"), file=sys.stderr)

@@ -35,6 +35,7 @@ _ALLOWED = (
     "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ... "
     "(further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`)"
 )
+_HOW = "columns are separated by commas, numbers have a decimal point"
 _ALLOWED_OF_MOTIONS = "`t[s]`, `q_1[unit]`, `sigma_q_1[unit]`, and so on for coordinates 2, 3, ..."
 
 
@@ -131,7 +132,7 @@ def _read(
         if len(row) != len(columns):
             raise ValueError(
                 f"{line}: a {what} must have {len(columns)} values, one per column, "
-                f"but has {len(row)}."
+                f"but has {len(row)} ({_HOW})."
             )
     return where, columns, rows[1:]
 
@@ -154,9 +155,11 @@ def _column(
     match = _HEADER.fullmatch(header)
     kind, body, unit = match.groups() if match else ("", None, "")
     if kind not in kinds or (body is None) != (kind == "t"):
-        hint = " (columns are separated by commas)" if ";" in header or "\t" in header else ""
+        separated = ";" in header or "\t" in header
+        told = _HOW if separated else "the first line names columns, bodies count from 1"
         raise ValueError(
-            f"{where}: column {index + 1} must be one of {allowed}, but has name {header!r}{hint}."
+            f"{where}: column {index + 1} must be one of {allowed}, but has name {header!r} "
+            f"({told})."
         )
     units, name = kinds[kind], kind if body is None else f"{kind}_{body}"
     if not unit:
@@ -216,7 +219,9 @@ def _number(where: str, column: Column, cell: str) -> float:
     try:
         number = float(cell)
     except ValueError:
-        raise ValueError(f"{where}: the value must be a number, but is {cell!r}.") from None
+        raise ValueError(
+            f"{where}: the value must be a number, but is {cell!r} ({_HOW})."
+        ) from None
     if not np.isfinite(number):
         raise ValueError(f"{where}: the value must be finite, but is {cell!r}.")
     return number * column.factor

@@ -5,19 +5,21 @@ import io
 import json
 import shutil
 import textwrap
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from jimpact.study_file import STUDY, located
 
 WIDEST = 100  # characters; longer lines of text are hard to read
 
 
 class Start(NamedTuple):
-    """What a study of one's own begins with: a bundled study, its data, cells of a notebook."""
+    """What a study of one's own begins with: a bundled study, cells of a notebook."""
 
     study: str
-    data: str | None
+    table: str  # which studies of this kind have
     title: str
     cells: tuple[str, ...]
 
@@ -32,14 +34,12 @@ jax.config.update("jax_enable_x64", True)  # double precision; jimpact never set
 import jimpact as ji
 """
 _READ = """\
-from jimpact.study import read_study
-
-study = read_study("study.toml")
+study = ji.read_study("study.toml")
 study.scene, study.law"""
 STARTS = {
     "fit": Start(
         "three_balls.toml",
-        "three_balls.csv",
+        "[scene]",
         "Fit a law to measured velocities",
         (
             _READ,
@@ -50,7 +50,7 @@ STARTS = {
     ),
     "compare": Start(
         "three_balls.toml",
-        "three_balls.csv",
+        "[scene]",
         "Every law on one impact",
         (
             _READ,
@@ -61,7 +61,7 @@ STARTS = {
     ),
     "montecarlo": Start(
         "three_balls_gaps.toml",
-        None,
+        "[monte_carlo]",
         "Velocities after an impact whose gaps are random",
         (
             _READ,
@@ -71,11 +71,10 @@ STARTS = {
     ),
     "simulate": Start(
         "cradle_motion.toml",
-        None,
+        "[system]",
         "A whole motion",
         (
-            "from jimpact.motion.study_motion import read_motion_study\n\n"
-            'study = read_motion_study("study.toml")\nstudy.law',
+            'study = ji.read_motion_study("study.toml")\nstudy.law',
             "motion = study.run()\nji.raise_on_failed_motion(motion)\nprint(motion)",
             "ji.plot.motion(motion, study.title, system=study.system)",
         ),
@@ -84,23 +83,27 @@ STARTS = {
 _HEAD = """\
 # A study of your own: change the numbers, then run
 #     jimpact {kind} study.toml
-# Every key carries its unit. All keys: `help(jimpact.study.read_study)`.
+# Every key carries its unit. All keys: `help(jimpact.read_study)`, of a motion
+# `help(jimpact.read_motion_study)`.
 """
 DATA = "shots.csv"
 
 
-def begin(kind: str, folder: Path) -> list[Path]:
-    """Write study, data and notebook; the files.
+def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
+    """Write study, data and notebook, as in the study `like`; the files.
 
     Raises:
-        ValueError: one of them is there already.
+        FileNotFoundError: there is no such study. ValueError: a file is there already.
     """
-    start, bundled = STARTS[kind], files("jimpact") / "data"
-    study = _HEAD.format(kind=kind) + "\n" + (bundled / start.study).read_text(encoding="utf-8")
-    texts = {folder / "study.toml": study}
-    if start.data is not None:
-        texts[folder / "study.toml"] = study.replace(start.data, DATA)
-        texts[folder / DATA] = (bundled / start.data).read_text(encoding="utf-8")
+    start = STARTS[kind]
+    path = located(Path(like or start.study), start.table)
+    study = path.read_text(encoding="utf-8")
+    data = tomllib.loads(study).get("data", {}).get("file")
+    texts = {}
+    if data is not None:
+        study = study.replace(data, DATA)
+        texts[folder / DATA] = (path.parent / data).read_text(encoding="utf-8")
+    texts[folder / STUDY] = _HEAD.format(kind=kind) + "\n" + study
     texts[folder / "study.ipynb"] = _notebook(start)
     there = [str(path) for path in texts if path.exists()]
     if there:
@@ -151,7 +154,9 @@ def fitting(text: str) -> str:
     """Text whose sentences are wrapped where a terminal is narrow; tables fit already."""
     width = shutil.get_terminal_size((len(text), 0)).columns
     return "\n".join(
-        textwrap.fill(line, width) if len(line) > width and "  " not in line.strip() else line
+        textwrap.fill(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip(" -"))))
+        if len(line) > width and "  " not in line.strip()
+        else line
         for line in text.splitlines()
     )
 

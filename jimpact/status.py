@@ -1,6 +1,9 @@
 """Status codes of an impact: set on the device, worded and raised on the host."""
 
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 
 class Status(NamedTuple):
@@ -33,6 +36,22 @@ CODE = {row.name: code for code, row in enumerate(STATUS)}
 # A sign is violated only beyond these multiples of the impact's own scale: rounding and the
 # solver's tolerance stay below (float64: 1e-7; float32: about 2e-3).
 SIGN_TOLERANCE = {"float64": 1e-7, "float32": 2e-3}
+
+
+def raise_for(
+    codes: Any, table: Sequence[Status], what: str, more: Callable[[Status, np.ndarray], str]
+) -> None:
+    """Raise a RuntimeError with all failures among codes of a table; `more` of those at (k,)."""
+    codes, lines = np.atleast_1d(np.asarray(codes)), []
+    for code in np.unique(codes):
+        row, at = table[code], np.argwhere(codes == code)
+        if row.failure:
+            first = ", ".join(str(tuple(map(int, i)) if len(i) > 1 else int(i[0])) for i in at[:5])
+            where = f" at {first}{', ...' if len(at) > 5 else ''}" if codes.size > 1 else ""
+            said = more(row, np.flatnonzero(codes == code))
+            lines.append(f"{row.name}: {row.message} ({len(at)}{where}){said}")
+    if lines:
+        raise RuntimeError(f"Failed {what} among {codes.size}:\n  " + "\n  ".join(lines))
 
 
 def sign_tolerance(dtype: Any) -> float:

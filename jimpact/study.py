@@ -34,12 +34,11 @@ from jimpact.registry import Row
 from jimpact.scene import Scene, chain
 from jimpact.study_file import (
     AT_KEYS,
-    DATA_KEYS,
     NO_DATA,
     STUDY_TABLES,
     body_keys,
+    check_data,
     check_fit,
-    check_keys,
     check_observed,
     check_sampling,
     check_scene,
@@ -65,7 +64,17 @@ _BODIES: dict[str, type[Body]] = {
 class Study:
     """What `read_study` found; `run` fits it, `monte_carlo(**study.monte_carlo)` samples it.
 
-    `parameters` are the law's values as the file gives them; `experiments` is None without data.
+    Attributes:
+        title: of pictures and reports.
+        scene: what collides.
+        law: with the study's values.
+        free: names -> masks of the parameters that `run` fits.
+        bounds: names -> (low, high).
+        experiments: the shots, None without `[data]`.
+        parameters: the law's values as the file gives them.
+        options: of `fit`, by name.
+        monte_carlo: arguments of `monte_carlo`, empty without `[monte_carlo]`.
+        measured: what `[[observe]]` tells, else None.
     """
 
     title: str
@@ -97,30 +106,42 @@ class Study:
 
 
 def read_study(path: str | Path, law: str | None = None) -> Study:
-    """Read a study file; `law` puts another law in the place of the study's.
+    """A study from its TOML file: scene, law, what is free, and the data, ready to be fitted.
 
-    Tables: `[scene]` masses_kg, wall, gaps_m (a chain, see `chain`), or a body (see `body_of`) and
-    q, its configuration at the impact, closed_below_m; `[law]` name, options and
-    start values, a number for all contacts or a list with one each (a `restitution_matrix` without
-    its `matrix` starts from an admissible one), module (a file or module that
-    registers the law, see `ji.register`), and `[law.bounds]`; `[fit]` free (a
-    list of names, or a table of masks), method, loss, starts, seed, max_steps, profiles; `[data]`
-    file (relative to the study), momentum_corrected; of shots with scenes of their own also near_m
-    and contacts (only shots with so many), see `read_experiments`; without data a study can be
-    compared, not fitted; `[[observe]]` in its place (any number of them): quantity (peak_force [N],
-    arrival_time [s], of a contact; duration [s] of a contact or of all; energy_ratio;
-    bounce_height [m] of a body), contact or body (from 1), value and sigma, numbers or lists, with
-    relative = true those over the first one; velocity_m_per_s, one a body, or drop_height_m, and
-    bodies (so many, those next to the wall), a number or one a value;
-    `[monte_carlo]` velocity_m_per_s, gaps_m, law, samples, seed (see `jimpact.montecarlo`). A name
-    of a bundled study is found where no such file is.
+    Args:
+        path: of the file, or the name of a bundled study (`three_balls.toml`).
+        law: name of another law in the place of the study's.
+
+    The tables of the file:
+
+    - `[scene]`: masses_kg, wall, gaps_m (a chain, see `chain`); or kind, the name of a body, with
+      its arguments (`width_m`, `mass_kg`, ...), q, its configuration at the impact, closed_below_m.
+    - `[law]`: name (`jimpact laws`), start values (a number for all contacts or a list with one
+      each), options, module (a file or module that registers the law, see `register`). A
+      `restitution_matrix` without its matrix starts from an admissible one.
+    - `[law.bounds]`: pairs, as `restitution = [0, 1]`.
+    - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
+      profiles.
+    - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
+      with scenes of their own near_m, contacts (only shots with so many). Without data a study
+      can be compared, not fitted.
+    - `[[observe]]`, in the place of `[data]`: quantity (peak_force [N], arrival_time [s] of a
+      contact; duration [s] of a contact or of all; energy_ratio; bounce_height [m] of a body),
+      contact or body (from 1), value and sigma, numbers or lists, with relative = true those over
+      the first one; velocity_m_per_s, one a body, or drop_height_m; bodies (so many, those next to
+      the wall), a number or one a value.
+    - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
+      `monte_carlo`.
+
+    Returns:
+        A `Study`.
 
     Raises:
         FileNotFoundError: no such study or data file.
         ValueError: no TOML, unknown or missing keys, and whatever scene, law or data refuse.
 
-    >>> from jimpact.study import read_study
-    >>> read_study("three_balls.toml").title
+    >>> import jimpact as ji
+    >>> ji.read_study("three_balls.toml").title
     'Three equal hard balls, one shot'
     """
     return from_file(path, "[scene]", lambda tables, file: _study(tables, file, law))
@@ -163,13 +184,14 @@ def with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, 
 
 def _experiments(table: Mapping[str, Any], path: Path, place: Scene | Body) -> Experiments:
     """The shots of the table [data], with the scenes that they have of their own."""
-    check_keys("[data]", table, DATA_KEYS, required=("file",))
+    check_data(table)
     found = read_experiments(path.parent / table["file"], place, table.get("near_m", CLOSED_BELOW))
     if found.scenes is None and isinstance(place, Scene):
         found.scene_of(place, 0)
+    for key in ("contacts", "near_m"):
+        if key in table and found.scenes is None:
+            raise ValueError(f"`{key}` in [data] is for shots with scenes of their own.")
     if "contacts" in table:
-        if found.scenes is None:
-            raise ValueError("`contacts` in [data] is for shots with scenes of their own.")
         kept = np.isin(found.contacts, table["contacts"])
         if not kept.any():
             raise ValueError(

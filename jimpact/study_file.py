@@ -14,9 +14,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jimpact._checks import check_choice, check_values
+from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.shots_file import read_positions, read_shots
 
+STUDY = "study.toml"  # of a folder that `jimpact new` has made
 STUDY_TABLES = ("fit", "data", "observe", "monte_carlo")
 SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
@@ -91,7 +92,7 @@ def callers_laws() -> set[str]:
 
 def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Path], T]) -> T:
     """What `build` makes of a study file's tables; studies of a kind have this `table`."""
-    path = _located(Path(path), table)
+    path = located(Path(path), table)
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -102,14 +103,14 @@ def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Pat
         raise ValueError(f"{path}: {error}") from None
 
 
-def _located(path: Path, table: str) -> Path:
-    """The file, or the bundled study of this name."""
-    if path.is_file():
-        return path
-    bundled = Path(str(files("jimpact") / "data" / path.name))
-    if path.parent == Path() and bundled.is_file():
-        return bundled
-    tables = sorted(bundled.parent.glob("*.toml"))
+def located(path: Path, table: str) -> Path:
+    """The file, that of a folder (`jimpact new`), or the bundled study of this name."""
+    if path.is_file() or (path / STUDY).is_file():
+        return path if path.is_file() else path / STUDY
+    bundled = Path(str(files("jimpact") / "data"))
+    if path.parent == Path() and (bundled / path).is_file():
+        return bundled / path
+    tables = sorted(bundled.glob("*.toml"))
     found = ", ".join(p.name for p in tables if table in p.read_text(encoding="utf-8"))
     raise FileNotFoundError(f"Study '{path}' does not exist; bundled studies are {found}.")
 
@@ -137,7 +138,7 @@ def check_study(path: str | Path, law: str | None = None) -> Found:
             _check_free(own, free if law is None else None)
         shots = 0
         if "data" in tables:
-            check_keys("[data]", tables["data"], DATA_KEYS, required=("file",))
+            check_data(tables["data"])
             shots = len(read_shots(file.parent / tables["data"]["file"]).values["pre"])
         if "observe" in tables:
             check_observed(tables["observe"], shots)
@@ -261,6 +262,10 @@ def _check_law(table: Mapping[str, Any], other: str | None) -> str | None:
 def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dict[str, Any]:
     """What is free, by name, nothing where nobody says; the table's words are checked."""
     check_keys("[fit]", table, keys)
+    _check_flag("[fit]", table, "profiles")
+    for key, low in (("starts", 1), ("seed", 0), ("max_steps", 1)):
+        as_whole(key, table.get(key, low), low)
+    check_choice("method", table.get("method", FIT_METHODS[0]), FIT_METHODS)
     free = table.get("free", [])
     if isinstance(free, dict):
         return free
@@ -279,6 +284,17 @@ def _check_free(law: str, free: Mapping[str, Any] | None) -> None:
             )
 
 
+def check_data(table: Mapping[str, Any]) -> None:
+    """The table [data] of shots."""
+    check_keys("[data]", table, DATA_KEYS, required=("file",))
+    _check_flag("[data]", table, "momentum_corrected")
+
+
+def _check_flag(where: str, table: Mapping[str, Any], key: str) -> None:
+    if not isinstance(table.get(key, False), bool):
+        raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")
+
+
 def check_observed(tables: list[Any], shots: int) -> None:
     """The tables [[observe]] of a study with so many shots in a file."""
     if shots:
@@ -286,6 +302,7 @@ def check_observed(tables: list[Any], shots: int) -> None:
     for number, table in enumerate(tables):
         where = f"[[observe]] {number + 1}"
         check_keys(where, table, (*OBSERVE_KEYS, *OBSERVE_SHOTS), ("quantity", "value"))
+        _check_flag(where, table, "relative")
         given = [key for key in OBSERVE_SHOTS if key in table]
         if len(given) != 1:
             told = " and ".join(given) or "none"
@@ -337,6 +354,12 @@ def check_tables(
     study: Mapping[str, Any], required: tuple[str, ...], others: tuple[str, ...]
 ) -> None:
     """Raise a ValueError unless a study has these tables, and besides them a title at most."""
+    for scene, system, kind in (("scene", "system", "a motion"), ("system", "scene", "one impact")):
+        if system in required and system not in study and scene in study:
+            raise ValueError(
+                f"the study must be of {kind}, with [{system}], but has [{scene}]: "
+                "`jimpact simulate` takes [system], other commands [scene]."
+            )
     check_keys("the study", study, ("title", *required, *others), required)
     for name in (*required, *others):
         given = study.get(name, [] if name == "observe" else {})

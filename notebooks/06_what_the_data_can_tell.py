@@ -33,30 +33,12 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 import jimpact as ji
 
 began = time.perf_counter()
-
-
-def drawing(velocities, title):
-    figure = Figure(figsize=(6, 1.6), layout="constrained")
-    axes = figure.subplots()
-    for i, v in enumerate(velocities):
-        x = 2 * i - (0.8 if i == 0 and v else 0)
-        axes.add_patch(Circle((x, 0), 1, fc="#56B4E9", ec="black"))
-        axes.text(x, 0, f"{i + 1}", ha="center", va="center")
-        if v:
-            axes.annotate("", (x + 1.6 * v, 1.3), (x, 1.3), arrowprops={"arrowstyle": "->"})
-    for j in range(len(velocities) - 1):
-        axes.text(2 * j + 1, -1.5, f"$k_{j + 1}, e_{j + 1}$", ha="center", va="top")
-    axes.set(xlim=(-2.2, 5.4), ylim=(-2.4, 1.7), aspect="equal", title=title)
-    axes.set_axis_off()
-    return figure
-
-
-drawing([1.0, 0.0, 0.0], "a striker, two balls at rest that touch")
+balls = ji.chain([1.0, 1.0, 1.0])
+ji.plot.system(balls, [1.0, 0.0, 0.0], "A striker, two balls at rest that touch")
 
 # %% [markdown]
 # ## A profile is the interval
@@ -65,7 +47,7 @@ drawing([1.0, 0.0, 0.0], "a striker, two balls at rest that touch")
 # $e = 0.95$ at both contacts, $k_2/k_1 = 3$. The fit takes one $e$ for both and the ratio.
 
 # %%
-balls, sigma = ji.chain([1.0, 1.0, 1.0]), 0.01
+sigma = 0.01
 both = {"restitution": [1, 1], "stiffness": [0, 1]}  # one e; the ratio
 
 
@@ -93,17 +75,9 @@ print(found)
 
 # %%
 def picture(profiles, truths):
-    figure = Figure(figsize=(2.4 + 2.8 * len(profiles), 3), layout="constrained")
-    for axes, p, truth in zip(np.ravel(figure.subplots(1, len(profiles))), profiles, truths):
-        axes.plot(p.value, np.minimum(p.deviance, 4 * p.limit), ".-", color="#0072B2")
-        axes.axhline(p.limit, color="black", lw=0.8, ls="--")
+    figure = ji.plot.profiles(profiles)
+    for axes, truth in zip(figure.axes, truths):
         axes.axvline(truth, color="#D55E00", lw=1)
-        for low, high in p.intervals:
-            axes.axvspan(low, high, color="#009E73", alpha=0.2, lw=0)
-        axes.set(xlabel=p.name, ylabel="deviance", ylim=(0, 4 * p.limit))
-        axes.set_title(p.words, fontsize="small")
-        if p.name.startswith("stiffness"):
-            axes.set_xscale("log")
     return figure
 
 
@@ -166,7 +140,7 @@ after = ji.fit(found.law, balls, shots(law(0.95, 3.0), more, seed=1), both)
 print(f"shot 1 alone {found.standard_error}, with the two planned ones {after.standard_error}")
 print("values", after.value, "truth", [0.95, 3.0])
 assert after.standard_error[1] < 0.7 * found.standard_error[1]
-drawing(candidates[plan.index[0]], "the shot to do next")
+ji.plot.system(balls, candidates[plan.index[0]], "The shot to do next")
 
 # %%
 print(f"run time {time.perf_counter() - began:.0f} s")

@@ -32,32 +32,14 @@ jax.config.update("jax_enable_x64", True)
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
 
 import jimpact as ji
-from jimpact.study import read_study
 
 began = time.perf_counter()
 np.set_printoptions(precision=3, suppress=True)
 
-
-def drawing(velocities, title):
-    figure = Figure(figsize=(6, 1.6), layout="constrained")
-    axes = figure.subplots()
-    for i, v in enumerate(velocities):
-        x = 2 * i - (0.8 if i == 0 and v else 0)
-        axes.add_patch(Circle((x, 0), 1, fc="#56B4E9", ec="black"))
-        axes.text(x, 0, f"{i + 1}", ha="center", va="center")
-        if v:
-            axes.annotate("", (x + 1.6 * v, 1.3), (x, 1.3), arrowprops={"arrowstyle": "->"})
-    for j in range(len(velocities) - 1):
-        axes.text(2 * j + 1, -1.5, f"contact {j + 1}", ha="center", va="top")
-    axes.set(xlim=(-2.2, 5.4), ylim=(-2.4, 1.7), aspect="equal", title=title)
-    axes.set_axis_off()
-    return figure
-
-
-drawing([1.0, 0.0, 0.0], "three equal balls, measured once")
+balls = ji.chain([1.0, 1.0, 1.0])
+ji.plot.system(balls, [1.0, 0.0, 0.0], "Three equal balls, measured once")
 
 # %% [markdown]
 # ## One measured shot
@@ -66,7 +48,7 @@ drawing([1.0, 0.0, 0.0], "three equal balls, measured once")
 # The command `jimpact fit restitution_matrix.toml` does the same.
 
 # %%
-study = read_study("restitution_matrix.toml")
+study = ji.read_study("restitution_matrix.toml")
 print("start\n", study.law.matrix)
 found = study.run()
 print(found)
@@ -81,7 +63,6 @@ print(found)
 # searches among matrices that promise both; `audit_matrix` checks any other.
 
 # %%
-balls = study.scene
 print(ji.theory.audit_matrix(balls, found.law.matrix))
 print(ji.theory.audit_matrix(balls, [[1.0, 0.5], [0.0, 1.0]]))
 

@@ -327,7 +327,7 @@ def test_in_words():
         (lambda: THREE.contains([1.0, 0.0]), r"`velocity` must have shape \(3,\) or \(k, 3\)"),
         (lambda: THREE.contains([np.inf, 0.0, 0.0]), r"`velocity` must be finite"),
         (lambda: THREE.contains(V, tolerance=-1.0), r"`tolerance`.*-1"),
-        (lambda: THREE.sample(0, 0), r"`count` must be an integer >= 1, but has value 0"),
+        (lambda: THREE.sample(0, 0), r"`count` must be an int >= 1, but has value 0"),
         (lambda: THREE.sample(0, 2.5), r"`count`.*2\.5"),
         (lambda: THREE.conserving_arc(0), r"`points`.*0"),
         (lambda: THREE.boundary(1), r"`points`.*1"),

@@ -20,8 +20,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.cli import keep_programs, main
-from jimpact.motion.study_motion import read_motion_study
-from jimpact.study import body_of, read_study
+from jimpact.study import body_of
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
 STUDY = """
@@ -93,10 +92,12 @@ def call(capsys, *arguments):
 # ------------------------------------------------------------------------------------ fit
 
 
-def test_fit_as_a_user_runs_it(tmp_path):
+def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
     """The bundled three balls: one e; corrected; all free; the other laws; a picture."""
     command = [sys.executable, "-m", "jimpact.cli", "fit", "--json"]
+    monkeypatch.delenv("COLUMNS", raising=False)
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert all(len(line) <= 80 for line in done.stderr.splitlines())
     fits = json.loads(done.stdout)["fits"]
     for name, rms in (("as measured", 0.0166), ("momentum corrected", 0.0089)):
         np.testing.assert_allclose(fits[name]["parameters"][0]["value"], 0.9911, atol=1e-4)
@@ -144,6 +145,11 @@ def test_every_law_is_fitted(tmp_path, capsys):
 REFUSED = [
     ("[scene]", "[scenery]", "the study must have the key `scene`"),
     ("[fit]", "[fit]\ntolerance = 1", "[fit] may have the keys free, method"),
+    ("[fit]", "[fit]\nprofiles = 'yes'", "`profiles` in [fit] must be true or false, but is 'yes'"),
+    ("[fit]", "[fit]\nseed = -1", "`seed` must be an int >= 0, but has value -1"),
+    ("file =", "momentum_corrected = 'no'\nfile =", "`momentum_corrected` in [data] must be true or"),
+    ("file =", "near_m = 1.0\nfile =", "`near_m` in [data] is for shots with scenes of their own"),
+    ("[scene]", "[system]", "the study must be of one impact, with [scene], but has [system]"),
     ("masses_kg", "masses", "[scene] must have the key `masses_kg`, but has masses"),
     ("[law]", "gravity = 9.81\n[law]", "[scene] may have the keys masses_kg, wall, gaps_m"),
     ('"Newton"', '"Aristotle"', "the law must be one of"),
@@ -163,7 +169,7 @@ REFUSED = [
 
 
 TYPOS = [  # what needs no numbers is told before JAX is imported
-    *((old, new) for old, new, _ in REFUSED if "1.0" not in old and "high" not in new),
+    *((old, new) for old, new, _ in REFUSED if "1.0" not in old + new and "high" not in new),
     ('free = ["restitution"]', 'free = ["restituton"]'),
     ("restitution = 0.9", "restitution = 0.9\nmethod = 'rk4'"),
     ('name = "Newton"\nrestitution = 0.9', "name = 'lzb'\nrestitution = 1.0\nmethod = 'rk4'"),
@@ -291,8 +297,13 @@ def test_ctrl_c_keeps_finished_chunks(tmp_path):
 VERBS = ("fit", "compare", "montecarlo", "chart", "stability", "advise", "simulate")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(
+    "verb",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
+        for x in VERBS
+    ],
+)
 def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
     monkeypatch.setenv("JIMPACT_CACHE", "")
@@ -370,14 +381,14 @@ def test_every_body_has_a_table(kind):
 def test_the_study_of_the_documents(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "motions.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```toml\n(.*?)```", text, re.S)
-    study = read_motion_study(written(tmp_path, block))
+    study = ji.read_motion_study(written(tmp_path, block))
     gaps = study.system.body.gap_function(np.array(study.arguments["q0"]))
     np.testing.assert_allclose(gaps, [0.0, 0.0, 0.6, 0.6, 0.0, 0.1], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["rocking_block", "discs_in_a_box", "tossed_brick"])
 def test_bundled_motions_begin_without_penetration(name):
-    study = read_motion_study(f"{name}.toml")
+    study = ji.read_motion_study(f"{name}.toml")
     q = np.array(study.arguments["q0"])
     assert study.system.body.gap_function(q).min() >= 0
     assert len(study.arguments["v0"]) == len(study.system.body.velocity_names)
@@ -388,7 +399,7 @@ def test_motions_of_several_bodies_and_a_base_in_space(tmp_path):
     bodies = bodies.replace('kind = "block"', 'kind = "PlanarBodies"').replace(
         "horizontal", "vertical"
     )
-    system = read_motion_study(written(tmp_path, bodies)).system
+    system = ji.read_motion_study(written(tmp_path, bodies)).system
     assert system.body.bodies[0].radius == 0.1
     np.testing.assert_array_equal(system.base_directions, [[0.0], [1.0], [0.0]])
     floating = MOTION.replace("block", "sphere").replace(
@@ -397,13 +408,13 @@ def test_motions_of_several_bodies_and_a_base_in_space(tmp_path):
     floating = floating.replace('"horizontal"', '"y"').replace(
         "[base]", "gravity_m_per_s2 = 0\n[base]"
     )
-    system = read_motion_study(written(tmp_path, floating)).system
+    system = ji.read_motion_study(written(tmp_path, floating)).system
     assert system.potential is None
     np.testing.assert_array_equal(system.base_directions, np.eye(6)[:, 1:2])
     hanging = "kind = 'pendulumcradle'\n" + BODIES["PendulumCradle"]
     hanging = MOTION.replace('kind = "block"\nwidth_m = 0.2\nheight_m = 0.6', hanging)
     with pytest.raises(ValueError, match="a PendulumCradle has no base"):
-        read_motion_study(written(tmp_path, hanging))
+        ji.read_motion_study(written(tmp_path, hanging))
 
 
 ON_GROUND = STUDY.replace("masses_kg = [1.0, 1.0]", """
@@ -421,7 +432,7 @@ def test_fit_of_a_body(tmp_path, capsys):
     path = written(tmp_path, ON_GROUND, TILTED)
     block = ji.Block(0.2, 0.6)
     np.testing.assert_array_equal(
-        read_study(path).scene.normals, block.scene(block.touching()).normals
+        ji.read_study(path).scene.normals, block.scene(block.touching()).normals
     )
     code, said = call(capsys, "fit", path, "--json")
     assert code == 0
@@ -529,9 +540,9 @@ def test_a_study_of_ones_own(tmp_path, capsys, kind):
     assert (code, f"Next: jimpact {kind} my_{kind}" in said.out) == (0, True)
     study = tmp_path / f"my_{kind}" / "study.toml"
     if kind == "simulate":
-        assert read_motion_study(study).title
+        assert ji.read_motion_study(study).title
     else:
-        found = read_study(study)
+        found = ji.read_study(study)
         assert (found.experiments is None) == (kind == "montecarlo")
     cells = nbformat.read(study.with_suffix(".ipynb"), as_version=4).cells
     code_cells = [cell.source for cell in cells if cell.cell_type == "code"]
@@ -541,6 +552,15 @@ def test_a_study_of_ones_own(tmp_path, capsys, kind):
     code, said = call(capsys, "new", kind)
     assert code == 2
     assert "must not exist" in said.err
+
+
+def test_a_study_of_ones_own_like_another(tmp_path, capsys):
+    assert call(capsys, "new", "simulate", "block", "--like", "rocking_block.toml")[0] == 0
+    assert ji.read_motion_study("block").system.body.names[2] == "angle [rad]"
+    assert call(capsys, "new", "fit", "carts", "--like", "air_track.toml")[0] == 0
+    assert len(ji.read_study("carts").experiments.shots) == 5
+    code, said = call(capsys, "new", "simulate", "--like", "block.toml")
+    assert (code, "bundled studies are cradle_motion.toml" in said.err) == (2, True)
 
 
 @pytest.mark.slow

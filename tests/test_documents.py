@@ -201,4 +201,4 @@ def test_notebooks_are_one_course():
             assert NOTEBOOKS[k + 1].name in script.cells[-1].source, path.stem
         code = "\n".join(cell.source for cell in script.cells if cell.cell_type == "code")
         own = set(re.findall(r"^(?:from|import) (jimpact\.\S+)", code, re.M))
-        assert own <= {"jimpact.study"}, "`ji` is all that one needs, but to read a study"
+        assert not own, "`ji` is all that one needs"

@@ -56,7 +56,15 @@ PATHS = {
 }
 
 
-@pytest.mark.parametrize("path", PATHS)
+@pytest.mark.parametrize(
+    "path",
+    [
+        "linear",
+        "Hertz",
+        pytest.param("quadratic", marks=pytest.mark.slow),
+        pytest.param("mixed", marks=pytest.mark.slow),
+    ],
+)
 def test_exponents_and_chains(path):
     eta, law = PATHS[path]
     given = states(eta)

@@ -440,9 +440,6 @@ def test_several_ratios():
         ({"stiffness": [1.0, 2.0, 3.0]}, ValueError, "`stiffness` must be a scalar or"),
         ({"exponent": 0.5}, ValueError, "`exponent` must lie in"),
         ({"exponent": (1.0, 1.5)}, ValueError, "`stiffness` must be given where exponents differ"),
-        ({"law": ji.Newton(0.5)}, TypeError, "`law` must be an LZB"),
-        ({"law": ji.LZB(1.0), "exponent": 1.5}, ValueError, "`exponent` must be None"),
-        ({"law": ji.LZB(1.0, initial_energy=1.0)}, ValueError, "no initial_energy"),
         (
             {"scene": ji.chain([1.0] * 3, gaps=[0.0, 2e-3])},
             ValueError,
@@ -484,6 +481,7 @@ def valid():
     return ji.validity_map(BALLS, STRIKE, RATIOS, (1.0, 1.5, 2.0, 3.0))
 
 
+@pytest.mark.slow
 def test_validity_map(valid):
     """Closed form; k2/k1 -> 0: binary; -> inf: Moreau; the larger the exponent, the later."""
     assert not valid.status.any()

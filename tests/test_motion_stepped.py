@@ -117,7 +117,13 @@ class Table(ji.Body):
         return lambda q: acceleration * q[1]
 
 
-@pytest.mark.parametrize("options", [{}, {"method": "time_stepping", "step": 1e-2}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"method": "time_stepping", "step": 1e-2},
+    ],
+)
 def test_leaving_the_range_of_a_gap_function_is_told(options):
     system = ji.System(Table(), potential=Table().gravity(G))
     motion = ji.simulate(system, ji.Moreau(0.5), [0.0, 0.1], [1.0, 0.0], 2.0, samples=11, **options)
@@ -130,6 +136,7 @@ def test_leaving_the_range_of_a_gap_function_is_told(options):
 # -------------------------------------------------------------------------- bodies in space
 
 
+@pytest.mark.slow
 def test_a_spinning_brick_comes_to_rest_on_a_face():
     brick = ji.Box([0.1, 0.06, 0.04], mass=0.5)
     motion = ji.simulate(

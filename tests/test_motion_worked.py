@@ -294,7 +294,7 @@ def test_fit_through_a_simulated_motion():
     assert "stiffness[2]" in str(found)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_friction_is_fitted_through_a_motion():
     """A dimer that is thrown; positions with (simulated) noise."""
     dimer, start = ji.dimer_system(0.01, 0.04), ([0.0, 0.1, 0.2], [0.5, 0.0, 0.0], 0.25)

@@ -61,7 +61,9 @@ def test_constraints_reduce_and_distort():
     assert (np.diag(g) < 1).all()
 
 
-@pytest.mark.parametrize("name", ["newton", "poisson", "binary", "lzb"])
+@pytest.mark.parametrize(
+    "name", ["newton", pytest.param("poisson", marks=pytest.mark.slow), "binary", "lzb"]
+)
 def test_welded_bodies_are_one(name):
     """Four balls, the middle two welded together: three balls, in every kind of law."""
     welded = jnp.array([[0.0], [-1], [1], [0]])

@@ -128,6 +128,23 @@ def test_restitution_by_speed_is_what_it_says():
     assert float(none.restitution_at(7.0)) == 0.3
 
 
+def test_slopes_of_restitution_by_speed_at_its_edges_are_whole():
+    """Where e reaches 1, at the yield speed, at e = 0: one side's, not the mean of two."""
+
+    def found(e, k, v_y, v):
+        law = ji.VelocityDependent(ji.Newton(e), speed_exponent=k, yield_speed=v_y)
+        return law.restitution_at(v)
+
+    cases = {
+        (1.0, 0.25, 0.0, 1.0): (1.0, 0.0, 0.0, -0.25),
+        (0.5, 0.25, 1.0, 1.0): (0.0, 0.0, 0.75, -0.75),
+        (0.0, 0.25, 0.0, 1.0): (1.0, 0.0, 0.0, 0.0),
+    }
+    at = jnp.array(list(cases))
+    slopes = jax.vmap(jax.jacrev(lambda x: found(*x)))(at)
+    np.testing.assert_allclose(slopes, list(cases.values()), atol=1e-15)
+
+
 def test_contacts_that_feel_each_other_share_a_speed():
     w = np.diag([2.0, 2.0, 2.0, 1.0, 1.0])
     w[0, 1] = w[1, 0] = w[1, 2] = w[2, 1] = -1.0  # a chain of three, and two apart

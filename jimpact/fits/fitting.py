@@ -8,7 +8,7 @@ from typing import Any, Generic, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_choice, check_kind
+from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.experiments import Experiments
 from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.least_squares import Method, check_method, default_steps
@@ -252,9 +252,8 @@ def fit(
     """
     check_method(method)
     steps = default_steps(method) if max_steps is None else max_steps
-    for name, count in (("starts", starts), ("max_steps", steps)):
-        if not isinstance(count, int) or count < 1:
-            raise ValueError(f"Argument `{name}` must be an integer >= 1, but has value {count!r}.")
+    for name, count, least in (("starts", starts, 1), ("max_steps", steps, 1), ("seed", seed, 0)):
+        as_whole(name, count, least)
     check_choice("loss", loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
         problem = law

@@ -141,7 +141,7 @@ class Measured(NamedTuple):
 
 
 def observations(scene: Scene, tables: Sequence[Mapping[str, Any]]) -> Measured:
-    """The observable of a study's `[[observe]]` tables, see `jimpact.study.read_study`.
+    """The observable of a study's `[[observe]]` tables, see `read_study`.
 
     Raises:
         ValueError: what a table says wrong.

@@ -118,16 +118,21 @@ class VelocityDependent(Law):
         e = free_parameters_of(self.law)["restitution"].value
         moving = v > 0
         safe = jnp.where(moving, v, self.reference_speed)  # at rest e is that of the law
+        # of two that are equal one is taken, whole: min() would halve the derivative
+        most = jnp.where(e > 1, e, 1.0)
         power = e * jnp.ones_like(v)
         if self.speed_exponent is not None:
-            falling = e * (safe / self.reference_speed) ** -self.speed_exponent
-            power = jnp.minimum(falling, jnp.maximum(e, 1.0))
+            ratio = safe / self.reference_speed
+            falls = e * ratio**-self.speed_exponent <= most
+            falling = e * jnp.where(falls, ratio, 1.0) ** -self.speed_exponent
+            power = jnp.where(falls, falling, most)
         if self.yield_speed is None:
             return power
-        y = jnp.where(moving, jnp.minimum(self.yield_speed / safe, 1.0), 0.0)
-        square = y**2 + (1 - y**2) * power**2
-        some = square > 0  # the root has no slope at 0
-        return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
+        yields = safe >= self.yield_speed
+        y = jnp.where(yields, self.yield_speed / jnp.where(yields, safe, 1.0), 1.0)
+        some = moving & (y > 0)  # the root has no slope at 0
+        square = jnp.where(some, y**2 + (1 - y**2) * power**2, 1.0)
+        return jnp.where(some, jnp.sqrt(square), power)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Those of the law with e at this speed."""

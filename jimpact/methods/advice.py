@@ -129,10 +129,9 @@ def advise(
     velocity: Any,
     tolerance: float = 1e-2,
     *,
-    law: LZB | None = None,
-    restitution: Any = None,
+    restitution: Any = 1.0,
     stiffness: Any = None,
-    exponent: Any = None,
+    exponent: Any = 1.5,
     stiffness_range: tuple[float, float] | None = None,
     samples: int = 128,
     seed: int = 0,
@@ -149,10 +148,9 @@ def advise(
         scene: n coordinates, m contacts. Friction is left out.
         velocity: v- (n,) [m/s].
         tolerance: of v+, relative to max |v-|; at least 100 times the reference's own 1e-8.
-        law: an `LZB` with all parameters, in place of the next three.
-        restitution: e in [0, 1], scalar or (m,); default 1.
+        restitution: e in [0, 1], scalar or (m,).
         stiffness: k > 0, scalar or (m,) [N / m^eta]; None: only their ratio's range is known.
-        exponent: eta >= 1, as in `LZB`; default 1.5.
+        exponent: eta >= 1, as in `LZB`.
         stiffness_range: low and high factor on every stiffness ratio (k_j over that of the first
             contact of its block; on every k_j where not only ratios count); default: (0.1, 10)
             where no stiffness is given, else (1, 1).
@@ -177,7 +175,10 @@ def advise(
     """
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
-    parameters, known = parameters_of(scene, law, restitution, stiffness, exponent)
+    known = stiffness is not None
+    k = stiffness if known else 1.0
+    for name, value in (("restitution", restitution), ("stiffness", k), ("exponent", exponent)):
+        check_per_contact(name, value, scene.contacts)
     span = span_of(stiffness_range, known)
     finest = FINEST_TOLERANCE * default_rtol("time", v.dtype)
     check_shape("tolerance", tolerance, (), "one number")
@@ -185,12 +186,12 @@ def advise(
     as_whole("samples", samples, 1)
     as_whole("seed", seed, 0)
     at = situation(scene, np.asarray(v))
-    mixed = len(np.unique(np.asarray(parameters["exponent"], float))) > 1
+    mixed = len(np.unique(np.asarray(exponent, float))) > 1
     absolute = bool(at.gapped.any()) or (mixed and bool(at.coupled))
     if absolute and not known:
         raise ValueError(missing_stiffness(at))
-    k = np.broadcast_to(np.asarray(parameters["stiffness"], v.dtype), (scene.contacts,))
-    laws = trials(at, parameters["restitution"], k, parameters["exponent"])
+    k = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
+    laws = trials(at, restitution, k, exponent)
     tried = rows(k, unknowns(at, k, span, absolute), samples, seed)
     return _found(at, laws, tried, float(tolerance), timing, progress)
 
@@ -234,34 +235,6 @@ def _found(
         rows=len(tried.stiffness),
         gap_ratio=gap_ratio,
     )
-
-
-def parameters_of(
-    scene: Scene, law: LZB | None, restitution: Any, stiffness: Any, exponent: Any
-) -> tuple[dict[str, Any], bool]:
-    """Restitution, stiffness and exponent, and whether the stiffness is known."""
-    given = {"restitution": restitution, "stiffness": stiffness, "exponent": exponent}
-    if law is not None:
-        if not isinstance(law, LZB):
-            raise TypeError(f"Argument `law` must be an LZB, but is {law!r}.")
-        double = [name for name, value in given.items() if value is not None]
-        if double:
-            raise ValueError(
-                f"Argument `{double[0]}` must be None where `law` is given, "
-                f"but has value {given[double[0]]!r}."
-            )
-        if np.asarray(law.initial_energy).any():
-            raise ValueError(
-                "Argument `law` must have no initial_energy (no simpler law knows of "
-                f"precompression), but has {law.initial_energy}."
-            )
-        given = {name: getattr(law, name) for name in given}
-    known = given["stiffness"] is not None
-    defaults = {"restitution": 1.0, "stiffness": 1.0, "exponent": 1.5}
-    values = {key: defaults[key] if value is None else value for key, value in given.items()}
-    for key, value in values.items():
-        check_per_contact(key, value, scene.contacts)
-    return values, known
 
 
 def span_of(given: tuple[float, float] | None, known: bool) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from jimpact.records import as_data, fields_as_data, number, table
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
 
-_WIDTH = 92  # of the printed lines
+_WIDTH = 80  # of the printed lines
 _BODIES = 5  # in the printed table
 
 _TOLD = 4  # stiffness ratios named one by one

@@ -30,6 +30,7 @@ ALGEBRAIC = ("newton", "moreau", "poisson", "binary")
 SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
 SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right
 HOST_BATCH = 4  # impacts that a method without vmap does for its time in a batch: a plain loop
+HOST = "host code: finite differences only"
 FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the other one it is compared with
 
 
@@ -236,7 +237,7 @@ def work_precision(
         ),
         compile_time={name: programs[name].compile_time for name in points},
         left_out=left_out,
-        without_gradient={m.name: m.no_gradient for m in chosen if m.no_gradient and gradients},
+        without_gradient={m.name: HOST for m in chosen if gradients and not m.jax},
         batch=batch,
         sample=case.sample,
         spread=SPREAD,
@@ -287,7 +288,7 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
 def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict[str, str]]:
     """Methods asked for; without names all that can, and why the others cannot."""
     if names is None:
-        why = {n: m.supports(case.law, case.scene) for n, m in METHODS.items()}
+        why = {n: m.supports(case.law) for n, m in METHODS.items()}
         left_out = {name: reason for name, reason in why.items() if reason is not None}
         return [m for n, m in METHODS.items() if n not in left_out], left_out
     return [_able("methods", name, case) for name in names], {}
@@ -295,7 +296,7 @@ def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict
 
 def _able(argument: str, name: str, case: Case) -> Method:
     check_choice(argument, name, METHODS)
-    reason = METHODS[name].supports(case.law, case.scene)
+    reason = METHODS[name].supports(case.law)
     if reason is not None:
         raise ValueError(
             f"Argument `{argument}` must be able to solve the impact, but has {name!r}: {reason}."
@@ -391,21 +392,12 @@ def _of_method(method: Method, case: Case, gradients: bool, durations: bool) -> 
     account = batched
     if durations and method.duration_apart:
         account = program("errors", whole, case.sample)
-    count = _counter(method, program) if method.counting else None
-
-    def accounted(setting: Any) -> Answer:
-        answer = jax.tree.map(lambda a: a[: case.sample], account(setting))
-        if count is None:
-            return answer
-        return answer._replace(evaluations=np.full(case.sample, count(setting)))
-
-    wanted = gradients and not method.no_gradient
     return Programs(
         single=program("single", fast, None),
         batched=batched,
         batch=len(case.stiffness),
-        account=accounted,
-        gradient=program("gradient", slopes, case.sample) if wanted else None,
+        account=lambda setting: jax.tree.map(lambda a: a[: case.sample], account(setting)),
+        gradient=program("gradient", slopes, case.sample) if gradients else None,
         compile_time=seconds,
     )
 
@@ -425,30 +417,6 @@ def _compiled(
     return lambda setting: ready()(
         *given, jnp.asarray(np.nan if setting is None else setting, float)
     )
-
-
-def _counter(method: Method, program: Callable[..., Callable[[Any], Any]]) -> Callable[[Any], int]:
-    """Field evaluations of the impact itself, counted one by one."""
-    evaluations = 0
-
-    def tally() -> None:
-        nonlocal evaluations
-        evaluations += 1
-
-    def counted(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
-        assert method.counting is not None
-        return method.counting(tally)(with_entries(law, ("stiffness",), k), scene, v, setting).code
-
-    run = program("count", counted, None)
-
-    def count(setting: Any) -> int:
-        nonlocal evaluations
-        evaluations = 0
-        jax.block_until_ready(run(setting))
-        jax.effects_barrier()
-        return evaluations
-
-    return count
 
 
 def _on_host(method: Method, case: Case) -> Programs:

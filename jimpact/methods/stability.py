@@ -24,13 +24,12 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.audits import audit
-from jimpact.events.impact_dynamics import solve
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import METHODS
-from jimpact.methods.contenders.base import Method, MethodResult, in_si, lzb_only, outcome, problem
+from jimpact.methods.contenders.base import Method, outcome
 from jimpact.progress import counting_bar
 from jimpact.records import as_data, fields_as_data, table
-from jimpact.scene import Scene, chain
+from jimpact.scene import chain
 from jimpact.status import CODE
 
 
@@ -378,17 +377,7 @@ def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
     return mass, stiffness
 
 
-def _solve_default(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-    """What `ji.impact(ji.LZB(..., rtol=setting), ...)` does."""
-    given = problem(law, scene, velocity, setting)
-    p, _, code = solve(given.dynamics, given.max_steps, law.method)
-    unknown = jnp.full((), jnp.nan, p.dtype)
-    return in_si(given, p / given.units.momentum, unknown, jnp.asarray(-1), code)
-
-
-DEFAULT = Method(
-    "default", "jimpact's default", "rtol", (1e-4, 1e-8, 1e-12), _solve_default, lzb_only
-)
+DEFAULT = METHODS["dop853"]._replace(name="default")
 
 
 class Found(NamedTuple):
@@ -401,20 +390,17 @@ class Found(NamedTuple):
 
 
 Runner = Callable[[np.ndarray, Any], Found]  # of points (L, 6) and settings () or (L,)
-Runners = Callable[[Method, int, bool], Runner]
+Runners = Callable[[Method, int], Runner]
 
 
-def runner(max_steps: int, method: Method, balls: int, linear: bool) -> Runner:
-    """One method on chains of so many balls.
-
-    `linear`: the exponent is the static 1.0, which some methods ask for.
-    """
+def runner(max_steps: int, method: Method, balls: int) -> Runner:
+    """One method on chains of so many balls."""
 
     def one(point: jax.Array, setting: jax.Array) -> tuple[jax.Array, ...]:
         _, kappa, eta, e, mu, _ = point
         mass, stiffness = chain_of(kappa, mu, balls)
         scene, v = chain(mass), jnp.zeros_like(mass).at[0].set(1.0)
-        law = LZB(e, stiffness, 1.0 if linear else eta, max_steps=max_steps)
+        law = LZB(e, stiffness, eta, max_steps=max_steps)
         found = method.solve(law, scene, v, setting)
         out = outcome(law, scene, v, found)
         return out.velocity, found.code, out.status, audit(scene, v, out).energy_gain
@@ -432,11 +418,11 @@ def runner(max_steps: int, method: Method, balls: int, linear: bool) -> Runner:
     return run
 
 
-def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int, bool]]:
-    """Points (indices) of equal shapes, their number of balls, whether they are linear."""
-    balls, linear = points[:, AXES.index("balls")], points[:, AXES.index("exponent")] == 1.0
-    for n, kind in np.unique(np.stack([balls, linear], axis=1), axis=0):
-        yield np.flatnonzero((balls == n) & (linear == kind)), int(n), bool(kind)
+def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
+    """Points (indices) of equal shapes, and their number of balls."""
+    balls = points[:, AXES.index("balls")]
+    for n in np.unique(balls):
+        yield np.flatnonzero(balls == n), int(n)
 
 
 # --------------------------------------------------------------------------- the references
@@ -447,10 +433,10 @@ def references(
 ) -> tuple[np.ndarray, Confirmation]:
     """v+ of every point (P, most balls), NaN where no run ends; how many scipy confirms."""
     exact = np.full((len(points), int(points[:, AXES.index("balls")].max())), np.nan)
-    for at, balls, linear in _groups(points):
+    for at, balls in _groups(points):
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
-        found = runners(DEFAULT, balls, linear)(rows, REFERENCE_RTOL)
+        found = runners(DEFAULT, balls)(rows, REFERENCE_RTOL)
         ended = (found.code == CODE["ok"]) | (found.code == CODE["plastic_limit"])
         exact[at, :balls] = np.where(ended[:, None], found.velocity, np.nan)[np.ravel(back)]
         advance(len(at))
@@ -502,13 +488,14 @@ def classes_of(
     allowed = np.full(len(points), FIXED_STEP_RIGHT)
     if method.setting == "rtol":
         allowed = HONEST * setting
-    for group, balls, linear in _groups(points):
-        run = runners(method, balls, linear)
+    e = points[:, AXES.index("restitution")]
+    for group, balls in _groups(points):
+        run = runners(method, balls)
 
         def off(found: Found, at: np.ndarray, balls: int = balls) -> np.ndarray:
             return np.abs(found.velocity - exact[at, :balls]).max(axis=1)
 
-        at = group[~_refused(method, points[group], linear)]
+        at = group[e[group] > 0] if method.divides else group
         if len(at):
             found = run(points[at], setting[at])
             errors[at] = off(found, at)
@@ -523,14 +510,6 @@ def classes_of(
     for i in np.flatnonzero(codes != RIGHT):
         causes[i] = _cause(method, points[i], CLASSES[codes[i]], float(setting[i]))
     return codes, errors, causes
-
-
-def _refused(method: Method, points: np.ndarray, linear: bool) -> np.ndarray:
-    """Points (L,) on which the method says beforehand that it cannot work."""
-    pair, exponent = chain(jnp.ones(2)), 1.0 if linear else jnp.asarray(1.5)
-    at_0, at_1 = (method.supports(LZB(e, exponent=exponent), pair) for e in (0.0, 1.0))
-    e = points[:, AXES.index("restitution")]
-    return np.where(e == 0, at_0 is not None, at_1 is not None)
 
 
 def _classified(found: Found, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:

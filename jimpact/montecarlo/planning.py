@@ -21,7 +21,7 @@ import numpy as np
 import jimpact
 from jimpact._checks import as_whole, check_kind, in_common_dtype
 from jimpact.impacts import impact
-from jimpact.law import Law, free_parameters_of
+from jimpact.law import Law, within_domains
 from jimpact.montecarlo.distributions import Distribution, Rows, Source, as_source
 from jimpact.montecarlo.statistics import BAD_GAP, BAD_LAW, BAD_VELOCITY, Chunk, Task, reduced
 from jimpact.montecarlo.store import fingerprint
@@ -93,7 +93,7 @@ def impacts(drawn: Drawn, scene: Scene, lanes: jax.Array) -> tuple[jax.Array, ja
 def _outcome(
     law: Law, velocity: jax.Array, gaps: jax.Array | None, scene: Scene
 ) -> tuple[jax.Array, jax.Array]:
-    code = jnp.where(_in_domain(law), 0, BAD_LAW)
+    code = jnp.where(within_domains(law), 0, BAD_LAW)
     code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
     if gaps is not None:
         fine = jnp.isfinite(gaps) & (gaps >= 0)
@@ -101,13 +101,6 @@ def _outcome(
         scene = with_gaps(scene, jnp.where(fine, gaps, 0))
     out = impact(law, scene, jnp.where(code == 0, velocity, 0))  # at rest: over at once
     return out.velocity, jnp.where(code == 0, out.status, code.astype(jnp.int32))
-
-
-def _in_domain(law: Law) -> jax.Array:
-    fine = jnp.asarray(True)
-    for value, _, domain in free_parameters_of(law).values():
-        fine = fine & domain.holds(value)
-    return fine
 
 
 @dataclass(frozen=True, eq=False)

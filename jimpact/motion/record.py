@@ -1,6 +1,7 @@
 """The record of a motion: samples, events, energy ledger, status."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.records import as_data, fields_as_data
-from jimpact.status import STATUS, Status
+from jimpact.status import STATUS, Status, raise_for
 
 # of these rows `failure` marks motions that end before t_end; the code is the row number
 MOTION_STATUS = (
@@ -249,14 +250,5 @@ def raise_on_failed_motion(motion: Motion) -> Motion:
     >>> ji.raise_on_failed_motion(motion) is motion
     True
     """
-    codes = np.atleast_1d(np.asarray(motion.status))
-    lines = []
-    for code in np.unique(codes):
-        row = MOTION_STATUS[code]
-        if row.failure:
-            at = np.flatnonzero(codes.ravel() == code)
-            where = f" at {', '.join(map(str, at[:5]))}" if codes.size > 1 else ""
-            lines.append(f"{row.name}: {row.message} ({len(at)}{where}){_said(motion, row, at)}")
-    if lines:
-        raise RuntimeError(f"Failed motions among {codes.size}:\n  " + "\n  ".join(lines))
+    raise_for(motion.status, MOTION_STATUS, "motions", partial(_said, motion))
     return motion

@@ -32,7 +32,18 @@ _DIRECTIONS = {1: ("vertical",), 2: ("horizontal", "vertical"), 3: ("x", "y", "v
 
 @dataclass(frozen=True)
 class MotionStudy:
-    """What `read_motion_study` found; `run` simulates it."""
+    """What `read_motion_study` found; `run` simulates it, `fit` fits it to its data.
+
+    Attributes:
+        title: of pictures and reports.
+        system: what moves, under its loads.
+        law: with the study's values.
+        arguments: of `simulate`, by name.
+        measured: times, positions and their errors of `[data]`, else None.
+        free: names -> masks of the parameters that `fit` finds.
+        bounds: names -> (low, high).
+        options: of `fit_motion`, by name.
+    """
 
     title: str
     system: System
@@ -69,21 +80,32 @@ class MotionStudy:
 
 
 def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
-    """Read the study of a motion; `law` puts another law in the place of the study's.
+    """The study of a motion from its TOML file: system, law, initial state, perhaps data.
 
-    Tables: `[system]` a body (see `jimpact.study.body_of`) and gravity_m_per_s2, 0 for none;
-    `[base]` amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
-    horizontal, in space x or y); `[law]` as in other studies; `[motion]` q0, v0, t_end_s and the
-    options of `simulate`. `[data]` file, a CSV file with columns t[s] in equal steps, q_1[m],
-    q_2[rad], ... and perhaps sigma_q_1[m], ..., and `[fit]` (without method) makes it one for
-    `jimpact fit`.
+    Args:
+        path: of the file, or the name of a bundled study (`cradle_motion.toml`).
+        law: name of another law in the place of the study's.
+
+    The tables of the file:
+
+    - `[system]`: kind, the name of a body, with its arguments (`width_m`, `mass_kg`, ...), and
+      gravity_m_per_s2, 0 for none.
+    - `[base]`: amplitude_m, frequency_hz, phase_rad, direction (vertical; in the plane also
+      horizontal, in space x or y).
+    - `[law]`, `[law.bounds]`: as in other studies, see `read_study`.
+    - `[motion]`: q0, v0, t_end_s and the options of `simulate`.
+    - `[data]`: file, a CSV file with columns t[s] in equal steps, q_1[m], q_2[rad], ... and perhaps
+      sigma_q_1[m], ...; `[fit]` (without method): what is free. With these it can be fitted.
+
+    Returns:
+        A `MotionStudy`.
 
     Raises:
-        FileNotFoundError: no such study; ValueError: no TOML, unknown or missing keys, and what
-            system and law refuse.
+        FileNotFoundError: no such study or data file.
+        ValueError: no TOML, unknown or missing keys, and what system and law refuse.
 
-    >>> from jimpact.motion.study_motion import read_motion_study
-    >>> read_motion_study("cradle_motion.toml").title
+    >>> import jimpact as ji
+    >>> ji.read_motion_study("cradle_motion.toml").title
     "Newton's cradle, three balls"
     """
     return from_file(path, "[system]", lambda tables, file: _study(tables, file, law))

@@ -15,15 +15,18 @@ from jimpact.methods.stability import CLASSES, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
 from jimpact.plot.style import (
     COLOURS,
+    COLUMNS,
     GREY,
     SMALL,
-    SPREAD,
     finish,
     heading,
+    in_words,
     legend_below,
     legend_within,
     logarithmic,
     new_figure,
+    new_panels,
+    side_by_side,
     wrapped,
 )
 from jimpact.status import CODE, STATUS
@@ -79,41 +82,22 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     2
     """
     gradients = any(point.gradient is not None for row in found.points.values() for point in row)
-    if gradients:
-        figure = new_figure(7.2)
-        (left, right), (below, corner) = figure.subplots(2, 2)
-    else:
-        figure, below, corner = new_figure(4.6), None, None
-        left, right = figure.subplots(1, 2)
+    figure, panels = new_panels(4, 3.6) if gradients else new_panels(2, 4.6)
     handles: dict[str, Any] = {}
-    for number, (name, row) in enumerate(found.points.items()):
-        style = _style(name, number, row)
-        for axes, quantity, place in (
-            (left, "velocity", lambda point: _times(point.batched)),
-            (right, "velocity", lambda point: (point.evaluations, None)),
-            (below, "gradient", lambda point: _times(point.gradient)),
-        ):
-            if axes is None:
-                continue
-            drawn = _draw(axes, row, quantity, place, style)
+    for axes, (quantity, place, x, y) in zip(panels, _PANELS):
+        for number, (name, row) in enumerate(found.points.items()):
+            drawn = _draw(axes, row, quantity, place, _style(name, number, row))
             if drawn is not None:
                 handles.setdefault(row[0].label, drawn)
-    labels = (
-        (left, "velocity", "time per impact in a batch [µs]", "error of v⁺, relative"),
-        (right, "velocity", "field evaluations per impact", "error of v⁺, relative"),
-        (below, "gradient", "time per impact with its gradient [µs]", "error of ∂v⁺/∂(ln k, e)"),
-    )
-    for axes, quantity, x, y in labels:
-        if axes is not None:
-            _finish(axes, found.reference.uncertainty[quantity], x, y)
+        _finish(axes, found.reference.uncertainty[quantity], x, y)
     for label, drawn in handles.items():
         drawn.set_label(label)
-    if corner is None:
+    if not gradients:
         legend_below(figure, list(handles.values()), 2, _note(found))
     else:  # beside the three panels
-        corner.axis("off")
+        panels[3].axis("off")
         options: dict[str, Any] = {"title": _note(found), "title_fontsize": SMALL, "loc": "center"}
-        corner.legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)
+        panels[3].legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)
     heading(figure, title)
     return figure
 
@@ -142,6 +126,28 @@ def _times(timing: Timing | None) -> tuple[float, tuple[float, float] | None]:
         1e6 * (timing.median - timing.low),
         1e6 * (timing.high - timing.median),
     )
+
+
+_PANELS: tuple[tuple[str, Callable[[Point], tuple[float, Any]], str, str], ...] = (
+    (
+        "velocity",
+        lambda point: _times(point.batched),
+        "time per impact in a batch [µs]",
+        "error of v⁺, relative",
+    ),
+    (
+        "velocity",
+        lambda point: (point.evaluations, None),
+        "field evaluations per impact",
+        "error of v⁺, relative",
+    ),
+    (
+        "gradient",
+        lambda point: _times(point.gradient),
+        "time per impact with its gradient [µs]",
+        "error of ∂v⁺/∂(ln k, e)",
+    ),
+)
 
 
 def _draw(
@@ -179,7 +185,6 @@ def _draw(
 
 
 def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
-    axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -218,20 +223,14 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
     1
     """
     names = list(found.axes)
-    columns = min(2, len(names))
-    rows = -(-len(names) // columns)
-    figure = new_figure(1.2 + rows * (0.8 + 0.3 * len(found.methods)))
-    grid = figure.subplots(rows, columns, squeeze=False)
-    for i, axes in enumerate(grid.flat):
-        if i >= len(names):
-            axes.remove()
-            continue
-        codes = [found.slices[name][i].codes for name in found.methods]
-        _draw_classes(axes, np.array(codes))
-        _ticks(axes, "x", names[i], found.axes[names[i]])
-        labels = found.methods if i % columns == 0 else [""] * len(found.methods)
+    figure, grid = new_panels(len(names), 0.8 + 0.3 * len(found.methods), 1.2)
+    for i, (axes, name) in enumerate(zip(grid, names)):
+        _draw_classes(axes, np.array([found.slices[method][i].codes for method in found.methods]))
+        _ticks(axes, "x", name, found.axes[name])
+        labels = found.methods if i % COLUMNS == 0 else [""] * len(found.methods)
         axes.set_yticks(range(len(found.methods)), labels, fontsize=SMALL)
-        _base_mark(axes, found, names[i])
+        axes.plot(_place(found, name), -0.62, "v", color="black", ms=5, clip_on=False)
+        axes.set_ylim(len(found.methods) - 0.5, -0.5)
     _finish_map(figure, found, title)
     return figure
 
@@ -277,7 +276,7 @@ def _pair(axes: Axes, found: StabilityMap, each: Slice, bottom: bool, left: bool
     axes.invert_yaxis()
     for which, name, labelled in (("x", each.axes[0], bottom), ("y", each.axes[1], left)):
         _ticks(axes, which, name, found.axes[name], labelled, 3)
-    x, y = (_place(found.axes[name], found.base[name]) for name in each.axes)
+    x, y = (_place(found, name) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
 
@@ -304,7 +303,7 @@ def _ticks(
 ) -> None:
     step = -(-len(values) // most)
     at = range(0, len(values), step)
-    labels = [_number(values[i]) if labelled else "" for i in at]
+    labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
     if which == "x":
         axes.set_xticks(at, labels, fontsize=SMALL)
         axes.set_xlabel(_LABELS[name] if labelled else "", fontsize=SMALL)
@@ -313,23 +312,10 @@ def _ticks(
         axes.set_ylabel(_LABELS[name] if labelled else "", fontsize=SMALL)
 
 
-def _number(value: float) -> str:
-    """Short: powers of ten as such."""
-    power = np.log10(value) if value > 0 else np.nan
-    if abs(power) >= 2 and abs(power - round(power)) < 1e-9:
-        return f"$10^{{{round(power)}}}$"
-    return f"{value:.2g}" if value < 1 or value != round(value) else f"{value:g}"
-
-
-def _place(values: np.ndarray, value: float) -> float:
-    """Where a value lies among the columns."""
-    return float(np.interp(value, values, np.arange(len(values))))
-
-
-def _base_mark(axes: Axes, found: StabilityMap, name: str) -> None:
-    place = _place(found.axes[name], found.base[name])
-    axes.plot(place, -0.62, "v", color="black", ms=5, clip_on=False)
-    axes.set_ylim(len(found.methods) - 0.5, -0.5)
+def _place(found: StabilityMap, name: str) -> float:
+    """Where the base lies among the values of an axis."""
+    values = found.axes[name]
+    return float(np.interp(found.base[name], values, np.arange(len(values))))
 
 
 def _finish_map(figure: Figure, found: StabilityMap, title: str) -> None:
@@ -407,7 +393,7 @@ def advice(found: Advice, title: str = "") -> Figure:
     """
     names, rows = list(found.candidates), list(found.candidates.values())
     bodies, x = len(found.velocity), np.arange(len(names))
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
+    dodge = side_by_side(bodies)
     figure = new_figure(6.5)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for i in range(bodies):

@@ -21,6 +21,7 @@ from jimpact.plot.style import (
     legend_below,
     logarithmic,
     new_figure,
+    side_by_side,
 )
 
 _LABELLED = 16  # shots up to which every one gets its label
@@ -55,7 +56,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
         *map(_in_rows, (fit.problem.measured, fit.predicted)),
     )
     shots, bodies = predicted.shape
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
+    dodge = side_by_side(bodies)
     x = np.arange(shots)[:, None] + dodge[None, :]
     size = float(np.clip(220 / (shots * bodies), 3, 8))
     figure = new_figure(6.0)

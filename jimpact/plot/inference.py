@@ -10,9 +10,8 @@ from scipy.special import ndtri
 from jimpact._checks import check_kind
 from jimpact.fits.fitting import Fit
 from jimpact.fits.profiles import Profile
-from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure
+from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure, new_panels
 
-_IN_A_ROW = 2
 _TITLE = 45  # letters of a line of a panel's title
 _TOP = 3.0  # of a profile's axis, in limits: beyond, the curve says nothing more
 _TWO_SIDED = 1.96  # standard errors with 95 % between
@@ -38,10 +37,7 @@ def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
     """
     for each in found:
         check_kind("found", each, Profile)
-    rows = -(-len(found) // _IN_A_ROW)
-    columns = min(len(found), _IN_A_ROW)
-    figure = new_figure(2.8 * rows)
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, grid = new_panels(len(found), 2.8)
     for axes, each in zip(grid, found):
         axes.plot(each.value, each.deviance, ".-", color=COLOURS[0], ms=3, lw=1)
         axes.axhline(each.limit, color=GREY, lw=0.8, ls="--")
@@ -57,8 +53,6 @@ def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
         axes.set_title(fill(words, _TITLE), loc="left", fontsize=SMALL)
         axes.set_ylabel("deviance")
         finish(axes)
-    for axes in grid[len(found) :]:
-        axes.remove()
     return figure
 
 

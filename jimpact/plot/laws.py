@@ -18,12 +18,12 @@ from jimpact.plot.style import (
     COLOURS,
     GREY,
     SMALL,
-    SPREAD,
     finish,
     heading,
     legend_below,
     legend_within,
     new_figure,
+    side_by_side,
     unit_of_time,
     wrapped,
 )
@@ -55,35 +55,44 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     names, entries = list(found.entries), list(found.entries.values())
     bodies = len(found.velocity)
     what, unit = ("body", "m/s") if found.scene.walls is not None else ("coordinate", "m/s, rad/s")
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / max(bodies, 1)
     figure = new_figure(6.0)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
-    x = np.arange(len(names))
-    velocity = np.array([np.asarray(entry.outcome.velocity) for entry in entries])
+    x, velocity = _dots(top, found, what)
     fine = np.array([bool(entry.audit.consistent) for entry in entries])
     for i in range(bodies):
-        colour = COLOURS[i % len(COLOURS)]
-        top.plot(x + dodge[i], velocity[:, i], "o", color=colour, label=f"{what} {i + 1}")
         if measured is not None and np.isfinite(measured[i]):
+            colour = COLOURS[i % len(COLOURS)]
             top.axhline(measured[i], color=colour, lw=1, ls="--", zorder=0)
         if not fine.all():
-            wrong = (x + dodge[i])[~fine], velocity[~fine, i]
+            wrong = x[~fine, i], velocity[~fine, i]
             top.plot(*wrong, "x", color="black", ms=10, label="audit failed" if i == 0 else None)
     if measured is not None:
         top.plot([], [], color="black", lw=1, ls="--", label="measured")
-    top.axhline(0, color="black", lw=0.6)
     top.set_ylabel(f"velocity after the impact [{unit}]")
     heading(figure, title)
     kept = [entry.energy_ratio for entry in entries]
     spread = [entry.dispersion_index for entry in entries]
-    bottom.bar(x - 0.18, kept, 0.32, color=GREY, label="energy kept T+/T-")
-    bottom.bar(x + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
+    at = np.arange(len(names))
+    bottom.bar(at - 0.18, kept, 0.32, color=GREY, label="energy kept T+/T-")
+    bottom.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
     bottom.set_ylabel("share of 1")
     _laws_axis(bottom, names)
     finish(top, bottom, grid="y")
     handles = [x for axes in (top, bottom) for x in axes.get_legend_handles_labels()[0]]
     legend_below(figure, handles, 4)
     return figure
+
+
+def _dots(axes: Axes, found: Comparison, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities after by every law (l, n), a dot each; where they stand."""
+    velocity = np.array([np.asarray(entry.outcome.velocity) for entry in found.entries.values()])
+    laws, bodies = velocity.shape
+    x = np.arange(laws)[:, None] + side_by_side(bodies)[None, :]
+    for i in range(bodies):
+        colour = COLOURS[i % len(COLOURS)]
+        axes.plot(x[:, i], velocity[:, i], "o", color=colour, label=f"{what} {i + 1}")
+    axes.axhline(0, color="black", lw=0.6)
+    return x, velocity
 
 
 def _laws_axis(axes: Axes, names: list[str]) -> None:
@@ -131,19 +140,12 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     loops.set_title("contact 1 alone", loc="left", fontsize="medium")
     legend_within(loops)
     heading(figure, title)
-    names = list(found.entries)
-    values = np.array([np.asarray(e.outcome.velocity) for e in found.entries.values()])
-    bodies = values.shape[1]
-    dodge = (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
-    for i in range(bodies):
-        at = np.arange(len(names)) + dodge[i]
-        outcome.plot(at, values[:, i], "o", color=COLOURS[i % len(COLOURS)], label=f"body {i + 1}")
-    _laws_axis(outcome, names)
-    outcome.axhline(0, color="black", lw=0.6)
+    _dots(outcome, found, "body")
+    _laws_axis(outcome, list(found.entries))
     outcome.set_ylabel("velocity after the impact [m/s]")
     outcome.set_xlabel("force")
     outcome.set_title("all contacts together", loc="left", fontsize="medium")
-    legend_within(outcome, max(1, bodies // 6))
+    legend_within(outcome, max(1, len(found.velocity) // 6))
     finish(loops, outcome)
     return figure
 

@@ -1,6 +1,6 @@
 """Pictures of motions: coordinates over time, phase portraits, animations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +19,7 @@ from jimpact.motion.system import System
 from jimpact.plot.style import COLOURS, GREY, finish, heading, legend_within, new_figure
 from jimpact.progress import counting_bar
 
-# q (n,) -> curves (k, 2) of points (x, y) in metres
-Outlines = Callable[[np.ndarray], Sequence[np.ndarray]]
+_FRAMES_PER_SECOND = 25
 _POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a mark of their own
 _MANY = 60  # impacts up to which each gets its line
@@ -289,8 +288,6 @@ def animation(
     system: System,
     motion: Motion,
     path: str | Path,
-    outlines: Outlines | None = None,
-    frames_per_second: float = 25.0,
     title: str = "",
     progress: float | None = None,
 ) -> Path:
@@ -303,8 +300,6 @@ def animation(
         system: that moved.
         motion: one motion.
         path: the file, ending in .gif.
-        outlines: q (n,) -> curves (k, 2) [m]; None: those of the body.
-        frames_per_second: of the GIF.
         title: of the picture; the time stands below it.
         progress: a bar on stderr; None: on a terminal, where it takes long.
 
@@ -331,7 +326,7 @@ def animation(
     if not len(q):
         raise ValueError("Argument `motion` must have a sample that was reached, but has none.")
     ground = _grounds(system, time)
-    curves = [outlines(x) for x in q] if outlines else _curves(system, q, time, ground)
+    curves = _curves(system, q, time, ground)
     figure = Figure(figsize=(4.8, 4.8), dpi=80)
     axes = figure.add_axes(_PLACE)
     floors = [_plane(angle, offset) for angle, offset in system.body.floors]
@@ -353,7 +348,7 @@ def animation(
     path.parent.mkdir(parents=True, exist_ok=True)
     shown = FuncAnimation(figure, draw, frames=len(q))
     with counting_bar(len(q), "frames", progress) as advance:
-        writer = PillowWriter(fps=round(frames_per_second))
+        writer = PillowWriter(fps=_FRAMES_PER_SECOND)
         shown.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
     return path
 

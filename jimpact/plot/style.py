@@ -15,6 +15,7 @@ SPREAD = 0.6  # width that the bodies of one group take, of the distance between
 
 # Width of every picture [in] and its smallest font: read at half a page's width, too.
 WIDTH = 7.2
+COLUMNS = 2  # panels beside each other
 SMALL = 8.5  # points
 
 _DECADES = 100.0  # an axis that spans less is labelled within its decades, too
@@ -25,6 +26,22 @@ _TIMES = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
 def new_figure(height: float) -> Figure:
     """A figure of the common width, `height` [in] high."""
     return Figure(figsize=(WIDTH, height), layout="constrained")
+
+
+def new_panels(count: int, height: float, more: float = 0.0, **shared: Any) -> tuple[Figure, Any]:
+    """A figure of so many panels, two beside each other; a row is `height` [in] high."""
+    columns = min(COLUMNS, count)
+    rows = -(-count // columns)
+    figure = new_figure(more + height * rows)
+    every = figure.subplots(rows, columns, squeeze=False, **shared).ravel()
+    for spare in every[count:]:
+        spare.remove()
+    return figure, every[:count]
+
+
+def side_by_side(bodies: int) -> np.ndarray:
+    """Where the bodies of one group stand (bodies,), around its place."""
+    return (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
 
 
 def finish(*panels: Axes, grid: Any = "both") -> None:

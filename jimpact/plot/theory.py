@@ -11,14 +11,23 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from jimpact.contact import kinetic_norm
-from jimpact.plot.style import COLOURS, GREY, SMALL, finish, heading, legend_below, new_figure
+from jimpact.plot.style import (
+    COLOURS,
+    COLUMNS,
+    GREY,
+    SMALL,
+    finish,
+    heading,
+    legend_below,
+    new_figure,
+    new_panels,
+)
 from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
 from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
 
 _FILL = "#DCE9F3"
 _MARKERS = "osD^vP*X"
-_COLUMNS = 2  # of panels
 _MOST_CONTACTS = 4  # beyond two contacts: projections onto pairs of the first so many
 _SAMPLES = 2000
 _SHORTEST = 0.5  # a side shorter than this part of the radius is not drawn: its name would not fit
@@ -167,7 +176,7 @@ def _line(
     axes.plot(*np.stack([start, end]).T, color=GREY, lw=1.0, ls=style)
     angle = np.degrees(np.arctan2(direction[1], direction[0]))
     angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
-    share, side = (0.62, "top") if style == "-" else (0.3, "bottom")
+    share, side = (0.45, "top") if style == "-" else (0.3, "bottom")
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
     _write(axes, start + share * length * direction, text, color=GREY, **turned)
 
@@ -180,12 +189,7 @@ def _projections(
     unit = np.asarray(found.scene.normals / kinetic_norm(found.scene)[None, :], float)[:, shown]
     cloud, kept = samples @ unit, _energy_kept(found, samples)
     pairs = list(combinations(range(len(shown)), 2)) or [(0, 0)]
-    columns = min(2, len(pairs))
-    rows = -(-len(pairs) // columns)
-    figure = new_figure(3.1 * rows + 0.8)
-    grid = np.atleast_1d(figure.subplots(rows, columns, squeeze=False)).ravel()
-    for spare in grid[len(pairs) :]:
-        spare.remove()
+    figure, grid = new_panels(len(pairs), 3.1, 0.8)
     for axes, (i, j) in zip(grid, pairs):
         single = i == j
         y = kept if single else cloud[:, j]
@@ -198,15 +202,13 @@ def _projections(
         energy = "energy kept $T^+ / T^-$"
         axes.set_ylabel(energy if single else _gap_label(shown[j]), fontsize=SMALL)
         finish(axes)
-    figure.colorbar(dots, ax=grid[: len(pairs)].tolist(), label="energy kept $T^+ / T^-$")
+    figure.colorbar(dots, ax=grid.tolist(), label="energy kept $T^+ / T^-$")
     _legend(figure, grid[0], 4)
     return figure
 
 
 def _energy_kept(found: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
-    mass = np.asarray(found.scene.mass, float)
-    momentum = velocity * mass if mass.ndim == 1 else velocity @ mass
-    energy = 0.5 * np.sum(momentum * velocity, axis=-1)
+    energy = 0.5 * np.sum(velocity @ dense_mass(found.scene) * velocity, axis=-1)
     return energy / found.energy if found.energy else np.ones_like(energy)
 
 
@@ -234,13 +236,12 @@ def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
     >>> len(ji.plot.rocking_dispersion(d).axes)
     1
     """
-    figure, panels = _panels(found, title, 2.8)
+    figure, panels = _panels(found, title)
     theta, size = np.degrees(found.kinetic_angle), np.abs(found.dispersion)
     for j, axes in enumerate(panels):
         for k, e in enumerate(np.asarray(found.restitution)):
             colour = COLOURS[k % len(COLOURS)]
             axes.plot(theta, size[:, j, k], color=colour, lw=1.6, label=f"e = {e:g}")
-        axes.axvline(_critical(found, j), color="black", ls=":", lw=1)
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     finish(*panels)
     _angle_axes(panels, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
@@ -269,42 +270,34 @@ def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = S
     >>> len(ji.plot.rocking_outcomes(d).axes)
     1
     """
-    figure, panels = _panels(found, title, 2.8)
+    figure, panels = _panels(found, title)
     codes = found.outcomes(stays)
     colours = ListedColormap(_OUTCOME_COLOURS)
     norm = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES))
     theta, e = np.degrees(found.kinetic_angle), np.asarray(found.restitution)
     for j, axes in enumerate(panels):
         axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
-        axes.axvline(_critical(found, j), color="black", ls=":", lw=1)
     _angle_axes(panels, "restitution e")
     shown = np.unique(codes)
     legend_below(figure, [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in shown], 5)
     return figure
 
 
-def _panels(found: RockingDispersion, title: str, height: float) -> tuple:
-    count, columns = len(found.friction), min(_COLUMNS, len(found.friction))
-    rows = -(-count // columns)
-    figure = new_figure(0.6 + height * rows)
-    every = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
-    for spare in every[count:]:
-        spare.remove()
+def _panels(found: RockingDispersion, title: str) -> tuple[Figure, Any]:
+    """A panel for each mu, with a line at its critical angle."""
+    figure, every = new_panels(len(found.friction), 2.8, 0.6, sharex=True, sharey=True)
     for axes, mu in zip(every, np.asarray(found.friction)):
         axes.set_title(f"mu = {mu:g}", loc="left", fontsize="medium")
+        critical = float(np.degrees(critical_kinetic_angle(mu)))
+        axes.axvline(critical, color="black", ls=":", lw=1)
     heading(figure, title)
-    return figure, every[:count]
+    return figure, every
 
 
 def _angle_axes(panels: np.ndarray, label: str) -> None:
     """Labels on the left, and below the last panel of each column."""
-    columns = min(_COLUMNS, len(panels))
-    for axes in panels[::columns]:
+    for axes in panels[::COLUMNS]:
         axes.set_ylabel(label)
-    for axes in panels[-columns:]:
+    for axes in panels[-COLUMNS:]:
         axes.set_xlabel(r"kinetic angle $\theta_{12}$ [degrees]")
         axes.tick_params(labelbottom=True)
-
-
-def _critical(found: RockingDispersion, j: int) -> float:
-    return float(np.degrees(critical_kinetic_angle(found.friction[j])))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_float_array, check_values
+from jimpact._checks import as_float_array, as_whole, check_values
 from jimpact.fits.capped_polyhedron import (
     CappedPolyhedron,
     capped_polyhedron,
@@ -97,7 +97,7 @@ class AdmissibleSet:
         Hit-and-run from an interior point, one walk a sample. For independent contacts, uniform
         in impulse space too.
         """
-        _check_count("count", count, 1)
+        as_whole("count", count, 1)
         if self.dimension == 0:
             return np.repeat(self.center[None], count, axis=0)
         return self._velocity(self.coordinates.sample(np.random.default_rng(seed), count))
@@ -112,7 +112,7 @@ class AdmissibleSet:
             ValueError: the set is not two-dimensional.
         """
         self._check_plane()
-        _check_count("points", points, 1)
+        as_whole("points", points, 1)
         ends = self.coordinates.arc()
         if ends is None:
             return np.zeros((0, self.scene.size))
@@ -131,7 +131,7 @@ class AdmissibleSet:
             ValueError: the set is not two-dimensional.
         """
         self._check_plane()
-        _check_count("points", points, 2)
+        as_whole("points", points, 2)
         return self._velocity(self.coordinates.boundary(points))
 
     def __str__(self) -> str:
@@ -220,13 +220,6 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
         energy,
         tolerance,
     )
-
-
-def _check_count(name: str, value: Any, least: int) -> None:
-    if not isinstance(value, int) or value < least:
-        raise ValueError(
-            f"Argument `{name}` must be an integer >= {least}, but has value {value!r}."
-        )
 
 
 def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:

@@ -48,10 +48,10 @@ def contact_coupling(scene: Scene) -> jax.Array:
     """
     n_q, t_q = quasi_basis(scene)
     g = as_matrix(normalized_delassus(scene))
-    if scene.tangents is None:
-        return jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
-    right = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
     left = jnp.concatenate([g, jnp.zeros((t_q.shape[1], g.shape[1]), g.dtype)])
+    if scene.tangents is None:
+        return left
+    right = jnp.concatenate([n_q.T @ scene.tangents, t_q.T @ scene.tangents])
     return jnp.concatenate([left, right], axis=1)
 
 
@@ -113,7 +113,7 @@ def _in_box(
     bounded = jnp.isfinite(jnp.concatenate([low, high]))
     room = jnp.concatenate([y - low, high - y])
     room = jnp.where(bounded, room, 1.0)  # a bound at infinity never binds
-    matrix = jnp.concatenate([jnp.concatenate([s, -s], axis=1), jnp.concatenate([-s, s], axis=1)])
+    matrix = jnp.block([[s, -s], [-s, s]])
     both = bounded[:, None] & bounded[None, :]
     matrix = jnp.where(both, matrix, jnp.eye(2 * len(y), dtype=s.dtype))
     # p = p_low - p_high is unique where S is regular, whatever the two parts are

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jimpact._checks import check_values, is_traced
+from jimpact._checks import as_whole, check_values, is_traced
 from jimpact.scene import Scene, as_velocity, dense_mass
 
 # Relative to the largest normalized approach velocity at the start: gap velocities and impulses
@@ -134,8 +134,7 @@ def _checked(scene: Scene, velocity: Any, max_depth: int) -> np.ndarray:
         raise TypeError("`han_gilmore` is a host function: it cannot be traced (jit, vmap, grad).")
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
-    if isinstance(max_depth, bool) or not isinstance(max_depth, int) or max_depth < 1:
-        raise ValueError(f"Argument `max_depth` must be an int >= 1, but has value {max_depth!r}.")
+    as_whole("max_depth", max_depth, 1)
     return np.asarray(velocity, float)
 
 

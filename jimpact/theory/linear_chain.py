@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_per_contact, check_shape, check_values
+from jimpact._checks import as_float_array, as_whole, check_per_contact, check_shape, check_values
 from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 
 
@@ -80,8 +80,6 @@ def newby_ratio(n: int) -> float:
     >>> round(ji.theory.newby_ratio(2), 6), round(ji.theory.newby_ratio(3), 6)
     (2.241338, 6.171293)
     """
-    if not isinstance(n, int | np.integer) or n < 2:
-        raise ValueError(f"Argument `n` must be a whole number of at least 2, but has value {n!r}.")
-    n = int(n)
+    n = as_whole("n", n, 2)
     root = float(np.sqrt(9 * n**8 - 12 * n**6 - 42 * n**4 - 12 * n**2 + 9))
     return (3 * n**4 - 2 * n**2 + 3 + root) / (8 * n**2)

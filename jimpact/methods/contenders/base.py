@@ -38,25 +38,6 @@ class MethodResult(NamedTuple):
     code: jax.Array
 
 
-def lzb_only(law: Law, scene: Scene) -> str | None:
-    """Whether the law has LZB's dynamics, and fits the scene."""
-    if not isinstance(law, LZB):
-        return f"it integrates the LZB law, and the law is {type(law).__name__}"
-    for name in ("restitution", "stiffness"):
-        shape = np.shape(getattr(law, name))[-1:]
-        if shape not in ((), (scene.contacts,)):
-            return f"`{name}` has {shape[0]} entries for {scene.contacts} contacts"
-    return None
-
-
-def finite_rate(law: Law, scene: Scene) -> str | None:
-    """As `lzb_only`; and the plain time form divides by e."""
-    reason = lzb_only(law, scene)
-    if reason is None and isinstance(law, LZB) and np.any(law.restitution == 0):
-        return "it divides by e^2, and a restitution is 0"
-    return reason
-
-
 Solve = Callable[[LZB, Scene, Any, Any], MethodResult]
 
 
@@ -66,11 +47,9 @@ class Method(NamedTuple):
     `setting` says what the number handed to `solve` is: 'rtol', a tolerance on velocities relative
     to the largest |v-|; 'step', the time step in units of `time_scale`; or 'impulse step', the
     step in the primary impulse, in units of the impact's own. `ladder`: settings from coarse to
-    fine. `supports(law, scene)` is None or says why not. `jax`: `solve(law, scene, velocity,
-    setting)` can be jitted, vmapped and differentiated forward, over the setting too; otherwise it
-    takes concrete values. `duration_apart`: the duration takes a run of its own.
-    `counting(tally)`: where `solve` gives no evaluations, one that calls `tally()` at each (one
-    impact at a time).
+    fine. `divides`: by e, which must not be 0. `jax`: `solve(law, scene, velocity, setting)` can
+    be jitted, vmapped and differentiated forward, over the setting too; otherwise it takes concrete
+    values. `duration_apart`: the duration takes a run of its own.
     """
 
     name: str
@@ -78,11 +57,14 @@ class Method(NamedTuple):
     setting: str
     ladder: tuple[float, ...]
     solve: Solve
-    supports: Callable[[Law, Scene], str | None] = finite_rate
+    divides: bool = True
     jax: bool = True
-    no_gradient: str | None = None  # why there is none that is meaningful
     duration_apart: bool = False
-    counting: Callable[[Callable[[], None]], Solve] | None = None
+
+    def supports(self, law: LZB) -> str | None:
+        """None, or why it cannot integrate this law."""
+        refused = self.divides and np.any(law.restitution == 0)
+        return "it divides by e^2, and a restitution is 0" if refused else None
 
 
 class GivenImpact(NamedTuple):
@@ -182,11 +164,6 @@ def time_form(
     closing = -flow.omega * jnp.where(now > 0, opening, 1.0) * now
     factor = (jnp.asarray(flow.exponent, x.dtype) + 1) / 2
     return closing, factor * flow.omega * power(x, flow.exponent)
-
-
-def held_open(x: jax.Array, closing: jax.Array) -> jax.Array:
-    """`x'` of a code that cannot clamp: an open contact keeps its x <= 0."""
-    return jnp.where((x <= 0) & (closing < 0), 0.0, closing)
 
 
 setup = eqx.filter_jit(problem)

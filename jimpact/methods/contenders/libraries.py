@@ -5,8 +5,6 @@ over when no contact holds or approaches by more than the tolerance; the event m
 downwards, for it begins at the approach itself.
 """
 
-import functools
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -21,7 +19,6 @@ from jimpact.methods.contenders.base import (
     Method,
     MethodResult,
     Solve,
-    held_open,
     in_si,
     problem,
     setup,
@@ -38,11 +35,7 @@ GIVE_UP = 5000  # evaluations a contact: LSODA may creep without end at an openi
 FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts about pi
 
 
-def _diffrax_solver(
-    solver: diffrax.AbstractSolver,
-    stages: int | None,
-    tally: Callable[[], None] | None = None,
-) -> Solve:
+def _diffrax_solver(solver: diffrax.AbstractSolver, stages: int | None) -> Solve:
     """`solve` by a diffrax solver of so many new stages a step (None: not known beforehand)."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
@@ -51,11 +44,10 @@ def _diffrax_solver(
         rtol = jnp.asarray(setting, inputs.gamma.dtype)
 
         def rates(t: Any, y: Any, args: Any) -> tuple[jax.Array, jax.Array]:
-            if tally is not None:
-                jax.debug.callback(tally)
             flow, gamma, _ = args
             closing, force = time_form(flow, gamma, *y)
-            return held_open(y[0], closing), force
+            # it cannot clamp: an open contact keeps its x <= 0
+            return jnp.where((y[0] <= 0) & (closing < 0), 0.0, closing), force
 
         def at_work(t: Any, y: Any, args: Any, **_: Any) -> jax.Array:
             (flow, gamma, rtol), (x, p) = args, y
@@ -94,8 +86,7 @@ def _diffrax_method(
     name: str, solver: Any, stages: int | None, ladder: tuple[float, ...]
 ) -> Method:
     label = f"diffrax {type(solver).__name__} with Event"
-    counting = None if stages is not None else functools.partial(_diffrax_solver, solver, None)
-    return Method(name, label, "rtol", ladder, _diffrax_solver(solver, stages), counting=counting)
+    return Method(name, label, "rtol", ladder, _diffrax_solver(solver, stages))
 
 
 DIFFRAX = (
@@ -158,8 +149,8 @@ def _scipy_solver(name: str) -> Solve:
 
 
 def _scipy_method(name: str, solver: str, ladder: tuple[float, ...]) -> Method:
-    label, why = f"scipy {solver} with event", "host code: finite differences only"
-    return Method(name, label, "rtol", ladder, _scipy_solver(solver), jax=False, no_gradient=why)
+    label = f"scipy {solver} with event"
+    return Method(name, label, "rtol", ladder, _scipy_solver(solver), jax=False)
 
 
 SCIPY = (

@@ -42,7 +42,6 @@ from jimpact.methods.contenders.base import (
     MethodResult,
     Solve,
     in_si,
-    lzb_only,
     problem,
     time_form,
 )
@@ -200,7 +199,7 @@ DOP853_ALIGNED = Method(
     "rtol",
     (1e-3, 1e-5, 1e-7, 1e-9, 1e-11),
     _solve_aligned,
-    lzb_only,
+    divides=False,
     duration_apart=True,
 )
 SCHEMES = (
@@ -210,7 +209,7 @@ SCHEMES = (
         "impulse step",
         (1e-2, 3e-3, 1e-3, 3e-4),
         _in_impulse(impulse_form.advance, 1),
-        lzb_only,
+        divides=False,
     ),
     Method(
         "impulse_rk4",
