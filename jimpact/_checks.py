@@ -33,13 +33,23 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
     else:
         host = np.asarray(value)
         if host.dtype.kind not in "fiub":
-            raise TypeError(f"Argument `{name}` must be numeric, but has value {value!r}.")
+            raise TypeError(f"Argument `{name}` must be numeric, but has value {shown(value)}.")
         array = jnp.asarray(value)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise TypeError(f"Argument `{name}` must be real, but has dtype {array.dtype}.")
     if not jnp.issubdtype(array.dtype, jnp.floating):
         array = array.astype(float)
     return array
+
+
+def as_axis(name: str, value: Any) -> "jax.Array":
+    """`value`, a scalar or with one axis, as a floating JAX array with one axis, not empty."""
+    array = as_float_array(name, value)
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(
+            f"Argument `{name}` must be a scalar or have one axis, but has shape {array.shape}."
+        )
+    return array.reshape(-1)
 
 
 def check_values(
@@ -90,7 +100,15 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
 def check_kind(name: str, value: Any, kind: type) -> None:
     """Raise a TypeError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
-        raise TypeError(f"Argument `{name}` must be of type {kind.__name__}, but is {value!r}.")
+        raise TypeError(
+            f"Argument `{name}` must be of type {kind.__name__}, but is {shown(value)}."
+        )
+
+
+def shown(value: Any) -> str:
+    """A value in a message: its type where it takes more than a line."""
+    text = repr(value)
+    return text if "\n" not in text and len(text) < 80 else f"a {type(value).__name__}"
 
 
 def check_concrete(name: str, value: Any) -> None:

@@ -25,7 +25,7 @@ from jimpact.fits.fitting import Fit
 from jimpact.progress import Steps, waiting
 from jimpact.records import as_data, table
 from jimpact.starting import as_csv, fitting
-from jimpact.study import Study, import_laws, read_study
+from jimpact.study import Study, read_study
 from jimpact.study_file import is_motion
 
 if TYPE_CHECKING:
@@ -46,7 +46,6 @@ class Answer(NamedTuple):
     pictures: Mapping[Path, "Figure | Callable[[Path], Any]"]  # to be saved, or what draws it
     failure: str = ""
     table: Table | None = None  # for --csv
-    printed: bool = False  # the text is what was asked for, be it JSON
 
 
 def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
@@ -68,9 +67,7 @@ def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
             path.write_bytes(whole.getvalue())
         steps(f"picture {path}")
     pictures = [str(path) for path in answer.pictures]
-    if answer.printed:
-        print(answer.text)
-    elif given.csv:
+    if given.csv:
         assert answer.table is not None  # every command has one
         print(as_csv(*answer.table))
     elif given.json:
@@ -478,23 +475,7 @@ def _failure(motion: "ji.Motion") -> str:
     return ""
 
 
-# ------------------------------------------------------------------------------------------- laws
-
-
-def laws(given: options.LawsCommand, steps: Steps) -> Answer:
-    """The registry with laws of others; those of the package alone `LawsCommand.run` lists."""
-    if given.module is not None:
-        import_laws(given.module, Path())
-    if given.bibtex and not given.json:
-        entries = dict.fromkeys(row.bibtex for row in ji.REGISTRY.values())
-        return Answer("", {}, "\n\n".join(entries), {})
-    rows = {
-        name: row._asdict() | {"parameters": row.parameters} for name, row in ji.REGISTRY.items()
-    }
-    return Answer("", {}, given.listed(rows), {}, printed=True)
-
-
 _COMMANDS: dict[str, Callable[[Any, Steps], Answer]] = {
     command.__name__: command
-    for command in (fit, compare, montecarlo, chart, stability, advise, simulate, laws)
+    for command in (fit, compare, montecarlo, chart, stability, advise, simulate)
 }

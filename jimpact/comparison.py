@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_values
+from jimpact._checks import check_kind, check_values
 from jimpact.audits import Audit, audit, nothing_approaches
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
@@ -183,6 +183,7 @@ def compare(
 
     Raises:
         ValueError: velocities of another size or NaN; both `laws` and values.
+        TypeError: `laws` without names.
 
     >>> import jimpact as ji
     >>> table = ji.compare(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0], restitution=1.0)
@@ -199,6 +200,7 @@ def compare(
             f"Argument `laws` must be None where parameters are given, but {', '.join(values)} "
             "came with it."
         )
+    check_kind("laws", laws, Mapping)
     runs = {name: partial(impact, law, scene, v) for name, law in laws.items()}
     first = [seconds(run) for run in runs.values()]
     each = [float(np.median(x)) for x in in_turns(list(runs.values()), _REPEATS)]

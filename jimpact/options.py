@@ -6,7 +6,6 @@
 import dataclasses
 import json
 import os
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -36,6 +35,8 @@ Count = Annotated[int | None, _own("N", int)]
 class Command:
     """Options of every command."""
 
+    light: ClassVar[bool] = False  # whether it has a `run` of its own
+
     json: Flag = False
     """Print JSON instead of text."""
     csv: Flag = False
@@ -43,11 +44,6 @@ class Command:
     # Compile anew. Else compiled programs are kept whole in the user's cache folder, or in the
     # folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
     no_cache: Flag = False
-
-    @property
-    def light(self) -> bool:
-        """Whether it has a `run` of its own, which does not need JAX."""
-        return False
 
     @classmethod
     def name(cls) -> str:
@@ -229,9 +225,9 @@ class StabilityCommand(DrawingCommand):
 
     methods: Annotated[tuple[str, ...], _own("NAME ...")] = ()
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
+    # Also other numbers of balls, finer, all pairs of axes with a picture a method, and 300 points
+    # over all axes besides.
     full: Flag = False
-    """Also other numbers of balls, finer, all pairs of axes with a picture a method, and 300 points
-    over all axes besides."""
 
     def check(self) -> None:
         """Also the methods' names."""
@@ -293,33 +289,36 @@ class LawsCommand(Command):
     bibtex: Flag = False
     """Print the references as BibTeX."""
 
-    @property
-    def light(self) -> bool:
-        """Those of the package are known without JAX."""
-        return self.module is None and not study_file.callers_laws()
+    light: ClassVar[bool] = True
 
     def run(self) -> int:
-        """Print them."""
-        if self.bibtex and not self.json:
-            bundled = files("jimpact") / "data" / "laws.bib"
-            print(bundled.read_text(encoding="utf-8").strip())
+        """Print them; those of the package alone are known without JAX."""
+        if self.module is None and not study_file.callers_laws():
+            laws = study_file.names()["laws"]
+            bibtex = (files("jimpact") / "data" / "laws.bib").read_text(encoding="utf-8").strip()
         else:
-            print(self.listed(study_file.names()["laws"]))
-        return 0
+            from jimpact import REGISTRY
+            from jimpact.study import import_laws
 
-    def listed(self, laws: Mapping[str, Mapping[str, Any]]) -> str:
-        """The laws as text, JSON or CSV."""
+            if self.module is not None:
+                import_laws(self.module, Path())
+            laws = {
+                x: row._asdict() | {"parameters": row.parameters} for x, row in REGISTRY.items()
+            }
+            bibtex = "\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values()))
         keys = ("parameters", "summary", "right_when", "fails_when", "source")
         rows = {name: {key: row[key] for key in keys} for name, row in laws.items()}
         if self.json:
-            return json.dumps(rows, indent=2)
-        if self.csv:
-            lines = [
-                [name, " ".join(row["parameters"]), *[*row.values()][1:]]
-                for name, row in rows.items()
-            ]
-            return starting.as_csv(["law", *keys], lines)
-        return starting.laws_as_text(rows)
+            text = json.dumps(rows, indent=2)
+        elif self.bibtex:
+            text = bibtex
+        elif self.csv:
+            lines = [[x, " ".join(row.pop("parameters")), *row.values()] for x, row in rows.items()]
+            text = starting.as_csv(["law", *keys], lines)
+        else:
+            text = starting.laws_as_text(rows)
+        print(text)
+        return 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -99,11 +99,10 @@ def begin(kind: str, folder: Path, like: str | None = None) -> list[Path]:
     path = located(Path(like or start.study), start.table)
     study = path.read_text(encoding="utf-8")
     data = tomllib.loads(study).get("data", {}).get("file")
-    texts = {}
+    texts = {folder / STUDY: _HEAD.format(kind=kind) + "\n" + study}
     if data is not None:
-        study = study.replace(data, DATA)
+        texts[folder / STUDY] = texts[folder / STUDY].replace(data, DATA)
         texts[folder / DATA] = (path.parent / data).read_text(encoding="utf-8")
-    texts[folder / STUDY] = _HEAD.format(kind=kind) + "\n" + study
     texts[folder / "study.ipynb"] = _notebook(start)
     there = [str(path) for path in texts if path.exists()]
     if there:

@@ -154,9 +154,7 @@ def _parameters(fit: Any) -> list[str]:
         for name, value, error, *rest in [head, *parameter_rows(fit)]
     ]
     if misleads(fit):
-        lines.append(
-            "A parabola at the minimum may mislead here: see `ji.profile(fit)`."
-        )
+        lines.append("A parabola at the minimum may mislead here: see `ji.profile(fit)`.")
     return lines
 
 

@@ -93,6 +93,9 @@ def contour(found: Contour, title: str = "") -> Figure:
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
+    Raises:
+        TypeError: something else.
+
     >>> import numpy as np
     >>> import jimpact as ji
     >>> x = np.linspace(0.4, 0.6, 5)
@@ -101,6 +104,7 @@ def contour(found: Contour, title: str = "") -> Figure:
     >>> ji.plot.contour(ji.Contour(*given)).axes[0].get_xlabel()
     'e[1]'
     """
+    check_kind("found", found, Contour)
     figure = new_figure(5.0)
     axes = figure.subplots()
     d, limit = np.where(np.isfinite(found.deviance), found.deviance, np.nan).T, found.limit

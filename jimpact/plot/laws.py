@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
+from jimpact._checks import check_kind
 from jimpact.comparison import Comparison
 from jimpact.contact import delassus_matrix
 from jimpact.histories import History
@@ -24,9 +25,9 @@ from jimpact.plot.style import (
     legend_within,
     new_figure,
     side_by_side,
-    unit_of_time,
     wrapped,
 )
+from jimpact.records import readable_unit
 from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
@@ -47,11 +48,15 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
+    Raises:
+        TypeError: something else.
+
     >>> import jimpact as ji
     >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
     >>> len(ji.plot.comparison(found).axes)
     2
     """
+    check_kind("found", found, Comparison)
     names, entries = list(found.entries), list(found.entries.values())
     bodies = len(found.velocity)
     what, unit = ("body", "m/s") if found.scene.walls is not None else ("coordinate", "m/s, rad/s")
@@ -167,7 +172,7 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """
     figure = new_figure(4.2)
     axes = figure.subplots()
-    unit, size = unit_of_time(max(float(h.duration) for h in histories.values()))
+    unit, size = readable_unit("s", max(float(h.duration) for h in histories.values()))
     for j, (name, h) in enumerate(histories.items()):
         time, force = np.asarray(h.time) / size, np.asarray(h.force[:, contact])
         axes.plot(time, force, color=COLOURS[j % len(COLOURS)], label=name)
@@ -190,16 +195,17 @@ def history(found: History, title: str = "") -> Figure:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        ValueError: a batch of impacts.
+        ValueError: a batch of impacts. TypeError: something else.
 
     >>> import jimpact as ji
     >>> h = ji.history(ji.LZB(1.0), ji.chain([1.0], wall=True), [1.0])
     >>> [axes.get_ylabel() for axes in ji.plot.history(h).axes]
     ['force [N]', 'gap velocity [m/s]', 'stored energy [J]']
     """
+    check_kind("found", found, History)
     if np.ndim(found.status):
         raise ValueError("Argument `found` must be of one impact, but is a batch: pick one of it.")
-    unit, size = unit_of_time(float(found.duration))
+    unit, size = readable_unit("s", float(found.duration))
     time, rows = np.asarray(found.time) / size, [found.force, found.gap_velocity, found.energy]
     figure = new_figure(6.8)
     panels = figure.subplots(3, 1, sharex=True)

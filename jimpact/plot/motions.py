@@ -12,6 +12,7 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jimpact._checks import check_kind
 from jimpact.bodies.base import Body, projected, rate_of, split_name
 from jimpact.motion.dynamics import kinetic, potential, seen_from_base
 from jimpact.motion.record import Motion
@@ -29,7 +30,8 @@ _LEGEND = 6  # coordinates that get an entry in the legend
 
 
 def one_motion(motion: Motion) -> None:
-    """Raise a ValueError for a batch."""
+    """Raise a ValueError for a batch, a TypeError for something else."""
+    check_kind("motion", motion, Motion)
     if np.ndim(motion.status):
         raise ValueError("Argument `motion` must be one motion, but is a batch: pick one of it.")
 
