@@ -42,6 +42,16 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
     return array
 
 
+def as_axis(name: str, value: Any) -> "jax.Array":
+    """`value`, a scalar or with one axis, as a floating JAX array with one axis, not empty."""
+    array = as_float_array(name, value)
+    if array.ndim > 1 or array.size == 0:
+        raise ValueError(
+            f"Argument `{name}` must be a scalar or have one axis, but has shape {array.shape}."
+        )
+    return array.reshape(-1)
+
+
 def check_values(
     name: str,
     value: Any,
@@ -99,6 +109,16 @@ def shown(value: Any) -> str:
     """A value in a message: its type where it takes more than a line."""
     text = repr(value)
     return text if "\n" not in text and len(text) < 80 else f"a {type(value).__name__}"
+
+
+def check_concrete(name: str, value: Any) -> None:
+    """Raise a TypeError where `value` is traced: what a fit needs are numbers."""
+    if is_traced(value):
+        raise TypeError(
+            f"Argument `{name}` must hold numbers, but is traced: fits run on the host, not under "
+            "jit, vmap or grad. For these, `FitProblem.residual` and `jacobian` are pure functions "
+            "of the parameters."
+        )
 
 
 def check_shape(name: str, value: Any, shape: tuple[int, ...], meaning: str) -> None:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtr
 
-from jimpact._checks import as_float_array, check_values
+from jimpact._checks import as_float_array, check_concrete, check_values
 from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 from jimpact.shots_file import ANGULAR, LINEAR, read_shots
@@ -38,7 +38,8 @@ class Experiments(eqx.Module):
         scenes: one `Scene` a shot, with the same coordinates, but any number of contacts; a law's
             entry j belongs to contact j of each. None: `fit` gets the scene.
         shots: K labels for tables and pictures; None: 1, 2, ...
-        lost_freedom: independent values that a correction has removed.
+        lost_freedom: independent values that a correction has removed from each shot, K numbers or
+            one for all.
         units: of each velocity, n times 'm/s' or 'rad/s'; None: all m/s. Without sigma, velocities
             of different units weigh as much as others of the same kinetic energy.
         sigma_pre: standard error of each `pre` value, (K, n) or a scalar, >= 0 [m/s]; with it goes
@@ -61,7 +62,7 @@ class Experiments(eqx.Module):
     sigma: jax.Array | None
     scenes: tuple[Scene, ...] | None
     shots: tuple[str, ...] = eqx.field(static=True)
-    lost_freedom: int = eqx.field(static=True)  # independent values that a correction removed
+    lost: tuple[int, ...] = eqx.field(static=True)  # of each shot, by a correction
     units: tuple[str, ...] = eqx.field(static=True)
     sigma_pre: jax.Array | None
     resolution: jax.Array | None
@@ -73,7 +74,7 @@ class Experiments(eqx.Module):
         sigma: Any = None,
         scenes: Sequence[Scene] | None = None,
         shots: Sequence[str] | None = None,
-        lost_freedom: int = 0,
+        lost_freedom: int | Sequence[int] = 0,
         units: Sequence[str] | None = None,
         sigma_pre: Any = None,
         resolution: Any = None,
@@ -112,7 +113,7 @@ class Experiments(eqx.Module):
                 f"Argument `shots` must have {len(measured)} labels, one per shot, "
                 f"but has {len(self.shots)}."
             )
-        self.lost_freedom = lost_freedom
+        self.lost = tuple(np.broadcast_to(lost_freedom, len(measured)).tolist())
         n = measured.shape[1]
         self.units = (LINEAR,) * n if units is None else tuple(units)
         if len(self.units) != n or not set(self.units) <= {LINEAR, ANGULAR}:
@@ -120,6 +121,11 @@ class Experiments(eqx.Module):
                 f"Argument `units` must have {n} entries, each '{LINEAR}' or '{ANGULAR}', "
                 f"but has value {self.units}."
             )
+
+    @property
+    def lost_freedom(self) -> int:
+        """Independent values that a correction has removed, of all shots."""
+        return sum(self.lost)
 
     @property
     def measured(self) -> np.ndarray:
@@ -192,18 +198,19 @@ class Experiments(eqx.Module):
         """
         post = np.array(self.post, dtype=float)
         variance = np.ones_like(post) if self.sigma is None else np.asarray(self.sigma, float) ** 2
-        lost = self.lost_freedom
+        lost = list(self.lost)
         for k, (m, pre, row) in enumerate(self.balances(scene)):
             if len(m) == 0 or np.isnan(row).any():
                 continue
             weighted = variance[k][:, None] * m.T
             post[k] -= weighted @ np.linalg.solve(m @ weighted, m @ (row - pre))
-            lost += len(m)
+            lost[k] += len(m)
         return self._with(post=post, lost_freedom=lost)
 
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with other fields."""
-        names = ("pre", "post", "sigma", "scenes", "shots", "lost_freedom", "units", "sigma_pre")
+        names = ("pre", "post", "sigma", "scenes", "shots", "units", "sigma_pre")
+        changed = {"lost_freedom": self.lost} | changed
         resolution = changed.pop("resolution", self.resolution)
         copy = Experiments(**({name: getattr(self, name) for name in names} | changed))
         # what it adds to sigma is there already
@@ -219,6 +226,7 @@ class Experiments(eqx.Module):
         """
         rows = np.arange(len(self.shots))[which]
         own: dict[str, Any] = {"shots": [self.shots[k] for k in rows]}
+        own["lost_freedom"] = [self.lost[k] for k in rows]
         for name in ("pre", "post", "sigma", "sigma_pre", "resolution"):
             given = getattr(self, name)
             own[name] = None if given is None else np.asarray(given)[rows]
@@ -306,6 +314,7 @@ def conserved_momenta(scene: Scene) -> np.ndarray:
 
 def _as_rows(name: str, value: Any) -> jax.Array:
     array = as_float_array(name, value)
+    check_concrete(name, array)
     array = array[None, :] if array.ndim == 1 else array
     if array.ndim != 2 or 0 in array.shape:
         raise ValueError(
@@ -317,6 +326,7 @@ def _as_rows(name: str, value: Any) -> jax.Array:
 
 def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None = None) -> jax.Array:
     sigma = as_float_array(name, value)
+    check_concrete(name, sigma)
     if sigma.shape == measured.shape[1:] and len(measured) == 1:
         sigma = sigma[None, :]
     if sigma.shape not in ((), measured.shape):
@@ -438,6 +448,9 @@ def data_defects(
     momenta: dict[int, list[tuple[int, _Defect]]] = {}
     energies, resting = [], []
     energy_ratios = experiments.energy_ratio(scene)
+    errors = None if experiments.sigma is None else np.asarray(experiments.sigma, float)
+    if errors is not None and experiments.sigma_pre is not None:
+        errors = np.hstack([errors, np.asarray(experiments.sigma_pre, float)])
     masses, closed = experiments.each(scene, dense_mass), experiments.each(scene, _closed_normals)
     for k, (rows, pre, post) in enumerate(experiments.balances(scene)):
         normals, mass = closed[k], masses[k]
@@ -446,9 +459,7 @@ def data_defects(
             resting.append(k)
         if np.isnan(post).any():
             continue
-        sigma = None if experiments.sigma is None else np.asarray(experiments.sigma[k], float)
-        if sigma is not None and experiments.sigma_pre is not None:
-            sigma = np.append(sigma, np.asarray(experiments.sigma_pre[k], float))
+        sigma = None if errors is None else errors[k]
         both = slice(None) if experiments.sigma_pre is not None else slice(len(post))
         for j, row in enumerate(rows):
             excess, scale = row @ (post - pre), np.abs(row) @ np.abs(pre)

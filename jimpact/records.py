@@ -47,6 +47,17 @@ def number(value: float | None, form: str) -> str:
     return "" if value is None or np.isnan(value) else format(value, form)
 
 
+def readable_unit(unit: str, largest: float) -> tuple[str, float]:
+    """The decimal part of an SI unit that a quantity is read best in, and its size.
+
+    >>> from jimpact.records import readable_unit
+    >>> readable_unit("m", 3e-5), readable_unit("s", 2.0)
+    (('µm', 1e-06), ('s', 1.0))
+    """
+    sizes = {unit: 1.0, f"m{unit}": 1e-3, f"µ{unit}": 1e-6, f"n{unit}": 1e-9}
+    return next((row for row in sizes.items() if largest >= row[1]), (f"n{unit}", 1e-9))
+
+
 def table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = (), keys: int = 1
 ) -> list[str]:

@@ -284,6 +284,7 @@ def interrupted(arguments, folder, moment):
     return process.returncode, told
 
 
+@pytest.mark.slow
 def test_ctrl_c_keeps_finished_chunks(tmp_path):
     path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
     run = tmp_path / "run"

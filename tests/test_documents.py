@@ -53,7 +53,7 @@ def as_a_user_runs_them(tmp_path, monkeypatch):
 
 
 LONG = (  # all rheologies, laws or methods are compiled
-    "laws.calibration", "plot.laws", "plot.charts", "methods.", "motion.fitting_motion", "comparison",
+    "laws.calibration", "plot.laws", "plot.charts", "plot.motions", "methods.", "motion.fitting_motion", "comparison",
     "plot.inference", "montecarlo.gaps", "bodies.solids",
 )  # fmt: skip
 
@@ -171,9 +171,21 @@ def test_notebook_and_script_agree(path):
     assert not any(output.output_type == "error" for output in outputs)
 
 
-@pytest.mark.long_run
+COMPILING = ("03", "04", "05", "08")  # takes most of the time of these
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(
+            path,
+            id=path.stem,
+            marks=[] if path.stem.startswith(COMPILING) else [pytest.mark.long_run],
+        )
+        for path in NOTEBOOKS
+    ],
+)
 def test_notebook_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
     place = {"metadata": {"path": str(tmp_path)}}

@@ -142,6 +142,7 @@ def test_momentum_of_the_measured_balls():
     corrected = data.momentum_corrected(CHAIN)
     np.testing.assert_allclose(corrected.post, data.post - 0.0422 / 3, atol=1e-15)
     assert corrected.lost_freedom == 1
+    assert [corrected.only(which).lost_freedom for which in ([0], [0, 0])] == [1, 2]
     assert data_defects(data, CHAIN) == [
         "The data break momentum (1 = conserved): shot 1: 1.0422; no law can reproduce that part "
         "(rms 0.0141 m/s).",
@@ -328,3 +329,19 @@ def test_a_fit_passes_errors_on_by_the_law_it_finds():
         found.standard_error / max(found.noise, 1), information**-0.5, rtol=1e-4
     )
     assert "those of the velocities before, passed on by the law" in str(found)
+    (many,) = ji.fit_many(ji.Newton(0.1), ji.chain([m1, m2]), [data])
+    np.testing.assert_allclose(many.value, found.value, rtol=1e-6)
+    np.testing.assert_allclose(many.standard_error, found.standard_error, rtol=1e-4)
+    np.testing.assert_allclose(found.jacobian[..., 0], slope, rtol=1e-9)
+    spread = ji.bootstrap(found, 400).value.std()
+    np.testing.assert_allclose(spread, found.standard_error[0], rtol=0.1)
+
+    robust = ji.fit(ji.Newton(0.1), ji.chain([m1, m2]), data, loss="student", starts=1)
+    covariance = 0.02**2 * np.eye(2)
+    covariance += jacobian(robust.value[0]) @ np.diag(before**2) @ jacobian(robust.value[0]).T
+    size = np.sqrt(np.diag(covariance))
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance / np.outer(size, size))) / size
+    u = (post - pre @ jacobian(robust.value[0]).T) @ whiten.T
+    psi = u / (4 + u**2)  # of Student's t with 4 degrees of freedom, but for a factor
+    gradient = np.sum(psi * (slope @ whiten.T))
+    assert abs(gradient) * robust.standard_error[0] < 1e-4

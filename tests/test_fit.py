@@ -652,6 +652,14 @@ def test_bad_profiles(options, message):
 # --------------------------------------------------------------------- many fits
 
 
+def test_fits_under_transformations_are_refused_in_words():
+    data = ji.Experiments(SHOTS, SHOTS)
+    with pytest.raises(TypeError, match="`law` must hold numbers, but is traced: fits run on"):
+        jax.grad(lambda e: ji.fit(ji.Newton(e), PAIR, data).rms)(0.5)
+    with pytest.raises(TypeError, match="`post` must hold numbers, but is traced"):
+        jax.vmap(lambda post: ji.Experiments(SHOTS, post).post)(jnp.ones((2, 4, 2)))
+
+
 def test_many_data_sets_are_fitted_as_one_by_one():
     posts = [simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02, seed=k) for k in range(5)]
     sets = [ji.Experiments(SHOTS[: 2 + k % 3], post[: 2 + k % 3]) for k, post in enumerate(posts)]

@@ -419,6 +419,19 @@ def test_lzb_of_a_flat_block():
 
 
 @pytest.mark.slow
+def test_a_flat_block_at_a_fine_tolerance():
+    """How the corners share what they hold is known to 1e-8 only: no step need be short for it."""
+    e, mu = np.array([0.71, 0.58, 0.98, 0.47]), np.array([0.81, 0.83, 0.71, 0.42])
+    v = np.array([[0.10, -0.54, 0.36], [0.41, -1.04, -0.13], [-0.31, -1.46, 1.96], [-0.2, -1, 0.9]])
+    block = ji.rocking_block(1.0, 2.0)
+
+    def fine(e, mu, v):
+        return ji.impact(ji.LZB(e, friction=mu, rtol=1e-12, max_steps=3000), block, v)
+
+    assert not np.any(jax.jit(jax.vmap(fine))(e, mu, v).status)
+
+
+@pytest.mark.slow
 def test_lzb_in_space():
     """The frame of the tangents does not matter; a motion in a plane is planar."""
     rng = np.random.default_rng(3)

@@ -199,8 +199,14 @@ def test_hard_points(point):
 
 
 @pytest.mark.long_run
-@pytest.mark.slow
-@pytest.mark.parametrize("point", HARD_LATER, ids=HARD_LATER.get)
+@pytest.mark.parametrize(
+    "point",
+    [  # twenty balls are a program that only those tests have
+        pytest.param(x, marks=pytest.mark.release if x == 4 else pytest.mark.slow)
+        for x in HARD_LATER
+    ],
+    ids=HARD_LATER.get,
+)
 def test_hard_points_after_many_steps(point):
     check_right(point, MANY_STEPS)
 

@@ -246,7 +246,7 @@ def shaken(x):
     [
         pytest.param(collides, [0.9, 0.3, 0.1], 2, 1e-4, 1e-8, marks=pytest.mark.release),
         # the plate of 2 cm: differences see no more
-        pytest.param(shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7, marks=pytest.mark.slow),
+        pytest.param(shaken, [0.02, 5.0, 0.7], 3, 4e-6, 1e-7, marks=pytest.mark.release),
     ],
 )
 def test_derivatives_of_a_motion_against_differences(given, at, events, step, allowed):

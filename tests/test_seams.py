@@ -214,7 +214,7 @@ TOUCHY = (  # masses, e, k
 )
 
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 def test_ill_conditioned_is_told_and_nothing_else_is(dtype):
     @jax.jit
     @jax.vmap

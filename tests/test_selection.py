@@ -348,6 +348,33 @@ def test_priors_are_declared_like_domains(found):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("lenient")
+def test_posterior_of_an_admissible_matrix_is_that_of_a_grid():
+    pytest.importorskip("numpyro")
+    pytest.importorskip("arviz")
+    balls, law = ji.chain([1.0] * 3), ji.RestitutionMatrix([[0.5, 0.1], [0.15, 0.4]])
+    pre = np.array([[1.0, 0, 0], [1, 0, -1], [0, 0, -1], [1, 0.2, -0.5]])
+    post = np.array([ji.impact(law, balls, v).velocity for v in pre])
+    post += 0.15 * np.random.default_rng(0).normal(size=post.shape)
+    free = {"matrix": np.array([[False, True], [True, False]])}
+    fitted = ji.fit(law, balls, ji.Experiments(pre, post, 0.15), free, starts=1)
+    drawn = ji.posterior(fitted, samples=800, warmup=300, chains=2).posterior
+    x = np.stack([np.ravel(drawn[name]) for name in fitted.names])
+
+    problem, region = fitted.problem, fitted.problem.residuals.region
+    middle = (np.arange(40) + 0.5) / 40
+    grid = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 2)
+    slack, density = jax.jit(
+        jax.vmap(lambda y, x: (region.conditions(y)[0].min(), problem.log_density(x)))
+    )(problem.point(grid), grid)
+    weight = np.where(slack >= 0, np.exp(density - np.max(density)), 0.0)
+    weight /= weight.sum()
+    mean = weight @ grid
+    np.testing.assert_allclose(x.mean(axis=1), mean, atol=0.015)
+    np.testing.assert_allclose(x.std(axis=1), np.sqrt(weight @ (grid - mean) ** 2), rtol=0.1)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("priors", "message"),
     [

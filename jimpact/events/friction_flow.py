@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jimpact.events.contact_flow import (
     COMPRESSION,
@@ -42,6 +43,11 @@ AHEAD = 1e-6  # of the unit of time: at the first touch there are no forces yet 
 SHARING = 1.0
 REFINEMENTS = 1
 LEFT = 0.1  # of the tolerance: a loaded contact with less energy ends the impact all the same
+
+
+def ridge(dtype: Any) -> float:
+    """The weight."""
+    return SHARING * math.sqrt(float(jnp.finfo(dtype).eps))
 
 
 def solve(matrix: jax.Array, *right: jax.Array) -> list[jax.Array]:
@@ -157,6 +163,15 @@ class FrictionFlow(ContactFlow):
 
     # ---- the protocol
 
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
+        """How contacts share what they hold is as good as the rounding beside the weight allows.
+
+        It changes no velocity, and all else of lambda is linear in F while the modes last.
+        """
+        m = self.contacts
+        shares = (np.arange(len(y)) // m == 4)[:, None]
+        return jnp.where(shares, jnp.maximum(ridge(y.dtype) / self.tolerance, 1.0), 1.0)
+
     def loaded(self, modes: jax.Array) -> jax.Array:
         phase = modes[: self.contacts]
         return (phase == COMPRESSION) | (phase == EXPANSION)
@@ -167,14 +182,13 @@ class FrictionFlow(ContactFlow):
         stick = (slip == 0) & self.loaded(modes)
         drag = -slip.astype(self.friction.dtype) * self.friction
         k = jnp.where(stick[:, None] & stick[None], self.along, 0.0)
-        share = SHARING * math.sqrt(float(jnp.finfo(k.dtype).eps))
         return Modes(
             frozen=super().constants(modes),
             stick=stick,
             drag=drag,
             pull=jnp.swapaxes(self.across, 0, 1) + self.along * drag[None],
             along=k,
-            share=jnp.where(stick, share, 1.0),
+            share=jnp.where(stick, ridge(k.dtype), 1.0),
         )
 
     def forces(self, const: Modes, y: jax.Array) -> Forces:

@@ -46,19 +46,17 @@ def unusable(problem: FitProblem, found: Search) -> np.ndarray:
 
 def weighted(problem: FitProblem, found: Search) -> Weighted:
     """Residuals and derivatives as the tests need them."""
-    r, here = problem.residuals, ~np.isnan(problem.measured)
-    size = float(r.size)
-    error = np.nan_to_num(problem.measured) - found.seen
+    here = ~np.isnan(problem.measured)
     rows = np.arange(len(here)) if here.ndim else np.zeros(1, int)
     shot = np.broadcast_to(rows.reshape(-1, *(1,) * (here.ndim - 1)), here.shape)
     return Weighted(
-        (size * np.asarray(r.mixed(np.asarray(r.weight, float) * error)))[here],
-        size * found.jacobian[here.ravel()],
+        problem.independent(problem.measured - found.seen)[here],
+        float(problem.residuals.size) * found.jacobian[here.ravel()],
         shot[here],
     )
 
 
-def adequacy(problem: FitProblem, found: Search, rank: int) -> list[str]:
+def adequacy(problem: FitProblem, found: Search, rank: int, robust: bool) -> list[str]:
     """Lack of fit and suspicious shots, in words; nothing of data that are reproduced exactly."""
     data = weighted(problem, found)
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
@@ -71,12 +69,13 @@ def adequacy(problem: FitProblem, found: Search, rank: int) -> list[str]:
             lines.append(
                 f"Lack of fit: the residuals are {times:.2g} times what sigma allows (chi^2 = "
                 f"{squares:.4g} with {freedom} degrees of freedom): the law or the stated errors "
-                "are wrong, or the parameters scatter; the standard errors are stretched by that."
+                "are wrong, or the parameters scatter; the standard errors "
+                f"{'are those of the loss' if robust else 'are stretched by that'}."
             )
     elif problem.experiments is not None:
         lines += _beyond_noise(problem, data, freedom) or _pattern(problem, data, freedom)
     if problem.experiments is not None:
-        lines += _suspicious(problem, data, freedom)
+        lines += _suspicious(problem, data, freedom, robust)
     return lines
 
 
@@ -144,9 +143,9 @@ def _noise(problem: FitProblem, data: Weighted) -> tuple[float, int]:
 def _conserved(problem: FitProblem) -> list[np.ndarray]:
     """Of every shot the directions (n, c) in which residuals are momentum: orthonormal columns."""
     assert problem.experiments is not None
-    weight = np.asarray(problem.residuals.weight, float) * float(problem.residuals.size)
     found, mixing = [], problem.residuals.mixing
-    for k, ((rows, _, _), w) in enumerate(zip(problem.experiments.balances(problem.scene), weight)):
+    balances = problem.experiments.balances(problem.scene)
+    for k, ((rows, _, _), w) in enumerate(zip(balances, problem.weight)):
         whole = (w > 0).all() and len(rows)
         back = (rows / w).T if whole else np.zeros((len(w), 0))
         if whole and mixing is not None:
@@ -161,8 +160,7 @@ def _reading_variance(problem: FitProblem) -> float:
     largest = np.abs(values).max()
     for digits in range(9):
         if np.abs(values - values.round(digits)).max() <= 1e-9 * largest:
-            weight = float(problem.residuals.weight.max()) * float(problem.residuals.size)
-            return weight**2 * 10.0 ** (-2 * digits) / 12
+            return float(problem.weight.max()) ** 2 * 10.0 ** (-2 * digits) / 12
     return 0.0
 
 
@@ -204,7 +202,7 @@ def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
     return u[:, singular > _RANGE * (singular[0] if size is None else size)]
 
 
-def _suspicious(problem: FitProblem, data: Weighted, freedom: int) -> list[str]:
+def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool) -> list[str]:
     """Shots that the others, fitted without them, would not expect."""
     assert problem.experiments is not None
     known, labels = _range(data.jacobian), problem.experiments.shots
@@ -224,9 +222,10 @@ def _suspicious(problem: FitProblem, data: Weighted, freedom: int) -> list[str]:
             found.append((own, labels[k]))
     if not found:
         return []
+    advice = "" if robust else ", or fit with loss='huber'"
     worst = ", ".join(label for _, label in sorted(found, reverse=True)[:_LISTED])
     more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
     return [
         f"Suspicious: shot{'s' * (len(found) > 1)} {worst}{more}, which the others do not expect "
-        f"(of {count}); look there for errors, or fit with loss='huber'."
+        f"(of {count}); look there for errors{advice}."
     ]

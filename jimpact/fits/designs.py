@@ -11,7 +11,7 @@ from jimpact.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import Box
 from jimpact.fits.multistart import repeated, run
-from jimpact.fits.problem import FitProblem, filled_up, to_scaled
+from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
 
 # Information that is added to that of the data, in shares of their largest: where they cannot see a
@@ -56,7 +56,7 @@ def design(
         fit: to shots, with a known noise.
         candidates: velocities before (K, n), scenes where they differ; of `post` it only counts
             what is measured (NaN: is not). Without sigma, the noise of the fit, or the median of
-            its sigma.
+            its sigma (stretched as the fit's errors are).
         scene: of the candidates; None: that of the fit.
         count: how many to choose; one may be chosen several times.
         target: name of the parameter that is wanted; None: all.
@@ -84,11 +84,10 @@ def design(
     own = fit.problem.scene if scene is None else scene
     problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.free)
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
-    noise = (
-        fit.noise
-        if fit.experiments.sigma is None
-        else float(np.nanmedian(np.asarray(fit.problem.sigma)))
-    )
+    noise = fit.noise
+    if fit.experiments.sigma is not None:  # which weigh candidates of other units as `fit` does
+        worth = fit.experiments.natural_errors(fit.problem.scene)
+        noise *= float(np.nanmedian(np.asarray(fit.problem.sigma) / worth))
     each = _information(problem, fit, 1.0 if candidates.sigma is not None else noise)
     known = known + _RIDGE * np.trace(known + each.sum(axis=0)) * np.eye(len(known))
     first = fit.problem.parameters.first
@@ -112,10 +111,8 @@ def design(
 
 def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     """`J^T J / noise^2` (K, P, P) of every shot at the parameters of the fit, in scaled form."""
-    residuals, r, first = filled_up(problem.residuals), fit.problem.residuals, problem.parameters
-    y = np.zeros(len(r.offset))
-    log = np.asarray(r.log)[first.first]
-    y[: len(first.names)] = to_scaled(fit.value, np.asarray(r.scale, float)[first.first], log)
+    residuals, r = filled_up(problem.residuals), fit.problem.residuals
+    y = fit.problem.point(fit.value)
     ends: Any = Box(*np.broadcast_to(y.astype(r.offset.dtype), (2, len(y))))  # held there
     parts = (r.mix, r.offset, r.scale, ends.low, ends.high, ends)
     here = eqx.tree_at(
@@ -124,5 +121,5 @@ def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     states = run(repeated(here, 1), y[None], "levenberg-marquardt", 1, lambda *told: None)
     shape = (*problem.measured.shape, -1)
     slopes = np.asarray(states.jacobian[0][: problem.measured.size], float)
-    rows = slopes.reshape(shape)[..., : len(first.names)] * float(problem.residuals.size) / noise
+    rows = slopes.reshape(shape)[..., : len(fit.names)] * float(problem.residuals.size) / noise
     return np.einsum("kip,kiq->kpq", rows, rows)

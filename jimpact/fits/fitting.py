@@ -8,11 +8,11 @@ from typing import Any, Generic, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice
+from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.experiments import Experiments
 from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.least_squares import Method, check_method, default_steps
-from jimpact.fits.multistart import Minimum, Search, search, search_near
+from jimpact.fits.multistart import Minimum, Search, ends, search, search_near, settled
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.profiles import (
@@ -34,7 +34,6 @@ HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the effic
 STUDENT = 4.0  # degrees of freedom of the tails
 MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 ROUNDS = 50  # of weights
-SETTLED = 1e-5  # the same, where errors of v- are passed on: far below any standard error
 SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 
 
@@ -224,12 +223,14 @@ def fit(
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
         starts: number of starts, the first from the law's values, the others random; if
-            more than one, further ones around the best follow as long as they improve it.
+            more than one, further ones around the best follow as long as they improve it, and,
+            of up to 64 shots, scans for other minima of what is fitted in its logarithm.
         seed: of the random starts.
         max_steps: iterations per start.
-        profiles: whether intervals are those of `profile`; None: of up to 64 shots, where standard
-            errors cannot be trusted: at a bound, in a valley, with several minima, or where the
-            data hardly see a parameter.
+        profiles: whether intervals are those of `profile`; None: where standard errors cannot be
+            trusted (at a bound, in a valley, with several minima, or where the data hardly see a
+            parameter), of up to 256 shots, with a single start of up to 64; else the report says
+            how to get them.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 
     Returns:
@@ -263,8 +264,12 @@ def fit(
         problem = _without(problem, lost)
         found = search(problem, method, starts, seed, steps, progress)
     if problem.residuals.mixing is not None:
-        problem, found = _errors_before(problem, found, method, steps)
-    robust = _robust(problem, found, loss, method, steps) if loss != "squares" else None
+        points = problem.point(np.array([end.value for end in found.minima]))
+        (problem,), states = settled([problem], points, method, steps)
+        found = ends(problem, states, np.array([end.starts for end in found.minima]), found.lost)
+    robust = None
+    if loss != "squares":
+        problem, robust = _robust(problem, found, loss, method, steps)
     end = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
     if profiles:
         return replace(end, profiles=profile(end, progress=progress))
@@ -273,18 +278,13 @@ def fit(
     return end
 
 
-def _errors_before(
-    problem: FitProblem, found: Search, method: Method, max_steps: int
-) -> tuple[FitProblem, Search]:
-    """Errors of v- passed on as the law that is found does, until both agree."""
-    for _ in range(ROUNDS):
-        before = found.y
-        law = with_entries(problem.law, problem.residuals.fields, jnp.asarray(found.entries))
-        problem = problem.with_errors_before(law)
-        found = search_near(problem, found.y, method, max_steps)
-        if np.abs(found.y - before).max() <= SETTLED:
-            break
-    return problem, found
+def check_squares(name: str, found: Any) -> None:
+    """Raise an error unless this is a fit by least squares."""
+    check_kind(name, found, Fit)
+    if found.loss != "squares":
+        raise ValueError(
+            f"Argument `{name}` must be by least squares, but has loss {found.loss!r}."
+        )
 
 
 def _rms(problem: FitProblem, residual: np.ndarray) -> float:
@@ -309,7 +309,7 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
 
 
 class Robust(NamedTuple):
-    """The end of a search, the factors its loss puts on the weights, and its noise."""
+    """The end of a search, factors its loss puts on the weights, noise times root of freedom."""
 
     found: Search
     factor: np.ndarray
@@ -333,16 +333,15 @@ LOSSES = {"huber": _huber, "student": _student}
 
 def _robust(
     problem: FitProblem, found: Search, loss: str, method: Method, max_steps: int
-) -> Robust:
+) -> tuple[FitProblem, Robust]:
     """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
 
     Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
     """
-    factor = np.ones(problem.measured.shape)
     here = ~np.isnan(problem.measured)
-    weight = np.asarray(problem.residuals.weight, float) * float(problem.residuals.size)
     for _ in range(ROUNDS):
-        error = weight * (np.nan_to_num(problem.measured) - found.seen)
+        problem = problem.passing_errors_at(found.y)
+        error = problem.independent(problem.measured - found.seen)
         scale = 1.0
         if problem.sigma is None:
             scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
@@ -351,10 +350,11 @@ def _robust(
         found = search_near(problem.weighed(factor), found.y, method, max_steps)
         if np.abs(found.y - before).max() <= SAME:
             break
+    else:
+        found = found._replace(converged=False)
     psi = (share * error / scale)[here]
-    freedom = max(int(here.sum()) - len(problem.names), 1)
-    noise = scale * np.sqrt(np.sum(psi**2) / freedom) / max(slope[here].mean(), SAME)
-    return Robust(found, factor, float(noise))
+    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
+    return problem, Robust(found, factor, float(noise))
 
 
 def as_fit(
@@ -362,25 +362,19 @@ def as_fit(
 ) -> Fit[Any]:
     """Errors, rank and warnings at the end of a search."""
     if robust is not None:  # as without the factors, but for the place
-        found, factor = robust.found, robust.factor
-        r, weighed = problem.residuals, problem.weighed(factor).residuals
-        back = float(weighed.size) / float(r.size) / factor.reshape(-1, 1)
-        weight = np.asarray(r.weight, float)
-        left = weight * (np.nan_to_num(problem.measured) - found.seen)
-        squares = float(np.sum(np.asarray(r.mixed(left)) ** 2))
-        jacobian = back * found.jacobian
-        if r.mixing is not None:  # which comes after the factors
-            mixing, each = np.asarray(r.mixing, float), factor[..., None]
-            alone = np.linalg.solve(
-                mixing, (jacobian * factor.reshape(-1, 1)).reshape(*each.shape[:-1], -1)
-            )
-            jacobian = (mixing @ (alone / each)).reshape(jacobian.shape)
-        minima = [Minimum(squares, found.value, 1, jacobian)]
-        found = found._replace(jacobian=jacobian, minima=minima)
+        found, weighed = robust.found, problem.weighed(robust.factor).residuals
+        back = float(weighed.size) / float(problem.residuals.size) / robust.factor.reshape(-1, 1)
+        left = problem.independent(problem.measured - found.seen) / float(problem.residuals.size)
+        end = Minimum(float(np.sum(left**2)), found.value, 1, back * found.jacobian)
+        found = found._replace(jacobian=end.jacobian, minima=[end])
     residuals, names = problem.residuals, problem.names
     size = float(residuals.size)
-    spread = _spread(problem, found, found.minima[0], robust.noise if robust else None)
-    if robust is None and problem.sigma is not None:
+    spread = _spread(problem, found, found.minima[0])
+    if robust is not None:
+        freedom = max(spread.degrees_of_freedom, 1)
+        noise = robust.noise / np.sqrt(freedom)
+        spread = _spread(problem, found, found.minima[0], noise)
+    elif problem.sigma is not None:
         times = stretch(problem, weighted(problem, found), spread.rank)
         spread = _spread(problem, found, found.minima[0], times) if times > 1 else spread
     residual = np.asarray(problem.measured, float) - found.seen
@@ -410,7 +404,7 @@ def as_fit(
         converged=found.converged,
         steps=found.steps,
         lost_starts=found.lost,
-        warnings=tuple(fit_warnings(problem, found, spread)),
+        warnings=tuple(fit_warnings(problem, found, spread, robust is not None)),
         problem=problem,
         jacobian=_slopes(problem, found),
     )
@@ -418,10 +412,8 @@ def as_fit(
 
 def _slopes(problem: FitProblem, found: Search) -> np.ndarray:
     """Derivatives of what was measured in the parameters themselves; NaN where nothing was."""
-    weight = np.broadcast_to(np.asarray(problem.residuals.weight, float), problem.measured.shape)
     slope = found.jacobian.reshape(*problem.measured.shape, len(problem.names)) / found.scale
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(weight[..., None] > 0, slope / weight[..., None], np.nan)
+    return problem.errors_of(float(problem.residuals.size) * slope)
 
 
 def _spread(

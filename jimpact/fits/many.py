@@ -1,7 +1,8 @@
 """Many fits side by side in the lanes of one program: data sets, bootstrap, shots left out."""
 
+import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -10,11 +11,12 @@ import numpy as np
 
 from jimpact._checks import as_whole
 from jimpact.experiments import Experiments
-from jimpact.fits.fitting import Fit, as_fit
+from jimpact.fits.adequacy import unusable
+from jimpact.fits.fitting import Fit, as_fit, check_squares, fit
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import ends, repeated, run, start_points
+from jimpact.fits.multistart import Search, at_minimum, ends, repeated, run, settled, start_points
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
-from jimpact.fits.problem import FitProblem, Residuals, filled_up, from_scaled, to_scaled
+from jimpact.fits.problem import FitProblem, Residuals, filled_up
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
 
@@ -36,7 +38,7 @@ def fit_many(
     """`fit` of one law to each of many data sets, side by side in one compiled program.
 
     Data sets of up to 4, 16, 64, 128, ... shots share a program. Arguments and errors as of `fit`;
-    `starts` are those of each data set.
+    `starts` are those of each data set; around the best, and in scans, none are added.
 
     Args:
         law: start values of all.
@@ -77,23 +79,41 @@ def fit_many(
                 lambda *x: np.repeat(np.stack([np.asarray(each) for each in x]), starts, axis=0),
                 *(filled[k] for k in group),
             )
+            own = [problems[k] for k in group]
             states = run(stacked, points, _METHOD, max_steps, show, rivals=False)
-            for i, k in enumerate(group):
-                own = jax.tree.map(lambda x, i=i: x[i * starts : (i + 1) * starts], states)
-                found[k] = as_fit(problems[k], ends(problems[k], own), _METHOD)
+            searches = _searches(own, states)
+            if stacked.mixing is not None:
+                best = np.array([search.y for search in searches])
+                own, states = settled(own, best, _METHOD, max_steps, show)
+                searches = _searches(own, states)
+            for k, problem, search in zip(group, own, searches):
+                if unusable(problem, search).any():  # what is left is another problem
+                    options: dict[str, Any] = {"starts": starts, "seed": seed, "profiles": False}
+                    found[k] = fit(problems[k], max_steps=max_steps, progress=False, **options)
+                else:
+                    found[k] = as_fit(problem, search, _METHOD)
     return [found[k] for k in range(len(problems))]
+
+
+def _searches(problems: list[FitProblem], states: SolverState) -> list[Search]:
+    """The ends of each problem, all of which have equally many starts."""
+    each = len(states.y) // len(problems)
+    rows = [slice(i * each, (i + 1) * each) for i in range(len(problems))]
+    return [ends(p, jax.tree.map(operator.itemgetter(r), states)) for p, r in zip(problems, rows)]
 
 
 @dataclass(frozen=True, eq=False)
 class Refits:
     """Parameters `value` (B, P), by `names`, of fits to changed data.
 
-    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s].
+    `predicted` (B, ...) is what each predicts, shaped like what was measured [m/s]; `converged`
+    (B,) which of the fits have.
     """
 
     names: tuple[str, ...]
     value: np.ndarray
     predicted: np.ndarray
+    converged: np.ndarray
 
     def interval(self, level: float = 0.95) -> np.ndarray:
         """Quantiles (P, 2) between which the share `level` of the values lies."""
@@ -107,7 +127,8 @@ def bootstrap(
 ) -> Refits:
     """Fits to data that the fitted law made, with the noise of the fit (parametric bootstrap).
 
-    Equation: `v+* = v+(law) + sigma z`, z standard normal; sigma as stated, else `fit.noise`.
+    Equation: `v+* = v+(law) + sigma z`, z standard normal; sigma as stated, else `fit.noise`;
+    errors of v- are passed on by the law.
 
     Args:
         fit: with a known noise.
@@ -119,7 +140,7 @@ def bootstrap(
         `Refits` with `value` (B, P).
 
     Raises:
-        ValueError: samples < 1; a noise that is not known.
+        ValueError: samples < 1; a noise that is not known; a robust loss.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.11, 0.88], [0.2, 1.81]], sigma=0.02)
@@ -129,22 +150,17 @@ def bootstrap(
     True
     """
     as_whole("samples", samples, 1)
+    check_squares("fit", fit)
     if not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must have a known noise, but its noise is not finite.")
-    residuals = filled_up(fit.problem.residuals)
-    shape = fit.predicted.shape
-    weight = np.asarray(residuals.weight, float) * float(residuals.size)
-    measured = np.repeat(np.asarray(residuals.measured, float)[None], samples, axis=0)
-    rows = slice(len(fit.predicted)) if shape else ()
-    here = weight[rows] > 0
-    sigma = fit.noise / np.where(here, weight[rows], 1.0)
+    residuals, shape = filled_up(fit.problem.residuals), fit.predicted.shape
     z = np.random.default_rng(seed).normal(size=(samples, *shape))
-    measured[(slice(None), rows) if shape else slice(None)] = np.where(
-        here, fit.predicted + sigma * z, 0.0
-    )
-    many = repeated(residuals, samples)
-    many = eqx.tree_at(lambda r: r.measured, many, measured.astype(residuals.measured.dtype))
-    return _refits(fit, many, samples, progress)
+    errors = fit.problem.errors_of(fit.noise * np.moveaxis(z, 0, -1))
+    measured = np.zeros((samples, *residuals.measured.shape), residuals.measured.dtype)
+    rows = (slice(None), slice(len(fit.predicted))) if shape else slice(None)
+    measured[rows] = np.nan_to_num(fit.predicted + np.moveaxis(errors, -1, 0))
+    many = eqx.tree_at(lambda r: r.measured, repeated(residuals, samples), measured)
+    return _refits(fit, [fit.problem] * samples, many, progress)
 
 
 def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
@@ -161,7 +177,7 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
         `Refits` with `value` (K, P).
 
     Raises:
-        ValueError: a fit to something else than at least two shots.
+        ValueError: a fit to something else than at least two shots; a robust loss.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.1, 0.9], [0.6, 1.4]])
@@ -169,6 +185,7 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     >>> ji.leave_one_out(found).value.round(6).tolist()
     [[0.4], [0.8]]
     """
+    check_squares("fit", fit)
     shots = 0 if fit.experiments is None else len(fit.predicted)
     if shots < 2:
         raise ValueError(f"Argument `fit` must be of at least 2 shots, but has {shots}.")
@@ -176,19 +193,24 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     weight = np.repeat(np.asarray(residuals.weight)[None], shots, axis=0)
     weight[np.arange(shots), np.arange(shots)] = 0.0
     many = eqx.tree_at(lambda r: r.weight, repeated(residuals, shots), weight)
-    found = _refits(fit, many, shots, progress)
+    each = np.eye(shots)[:, :, None] * np.ones(fit.predicted.shape)
+    problems = [fit.problem.weighed(1 - own) for own in each]
+    found = _refits(fit, problems, many, progress)
     one_each = found.predicted[np.arange(shots), np.arange(shots)]
-    return Refits(found.names, found.value, one_each)
+    return replace(found, predicted=one_each)
 
 
-def _refits(fit: Fit, many: Residuals, count: int, progress: float | None) -> Refits:
-    """Minima of so many problems next to a fit."""
-    r, first = fit.problem.residuals, fit.problem.parameters.first
-    scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
-    y = np.zeros((count, len(r.offset)))
-    y[:, : len(first)] = to_scaled(fit.value, scale, log)
+def _refits(
+    fit: Fit, problems: list[FitProblem], many: Residuals, progress: float | None
+) -> Refits:
+    """Minima of these problems next to a fit."""
+    points, limit = (
+        np.tile(fit.problem.point(fit.value), (len(problems), 1)),
+        DEFAULT_STEPS[_METHOD],
+    )
     with progress_bar(progress) as show:
-        states: SolverState = run(many, y, _METHOD, DEFAULT_STEPS[_METHOD], show, rivals=False)
-    value = from_scaled(np.asarray(states.y, float)[:, : len(first)], scale, log)
+        _, states = settled(problems, points, _METHOD, limit, show, many)
+    value = fit.problem.values_at(np.asarray(states.y, float))
     seen = np.asarray(states.kept[0], float)
-    return Refits(fit.names, value, seen[:, : len(fit.predicted)] if fit.predicted.ndim else seen)
+    seen = seen[:, : len(fit.predicted)] if fit.predicted.ndim else seen
+    return Refits(fit.names, value, seen, at_minimum(states))

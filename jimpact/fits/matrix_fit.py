@@ -116,12 +116,12 @@ class AdmissibleMatrices(eqx.Module):
 
         Differentiated (in line searches) as if the share of the way stayed the same.
         """
-        share = self._share(jax.lax.stop_gradient(y))
+        share = self.share(jax.lax.stop_gradient(y))
         short = 1 - _SHORT * jnp.finfo(y.dtype).eps
         inside = self.center + short * share * (y - self.center)
         return jnp.where(share < 1, inside, y)
 
-    def _share(self, y: jax.Array) -> jax.Array:
+    def share(self, y: jax.Array) -> jax.Array:
         """How much of the way from the center to y is admissible, at most 1."""
         here, there = self.elementwise(self.center), self.elementwise(y)
         crossed = there < 0

@@ -44,6 +44,7 @@ START_RESTITUTION = 0.3
 # Starts around the best find lower ones; they repeat while they gain.
 ROUNDS = 5
 NEAR_SPREAD = 2.0  # standard errors
+SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 NEAR_RCOND = 1e-10  # directions the data cannot see are not searched
 
 # Impacts map a stiffness ratio many to one: three balls of ratio 40 come apart as those of up to
@@ -120,15 +121,57 @@ def search(
             points = _valleys(problem, residuals, states, show)
             if len(points):
                 more = run(repeated(residuals, len(points)), points, method, max_steps, show)
-                kept = _converged(more)
+                kept = at_minimum(more)
                 states = jax.tree.map(lambda a, b: np.concatenate([a, b[kept]]), states, more)
     return ends(problem, states)
+
+
+def _quiet(what: str, done: float, total: float) -> None:
+    """No progress is shown."""
 
 
 def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Search:
     """The minimum next to y (Q,)."""
     residuals = repeated(filled_up(problem.residuals), 1)
-    return ends(problem, run(residuals, y[None], method, max_steps, lambda *told: None))
+    return ends(problem, run(residuals, y[None], method, max_steps, _quiet))
+
+
+def settled(
+    problems: list[FitProblem],
+    points: np.ndarray,
+    method: Method,
+    max_steps: int,
+    show: Show = _quiet,
+    many: Residuals | None = None,
+) -> tuple[list[FitProblem], SolverState]:
+    """Minima next to points (S, Q), equally many of each problem, its best one first.
+
+    Errors of v- are passed on as the law of the best does that is found, until both agree. `many`:
+    other residuals (S, ...) than the problems', whose weights alone are taken.
+    """
+    each = len(points) // len(problems)
+    best = np.arange(0, len(points), each)
+    if many is None:
+        every = [filled_up(problem.residuals) for problem in problems for _ in range(each)]
+        many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *every)
+    for _ in range(SETTLING):
+        if many.mixing is not None:
+            problems = [p.passing_errors_at(points[b]) for p, b in zip(problems, best)]
+            weights = [_weights(filled_up(p.residuals)) for p in problems]
+            stacked = (np.repeat(np.stack(x), each, axis=0) for x in zip(*weights))
+            many = eqx.tree_at(_weights, many, tuple(stacked))
+        states = run(many, points, method, max_steps, show, rivals=False)
+        before, points = points, np.asarray(states.y, float)
+        moved = np.abs(points - before).max(axis=1) > SETTLED
+        if many.mixing is None or not moved.any():
+            return problems, states
+        cost = states.cost.reshape(-1, each)
+        best = np.arange(0, len(points), each) + np.nanargmin(cost, axis=1)
+    return problems, eqx.tree_at(lambda s: s.gain, states, np.where(moved, np.inf, states.gain))
+
+
+def _weights(residuals: Residuals) -> tuple[Any, ...]:
+    return residuals.weight, residuals.size, residuals.mixing
 
 
 def repeated(residuals: Residuals, count: int) -> Residuals:
@@ -154,7 +197,7 @@ def run(
     """
     few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
     most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
-    lanes = most if few else min(len(points), most)
+    lanes = most if few or len(points) > 1 else 1  # not a program for each number of points
     points = points.astype(problems.offset.dtype)
     limit: Any = max_steps
     if method == "levenberg-marquardt":
@@ -221,8 +264,11 @@ def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray
     return leaf
 
 
-def ends(problem: FitProblem, states: SolverState) -> Search:
-    """Pick the best end (the states are on the host)."""
+def ends(
+    problem: FitProblem, states: SolverState, counts: np.ndarray | None = None, lost: int = 0
+) -> Search:
+    """Pick the best end (the states are on the host); counts: of the starts that a state is for."""
+    counts = np.ones(len(states.y), int) if counts is None else counts
     parameters, r = problem.parameters, problem.residuals
     count, first = len(parameters.names), parameters.first
     scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
@@ -230,7 +276,7 @@ def ends(problem: FitProblem, states: SolverState) -> Search:
     squares = 2 * np.asarray(states.cost, float)
     values = from_scaled(np.asarray(y, float), scale, log)
     exact = EXACT[str(y.dtype)]
-    converged = _converged(states)
+    converged = at_minimum(states)
     groups = _groups(squares, y, converged, exact)
     best = groups[0][0]
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
@@ -255,13 +301,15 @@ def ends(problem: FitProblem, states: SolverState) -> Search:
         at_bound=(y[best] <= low) | (y[best] >= high),
         steps=int(np.max(states.steps)),
         minima=[
-            Minimum(float(squares[g[0]]), values[g[0]], len(g), slopes(g[0])) for g in ends if g
+            Minimum(float(squares[g[0]]), values[g[0]], int(counts[g].sum()), slopes(g[0]))
+            for g in ends
+            if g
         ],
-        lost=len(y) - sum(len(g) for g in ends),
+        lost=lost + int(counts.sum() - sum(counts[g].sum() for g in ends)),
     )
 
 
-def _converged(states: SolverState) -> np.ndarray:
+def at_minimum(states: SolverState) -> np.ndarray:
     """Which of the states (S,) are at a minimum."""
     squares = 2 * np.asarray(states.cost, float)
     exact = squares <= EXACT[str(states.y.dtype)]

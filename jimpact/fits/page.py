@@ -10,11 +10,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import equinox as eqx
 import numpy as np
 
 import jimpact
-from jimpact.fits.profiles import can_be_profiled, in_words, profile
-from jimpact.fits.report import report_blocks
+from jimpact.fits.profiles import can_be_profiled, profile
+from jimpact.fits.report import parameter_rows, report_blocks
 from jimpact.status import STATUS
 
 if TYPE_CHECKING:
@@ -89,15 +90,7 @@ def _listed(title: str, lines: Sequence[str]) -> str:
 def _parameters(fit: Any) -> tuple[list[str], list[list[str]]]:
     kind = "profile" if fit.profiles else "linearized"
     heads = ["parameter", "value", "standard error", f"95 % interval, {kind}", ""]
-    rows = []
-    for i, pieces in enumerate(fit.intervals()):
-        error = fit.standard_error[i]
-        word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
-        told = np.isfinite(error) or bool(fit.profiles)
-        interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
-        note = "at its bound" if fit.at_bound[i] else ""
-        rows.append([fit.names[i], f"{fit.value[i]:.6g}", word, interval, note])
-    return heads, rows
+    return heads, parameter_rows(fit)
 
 
 def _shots(fit: Any) -> tuple[list[str], list[list[str]]]:
@@ -147,7 +140,7 @@ def _inline(title: str, figure: "Figure", vectors: bool) -> str:
 def _made_by(fit: Any) -> list[list[str]]:
     starts = sum(start.count for start in fit.starts) + fit.lost_starts
     rows = [
-        ["law", repr(fit.law)],
+        ["law", eqx.tree_pformat(fit.law, short_arrays=False)],
         ["solver", f"{fit.method}, loss {fit.loss}, {starts} starts, seed {fit.seed}"],
         ["precision", str(fit.problem.residuals.offset.dtype)],
         ["jimpact", jimpact.__version__],

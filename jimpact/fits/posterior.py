@@ -1,5 +1,6 @@
 """The posterior of a fit's parameters, sampled by numpyro's NUTS (extra `bayes`)."""
 
+import sys
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -8,8 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole, check_kind
-from jimpact.fits.fitting import Fit
+from jimpact._checks import as_whole
+from jimpact.fits.fitting import Fit, check_squares
 from jimpact.fits.least_squares import Box
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.tables import needed
@@ -18,6 +19,8 @@ from jimpact.montecarlo.distributions import Normal, Uniform
 HOW = 'pip install "jimpact[bayes]"'
 # Chains begin inside: at the end of a domain the sampler's own coordinate is infinite.
 _INSIDE = 1e-3  # of the domain's width, or of the value where it has no end
+_AFAR = 1e3  # farther than any admissible matrix
+_FREE = "z"  # what is sampled in the place of an admissible matrix
 MIXED = 1.05  # r-hat above which chains disagree about where the posterior is
 
 
@@ -29,54 +32,74 @@ def posterior(
     warmup: int = 1000,
     chains: int = 4,
     seed: int = 0,
+    progress: float | None = None,
 ) -> Any:
     """Draws from the posterior density of the parameters, by NUTS.
 
     Equation: `p(x | data) ~ exp(problem.log_density(x)) prior(x)`; where sigma is not known it is
     integrated over `d sigma / sigma`. Chains start at the fit. Derivatives are by forward mode.
+    Matrices that are kept admissible are `E = E_0 + L(d) tanh(|z| / L(d)) d` of the sampled z, d
+    its direction, L(d) how far the admissible ones reach from an inner E_0.
 
     Args:
         fit: a fit by least squares, or a problem.
         priors: by name of a parameter, or of a field for all its entries: `ji.Uniform(low, high)`,
             `ji.Normal(mean, std)` (truncated to the domain), or a numpyro distribution of a scalar.
             Others are flat over the parameter's domain; of what is fitted in its logarithm (a
-            stiffness), flat in that.
+            stiffness), flat in that; of an admissible matrix, flat over all that are.
         samples, warmup: of each chain.
         chains: side by side in one program.
         seed: of the sampler.
+        progress: numpyro's bar on stderr; None: on a terminal.
 
     Returns:
-        `arviz.InferenceData` whose variables are called like the parameters.
+        `arviz.InferenceData` whose variables are called like the parameters, such as
+        `draws.posterior["restitution"]` (chains, samples).
 
     Raises:
         ImportError: numpyro or arviz is missing; the extra is named.
-        ValueError: unknown names, priors outside the domain, a robust loss, a matrix that is kept
-            admissible.
+        ValueError: unknown names, priors outside the domain, a robust loss.
 
     Warns of chains that disagree, and of divergences: the draws are then not to be trusted.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
     >>> found = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
-    >>> draws = ji.posterior(found, {"restitution": ji.Normal(0.5, 0.1)})  # doctest: +SKIP
+    >>> prior = {"restitution": ji.Normal(0.5, 0.1)}
+    >>> draws = ji.posterior(found, prior)  # doctest: +SKIP
+    >>> e = draws.posterior["restitution"]  # doctest: +SKIP
+    >>> print(f"{float(e.mean()):.2f} +- {float(e.std()):.3f}")  # doctest: +SKIP
+    0.40 +- 0.013
     """
     numpyro, arviz = needed("numpyro", HOW), needed("arviz", HOW)
-    check_kind("fit", fit.problem if isinstance(fit, Fit) else fit, FitProblem)
-    if isinstance(fit, Fit) and fit.loss != "squares":
-        raise ValueError(f"Argument `fit` must be by least squares, but has loss {fit.loss!r}.")
+    if not isinstance(fit, FitProblem):
+        check_squares("fit", fit)
     problem = fit.problem if isinstance(fit, Fit) else fit
     start = fit.value if isinstance(fit, Fit) else problem.start
-    if not isinstance(problem.residuals.region, Box):
-        raise ValueError("Argument `fit` must not be of a matrix that is kept admissible.")
     for name, count in (("samples", samples), ("warmup", warmup), ("chains", chains)):
         as_whole(name, count, 1)
     each = _priors(problem, dict(priors or {}), numpyro.distributions)
 
+    region = problem.residuals.region
+    inner = None if isinstance(region, Box) else _Inner(problem, region)
+
     def model() -> None:
-        x = jnp.stack([numpyro.sample(name, prior) for name, prior in each.items()])
+        if inner is None:
+            x = jnp.stack([numpyro.sample(name, prior) for name, prior in each.items()])
+        else:
+            flat = numpyro.distributions.ImproperUniform(
+                numpyro.distributions.constraints.real_vector, (), (len(each),)
+            )
+            x, change = inner.values(numpyro.sample(_FREE, flat))
+            own = [prior.log_prob(x[i]) for i, prior in enumerate(each.values())]
+            numpyro.factor("prior", change + sum(own))
+            for i, name in enumerate(each):
+                numpyro.deterministic(name, x[i])
         numpyro.factor("data", problem.log_density(x))
 
     first = dict(zip(problem.names, _inside(start, problem.domains)))
+    if inner is not None:
+        first = {_FREE: inner.free(start)}
     kernel = numpyro.infer.NUTS(
         model,
         forward_mode_differentiation=True,
@@ -89,12 +112,48 @@ def posterior(
         num_samples=samples,
         num_chains=chains,
         chain_method="vectorized",
-        progress_bar=False,
+        progress_bar=sys.stderr.isatty() if progress is None else progress is not False,
     )
     sampler.run(jax.random.PRNGKey(seed))
     found = arviz.from_numpyro(sampler, log_likelihood=False)
+    if inner is not None:
+        del found.posterior[_FREE]
     _warn(found, arviz)
     return found
+
+
+class _Inner:
+    """All admissible matrices as the space of z (P,), and how volumes change on the way."""
+
+    def __init__(self, problem: FitProblem, region: Any):
+        self.problem, self.region, self.count = problem, region, len(problem.names)
+        self.reach = jax.jit(self._reach)
+
+    def _reach(self, direction: jax.Array) -> jax.Array:
+        """L: how far the region reaches from its center."""
+        ahead = jnp.zeros_like(self.region.center).at[: self.count].set(_AFAR * direction)
+        return _AFAR * self.region.share(self.region.center + ahead)
+
+    def values(self, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """x (P,) of z, and the logarithm of the determinant of dx/dz, up to a constant."""
+        r = jnp.sqrt(jnp.sum(z**2) + jnp.finfo(z.dtype).tiny)
+        reach = self.reach(z / r)
+        move = reach * jnp.tanh(r / reach)
+        y = self.region.center.at[: self.count].add(move * z / r)
+        residuals, first = self.problem.residuals, np.asarray(self.problem.parameters.first)
+        x = y[: self.count] * residuals.scale[first]
+        # of dmove/dr = 1 / cosh^2, in a form that does not overflow
+        slope = -2 * (jnp.logaddexp(r / reach, -r / reach) - jnp.log(2.0))
+        return x, slope + (self.count - 1) * jnp.log(move / r)
+
+    def free(self, start: np.ndarray) -> jax.Array:
+        """z of values x, a little inside."""
+        move = (jnp.asarray(self.problem.point(start)) - self.region.center)[: self.count]
+        size = jnp.linalg.norm(move)
+        if size == 0:
+            return move
+        reach = self.reach(move / size)
+        return reach * jnp.arctanh(jnp.minimum(size / reach, 1 - _INSIDE)) * move / size
 
 
 def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_kind, check_values
+from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import quick_jit
 from jimpact.experiments import Experiments
 from jimpact.fits.least_squares import Box, Method, Region, SolverState, advance, begin
@@ -202,6 +202,8 @@ class FitProblem:
         """
         check_kind("law", law, Law)
         check_kind("experiments", experiments, Experiments)
+        check_concrete("law", law)
+        check_concrete("scene", scene)
         own = experiments.each(scene, lambda s: s)
         same = experiments.scenes is None
         alike, extra = stackable(own[:1] if same else own)
@@ -240,9 +242,9 @@ class FitProblem:
         covariance = both + own[:, :, None] * np.eye(n)
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
-        # factors that a weight already has (shots left out, robust ones) stay
+        # factors that a weight already has (shots left out) stay
         old = np.where(here, np.asarray(self.sigma, float), 1.0)
-        weight = np.asarray(r.weight, float) * float(r.size) * old / sigma
+        weight = self.weight * old / sigma
         size = float(r.unit) * np.linalg.norm(weight)
         mixing = jnp.asarray(np.linalg.inv(factor), r.weight.dtype)
         arrays = (jnp.asarray(weight / size, r.weight.dtype), jnp.asarray(size, r.size.dtype))
@@ -287,6 +289,8 @@ class FitProblem:
         0.7
         """
         check_kind("law", law, Law)
+        check_concrete("law", law)
+        check_concrete("measured", measured)
         post = np.asarray(as_float_array("measured", measured))
         check_values("measured", post, nan_allowed=True)
         if not np.isfinite(post).any():
@@ -360,20 +364,74 @@ class FitProblem:
         if self.sigma is None:
             return -0.5 * self.values * jnp.log(squares)
         seen = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
+        other = np.zeros_like(self.measured)
+        if self.residuals.mixing is not None:
+            other = np.log(np.diagonal(self.residuals.mixing, axis1=1, axis2=2))
+        constant = np.log(seen * math.sqrt(2 * math.pi)) - other[~np.isnan(self.measured)]
+        return -0.5 * squares - float(np.sum(constant))
+
+    @property
+    def weight(self) -> np.ndarray:
+        """1 / sigma, shaped like `measured`; 0 where nothing was."""
+        return np.asarray(self.residuals.weight, float) * float(self.residuals.size)
+
+    def independent(self, errors: np.ndarray) -> np.ndarray:
+        """Errors (K, n, ...) of what was measured, in units of sigma and as independent ones."""
+        more = (1,) * (errors.ndim - self.measured.ndim)
+        scaled = np.nan_to_num(errors) * self.weight.reshape(*self.measured.shape, *more)
         mixing = self.residuals.mixing
-        other = 0.0 if mixing is None else np.log(np.diagonal(mixing, axis1=1, axis2=2)).sum()
-        return -0.5 * squares - float(np.sum(np.log(seen * math.sqrt(2 * math.pi))) - other)
+        return scaled if mixing is None else np.einsum("kij,kj...->ki...", mixing, scaled)
+
+    def errors_of(self, independent: np.ndarray) -> np.ndarray:
+        """The errors (K, n, ...) that are these as independent ones; NaN where nothing was."""
+        more = (1,) * (independent.ndim - self.measured.ndim)
+        weight = self.weight.reshape(*self.measured.shape, *more)
+        if self.residuals.mixing is not None:
+            back = np.linalg.inv(np.asarray(self.residuals.mixing, float))
+            independent = np.einsum("kij,kj...->ki...", back, independent)
+        return np.where(weight > 0, independent / np.where(weight > 0, weight, 1.0), np.nan)
+
+    def passing_errors_at(self, y: Any) -> "FitProblem":
+        """With errors of v-, if there are any, passed on as the law of y (Q,) does."""
+        if self.residuals.mixing is None:
+            return self
+        return self.with_errors_before(
+            self.residuals.law_at(jnp.asarray(y, self.residuals.offset.dtype))
+        )
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
-        """With weights 1 / sigma times a factor, shaped like `measured`; 0 leaves a value out."""
-        r = self.residuals
-        weight = np.asarray(r.weight, float) * float(r.size) * factor
+        """With factors on the independent errors, shaped like `measured`; 0 leaves a value out."""
+        r, kept = self.residuals, factor > 0
+        mixing: Any = r.mixing
+        weight = self.weight * factor
+        if mixing is not None:  # which comes before the factors
+            weight = self.weight * kept
+            mixing = np.asarray(np.where(kept, factor, 1.0)[..., None] * mixing, r.weight.dtype)
         size = float(r.unit) * np.linalg.norm(weight)
-        arrays = (np.asarray(weight / size, r.weight.dtype), np.asarray(size, r.size.dtype))
-        kept = np.where(factor > 0, self.measured, np.nan)
-        lost = int(np.isnan(kept).sum() - np.isnan(self.measured).sum())
-        residuals = eqx.tree_at(lambda r: (r.weight, r.size), r, arrays)
-        return replace(self, residuals=residuals, measured=kept, values=self.values - lost)
+        arrays = (np.asarray(weight / size, r.weight.dtype), np.asarray(size, r.size.dtype), mixing)
+        measured = np.where(kept, self.measured, np.nan)
+        lost = int(np.isnan(measured).sum() - np.isnan(self.measured).sum())
+        if self.experiments is not None:  # whole shots are left out, with what a correction took
+            gone = np.isnan(measured).all(axis=1) & ~np.isnan(self.measured).all(axis=1)
+            lost -= int(np.array(self.experiments.lost)[gone].sum())
+        residuals = eqx.tree_at(
+            lambda r: (r.weight, r.size, r.mixing), r, arrays, is_leaf=lambda x: x is None
+        )
+        return replace(self, residuals=residuals, measured=measured, values=self.values - lost)
+
+    def point(self, values: np.ndarray) -> np.ndarray:
+        """y (..., Q) of values (..., P), on the host."""
+        r, first = self.residuals, self.parameters.first
+        y = np.zeros((*values.shape[:-1], len(r.offset)))
+        scale = np.asarray(r.scale, float)[first]
+        y[..., : len(first)] = to_scaled(values, scale, np.asarray(r.log)[first])
+        return y
+
+    def values_at(self, y: np.ndarray) -> np.ndarray:
+        """Values (..., P) of y (..., Q), on the host."""
+        r, first = self.residuals, self.parameters.first
+        scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
+        return from_scaled(y[..., : len(first)], scale, log)
 
     def _scaled(self, x: Any) -> jax.Array:
         """y (Q,) of x (P,)."""

@@ -23,6 +23,7 @@ NEAR = np.array([-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2])  # half-widths of the inte
 SAME = 1e-6  # relative sums of squares that are equal
 END = 1e-3  # of the root of the limit: how near to it an end is searched for
 FAR, ROUGH = 2.0, 2  # times the limit from which only so many passes are spent
+MANY = 256  # shots up to which they take half as long as a fit with eight starts
 QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # what `fit` profiles of itself: values across the domain
 HARDLY_SEEN = 0.2  # relative error of a stiffness beyond which no parabola is believed
 LONGEST = 2.0  # steps by which a scan is extrapolated
@@ -135,6 +136,7 @@ class Scaled:
 
     def __init__(self, fit: "Fit"):
         r, first = fit.problem.residuals, fit.problem.parameters.first
+        self.point = fit.problem.point
         self.scale, self.log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
         self.low, self.high = np.asarray(r.low, float), np.asarray(r.high, float)
         self.size = float(r.size)
@@ -143,12 +145,6 @@ class Scaled:
         # of the weighted residuals; where nothing tells it, what is exact up to rounding
         self.variance = float(fit.noise**2) if stated else exact
         self.best = self.point(fit.value)
-
-    def point(self, value: np.ndarray) -> np.ndarray:
-        """y (Q,) of values (P,)."""
-        y = np.zeros(len(self.low))
-        y[: len(value)] = to_scaled(value, self.scale, self.log)
-        return y
 
     def real(self, i: int, y: np.ndarray) -> np.ndarray:
         """Values of the i-th parameter."""
@@ -391,7 +387,7 @@ class _Scans(Scaled):
         low, high = self.fit.problem.domains[i]
         better = None
         if self.lower is not None:
-            better = from_scaled(self.lower[: len(self.scale)], self.scale, self.log)
+            better = self.fit.problem.values_at(self.lower)
         given = (self.fit.names[i], real, d, limit, self.level, tuple(intervals))
         return Profile(*given, (float(low), float(high)), better)
 
@@ -450,10 +446,17 @@ def linearized(fit: "Fit", i: int, q: float) -> tuple[tuple[float, float], ...]:
 
 
 def needs_profiles(fit: "Fit") -> bool:
-    """Whether parabolas may mislead, and profiles cost little."""
+    """Whether parabolas may mislead, and profiles cost little: no more than the fit did."""
+    starts = sum(start.count for start in fit.starts) + fit.lost_starts
+    most = FEW if starts == 1 else MANY
+    few = fit.experiments is not None and len(fit.predicted) <= most
+    return few and misleads(fit)
+
+
+def misleads(fit: "Fit") -> bool:
+    """Whether there are no profiles, though parabolas may mislead."""
     problem = fit.problem
-    few = fit.experiments is not None and len(fit.predicted) <= FEW
-    if not few or not can_be_profiled(fit) or not fit.converged:
+    if fit.profiles or not can_be_profiled(fit) or not fit.converged:
         return False
     if fit.rank < len(fit.names):
         return True

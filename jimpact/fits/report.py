@@ -10,7 +10,7 @@ from jimpact.fits.adequacy import adequacy
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.profiles import in_words
+from jimpact.fits.profiles import in_words, misleads
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -133,18 +133,35 @@ def _headline(fit: Any) -> str:
     )
 
 
-def _parameters(fit: Any) -> list[str]:
-    width = max(9, *(len(name) for name in fit.names))
-    head = "95 % interval" + " (profile)" * bool(fit.profiles)
-    lines = [f"{'parameter':{width}s} {'value':>12s} {'std. error':>12s}   {head}"]
+def parameter_rows(fit: Any) -> list[list[str]]:
+    """Name, value, standard error, interval, and whether it is at its bound."""
+    rows = []
     for i, pieces in enumerate(fit.intervals()):
         error = fit.standard_error[i]
         word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
         told = np.isfinite(error) or bool(fit.profiles)
         interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
-        note = "   at its bound" if fit.at_bound[i] else ""
-        lines.append(f"{fit.names[i]:{width}s} {fit.value[i]:12.6g} {word:>12s}   {interval}{note}")
-    return lines
+        note = "at its bound" if fit.at_bound[i] else ""
+        rows.append([fit.names[i], f"{fit.value[i]:.6g}", word, interval, note])
+    return rows
+
+
+def _parameters(fit: Any) -> list[str]:
+    width = max(9, *(len(name) for name in fit.names))
+    head = "95 % interval" + " (profile)" * bool(fit.profiles)
+    rows = [["parameter", "value", "std. error", head, ""], *parameter_rows(fit)]
+    lines = [
+        f"{name:{width}s} {value:>12s} {error:>12s}   {interval}   {note}".rstrip()
+        for name, value, error, interval, note in rows
+    ]
+    return [*lines, *unprofiled(fit)]
+
+
+def unprofiled(fit: Any) -> list[str]:
+    """How to get intervals that are true, where these may not be."""
+    if not misleads(fit):
+        return []
+    return ["A parabola at the minimum may mislead here: `ji.profile(fit)` finds true intervals."]
 
 
 def _quality(fit: Any) -> list[str]:
@@ -154,7 +171,7 @@ def _quality(fit: Any) -> list[str]:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
         lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
         lines += _said_of_sigma(fit.experiments)
-        if fit.noise > 1:
+        if fit.noise > 1 and fit.loss == "squares":
             lines.append(
                 f"errors         stretched by {fit.noise:.3g}, the root of chi^2 over that"
             )
@@ -282,7 +299,9 @@ def to_json(fit: Any) -> dict[str, Any]:
     }
 
 
-def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> list[str]:
+def fit_warnings(
+    problem: FitProblem, found: Search, spread: Uncertainty, robust: bool
+) -> list[str]:
     """All warnings, those about the data first."""
     lines, data = list(problem.left_out), problem.experiments
     if data is not None:
@@ -298,7 +317,7 @@ def fit_warnings(problem: FitProblem, found: Search, spread: Uncertainty) -> lis
         lines += _statuses(found.status, data.shots)
         lines += _matrix(problem, found, contacts)
     lines += _no_numbers(problem, found)
-    lines += adequacy(problem, found, spread.rank)
+    lines += adequacy(problem, found, spread.rank, robust)
     if data is not None and problem.sigma is None and len(set(data.units)) > 1:
         lines.append(
             "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."

@@ -144,7 +144,7 @@ def scatter(fit: "Fit", name: str | None = None) -> Scatter:
 
 def shown_scatter(fit: Any) -> Scatter | None:
     """The scatter that explains why a fit is worse than sigma allows; None where it does not."""
-    stretched = fit.problem.sigma is not None and fit.noise > 1
+    stretched = fit.problem.sigma is not None and fit.noise > 1 and fit.loss == "squares"
     if not stretched or fit.experiments is None or not np.isfinite(fit.standard_error).all():
         return None
     if np.isfinite(fit.problem.measured).any(axis=1).sum() < SHOWN_FROM:
@@ -173,10 +173,9 @@ def _which(fit: "Fit", name: str | None) -> int:
 
 def _weighted(fit: "Fit") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals (R,) in units of sigma, their derivatives (R, P), shots (R,)."""
-    r, here = fit.problem.residuals, ~np.isnan(fit.problem.measured)
-    weight = np.broadcast_to(np.asarray(r.weight, float) * float(r.size), here.shape)[here]
+    problem, here = fit.problem, ~np.isnan(fit.problem.measured)
     shot = np.broadcast_to(np.arange(len(here))[:, None], here.shape)[here]
-    return weight * fit.residual[here], weight[:, None] * fit.jacobian[here], shot
+    return problem.independent(fit.residual)[here], problem.independent(fit.jacobian)[here], shot
 
 
 class _Model:

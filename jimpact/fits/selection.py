@@ -11,7 +11,7 @@ from scipy.special import chdtrc, fdtrc, stdtr
 from jimpact._checks import check_choice, check_kind
 from jimpact.comparison import registered_laws
 from jimpact.experiments import Experiments
-from jimpact.fits.fitting import Fit, fit
+from jimpact.fits.fitting import Fit, check_squares, fit
 from jimpact.fits.many import leave_one_out
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.multistart import EXACT
@@ -195,9 +195,7 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     True
     """
     for name, each in (("simple", simple), ("full", full)):
-        check_kind(name, each, Fit)
-        if each.loss != "squares":
-            raise ValueError(f"Argument `{name}` must be by least squares, but is {each.loss!r}.")
+        check_squares(name, each)
     same = np.array_equal(simple.problem.measured, full.problem.measured, equal_nan=True)
     if not same:
         raise ValueError("Arguments `simple` and `full` must be fits of the same data.")
@@ -445,29 +443,19 @@ def _errors_left_out(found: Fit) -> np.ndarray:
 
 def _linearized(found: Fit) -> np.ndarray:
     """The same by one Gauss-Newton step: `(I - J_k (J^T J)^-1 J_k^T)^-1 r_k`."""
-    here = ~np.isnan(found.problem.measured)
-    weight = _weights(found)
-    jacobian = np.nan_to_num(found.jacobian) * weight[..., None]
-    residual = np.nan_to_num(found.residual) * weight
+    jacobian, residual = map(found.problem.independent, (found.jacobian, found.residual))
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
     hat = jacobian @ inverse @ np.swapaxes(jacobian, 1, 2)
     rest = np.eye(hat.shape[-1]) - hat
     error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(rest, residual)])
-    return np.where(here, error / np.where(weight > 0, weight, 1.0), np.nan)
-
-
-def _weights(found: Fit) -> np.ndarray:
-    r = found.problem.residuals
-    weight = np.asarray(r.weight, float) * float(r.size)
-    return np.broadcast_to(weight, found.residual.shape)
+    return found.problem.errors_of(error)
 
 
 def _per_shot(found: Fit, error: np.ndarray) -> np.ndarray:
     """Weighted squares (K,) of these errors; NaN where a shot has none."""
-    squares = (_weights(found) * error) ** 2
-    here = ~np.isnan(squares)
-    return np.where(here.any(axis=1), np.where(here, squares, 0.0).sum(axis=1), np.nan)
+    squares = np.sum(found.problem.independent(error) ** 2, axis=1)
+    return np.where(np.isnan(error).all(axis=1), np.nan, squares)
 
 
 def _total(squares: np.ndarray) -> float:

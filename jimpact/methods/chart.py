@@ -287,11 +287,10 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
 
 def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict[str, str]]:
     """Methods asked for; without names all that can, and why the others cannot."""
-    if names is None:
-        why = {n: m.supports(case.law) for n, m in METHODS.items()}
-        left_out = {name: reason for name, reason in why.items() if reason is not None}
-        return [m for n, m in METHODS.items() if n not in left_out], left_out
-    return [_able("methods", name, case) for name in names], {}
+    if names is not None:
+        return [_able("methods", name, case) for name in names], {}
+    left_out = {n: why for n, m in METHODS.items() if (why := m.supports(case.law)) is not None}
+    return [m for n, m in METHODS.items() if n not in left_out], left_out
 
 
 def _able(argument: str, name: str, case: Case) -> Method:

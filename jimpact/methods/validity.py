@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_choice, check_per_contact, check_values
+from jimpact._checks import as_axis, as_float_array, check_choice, check_per_contact, check_values
 from jimpact.comparison import dispersion_index
 from jimpact.impacts import impact
 from jimpact.law import Law
@@ -116,8 +116,11 @@ def validity_map(
             "Argument `scene` must have two or more contacts, all closed, but has "
             f"{scene.contacts}, {int(np.asarray(scene.closed).sum())} of them closed."
         )
-    over = np.geomspace(*RATIOS[:2], int(RATIOS[2])) if ratios is None else ratios
-    ratio, eta = _axis("ratios", over, v, 0.0, True), _axis("exponents", exponents, v, 1.0, False)
+    over = np.geomspace(*RATIOS) if ratios is None else ratios
+    ratio = as_axis("ratios", over).astype(v.dtype)
+    eta = as_axis("exponents", exponents).astype(v.dtype)
+    check_values("ratios", ratio, low=0.0, open_low=True)
+    check_values("exponents", eta, low=1.0)
     if (np.diff(np.asarray(ratio)) <= 0).any():
         raise ValueError("Argument `ratios` must rise, but does not.")
     e = as_float_array("restitution", restitution)
@@ -137,14 +140,6 @@ def validity_map(
         laws={name: np.asarray(x) for name, x in found.items()},
         law_dispersion={name: float(dispersion_index(scene, x)) for name, x in found.items()},
     )
-
-
-def _axis(name: str, values: Any, like: jax.Array, low: float, open_low: bool) -> jax.Array:
-    axis = as_float_array(name, values).astype(like.dtype)
-    if axis.ndim != 1 or axis.size == 0:
-        raise ValueError(f"Argument `{name}` must have shape (r,), but has shape {axis.shape}.")
-    check_values(name, axis, low=low, open_low=open_low)
-    return axis
 
 
 @eqx.filter_jit

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_axis, as_float_array, check_shape, check_values, is_traced
 from jimpact.contact import delassus_matrix
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law
@@ -16,6 +16,7 @@ from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
 from jimpact.laws.lzb import LZB
 from jimpact.montecarlo.results import MonteCarlo
+from jimpact.records import readable_unit
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS
@@ -64,10 +65,8 @@ def _in_words(gap: float, delta: float) -> str:
 
 
 def _length(metres: float) -> str:
-    for unit, size in (("m", 1.0), ("mm", 1e-3), ("um", 1e-6)):
-        if metres >= size or metres == 0:
-            return f"{metres / size:.3g} {unit}"
-    return f"{metres / 1e-9:.3g} nm"
+    unit, size = readable_unit("m", metres or 1.0)
+    return f"{metres / size:.3g} {unit}"
 
 
 def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
@@ -91,8 +90,8 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     >>> import jimpact as ji
     >>> scene = ji.chain([0.0665, 0.0665, 0.0665], gaps=[0.0, 1e-4])  # one-inch steel balls
     >>> print(ji.gap_scale(scene, ji.Compliant(ji.Hertz(1.2e10)), [1.0, 0.0, 0.0]))
-    gap 1 is closed (delta_c = 31.4 um)
-    gap 2 is 3.18 delta_c (delta_c = 31.4 um): wide, its collisions come one after another
+    gap 1 is closed (delta_c = 31.4 µm)
+    gap 2 is 3.18 delta_c (delta_c = 31.4 µm): wide, its collisions come one after another
     """
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
@@ -151,9 +150,7 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
         raise ValueError(f"Argument `scene` must have two contacts, but has {scene.contacts}.")
     if not isinstance(law, Compliant):
         raise TypeError(f"Argument `law` must be a Compliant, but is {law!r}.")
-    s = as_float_array("offset", offset)
-    if s.ndim != 1:
-        raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
+    s = as_axis("offset", offset)
     check_values("offset", s)
     scale = gap_scale(scene, law, velocity)
     delta = jnp.max(scale.delta)

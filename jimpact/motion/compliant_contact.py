@@ -329,7 +329,9 @@ def _turning(
     max_steps: int,
 ) -> TurningImpact:
     zero = jnp.zeros_like(horizon)
-    settings = Settings(rtol, rtol * 1e-3, jnp.asarray(1e-12), max_steps, False, horizon, zero)
+    settings = Settings(
+        rtol, rtol * 1e-3, jnp.asarray(1e-12), zero, max_steps, False, horizon, zero
+    )
     times = jnp.stack([zero, horizon])
     _, end, apart = compliant_motion(system, force, settings, q, v, times, 1000, True)
     return TurningImpact(end.v, end.q, end.t, apart)

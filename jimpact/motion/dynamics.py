@@ -7,6 +7,13 @@ import jax.numpy as jnp
 
 from jimpact.motion.system import System
 
+_ROUNDINGS = 4
+
+
+def not_rounding(share: float, dtype: jnp.dtype) -> float:
+    """A share that counts as 0, in single precision that of a few roundings."""
+    return max(share, _ROUNDINGS * float(jnp.finfo(dtype).eps))
+
 
 class Kinematics(NamedTuple):
     """Of the m contacts at one instant; `rate' = grad^T q'' + drift`."""

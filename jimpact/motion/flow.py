@@ -18,11 +18,11 @@ from jimpact.motion.dynamics import (
     gaps,
     kinematics,
     mass_at,
+    not_rounding,
     seen_from_base,
     user_force,
 )
 from jimpact.motion.persistent_contact import (
-    REST_ACCELERATION,
     Contacts,
     Modes,
     constraint_impulse,
@@ -31,12 +31,12 @@ from jimpact.motion.persistent_contact import (
     least_regularity,
     powers,
     regularity,
+    rest_acceleration,
 )
 from jimpact.motion.record import MOTION_CODE, Events
 from jimpact.motion.system import System
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
-ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is rounding
 # Error allowed in the ledger, of what the errors allowed in q and v are worth: ten times more, and
 # the steps of a body that rests on a moving base are those of the base's motion only.
 LEDGER = 0.01
@@ -64,6 +64,7 @@ class Settings(NamedTuple):
     rtol: float
     atol: float
     closed_below: jax.Array
+    gap_rounding: jax.Array  # gaps below it are rounding
     max_steps: int
     friction: bool
     duration: jax.Array
@@ -92,7 +93,7 @@ def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales)
     m = modes.active.shape[0]
     found = forces(given, mu, modes)
     w = jnp.diagonal(given.delassus)
-    slack = REST_ACCELERATION * scales.acceleration
+    slack = rest_acceleration(w.dtype) * scales.acceleration
     normal = jnp.where(modes.active, found.normal * w[:m] + slack, given.normal.value)
     if given.tangent is None or mu is None or found.tangential is None:
         return normal
@@ -384,7 +385,7 @@ def one_pass(
     sampled = landed[-1]
     state = selected(accept, _reached(flow, flight.aim, after.y), state)
     steps = flight.steps + jnp.asarray(flies).astype(flight.steps.dtype)
-    vanishes = flies & ~accept & (after.step.clock[1, 0] < SMALLEST_STEP * _span(targets))
+    vanishes = flies & ~accept & (after.step.clock[1, 0] < _smallest_step(targets))
     # what an event or a sample shortens says nothing of the steps after it
     tried, lands = flight.aim.clock[1, 0], flight.aim.clock[3, 0] > 0
     proposed = after.step.clock[1, 0]
@@ -457,8 +458,8 @@ def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Fl
     return jnp.concatenate(errors)
 
 
-def _span(targets: jax.Array) -> jax.Array:
-    return jnp.abs(targets[0]) + jnp.abs(targets[-1])
+def _smallest_step(targets: jax.Array) -> jax.Array:
+    return not_rounding(SMALLEST_STEP, targets.dtype) * (jnp.abs(targets[0]) + jnp.abs(targets[-1]))
 
 
 def allowed_errors(
@@ -480,9 +481,8 @@ def allowed_errors(
 
 def roundings(settings: Settings, margins: jax.Array, targets: jax.Array) -> jax.Array:
     """Roundings of these margins and of the time to the next sample (k,)."""
-    span = _span(targets)
-    least = float(jnp.finfo(span.dtype).tiny) ** 0.5
-    every = jnp.append(margins, SMALLEST_STEP * span)
+    least = float(jnp.finfo(targets.dtype).tiny) ** 0.5
+    every = jnp.append(margins, _smallest_step(targets))
     return jax.lax.stop_gradient(jnp.maximum(every, least))
 
 
@@ -496,9 +496,10 @@ def flow_of(
     state: State,
 ) -> MechanicalFlow:
     """The flow with these modes; `one_pass` sets the time of the next sample, and the errors."""
-    slack = REST_ACCELERATION * scales.acceleration
-    normal = jnp.where(modes.active, slack, ROUNDING_GAP * settings.closed_below)
-    side = jnp.where(modes.stick, slack, REST_ACCELERATION * scales.speed)
+    share = rest_acceleration(state.q.dtype)
+    slack = share * scales.acceleration
+    normal = jnp.where(modes.active, slack, settings.gap_rounding)
+    side = jnp.where(modes.stick, slack, share * scales.speed)
     margins = jnp.concatenate([normal, side]) if settings.friction else normal
     rounded, longest = roundings(settings, margins, targets), longest_step(system, targets)
     blank = jnp.zeros((1, 1), state.q.dtype)

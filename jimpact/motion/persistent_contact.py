@@ -18,6 +18,7 @@ from jimpact.motion.dynamics import (
     free_acceleration,
     kinematics,
     mass_at,
+    not_rounding,
     solve_mass,
     user_force,
 )
@@ -34,7 +35,7 @@ _WRITTEN_OUT = 4  # rows up to which it is eliminated by scalars: beyond, that t
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
-REST_ACCELERATION = 1e-11
+_REST_ACCELERATION = 1e-11
 _PASSES = 3  # choices: contacts that would not slide as they are taken to are asked again
 # A power of rounding: of the matrix of the forces the rest would be rounding. What happens until it
 # has fallen from there to 0 is as small.
@@ -157,6 +158,11 @@ def _determinants(k: jax.Array) -> jax.Array:
     lower = k[..., 2, left] * k[..., 3, right] - k[..., 2, right] * k[..., 3, left]
     signs = jnp.asarray(np.where((left + right) % 2, 1, -1), k.dtype)
     return jnp.sum(upper * lower[..., ::-1] * signs[None], axis=-1)
+
+
+def rest_acceleration(dtype: jnp.dtype) -> float:
+    """See `_REST_ACCELERATION`."""
+    return not_rounding(_REST_ACCELERATION, dtype)
 
 
 def least_regularity(dtype: jnp.dtype) -> float:

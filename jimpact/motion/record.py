@@ -29,7 +29,10 @@ MOTION_STATUS = (
     Status("out_of_range", "a gap function does not hold any more (`valid` of the body)", True),
     Status("not_finite", "the motion or its input is NaN or infinite", True),
     Status(
-        "coarse_step", "a contact is struck again within 3 steps: they are too long for it", False
+        "coarse_step",
+        "steps are too long: within 3 a contact is struck again, or in one a disc of a pile moves "
+        "by more than the least radius",
+        False,
     ),
     Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
     Status("room", "more contacts are closed than the body has `room` for", True),

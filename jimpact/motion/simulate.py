@@ -37,6 +37,10 @@ from jimpact.progress import progress_bar, waiting
 from jimpact.scene import check_mass
 
 CLOSED_BELOW = 1e-9  # [m] contacts with smaller gaps take part in an impact
+ROUNDING_GAP = 1e-5  # of the gap that counts as closed: below it a gap is rounding
+# Roundings that a gap may be off by, of the largest coordinate or gap at the start; what counts as
+# closed is so many times more. In metres and double precision neither of them matters.
+GAP_ROUNDINGS, MORE_CLOSED = 8, 10
 TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
 SLOW = 1e-6  # of the largest gap velocity: what leaves slower and is pressed back stays
 MAX_STEPS = 100_000
@@ -62,7 +66,7 @@ def simulate(
     max_events: int | None = None,
     rtol: float | None = None,
     atol: float | None = None,
-    closed_below: float = CLOSED_BELOW,
+    closed_below: float | None = None,
     slow: float = SLOW,
     max_steps: int = MAX_STEPS,
     progress: float | None = None,
@@ -93,7 +97,8 @@ def simulate(
             found by the program for 500 in as many runs as needed.
         rtol: relative tolerance of the flights; None: 1e-10, in single precision 1e-5.
         atol: absolute one [m, m/s, rad, ..]; None: 1e-12, in single precision 1e-7.
-        closed_below: contacts with smaller gaps [m] take part in an impact.
+        closed_below: contacts with smaller gaps [m] take part in an impact; None: 1e-9, or 80
+            roundings of the largest coordinate or gap at the start, if that is more.
         slow: accumulations are passed: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed; contacts that share
             bodies below the root of that share (docs/motions.md). `events` tells what is passed.
@@ -130,15 +135,14 @@ def simulate(
     system, law, q, v = in_common_dtype(system, law, q, v)
     dtype = q.dtype
     start, end = start.astype(dtype), end.astype(dtype)
-    deepest = np.inf if method == "contact_forces" else closed_below
-    _check_motion(system, q, v, start, end, deepest)
+    f = _check_motion(system, q, v, start, end)
     count = as_whole("samples", samples, 2)
     if max_events is not None:
         as_whole("max_events", max_events, 1)
     rows = CHUNK if max_events is None else max_events
     as_whole("max_steps", max_steps, 1)
     usual = TOLERANCES.get(str(dtype), TOLERANCES["float32"])
-    rtol, atol = (y if x is None else x for x, y in zip((rtol, atol), usual))
+    rtol, atol = usual[0] if rtol is None else rtol, usual[1] if atol is None else atol
     for name, value in (("rtol", rtol), ("atol", atol), ("closed_below", closed_below)):
         check_values(name, value, low=0.0, open_low=True)
     check_values("slow", slow, low=0.0, high=1.0)
@@ -151,10 +155,17 @@ def simulate(
         )
     mu = _friction_of(system, law, friction, q, in_space=method == "time_stepping")
     system = _opened(system, q, v, start)
+    size = jax.lax.stop_gradient(jnp.maximum(jnp.abs(q).max(), jnp.abs(f).max()))
+    off = GAP_ROUNDINGS * float(jnp.finfo(dtype).eps) * size
+    default = jnp.maximum(CLOSED_BELOW, MORE_CLOSED * off)
+    below = default if closed_below is None else jnp.asarray(closed_below, dtype)
+    if method != "contact_forces":
+        _check_penetration(f, below)
     settings = Settings(
         rtol,
         atol,
-        jnp.asarray(closed_below, dtype),
+        below.astype(dtype),
+        jnp.maximum(ROUNDING_GAP * below, off).astype(dtype),
         max_steps,
         mu is not None,
         end - start,
@@ -307,9 +318,8 @@ def _check_motion(
     v: jax.Array,
     start: jax.Array,
     end: jax.Array,
-    closed_below: float,
-) -> None:
-    """Raise a ValueError for a bad start, end or system."""
+) -> jax.Array:
+    """Raise a ValueError for a bad start, end or system; the gaps at the start (m,)."""
     if q.ndim != 1:
         raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
     many = system.body.coordinates
@@ -327,7 +337,7 @@ def _check_motion(
             f"but has value {float(end):g}."
         )
     _check_functions(system, q, v, start)
-    _check_system(system, q, v, start, end, closed_below)
+    return _check_system(system, q, v, start, end)
 
 
 def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
@@ -387,12 +397,11 @@ def _check_system(
     v: jax.Array,
     start: jax.Array,
     end: jax.Array,
-    closed_below: float,
-) -> None:
+) -> jax.Array:
     # functions of a system may close over traced numbers
     mass, f = mass_at(system, q), gaps(system, q, start)
     if is_traced((system, q, v, start, end, mass, f)):
-        return
+        return f
     if callable(system.mass):
         check_mass(mass)
     if system.base is not None:
@@ -400,7 +409,7 @@ def _check_system(
         moved = system.base
         base = jax.vmap(lambda t: jnp.atleast_1d(moved(t)))(jnp.asarray(looks, q.dtype))
         if is_traced(base):
-            return
+            return f
         bad = ~np.isfinite(np.asarray(base)).all(axis=1)
         if bad.any():
             raise ValueError(
@@ -413,10 +422,16 @@ def _check_system(
             "Argument `q0` must be in the range of the gap function "
             f"({system.body.range_in_words}), but its margin has value {margin:g}."
         )
+    return f
+
+
+def _check_penetration(f: jax.Array, closed_below: jax.Array) -> None:
+    if is_traced((f, closed_below)):
+        return
     if not (f >= -closed_below).all():
         worst = int(jnp.argmin(f))
         raise ValueError(
-            f"Argument `q0` must have no penetration (f >= -{closed_below:g} m), "
+            f"Argument `q0` must have no penetration (f >= {-float(closed_below):g} m), "
             f"but gap {worst} has value {f[worst]:g} m."
         )
 

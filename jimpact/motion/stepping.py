@@ -319,7 +319,9 @@ def _one_step(
     before = close.rates(state.v - carried)
     eps = float(jnp.finfo(dtype).eps)
     speed = jnp.maximum(course.speed, close.fastest(state.v))
+    tolerance = max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps)
     noise = max(_ROUNDING, _ROUNDINGS * eps) * speed + course.missed
+    noise += tolerance * close.fastest(h * free_before)
     slow = noise + SLOW * h * jnp.abs(close.rates(free_before)[:, 0])
     strikes = close.there & (before[:, 0] < -slow)
     struck, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
@@ -341,7 +343,6 @@ def _one_step(
     rates = before + close.product(struck)
     late = jnp.where(strikes, 0.5 * h * close.rates(free_before)[:, 0], 0.0)
     wanted, against_mean = _wanted(e, jnp.where(strikes, e_t, 0.0), rates, late)
-    tolerance = max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps)
 
     def solved(tried: _Tried) -> _Tried:
         """The step with the forces at its mean velocity, as far as that is known."""
@@ -399,8 +400,12 @@ def _one_step(
         sound = definite(mass) | ~jnp.all(jnp.isfinite(mass))
         status = jnp.where(sound, status, MOTION_CODE["singular_mass"])
     status = status.astype(jnp.int32)
-    again = isinstance(close, _Few) & jnp.any(strikes & (course.since < APART))
-    coarse = jnp.where(again, MOTION_CODE["coarse_step"], 0)
+    if isinstance(body, Discs):  # two of them may pass through each other between two looks
+        far = h * jnp.sqrt(jnp.max(jnp.sum(v.reshape(-1, 3)[:, :2] ** 2, axis=1)))
+        long = far > jnp.min(body.radii)
+    else:
+        long = jnp.any(strikes & (course.since < APART))
+    coarse = jnp.where(long, MOTION_CODE["coarse_step"], 0)
     missed = jnp.where(found.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
     told = jnp.maximum(course.told, jnp.maximum(coarse, missed)).astype(jnp.int32)
     events = course.events

@@ -12,11 +12,11 @@ from jimpact.motion.dynamics import (
     kinematics,
     kinetic,
     mass_at,
+    not_rounding,
     seen_from_base,
 )
-from jimpact.motion.flow import ROUNDING_GAP, Scales, Settings, State, selected
+from jimpact.motion.flow import Scales, Settings, State, selected
 from jimpact.motion.persistent_contact import (
-    REST_ACCELERATION,
     Choice,
     Contacts,
     Modes,
@@ -26,6 +26,7 @@ from jimpact.motion.persistent_contact import (
     least_regularity,
     no_modes,
     pressed_together,
+    rest_acceleration,
 )
 from jimpact.motion.record import KIND_CODE, MOTION_CODE
 from jimpact.motion.system import System
@@ -183,11 +184,11 @@ def resolve(
     gamma = given.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
     # a hop below the rounding of gaps is none: it would strike faster than it left
-    floor = ROUNDING_GAP * settings.closed_below
-    slowly = jnp.maximum(slowly, jnp.sqrt(2 * scales.acceleration * floor))
+    least_hop = 2 * scales.acceleration * settings.gap_rounding
+    slowly = jnp.maximum(slowly, jnp.sqrt(least_hop))
     slowly = jnp.maximum(slowly, SUPPLIED * approach)
     tight = closed & (jnp.abs(gamma) <= rest)
-    slack = REST_ACCELERATION * scales.acceleration
+    slack = rest_acceleration(gamma.dtype) * scales.acceleration
     stick = jnp.zeros(m, bool)
     if given.tangent is not None:
         stick = jnp.abs(given.tangent.rate) <= slowly
@@ -301,7 +302,7 @@ def _rest(settings: Settings, scales: Scales) -> jax.Array:
     """Gap velocities () that are rounding."""
     duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
     rounding = ROUNDINGS * float(jnp.finfo(duration.dtype).eps) * duration
-    return REST_SPEED * scales.speed + rounding * scales.acceleration
+    return not_rounding(REST_SPEED, duration.dtype) * scales.speed + rounding * scales.acceleration
 
 
 def _struck(

@@ -304,12 +304,9 @@ def _ticks(
     step = -(-len(values) // most)
     at = range(0, len(values), step)
     labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
-    if which == "x":
-        axes.set_xticks(at, labels, fontsize=SMALL)
-        axes.set_xlabel(_LABELS[name] if labelled else "", fontsize=SMALL)
-    else:
-        axes.set_yticks(at, labels, fontsize=SMALL)
-        axes.set_ylabel(_LABELS[name] if labelled else "", fontsize=SMALL)
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    axis.set_ticks(at, labels, fontsize=SMALL)
+    axis.set_label_text(_LABELS[name] if labelled else "", fontsize=SMALL)
 
 
 def _place(found: StabilityMap, name: str) -> float:

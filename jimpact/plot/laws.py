@@ -25,9 +25,9 @@ from jimpact.plot.style import (
     legend_within,
     new_figure,
     side_by_side,
-    unit_of_time,
     wrapped,
 )
+from jimpact.records import readable_unit
 from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 
@@ -172,7 +172,7 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     """
     figure = new_figure(4.2)
     axes = figure.subplots()
-    unit, size = unit_of_time(max(float(h.duration) for h in histories.values()))
+    unit, size = readable_unit("s", max(float(h.duration) for h in histories.values()))
     for j, (name, h) in enumerate(histories.items()):
         time, force = np.asarray(h.time) / size, np.asarray(h.force[:, contact])
         axes.plot(time, force, color=COLOURS[j % len(COLOURS)], label=name)
@@ -205,7 +205,7 @@ def history(found: History, title: str = "") -> Figure:
     check_kind("found", found, History)
     if np.ndim(found.status):
         raise ValueError("Argument `found` must be of one impact, but is a batch: pick one of it.")
-    unit, size = unit_of_time(float(found.duration))
+    unit, size = readable_unit("s", float(found.duration))
     time, rows = np.asarray(found.time) / size, [found.force, found.gap_velocity, found.energy]
     figure = new_figure(6.8)
     panels = figure.subplots(3, 1, sharex=True)

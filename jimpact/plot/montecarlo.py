@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
+from jimpact.records import readable_unit
 
 _BARS = 100  # of a histogram in the picture
 _BODIES = 6  # with a histogram of their own; of more only the most scattered are shown
@@ -76,7 +77,7 @@ def _histogram(axes: Axes, found: MonteCarlo, body: int) -> None:
 
 def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
     first = found.first
-    fine = np.isfinite(first["velocity"]).all(axis=1) & _used(found)
+    fine = np.isfinite(first["velocity"]).all(axis=1) & ~FAILURE[first["status"]]
     velocity = first["velocity"][fine, body]
     vary = np.argsort(-np.diag(found.gap_covariance), kind="stable")[:2]
     gaps = sorted(vary.tolist())
@@ -96,22 +97,14 @@ def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
     axes.set_aspect("equal" if _alike(x[0][0], x[1][0]) else "auto")
 
 
-def _used(found: MonteCarlo) -> np.ndarray:
-    """Which of the first samples did not fail."""
-    return ~FAILURE[found.first["status"]]
-
-
 def _in_units(found: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.ndarray, str]:
     """Gaps in gap scales where there are such, else in the metric unit that fits, and the label."""
     name = f"gap {contact + 1}"
     if found.gap_scale is not None:
         scale = found.gap_scale[contact]
         return gap / scale, f"{name} / {scale * 1e6:.3g} µm (gap scale)"
-    largest = np.max(gap, initial=0.0)
-    for unit, size in (("m", 1.0), ("mm", 1e-3), ("µm", 1e-6)):
-        if largest >= size:
-            return gap / size, f"{name} [{unit}]"
-    return gap / 1e-9, f"{name} [nm]"
+    unit, size = readable_unit("m", np.max(gap, initial=0.0))
+    return gap / size, f"{name} [{unit}]"
 
 
 def _alike(x: np.ndarray, y: np.ndarray) -> bool:

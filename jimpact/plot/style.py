@@ -20,7 +20,6 @@ SMALL = 8.5  # points
 
 _DECADES = 100.0  # an axis that spans less is labelled within its decades, too
 _PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
-_TIMES = (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6), ("ns", 1e-9))
 
 
 def new_figure(height: float) -> Figure:
@@ -98,11 +97,6 @@ def in_words(x: float) -> str:
     factor = x / 10.0**power
     head = "" if abs(factor - 1) < 1e-6 else f"{factor:.3g}\\cdot"
     return f"${head}10^{{{power}}}$"
-
-
-def unit_of_time(longest: float) -> tuple[str, float]:
-    """The unit that a duration [s] is read best in, and how long it is [s]."""
-    return next((row for row in _TIMES if longest >= row[1]), _TIMES[-1])
 
 
 def wrapped(name: str) -> str:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values
+from jimpact._checks import as_axis, as_float_array, check_shape, check_values
 from jimpact.bodies.blocks import rocking_block
 from jimpact.impacts import impact
 from jimpact.laws.lzb import LZB
@@ -301,11 +301,8 @@ def rocking_dispersion(
     ...
     ValueError: Argument `aspect` must lie in (0, inf), but has value -1 at index 0.
     """
-    a, mu, e = (
-        _axis("aspect", aspect),
-        _axis("friction", friction),
-        _axis("restitution", restitution),
-    )
+    a, mu = as_axis("aspect", aspect), as_axis("friction", friction)
+    e = as_axis("restitution", restitution)
     check_values("aspect", a, low=0.0, open_low=True)
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0)
@@ -344,7 +341,7 @@ def search_critical_angle(
     ...
     ValueError: Argument `restitution` must lie in (0, 1], but has value -0.5 at index 0.
     """
-    mu, e = _axis("friction", friction), _axis("restitution", restitution)
+    mu, e = as_axis("friction", friction), as_axis("restitution", restitution)
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0, open_low=True)
     law = _law(stiffness, exponent, None)
@@ -359,12 +356,3 @@ def search_critical_angle(
         step = (high - low) / (_POINTS - 1)
         low, high = best - step, best + step
     return rocking_kinetic_angle(best).reshape(len(mu), len(e))
-
-
-def _axis(name: str, value: Any) -> jax.Array:
-    array = jnp.atleast_1d(as_float_array(name, value))
-    if array.ndim != 1 or not array.size:
-        raise ValueError(
-            f"Argument `{name}` must be a scalar or have one axis, but has shape {array.shape}."
-        )
-    return array
