@@ -376,7 +376,11 @@ class FitProblem:
         return np.asarray(self.residuals.weight, float) * float(self.residuals.size)
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
-        """Errors (K, n, ...) of what was measured, in units of sigma and as independent ones."""
+        """Errors of what was measured, in units of sigma and as independent ones.
+
+        Args:
+            errors: (K, n, ...), shaped like `measured`, in its units.
+        """
         more = (1,) * (errors.ndim - self.measured.ndim)
         scaled = np.nan_to_num(errors) * self.weight.reshape(*self.measured.shape, *more)
         mixing = self.residuals.mixing
@@ -400,7 +404,11 @@ class FitProblem:
         )
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
-        """With factors on the independent errors, shaped like `measured`; 0 leaves a value out."""
+        """With factors on the independent errors.
+
+        Args:
+            factor: shaped like `measured`; 0 leaves a value out.
+        """
         r, kept = self.residuals, factor > 0
         mixing: Any = r.mixing
         weight = self.weight * factor
