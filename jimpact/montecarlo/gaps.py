@@ -130,7 +130,7 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
         scene: with two contacts; the mean of its gaps (none: closed) is widened as needed.
         law: a `Compliant`.
         velocity: v- (n,) [m/s].
-        offset: (s,) values of `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
+        offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
 
     Returns:
         `Crossover`: `gaps` (s, 2) [m], `velocity` (s, n) [m/s], `status` (s,), a row an offset.
