@@ -9,6 +9,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from jimpact._checks import check_kind
 from jimpact.methods.advice_report import Advice, as_code, share
 from jimpact.methods.chart import Point, Timing, WorkPrecision
 from jimpact.methods.stability import CLASSES, Slice, StabilityMap
@@ -74,6 +75,7 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     >>> len(ji.plot.work_precision(found).axes)
     2
     """
+    check_kind("found", found, WorkPrecision)
     gradients = any(point.gradient is not None for row in found.points.values() for point in row)
     figure, panels = new_panels(4, 3.6) if gradients else new_panels(2, 4.6)
     handles: dict[str, Any] = {}
@@ -215,6 +217,7 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
     >>> len(ji.plot.stability_map(found).axes)
     1
     """
+    check_kind("found", found, StabilityMap)
     names = list(found.axes)
     figure, grid = new_panels(len(names), 0.8 + 0.3 * len(found.methods), 1.2)
     for i, (axes, name) in enumerate(zip(grid, names)):
@@ -340,6 +343,7 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     >>> len(ji.plot.validity_map(found).axes)
     2
     """
+    check_kind("found", found, ValidityMap)
     figure = new_figure(6.8)
     top, bottom = figure.subplots(2, 1, sharex=True)
     for i, eta in enumerate(found.exponents):
@@ -382,6 +386,7 @@ def advice(found: Advice, title: str = "") -> Figure:
     >>> len(ji.plot.advice(found).axes)
     2
     """
+    check_kind("found", found, Advice)
     names, rows = list(found.candidates), list(found.candidates.values())
     bodies, x = len(found.velocity), np.arange(len(names))
     dodge = side_by_side(bodies)
