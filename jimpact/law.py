@@ -4,7 +4,7 @@ import abc
 import dataclasses
 import operator
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, get_args, overload
 
 import equinox as eqx
 import jax
@@ -257,7 +257,11 @@ class Declared(eqx.Module):
         for field in dataclasses.fields(self):
             declared = field.metadata.get(_KEY)
             if isinstance(declared, Domain):
-                declared.of(self).check(getattr(self, field.name))
+                value = getattr(self, field.name)
+                optional = field.default is None or type(None) in get_args(field.type)
+                if value is None and not optional:
+                    as_float_array(field.name, value)  # raises
+                declared.of(self).check(value)
 
 
 class Parameter(NamedTuple):

@@ -523,6 +523,13 @@ def test_derivatives(name, kind):
     assert np.sort(error)[-2] < 2e-5, error  # one of them may cross a change of stick and slip
 
 
+def test_slopes_of_a_plastic_poisson():
+    """At e = 0 towards the only side there is: what expands slides as it did."""
+    particle = ji.Scene([1.0, 1.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    after = jax.jacfwd(lambda e: ji.impact(ji.Poisson(e, 0.1), particle, [1.0, -1.0]).velocity)
+    close(jax.jit(after)(0.0), [-0.1, 1.0], atol=1e-12)
+
+
 def count(jaxpr):
     """Operations of a program, loops and branches included."""
     inner = [x for e in jaxpr.eqns for x in jax.tree.leaves(list(e.params.values()))]

@@ -487,12 +487,17 @@ def test_time_stepping_is_of_first_order():
     assert 0.8 < np.log10(coarse / fine) < 1.2
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("system", "law", "q0", "v0", "end"),
     [
-        (ji.cradle_system([1.0] * 3), ji.LZB(0.9), [-0.5, 0, 0], [0.0] * 3, 0.3),
-        (ji.column_system([1.0, 0.5], 0.05), ji.Moreau(0.6), [0.2, 0.45], [0.0] * 2, 0.35),
+        pytest.param(
+            ji.cradle_system([1.0] * 3), ji.LZB(0.9), [-0.5, 0, 0], [0.0] * 3, 0.3,
+            marks=pytest.mark.release,
+        ),
+        pytest.param(
+            ji.column_system([1.0, 0.5], 0.05), ji.Moreau(0.6), [0.2, 0.45], [0.0] * 2, 0.35,
+            marks=pytest.mark.slow,
+        ),
         # it falls on a corner, tips and strikes with the other one
         pytest.param(
             ji.block_system(0.2, 0.4), ji.Moreau(0.0, friction=0.3),

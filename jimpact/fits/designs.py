@@ -74,6 +74,7 @@ def design(
     >>> print(ji.design(found, ji.Experiments([[2.0, 0, 0], [0, 0, -1.0]], [[0.0] * 3] * 2)))
     shot 2: restitution[1] +- 0.012, restitution[2] +- 0.012
     """
+    check_kind("fit", fit, Fit)
     check_kind("candidates", candidates, Experiments)
     as_whole("count", count, 1)
     if fit.experiments is None or not np.isfinite(fit.noise):

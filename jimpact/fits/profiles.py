@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
+from jimpact._checks import check_kind
 from jimpact.fits.least_squares import DEFAULT_STEPS, Box, SolverState
 from jimpact.fits.multistart import EXACT, START_SCALES, run_held
 from jimpact.fits.problem import FEW, Residuals, filled_up, from_scaled, to_scaled
@@ -173,7 +174,10 @@ def can_be_profiled(fit: "Fit") -> bool:
 
 
 def check_profiled(fit: "Fit") -> None:
-    """Raise a ValueError unless parameters of this fit can be held."""
+    """Raise an error unless this is a fit, of parameters that can be held."""
+    from jimpact.fits.fitting import Fit  # whose methods profile
+
+    check_kind("fit", fit, Fit)
     if not can_be_profiled(fit):
         raise ValueError(
             "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."

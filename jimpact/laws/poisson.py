@@ -91,7 +91,9 @@ class Poisson(Law):
         returned = self.restitution * first.normal
         rate = jnp.concatenate([contact.gap_velocity, (1 + e_t) * contact.slip])
         rate = rate + a @ jnp.concatenate([first.normal + returned, first.tangential])
-        second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=returned)
+        # also at e = 0, where it begins with e
+        load = returned + jnp.finfo(mu.dtype).eps ** 2 * first.normal
+        second = solve(a, rate[:m], rate[m:], mu, complementary=True, load=load)
         code = jnp.maximum(first.status, second.status)
         if self.restitution.ndim == 1:
             loaded = jnp.concatenate([first.normal > 0, jnp.repeat(first.normal > 0, each)])

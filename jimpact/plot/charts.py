@@ -9,6 +9,7 @@ from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from jimpact._checks import check_kind
 from jimpact.methods.advice_report import Advice, as_code, share
 from jimpact.methods.chart import Point, Timing, WorkPrecision
 from jimpact.methods.stability import CLASSES, Slice, StabilityMap
@@ -47,14 +48,7 @@ CLASS_COLOURS = (
     "#000000",
     "#EEEEEE",
 )
-_LABELS = {
-    "setting": "setting, 1 finest",
-    "stiffness_ratio": "stiffness ratio",
-    "exponent": "exponent",
-    "restitution": "restitution e",
-    "mass_ratio": "mass ratio",
-    "balls": "balls N",
-}
+_LABELS = {"setting": "setting, 1 finest", "restitution": "restitution e", "balls": "balls N"}
 _TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
 _FLOOR = 1e-9  # errors below are drawn here
@@ -81,6 +75,7 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     >>> len(ji.plot.work_precision(found).axes)
     2
     """
+    check_kind("found", found, WorkPrecision)
     gradients = any(point.gradient is not None for row in found.points.values() for point in row)
     figure, panels = new_panels(4, 3.6) if gradients else new_panels(2, 4.6)
     handles: dict[str, Any] = {}
@@ -222,6 +217,7 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
     >>> len(ji.plot.stability_map(found).axes)
     1
     """
+    check_kind("found", found, StabilityMap)
     names = list(found.axes)
     figure, grid = new_panels(len(names), 0.8 + 0.3 * len(found.methods), 1.2)
     for i, (axes, name) in enumerate(zip(grid, names)):
@@ -306,7 +302,8 @@ def _ticks(
     labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_ticks(at, labels, fontsize=SMALL)
-    axis.set_label_text(_LABELS[name] if labelled else "", fontsize=SMALL)
+    word = _LABELS.get(name, name.replace("_", " ")) if labelled else ""
+    axis.set_label_text(word, fontsize=SMALL)
 
 
 def _place(found: StabilityMap, name: str) -> float:
@@ -346,6 +343,7 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     >>> len(ji.plot.validity_map(found).axes)
     2
     """
+    check_kind("found", found, ValidityMap)
     figure = new_figure(6.8)
     top, bottom = figure.subplots(2, 1, sharex=True)
     for i, eta in enumerate(found.exponents):
@@ -388,6 +386,7 @@ def advice(found: Advice, title: str = "") -> Figure:
     >>> len(ji.plot.advice(found).axes)
     2
     """
+    check_kind("found", found, Advice)
     names, rows = list(found.candidates), list(found.candidates.values())
     bodies, x = len(found.velocity), np.arange(len(names))
     dodge = side_by_side(bodies)

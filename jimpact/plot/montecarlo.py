@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jimpact._checks import check_kind
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
@@ -38,6 +39,7 @@ def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     >>> len(ji.plot.monte_carlo(found).axes)  # three bodies, map, its colour bar
     5
     """
+    check_kind("found", found, MonteCarlo)
     scattered = np.argsort(-found.std, kind="stable")
     bodies = sorted(scattered[:_BODIES].tolist())
     mapped = found.first["gaps"].shape[1] > 0

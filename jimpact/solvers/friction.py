@@ -97,7 +97,8 @@ def solve(
         friction: mu (m,).
         complementary: contacts may part; otherwise they may pull (without friction).
         load: (m,) >= 0, normal impulses beside p that friction knows of: it is bounded by
-            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0.
+            `mu (p + load)`, and acts on contacts with p = 0 too. None: 0. One below rounding counts
+            as one that begins: where p = 0 = r, derivatives are those of a contact that opens.
         sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
             already: s, an acceleration, does not decide), 0 where it is asked for. Not together
             with `load`.
@@ -106,9 +107,11 @@ def solve(
         p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are looked at, and
         consistent ones whose velocities differ were found; that which sticks most is returned. In
         space Newton's method looks for the directions of slip from 4 starts a contact, all
-        combined: solutions that none of them reaches are missed. Above 3 contacts others are not
-        looked for. `impulse_not_unique`: only the impulses differ. `infeasible`: no modes are
-        consistent; `max_steps`: none were found (in space, above 3 contacts).
+        combined: solutions that none of them reaches are missed. Above 3 contacts other modes are
+        not looked for. It is told, too, where redundant contacts slide, so that how they share p
+        changes their slip (a spinning cube flat on four corners). `impulse_not_unique`: only the
+        impulses differ. `infeasible`: no modes are consistent; `max_steps`: none were found (in
+        space, above 3 contacts).
 
     Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are
     about to change, and take a singular matrix to keep its rank; those of impulses that are not
@@ -160,8 +163,13 @@ def solve(
     fixed = _Problem(*jax.lax.stop_gradient(problem[:4]), complementary)
     modes, x, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
     modes, inverted = _most_at_rest(fixed, modes, x)
-    shared = jnp.any(jnp.abs(inverted.pairs) > 0)
-    status = jnp.maximum(status, jnp.where(shared, CODE["impulse_not_unique"], CODE["ok"]))
+    # what is free: contacts that slide may share p so that slip changes
+    free = inverted.weight.reshape(-1, 1) * inverted.pairs.T
+    moves = jnp.abs(fixed.matrix.reshape(free.shape) @ free)
+    root = float(jnp.finfo(matrix.dtype).eps) ** 0.5
+    code = jnp.where(jnp.any(free != 0), CODE["impulse_not_unique"], CODE["ok"])
+    code = jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
+    status = jnp.maximum(status, code)
     x = _on_modes(problem, modes, inverted, x)
     x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
     p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
@@ -387,6 +395,9 @@ def _at_rest(problem: _Problem, x: jax.Array, room: jax.Array) -> _Modes:
     rate = _rates(problem, x[..., None])
     room = (room * _size(x[..., None]))[None]
     taking = rate[:, 0] <= room if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
+    if problem.load is not None:
+        begins = (problem.load > 0) & (problem.load < float(jnp.finfo(x.dtype).eps))
+        taking = taking & ~(begins[:, None] & (x[:, :1] <= room))
     pushes = taking & (x[:, :1] >= -room)
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
