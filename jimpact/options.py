@@ -225,9 +225,8 @@ class StabilityCommand(DrawingCommand):
 
     methods: Annotated[tuple[str, ...], _own("NAME ...")] = ()
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
-    # Also other numbers of balls, finer, all pairs of axes with a picture a method, and 300 points
-    # over all axes besides.
     full: Flag = False
+    """Also other numbers of balls, all pairs of axes, 300 points between them."""
 
     def check(self) -> None:
         """Also the methods' names."""

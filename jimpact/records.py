@@ -2,11 +2,14 @@
 
 import dataclasses
 import shutil
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+
+_LEAST = 20  # characters of a column whose text is wrapped
 
 
 def as_data(value: Any) -> Any:
@@ -64,7 +67,7 @@ def table(
     """Lines of a table; the first column and those with a head in `left` are text, others numbers.
 
     On a terminal that is too narrow the columns are told in several tables, one below the other,
-    each with the first columns, as many as `keys`.
+    each with the first columns, as many as `keys`; text at the end of a line is wrapped.
 
     >>> from jimpact.records import table
     >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
@@ -77,12 +80,16 @@ def table(
     lines: list[str] = []
     for part in _parts(widths, keys, room):
         lines += [""] if lines else []
-        lines += [
-            "  ".join(
+        before = sum(widths[i] + 2 for i in part[:-1])
+        for row in whole:
+            cells = (
                 row[i].ljust(widths[i]) if is_text[i] else row[i].rjust(widths[i]) for i in part
-            ).rstrip()
-            for row in whole
-        ]
+            )
+            line = "  ".join(cells).rstrip()
+            wrapped = is_text[part[-1]] and len(line) > room > before + _LEAST
+            lines += (
+                textwrap.wrap(line, room, subsequent_indent=" " * before) if wrapped else [line]
+            )
     return lines
 
 

@@ -132,10 +132,7 @@ def check_study(path: str | Path, law: str | None = None) -> Found:
     def check(tables: dict[str, Any], file: Path) -> Found:
         check_tables(tables, ("scene", "law"), STUDY_TABLES)
         check_scene(tables["scene"])
-        own = _check_law(tables["law"], law)
-        free = check_fit(tables.get("fit", {}))
-        if own is not None:
-            _check_free(own, free if law is None else None)
+        _check_law(tables["law"], law, check_fit(tables.get("fit", {})))
         shots = 0
         if "data" in tables:
             check_data(tables["data"])
@@ -157,10 +154,8 @@ def check_motion_study(path: str | Path, law: str | None = None) -> bool:
 
     def check(tables: dict[str, Any], file: Path) -> bool:
         check_motion_tables(tables)
-        own = _check_law(tables["law"], law)
+        _check_law(tables["law"], law, check_fit(tables.get("fit", {})))
         body_keys("[system]", tables["system"], (GRAVITY,))
-        if own is not None:
-            _check_free(own, check_fit(tables.get("fit", {})) if law is None else None)
         if "data" in tables:
             read_positions(file.parent / tables["data"]["file"])
         return "data" in tables
@@ -242,21 +237,28 @@ def law_values(
     return name, kept, {k: v for k, v in bounds.items() if k in laws[name].parameters}
 
 
-def _check_law(table: Mapping[str, Any], other: str | None) -> str | None:
-    """Name of the law, None where only its class knows; words and ranges checked."""
+def _check_law(table: Mapping[str, Any], other: str | None, free: Mapping[str, Any]) -> None:
+    """Words and ranges of the law, and what is free of it, but where only its class knows them."""
     wanted = {str(table.get("name", "")).lower(), (other or "").lower()}
     if "module" in table or wanted & callers_laws():
-        return None
+        return
     name, values, _ = law_values(table, other, known_laws())
     row = names()["laws"][name]
     for key, value in values.items():
         if key in row["choices"]:
             check_choice(key, value, row["choices"][key])
+        if key in row["ranges"] and isinstance(value, bool | str):
+            raise ValueError(f"Argument `{key}` must be numeric, but has value {value!r}.")
         if key in row["ranges"] and isinstance(value, int | float):
             low, high, open_low, high_unless = row["ranges"][key]
             high = float("inf") if high is None or values.get(high_unless) else high
             check_values(key, value, low=low, high=high, open_low=open_low)
-    return name
+    for parameter in free if other is None else ():
+        if parameter not in row["free"]:
+            raise ValueError(
+                f"`free` in [fit] must name parameters of {name}, {', '.join(row['free'])}, "
+                f"but has {parameter!r}."
+            )
 
 
 def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dict[str, Any]:
@@ -272,16 +274,6 @@ def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dic
     if isinstance(free, list) and all(isinstance(name, str) for name in free):
         return dict.fromkeys(free, True)
     raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
-
-
-def _check_free(law: str, free: Mapping[str, Any] | None) -> None:
-    known = names()["laws"][law]["free"]
-    for name in free or ():
-        if name not in known:
-            raise ValueError(
-                f"`free` in [fit] must name parameters of {law}, {', '.join(known)}, "
-                f"but has {name!r}."
-            )
 
 
 def check_data(table: Mapping[str, Any]) -> None:

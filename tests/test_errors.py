@@ -193,7 +193,7 @@ CALLS = [
     (lambda: ji.gap_scale(PAIR, ji.Newton(1.0), [1.0, 0.0]), r"`law`"),
     (lambda: ji.gap_scale(PAIR, ji.LZB(1.0), [1.0]), r"`velocity`"),
     (lambda: ji.crossover(PAIR, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0], [0.0]), r"two contacts"),
-    (lambda: ji.crossover(BALLS, ji.Compliant(ji.Hertz(1.0)), V, 0.0), r"`offset`"),
+    (lambda: ji.crossover(BALLS, ji.Compliant(ji.Hertz(1.0)), V, [[0.0]]), r"`offset`"),
     (lambda: ji.theory.rocking_dispersion(0.0), r"`aspect`"),
     (lambda: ji.theory.rocking_dispersion([[1.0]]), r"`aspect`.*one axis"),
     (lambda: ji.theory.rocking_dispersion(1.0, friction=-0.1), r"`friction`"),

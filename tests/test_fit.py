@@ -186,6 +186,32 @@ def test_shots_whose_derivatives_are_garbage_are_left_out_and_named():
     assert np.isnan(found.residual[2]).all()
 
 
+class Rootlike(ji.Newton):
+    """Fast impacts have no derivative."""
+
+    def impulses(self, contact):
+        p, side, status = super().impulses(contact)
+        change = self.restitution - jax.lax.stop_gradient(self.restitution)
+        root = jnp.sqrt(jnp.where(contact.gap_velocity < -1.8, 0.0 * change, 1.0))
+        return ji.Impulses(p * (1 + root - jax.lax.stop_gradient(root)), side, status)
+
+
+def test_derivatives_that_are_no_numbers_are_left_out_or_refused():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01)
+    slow = [0, 1, 3]
+    found = ji.fit(Rootlike(0.9), PAIR, ji.Experiments(SHOTS, post))
+    expected = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[slow], post[slow]))
+    assert "Left out: 1 of 4 shots (3)" in told(found)
+    np.testing.assert_allclose(found.value, expected.value, rtol=1e-6)
+    problem = ji.FitProblem.from_observable(
+        ji.Newton(0.9), lambda law: jnp.sqrt(0.0 * law.restitution)[None], [0.1]
+    )
+    with pytest.raises(ValueError, match=r"at restitution = 0.9 those of 1 measured values \(1\)"):
+        ji.fit(problem)
+    with pytest.raises(ValueError, match="`bounds` must be left out where a FitProblem is given"):
+        ji.fit(problem, bounds={"restitution": (0.5, 1.0)})
+
+
 def test_turning_weighs_by_kinetic_energy():
     """A rod that strikes with its end: rad/s and m/s, with no sigma."""
     scene = ji.Scene([1.0, 0.01], [[1.0], [0.2]])

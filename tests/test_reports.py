@@ -157,7 +157,7 @@ def test_picture_of_a_rocking_record():
         a, np.array([0.3]), np.array([0.5]), gamma[:, None, None], one, one, one, one
     )
     v = ji.plot.rocking_dispersion(record)
-    curve = v.axes[0].lines[1]  # after the critical angle's
+    curve = v.axes[0].lines[0]
     np.testing.assert_allclose(curve.get_ydata(), np.abs(gamma[:, 1]))
     assert "critical angle 79.42 degrees" in str(record)
 

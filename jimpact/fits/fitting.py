@@ -242,7 +242,7 @@ def fit(
 
     Raises:
         ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of
-            scene and experiments that differ in number.
+            scene and experiments that differ in number, derivatives that are no numbers.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -256,6 +256,11 @@ def fit(
         as_whole(name, count, least)
     check_choice("loss", loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
+        if not (scene is experiments is bounds is None and free is DEFAULT_FREE):
+            raise ValueError(
+                "Arguments `scene`, `experiments`, `free` and `bounds` must be left out where a "
+                "FitProblem is given, which holds its own."
+            )
         problem = law
     else:
         problem = FitProblem.from_shots(law, scene, experiments, free, bounds)  # type: ignore[arg-type]
@@ -263,6 +268,7 @@ def fit(
     while (lost := unusable(problem, found)).any() and not lost.all():
         problem = _without(problem, lost)
         found = search(problem, method, starts, seed, steps, progress)
+    _check_derivatives(problem, found)
     if problem.residuals.mixing is not None:
         points = problem.point(np.array([end.value for end in found.minima]))
         (problem,), states = settled([problem], points, method, steps)
@@ -276,6 +282,18 @@ def fit(
     if profiles is None and needs_profiles(end):
         return replace(end, profiles=quick_profiles(end, progress))
     return end
+
+
+def _check_derivatives(problem: FitProblem, found: Search) -> None:
+    """Raise a ValueError where they are no numbers, which no shots left out could mend."""
+    lost = np.flatnonzero(~np.isfinite(found.jacobian).all(axis=1))
+    if len(lost):
+        at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, found.value))
+        which = ", ".join(str(i + 1) for i in lost[:LISTED]) + ", ..." * (len(lost) > LISTED)
+        raise ValueError(
+            f"Argument `law` must have derivatives that are numbers, but at {at} those of "
+            f"{len(lost)} measured values ({which}) are not."
+        )
 
 
 def check_squares(name: str, found: Any) -> None:
@@ -371,8 +389,8 @@ def as_fit(
     size = float(residuals.size)
     spread = _spread(problem, found, found.minima[0])
     if robust is not None:
-        freedom = max(spread.degrees_of_freedom, 1)
-        noise = robust.noise / np.sqrt(freedom)
+        freedom, unknown = spread.degrees_of_freedom, np.nan if problem.sigma is None else 1.0
+        noise = robust.noise / np.sqrt(freedom) if freedom > 0 else unknown
         spread = _spread(problem, found, found.minima[0], noise)
     elif problem.sigma is not None:
         times = stretch(problem, weighted(problem, found), spread.rank)

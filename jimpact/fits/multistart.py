@@ -110,7 +110,7 @@ def search(
         for _ in range(ROUNDS if starts > 1 else 0):
             best = int(np.nanargmin(states.cost))
             least = float(states.cost[best])
-            if 2 * least <= EXACT[str(states.y.dtype)]:
+            if 2 * least <= EXACT[str(states.y.dtype)] or not _smooth(states, best):
                 break
             points = _near(residuals, states, best, min(starts, LANES), rng)
             more = run(repeated(residuals, len(points)), points, method, max_steps, show)
@@ -344,6 +344,11 @@ def _groups(
     return groups
 
 
+def _smooth(states: SolverState, best: int) -> bool:
+    """Whether the derivatives at an end are numbers."""
+    return bool(np.isfinite(states.jacobian[best]).all())
+
+
 def _near(
     problem: Residuals, states: SolverState, best: int, count: int, rng: np.random.Generator
 ) -> np.ndarray:
@@ -367,6 +372,8 @@ def _valleys(
     slopes that the Jacobian gives: two turns between two of them are seen.
     """
     best, count = int(np.nanargmin(states.cost)), len(problem.names)
+    if not _smooth(states, best):
+        return np.zeros((0, states.y.shape[1]))
     known = np.asarray(states.jacobian[best], float)[:, :count]
     singular = np.linalg.svd(known, compute_uv=False)
     alone = isinstance(residuals.observe, Shots) and len(residuals.measured) <= FEW

@@ -15,8 +15,7 @@ import numpy as np
 
 import jimpact
 from jimpact.fits.profiles import can_be_profiled, profile
-from jimpact.fits.report import parameter_rows, report_blocks
-from jimpact.status import STATUS
+from jimpact.fits.report import parameter_rows, report_blocks, shot_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -32,6 +31,8 @@ td:first-child, th:first-child { text-align: left; }
 img { max-width: 100%; }
 .small { color: #555; font-size: .85rem; }
 """.strip()
+_PARAMETERS = ("parameter", "value", "standard error")
+_SHOTS = ("shot", "velocity", "before", "measured", "fitted", "residual", "unit", "status")
 _PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 
 
@@ -49,13 +50,13 @@ def write_page(fit: Any, path: Path, profiles: bool) -> Path:
 
 def page(fit: Any) -> str:
     """The page as text."""
-    blocks = report_blocks(fit)
+    blocks, kind = report_blocks(fit), "profile" if fit.profiles else "linearized"
     title = escape(blocks["headline"][0])
     parts = [
         f"<h1>{title}</h1>",
         f'<p class="verdict">{escape(fit.verdict)}</p>',
         "<h2>Parameters</h2>",
-        _table(*_parameters(fit)),
+        _table((*_PARAMETERS, f"95 % interval, {kind}", ""), parameter_rows(fit)),
         _listed("What the data cannot see", fit.identifiability),
         _listed("Defects of the data, warnings", fit.warnings or ("None.",)),
         _listed("Scatter from shot to shot", [x.strip(" -") for x in blocks["scatter"][1:]]),
@@ -64,7 +65,7 @@ def page(fit: Any) -> str:
         *_pictures(fit),
     ]
     if fit.experiments is not None:
-        parts += ["<h2>Shots</h2>", _table(*_shots(fit))]
+        parts += ["<h2>Shots</h2>", _table(_SHOTS, shot_rows(fit))]
     parts += ["<h2>How</h2>", _table(("", ""), _made_by(fit))]
     body = "\n".join(part for part in parts if part)
     head = f'<meta charset="utf-8">\n<title>{title}</title>\n<style>{_STYLE}</style>'
@@ -85,26 +86,6 @@ def _listed(title: str, lines: Sequence[str]) -> str:
         return ""
     items = "\n".join(f"<li>{escape(' '.join(line.split()))}</li>" for line in lines)
     return f"<h2>{escape(title)}</h2>\n<ul>\n{items}\n</ul>"
-
-
-def _parameters(fit: Any) -> tuple[list[str], list[list[str]]]:
-    kind = "profile" if fit.profiles else "linearized"
-    heads = ["parameter", "value", "standard error", f"95 % interval, {kind}", ""]
-    return heads, parameter_rows(fit)
-
-
-def _shots(fit: Any) -> tuple[list[str], list[list[str]]]:
-    data = fit.experiments
-    before, measured = np.asarray(data.pre, float), np.asarray(fit.problem.measured, float)
-    rows = []
-    for k, i in np.ndindex(*before.shape):
-        code = int(fit.status[k])
-        seen = "-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"
-        residual = "-" if np.isnan(measured[k, i]) else f"{fit.residual[k, i]:.3g}"
-        values = [f"{before[k, i]:.6g}", seen, f"{fit.predicted[k, i]:.6g}", residual]
-        told = "" if code == 0 or i else STATUS[code].name
-        rows.append([data.shots[k] if i == 0 else "", str(i + 1), *values, data.units[i], told])
-    return ["shot", "velocity", "before", "measured", "fitted", "residual", "unit", "status"], rows
 
 
 def _pictures(fit: Any) -> list[str]:

@@ -122,6 +122,7 @@ class Residuals(eqx.Module):
         bad = jnp.broadcast_to(seen.bad, self.measured.shape)
         harmless = jnp.where(bad, self.measured, seen.value)
         error = jnp.where(bad, PENALTY * self.unit, harmless - self.measured)
+        error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be no numbers
         return self.mixed(error * self.weight).reshape(-1), seen
 
     def mixed(self, weighted: Any) -> Any:

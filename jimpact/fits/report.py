@@ -134,7 +134,7 @@ def _headline(fit: Any) -> str:
 
 
 def parameter_rows(fit: Any) -> list[list[str]]:
-    """Name, value, standard error, interval, and whether it is at its bound."""
+    """Name, value, standard error, 95 % interval, remark of every parameter."""
     rows = []
     for i, pieces in enumerate(fit.intervals()):
         error = fit.standard_error[i]
@@ -148,20 +148,14 @@ def parameter_rows(fit: Any) -> list[list[str]]:
 
 def _parameters(fit: Any) -> list[str]:
     width = max(9, *(len(name) for name in fit.names))
-    head = "95 % interval" + " (profile)" * bool(fit.profiles)
-    rows = [["parameter", "value", "std. error", head, ""], *parameter_rows(fit)]
+    head = ["parameter", "value", "std. error", "95 % interval" + " (profile)" * bool(fit.profiles)]
     lines = [
-        f"{name:{width}s} {value:>12s} {error:>12s}   {interval}   {note}".rstrip()
-        for name, value, error, interval, note in rows
+        f"{name:{width}s} {value:>12s} {error:>12s}   {'   '.join(rest)}".rstrip()
+        for name, value, error, *rest in [head, *parameter_rows(fit)]
     ]
-    return [*lines, *unprofiled(fit)]
-
-
-def unprofiled(fit: Any) -> list[str]:
-    """How to get intervals that are true, where these may not be."""
-    if not misleads(fit):
-        return []
-    return ["A parabola at the minimum may mislead here: `ji.profile(fit)` finds true intervals."]
+    if misleads(fit):
+        lines.append("A parabola at the minimum may mislead here: see `ji.profile(fit)`.")
+    return lines
 
 
 def _quality(fit: Any) -> list[str]:
@@ -234,26 +228,34 @@ def _minima(fit: Any) -> list[str]:
     return [*lines, late] if late else lines
 
 
+def shot_rows(fit: Any, most: int | None = None) -> list[list[str]]:
+    """Label, number, before, measured, fitted, residual, unit, status; of so many shots."""
+    data = fit.experiments
+    before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
+    rows = []
+    for k, i in np.ndindex(*before[:most].shape):
+        seen = ["-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"]
+        residual = "-" if np.isnan(fit.residual[k, i]) else f"{fit.residual[k, i]:.3g}"
+        values = [f"{before[k, i]:.6g}", *seen, f"{fit.predicted[k, i]:.6g}", residual]
+        told = "" if fit.status[k] == 0 or i else STATUS[int(fit.status[k])].name
+        rows.append([data.shots[k] if i == 0 else "", str(i + 1), *values, data.units[i], told])
+    return rows
+
+
 def _shots(fit: Any) -> list[str]:
     data = fit.experiments
     if data is None:
         return []
-    pre, post = np.asarray(data.pre, float), np.asarray(data.post, float)
     mixed = len(set(data.units)) > 1
     unit = "" if mixed else f" [{data.units[0]}]"
     lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}{unit}"]
-    shown = max(1, _VELOCITIES_SHOWN // pre.shape[1])
-    for k in range(min(len(pre), shown)):
-        code = int(fit.status[k])
-        note = "" if code == 0 else f"   {STATUS[code].name}"
-        for i in range(pre.shape[1]):
-            label = data.shots[k] if i == 0 else ""
-            seen = "-" if np.isnan(post[k, i]) else f"{post[k, i]:.6g}"
-            values = f"{pre[k, i]:12.6g} {seen:>12s} {fit.predicted[k, i]:12.6g}"
-            each = f" {data.units[i]}" if mixed else ""
-            lines.append(f"{label:>8s} {i + 1:5d} {values}{each}{note if i == 0 else ''}")
-    if len(pre) > shown:
-        lines.append(f"     ... and {len(pre) - shown} more shots")
+    shots, bodies = data.pre.shape
+    shown = max(1, _VELOCITIES_SHOWN // bodies)
+    for label, body, before, seen, fitted, _, own, told in shot_rows(fit, shown):
+        row = f"{label:>8s} {body:>5s} {before:>12s} {seen:>12s} {fitted:>12s}"
+        lines.append(f"{row}{' ' + own if mixed else ''}{'   ' + told if told else ''}")
+    if shots > shown:
+        lines.append(f"     ... and {shots - shown} more shots")
     return lines
 
 

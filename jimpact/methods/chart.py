@@ -137,7 +137,7 @@ class WorkPrecision:
             f"Errors: relative, the largest of {self.sample} impacts with stiffness spread over a "
             f"factor {self.spread:g}; of a law its model error.",
             f"Times: medians of {self.repeats} in turns, µs per impact: alone, in a batch of "
-            f"{self.batch} (quartiles), with gradient.",
+            f"{self.batch} (quartiles){', with the Jacobian' if 'with J' in heads else ''}.",
         ]
         lines += [f"left out: {name}: {why}." for name, why in self.left_out.items()]
         lines += [f"no gradient: {name}: {why}." for name, why in self.without_gradient.items()]

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_axis, as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.contact import delassus_matrix
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law
@@ -130,7 +130,7 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
         scene: with two contacts; the mean of its gaps (none: closed) is widened as needed.
         law: a `Compliant`.
         velocity: v- (n,) [m/s].
-        offset: (s,) values of `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
+        offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
 
     Returns:
         `Crossover`: `gaps` (s, 2) [m], `velocity` (s, n) [m/s], `status` (s,), a row an offset.
@@ -150,7 +150,9 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
         raise ValueError(f"Argument `scene` must have two contacts, but has {scene.contacts}.")
     if not isinstance(law, Compliant):
         raise TypeError(f"Argument `law` must be a Compliant, but is {law!r}.")
-    s = as_axis("offset", offset)
+    s = as_float_array("offset", offset)
+    if s.ndim != 1:
+        raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
     check_values("offset", s)
     scale = gap_scale(scene, law, velocity)
     delta = jnp.max(scale.delta)

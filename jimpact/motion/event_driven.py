@@ -262,7 +262,7 @@ def _continued(start: _Run, past: jax.Array) -> _Run:
 
 
 def _begin(given: Given, max_events: int, records: bool) -> _Run:
-    system, _, _, settings, q0, v0, times, *_ = given
+    system, _, mu, settings, q0, v0, times, *_ = given
     m, dtype = given.contacts, q0.dtype
     state = given.start
     watched = 2 * m if settings.friction else m
@@ -282,6 +282,10 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         row = Row(last, no, flight.aim)
         rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), row)
         plan = Plan(rows, jnp.int32(0), no)
+    status = status_at_start(system, state, times[-1], settings.closed_below)
+    if mu is not None:
+        known = jnp.all(jnp.isfinite(mu))
+        status = jnp.where(known, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
     return _Run(
         flight,
         none,
@@ -292,7 +296,7 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
         last,
         table,
         jnp.int32(0),
-        status_at_start(system, state, times[-1], settings.closed_below),
+        status,
         plan,
     )
 

@@ -423,6 +423,7 @@ def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any
     penetrates = jnp.any(gaps(system, at.q, at.t) < -closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
     status = jnp.where(out_of_range(system, at), MOTION_CODE["out_of_range"], status)
+    status = jnp.where(end < at.t, MOTION_CODE["backward"], status)
     finite = jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
     return jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
 

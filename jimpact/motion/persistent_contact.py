@@ -31,6 +31,10 @@ from jimpact.status import CODE
 # Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
 # stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
+# Without friction masses may differ by as much as rounding lets them; who carries what of redundant
+# contacts may err by rounding over this.
+_THIN_RIDGE = 1e-9
+_INDEPENDENT = 3  # frictionless contacts that are taken not to be redundant: legs of a table
 _WRITTEN_OUT = 4  # rows up to which it is eliminated by scalars: beyond, that takes long to compile
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
@@ -97,9 +101,7 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     """The forces that keep the modes, and the acceleration with them."""
     m = given.normal.value.shape[0]
     if given.tangent is None or mu is None:
-        both = modes.active[:, None] & modes.active[None, :]
-        k = jnp.where(both, given.delassus, jnp.eye(m, dtype=given.free.dtype))
-        normal = solve_definite(k, jnp.where(modes.active, -given.approach, 0.0))
+        normal = _without_friction(given.delassus, -given.approach[:, None], modes.active)[:, 0]
         return Forces(normal, None, given.free + given.moved @ normal)
     w, held, drag = _dragged(given, mu, modes)
     right = -given.approach
@@ -170,7 +172,17 @@ def least_regularity(dtype: jnp.dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** _LEAST_REGULARITY
 
 
-def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -> jax.Array:
+def _without_friction(w: jax.Array, right: jax.Array, held: jax.Array) -> jax.Array:
+    """As `_least`; few contacts are taken not to be redundant."""
+    if len(held) > _INDEPENDENT:
+        return _least(w, right, held, jnp.ones_like(right[:, 0]), _THIN_RIDGE)
+    k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(len(held), dtype=w.dtype))
+    return solve_definite(k, jnp.where(held[:, None], right, 0.0))
+
+
+def _least(
+    w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array, beside: float = _RIDGE
+) -> jax.Array:
     """`w x = right` (k, columns) on the rows that are held; 0 elsewhere.
 
     Where that has many solutions, the one of least `sum w_jj x_j^2 / weight_j`.
@@ -181,7 +193,7 @@ def _least(w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array) -
     scaled = w * scale[:, None] * (scale * weight)[None]
     k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
-    ridge = jnp.where(held, _RIDGE, 0.0)
+    ridge = jnp.where(held, beside, 0.0)
     invert = inverse if len(held) <= _WRITTEN_OUT else _inverse_by_library
     z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS, invert)
     return (scale * weight)[:, None] * z
@@ -209,8 +221,7 @@ def constraint_impulse(
     if friction:
         p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
     else:
-        k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(size, dtype=rates.dtype))
-        p = solve_definite(k, jnp.where(held[:, None], -columns, 0.0))
+        p = _without_friction(w, -columns, held)
     rest = given.delassus.shape[0] - size
     return jnp.pad(p.reshape(rates.shape), ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
 

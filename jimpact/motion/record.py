@@ -41,6 +41,7 @@ MOTION_STATUS = (
         "contact forces with friction have several solutions: contacts stick or part (`events`)",
         False,
     ),
+    Status("backward", "t_end is before t_start", True),
 )
 MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 

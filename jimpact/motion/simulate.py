@@ -474,7 +474,7 @@ def _friction_of(
     check_values("friction", mu, low=0.0)
     if is_traced(mu):
         mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
-    elif not np.any(mu):
+    elif not np.asarray(mu).any():
         return None  # frictionless systems pay nothing
     m = _contacts_of(system, q)
     if tangents.shape[1] not in (m, 2 * m):

@@ -210,11 +210,15 @@ def resolve(
         both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
         found, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
         found = selected(_undisturbed(system, given, cluster, tight, t), cluster, found)
-    jump, held, pressed = found.jump, found.held, found.pressed
+    jump, pressed = found.jump, found.pressed
+    # redundant contacts come to rest with others
+    rate = given.normal.gradient.T @ (jump.v - carried_along(system, jump.v, t))
+    at_rest = closed & (jnp.abs(rate) <= rest)
+    held = found.held | at_rest
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strikes
     if mu is None:
-        active = pressed | (tight & found.still & ~released)
+        active = pressed | (at_rest & found.still & ~released)
         no = jnp.asarray(False)
         modes = no_modes(m, gamma.dtype)._replace(active=active)
         choice = Choice(modes, ~no, rest, no, jnp.zeros(m, bool))
@@ -232,7 +236,7 @@ def resolve(
         code = jnp.where(choice.several, jnp.maximum(code, CODE["several_outcomes"]), code)
     took = jnp.where(strikes, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
     took = took | choice.parts
-    decision = Decision(strikes, approach, closed, held, stick, found.ends, scales)
+    decision = Decision(strikes, approach, closed, found.held, stick, found.ends, scales)
     after = After(_booked(state, jump), jump, found.passed)
     kind = _kind(strikes, jams, jnp.any(found.ends), released[:m] | choice.parts, fired)
     return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)

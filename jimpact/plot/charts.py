@@ -47,14 +47,7 @@ CLASS_COLOURS = (
     "#000000",
     "#EEEEEE",
 )
-_LABELS = {
-    "setting": "setting, 1 finest",
-    "stiffness_ratio": "stiffness ratio",
-    "exponent": "exponent",
-    "restitution": "restitution e",
-    "mass_ratio": "mass ratio",
-    "balls": "balls N",
-}
+_LABELS = {"setting": "setting, 1 finest", "restitution": "restitution e", "balls": "balls N"}
 _TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
 _FLOOR = 1e-9  # errors below are drawn here
@@ -306,7 +299,8 @@ def _ticks(
     labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_ticks(at, labels, fontsize=SMALL)
-    axis.set_label_text(_LABELS[name] if labelled else "", fontsize=SMALL)
+    word = _LABELS.get(name, name.replace("_", " ")) if labelled else ""
+    axis.set_label_text(word, fontsize=SMALL)
 
 
 def _place(found: StabilityMap, name: str) -> float:

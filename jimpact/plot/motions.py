@@ -42,7 +42,8 @@ def motion(
     """Coordinates, velocities and gaps against time, events, and where the energy goes.
 
     Each unit has axes of its own. Curves go through the states before and after every event, so
-    that a jump stands upright at its time.
+    that a jump stands upright at its time. Gaps far above all of contacts that closed are left out,
+    and the potential energy counts from its least value.
 
     Args:
         motion: one motion (of a batch: `jax.tree.map(lambda x: x[i], motion)`).
@@ -170,13 +171,16 @@ def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
 
 
 def _gaps(axes: Axes, motion: Motion) -> None:
-    """Gaps; they are 0 at the events of their contacts."""
+    """Gaps, 0 at the events of their contacts; not those far above all of contacts that closed."""
     values, events = np.asarray(motion.gaps), motion.events
     single = events.contacts.shape[-1] == values.shape[1]
-    for j in range(values.shape[1]):
-        rows = np.zeros(len(events.time), bool)
-        if single:
-            rows = (np.asarray(events.kind) > 0) & np.asarray(events.contacts)[:, j]
+    closed = np.zeros((len(events.time), values.shape[1]), bool)
+    if single:
+        closed = (np.asarray(events.kind) > 0)[:, None] & np.asarray(events.contacts)
+    ever = closed.any(axis=0)
+    far = np.nanmax(values[:, ever], initial=-np.inf) if ever.any() else np.inf
+    for j in np.flatnonzero(np.nanmin(values, axis=0, initial=np.inf) <= far):
+        rows = closed[:, j]
         time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
         order = np.argsort(time, kind="stable")
         gap = np.concatenate([values[:, j], np.zeros(rows.sum())])[order]
@@ -196,7 +200,10 @@ def _event_lines(axes: Axes, motion: Motion) -> None:
 
 
 def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
-    """Energy, and what has gone where since the start; of a known system with its jumps."""
+    """Energy, and what has gone where since the start; of a known system with its jumps.
+
+    V counts from its least value, beside which what is lost can be seen.
+    """
     time = np.asarray(motion.time)
     if system is None:
         drawn = time, motion.kinetic_energy, motion.energy
@@ -204,7 +211,8 @@ def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) 
         q, v = jnp.asarray(course.q), jnp.asarray(course.v)
         moving = jax.vmap(partial(kinetic, system))(q, v)
         drawn = course.time, moving, moving + jax.vmap(partial(potential, system))(q)
-    axes.plot(drawn[0], drawn[2], color="black", label="T + V")
+    least = np.nanmin(drawn[2] - drawn[1], initial=np.inf)
+    axes.plot(drawn[0], drawn[2] - least, color="black", label="T + V − min V")
     axes.plot(drawn[0], drawn[1], color=GREY, lw=0.8, label="T")
     # the shares of single contacts in a multiple impact may have either sign: their sum is shown
     normal, tangential = np.asarray(motion.contact_work).sum(axis=-1).T

@@ -244,7 +244,7 @@ def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
             axes.plot(theta, size[:, j, k], color=colour, lw=1.6, label=f"e = {e:g}")
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     finish(*panels)
-    _angle_axes(panels, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
+    _angle_axes(found, panels, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
     legend_below(figure, panels[0].get_legend_handles_labels()[0], 6)
     return figure
 
@@ -277,25 +277,26 @@ def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = S
     theta, e = np.degrees(found.kinetic_angle), np.asarray(found.restitution)
     for j, axes in enumerate(panels):
         axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
-    _angle_axes(panels, "restitution e")
+    _angle_axes(found, panels, "restitution e")
     shown = np.unique(codes)
     legend_below(figure, [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in shown], 5)
     return figure
 
 
 def _panels(found: RockingDispersion, title: str) -> tuple[Figure, Any]:
-    """A panel for each mu, with a line at its critical angle."""
+    """A panel for each mu."""
     figure, every = new_panels(len(found.friction), 2.8, 0.6, sharex=True, sharey=True)
     for axes, mu in zip(every, np.asarray(found.friction)):
         axes.set_title(f"mu = {mu:g}", loc="left", fontsize="medium")
-        critical = float(np.degrees(critical_kinetic_angle(mu)))
-        axes.axvline(critical, color="black", ls=":", lw=1)
     heading(figure, title)
     return figure, every
 
 
-def _angle_axes(panels: np.ndarray, label: str) -> None:
-    """Labels on the left, and below the last panel of each column."""
+def _angle_axes(found: RockingDispersion, panels: np.ndarray, label: str) -> None:
+    """Critical angles; labels on the left, and below the last panel of each column."""
+    for axes, mu in zip(panels, np.asarray(found.friction)):
+        critical = float(np.degrees(critical_kinetic_angle(mu)))
+        axes.axvline(critical, color="black", ls=":", lw=1)
     for axes in panels[::COLUMNS]:
         axes.set_ylabel(label)
     for axes in panels[-COLUMNS:]:
