@@ -259,13 +259,8 @@ class FrictionFlow(ContactFlow):
         ask = any_of(stopped | (closed & resting))
         asked = ask & loaded & (stopped | resting | (slip == 0))
         u = jnp.where(asked, 0.0, u)
-        still = jax.lax.stop_gradient(self)
-        const = ContactFlow.constants(still, modes)
-        x, g, _ = jax.lax.stop_gradient(self.rows(y))
-        soon = jnp.maximum(x + AHEAD * const.closing * g, 0.0)
-        f = still.force(const, soon, g)
-        top = jnp.max(f, axis=0, keepdims=True)
-        f = f / jnp.where(top > 0, top, 1.0)
+        still, state = jax.lax.stop_gradient((self, y))
+        f = still.soon(modes, state)
         most = still.friction * f
         slides = jnp.where(asked | ~loaded, 0.0, -slip.astype(u.dtype) * most)
         b = times(jnp.swapaxes(still.across, 0, 1), f) + times(still.along, slides)
@@ -273,6 +268,14 @@ class FrictionFlow(ContactFlow):
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
         slip = jnp.where(asked, towards, slip)
         return jnp.concatenate([modes[: 2 * m], slip]), jnp.concatenate([y[: 3 * m], u, y[4 * m :]])
+
+    def soon(self, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Forces (m, B) a moment later, in parts of the largest."""
+        const = ContactFlow.constants(self, modes)
+        x, g, _ = self.rows(y)
+        f = self.force(const, jnp.maximum(x + AHEAD * const.closing * g, 0.0), g)
+        top = jnp.max(f, axis=0, keepdims=True)
+        return f / jnp.where(top > 0, top, 1.0)
 
     def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
         m, side = self.contacts, self.forces(self.constants(modes), y).side

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, as_pytree, times, unit
-from jimpact.events.friction_flow import AHEAD, FrictionFlow, inverse, solve
+from jimpact.events.friction_flow import FrictionFlow, inverse, solve
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.friction import distribute
 
@@ -387,13 +387,8 @@ class SlipFlow(FrictionFlow):
         slip = jnp.where(slips, SLIPS, slip)
         ask = any_of(stopped | (closed & resting))
         asked = ask & loaded & (stopped | resting | stick)
-        still = jax.lax.stop_gradient(self)
-        frozen = ContactFlow.constants(still, modes)
-        x, g, _ = jax.lax.stop_gradient(self.rows(y))
-        soon = jnp.maximum(x + AHEAD * frozen.closing * g, 0.0)
-        f = still.force(frozen, soon, g)
-        top = jnp.max(f, axis=0, keepdims=True)
-        f = f / jnp.where(top > 0, top, 1.0)
+        still, state = jax.lax.stop_gradient((self, y))
+        f = still.soon(modes, state)
         most = still.friction * f
         slides = jnp.where(
             (asked | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
