@@ -61,6 +61,20 @@ def readable_unit(unit: str, largest: float) -> tuple[str, float]:
     return next((row for row in sizes.items() if largest >= row[1]), (f"n{unit}", 1e-9))
 
 
+def with_error(value: float, error: float) -> str:
+    """A value and its standard error, to the digits that count.
+
+    >>> from jimpact.records import with_error
+    >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
+    ('0.991 ± 0.004', '132 ± 18', '0.4 ± 0')
+    """
+    if not 1e-9 * abs(value) < error < np.inf:
+        return f"{value:.6g} ± {error:.2g}"
+    power = int(np.floor(np.log10(error)))
+    digits = max(0, -power + (error < 2 * 10.0**power))  # two digits of an error that begins with 1
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
 def table(
     heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[str] = (), keys: int = 1
 ) -> list[str]:

@@ -14,7 +14,7 @@ from jimpact.fits.profiles import in_words, misleads
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.records import as_data
+from jimpact.records import as_data, with_error
 from jimpact.status import STATUS
 
 _VELOCITIES_SHOWN = 24
@@ -106,20 +106,6 @@ def _told(fit: Any, i: int) -> str:
         if words.startswith("at ") or " or " in words:
             return f"{name} = {told}, {words} ({100 * fit.profiles[i].level:g} %)"
     return f"{name} = {told}{', the end of what is allowed' if fit.at_bound[i] else ''}"
-
-
-def with_error(value: float, error: float) -> str:
-    """A value and its standard error, to the digits that count.
-
-    >>> from jimpact.fits.report import with_error
-    >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
-    ('0.991 ± 0.004', '132 ± 18', '0.4 ± 0')
-    """
-    if not 1e-9 * abs(value) < error < np.inf:
-        return f"{value:.6g} ± {error:.2g}"
-    power = int(np.floor(np.log10(error)))
-    digits = max(0, -power + (error < 2 * 10.0**power))  # two digits of an error that begins with 1
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _headline(fit: Any) -> str:

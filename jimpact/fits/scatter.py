@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import chdtrc, stdtr
 
+from jimpact.records import with_error
+
 if TYPE_CHECKING:
     from jimpact.fits.fitting import Fit
 
@@ -38,8 +40,6 @@ class Scatter:
     each_error: np.ndarray
 
     def __str__(self) -> str:
-        from jimpact.fits.report import with_error
-
         i = self.names.index(self.name)
         mean, error = self.mean[i], self.standard_error[i]
         if self.chance > SURE:
