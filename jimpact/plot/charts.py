@@ -68,6 +68,9 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
+    Raises:
+        TypeError: something else.
+
     >>> import jimpact as ji
     >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
     >>> options = {"laws": {}, "batch": 4, "gradients": False}
@@ -211,6 +214,9 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
+    Raises:
+        TypeError: something else.
+
     >>> import jimpact as ji
     >>> axes = {"restitution": [0.5, 1.0]}
     >>> found = ji.stability_map(["verlet"], axes, {"balls": 2, "exponent": 1})
@@ -338,6 +344,9 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
+    Raises:
+        TypeError: something else.
+
     >>> import jimpact as ji
     >>> found = ji.validity_map(ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0])
     >>> len(ji.plot.validity_map(found).axes)
@@ -380,6 +389,9 @@ def advice(found: Advice, title: str = "") -> Figure:
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: something else.
 
     >>> import jimpact as ji
     >>> found = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)

@@ -32,6 +32,9 @@ def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
+    Raises:
+        TypeError: something else.
+
     >>> import jimpact as ji
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([1.0, 1.0, 1.0])
     >>> gaps = ji.Uniform(0.0, 1e-5)
