@@ -105,14 +105,14 @@ class Scene(eqx.Module):
         left, _ = self.walls
         body = np.arange(self.size)[:, None]
         first = np.arange(self.contacts)[None, :] - int(left)  # body on the contact's left
-        signs = (body == first + 1).astype(int) - (body == first).astype(int)
-        return jnp.asarray(signs, self.mass.dtype)
+        dtype = self.mass.dtype
+        return jnp.asarray((body == first + 1).astype(dtype) - (body == first).astype(dtype))
 
     @property
     def closed(self) -> jax.Array:
         """Boolean (m,): contacts without a gap."""
         if self.gaps is None:
-            return jnp.ones(self.contacts, bool)
+            return jnp.asarray(np.ones(self.contacts, bool))
         return self.gaps <= 0
 
 

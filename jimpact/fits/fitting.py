@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
@@ -397,7 +396,7 @@ def as_fit(
         spread = _spread(problem, found, found.minima[0], times) if times > 1 else spread
     residual = np.asarray(problem.measured, float) - found.seen
     return Fit(
-        law=with_entries(problem.law, residuals.fields, jnp.asarray(found.entries)),
+        law=with_entries(problem.law, residuals.fields, found.entries),
         method=method if isinstance(method, str) else "optax",
         names=names,
         value=found.value,

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Collection, Mapping
 from typing import Any, TypeVar
 
-import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
@@ -55,13 +55,13 @@ def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
     return np.concatenate([np.ravel(np.asarray(value_of(law, f), float)) for f in fields])
 
 
-def with_entries(law: AnyLaw, fields: tuple[str, ...], values: jax.Array) -> AnyLaw:
+def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
     """The law with these entries (Q,)."""
     start = 0
     for field in fields:
         old = value_of(law, field)
         new = values[start : start + old.size].reshape(old.shape).astype(old.dtype)
-        law = with_parameter(law, field, new)
+        law = with_parameter(law, field, jnp.asarray(new))
         start += old.size
     return law
 

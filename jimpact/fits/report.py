@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jimpact.experiments import data_defects
@@ -294,7 +293,7 @@ def fit_warnings(
     lines, data = list(problem.left_out), problem.experiments
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
-        stored = float(np.sum(jnp.broadcast_to(problem.law.stored, contacts)))
+        stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
         lines += data_defects(data, problem.scene, stored)
     if not found.converged:
         lines.append(
