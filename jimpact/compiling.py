@@ -5,13 +5,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from jimpact.kept import KeptPrograms
+if TYPE_CHECKING:
+    from jimpact.kept import KeptPrograms
 
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
 # take twice as long to compile a program of many small loops.
@@ -19,12 +20,14 @@ QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_kept: ContextVar[KeptPrograms | None] = ContextVar("kept", default=None)
+_kept: "ContextVar[KeptPrograms | None]" = ContextVar("kept", default=None)
 
 
 @contextmanager
 def kept_in(folder: str | Path | None) -> Iterator[None]:
     """Within, programs of their own are kept in this folder, and taken from it; None: nowhere."""
+    from jimpact.kept import KeptPrograms  # which none but the command line needs
+
     before = _kept.set(None if folder is None else KeptPrograms(Path(folder)))
     try:
         yield

@@ -15,7 +15,7 @@ import pickle
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,7 @@ def _described(made_of: Any) -> bytes | None:
     return text.getvalue()
 
 
+@cache
 def _sources() -> bytes:
     """This library's source, and versions of what it runs with."""
     found = hashlib.sha256()
@@ -67,10 +68,7 @@ class KeptPrograms:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.sources = _sources()
         self.at_hand: dict[Any, Callable[..., Any]] = {}
-        # JAX finds LAPACK, without which loaded programs crash, when it lowers a use of it.
-        jax.jit(jax.lax.linalg.lu).lower(np.eye(1, dtype=np.float32))
 
     def run(
         self, program: Any, called: Callable[..., Any], fixed: Any, arrays: list[jax.Array]
@@ -90,7 +88,7 @@ class KeptPrograms:
             self.at_hand[place] = partial(program, fixed)
             return program(fixed, arrays)
         settings = f"{jax.config.values} {os.environ.get('XLA_FLAGS')}".encode()
-        path = self.folder / hashlib.sha256(self.sources + settings + described).hexdigest()
+        path = self.folder / hashlib.sha256(_sources() + settings + described).hexdigest()
         with suppress(Exception):  # not there, or of no use: compiled anew, and replaced
             loaded = _read(path, arrays)
             result = jax.block_until_ready(loaded(arrays))
@@ -113,8 +111,15 @@ def _compiled(program: Any, fixed: Any, arrays: list[jax.Array]) -> jax.stages.C
         jax.config.update(least, before)
 
 
+@cache
+def _find_lapack() -> None:
+    """JAX finds it when it lowers a use of it; programs that are loaded crash without it."""
+    jax.jit(jax.lax.linalg.lu).lower(np.eye(1, dtype=np.float32))
+
+
 def _read(path: Path, arrays: list[jax.Array]) -> Callable[..., Any]:
     code, given = pickle.loads(path.read_bytes())
+    _find_lapack()
     trees = jax.tree.structure(((arrays,), {})), jax.tree.structure(given)
     return serialize_executable.deserialize_and_load(code, *trees)
 

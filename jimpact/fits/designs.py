@@ -10,7 +10,7 @@ from jimpact._checks import as_whole, check_kind
 from jimpact.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import Box
-from jimpact.fits.multistart import repeated, run
+from jimpact.fits.multistart import quiet, repeated, run
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
 
@@ -119,7 +119,7 @@ def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     here = eqx.tree_at(
         lambda r: (r.mix, r.offset, r.scale, r.low, r.high, r.region), residuals, parts
     )
-    states = run(repeated(here, 1), y[None], "levenberg-marquardt", 1, lambda *told: None)
+    states = run(repeated(here, 1), y[None], "levenberg-marquardt", 1, quiet)
     shape = (*problem.measured.shape, -1)
     slopes = np.asarray(states.jacobian[0][: problem.measured.size], float)
     rows = slopes.reshape(shape)[..., : len(fit.names)] * float(problem.residuals.size) / noise

@@ -204,12 +204,9 @@ def _refits(
     fit: Fit, problems: list[FitProblem], many: Residuals, progress: float | None
 ) -> Refits:
     """Minima of these problems next to a fit."""
-    points, limit = (
-        np.tile(fit.problem.point(fit.value), (len(problems), 1)),
-        DEFAULT_STEPS[_METHOD],
-    )
+    points = np.tile(fit.problem.point(fit.value), (len(problems), 1))
     with progress_bar(progress) as show:
-        _, states = settled(problems, points, _METHOD, limit, show, many)
+        _, states = settled(problems, points, _METHOD, DEFAULT_STEPS[_METHOD], show, many)
     value = fit.problem.values_at(np.asarray(states.y, float))
     seen = np.asarray(states.kept[0], float)
     seen = seen[:, : len(fit.predicted)] if fit.predicted.ndim else seen

@@ -126,14 +126,14 @@ def search(
     return ends(problem, states)
 
 
-def _quiet(what: str, done: float, total: float) -> None:
+def quiet(what: str, done: float, total: float) -> None:
     """No progress is shown."""
 
 
 def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Search:
     """The minimum next to y (Q,)."""
     residuals = repeated(filled_up(problem.residuals), 1)
-    return ends(problem, run(residuals, y[None], method, max_steps, _quiet))
+    return ends(problem, run(residuals, y[None], method, max_steps, quiet))
 
 
 def settled(
@@ -141,7 +141,7 @@ def settled(
     points: np.ndarray,
     method: Method,
     max_steps: int,
-    show: Show = _quiet,
+    show: Show = quiet,
     many: Residuals | None = None,
 ) -> tuple[list[FitProblem], SolverState]:
     """Minima next to points (S, Q), equally many of each problem, its best one first.
