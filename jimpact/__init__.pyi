@@ -17,10 +17,10 @@ from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle 
 from .bodies.piles import Discs as Discs
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
 from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
-from .comparison import (
-    compare as compare,
-    dispersion_index as dispersion_index,
-    energy_ratio as energy_ratio,
+from .cli.study import Study as Study, cube_impacts as cube_impacts, read_study as read_study
+from .cli.study_motion import (
+    MotionStudy as MotionStudy,
+    read_motion_study as read_motion_study,
 )
 from .contact import (
     Contact as Contact,
@@ -29,9 +29,9 @@ from .contact import (
     normalized_delassus as normalized_delassus,
     normalized_gap_velocity as normalized_gap_velocity,
 )
-from .experiments import Experiments as Experiments, read_experiments as read_experiments
 from .fits.contours import Contour as Contour, contour as contour
 from .fits.designs import Design as Design, design as design
+from .fits.experiments import Experiments as Experiments, read_experiments as read_experiments
 from .fits.fitting import Fit as Fit, fit as fit
 from .fits.many import (
     Refits as Refits,
@@ -49,7 +49,6 @@ from .fits.selection import (
     fit_laws as fit_laws,
     nested_test as nested_test,
 )
-from .histories import history as history
 from .impacts import Impact as Impact, impact as impact, raise_on_failure as raise_on_failure
 from .law import (
     Impulses as Impulses,
@@ -76,6 +75,7 @@ from .laws.forces import (
     PowerLaw as PowerLaw,
     UserForce as UserForce,
 )
+from .laws.histories import history as history
 from .laws.kinematic import (
     Moreau as Moreau,
     Newton as Newton,
@@ -87,6 +87,11 @@ from .laws.poisson import Poisson as Poisson
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent
 from .methods.advice import advise as advise
 from .methods.chart import work_precision as work_precision
+from .methods.comparison import (
+    compare as compare,
+    dispersion_index as dispersion_index,
+    energy_ratio as energy_ratio,
+)
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
@@ -102,10 +107,6 @@ from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
 from .motion.simulate import simulate as simulate
-from .motion.study_motion import (
-    MotionStudy as MotionStudy,
-    read_motion_study as read_motion_study,
-)
 from .motion.system import (
     HarmonicBase as HarmonicBase,
     System as System,
@@ -126,7 +127,6 @@ from .scene import (
     velocity_change as velocity_change,
 )
 from .status import STATUS as STATUS
-from .study import Study as Study, cube_impacts as cube_impacts, read_study as read_study
 from .theory.han_gilmore_tree import han_gilmore as han_gilmore
 
 __version__: str

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 if TYPE_CHECKING:
-    from jimpact.kept import KeptPrograms
+    from jimpact.cli.kept import KeptPrograms
 
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
 # take twice as long to compile a program of many small loops.
@@ -26,7 +26,7 @@ _kept: "ContextVar[KeptPrograms | None]" = ContextVar("kept", default=None)
 @contextmanager
 def kept_in(folder: str | Path | None) -> Iterator[None]:
     """Within, programs of their own are kept in this folder, and taken from it; None: nowhere."""
-    from jimpact.kept import KeptPrograms  # which none but the command line needs
+    from jimpact.cli.kept import KeptPrograms  # which none but the command line needs
 
     before = _kept.set(None if folder is None else KeptPrograms(Path(folder)))
     try:

@@ -1,12 +1,12 @@
 """How far long work is, on stderr: a bar on a terminal, elsewhere a line a step."""
 
 import contextlib
+import shutil
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
-
-from jimpact.starting import fitting
 
 LONG = 2.0  # seconds after which work counts as long
 LINE_EVERY = 10.0  # seconds between two lines about one step
@@ -133,4 +133,15 @@ class Steps:
         self.done.append(step)
         seconds = time.monotonic() - self.patience.begun
         if seconds > LONG:
-            print(fitting(f"{self.command}: {step} ({seconds:.0f} s)"), file=sys.stderr)
+            print(wrapped(f"{self.command}: {step} ({seconds:.0f} s)"), file=sys.stderr)
+
+
+def wrapped(text: str) -> str:
+    """The text with its sentences wrapped to the width of the terminal; tables stay as they are."""
+    width = shutil.get_terminal_size((len(text), 0)).columns
+    return "\n".join(
+        textwrap.fill(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip(" -"))))
+        if len(line) > width and "  " not in line.strip()
+        else line
+        for line in text.splitlines()
+    )

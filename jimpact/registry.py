@@ -1,7 +1,7 @@
 """The registry of laws: what studies, comparisons and the command line know by name."""
 
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 from jimpact._checks import check_choice
@@ -119,3 +119,23 @@ def register(
 
 def _place(law: type[Law]) -> tuple[str, str]:
     return law.__module__, law.__qualname__
+
+
+def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str, str]]:
+    """One law of each kind of the registry, from parameters by name; and why others are left out.
+
+    >>> import jimpact as ji
+    >>> from jimpact.registry import registered_laws
+    >>> assert ji.REGISTRY  # our own laws are registered where they are imported
+    >>> laws, left_out = registered_laws({"restitution": 0.9})
+    >>> sorted(laws), left_out["restitution_matrix"]
+    (['binary', 'lzb', 'moreau', 'newton', 'poisson'], 'needs `matrix`')
+    """
+    laws, left_out = {}, {}
+    for name, row in REGISTRY.items():
+        missing = [f"`{key}`" for key in row.required if key not in values]
+        if missing:
+            left_out[name] = f"needs {', '.join(missing)}"
+        else:
+            laws[name] = row.build(**{key: values[key] for key in row.arguments if key in values})
+    return laws, left_out

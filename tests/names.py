@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 import jimpact as ji
+from jimpact.cli.study import _BODIES
 from jimpact.law import _KEY, Domain, Option
 from jimpact.methods.contenders import METHODS
-from jimpact.study import _BODIES
 
 PATH = Path(ji.__file__).parent / "data" / "names.json"
 

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.cli import keep_programs, main
-from jimpact.study import body_of
+from jimpact.cli.main import keep_programs, main
+from jimpact.cli.study import body_of
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
 STUDY = """
@@ -640,7 +640,7 @@ def test_typos_are_told_before_jax_is_imported(tmp_path):
         (tmp_path / f"{i}.toml").write_text(STUDY.replace(old, new))
         calls.append(["fit", f"{i}.toml"])
     code = (
-        "import sys\nfrom jimpact.cli import main\n"
+        "import sys\nfrom jimpact.cli.main import main\n"
         f"for arguments in {calls}:\n"
         "    try: print(main(arguments))\n"
         "    except SystemExit: pass\n"

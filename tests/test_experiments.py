@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.experiments import data_defects
-from jimpact.shots_file import UNITS
-from jimpact.study import read_study
+from jimpact.cli.study import read_study
+from jimpact.files.shots_file import UNITS
+from jimpact.fits.experiments import data_defects
 
 DATA = files("jimpact") / "data"
 CHAIN = ji.chain([1.0, 1.0, 1.0])

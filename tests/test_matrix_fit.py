@@ -10,8 +10,8 @@ from scipy.optimize import minimize
 
 import jimpact as ji
 from jimpact import RestitutionMatrix, fit, normalized_delassus
+from jimpact.cli.study import read_study
 from jimpact.fits.matrix_fit import admissible_start
-from jimpact.study import read_study
 from jimpact.theory.restitution_matrices import margin
 
 CHAIN = ji.chain([1.0, 2.0, 3.0])

@@ -30,7 +30,7 @@ from jimpact import (
     monte_carlo,
     read_samples,
 )
-from jimpact.comparison import registered_laws
+from jimpact.laws import registered_laws
 from jimpact.montecarlo import statistics as histograms, store
 from jimpact.montecarlo.statistics import merged, moments
 from jimpact.montecarlo.store import fingerprint

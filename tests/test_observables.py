@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.motion.study_motion import read_motion_study
-from jimpact.study import read_study
+from jimpact.cli.study import read_study
+from jimpact.cli.study_motion import read_motion_study
 
 COLUMN = """
 [scene]

@@ -102,7 +102,7 @@ def test_it_is_sampled():
 
 
 def test_it_is_named_in_a_study(registered, tmp_path, capsys):
-    from jimpact.cli import main
+    from jimpact.cli.main import main
 
     (tmp_path / "shots.csv").write_text(
         "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.2,0.8\n2,0,0.4,1.6\n"

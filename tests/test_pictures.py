@@ -16,10 +16,10 @@ from test_reports import canned, rocked
 
 import jimpact as ji
 from jimpact.audits import Audit
-from jimpact.comparison import Comparison, Entry
-from jimpact.histories import History
+from jimpact.laws.histories import History
 from jimpact.methods.advice_report import Advice, Candidate
 from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
+from jimpact.methods.comparison import Comparison, Entry
 from jimpact.methods.stability import Confirmation, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
 from jimpact.plot.style import SMALL, WIDTH

@@ -10,10 +10,10 @@ import pytest
 from scipy.special import chdtrc, erf
 
 import jimpact as ji
+from jimpact.cli.study import read_study
 from jimpact.fits.posterior import _priors
 from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.velocity_dependent import approach_speed
-from jimpact.study import read_study
 
 PAIR = ji.chain([1.0, 2.0])
 SPEED = np.linspace(0.5, 4.0, 12)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.cli import main
-from jimpact.study import import_laws, read_study
+from jimpact.cli.main import main
+from jimpact.cli.study import import_laws, read_study
 
 FILE = '''
 import jax.numpy as jnp

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from jimpact._checks import as_whole, check_kind
-from jimpact.experiments import Experiments
+from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import Box
 from jimpact.fits.multistart import quiet, repeated, run

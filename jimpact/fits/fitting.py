@@ -8,8 +8,8 @@ from typing import Any, Generic, NamedTuple
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_kind
-from jimpact.experiments import Experiments
 from jimpact.fits.adequacy import stretch, unusable, weighted
+from jimpact.fits.experiments import Experiments
 from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Minimum, Search, ends, search, search_near, settled
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries

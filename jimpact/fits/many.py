@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from jimpact._checks import as_whole
-from jimpact.experiments import Experiments
 from jimpact.fits.adequacy import unusable
+from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit, as_fit, check_squares, fit
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
 from jimpact.fits.multistart import Search, at_minimum, ends, repeated, run, settled, start_points

@@ -11,9 +11,9 @@ import numpy as np
 from jimpact._checks import as_float_array, check_choice, check_values
 from jimpact.bodies.base import STANDARD_GRAVITY
 from jimpact.fits.problem import Seen, means_nothing
-from jimpact.histories import History, history
 from jimpact.impacts import impact
 from jimpact.law import Law
+from jimpact.laws.histories import History, history
 from jimpact.scene import Scene, with_gaps
 
 QUANTITIES = ("peak_force", "duration", "arrival_time", "energy_ratio", "bounce_height")

@@ -17,7 +17,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import quick_jit
-from jimpact.experiments import Experiments
+from jimpact.fits.experiments import Experiments
 from jimpact.fits.least_squares import Box, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import (

@@ -4,8 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.experiments import data_defects
+from jimpact.files.records import as_data, with_error
 from jimpact.fits.adequacy import adequacy
+from jimpact.fits.experiments import data_defects
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import EXACT, Search
 from jimpact.fits.problem import FitProblem
@@ -13,7 +14,6 @@ from jimpact.fits.profiles import in_words, misleads
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.records import as_data, with_error
 from jimpact.status import STATUS
 
 _VELOCITIES_SHOWN = 24

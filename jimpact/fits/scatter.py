@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import chdtrc, stdtr
 
-from jimpact.records import with_error
+from jimpact.files.records import with_error
 
 if TYPE_CHECKING:
     from jimpact.fits.fitting import Fit

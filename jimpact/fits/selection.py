@@ -9,8 +9,8 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc, stdtr
 
 from jimpact._checks import check_choice, check_kind
-from jimpact.comparison import registered_laws
-from jimpact.experiments import Experiments
+from jimpact.files.records import as_data, number, table
+from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit, check_squares, fit
 from jimpact.fits.many import leave_one_out
 from jimpact.fits.matrix_fit import admissible_start
@@ -22,7 +22,7 @@ from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.lzb import LZB
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar
-from jimpact.records import as_data, number, table
+from jimpact.registry import registered_laws
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 

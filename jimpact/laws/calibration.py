@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from jimpact._checks import as_float_array, check_per_contact, check_values
-from jimpact.comparison import Comparison, compare
 from jimpact.contact import delassus_matrix
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
+from jimpact.methods.comparison import Comparison, compare
 from jimpact.scene import Scene, chain, gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 

@@ -24,11 +24,11 @@ from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.laws.poisson import Poisson
 from jimpact.methods.advice_report import Advice, Block, Candidate, Unknown
+from jimpact.methods.timing import in_turns
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
 from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change, with_gaps
 from jimpact.status import STATUS
-from jimpact.timing import in_turns
 
 FINEST_TOLERANCE = 100  # times the reference's own tolerance
 RTOL_PART = 10  # the advised rtol is this part of the tolerance, or a little less

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jimpact.files.records import as_data, fields_as_data, number, table
 from jimpact.law import Law
 from jimpact.laws import REGISTRY
 from jimpact.laws.binary import Binary
@@ -14,7 +15,6 @@ from jimpact.laws.compliant import Compliant
 from jimpact.laws.kinematic import Newton
 from jimpact.laws.lzb import LZB
 from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
-from jimpact.records import as_data, fields_as_data, number, table
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
 

@@ -12,17 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values, in_common_dtype
-from jimpact.comparison import registered_laws
+from jimpact.files.records import fields_as_data, number, table
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law, check_law
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import METHODS, UNCOUNTED, Method, outcome
+from jimpact.methods.timing import in_turns
 from jimpact.progress import counting_bar
-from jimpact.records import fields_as_data, number, table
+from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity, kinetic_energy
 from jimpact.status import STATUS
-from jimpact.timing import in_turns
 
 QUANTITIES = ("velocity", "impulse", "energy", "duration", "gradient")
 ALGEBRAIC = ("newton", "moreau", "poisson", "binary")

@@ -24,11 +24,11 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.audits import audit
+from jimpact.files.records import as_data, fields_as_data, table
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import METHODS
 from jimpact.methods.contenders.base import Method, outcome
 from jimpact.progress import counting_bar
-from jimpact.records import as_data, fields_as_data, table
 from jimpact.scene import chain
 from jimpact.status import CODE
 

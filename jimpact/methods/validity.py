@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_axis, as_float_array, check_choice, check_per_contact, check_values
-from jimpact.comparison import dispersion_index
+from jimpact.files.records import fields_as_data, table
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.laws.binary import Binary
 from jimpact.laws.kinematic import Moreau
 from jimpact.laws.lzb import LZB
-from jimpact.records import fields_as_data, table
+from jimpact.methods.comparison import dispersion_index
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.contact import delassus_matrix
+from jimpact.files.records import readable_unit
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
 from jimpact.laws.lzb import LZB
 from jimpact.montecarlo.results import MonteCarlo
-from jimpact.records import readable_unit
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS

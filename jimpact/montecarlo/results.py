@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from jimpact._checks import check_values
+from jimpact.files.records import as_data, fields_as_data, table
 from jimpact.law import Law
 from jimpact.montecarlo.planning import Run
 from jimpact.montecarlo.statistics import (
@@ -16,7 +17,6 @@ from jimpact.montecarlo.statistics import (
     binned_quantiles,
     named,
 )
-from jimpact.records import as_data, fields_as_data, table
 from jimpact.scene import Scene
 
 REPORTED = (0.05, 0.5, 0.95)  # quantiles in the report

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.records import as_data, fields_as_data
+from jimpact.files.records import as_data, fields_as_data
 from jimpact.status import STATUS, Status, raise_for
 
 # of these rows `failure` marks motions that end before t_end; the code is the row number

@@ -10,11 +10,12 @@ from matplotlib.figure import Figure
 from scipy.integrate import solve_ivp
 
 from jimpact._checks import check_kind
-from jimpact.comparison import Comparison
 from jimpact.contact import delassus_matrix
-from jimpact.histories import History
+from jimpact.files.records import readable_unit
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Force
+from jimpact.laws.histories import History
+from jimpact.methods.comparison import Comparison
 from jimpact.plot.style import (
     COLOURS,
     GREY,
@@ -27,7 +28,6 @@ from jimpact.plot.style import (
     side_by_side,
     wrapped,
 )
-from jimpact.records import readable_unit
 from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
 

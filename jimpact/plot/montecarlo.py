@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jimpact._checks import check_kind
+from jimpact.files.records import readable_unit
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
-from jimpact.records import readable_unit
 
 _BARS = 100  # of a histogram in the picture
 _BODIES = 6  # with a histogram of their own; of more only the most scattered are shown

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jimpact.study_file import STUDY, located
+from jimpact.files.study_file import STUDY, located
 
 WIDEST = 100  # characters; longer lines of text are hard to read
 
@@ -147,17 +147,6 @@ def laws_as_text(rows: Mapping[str, Mapping[str, Any]]) -> str:
             )
         lines.append("")
     return "\n".join(lines).rstrip()
-
-
-def fitting(text: str) -> str:
-    """Text whose sentences are wrapped where a terminal is narrow; tables fit already."""
-    width = shutil.get_terminal_size((len(text), 0)).columns
-    return "\n".join(
-        textwrap.fill(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip(" -"))))
-        if len(line) > width and "  " not in line.strip()
-        else line
-        for line in text.splitlines()
-    )
 
 
 def as_csv(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

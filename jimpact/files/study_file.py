@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from jimpact._checks import as_whole, check_choice, check_values
-from jimpact.shots_file import read_positions, read_shots
+from jimpact.files.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # of a folder that `jimpact new` has made
 STUDY_TABLES = ("fit", "data", "observe", "monte_carlo")

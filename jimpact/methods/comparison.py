@@ -11,13 +11,13 @@ import numpy as np
 
 from jimpact._checks import check_kind, check_values
 from jimpact.audits import Audit, audit, nothing_approaches
+from jimpact.files.records import as_data, fields_as_data, number, table
 from jimpact.impacts import Impact, impact
 from jimpact.law import Law
-from jimpact.laws import REGISTRY
-from jimpact.records import as_data, fields_as_data, number, table
+from jimpact.methods.timing import in_turns, seconds
+from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity, kinetic_energy, momentum
 from jimpact.status import STATUS
-from jimpact.timing import in_turns, seconds
 
 _REPEATS = 20  # of the timing; its median is told
 
@@ -145,24 +145,6 @@ class Comparison:
         spread = dispersion_index(self.scene, after)
         v = [number(x, ".5f") for x in np.asarray(after)]
         return [*v, number(float(ratio), ".4f"), number(float(spread), ".3f")]
-
-
-def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str, str]]:
-    """One law of each kind of the registry, from parameters by name; and why others are left out.
-
-    >>> from jimpact.comparison import registered_laws
-    >>> laws, left_out = registered_laws({"restitution": 0.9})
-    >>> sorted(laws), left_out["restitution_matrix"]
-    (['binary', 'lzb', 'moreau', 'newton', 'poisson'], 'needs `matrix`')
-    """
-    laws, left_out = {}, {}
-    for name, row in REGISTRY.items():
-        missing = [f"`{key}`" for key in row.required if key not in values]
-        if missing:
-            left_out[name] = f"needs {', '.join(missing)}"
-        else:
-            laws[name] = row.build(**{key: values[key] for key in row.arguments if key in values})
-    return laws, left_out
 
 
 def compare(

@@ -20,19 +20,7 @@ from jimpact.bodies.pendulums import PendulumCradle
 from jimpact.bodies.piles import Discs
 from jimpact.bodies.polygons import Disc, Polygon
 from jimpact.bodies.solids import Box, Sphere
-from jimpact.experiments import Experiments, read_experiments
-from jimpact.fits.fitting import Fit, fit
-from jimpact.fits.matrix_fit import admissible_start
-from jimpact.fits.observables import Measured, observations
-from jimpact.fits.parameters import OF_SPEED, default_free
-from jimpact.fits.problem import FitProblem
-from jimpact.law import Law, free_parameters_of
-from jimpact.laws import REGISTRY
-from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
-from jimpact.registry import Row
-from jimpact.scene import Scene, chain
-from jimpact.study_file import (
+from jimpact.files.study_file import (
     AT_KEYS,
     NO_DATA,
     STUDY_TABLES,
@@ -47,6 +35,18 @@ from jimpact.study_file import (
     from_file,
     law_values,
 )
+from jimpact.fits.experiments import Experiments, read_experiments
+from jimpact.fits.fitting import Fit, fit
+from jimpact.fits.matrix_fit import admissible_start
+from jimpact.fits.observables import Measured, observations
+from jimpact.fits.parameters import OF_SPEED, default_free
+from jimpact.fits.problem import FitProblem
+from jimpact.law import Law, free_parameters_of
+from jimpact.laws import REGISTRY
+from jimpact.laws.kinematic import RestitutionMatrix
+from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
+from jimpact.registry import Row
+from jimpact.scene import Scene, chain
 
 _ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
 _DISTRIBUTIONS: dict[str, Any] = {"Uniform": Uniform, "Normal": Normal}
@@ -244,7 +244,7 @@ def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) 
     `inertia_kg_m2`, `angle_rad`. Bodies of `PlanarBodies` are tables of this kind themselves.
     `others` are keys of the table that belong to somebody else.
 
-    >>> from jimpact.study import body_of
+    >>> from jimpact.cli.study import body_of
     >>> body_of("[scene]", {"kind": "Block", "width_m": 0.2, "height_m": 0.6}).names
     ('x [m]', 'y [m]', 'angle [rad]')
     """

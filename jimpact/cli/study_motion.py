@@ -6,16 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from jimpact.bodies.base import STANDARD_GRAVITY
-from jimpact.fits.fitting import Fit
-from jimpact.fits.parameters import default_free
-from jimpact.law import Law, free_parameters_of
-from jimpact.motion.fitting_motion import fit_motion
-from jimpact.motion.record import Motion
-from jimpact.motion.simulate import simulate
-from jimpact.motion.system import HarmonicBase, System, gravity
-from jimpact.shots_file import Positions, read_positions
-from jimpact.study import body_of, law_table, with_exponent
-from jimpact.study_file import (
+from jimpact.cli.study import body_of, law_table, with_exponent
+from jimpact.files.shots_file import Positions, read_positions
+from jimpact.files.study_file import (
     BASE_KEYS,
     GRAVITY,
     MOTION_FIT_KEYS,
@@ -25,6 +18,13 @@ from jimpact.study_file import (
     check_motion_tables,
     from_file,
 )
+from jimpact.fits.fitting import Fit
+from jimpact.fits.parameters import default_free
+from jimpact.law import Law, free_parameters_of
+from jimpact.motion.fitting_motion import fit_motion
+from jimpact.motion.record import Motion
+from jimpact.motion.simulate import simulate
+from jimpact.motion.system import HarmonicBase, System, gravity
 
 # directions of a base by how many a body has
 _DIRECTIONS = {1: ("vertical",), 2: ("horizontal", "vertical"), 3: ("x", "y", "vertical")}

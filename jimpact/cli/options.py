@@ -12,8 +12,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
-from jimpact import starting, study_file
 from jimpact._checks import check_choice
+from jimpact.cli import starting
+from jimpact.files import study_file
 
 Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
 EVERY_LAW = "all"  # in the place of a law's name
@@ -297,7 +298,7 @@ class LawsCommand(Command):
             bibtex = (files("jimpact") / "data" / "laws.bib").read_text(encoding="utf-8").strip()
         else:
             from jimpact import REGISTRY
-            from jimpact.study import import_laws
+            from jimpact.cli.study import import_laws
 
             if self.module is not None:
                 import_laws(self.module, Path())

@@ -16,7 +16,7 @@ def as_data(value: Any) -> Any:
     """Records, arrays and mappings as what a JSON file can hold; numbers not finite are None.
 
     >>> import numpy as np
-    >>> from jimpact.records import as_data
+    >>> from jimpact.files.records import as_data
     >>> as_data({"velocity": np.array([1.0, np.nan]), "bodies": (1, 2)})
     {'velocity': [1.0, None], 'bodies': [1, 2]}
     """
@@ -43,7 +43,7 @@ def fields_as_data(record: Any, *left_out: str) -> dict[str, Any]:
 def number(value: float | None, form: str) -> str:
     """The number in this format, nothing where there is none.
 
-    >>> from jimpact.records import number
+    >>> from jimpact.files.records import number
     >>> number(0.25, ".1f"), number(float("nan"), ".1f"), number(None, ".1f")
     ('0.2', '', '')
     """
@@ -53,7 +53,7 @@ def number(value: float | None, form: str) -> str:
 def readable_unit(unit: str, largest: float) -> tuple[str, float]:
     """The decimal part of an SI unit that a quantity is read best in, and its size.
 
-    >>> from jimpact.records import readable_unit
+    >>> from jimpact.files.records import readable_unit
     >>> readable_unit("m", 3e-5), readable_unit("s", 2.0)
     (('µm', 1e-06), ('s', 1.0))
     """
@@ -64,7 +64,7 @@ def readable_unit(unit: str, largest: float) -> tuple[str, float]:
 def with_error(value: float, error: float) -> str:
     """A value and its standard error, to the digits that count.
 
-    >>> from jimpact.records import with_error
+    >>> from jimpact.files.records import with_error
     >>> with_error(0.99123, 0.0042), with_error(131.7, 18.2), with_error(0.4, 0.0)
     ('0.991 ± 0.004', '132 ± 18', '0.4 ± 0')
     """
@@ -83,7 +83,7 @@ def table(
     On a terminal that is too narrow the columns are told in several tables, one below the other,
     each with the first columns, as many as `keys`; text at the end of a line is wrapped.
 
-    >>> from jimpact.records import table
+    >>> from jimpact.files.records import table
     >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
     ['law       e  status', 'newton  0.5  ok']
     """
@@ -110,7 +110,7 @@ def table(
 def _parts(widths: Sequence[int], keys: int, room: int) -> list[list[int]]:
     """Columns of tables side by side that fit the room, each with the first `keys`.
 
-    >>> from jimpact.records import _parts
+    >>> from jimpact.files.records import _parts
     >>> _parts([6, 6, 6, 6], 1, 22), _parts([6, 60], 1, 22)
     ([[0, 1, 2], [0, 3]], [[0, 1]])
     """

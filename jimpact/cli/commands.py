@@ -18,20 +18,20 @@ import jax
 import numpy as np
 
 import jimpact as ji
-from jimpact import options
-from jimpact.comparison import registered_laws
+from jimpact.cli import options
+from jimpact.cli.starting import as_csv
+from jimpact.cli.study import Study, read_study
 from jimpact.compiling import kept_in
+from jimpact.files.records import as_data, table
+from jimpact.files.study_file import is_motion
 from jimpact.fits.fitting import Fit
-from jimpact.progress import Steps, waiting
-from jimpact.records import as_data, table
-from jimpact.starting import as_csv, fitting
-from jimpact.study import Study, read_study
-from jimpact.study_file import is_motion
+from jimpact.progress import Steps, waiting, wrapped
+from jimpact.registry import registered_laws
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure  # which takes long to import
 
-    from jimpact.motion.study_motion import MotionStudy
+    from jimpact.cli.study_motion import MotionStudy
 
 DPI = 150
 Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
@@ -75,7 +75,7 @@ def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
         print(dumps(about | answer.data, indent=2))
     else:
         lines = [answer.title, answer.text, *(f"Picture: {path}" for path in pictures)]
-        print("\n".join(fitting(line) for line in lines if line))
+        print("\n".join(wrapped(line) for line in lines if line))
     for path in replaced:
         print(f"jimpact {given.name()}: {path} was there before: replaced.", file=sys.stderr)
     return answer.failure
@@ -114,7 +114,7 @@ def fit(given: options.FitCommand, steps: Steps) -> Answer:
     chosen = {"starts": given.starts, "seed": given.seed, "progress": steps.patience}
     study: Study | MotionStudy
     if is_motion(given.study):
-        from jimpact.motion.study_motion import read_motion_study
+        from jimpact.cli.study_motion import read_motion_study
 
         study = read_motion_study(given.study, given.law)
         fits = {RAW: study.fit(**chosen)}
@@ -446,7 +446,7 @@ def _lzb_parameters(study: Study) -> dict[str, Any]:
 
 def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
-    from jimpact.motion.study_motion import read_motion_study
+    from jimpact.cli.study_motion import read_motion_study
 
     path, portrait = given.picture(), given.portrait
     study = read_motion_study(given.study)

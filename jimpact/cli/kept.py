@@ -52,7 +52,7 @@ def _described(made_of: Any) -> bytes | None:
 def _sources() -> bytes:
     """This library's source, and versions of what it runs with."""
     found = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.rglob("*.py")):
+    for path in sorted(Path(__file__).parent.parent.rglob("*.py")):
         found.update(path.read_bytes())
     for name in KNOWN[1:-1]:
         found.update(f"{name} {metadata.version(name)}".encode())

@@ -14,8 +14,8 @@ from scipy.special import ndtri, stdtr
 
 from jimpact._checks import as_float_array, check_concrete, check_values
 from jimpact.bodies.base import CLOSED_BELOW, Body
+from jimpact.files.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
-from jimpact.shots_file import ANGULAR, LINEAR, read_shots
 
 # Defects below this share of the momentum or energy before are no finding: a tenth of a percent
 # is what a good measured velocity is worth. With `sigma`, a defect is held against its own error.
@@ -441,7 +441,7 @@ def data_defects(
         stored_energy: what the law may add to the energy (precompression) [J].
 
     >>> import jimpact as ji
-    >>> from jimpact.experiments import data_defects
+    >>> from jimpact.fits.experiments import data_defects
     >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
     'The data gain energy (1 = conserved): shot 1: 1.4400.'
     """

@@ -100,7 +100,7 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
         if given.light:
             return given.run()
         folder = keep_programs(given.no_cache)
-        from jimpact.commands import run
+        from jimpact.cli.commands import run
         from jimpact.progress import Steps
 
         call.steps = Steps(call.name)
@@ -122,7 +122,7 @@ def parsed(arguments: list[str]) -> Any:
 
     import tyro
 
-    from jimpact.options import COMMANDS
+    from jimpact.cli.options import COMMANDS
 
     commands: list[Any] = [Annotated[x, tyro.conf.subcommand(x.name())] for x in COMMANDS]
     return tyro.cli(
@@ -192,7 +192,3 @@ def end_on_interrupt(farewell: Callable[[], str]) -> None:
     signal.signal(signal.SIGINT, end)
     signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
     threading.Thread(target=wait, daemon=True).start()
-
-
-if __name__ == "__main__":
-    sys.exit(program())

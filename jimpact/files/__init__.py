@@ -1,0 +1,1 @@
+"""Files: studies, measured shots and tables as they are written, without JAX."""
