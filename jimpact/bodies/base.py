@@ -159,6 +159,11 @@ class Body(eqx.Module):
         """
         raise NotImplementedError(f"{type(self).__name__} has no `pair_count`, no `active_pairs`.")
 
+    @property
+    def functions(self) -> tuple[Any, ...]:
+        """Functions of q (or None) that it holds as fields; they may close over traced arrays."""
+        return ()
+
     def gravity(self, acceleration: Any) -> Potential:
         """Potential `q -> V ()` [J] of its weight at this acceleration g [m/s^2]."""
         raise TypeError(f"{type(self).__name__} has no vertical: give its `potential` yourself.")
@@ -295,6 +300,11 @@ class GivenBody(Body):
         else:
             self.mass_given = as_float_array("mass", mass)
             check_mass(self.mass_given)
+
+    @property
+    def functions(self) -> tuple[Any, ...]:
+        """The gaps, the displacements and the mass."""
+        return self.gaps, self.sliding, self.mass_given
 
     @property
     def mass(self) -> Any:
