@@ -630,13 +630,17 @@ def test_discs_are_a_body_like_others():
     pile = ji.Discs([1.0, 2.0, 3.0], [0.1, 0.2, 0.1], walls=[[0.0, 2.0, 0.0], [3.0, 4.0, -1.0]])
     q = pile.at([[0.0, 0.1], [0.3, 0.1], [-0.2, 0.1]]) + jnp.array([0, 0, 0.3] * 3)
     near, gradients, slips = jax.jit(
-        lambda q: (pile.near(q, q, 0.0), jax.jacobian(pile.gap_function)(q), pile.tangents(q))
+        lambda q: (
+            pile.active_pairs(q, q, 0.0),
+            jax.jacobian(pile.gap_function)(q),
+            pile.tangents(q),
+        )
     )(q)
     order = [(0, 1), (0, 2), (1, 2)] + [(i, 3 + w) for i in range(3) for w in range(2)]
     names = [i * 5 + j for i, j in order]
-    there = np.asarray(near.there)
-    assert sorted(np.asarray(near.number)[there]) == [1, 2, 3, 8, 13]
-    for k in np.flatnonzero(there):
+    closed = np.asarray(near.closed)
+    assert sorted(np.asarray(near.number)[closed]) == [1, 2, 3, 8, 13]
+    for k in np.flatnonzero(closed):
         column = names.index(int(near.number[k]))
         for row, expected in enumerate((gradients.T, slips)):
             found = np.zeros((4, 3))
