@@ -515,10 +515,14 @@ def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
             f"{STATUS[int(reference.status[0])].message}."
         )
 
-    def kept(rows: Any) -> Any:
+    def usable(rows: Any) -> Any:
         return None if rows is None else np.where(failed[:, None], np.nan, rows)
 
-    return Outcomes(*map(kept, reference[:3]), reference.status)
+    return reference._replace(
+        velocity=usable(reference.velocity),
+        impulse=usable(reference.impulse),
+        tangential=usable(reference.tangential),
+    )
 
 
 def _candidate(
