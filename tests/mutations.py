@@ -87,8 +87,8 @@ MUTATIONS = [
     Mutation("Poisson without the supplement", r"compression\.z \+ returned \+ supplement\.z", "compression.z + returned", KINEMATIC, "poisson.py"),
     Mutation("fastest becomes first", r"level = rivals & \(speed \+ noise >= fastest\)", "level = rivals", ("test_binary.py", "test_values.py"), "collisions.py"),
     # --- friction
-    Mutation("friction along the slip", r"-modes\[2 \* m :\]\.astype\(most\.dtype\) \* most", "modes[2 * m :].astype(most.dtype) * most", ("test_friction.py",), "friction_flow.py"),
-    Mutation("friction of the other contact", r"most = self\.friction \* f\n", "most = self.friction[::-1] * f\n", ("test_friction.py",), "friction_flow.py"),
+    Mutation("friction along the slip", r"-slip\.astype\(u\.dtype\) \* most", "slip.astype(u.dtype) * most", ("test_friction.py",), "friction_flow.py"),
+    Mutation("friction of the other contact", r"most, pull = self\.friction \* f,", "most, pull = self.friction[::-1] * f,", ("test_friction.py",), "friction_flow.py"),
     # --- impact
     Mutation("energy gain is not told", r"change > total \+ tolerance", "change > total + jnp.inf", ("test_contract.py", "test_values.py", "test_complementarity.py"), "impacts.py"),
     Mutation("pulling is not told", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", ("test_contract.py", "test_values.py"), "impacts.py"),
