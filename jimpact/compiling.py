@@ -4,15 +4,11 @@ import functools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
-
-if TYPE_CHECKING:
-    from jimpact.cli.kept import KeptPrograms
 
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
 # take twice as long to compile a program of many small loops.
@@ -20,19 +16,21 @@ QUICK = {"xla_cpu_use_fusion_emitters": False}
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
-_kept: "ContextVar[KeptPrograms | None]" = ContextVar("kept", default=None)
+# Runs a jitted program of (static arguments, arrays); the second argument is the public function
+# by which the program is known.
+Runner = Callable[[Callable[..., Any], Callable[..., Any], Any, list[jax.Array]], Any]
+
+_runner: "ContextVar[Runner | None]" = ContextVar("runner", default=None)
 
 
 @contextmanager
-def kept_in(folder: str | Path | None) -> Iterator[None]:
-    """Within, programs of their own are kept in this folder, and taken from it; None: nowhere."""
-    from jimpact.cli.kept import KeptPrograms  # which none but the command line needs
-
-    before = _kept.set(None if folder is None else KeptPrograms(Path(folder)))
+def run_programs_with(runner: Runner | None) -> Iterator[None]:
+    """Within, `runner` runs the library's programs; None: they run as JAX compiles them."""
+    before = _runner.set(runner)
     try:
         yield
     finally:
-        _kept.reset(before)
+        _runner.reset(before)
 
 
 @functools.cache
@@ -77,7 +75,7 @@ def quick_jit(function: Function) -> Function:
             args, given = jax.tree.unflatten(tree, leaves)
             return function(*args, **given)
 
-        # JAX's cache goes by names, too, and must not hand out what is kept whole.
+        # JAX's cache goes by names, too, and must not hand out what a runner stores.
         of_arrays.__name__ = f"whole_{function.__name__}" if whole else function.__name__
         return jax.jit(of_arrays, static_argnums=0, compiler_options=known_options())
 
@@ -88,9 +86,9 @@ def quick_jit(function: Function) -> Function:
         leaves, tree = jax.tree.flatten((args, given))
         fixed = tree, tuple(None if eqx.is_array(x) else (x,) for x in leaves)
         arrays = [x for x in leaves if eqx.is_array(x)]
-        kept = _kept.get()
-        if kept is None or any(isinstance(x, jax.core.Tracer) for x in arrays):
+        runner = _runner.get()
+        if runner is None or any(isinstance(x, jax.core.Tracer) for x in arrays):
             return own()(fixed, arrays)
-        return kept.run(own(whole=True), call, fixed, arrays)
+        return runner(own(whole=True), call, fixed, arrays)
 
     return call  # type: ignore[return-value]

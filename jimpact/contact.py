@@ -4,6 +4,7 @@ A scene of n coordinates and m contacts is reduced to W, gamma- and, where it ha
 tangential rows: everything that an impact law may depend on.
 """
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -13,6 +14,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, is_traced
 from jimpact.scene import Scene, gap_velocity, solve_mass, without_constraints
+from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
 
 # A gap velocity is taken for 0 below this many times eps |N|^T |v-|: v- comes out of sums and
@@ -50,9 +52,8 @@ class Contact(eqx.Module):
         norm: |grad f_j| (m,) in the metric of M^-1; None: sqrt(W_jj), which it is without
             bilateral constraints.
         noise: (m,) [m/s] what the rounding of v- leaves unknown of gamma-; None: 0.
-        cross: W_nt (m, t), None without tangents; t = m planar, 2 m in space, contact-major.
-        tangential: W_tt (t, t), or None.
-        slip: tangential velocities u- (t,) [m/s], or None.
+        tangential_block: (W_nt (m, t), W_tt (t, t), u- (t,) [m/s]), None without tangents; t = m
+            planar, 2 m in space, contact by contact.
 
     Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
 
@@ -69,9 +70,7 @@ class Contact(eqx.Module):
     stored: jax.Array
     norm: jax.Array
     noise: jax.Array
-    cross: jax.Array | None
-    tangential: jax.Array | None
-    slip: jax.Array | None
+    tangential_block: TangentialBlock | None
 
     def __init__(
         self,
@@ -83,9 +82,7 @@ class Contact(eqx.Module):
         stored: Any = None,
         norm: Any = None,
         noise: Any = None,
-        cross: Any = None,
-        tangential: Any = None,
-        slip: Any = None,
+        tangential_block: Any = None,
     ):
         chain = isinstance(delassus, Tridiagonal)
         self.delassus = delassus if chain else as_float_array("delassus", delassus)
@@ -96,7 +93,8 @@ class Contact(eqx.Module):
         self.stored = zero if stored is None else stored
         self.norm = jnp.sqrt(diagonal(self.delassus)) if norm is None else norm
         self.noise = zero if noise is None else noise
-        self.cross, self.tangential, self.slip = cross, tangential, slip
+        block = tangential_block
+        self.tangential_block = None if block is None else TangentialBlock(*block)
 
     @property
     def contacts(self) -> int:
@@ -107,6 +105,21 @@ class Contact(eqx.Module):
     def tangents(self) -> int:
         """Tangents of each contact: 0, 1 (planar) or 2."""
         return 0 if self.slip is None else self.slip.shape[0] // self.contacts
+
+    @property
+    def cross(self) -> jax.Array | None:
+        """W_nt (m, t) [1/kg]; None without tangents."""
+        return None if self.tangential_block is None else self.tangential_block.normal_tangent
+
+    @property
+    def tangential(self) -> jax.Array | None:
+        """W_tt (t, t) [1/kg]; None without tangents."""
+        return None if self.tangential_block is None else self.tangential_block.tangent
+
+    @property
+    def slip(self) -> jax.Array | None:
+        """u- (t,) [m/s]; None without tangents."""
+        return None if self.tangential_block is None else self.tangential_block.slip
 
     @property
     def chain(self) -> bool:
@@ -127,9 +140,10 @@ class Contact(eqx.Module):
     def whole_delassus(self) -> jax.Array:
         """[[W, W_nt], [W_tn, W_tt]] (m + t, m + t); W where there are no tangents."""
         w = as_matrix(self.delassus)
-        if self.cross is None or self.tangential is None:
+        if self.tangential_block is None:
             return w
-        return jnp.block([[w, self.cross], [self.cross.T, self.tangential]])
+        cross, tangent, _ = self.tangential_block
+        return jnp.block([[w, cross], [cross.T, tangent]])
 
     @property
     def size(self) -> jax.Array:
@@ -161,16 +175,15 @@ class Contact(eqx.Module):
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """gamma+ (m,) [m/s] of impulses, normal p (m,) and tangential p_t (t,)."""
         after = self.gap_velocity + self.delassus @ normal
-        return (
-            after if self.cross is None or tangential is None else after + self.cross @ tangential
-        )
+        if self.tangential_block is None or tangential is None:
+            return after
+        return after + self.tangential_block.normal_tangent @ tangential
 
     def slip_after(self, normal: jax.Array, tangential: jax.Array) -> jax.Array:
         """u+ (t,) [m/s] of impulses, normal (m,) and tangential (t,), where there are tangents."""
-        assert self.cross is not None
-        assert self.slip is not None
-        assert self.tangential is not None
-        return self.slip + self.cross.T @ normal + self.tangential @ tangential
+        assert self.tangential_block is not None
+        cross, tangent, slip = self.tangential_block
+        return slip + cross.T @ normal + tangent @ tangential
 
     def energy_change(self, normal: jax.Array, tangential: jax.Array | None = None) -> jax.Array:
         """T+ - T- () [J] of normal and tangential impulses: their work at the mean velocities."""
@@ -204,32 +217,50 @@ def contact_of(
 
     Those with a gap of infinity never do.
     """
-    gamma, noise = settled(scene, velocity)
-    w, gaps, m = delassus_matrix(scene), scene.gaps, scene.contacts
-    cross, tangential, slip = _tangential_block(scene, velocity)
-    norm = jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene)
-    stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, (m,))
-    stored = jnp.where(scene.closed, stored, 0.0)
-    if gaps is not None:
-        part = gaps < jnp.inf if uses_gaps else scene.closed
-        w, gamma, gaps = decoupled(w, part), jnp.where(part, gamma, 0.0), jnp.where(part, gaps, 1.0)
-        if cross is not None and tangential is not None and slip is not None:
-            cross, tangential, slip = _closed_block(part, w, cross, tangential, slip)
-    return Contact(
+    gamma, noise = rounded_gap_velocity(scene, velocity)
+    w, block = delassus_matrix(scene), None
+    if scene.tangents is not None:
+        moved = solve_mass(scene, scene.tangents)
+        cross, tangent = scene.normals.T @ moved, scene.tangents.T @ moved
+        block = TangentialBlock(cross, tangent, scene.tangents.T @ velocity)
+    stored = jnp.zeros_like(gamma) if stored is None else jnp.broadcast_to(stored, gamma.shape)
+    contact = Contact(
         w,
         gamma,
         closed=scene.closed,
-        gaps=gaps,
-        stored=stored.astype(gamma.dtype),
-        norm=norm,
+        gaps=scene.gaps,
+        stored=jnp.where(scene.closed, stored, 0.0).astype(gamma.dtype),
+        norm=jnp.sqrt(diagonal(w)) if scene.constraints is None else kinetic_norm(scene),
         noise=noise,
-        cross=cross,
-        tangential=tangential,
-        slip=slip,
+        tangential_block=block,
+    )
+    if scene.gaps is None:
+        return contact
+    return _taking_part(contact, scene.gaps < jnp.inf if uses_gaps else scene.closed)
+
+
+def _taking_part(contact: Contact, part: jax.Array) -> Contact:
+    """The contact where those outside `part` (m,) are decoupled, at rest, and at a gap of 1 m."""
+    w = decoupled(contact.delassus, part)
+    block = contact.tangential_block
+    if block is not None:
+        each = block.slip.shape[0] // part.shape[0]
+        rows = jnp.repeat(part, each)
+        # a row that takes no part keeps a diagonal entry of the size of W's
+        unit = jnp.diag(jnp.where(rows, 0.0, jnp.repeat(diagonal(w), each)))
+        block = TangentialBlock(
+            jnp.where(part[:, None] & rows[None, :], block.normal_tangent, 0.0),
+            jnp.where(rows[:, None] & rows[None, :], block.tangent, unit),
+            jnp.where(rows, block.slip, 0.0),
+        )
+    gamma = jnp.where(part, contact.gap_velocity, 0.0)
+    gaps = jnp.where(part, contact.gaps, 1.0)
+    return dataclasses.replace(
+        contact, delassus=w, gap_velocity=gamma, gaps=gaps, tangential_block=block
     )
 
 
-def settled(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
+def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
     """gamma- (m,), 0 where it is within the rounding of v-, and that rounding (m,).
 
     The derivative of gamma- stays that of N^T v- where its value is set to 0.
@@ -243,26 +274,6 @@ def settled(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
         size = padded[:-1] + padded[1:]
     noise = jax.lax.stop_gradient(ROUNDINGS * float(jnp.finfo(speed.dtype).eps) * size)
     return gamma - jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0)), noise
-
-
-def _tangential_block(scene: Scene, velocity: jax.Array) -> tuple[jax.Array | None, ...]:
-    """W_nt, W_tt and u-; None without tangents."""
-    if scene.tangents is None:
-        return None, None, None
-    moved = solve_mass(scene, scene.tangents)
-    return scene.normals.T @ moved, scene.tangents.T @ moved, scene.tangents.T @ velocity
-
-
-def _closed_block(
-    closed: jax.Array, w: Symmetric, cross: jax.Array, tangential: jax.Array, slip: jax.Array
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The tangential block with 0 for open contacts; their diagonal is that of W."""
-    each = slip.shape[0] // closed.shape[0]
-    rows = jnp.repeat(closed, each)
-    keep = rows[:, None] & rows[None, :]
-    own = jnp.diag(jnp.where(rows, 0.0, jnp.repeat(diagonal(w), each)))
-    cross = jnp.where(closed[:, None] & rows[None, :], cross, 0.0)
-    return cross, jnp.where(keep, tangential, own), jnp.where(rows, slip, 0.0)
 
 
 def delassus_matrix(scene: Scene) -> Symmetric:
@@ -430,11 +441,12 @@ def _by_size(groups: list[np.ndarray], m: int) -> Groups:
     entries = few * size[few - 1] ** 2 + (len(groups) - few) * size[-1] ** 2
     cut = int(np.argmin(entries)) if entries[0] > WORTH_A_PROGRAM * entries.min() else 0
 
-    def filled(part: list[np.ndarray]) -> np.ndarray:
+    def padded(part: list[np.ndarray]) -> np.ndarray:
+        """Index arrays in rows of the last one's length."""
         most = len(part[-1])
         return np.stack([np.pad(g, (0, most - len(g)), constant_values=m + g[0]) for g in part])
 
-    return tuple(filled(part) for part in (groups[:cut], groups[cut:]) if part)
+    return tuple(padded(part) for part in (groups[:cut], groups[cut:]) if part)
 
 
 def contacts_of_groups(
@@ -442,9 +454,9 @@ def contacts_of_groups(
 ) -> list[Contact]:
     """For each array of groups (c, g) their contacts, with a leading axis (c,).
 
-    W of all contacts is never formed; what fills a group up is like an open contact.
+    W of all contacts is never formed. An entry that only pads its group is like an open contact.
     """
-    gamma, noise = settled(scene, velocity)
+    gamma, noise = rounded_gap_velocity(scene, velocity)
     m, norm = scene.contacts, kinetic_norm(scene)
     gaps = jnp.zeros_like(gamma) if scene.gaps is None else scene.gaps
     each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
@@ -454,31 +466,26 @@ def contacts_of_groups(
         slip = scene.tangents.T @ velocity
     moved = solve_mass(scene, columns)
 
-    def of_array(filled: np.ndarray) -> Contact:
-        index = filled % m
+    def contacts_of(padded: np.ndarray) -> Contact:
+        """The contacts of groups of one size."""
+        index = padded % m
         g = index.shape[1]
-        sides = m + each * index[:, :, None] + jnp.arange(each)[None, None, :]
-        sides = sides.reshape(len(index), each * g)
-        every = jnp.concatenate([index, sides], axis=1)
-        there = jnp.asarray(filled < m) & scene.closed[index]
-        matrix = jnp.einsum("nca,ncb->cab", columns[:, every], moved[:, every])
-        w = jax.vmap(decoupled)(matrix[:, :g, :g], there)
-        block: tuple[jax.Array | None, ...] = (None, None, None)
-        if each:
-            own = matrix[:, :g, g:], matrix[:, g:, g:], slip[sides - m]
-            block = jax.vmap(_closed_block)(there, w, *own)
-        cross, tangential, side = block
-        return Contact(
-            w,
-            jnp.where(there, gamma[index], 0.0),
-            closed=there,
+        tangents = each * index[:, :, None] + jnp.arange(each)[None, None, :]
+        tangents = tangents.reshape(len(index), each * g)
+        directions = jnp.concatenate([index, m + tangents], axis=1)
+        part = jnp.asarray(padded < m) & scene.closed[index]
+        matrix = jnp.einsum("nca,ncb->cab", columns[:, directions], moved[:, directions])
+        block = (matrix[:, :g, g:], matrix[:, g:, g:], slip[tangents]) if each else None
+        contact = Contact(
+            matrix[:, :g, :g],
+            gamma[index],
+            closed=part,
             gaps=gaps[index],
-            stored=jnp.where(there, stored[index], 0.0),
+            stored=jnp.where(part, stored[index], 0.0),
             norm=norm[index],
             noise=noise[index],
-            cross=cross,
-            tangential=tangential,
-            slip=side,
+            tangential_block=block,
         )
+        return jax.vmap(_taking_part)(contact, part)
 
-    return [of_array(filled) for filled in groups]
+    return [contacts_of(padded) for padded in groups]

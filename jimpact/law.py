@@ -306,10 +306,14 @@ def within_domains(law: eqx.Module) -> jax.Array:
     return jnp.all(jnp.asarray(every, bool))
 
 
+def declarations_of(kind: type[eqx.Module]) -> dict[str, Domain | Option]:
+    """What the fields of a class declare, by name."""
+    return {f.name: f.metadata[_KEY] for f in dataclasses.fields(kind) if _KEY in f.metadata}
+
+
 def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
     """Names of the fields that say how a law is solved."""
-    fields = dataclasses.fields(kind)
-    return tuple(f.name for f in fields if isinstance(f.metadata.get(_KEY), Option))
+    return tuple(k for k, x in declarations_of(kind).items() if isinstance(x, Option))
 
 
 class Impulses(NamedTuple):

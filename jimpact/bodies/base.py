@@ -1,7 +1,7 @@
 """The description of a body: gaps, tangents and mass matrix as functions of its configuration."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -41,6 +41,17 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
         return tuple(names)
     parts = [split_name(name) for name in names]
     return tuple(f"{word}{i + 1} [{unit}]" for i in range(count) for word, unit in parts)
+
+
+class ActivePairs(NamedTuple):
+    """The closed contacts of many planar bodies, K rows; rows that are not used are 0."""
+
+    number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
+    closed: jax.Array  # (K,) whether the row is used
+    bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
+    directions: jax.Array  # (K, 2, 2, 3): normal and tangent, of both bodies, in x, y, turn
+    overflows: jax.Array  # () whether more are closed than there are rows
+    reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
 
 
 class Body(eqx.Module):
@@ -135,6 +146,23 @@ class Body(eqx.Module):
             return jax.jacobian(function)(q).T
         still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
         return jax.jacfwd(lambda u: function(self.moved(q, u)))(still).T
+
+    @property
+    def pair_count(self) -> int | None:
+        """How many contacts `active_pairs` chooses from; None: time stepping takes all contacts."""
+        return None
+
+    def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
+        """The contacts, at q, with gaps up to `below` [m] at q or `later`, for time stepping.
+
+        Of planar bodies, three velocities each, with a diagonal mass matrix.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no `pair_count`, no `active_pairs`.")
+
+    @property
+    def functions(self) -> tuple[Any, ...]:
+        """Functions of q (or None) that it holds as fields; they may close over traced arrays."""
+        return ()
 
     def gravity(self, acceleration: Any) -> Potential:
         """Potential `q -> V ()` [J] of its weight at this acceleration g [m/s^2]."""
@@ -272,6 +300,11 @@ class GivenBody(Body):
         else:
             self.mass_given = as_float_array("mass", mass)
             check_mass(self.mass_given)
+
+    @property
+    def functions(self) -> tuple[Any, ...]:
+        """The gaps, the displacements and the mass."""
+        return self.gaps, self.sliding, self.mass_given
 
     @property
     def mass(self) -> Any:

@@ -1,6 +1,6 @@
 """Piles: many discs between walls, each contact between two of them or with a wall."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,6 +10,7 @@ import numpy as np
 from jimpact._checks import as_float_array, as_whole, check_values
 from jimpact.bodies.base import (
     PLANAR,
+    ActivePairs,
     Body,
     LinearPotential,
     numbered,
@@ -20,16 +21,6 @@ from jimpact.bodies.base import (
 )
 
 ROOM = 4  # contacts per disc: equal discs have 3, and walls
-
-
-class Near(NamedTuple):
-    """Contacts of a pile that are closed, at most `room` of them; rows beyond are 0."""
-
-    number: jax.Array  # (K,) of the contact among all (i, j), count * (count + walls) for none
-    there: jax.Array  # (K,)
-    bodies: jax.Array  # (K, 2); the number of discs stands for a wall
-    directions: jax.Array  # (K, 2, 2, 3): normal and tangent, of both discs, in x, y, turn
-    lost: jax.Array  # whether there are more
 
 
 class Discs(Body):
@@ -132,14 +123,19 @@ class Discs(Body):
 
     # ---- closed contacts only
 
-    def near(self, q: jax.Array, later: jax.Array, below: jax.Array) -> Near:
+    @property
+    def pair_count(self) -> int:
+        """Every pair (i, j), in both orders, and every disc with every wall."""
+        return self.count * (self.count + len(self.walls))
+
+    def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` at q or `later`."""
         gaps = jnp.minimum(self._all_gaps(q), self._all_gaps(later))
-        none, across = gaps.size, gaps.shape[1]
+        none, columns = gaps.size, gaps.shape[1]
         closed = gaps.reshape(-1) <= below
         number = jnp.nonzero(closed, size=self.room, fill_value=none)[0]
-        there = number < none
-        i, j = jnp.where(there, number, 0) // across, jnp.where(there, number, 0) % across
+        used = number < none
+        i, j = jnp.where(used, number, 0) // columns, jnp.where(used, number, 0) % columns
         wall = j >= self.count
         at, radius = q.reshape(-1, 3), self.radii
         other = jnp.minimum(j, self.count - 1)
@@ -152,15 +148,16 @@ class Discs(Body):
         zero = jnp.zeros_like(normal[:, 0])
         x, y = normal.T
         arms = -radius[i], -jnp.where(wall, 0.0, radius[other])
-        own = jnp.stack([jnp.stack([x, y, zero], 1), jnp.stack([-y, x, arms[0]], 1)], axis=1)
-        opposite = jnp.stack([jnp.stack([-x, -y, zero], 1), jnp.stack([y, -x, arms[1]], 1)], 1)
-        directions = jnp.stack([own, opposite], axis=2)
-        return Near(
+        first = jnp.stack([jnp.stack([x, y, zero], 1), jnp.stack([-y, x, arms[0]], 1)], axis=1)
+        second = jnp.stack([jnp.stack([-x, -y, zero], 1), jnp.stack([y, -x, arms[1]], 1)], axis=1)
+        directions = jnp.stack([first, second], axis=2)
+        return ActivePairs(
             number,
-            there,
+            used,
             jnp.stack([i, jnp.where(wall, self.count, other)], axis=1),
-            jnp.where(there[:, None, None, None], directions, 0.0),
+            jnp.where(used[:, None, None, None], directions, 0.0),
             jnp.sum(closed) > self.room,
+            jnp.min(radius),
         )
 
     @property

@@ -19,9 +19,9 @@ import numpy as np
 
 import jimpact as ji
 from jimpact.cli import options
+from jimpact.cli.program_cache import stored_programs
 from jimpact.cli.starting import as_csv
 from jimpact.cli.study import Study, read_study
-from jimpact.compiling import kept_in
 from jimpact.files.records import as_data, table
 from jimpact.files.study_file import is_motion
 from jimpact.fits.fitting import Fit
@@ -54,7 +54,7 @@ def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
     Programs are kept in the folder, if there is one.
     """
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
-    with kept_in(folder):
+    with stored_programs(folder):
         answer = _COMMANDS[given.name()](given, steps)
     replaced = [path for path in answer.pictures if path.exists()]
     for path, picture in answer.pictures.items():

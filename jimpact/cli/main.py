@@ -138,21 +138,21 @@ def keep_programs(no_cache: bool) -> str | None:
     """Have JAX keep what it compiles, before it is imported; settings of the user's own stay.
 
     In the folder `JIMPACT_CACHE` (empty: nowhere), else in the user's cache folder. Returns the
-    folder for programs that are kept whole.
+    folder for programs that are kept whole, in which JAX has its own.
     """
-    folder = os.environ.get("JIMPACT_CACHE")
+    root = os.environ.get("JIMPACT_CACHE")
     if no_cache:
         os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
-    if no_cache or folder == "":
+    if no_cache or root == "":
         return None
     import platformdirs
 
     # One for each kind of processor: a home may be shared by machines that differ.
-    of_machine = f"programs-{_processor()}"
-    folder = folder or os.path.join(platformdirs.user_cache_dir("jimpact"), of_machine)
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", folder)
+    root = root or platformdirs.user_cache_dir("jimpact")
+    folder = os.path.join(root, f"programs-{_processor()}")
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(folder, "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", WORTH_KEEPING)
-    return os.path.join(folder, f"whole-{of_machine}")
+    return folder
 
 
 def _processor() -> str:

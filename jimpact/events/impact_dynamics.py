@@ -30,6 +30,7 @@ from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import pushforward, value_of
+from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
@@ -65,10 +66,8 @@ class Problem(NamedTuple):
 class Sides(NamedTuple):
     """The tangential block with friction: normalized as the normal one."""
 
-    across: jax.Array  # K_nt (m, t)
-    along: jax.Array  # K_tt (t, t)
+    block: TangentialBlock  # K_nt (m, t), K_tt (t, t), u- (t,)
     friction: jax.Array  # mu (m,)
-    slip: jax.Array  # u- (t,)
 
 
 class ImpactUnits(NamedTuple):
@@ -137,16 +136,9 @@ def dimensionless(
 
 def sides_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Sides:
     """The tangential block of the contacts in the units of the normal one."""
-    assert contact.cross is not None
-    assert contact.tangential is not None
-    assert contact.slip is not None
-    root = jnp.repeat(units.root, contact.tangents)
-    return Sides(
-        contact.cross / (units.root[:, None] * root[None]),
-        contact.tangential / (root[:, None] * root[None]),
-        friction * jnp.ones_like(units.root),
-        contact.slip / (root * units.velocity),
-    )
+    assert contact.tangential_block is not None  # see `check_law`
+    block = contact.tangential_block.scaled(units.root, units.velocity)
+    return Sides(block, friction * jnp.ones_like(units.root))
 
 
 def flow_of(
@@ -184,7 +176,7 @@ def flow_of(
     if problem.sides is None:
         flow = ContactFlow(**parts)
         return flow, *flow.start(problem.gamma, x)
-    across, along, friction, slip = problem.sides
+    (across, along, slip), friction = problem.sides
     kind = FrictionFlow if len(slip) == m else SlipFlow
     frictional = kind(**parts, across=across, along=along, friction=friction)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
@@ -275,7 +267,7 @@ class Dynamics(NamedTuple):
     @property
     def tangents(self) -> int:
         """Tangential rows t."""
-        return 0 if self.problem.sides is None else self.problem.sides.slip.shape[0]
+        return 0 if self.problem.sides is None else self.problem.sides.block.slip.shape[0]
 
     def columns(self) -> tuple[tuple[jax.Array, ...], Any]:
         """The arrays of the problem with the batch last, and its structure."""
@@ -353,10 +345,9 @@ def velocity_changes(contact: Contact, p: jax.Array, sides: jax.Array | None) ->
     """Changes (m,) or (m + t,) of gap velocities and slip [m/s] that impulses make."""
     if sides is None:
         return contact.delassus @ p
-    assert contact.cross is not None
-    assert contact.tangential is not None
-    normal = contact.delassus @ p + contact.cross @ sides
-    return jnp.concatenate([normal, contact.cross.T @ p + contact.tangential @ sides])
+    assert contact.tangential_block is not None
+    cross, tangent, _ = contact.tangential_block
+    return jnp.concatenate([contact.delassus @ p + cross @ sides, cross.T @ p + tangent @ sides])
 
 
 def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:

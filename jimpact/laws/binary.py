@@ -135,16 +135,14 @@ class Binary(Law):
             return None
         return jnp.zeros_like(gamma) if gaps is None else gaps
 
-    def _sides(self, contact: Contact) -> collisions.Sides | None:
+    def _friction(self, contact: Contact) -> collisions.CoulombFriction | None:
+        """The tangential block with mu and e_t (m,); None without friction."""
         mu, e_t = self.friction, self.tangential_restitution
         if mu is None or e_t is None:
             return None
-        cross, along = contact.cross, contact.tangential
-        assert cross is not None  # see `check_law`
-        assert along is not None
-        assert contact.slip is not None
+        assert contact.tangential_block is not None  # see `check_law`
         ones = jnp.ones_like(contact.gap_velocity)
-        return collisions.Sides(cross, along, contact.slip, mu * ones, e_t * ones)
+        return collisions.CoulombFriction(contact.tangential_block, mu * ones, e_t * ones)
 
     def _solve(self, contact: Contact) -> tuple[jax.Array, jax.Array | None, collisions.End]:
         gamma = contact.gap_velocity
@@ -155,7 +153,7 @@ class Binary(Law):
             self._gaps(contact.gaps, gamma),
             self._cycle(gamma.shape[0]),
             self.max_collisions,
-            self._sides(contact),
+            self._friction(contact),
         )
 
     def collisions(self, scene: Scene, velocity: Any) -> jax.Array:
@@ -197,7 +195,7 @@ class Binary(Law):
         contact = law.contact(scene, v)
         w, gamma = contact.delassus, contact.gap_velocity
         gaps = law._gaps(contact.gaps, gamma)
-        inputs = collisions.to_inputs(w, gamma, law.restitution, gaps, law._sides(contact))
+        inputs = collisions.to_inputs(w, gamma, law.restitution, gaps, law._friction(contact))
         cycle = law._cycle(scene.contacts)
         options = collisions.Options(cycle, self.max_collisions, isinstance(w, Tridiagonal))
         g, at = collisions.coupling_matrix(inputs, options), collisions.begin(inputs)

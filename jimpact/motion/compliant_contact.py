@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact._checks import as_float_array, check_kind, check_shape, check_values
-from jimpact.bodies.base import Body, GivenBody
+from jimpact.bodies.base import Body
 from jimpact.compiling import quick_jit
 from jimpact.contact import delassus_matrix
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
@@ -307,15 +307,15 @@ def turning_impact(
     check_shape("velocity", v, position.shape, "one per coordinate")
     check_values("velocity", v)
     check_kind("force", force, Force)
-    body = gap_function if isinstance(gap_function, Body) else GivenBody(gap_function, mass)
-    scene = body.scene(position)  # and its checks
+    system = System(gap_function, mass)
+    scene = system.body.scene(position)  # and its checks
     gamma = gap_velocity(scene, v)
     speed = jnp.max(jnp.where(gamma < 0, -gamma, 0.0))
     speed = jnp.where(speed > 0, speed, 1.0)
     reduced = jnp.max(1 / jnp.diagonal(jnp.asarray(delassus_matrix(scene))))
     depth = force.indentation_scale(0.5 * reduced * speed**2 * jnp.ones_like(gamma))
     unit = jax.lax.stop_gradient(jnp.max(depth) / speed)
-    return _turning(System(body), force, position, v, HORIZON * unit, rtol, max_steps)
+    return _turning(system, force, position, v, HORIZON * unit, rtol, max_steps)
 
 
 @quick_jit

@@ -20,7 +20,6 @@ from jimpact._checks import (
     in_common_dtype,
     is_traced,
 )
-from jimpact.bodies.base import GivenBody
 from jimpact.compiling import is_own, quick_jit
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
@@ -369,7 +368,7 @@ def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -
 
     f = returned("gap_function", body.gap_function, q)
     check("gap_function", f, "(m,), a gap for each of m >= 1 contacts", len(f) == 1 and f[0] > 0)
-    if isinstance(body, GivenBody) and body.sliding is not None:
+    if jax.eval_shape(body.tangent_function, q) is not None:
         h = returned("tangent_function", body.tangent_function, q)
         check("tangent_function", h, "(m,), one displacement a contact", len(h) == 1)
     if system.force is not None:
@@ -449,13 +448,9 @@ def _opened(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> System:
         return new if is_traced(new) else function
 
     def parts(s: System) -> list[Any]:
-        body = s.body
-        found: list[Any] = [s.force, s.potential, s.base]
-        if isinstance(body, GivenBody):
-            found += [body.gaps, body.sliding, body.mass_given]
-        return found
+        return [s.force, s.potential, s.base, *s.body.functions]
 
-    args = [(q, v, t), (q,), (t,), (q,), (q,), (q,)]
+    args = [(q, v, t), (q,), (t,), *[(q,)] * len(system.body.functions)]
     new = [opened(function, *x) for function, x in zip(parts(system), args)]
     return eqx.tree_at(parts, system, new, is_leaf=lambda x: x is None)
 

@@ -6,16 +6,16 @@ One step of length h (after Remark 6.9 of Brogliato):
     v'  = v + h M^-1 F + M^-1 (N p + H p_t)      0 <= p _|_ gamma' + w >= 0
     q'  = q_m + h/2 v'                           p_t in -mu p Sgn(u' + w_t)
 
-with `w = e gamma` of a contact that approaches by Moreau's law, which so joins the problem. Any
-other law acts before it, in the middle of the forces, `v+ = impact(law, scene(q_m), v + h/2 M^-1
+with `w = e gamma` for a contact that approaches by Moreau's law, which joins the problem this way.
+Any other law acts first, in the middle of the forces, `v+ = impact(law, scene(q_m), v + h/2 M^-1
 F)`, and slow approach (within what forces give in two steps) is rest, `w = 0`. Order 1: an impact
 is early or late by up to h / 2.
 
-ENERGY. A contact gives `p (gamma' + gamma) / 2`: no energy where `w >= gamma`. So what leaves may
-come back as fast as it leaves, `w = gamma`, and is at rest two steps later. Friction is against the
-slip at the end, `w_t = 0` (`e_t u` in an impact). That may give energy where the slip reverses
-within the step, up to (h g)^2 in a stop on a slope, and more in Kane's paradox; such a step is
-solved again with all friction against the mean slip, `w_t = u`, which cannot.
+ENERGY. A contact gives `p (gamma' + gamma) / 2`: no energy where `w >= gamma`. So a contact that
+separates may come back as fast as it leaves, `w = gamma`, and is at rest two steps later. Friction
+opposes the slip at the end, `w_t = 0` (`e_t u` in an impact). That may give energy where the slip
+reverses within the step, up to (h g)^2 in a stop on a slope, and more in Kane's paradox; such a
+step is solved again with all friction against the mean slip, `w_t = u`, which cannot.
 
 DERIVATIVES of such a step do not converge: with h the time of an impact is constant, while its
 derivative is not. They are refused.
@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.bodies.piles import Discs, Near
+from jimpact.bodies.base import ActivePairs
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
 from jimpact.laws.kinematic import Moreau
@@ -55,12 +55,13 @@ from jimpact.status import CODE
 # every step; ten times more, and slow impacts come a step later.
 _ROUNDING, _ROUNDINGS = 1e-12, 64
 SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an impact
-# Misfit of a step's impulses, of its velocities: wanted of a few contacts, of a pile; in float32
-# so many roundings at least. A step that misses by more than OFF is told.
-FEW, PILE, ROUNDINGS, OFF = 1e-9, 1e-6, 32, 1e-2
-ITERATIONS = 1000
+# Misfit of a step's impulses over its velocities: what the solver aims at for a few contacts, for
+# a pile; in float32 at least so many roundings. Ten times more, and resting piles creep visibly.
+FEW, PILE, ROUNDINGS = 1e-9, 1e-6, 32
+OFF = 1e-2  # misfit above which `unsolved_step` is reported: ten times more is visible in motions
+ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jammed piles only
 MEAN = 4  # tries for the mean velocity that forces depend on; each gains h omega, of spin omega
-APART = 3  # steps: a contact that is struck again before is told
+APART = 3  # steps: a contact that is struck again within them is reported as `coarse_step`
 
 WHY = (
     "Argument `method` must not be 'time_stepping' where derivatives are taken: with the step the "
@@ -68,13 +69,13 @@ WHY = (
 )
 
 
-class _Few(NamedTuple):
-    """The contacts of a body, all of them, in one step."""
+class _AllContacts(NamedTuple):
+    """All contacts of a body in one step; those that are open are 0."""
 
-    there: jax.Array  # (m,) closed
+    closed: jax.Array  # (m,)
     directions: jax.Array  # (n, m, b): normals, tangents
     moved: jax.Array  # M^-1 of them
-    matrix: jax.Array  # (m, b, m, b); 0 where open
+    matrix: jax.Array  # (m, b, m, b) Delassus matrix
 
     def rates(self, v: jax.Array) -> jax.Array:
         """Gap velocities and slips (m, b) of v (n,)."""
@@ -84,110 +85,154 @@ class _Few(NamedTuple):
         """Gap velocity () that the speeds of v could give."""
         return jnp.max(jnp.abs(v) @ jnp.abs(self.directions[:, :, 0]))
 
-    def push(self, x: jax.Array) -> jax.Array:
+    def velocity_change(self, x: jax.Array) -> jax.Array:
         """Change of velocity (n,) by impulses x (m, b)."""
         return jnp.tensordot(self.moved, x, axes=2)
 
-    def pull(self, x: jax.Array) -> jax.Array:
-        """Generalized impulse (n,)."""
+    def generalized_impulse(self, x: jax.Array) -> jax.Array:
+        """Generalized impulse (n,) of impulses x (m, b)."""
         return jnp.tensordot(self.directions, x, axes=2)
 
     def product(self, x: jax.Array) -> jax.Array:
-        """Rates (m, b) that impulses give."""
+        """Rates (m, b) that impulses x (m, b) give."""
         return jnp.tensordot(self.matrix, x, axes=2)
 
     @property
     def diagonal(self) -> jax.Array:
-        """Of the matrix (m, b)."""
+        """Of the Delassus matrix (m, b)."""
         m, b = self.matrix.shape[:2]
         return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
 
-    def recall(self, memory: jax.Array) -> jax.Array:
+    def warm_start(self, memory: jax.Array) -> jax.Array:
         """Impulses (m, b) of the last step."""
-        return jnp.where(self.there[:, None], memory, 0.0)
+        return jnp.where(self.closed[:, None], memory, 0.0)
 
-    def keep(self, memory: jax.Array, x: jax.Array) -> jax.Array:
-        """The memory, for the next step."""
+    def stored(self, memory: jax.Array, x: jax.Array) -> jax.Array:
+        """The memory of impulses x (m, b) for the next step."""
         return x
 
-    def seen(self, values: jax.Array) -> jax.Array:
-        """What of contacts (.., m) is recorded."""
+    def recorded(self, values: jax.Array) -> jax.Array:
+        """Values of contacts (.., m) as the record holds them."""
         return values
 
 
-class _Heap(NamedTuple):
-    """The closed contacts of a pile in one step; as `_Few`."""
+class _ActiveContacts(NamedTuple):
+    """The closed contacts of a pile in one step; methods as those of `_AllContacts`."""
 
-    near: Near
-    inverse: jax.Array  # 1 / M (k + 1, 3), 0 of walls
+    pairs: ActivePairs
+    inverse: jax.Array  # 1 / M (k + 1, 3), 0 for walls
 
     @property
-    def there(self) -> jax.Array:
-        return self.near.there
+    def closed(self) -> jax.Array:
+        """(m,)."""
+        return self.pairs.closed
 
     def rates(self, v: jax.Array) -> jax.Array:
-        at = jnp.pad(v.reshape(-1, 3), ((0, 1), (0, 0)))[self.near.bodies]
-        return jnp.sum(self.near.directions * at[:, None], axis=(2, 3))
+        """Gap velocities and slips (m, b) of v (n,)."""
+        bodies = jnp.pad(v.reshape(-1, 3), ((0, 1), (0, 0)))[self.pairs.bodies]
+        return jnp.sum(self.pairs.directions * bodies[:, None], axis=(2, 3))
 
     def fastest(self, v: jax.Array) -> jax.Array:
+        """Gap velocity () that the speeds of v could give."""
         return 2 * jnp.max(jnp.abs(v))
 
-    def push(self, x: jax.Array) -> jax.Array:
-        return self.pull(x) * self.inverse[:-1].reshape(-1)
+    def velocity_change(self, x: jax.Array) -> jax.Array:
+        """Change of velocity (n,) by impulses x (m, b)."""
+        return self.generalized_impulse(x) * self.inverse[:-1].reshape(-1)
 
-    def pull(self, x: jax.Array) -> jax.Array:
-        each = jnp.sum(self.near.directions * x[:, :, None, None], axis=1)
-        return jnp.zeros_like(self.inverse).at[self.near.bodies].add(each)[:-1].reshape(-1)
+    def generalized_impulse(self, x: jax.Array) -> jax.Array:
+        """Generalized impulse (n,) of impulses x (m, b)."""
+        each = jnp.sum(self.pairs.directions * x[:, :, None, None], axis=1)
+        return jnp.zeros_like(self.inverse).at[self.pairs.bodies].add(each)[:-1].reshape(-1)
 
     def product(self, x: jax.Array) -> jax.Array:
-        return self.rates(self.push(x))
+        """Rates (m, b) that impulses x (m, b) give."""
+        return self.rates(self.velocity_change(x))
 
     @property
     def diagonal(self) -> jax.Array:
-        return jnp.sum(self.near.directions**2 * self.inverse[self.near.bodies][:, None], (2, 3))
+        """Of the Delassus matrix (m, b)."""
+        return jnp.sum(self.pairs.directions**2 * self.inverse[self.pairs.bodies][:, None], (2, 3))
 
-    def recall(self, memory: jax.Array) -> jax.Array:
-        return memory.at[self.near.number].get(mode="fill", fill_value=0.0)
+    def warm_start(self, memory: jax.Array) -> jax.Array:
+        """Impulses (m, b) of the last step."""
+        return memory.at[self.pairs.number].get(mode="fill", fill_value=0.0)
 
-    def keep(self, memory: jax.Array, x: jax.Array) -> jax.Array:
-        return jnp.zeros_like(memory).at[self.near.number].set(x, mode="drop")
+    def stored(self, memory: jax.Array, x: jax.Array) -> jax.Array:
+        """The memory (pairs, b) of impulses x (m, b) for the next step."""
+        return jnp.zeros_like(memory).at[self.pairs.number].set(x, mode="drop")
 
-    def seen(self, values: jax.Array) -> jax.Array:
+    def recorded(self, values: jax.Array) -> jax.Array:
+        """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
         return jnp.sum(values, axis=-1, keepdims=True)
 
 
-class _Tried(NamedTuple):
-    """One try of a step: velocity at its end, mean velocity, forces taken, impulses."""
+class _Problem(NamedTuple):
+    """What does not change from step to step."""
 
-    v: jax.Array
-    mean: jax.Array
-    force: jax.Array
-    found: Many
-    gains: jax.Array  # () whether the impulses give energy
-    tries: jax.Array  # () so far, this one included
+    system: System
+    law: Law
+    mu: jax.Array | None
+    h: jax.Array  # () [s]
+    closed_below: jax.Array  # () [m]
+    joint: bool  # see `time_stepping`
 
 
 class _Progress(NamedTuple):
+    """The motion up to now."""
+
     state: State
-    speed: jax.Array  # the largest that velocities could give a gap so far
+    speed: jax.Array  # () largest gap velocity that velocities could give so far
     memory: jax.Array  # impulses of the last step
-    missed: jax.Array  # gap velocity () that they miss
+    missed: jax.Array  # gap velocity () by which they miss
     steepness: jax.Array
     since: jax.Array  # (m,) steps since each was struck
     events: Events
     status: jax.Array
-    told: jax.Array  # what is no failure
+    reported: jax.Array  # a status that is not a failure
+
+
+class _Setup(NamedTuple):
+    """One step before it is solved: contacts in its middle and what the law does there."""
+
+    middle: jax.Array  # () time in the middle of the step
+    end: jax.Array  # () time at its end
+    q: jax.Array  # in the middle
+    mass: jax.Array
+    carried: jax.Array  # (n,) velocity of the base
+    contacts: _AllContacts | _ActiveContacts
+    speed: jax.Array  # as in `_Progress`
+    noise: jax.Array  # () gap velocities below it are rounding
+    tolerance: float  # of the solver
+    strikes: jax.Array  # (m,) whether there is an impact
+    met: jax.Array  # (n,) velocity that the law is shown
+    law_impulse: jax.Array  # (m, b) of a law that does not join the problem
+    law_status: jax.Array
+    rates: jax.Array  # (m, b) of gaps and slips, after those impulses, before forces
+    wanted: jax.Array  # w (m, b) with friction against the slip at the end
+    against_mean: jax.Array  # w (m, b) with friction against the mean slip
+
+
+class _Trial(NamedTuple):
+    """One try of a step."""
+
+    v: jax.Array  # at its end
+    mean: jax.Array  # velocity
+    force: jax.Array
+    solution: Many
+    gains: jax.Array  # () whether the impulses give energy
+    tries: jax.Array  # () so far, this one included
 
 
 def is_pile(system: System) -> bool:
-    """Whether only closed contacts are looked at."""
-    return isinstance(system.body, Discs)
+    """Whether time stepping takes the closed contacts only."""
+    return system.body.pair_count is not None
 
 
 def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     """Gaps (m,), of a pile the least one (1,)."""
-    found = gaps(system, q, t)
-    return jnp.min(found, keepdims=True) if is_pile(system) else found
+    f = gaps(system, q, t)
+    return jnp.min(f, keepdims=True) if is_pile(system) else f
 
 
 def time_stepping(
@@ -217,7 +262,7 @@ def time_stepping(
         return _contacts(system, q, t, q, t, closed_below, mu is not None).rates(v0)
 
     contacts, b = jax.eval_shape(rates_at, q0).shape
-    kept = _numbers(system.body) if isinstance(system.body, Discs) else contacts
+    pair_count = system.body.pair_count
     rest = jnp.zeros((2, m), dtype)
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     rows = 1 if is_pile(system) else max_events
@@ -226,10 +271,11 @@ def time_stepping(
     fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
     status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
     h = (times[1] - times[0]) / substeps.astype(dtype)
+    problem = _Problem(system, law, mu, h, closed_below, joint)
     start = _Progress(
         begin,
         zero,
-        jnp.zeros((kept, b), dtype),
+        jnp.zeros((contacts if pair_count is None else pair_count, b), dtype),
         zero,
         jnp.ones((), dtype),
         jnp.full(contacts, substeps * len(times)),
@@ -241,8 +287,7 @@ def time_stepping(
     def to_sample(course: _Progress, t: jax.Array) -> tuple[_Progress, State]:
         def one(i: jax.Array, course: _Progress) -> _Progress:
             def go() -> _Progress:
-                now = t + i.astype(dtype) * h
-                return _one_step(system, law, mu, h, closed_below, joint, course, now)
+                return _one_step(problem, course, t + i.astype(dtype) * h)
 
             return jax.lax.cond(course.status == MOTION_CODE["ok"], go, lambda: course)
 
@@ -253,12 +298,8 @@ def time_stepping(
     end, later = jax.lax.scan(to_sample, start, times[:-1])
     samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, later)
     steps = substeps * (times.shape[0] - 1)
-    status = jnp.where(end.status == MOTION_CODE["ok"], end.told, end.status)
+    status = jnp.where(end.status == MOTION_CODE["ok"], end.reported, end.status)
     return Course(samples, end.events, steps, status)
-
-
-def _numbers(pile: Discs) -> int:
-    return pile.count * (pile.count + len(pile.walls))
 
 
 def _contacts(
@@ -269,173 +310,211 @@ def _contacts(
     t_end: jax.Array,
     closed_below: jax.Array,
     friction: bool,
-) -> _Few | _Heap:
+) -> _AllContacts | _ActiveContacts:
     """The contacts of a step whose middle is at (q, t), and its end, without contacts, at q_end."""
     at, end = seen_from_base(system, q, t), seen_from_base(system, q_end, t_end)
     mass = mass_at(system, q)
-    if isinstance(system.body, Discs):
-        near = system.body.near(at, end, closed_below)
-        near = near if friction else near._replace(directions=near.directions[:, :1])
-        return _Heap(near, jnp.pad(1 / mass.reshape(-1, 3), ((0, 1), (0, 0))))
-    given = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
-    gap, normals = given.value, given.gradient
+    if is_pile(system):
+        pairs = system.body.active_pairs(at, end, closed_below)
+        pairs = pairs if friction else pairs._replace(directions=pairs.directions[:, :1])
+        return _ActiveContacts(pairs, jnp.pad(1 / mass.reshape(-1, 3), ((0, 1), (0, 0))))
+    normal = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
+    gap, normals = normal.value, normal.gradient
     n, m = normals.shape
     directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
     if friction:
-        sides = system.body.tangents(at)
-        assert sides is not None
-        directions = jnp.concatenate([directions, sides.reshape(n, m, -1)], axis=2)
+        tangents = system.body.tangents(at)
+        assert tangents is not None
+        directions = jnp.concatenate([directions, tangents.reshape(n, m, -1)], axis=2)
     least = jnp.minimum(gap, jnp.atleast_1d(system.body.gap_function(end)))
-    there = ~(least > closed_below)  # NaN does not pass for open
-    directions = jnp.where(there[:, None], directions, 0.0)
+    closed = ~(least > closed_below)  # NaN does not pass for open
+    directions = jnp.where(closed[:, None], directions, 0.0)
     moved = solve_mass(mass, directions.reshape(n, -1)).reshape(directions.shape)
-    return _Few(there, directions, moved, jnp.tensordot(directions, moved, axes=([0], [0])))
+    return _AllContacts(
+        closed, directions, moved, jnp.tensordot(directions, moved, axes=([0], [0]))
+    )
 
 
-def _one_step(
-    system: System,
-    law: Law,
-    mu: jax.Array | None,
-    h: jax.Array,
-    closed_below: jax.Array,
-    joint: bool,
-    course: _Progress,
-    t: jax.Array,
-) -> _Progress:
+def _one_step(problem: _Problem, course: _Progress, t: jax.Array) -> _Progress:
+    """The motion one step later."""
+    setup = _set_up(problem, course, t)
+    trial = _solve(problem, course, setup)
+    state, energy = _ledger(problem, course, setup, trial)
+    status, reported = _status(problem, course, setup, trial, state)
+    return _Progress(
+        state,
+        setup.speed,
+        setup.contacts.stored(course.memory, trial.solution.impulse),
+        trial.solution.missed,
+        trial.solution.steepness,
+        jnp.where(setup.strikes, 1, course.since + 1),
+        _recorded_impact(problem, course.events, setup, trial, energy),
+        status,
+        reported,
+    )
+
+
+def _loads(
+    system: System, q: jax.Array, v: jax.Array, t: jax.Array, mass: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Forces (n,), and the acceleration (n,) without contacts."""
+    force = user_force(system, q, v, t)
+    return force, free_acceleration(system, q, v, force, mass)
+
+
+def _set_up(problem: _Problem, course: _Progress, t: jax.Array) -> _Setup:
+    """The step that begins at t: its contacts, which of them strike, and what the law does."""
+    system, law, mu, h, closed_below, joint = problem
     state, dtype, body = course.state, course.state.q.dtype, system.body
-    middle = t + 0.5 * h
+    middle, end = t + 0.5 * h, t + h
     q = body.moved(state.q, 0.5 * h * state.v)
     carried = carried_along(system, state.v, middle)
     mass = mass_at(system, q)
-
-    def pushed(v: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Forces, and the acceleration without contacts, at the velocity v."""
-        force = user_force(system, q, v, middle)
-        return force, free_acceleration(system, q, v, force, mass)
-
-    free_before = pushed(state.v)[1]
-    falls = body.moved(q, 0.5 * h * (state.v + h * free_before))
-    close = _contacts(system, q, middle, falls, t + h, closed_below, mu is not None)
-    before = close.rates(state.v - carried)
+    free = _loads(system, q, state.v, middle, mass)[1]
+    falls = body.moved(q, 0.5 * h * (state.v + h * free))
+    contacts = _contacts(system, q, middle, falls, end, closed_below, mu is not None)
+    before = contacts.rates(state.v - carried)
     eps = float(jnp.finfo(dtype).eps)
-    speed = jnp.maximum(course.speed, close.fastest(state.v))
-    tolerance = max(PILE if isinstance(close, _Heap) else FEW, ROUNDINGS * eps)
+    speed = jnp.maximum(course.speed, contacts.fastest(state.v))
+    tolerance = max(PILE if is_pile(system) else FEW, ROUNDINGS * eps)
     noise = max(_ROUNDING, _ROUNDINGS * eps) * speed + course.missed
-    noise += tolerance * close.fastest(h * free_before)
-    slow = noise + SLOW * h * jnp.abs(close.rates(free_before)[:, 0])
-    strikes = close.there & (before[:, 0] < -slow)
-    struck, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
+    noise += tolerance * contacts.fastest(h * free)
+    slow = noise + SLOW * h * jnp.abs(contacts.rates(free)[:, 0])
+    strikes = contacts.closed & (before[:, 0] < -slow)
+    impulse, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
     e, e_t = jnp.zeros((), dtype), jnp.zeros((), dtype)
     # half of the forces before an impact, half after it: over the whole step they take as much
     # energy from the velocities as the potential gains
-    met = state.v if joint else state.v + 0.5 * h * free_before
+    met = state.v if joint else state.v + 0.5 * h * free
     if joint:
         assert isinstance(law, Moreau)
         e = law.restitution
         e_t = e_t if law.tangential_restitution is None else law.tangential_restitution
     else:
-        scene = scene_at(system, q, state.v, middle, close.there)
-        struck, code = jax.lax.cond(
+        scene = scene_at(system, q, state.v, middle, contacts.closed)
+        impulse, code = jax.lax.cond(
             jnp.any(strikes),
-            lambda: _struck(law, scene, met - carried, noise, before.shape),
-            lambda: (struck, code),
+            lambda: _law_impulses(law, scene, met - carried, noise, before.shape),
+            lambda: (impulse, code),
         )
-    rates = before + close.product(struck)
-    late = jnp.where(strikes, 0.5 * h * close.rates(free_before)[:, 0], 0.0)
+    rates = before + contacts.product(impulse)
+    late = jnp.where(strikes, 0.5 * h * contacts.rates(free)[:, 0], 0.0)
     wanted, against_mean = _wanted(e, jnp.where(strikes, e_t, 0.0), rates, late)
+    return _Setup(
+        middle, end, q, mass, carried, contacts, speed, noise, tolerance,
+        strikes, met, impulse, code, rates, wanted, against_mean,
+    )  # fmt: skip
 
-    def solved(tried: _Tried) -> _Tried:
+
+def _solve(problem: _Problem, course: _Progress, setup: _Setup) -> _Trial:
+    """The impulses of the step, with forces at its mean velocity, that give no energy."""
+    system, h, contacts, v0 = problem.system, problem.h, setup.contacts, course.state.v
+    constant = system.force is None and not callable(system.mass)
+    least = 1 if constant and system.body.coordinates is None else MEAN
+
+    def tried(last: _Trial) -> _Trial:
         """The step with the forces at its mean velocity, as far as that is known."""
-        force, free = pushed(tried.mean)
-        pulled = rates + h * close.rates(free)
-        goal = pulled + jnp.where(tried.tries < least, wanted, against_mean)
-        found = solve_many(
-            close.product,
-            close.diagonal,
-            jnp.where(close.there[:, None], goal, 0.0),
-            jnp.zeros((), dtype) if mu is None else mu,
-            tried.found.impulse,
-            tried.found.steepness,
-            tolerance,
+        force, free = _loads(system, setup.q, last.mean, setup.middle, setup.mass)
+        pulled = setup.rates + h * contacts.rates(free)
+        goal = pulled + jnp.where(last.tries < least, setup.wanted, setup.against_mean)
+        solution = solve_many(
+            contacts.product,
+            contacts.diagonal,
+            jnp.where(contacts.closed[:, None], goal, 0.0),
+            jnp.zeros((), v0.dtype) if problem.mu is None else problem.mu,
+            last.solution.impulse,
+            last.solution.steepness,
+            setup.tolerance,
             ITERATIONS,
         )
-        v = state.v + h * free + close.push(struck + found.impulse)
-        after = pulled + close.product(found.impulse)
-        gained = 0.5 * jnp.vdot(found.impulse, rates + after)
-        gains = gained > (noise + found.missed) * jnp.sum(jnp.abs(found.impulse))
-        return _Tried(v, 0.5 * (state.v + v), force, found, gains, tried.tries + 1)
+        x = solution.impulse
+        v = v0 + h * free + contacts.velocity_change(setup.law_impulse + x)
+        after = pulled + contacts.product(x)
+        energy = 0.5 * jnp.vdot(x, setup.rates + after)
+        gains = energy > (setup.noise + solution.missed) * jnp.sum(jnp.abs(x))
+        return _Trial(v, 0.5 * (v0 + v), force, solution, gains, last.tries + 1)
 
-    def goes_on(tried: _Tried) -> jax.Array:
-        return (tried.tries < least) | (tried.gains & (tried.tries < 2 * least))
+    def goes_on(trial: _Trial) -> jax.Array:
+        return (trial.tries < least) | (trial.gains & (trial.tries < 2 * least))
 
-    begun = Many(close.recall(course.memory), 0 * speed, 0 * speed, jnp.int32(0), course.steepness)
-    start = _Tried(
-        state.v, state.v, jnp.zeros_like(state.v), begun, jnp.asarray(False), jnp.int32(0)
+    zero = 0 * setup.speed
+    begin = Many(contacts.warm_start(course.memory), zero, zero, jnp.int32(0), course.steepness)
+    start = _Trial(v0, v0, jnp.zeros_like(v0), begin, jnp.asarray(False), jnp.int32(0))
+    return jax.lax.while_loop(goes_on, tried, start)
+
+
+def _ledger(
+    problem: _Problem, course: _Progress, setup: _Setup, trial: _Trial
+) -> tuple[State, jax.Array]:
+    """The state at the end, with its work, and the energy (2, m) that each contact gave."""
+    h, state, contacts = problem.h, course.state, setup.contacts
+    x = setup.law_impulse + trial.solution.impulse
+    work = x * contacts.rates(trial.mean - setup.carried)
+    energy = jnp.stack([work[:, 0], jnp.sum(work[:, 1:], axis=1)])
+    new = state._replace(
+        q=problem.system.body.moved(setup.q, 0.5 * h * trial.v),
+        v=trial.v,
+        t=setup.end,
+        work=state.work + h * trial.force @ trial.mean,
+        base_work=state.base_work + contacts.generalized_impulse(x) @ setup.carried,
+        contact_work=state.contact_work + contacts.recorded(energy),
     )
-    constant = system.force is None and not callable(system.mass) and body.coordinates is None
-    least = 1 if constant else MEAN
-    end = jax.lax.while_loop(goes_on, solved, start)
-    found, v, mean = end.found, end.v, end.mean
-    x = struck + found.impulse
-    energy = x * close.rates(mean - carried)
-    sides = jnp.sum(energy[:, 1:], axis=1)
-    moved = state._replace(
-        q=body.moved(q, 0.5 * h * v),
-        v=v,
-        t=t + h,
-        work=state.work + h * end.force @ mean,
-        base_work=state.base_work + close.pull(x) @ carried,
-        contact_work=state.contact_work + close.seen(jnp.stack([energy[:, 0], sides])),
-    )
-    fails = jnp.asarray(FAILS)[code]
+    return new, energy
+
+
+def _status(
+    problem: _Problem, course: _Progress, setup: _Setup, trial: _Trial, state: State
+) -> tuple[jax.Array, jax.Array]:
+    """The status after the step, and what is reported without being a failure."""
+    system, contacts = problem.system, setup.contacts
+    fails = jnp.asarray(FAILS)[setup.law_status]
     status = jnp.where(fails, MOTION_CODE["law_failed"], course.status)
-    status = jnp.where(out_of_range(system, moved), MOTION_CODE["out_of_range"], status)
-    if isinstance(close, _Heap):
-        status = jnp.where(close.near.lost, MOTION_CODE["room"], status)
+    status = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], status)
+    if isinstance(contacts, _ActiveContacts):
+        status = jnp.where(contacts.pairs.overflows, MOTION_CODE["room"], status)
     # a base that is NaN shows in its work, a coefficient in that of the contacts
-    finite = jnp.all(jnp.isfinite(v)) & jnp.isfinite(moved.base_work)
-    finite &= jnp.all(jnp.isfinite(moved.contact_work))
+    finite = jnp.all(jnp.isfinite(trial.v)) & jnp.isfinite(state.base_work)
+    finite &= jnp.all(jnp.isfinite(state.contact_work))
     status = jnp.where(finite, status, MOTION_CODE["not_finite"])
     if callable(system.mass):
-        sound = definite(mass) | ~jnp.all(jnp.isfinite(mass))
+        sound = definite(setup.mass) | ~jnp.all(jnp.isfinite(setup.mass))
         status = jnp.where(sound, status, MOTION_CODE["singular_mass"])
-    status = status.astype(jnp.int32)
-    if isinstance(body, Discs):  # two of them may pass through each other between two looks
-        far = h * jnp.sqrt(jnp.max(jnp.sum(v.reshape(-1, 3)[:, :2] ** 2, axis=1)))
-        long = far > jnp.min(body.radii)
+    if isinstance(contacts, _ActiveContacts):
+        speeds = jnp.sum(trial.v.reshape(-1, 3)[:, :2] ** 2, axis=1)
+        coarse = problem.h * jnp.sqrt(jnp.max(speeds)) > contacts.pairs.reach
     else:
-        long = jnp.any(strikes & (course.since < APART))
-    coarse = jnp.where(long, MOTION_CODE["coarse_step"], 0)
-    missed = jnp.where(found.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
-    told = jnp.maximum(course.told, jnp.maximum(coarse, missed)).astype(jnp.int32)
-    events = course.events
-    if isinstance(close, _Few):
-        given = x if joint else struck
-        row = {
-            "time": middle,
-            "kind": jnp.int32(KIND_CODE["impact"]),
-            "contacts": strikes,
-            "q": q,
-            "velocity_before": met,
-            "velocity_after": v if joint else met + close.push(struck),
-            "impulse": given[:, 0],
-            "energy": jnp.stack([energy[:, 0], sides]),
-            "status": code,
-        }
-        if before.shape[1] > 1:
-            row["tangential_impulse"] = given[:, 1:].reshape(-1)
-        events = with_row(events, jnp.any(strikes), row)
-    return _Progress(
-        moved,
-        speed,
-        close.keep(course.memory, found.impulse),
-        found.missed,
-        found.steepness,
-        jnp.where(strikes, 1, course.since + 1),
-        events,
-        status,
-        told,
-    )
+        coarse = jnp.any(setup.strikes & (course.since < APART))
+    coarse = jnp.where(coarse, MOTION_CODE["coarse_step"], 0)
+    missed = jnp.where(trial.solution.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
+    reported = jnp.maximum(course.reported, jnp.maximum(coarse, missed))
+    return status.astype(jnp.int32), reported.astype(jnp.int32)
+
+
+def _recorded_impact(
+    problem: _Problem, events: Events, setup: _Setup, trial: _Trial, energy: jax.Array
+) -> Events:
+    """The events with the impact of this step, if there is one; a pile records none."""
+    contacts, x, after = setup.contacts, setup.law_impulse, trial.v
+    if isinstance(contacts, _ActiveContacts):
+        return events
+    if problem.joint:
+        x = x + trial.solution.impulse
+    else:
+        after = setup.met + contacts.velocity_change(x)
+    row = {
+        "time": setup.middle,
+        "kind": jnp.int32(KIND_CODE["impact"]),
+        "contacts": setup.strikes,
+        "q": setup.q,
+        "velocity_before": setup.met,
+        "velocity_after": after,
+        "impulse": x[:, 0],
+        "energy": energy,
+        "status": setup.law_status,
+    }
+    if x.shape[1] > 1:
+        row["tangential_impulse"] = x[:, 1:].reshape(-1)
+    return with_row(events, jnp.any(setup.strikes), row)
 
 
 def _wanted(
@@ -460,7 +539,7 @@ def joins_step(law: Law) -> bool:
     return isinstance(law, Moreau) and law.restitution.ndim < 2
 
 
-def _struck(
+def _law_impulses(
     law: Law, scene: Scene, v: jax.Array, noise: jax.Array, shape: tuple[int, ...]
 ) -> tuple[jax.Array, jax.Array]:
     """Impulses (m, b) of the law, and its status."""

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from jimpact.solvers.friction import solve as solve_friction
 from jimpact.solvers.sensitivity import both_modes
+from jimpact.solvers.tangential import TangentialBlock, per_tangent
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
@@ -30,13 +31,11 @@ BOUNDARY = 8.0  # eps: a state on the edge of the endless cone (body between two
 SINGULAR = 16.0  # eps: two contacts with 1 - cos^2 below this are redundant
 
 
-class Sides(NamedTuple):
-    """Tangential directions (t,), contact by contact, normalized by the `sqrt(W_jj)` of theirs."""
+class CoulombFriction(NamedTuple):
+    """The tangential block, normalized by the `sqrt(W_jj)` of each contact, and its parameters."""
 
-    cross: jax.Array  # (m, t)
-    along: jax.Array  # (t, t)
-    slip: jax.Array  # (t,)
-    friction: jax.Array  # mu (m,)
+    block: TangentialBlock
+    coefficient: jax.Array  # mu (m,)
     restitution: jax.Array  # e_t (m,)
 
 
@@ -48,7 +47,7 @@ class Inputs(NamedTuple):
     qn: jax.Array
     root: jax.Array  # sqrt(W_jj), only compared
     gaps: jax.Array | None  # None: no free flight
-    sides: Sides | None = None  # None: no friction
+    friction: CoulombFriction | None = None
 
 
 class Options(NamedTuple):
@@ -98,10 +97,10 @@ def solve(
     gaps: jax.Array | None,
     cycle: tuple[int, ...] | None,
     max_collisions: int,
-    sides: Sides | None = None,
+    friction: CoulombFriction | None = None,
 ) -> tuple[jax.Array, jax.Array | None, End]:
     """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
-    inputs = to_inputs(delassus, gamma, restitution, gaps, sides)
+    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
     (p, side), end = both_modes(lambda given, _: run(given, options))(inputs)
     return *impulses_of(p, side, jnp.sqrt(diagonal(delassus))), end
@@ -114,17 +113,12 @@ def impulses_of(
     return p / root, None if side is None else side / per_tangent(root, side)
 
 
-def per_tangent(values: jax.Array, like: jax.Array) -> jax.Array:
-    """Values (m,) of contacts for each of their tangents (t,)."""
-    return jnp.repeat(values, len(like) // len(values))
-
-
 def to_inputs(
     delassus: Symmetric,
     gamma: jax.Array,
     restitution: jax.Array,
     gaps: jax.Array | None,
-    sides: Sides | None = None,
+    friction: CoulombFriction | None = None,
 ) -> Inputs:
     """The normalized problem. Gaps and `sqrt(W_jj)` only order the collisions: no derivatives."""
     root = jnp.sqrt(diagonal(delassus))
@@ -132,20 +126,15 @@ def to_inputs(
     m = gamma.shape[0]
     beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     fixed = jax.lax.stop_gradient
-    if sides is not None:
-        each = per_tangent(root, sides.slip)
-        sides = sides._replace(
-            cross=sides.cross / (root[:, None] * each[None]),
-            along=sides.along / (each[:, None] * each[None]),
-            slip=sides.slip / each,
-        )
+    if friction is not None:
+        friction = friction._replace(block=friction.block.scaled(root))
     return Inputs(
         beside,
         restitution,
         gamma / root,
         fixed(root),
         None if gaps is None else fixed(gaps),
-        sides,
+        friction,
     )
 
 
@@ -153,7 +142,7 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
     """Normalized impulses and the end of the sequence."""
     g = coupling_matrix(inputs, options)
     start = begin(inputs)
-    pair = inputs.qn.shape[0] == 2 and inputs.sides is None
+    pair = inputs.qn.shape[0] == 2 and inputs.friction is None
     endless, limit = jnp.array(False), start.p
     if pair:
         first = choose(inputs, options, g, start).contact
@@ -214,8 +203,8 @@ def begin(inputs: Inputs) -> Carry:
         tied=jnp.array(False),
         gaps=inputs.gaps,
         time=jnp.array(0, dtype),
-        slip=None if inputs.sides is None else inputs.sides.slip,
-        side=None if inputs.sides is None else jnp.zeros_like(inputs.sides.slip),
+        slip=None if inputs.friction is None else inputs.friction.block.slip,
+        side=None if inputs.friction is None else jnp.zeros_like(inputs.friction.block.slip),
         code=jnp.array(CODE["ok"], jnp.int32),
     )
 
@@ -271,15 +260,16 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Carry:
     choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
     chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
     slip, side, code = at.slip, at.side, at.code
-    if inputs.sides is None:
+    if inputs.friction is None:
         jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
         after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, jump))
     else:
         assert slip is not None
         assert side is not None
-        jump, push, status = _with_friction(inputs, inputs.sides, at, choice.contact)
-        after = at.qn + times(g, jump) + inputs.sides.cross @ push
-        slip = slip + inputs.sides.cross.T @ jump + inputs.sides.along @ push
+        jump, push, status = _with_friction(inputs, inputs.friction, at, choice.contact)
+        cross, tangent, _ = inputs.friction.block
+        after = at.qn + times(g, jump) + cross @ push
+        slip = slip + cross.T @ jump + tangent @ push
         side, code = side + push, jnp.maximum(code, status)
     gaps = at.gaps
     if gaps is not None:
@@ -301,22 +291,22 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Carry:
 
 
 def _with_friction(
-    inputs: Inputs, sides: Sides, at: Carry, contact: jax.Array
+    inputs: Inputs, friction: CoulombFriction, at: Carry, contact: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Impulses (m,) and (t,) of a collision at one contact, and its status."""
-    m, t = sides.cross.shape
+    m, t = friction.block.normal_tangent.shape
     each = t // m
     rows = contact * each + jnp.arange(each, dtype=contact.dtype)
-    cross = sides.cross[contact, rows][None]
-    corner = jnp.ones((1, 1), cross.dtype)
-    matrix = jnp.block([[corner, cross], [cross.T, sides.along[rows[:, None], rows[None]]]])
+    cross = friction.block.normal_tangent[contact, rows][None]
+    tangent = friction.block.tangent[rows[:, None], rows[None]]
+    matrix = jnp.block([[jnp.ones((1, 1), cross.dtype), cross], [cross.T, tangent]])
     e = jnp.broadcast_to(inputs.restitution, (m,))[contact]
     assert at.slip is not None
     found = solve_friction(
         matrix,
         ((1 + e) * at.qn[contact])[None],
-        (1 + sides.restitution[contact]) * at.slip[rows],
-        sides.friction[contact][None],
+        (1 + friction.restitution[contact]) * at.slip[rows],
+        friction.coefficient[contact][None],
         complementary=True,
     )
     jump = jnp.zeros_like(at.qn).at[contact].set(found.normal[0])

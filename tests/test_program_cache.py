@@ -1,5 +1,7 @@
 """Programs on the disk: the same values from what was not compiled here, and nothing stale."""
 
+import os
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,37 +10,37 @@ import pytest
 from numpy.testing import assert_array_equal
 
 import jimpact as ji
-from jimpact import kept
-from jimpact.compiling import kept_in
+from jimpact.cli import program_cache
+from jimpact.cli.program_cache import limit_size, stored_programs
 
 V = np.array([1.0, 0.1, 0.0])
 BALLS = ji.chain([1.0, 2.0, 1.0])
 
 
 class Softened(ji.Newton):
-    """A law of the caller's own."""
+    """A user's own law."""
 
 
 @pytest.fixture
 def compiled(monkeypatch):
     """Names of what was compiled, not read."""
     names = []
-    made = kept._compiled
+    made = program_cache._compile
 
-    def counted(program, fixed, arrays):
+    def counted(program, static, arrays):
         names.append(program.__name__)
-        return made(program, fixed, arrays)
+        return made(program, static, arrays)
 
-    monkeypatch.setattr(kept, "_compiled", counted)
+    monkeypatch.setattr(program_cache, "_compile", counted)
     return names
 
 
 def outcome(folder, law=None, scene=BALLS, v=V):
-    with kept_in(folder):
+    with stored_programs(folder):
         return ji.impact(ji.Newton(0.5) if law is None else law, scene, v)
 
 
-def test_what_is_read_is_what_was_compiled(tmp_path, compiled):
+def test_a_program_that_is_read_gives_the_values_of_the_compiled_one(tmp_path, compiled):
     law = ji.LZB(restitution=0.9, stiffness=[1.0, 3.0])
     plain = ji.impact(law, BALLS, V)
     for _ in range(3):
@@ -51,7 +53,7 @@ def test_what_is_read_is_what_was_compiled(tmp_path, compiled):
     assert len(compiled) == 1
 
 
-def test_what_is_static_or_shaped_otherwise_is_another_program(tmp_path, compiled):
+def test_other_static_arguments_and_shapes_are_other_programs(tmp_path, compiled):
     outcome(tmp_path)
     outcome(tmp_path, ji.Moreau(0.5))
     outcome(tmp_path, ji.LZB(0.5))
@@ -62,21 +64,21 @@ def test_what_is_static_or_shaped_otherwise_is_another_program(tmp_path, compile
     assert len(compiled) == len(list(tmp_path.iterdir())) == 6
 
 
-def test_laws_of_the_callers_own_are_not_kept(tmp_path, compiled):
+def test_programs_of_a_users_own_law_are_not_stored(tmp_path, compiled):
     assert_array_equal(outcome(tmp_path, Softened(0.5)).velocity, outcome(None).velocity)
     assert not compiled
     assert not list(tmp_path.iterdir())
 
 
-def test_other_sources_other_programs(tmp_path, compiled, monkeypatch):
+def test_an_edited_source_makes_other_programs(tmp_path, compiled, monkeypatch):
     outcome(tmp_path)
-    monkeypatch.setattr(kept, "_sources", lambda: b"edited")
+    monkeypatch.setattr(program_cache, "_source_hash", lambda: b"edited")
     outcome(tmp_path)
     assert len(compiled) == 2
 
 
-def test_derivatives_pass(tmp_path):
-    with kept_in(tmp_path):
+def test_derivatives_and_batches_do_not_use_the_folder(tmp_path):
+    with stored_programs(tmp_path):
         slope = jax.jacfwd(lambda e: ji.impact(ji.Newton(e), BALLS, V).velocity)(0.5)
         batch = jax.vmap(lambda e: ji.impact(ji.Newton(e), BALLS, V).velocity)(jnp.ones(2))
         inside = eqx.filter_jit(ji.impact)(ji.Newton(0.5), BALLS, V).velocity
@@ -95,8 +97,24 @@ def test_a_damaged_file_is_replaced(tmp_path, compiled):
     assert len(compiled) == 4
 
 
-def test_without_a_place_it_works_all_the_same(tmp_path, compiled):
-    place = tmp_path / "file"
-    place.write_text("")
-    assert_array_equal(outcome(place).velocity, outcome(None).velocity)
+def test_an_unusable_folder_is_ignored(tmp_path, compiled):
+    folder = tmp_path / "file"
+    folder.write_text("")
+    assert_array_equal(outcome(folder).velocity, outcome(None).velocity)
     assert len(compiled) == 1
+
+
+def test_the_least_recently_used_files_go_first(tmp_path, monkeypatch):
+    for age, name in enumerate(("new", "jax/middle", "old")):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(bytes(100))
+        os.utime(path, (1e9 - age, 1e9 - age - 50))  # read, written
+    limit_size(tmp_path, 300)
+    assert (tmp_path / "old").exists()
+    limit_size(tmp_path, 250)
+    assert [x.name for x in tmp_path.rglob("*") if x.is_file()] == ["new", "middle"]
+    monkeypatch.setattr(program_cache.limit_size, "__defaults__", (100,))
+    with stored_programs(tmp_path):
+        pass
+    assert [x.name for x in tmp_path.rglob("*") if x.is_file()] == ["new"]
