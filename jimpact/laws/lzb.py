@@ -149,7 +149,7 @@ class LZB(Law):
         check_rtol(self.rtol, dtype)
 
     @property
-    def fills_up(self) -> bool:
+    def pads_scenes(self) -> bool:
         """Without friction, by the stepper."""
         return self.method == "time" and self.friction is None
 
