@@ -29,6 +29,12 @@ def test_one_unit_in_the_last_place_is_no_impact():
     assert not out.impulse.any()
 
 
+def test_ten_times_the_rounding_is_an_impact():
+    """Velocities of 0.7 are known within eps: an approach of 30 eps is one."""
+    v = np.array([0.7 + 60 * ULP, 0.7, 0.7, 0.7])
+    assert ji.impact(ji.Moreau(0.9), FOUR, v).impulse[0] > 0
+
+
 @pytest.mark.parametrize(
     "law",
     [
@@ -141,6 +147,28 @@ def test_contacts_that_do_not_feel_each_other_are_solved_apart():
     apart = ji.impact(ji.Newton(e), balls, v)
     np.testing.assert_allclose(apart.velocity, whole.velocity, atol=1e-14)
     np.testing.assert_allclose(apart.impulse, whole.impulse, atol=1e-14)
+
+
+class Gains(ji.Law):
+    """gamma+ = -1.001 gamma-: a thousandth more energy than before."""
+
+    separable = True
+
+    def impulses(self, contact):
+        return ji.Impulses(jnp.linalg.solve(contact.delassus, -2.001 * contact.gap_velocity))
+
+
+def test_groups_are_judged_on_the_scale_of_their_impact():
+    pairs = ji.Scene(np.ones(4), [[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    assert coupled_groups(pairs) is not None
+    out = ji.impact(Gains(), pairs, [1.0, 0.0, 1.0, 0.5])
+    assert int(out.status) == CODE["energy_gain"]
+
+
+def test_each_contact_keeps_its_restitution_before_a_right_wall():
+    """The row is filled up with open contacts on its left: v2+ = 0.7 (wall), v1+ = v2+ - 0.8 * 2."""
+    out = ji.impact(ji.Newton([0.8, 0.7]), ji.chain([2.0, 5.0], wall=True), [3.0, 1.0])
+    np.testing.assert_allclose(out.velocity, [-0.7 - 1.6, -0.7], rtol=1e-13)
 
 
 @pytest.mark.slow

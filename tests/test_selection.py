@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.special import chdtrc, erf
 
 import jimpact as ji
@@ -232,6 +233,9 @@ def test_the_need_of_a_dependence_on_speed_is_tested():
             gain = constant.starts[0].sum_of_squares - full.starts[0].sum_of_squares
             if sigma is None:
                 assert test.statistic == pytest.approx(gain / full.noise**2)
+                # 24 measured velocities, 2 parameters, of which 1 is tested
+                chance = stats.f.sf(test.statistic, 1, 22)
+                assert test.chance == pytest.approx(chance, rel=1e-9, abs=1e-300)
             elif full.noise == 1:
                 assert test.chance == pytest.approx(chdtrc(1, gain))
     with pytest.raises(ValueError, match="more parameters"):
