@@ -11,6 +11,7 @@ import shutil
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -98,23 +99,31 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
         print(WELCOME, end="")
         return 0
     try:
-        command = call.command = parse(arguments)
-        command.check()
-        if command.light:
-            return command.run()
-        folder = keep_programs(command.no_cache)
-        from jimpact.cli.commands import run
-        from jimpact.progress import Steps
-
-        call.steps = Steps(call.name)
-        failure = run(command, call.steps, folder)
-        return call.fail(failure, FAILURE) if failure else 0
+        with warnings.catch_warnings():
+            warnings.simplefilter("default", UserWarning)  # each once
+            warnings.showwarning = lambda text, *_: print(f"{call.name}: {text}", file=sys.stderr)
+            return run_command(call, arguments)
     except BrokenPipeError:
         raise
     except (ValueError, TypeError, OSError, ImportError) as error:
         return call.fail(error, BAD_INPUT)
     except RuntimeError as error:
         return call.fail(error, FAILURE)
+
+
+def run_command(call: Call, arguments: list[str]) -> int:
+    """Parse, check and run; the exit code."""
+    command = call.command = parse(arguments)
+    command.check()
+    if command.light:
+        return command.run()
+    folder = keep_programs(command.no_cache)
+    from jimpact.cli.commands import run
+    from jimpact.progress import Steps
+
+    call.steps = Steps(call.name)
+    failure = run(command, call.steps, folder)
+    return call.fail(failure, FAILURE) if failure else 0
 
 
 def parse(arguments: list[str]) -> Any:
