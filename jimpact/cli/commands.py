@@ -451,7 +451,8 @@ def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
 
 # ----------------------------------------------------------------------------------------- advise
 
-_LZB_PARAMETERS = ("restitution", "stiffness", "exponent")  # that `ji.advise` takes
+_ADVISE_PARAMETERS = ("restitution", "stiffness", "exponent", "friction")  # that `ji.advise` takes
+_ADVISE_REFUSED = ("tangential_restitution", "initial_energy")  # these would change the outcome
 
 
 def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
@@ -466,7 +467,7 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
         samples=command.samples,
         seed=command.seed,
         progress=steps.patience,
-        **_lzb_parameters(study),
+        **_advise_parameters(study),
     )
     picture = ji.plot.advice(result, study.title)
     title, heads = _titled(study, before), ["law", "worst", "chosen"]
@@ -474,15 +475,21 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
     return CommandResult(title, result.to_dict(), str(result), {path: picture}, table=(heads, rows))
 
 
-def _lzb_parameters(study: Study) -> dict[str, Any]:
-    """The study's parameters that LZB has too."""
+def _advise_parameters(study: Study) -> dict[str, Any]:
+    """The study's parameters that `ji.advise` takes; others that matter are refused."""
     rheology = study.parameters.get("rheology", "bistiffness")
     if rheology != "bistiffness":
         raise ValueError(
             f"the study must have bistiffness contacts, but has rheology {rheology!r}: of viscous "
             "contacts only the compliant law knows."
         )
-    return {key: value for key, value in study.parameters.items() if key in _LZB_PARAMETERS}
+    for key in _ADVISE_REFUSED:
+        if np.any(study.parameters.get(key, 0.0)):
+            raise ValueError(
+                f"the study must not have `{key}`, but has {study.parameters[key]}: `jimpact "
+                "advise` compares laws without it."
+            )
+    return {key: value for key, value in study.parameters.items() if key in _ADVISE_PARAMETERS}
 
 
 # --------------------------------------------------------------------------------------- simulate

@@ -49,6 +49,9 @@ class Call:
     command: Any = None  # until the options are parsed
     steps: Any = None
 
+    def __init__(self) -> None:
+        self.warnings: set[str] = set()
+
     @property
     def name(self) -> str:
         """The words that messages begin with."""
@@ -59,6 +62,12 @@ class Call:
         done = f" after: {'; '.join(self.steps.done)}" if self.steps and self.steps.done else ""
         remains = "" if self.command is None else self.command.remains()
         return f"{self.name}: stopped{done}. {remains}".rstrip()
+
+    def warn(self, message: Any, *_: Any) -> None:
+        """Print a warning, once: a file may be read twice. In the place of `showwarning`."""
+        if str(message) not in self.warnings:
+            self.warnings.add(str(message))
+            print(f"{self.name}: {message}", file=sys.stderr)
 
     def fail(self, reason: Any, code: int) -> int:
         """Print the reason; the exit code."""
@@ -100,8 +109,8 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
         return 0
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("default", UserWarning)  # each once
-            warnings.showwarning = lambda text, *_: print(f"{call.name}: {text}", file=sys.stderr)
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = call.warn
             return run_command(call, arguments)
     except BrokenPipeError:
         raise

@@ -223,7 +223,7 @@ def _report_nan(
         warnings.warn(
             f"{path}: {len(cells)} cells are NaN and count as not measured, as empty ones do; the "
             f"first is in {where.removeprefix(f'{path}, ')}, column `{column.header}`.",
-            stacklevel=1,  # the same place for all callers: reported once
+            stacklevel=1,  # one place for all callers: Python reports it once
         )
 
 
