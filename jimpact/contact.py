@@ -137,9 +137,14 @@ class Contact(eqx.Module):
         return self.gap_velocity / self.norm
 
     @property
+    def normal_delassus(self) -> jax.Array:
+        """W (m, m) [1/kg] as an array, of a chain too."""
+        return as_matrix(self.delassus)
+
+    @property
     def whole_delassus(self) -> jax.Array:
         """[[W, W_nt], [W_tn, W_tt]] (m + t, m + t); W where there are no tangents."""
-        w = as_matrix(self.delassus)
+        w = self.normal_delassus
         if self.tangential_block is None:
             return w
         cross, tangent, _ = self.tangential_block

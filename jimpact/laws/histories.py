@@ -14,7 +14,6 @@ from jimpact.events.impact_dynamics import Outcome
 from jimpact.events.impact_history import Samples
 from jimpact.law import Law, check_law
 from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness
 from jimpact.laws.lzb import LZB
 from jimpact.scene import Scene, as_velocity, velocity_change
 
@@ -71,12 +70,10 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     >>> round(float(h.duration), 3), round(float(h.maximum_force[0]), 3)  # pi/sqrt(k), sqrt(k)
     (2.221, 1.414)
     """
-    compliant = isinstance(law, Compliant) and isinstance(law.force, Bistiffness)
-    if not compliant and not (isinstance(law, LZB) and law.method == "time"):
+    if not law.has_history:
         raise TypeError(
-            "Argument `law` must be an LZB law with method='time' or a Compliant law with a "
-            "Bistiffness force (others have no impact dynamics that are sampled), "
-            f"but is {law!r}."
+            "Argument `law` must have a history (`has_history`: LZB with method='time', Compliant "
+            f"with a Bistiffness force, a law of your own with `dynamics`), but is {law!r}."
         )
     as_whole("samples", samples, 2)
     v = as_velocity(scene, velocity)
