@@ -129,7 +129,7 @@ MUTATIONS = [
     Mutation("a hundred times the rounding of velocities", r"\nROUNDINGS = 4\n", "\nROUNDINGS = 400\n", ("test_seams.py::test_ten_times_the_rounding_is_an_impact",), "contact.py"),
     Mutation("degrees of freedom of the F test swapped", r"fdtrc\(more, rest, ratio\)", "fdtrc(rest, more, ratio)", ("test_selection.py::test_the_need_of_a_dependence_on_speed_is_tested",), "selection.py"),
     Mutation("crossover in units of the smaller indentation", r"delta = jnp\.max\(scale\.delta\)", "delta = jnp.min(scale.delta)", ("test_compliant.py::test_offsets_of_gaps_are_in_units_of_the_larger_indentation",), "gaps.py"),
-    Mutation("parameters of contacts before a right wall in wrong order", r"np\.roll\(gaps, missing\), m - 1 - copied\[::-1\]", "np.roll(gaps, missing), copied", ("test_seams.py::test_each_contact_keeps_its_restitution_before_a_right_wall",), "scene.py"),
+    Mutation("parameters of contacts before a right wall in wrong order", r"np\.roll\(gaps, missing\), m - 1 - copied\[::-1\]", "np.roll(gaps, missing), copied", ("test_seams.py::test_a_chain_filled_up_contains_itself",), "scene.py"),
     Mutation("sign of e_t in Poisson's expansion", r"\(1 \+ e_t\) \* contact\.", "(1 - e_t) * contact.", ("test_friction.py::test_disk_in_closed_form[poisson]",), "poisson.py"),
     Mutation("nested accumulations without the root", r"jnp\.sqrt\(settings\.accumulation\)", "settings.accumulation", ("test_motion.py::test_nested_accumulations_are_passed_below_the_root_of_slow",), "transitions.py"),
     Mutation("moments of inertia of a box with 1/10", r"\(jnp\.sum\(square\) - square\) / 12", "(jnp.sum(square) - square) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",), "solids.py"),

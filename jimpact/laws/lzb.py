@@ -190,5 +190,5 @@ class LZB(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
-        doubted = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method, doubted))
+        checked = contact if self.check_conditioning else None
+        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method, checked))
