@@ -93,8 +93,9 @@ class Contact(eqx.Module):
         self.stored = zero if stored is None else stored
         self.norm = jnp.sqrt(diagonal(self.delassus)) if norm is None else norm
         self.noise = zero if noise is None else noise
-        block = tangential_block
-        self.tangential_block = None if block is None else TangentialBlock(*block)
+        self.tangential_block = None
+        if tangential_block is not None:
+            self.tangential_block = TangentialBlock(*map(jnp.asarray, tangential_block))
 
     @property
     def contacts(self) -> int:

@@ -382,14 +382,14 @@ class Law(Declared):
         """Impulses from what `contact` holds, and the law's own status code."""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """What `impulses` gets of the scene at v- (n,); override it where the law needs more."""
+        """What `impulses` gets of a scene at a velocity v- (n,); to override to add to it."""
         return contact_of(scene, velocity, self.stored, self.uses_gaps)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
     def dynamics(self, contact: Contact) -> "Dynamics":
-        """To override where `has_history`: the impact dynamics of the contacts."""
+        """To override where `has_history`: the impact dynamics at what `contact` holds."""
         raise NotImplementedError
 
     @property

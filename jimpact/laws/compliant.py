@@ -110,12 +110,12 @@ class Compliant(Law):
         problem = problem._replace(viscous=viscous)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, exponent, contact.chain)
+        return Dynamics(problem, units, exponent, contact.chain, self.max_steps)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
         checked = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.max_steps, condition_check=checked))
+        return Impulses(*solve(self.dynamics(contact), condition_check=checked))
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

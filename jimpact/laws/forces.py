@@ -56,11 +56,11 @@ class Force(Declared):
         return None
 
     def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
-        """A strong value of its parameter `damping` for a pair; None: it has no such parameter."""
+        """A strong `damping` of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: no such."""
         return None
 
     def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
-        """e of a pair of this reduced mass [kg] and speed [m/s]; None: to be integrated."""
+        """e of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: to be integrated."""
         return None
 
     def indentation_scale(self, energy: jax.Array) -> jax.Array:

@@ -186,9 +186,9 @@ class LZB(Law):
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, self.exponent, contact.chain)
+        return Dynamics(problem, units, self.exponent, contact.chain, self.max_steps)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
         checked = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method, checked))
+        return Impulses(*solve(self.dynamics(contact), self.method, checked))
