@@ -94,7 +94,19 @@ def check_choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """Raise a ValueError unless `value` is one of `choices`."""
     if value not in choices:
         known = ", ".join(map(str, choices))
-        raise ValueError(f"Argument `{name}` must be one of {known}, but has value {value!r}.")
+        raise ValueError(
+            f"Argument `{name}` must be one of {known}, but has value {value!r}."
+            f"{suggestion(value, choices)}"
+        )
+
+
+def suggestion(word: Any, choices: Iterable[Any]) -> str:
+    """' Did you mean X?' for the choice that is spelled most like the word, '' if none is alike."""
+    import difflib
+
+    known = {str(x).lower(): x for x in choices}
+    close = difflib.get_close_matches(str(word).lower(), known, n=1)
+    return f" Did you mean {known[close[0]]}?" if close else ""
 
 
 def check_kind(name: str, value: Any, kind: type) -> None:

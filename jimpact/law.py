@@ -306,10 +306,14 @@ def within_domains(law: eqx.Module) -> jax.Array:
     return jnp.all(jnp.asarray(every, bool))
 
 
+def declarations_of(kind: type[eqx.Module]) -> dict[str, Domain | Option]:
+    """What the fields of a class declare, by name."""
+    return {f.name: f.metadata[_KEY] for f in dataclasses.fields(kind) if _KEY in f.metadata}
+
+
 def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
     """Names of the fields that say how a law is solved."""
-    fields = dataclasses.fields(kind)
-    return tuple(f.name for f in fields if isinstance(f.metadata.get(_KEY), Option))
+    return tuple(k for k, x in declarations_of(kind).items() if isinstance(x, Option))
 
 
 class Impulses(NamedTuple):
@@ -372,8 +376,8 @@ class Law(Declared):
         """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
     @property
-    def fills_up(self) -> bool:
-        """Whether open contacts cost it little beside compiling for another number of contacts."""
+    def pads_scenes(self) -> bool:
+        """Whether it is cheaper to solve more, open contacts than to compile for their number."""
         return False
 
     @property
@@ -407,6 +411,6 @@ def is_separable(law: Law) -> bool:
     return law.separable and known and not law.uses_gaps
 
 
-def of_contacts(law: Law, index: jax.Array) -> Law:
-    """The law of some contacts only: their entries of what it has one of per contact."""
-    return jax.tree.map(lambda x: x[index] if eqx.is_array(x) and x.ndim == 1 else x, law)
+def restrict_law(law: Law, contacts: jax.Array) -> Law:
+    """The law of the contacts with these indices (k,): their entries of parameters (m,)."""
+    return jax.tree.map(lambda x: x[contacts] if eqx.is_array(x) and x.ndim == 1 else x, law)

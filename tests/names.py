@@ -1,63 +1,49 @@
 """What `jimpact/data/names.json` holds: `python tests/names.py` writes it from the classes."""
 
-import dataclasses
 import inspect
 import json
 from pathlib import Path
 
-import numpy as np
-
 import jimpact as ji
-from jimpact.cli.study import _BODIES
-from jimpact.law import _KEY, Domain, Option
+from jimpact.cli.study import BODIES
+from jimpact.fits.fitting import LOSSES
+from jimpact.fits.least_squares import DEFAULT_STEPS
+from jimpact.fits.observables import QUANTITIES
 from jimpact.methods.contenders import METHODS
+from jimpact.motion.simulate import METHODS as MOTION_METHODS
 
 PATH = Path(ji.__file__).parent / "data" / "names.json"
 
 
-def law(row):
-    declared = {f.name: f.metadata.get(_KEY) for f in dataclasses.fields(row.law)}
-    declared = {k: x for k, x in declared.items() if row.make is None or k not in row.arguments}
-    domains = {k: x for k, x in declared.items() if isinstance(x, Domain)}
-    return {
-        "summary": row.summary,
-        "right_when": row.right_when,
-        "fails_when": row.fails_when,
-        "source": row.source,
-        "arguments": list(row.arguments),
-        "parameters": list(row.parameters),
-        "free": sorted({*row.parameters, *domains}),
-        "ranges": {
-            k: [x.low, x.high if np.isfinite(x.high) else None, x.open_low, x.high_unless]
-            for k, x in domains.items()
-            if np.isfinite(x.low)
-        },
-        "choices": {
-            k: x.choices for k, x in declared.items() if isinstance(x, Option) and x.choices
-        },
-    }
-
-
-def body(kind):
+def body_arguments(kind):
+    """Whether each argument of a body must be given, by name."""
     arguments = list(inspect.signature(kind.__init__).parameters.values())[1:]
-    return {x.name: x.default is x.empty for x in arguments}  # whether it must be given
+    return {x.name: x.default is x.empty for x in arguments}
 
 
 def names():
-    own = {k: row for k, row in ji.REGISTRY.items() if row.law.__module__.startswith("jimpact.")}
+    """Laws, bodies and methods by name, and the words of options."""
+    ours = {k: row for k, row in ji.REGISTRY.items() if row.law.__module__.startswith("jimpact.")}
     return {
-        "laws": {name: law(row) for name, row in own.items()},
-        "bodies": {name: body(kind) for name, kind in _BODIES.items()},
+        "laws": {name: row.declaration for name, row in ours.items()},
+        "bodies": {name: body_arguments(kind) for name, kind in BODIES.items()},
         "methods": {name: method.jax for name, method in METHODS.items()},
+        "fit_methods": list(DEFAULT_STEPS),
+        "losses": ["squares", *LOSSES],
+        "quantities": list(QUANTITIES),
+        "motion_methods": list(MOTION_METHODS),
     }
 
 
 def as_text():
-    """A line an entry."""
+    """The names as JSON, one line for each law, body and method."""
     groups = []
     for group, rows in names().items():
-        lines = ",\n".join(f"  {json.dumps(k)}: {json.dumps(x)}" for k, x in rows.items())
-        groups.append(f" {json.dumps(group)}: {{\n{lines}\n }}")
+        text = json.dumps(rows)
+        if isinstance(rows, dict):
+            lines = ",\n".join(f"  {json.dumps(k)}: {json.dumps(x)}" for k, x in rows.items())
+            text = f"{{\n{lines}\n }}"
+        groups.append(f" {json.dumps(group)}: {text}")
     return "{\n" + ",\n".join(groups) + "\n}\n"
 
 

@@ -264,6 +264,13 @@ def test_contacts_of_a_box(brick):
     assert float(margin) >= 0
 
 
+def test_moments_of_inertia_of_homogeneous_solids():
+    """m (b^2 + c^2) / 12 about the axis along a; 2 m r^2 / 5."""
+    box = ji.Box([1.0, 2.0, 3.0], mass=6.0)
+    np.testing.assert_allclose(box.inertia, [6.5, 5.0, 2.5], rtol=1e-15)
+    np.testing.assert_allclose(ji.Sphere(0.5, mass=4.0).inertia, [0.4] * 3, rtol=1e-15)
+
+
 def test_turning_is_exact(brick):
     """`moved` is a rotation about the body's axes, `rates` its derivative, spin does no work."""
     box, turn, _, q, v, (parts, (after, rates, spin), slopes) = brick

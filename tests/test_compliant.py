@@ -1,6 +1,7 @@
 """Compliant contacts: gapped chains against scipy, forces of a pair, histories, gap scales."""
 
 import functools
+import sys
 import tomllib
 from importlib.resources import files
 
@@ -232,6 +233,19 @@ def test_calibration_is_differentiable():
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
 
 
+def test_linear_forces_reach_the_indentation_of_hertz(monkeypatch):
+    """Without losses `k_h x^2.5 / 2.5 = k x^2 / 2 = m v^2 / 2` at the deepest x."""
+    calibration = sys.modules[ji.compare_rheologies.__module__]
+    monkeypatch.setattr(calibration, "calibrate", lambda force, *_: force)
+    scene, speed, k = ji.chain([1.0, 3.0, 0.5]), 2.0, jnp.array([5.0, 7.0])
+    forces = calibration.forces_of_equal_restitution(scene, [2.0, 0.0, 0.0], 0.9, k)
+    mass = np.array([3 / 4, 3 / 7])  # reduced masses of the pairs
+    deepest = (1.25 * mass * speed**2 / np.array([5.0, 7.0])) ** 0.4
+    np.testing.assert_allclose(k * deepest**2.5 / 2.5, mass * speed**2 / 2)
+    for name in ("linear, bistiffness", "Kelvin-Voigt"):
+        np.testing.assert_allclose(forces[name].stiffness * deepest**2, mass * speed**2)
+
+
 @pytest.mark.slow
 def test_same_pair_restitution_other_chain():
     """e = 0.9 at every pair; the outcomes differ by a tenth of the striker's speed."""
@@ -452,3 +466,14 @@ def test_symmetric_discontinuity_is_a_smooth_crossover():
     part = (w[:, 0] + 0.6) / -0.64
     ten, ninety = (np.interp(level, part, offset) for level in (0.1, 0.9))
     assert 1.8 < ninety - ten < 2.2
+
+
+def test_offsets_of_gaps_are_in_units_of_the_larger_indentation():
+    """The lighter pair indents less: `delta_c^2.5 = m v^2 / k`, m = 2 m1 m2 / (m1 + m2)."""
+    masses, v, offset = [0.25, 1.0, 4.0], jnp.array([1.0, 0.0, -1.0]), jnp.linspace(-4, 4, 41)
+    scene, law = ji.chain(jnp.array(masses)), ji.Compliant(ji.Hertz(1.0))
+    outcome = ji.crossover(scene, law, v, offset)
+    larger = (2 * 1.0 * 4.0 / 5.0) ** 0.4
+    gaps = larger * (2.0 + 0.5 * offset[:, None] * jnp.array([[1.0, -1.0]]))
+    direct = jax.vmap(lambda g: ji.impact(law, ji.chain(jnp.array(masses), gaps=g), v))(gaps)
+    np.testing.assert_allclose(outcome.velocity, direct.velocity, rtol=0, atol=1e-9)

@@ -1,5 +1,6 @@
 """README, docs, docstrings and notebooks run as printed; all in one process, which shares programs."""
 
+import ast
 import doctest
 import importlib
 import pkgutil
@@ -78,7 +79,7 @@ def test_readme_runs():
     done = doctest.testfile(str(ROOT / "README.md"), module_relative=False, optionflags=OPTIONS)
     assert done.attempted > 10
     assert done.failed == 0
-    assert len(README.splitlines()) <= 150
+    assert len(README.splitlines()) <= 120
 
 
 LONG_PAGES = ("embedding", "fitting", "motions", "speed_accuracy")
@@ -119,6 +120,61 @@ def test_docs_name_what_exists():
             assert hasattr(ji, name), (path.name, name)
         for name in set(re.findall(r"\]\(((?!http)[^)#]+)\)", text)):
             assert (path.parent / name).exists(), (path.name, name)
+
+
+def test_docs_name_files_that_exist():
+    """A page that names a file of the package, or of the tests, names one that is there."""
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS]:
+        names = re.findall(
+            r"`((?:jimpact|tests|docs|notebooks)/[\w/.-]+)`", path.read_text("utf-8")
+        )
+        missing = [x for x in names if not (ROOT / x).exists()]
+        assert not missing, (path.name, missing)
+
+
+@pytest.fixture
+def pages(monkeypatch):
+    """The module that writes generated pages."""
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    return importlib.import_module("pages")
+
+
+def test_every_public_name_has_a_place_in_the_api(pages):
+    names = [name for page in pages.public_names().values() for name in page]
+    everything = [x for x in ji.__all__ if x not in ("plot", "theory", "__version__")]
+    everything += [f"{part.__name__.removeprefix('jimpact.')}.{name}"
+                   for part in (ji.plot, ji.theory) for name in part.__all__]  # fmt: skip
+    assert sorted(names) == sorted(everything)
+    index = pages.api_pages()["api/index.md"]
+    for name in names:
+        assert re.search(rf"\| `ji.{re.escape(name)}` \| \S.* \|", index), name
+
+
+def test_rooms_are_the_folders_of_the_package(pages):
+    folders = {x.parent.name for x in (ROOT / "jimpact").glob("*/__init__.py")}
+    assert {room for row in pages.ROOMS for room, _ in row} == folders | {"heart"}
+
+
+def test_constants_are_complete_and_explained(pages, tmp_path):
+    """Every number in capitals at the top of a module is in the table, with a meaning."""
+    module = tmp_path / "example.py"
+    module.write_text(
+        "# [m] above\nA = 1.0\nB = 2  # beside\n\nC: float = 3.0\nD, E = 0, 1\nname = 4\n"
+    )
+    assert pages.constants_of(module) == [
+        ("A", "1.0", "[m] above"), ("B", "2", "beside"), ("C", "3.0", ""),
+    ]  # fmt: skip
+    assert pages.unit_of("[m] above") == "m"
+    page = pages.constants_page()["constants.md"]
+    for path in (ROOT / "jimpact").rglob("*.py"):
+        if path.name == "tableaux.py":
+            continue
+        for line in ast.parse(path.read_text(encoding="utf-8")).body:
+            value = getattr(line, "value", None)
+            target = line.targets[0] if isinstance(line, ast.Assign) else getattr(line, "target", 0)
+            number = isinstance(value, ast.Constant) and isinstance(value.value, int | float)
+            if isinstance(target, ast.Name) and target.id.isupper() and number:
+                assert f"| `{target.id}` | `{value.value}` |" in page, (path, target.id)
 
 
 def test_every_law_is_in_the_readme_as_in_the_registry():

@@ -8,7 +8,7 @@ import pytest
 import jimpact as ji
 from jimpact.cli.study import read_study
 from jimpact.files.shots_file import UNITS
-from jimpact.fits.experiments import data_defects
+from jimpact.fits.defects import data_defects
 
 DATA = files("jimpact") / "data"
 CHAIN = ji.chain([1.0, 1.0, 1.0])

@@ -148,6 +148,21 @@ def test_robust_losses_minimize_what_they_say():
         np.testing.assert_allclose(ji.fit(problem, loss=loss).value, best, atol=2e-4)
 
 
+def test_the_scale_of_robust_losses_is_that_of_normal_errors():
+    """Without sigma: the median absolute residual over that of a standard normal variable."""
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05)
+    post[1] += [0.8, -0.4]
+    at_0 = simulated(ji.Newton(0.0), PAIR, SHOTS)
+    x, y = (simulated(ji.Newton(1.0), PAIR, SHOTS) - at_0).ravel(), (post - at_0).ravel()
+    e = x @ y / (x @ x)
+    for _ in range(200):
+        scale = np.median(np.abs(y - e * x)) / stats.norm.ppf(0.75)
+        weight = np.minimum(1.0, 1.345 * scale / np.abs(y - e * x))
+        e = (weight * x) @ y / ((weight * x) @ x)
+    fitted = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post), loss="huber")
+    np.testing.assert_allclose(fitted.value, [e], rtol=1e-5)
+
+
 def test_swapped_velocities_are_told():
     post = simulated(ji.Newton(0.9), PAIR, SHOTS)
     assert "No contact approaches in 4 of 4 shots" in told(

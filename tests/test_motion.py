@@ -35,17 +35,22 @@ def status(motion):
 # ---------------------------------------------------------------- bouncing ball
 
 
-def dropped(e, q0):
+def dropped(e, q0, slow):
     return ji.simulate(
-        ji.ball_system(), ji.Newton(e), q0[None], jnp.zeros(1), 5.0, samples=101, max_events=100
-    )
+        ji.ball_system(), ji.Newton(e), q0[None], jnp.zeros(1), 5.0, samples=101, max_events=100,
+        slow=slow,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def balls():
     """(motion, d motion / d e) of a batch, most of it bad: one program for many tests."""
-    run = jax.jit(jax.vmap(lambda e, q: jax.jvp(lambda e: dropped(e, q), (e,), (1.0,))))
-    return run(jnp.array([0.8, 0.8, 0.8, 0.99, 0.5]), jnp.array([1.0, jnp.nan, -0.1, 1e-4, 0.5]))
+    run = jax.jit(jax.vmap(lambda e, *x: jax.jvp(lambda e: dropped(e, *x), (e,), (1.0,))))
+    return run(
+        jnp.array([0.8, 0.8, 0.8, 0.99, 0.5, 0.5]),
+        jnp.array([1.0, jnp.nan, -0.1, 1e-4, 0.5, 1.0]),
+        jnp.array([1e-6] * 5 + [1e-12]),
+    )
 
 
 def bounce_times(e, n=20):
@@ -94,6 +99,20 @@ def test_finite_accumulation_is_passed(balls):
     assert rest.any()
     np.testing.assert_allclose(motion.q[rest], 0, atol=1e-12)
     np.testing.assert_allclose(motion.velocity[rest], 0, atol=1e-12)
+
+
+def test_hops_below_the_rounding_of_gaps_are_passed(balls):
+    """`slow` would resolve hops of 1e-24 m beside a height of 1 m, known within 2e-16 m."""
+    motion = lane(balls[0], 5)
+    last = int(motion.events.count) - 1
+    assert kinds(motion) == ["impact"] * last + ["accumulation"]
+    hops = np.asarray(motion.events.velocity_before)[: last + 1, 0] ** 2 / (2 * G) * 0.5**2
+    eps = np.finfo(float).eps
+    assert hops[last] < 100 * eps
+    assert (hops[:last] > eps).all()
+    first = np.sqrt(2 / G)
+    end = motion.events.accumulation_end[last]
+    np.testing.assert_allclose(end, first * (1 + 0.5) / (1 - 0.5), rtol=1e-6)
 
 
 class Pull(eqx.Module):
@@ -191,11 +210,11 @@ def test_runs_of_the_program_follow_each_other():
 
 
 def test_a_bad_motion_ends_alone(balls):
-    told = [status(lane(balls[0], i)) for i in range(5)]
-    assert told == ["ok", "not_finite", "penetration", "max_events", "ok"]
+    ends = [status(lane(balls[0], i)) for i in range(5)]
+    assert ends == ["ok", "not_finite", "penetration", "max_events", "ok"]
     with pytest.raises(RuntimeError, match=r"max_events.*\(1 at 3\)"):
         ji.raise_on_failed_motion(balls[0])
-    assert str(balls[0]) == "5 motions: 2 ok, 1 max_events, 1 penetration, 1 not_finite"
+    assert str(balls[0]) == "6 motions: 3 ok, 1 max_events, 1 penetration, 1 not_finite"
     np.testing.assert_allclose(lane(balls[0], 4).events.time[0], np.sqrt(1 / G), atol=1e-12)
     assert np.isnan(np.asarray(lane(balls[0], 3).q)[-1]).all()
 
@@ -390,7 +409,7 @@ def test_ball_leaves_a_vibrating_plate():
     np.testing.assert_allclose(np.asarray(motion.q)[together, 0], plate[together], atol=1e-13)
 
 
-def on_slope(angle, speed, mu, corners="all"):
+def on_slope(angle, speed, mu, e=0.0, drop=0.0, tilt=0.0, corners="all"):
     weights = G * jnp.stack([-jnp.sin(angle), jnp.cos(angle), jnp.zeros_like(angle)])
     block = ji.block_system(0.2, 0.4, corners=corners)
     system = ji.System(
@@ -399,15 +418,17 @@ def on_slope(angle, speed, mu, corners="all"):
         potential=type(ji.gravity([0.0]))(weights),
         tangent_function=block.tangent_function,
     )
-    v0 = jnp.stack([speed, 0 * speed, 0 * speed])
-    return ji.simulate(system, ji.Moreau(0.0), [0.0, 0.2, 0.0], v0, 1.0, samples=21, friction=mu)
+    none = 0 * speed
+    q0, v0 = jnp.stack([none, 0.2 + drop + none, tilt + none]), jnp.stack([speed, none, none])
+    return ji.simulate(system, ji.Moreau(e), q0, v0, 1.0, samples=21, friction=mu)
 
 
 @pytest.fixture(scope="module")
 def slides():
-    """A block on a slope: slides to stick; is held; slips; tips about its corner."""
+    """A block on a slope: slides to stick; is held; slips; tips; chatters on two corners."""
     rows = [(0.0, 1.0, 0.3), (np.arctan(0.29), 0.0, 0.3), (np.arctan(0.31), 0.0, 0.3)]
-    rows += [(np.arctan(0.6), 0.0, 2.0)]
+    rows = [(*row, 0.0, 0.0, 0.0) for row in (*rows, (np.arctan(0.6), 0.0, 2.0))]
+    rows += [(0.0, 0.0, 0.3, 0.5, 0.01, 0.02)]
     return jax.jit(jax.vmap(on_slope))(*np.array(rows, float).T)
 
 
@@ -461,6 +482,17 @@ def test_block_tips_about_its_corner(slides):
     fallen = np.asarray(motion.potential_energy)[0] - np.asarray(motion.potential_energy)[reached]
     np.testing.assert_allclose(0.5 * inertia * v[:, 2] ** 2, fallen, atol=1e-9)
     assert v[-1, 2] < -1
+
+
+def test_nested_accumulations_are_passed_below_the_root_of_slow(slides):
+    """Corners of one block: below 1e-3 of the fastest approach; a single contact, 1e-6 of it."""
+    motion = lane(slides, 4)
+    last = kinds(motion).index("accumulation", 12)
+    v = np.asarray(motion.events.velocity_before)[: last + 1]
+    approach = np.maximum(-(v[:, 1:2] + v[:, 2:] * [-0.1, 0.1]), 0.0)  # tilted by 0.02 at most
+    assert 1e-4 < approach[last].max() / approach.max() < 2.5e-3
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
+    np.testing.assert_allclose(motion.gaps[-1, :2], 0, atol=1e-12)
 
 
 # -------------------------------------------------------------------- time stepping

@@ -133,6 +133,18 @@ def test_leaving_the_range_of_a_gap_function_is_told(options):
         ji.simulate(system, ji.Moreau(0.5), [1.5, 0.1], [1.0, 0.0], 2.0, **options)
 
 
+def test_an_impact_is_in_the_middle_of_its_step():
+    """`v(t) = e (|v-| + G h / 2) - G (t - h / 2)` of a point that strikes in the first step."""
+    system = ji.System(Table(), potential=Table().gravity(G))
+    e, h, t = 0.5, 1e-2, 0.2
+    motion = ji.simulate(
+        system, ji.Moreau(e), [0.0, 0.0], [0.0, -10.0], 2.0,
+        samples=11, method="time_stepping", step=h,
+    )  # fmt: skip
+    after = e * (10.0 + 0.5 * G * h) - G * (t - 0.5 * h)
+    np.testing.assert_allclose(motion.velocity[1], [0.0, after], rtol=1e-9, atol=1e-12)
+
+
 # -------------------------------------------------------------------------- bodies in space
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.fits.fitting import Fit, Start
+from jimpact.fits.fitting import Fit
+from jimpact.fits.result import FitMinimum
 from jimpact.motion.record import KIND_CODE, no_events, with_row
 
 
@@ -59,9 +60,9 @@ def canned(shots, **change):
 
 
 def start(value, count):
-    fields = {name: None for name in Start.__annotations__}
+    fields = {name: None for name in FitMinimum.__annotations__}
     known = {"value": np.array([value, 2.0]), "sum_of_squares": 1e-4, "count": count}
-    return Start(**(fields | {k: v for k, v in known.items() if k in fields}))
+    return FitMinimum(**(fields | {k: v for k, v in known.items() if k in fields}))
 
 
 @pytest.mark.parametrize("shots", [1, 2, 50])

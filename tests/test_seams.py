@@ -9,6 +9,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.contact import coupled_groups
+from jimpact.scene import pad_scene
 from jimpact.status import CODE
 
 FOUR = ji.chain(np.ones(4))
@@ -27,6 +28,12 @@ def test_one_unit_in_the_last_place_is_no_impact():
     assert int(out.status) == 0
     assert np.array_equal(out.velocity, v)
     assert not out.impulse.any()
+
+
+def test_ten_times_the_rounding_is_an_impact():
+    """Velocities of 0.7 are known within eps: an approach of 30 eps is one."""
+    v = np.array([0.7 + 60 * ULP, 0.7, 0.7, 0.7])
+    assert ji.impact(ji.Moreau(0.9), FOUR, v).impulse[0] > 0
 
 
 @pytest.mark.parametrize(
@@ -141,6 +148,36 @@ def test_contacts_that_do_not_feel_each_other_are_solved_apart():
     apart = ji.impact(ji.Newton(e), balls, v)
     np.testing.assert_allclose(apart.velocity, whole.velocity, atol=1e-14)
     np.testing.assert_allclose(apart.impulse, whole.impulse, atol=1e-14)
+
+
+class Gains(ji.Law):
+    """gamma+ = -1.001 gamma-: a thousandth more energy than before."""
+
+    separable = True
+
+    def impulses(self, contact):
+        return ji.Impulses(jnp.linalg.solve(contact.delassus, -2.001 * contact.gap_velocity))
+
+
+def test_groups_are_judged_on_the_scale_of_their_impact():
+    pairs = ji.Scene(np.ones(4), [[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])
+    assert coupled_groups(pairs) is not None
+    out = ji.impact(Gains(), pairs, [1.0, 0.0, 1.0, 0.5])
+    assert int(out.status) == CODE["energy_gain"]
+
+
+@pytest.mark.parametrize("wall", [False, "left", "right"])
+def test_a_padded_chain_contains_itself(wall):
+    """Its masses, gaps and parameters are at its own places; what is added is open."""
+    masses = [1.0, 2.0, 5.0]
+    chain = ji.chain(masses, wall=wall, gaps=np.linspace(0.0, 0.2, 2 + bool(wall)))
+    padded = pad_scene(chain, 8)
+    np.testing.assert_array_equal(padded.scene.mass[padded.coordinates], masses)
+    np.testing.assert_array_equal(padded.scene.gaps[padded.contacts], chain.gaps)
+    np.testing.assert_array_equal(padded.copied[padded.contacts], np.arange(chain.contacts))
+    whole = np.asarray(padded.scene.normals)[padded.coordinates, padded.contacts]
+    np.testing.assert_array_equal(whole, chain.normals)
+    assert (np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts]) > 0).all()
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.special import chdtrc, erf
 
 import jimpact as ji
@@ -71,10 +72,11 @@ def test_a_law_that_fails_is_named_and_comes_last():
 
 
 def test_simplest_first_is_the_order_of_advise():
-    from jimpact.methods.advice import situation, trials
+    from jimpact.methods.advice import situation_of, trials
 
-    at = situation(PAIR, np.array([1.0, 0.0]))
-    assert tuple(trials(at, 0.8, np.ones(1), 1.5)) == SIMPLEST_FIRST[:5]
+    law = ji.LZB(0.8)
+    situation = situation_of(PAIR, np.array([1.0, 0.0]), law, known=False)
+    assert tuple(trials(situation, law)) == SIMPLEST_FIRST
 
 
 @pytest.mark.parametrize(
@@ -232,6 +234,9 @@ def test_the_need_of_a_dependence_on_speed_is_tested():
             gain = constant.starts[0].sum_of_squares - full.starts[0].sum_of_squares
             if sigma is None:
                 assert test.statistic == pytest.approx(gain / full.noise**2)
+                # 24 measured velocities, 2 parameters, of which 1 is tested
+                chance = stats.f.sf(test.statistic, 1, 22)
+                assert test.chance == pytest.approx(chance, rel=1e-9, abs=1e-300)
             elif full.noise == 1:
                 assert test.chance == pytest.approx(chdtrc(1, gain))
     with pytest.raises(ValueError, match="more parameters"):

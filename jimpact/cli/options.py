@@ -6,7 +6,6 @@
 import dataclasses
 import json
 import os
-from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -113,7 +112,7 @@ class ShotCommand(DrawingCommand):
     def check(self) -> None:
         """Also the study, and whether it has velocities."""
         super().check()
-        shots = study_file.check_study(self.study).shots
+        _, shots = study_file.check_study(self.study)
         if self.velocity:
             return
         if not shots:
@@ -149,13 +148,12 @@ class FitCommand(DrawingCommand):
         if study_file.is_motion(self.study):
             if self.method is not None or self.law == EVERY_LAW:
                 raise ValueError("--method and --law all must be left out for a motion.")
-            fitted = study_file.check_motion_study(self.study, law)
+            study = study_file.check_motion_study(self.study, law)
         else:
-            found = study_file.check_study(self.study, law)
-            fitted = found.fitted
-            if self.law == EVERY_LAW and not found.shots:
+            study, shots = study_file.check_study(self.study, law)
+            if self.law == EVERY_LAW and not shots:
                 raise ValueError("--law all must be left out where no shots are fitted.")
-        if not fitted:
+        if not study.fitted:
             raise ValueError(study_file.NO_DATA)
 
 
@@ -189,7 +187,8 @@ class MonteCarloCommand(DrawingCommand):
     def check(self) -> None:
         """Also the study, which must say what is random."""
         super().check()
-        if not study_file.check_study(self.study).sampled:
+        study, _ = study_file.check_study(self.study)
+        if "monte_carlo" not in study.tables:
             raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
         if self.scheduler is not None and self.executor != "dask":
             raise ValueError(f"--scheduler needs --executor dask, but it is {self.executor}.")
@@ -292,26 +291,18 @@ class LawsCommand(Command):
     light: ClassVar[bool] = True
 
     def run(self) -> int:
-        """Print them; those of the package alone are known without JAX."""
-        if self.module is None and not study_file.callers_laws():
-            laws = study_file.names()["laws"]
-            bibtex = (files("jimpact") / "data" / "laws.bib").read_text(encoding="utf-8").strip()
-        else:
-            from jimpact import REGISTRY
+        """Print them; JAX is imported only for a module."""
+        if self.module is not None:
             from jimpact.cli.study import import_laws
 
-            if self.module is not None:
-                import_laws(self.module, Path())
-            laws = {
-                x: row._asdict() | {"parameters": row.parameters} for x, row in REGISTRY.items()
-            }
-            bibtex = "\n\n".join(dict.fromkeys(row.bibtex for row in REGISTRY.values()))
+            import_laws(self.module, Path())
+        laws = study_file.declared_laws()
         keys = ("parameters", "summary", "right_when", "fails_when", "source")
         rows = {name: {key: row[key] for key in keys} for name, row in laws.items()}
         if self.json:
             text = json.dumps(rows, indent=2)
         elif self.bibtex:
-            text = bibtex
+            text = "\n\n".join(dict.fromkeys(row["bibtex"] for row in laws.values()))
         elif self.csv:
             lines = [[x, " ".join(row.pop("parameters")), *row.values()] for x, row in rows.items()]
             text = starting.as_csv(["law", *keys], lines)

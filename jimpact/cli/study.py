@@ -1,4 +1,4 @@
-"""A study: one TOML file with scene, law, what is free, and the data file."""
+"""Studies of one impact: scene, law, what is free and the data, built of a checked TOML file."""
 
 import importlib.util
 import sys
@@ -23,17 +23,11 @@ from jimpact.bodies.solids import Box, Sphere
 from jimpact.files.study_file import (
     AT_KEYS,
     NO_DATA,
-    STUDY_TABLES,
+    CheckedStudy,
     body_keys,
-    check_data,
-    check_fit,
-    check_observed,
-    check_sampling,
-    check_scene,
-    check_tables,
+    check_impact_tables,
     distribution,
     from_file,
-    law_values,
 )
 from jimpact.fits.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
@@ -45,12 +39,12 @@ from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
-from jimpact.registry import Row
 from jimpact.scene import Scene, chain
 
-_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
+# Keys of [monte_carlo] that `monte_carlo` calls otherwise.
+_SAMPLING_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
 _DISTRIBUTIONS: dict[str, Any] = {"Uniform": Uniform, "Normal": Normal}
-_BODIES: dict[str, type[Body]] = {
+BODIES: dict[str, type[Body]] = {
     body.__name__: body
     for body in (
         *(Block, Polygon, Disc, Dimer, PlanarBodies),
@@ -62,7 +56,7 @@ _BODIES: dict[str, type[Body]] = {
 
 @dataclass(frozen=True)
 class Study:
-    """What `read_study` found; `run` fits it, `monte_carlo(**study.monte_carlo)` samples it.
+    """A study that `read_study` read; `run` fits it, `monte_carlo(**study.monte_carlo)` samples it.
 
     Attributes:
         title: of pictures and reports.
@@ -71,10 +65,10 @@ class Study:
         free: names -> masks of the parameters that `run` fits.
         bounds: names -> (low, high).
         experiments: the shots, None without `[data]`.
-        parameters: the law's values as the file gives them.
+        parameters: the law's values as the file states them.
         options: of `fit`, by name.
         monte_carlo: arguments of `monte_carlo`, empty without `[monte_carlo]`.
-        measured: what `[[observe]]` tells, else None.
+        measured: the values of `[[observe]]`, else None.
     """
 
     title: str
@@ -89,13 +83,12 @@ class Study:
     measured: Measured | None = None
 
     def run(self, **options: Any) -> Fit:
-        """`fit` with the study's options; keyword arguments that are not None go first."""
-        given = {key: value for key, value in options.items() if value is not None}
-        return fit(self.problem, **(self.options | given))
+        """`fit` with the study's options, or with those that are passed and not None."""
+        return fit(self.problem, **(self.options | without_none(options)))
 
     @property
     def problem(self) -> FitProblem:
-        """What `run` solves: of the shots, or of the observables."""
+        """The problem that `run` solves: of the shots, or of the observables."""
         parameters: dict[str, Any] = {"free": self.free, "bounds": self.bounds}
         if self.measured is not None:
             value, sigma, observe = self.measured
@@ -144,64 +137,76 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     >>> ji.read_study("three_balls.toml").title
     'Three equal hard balls, one shot'
     """
-    return from_file(path, "[scene]", lambda tables, file: _study(tables, file, law))
+
+    def build(tables: dict[str, Any], file: Path) -> Study:
+        import_module_of(tables, file.parent)
+        return _build(check_impact_tables(tables, file, law, modules=True))
+
+    return from_file(path, "[scene]", build)
 
 
-def _study(tables: Mapping[str, Any], path: Path, other_law: str | None) -> Study:
-    check_tables(tables, ("scene", "law"), STUDY_TABLES)
+def _build(checked: CheckedStudy) -> Study:
+    """The study of checked tables."""
+    tables, free = checked.tables, checked.free
     scene, body = _scene(tables["scene"])
-    free = check_fit(tables.get("fit", {}))
-    options = {key: x for key, x in tables.get("fit", {}).items() if key != "free"}
-    row, values, bounds = law_table(tables["law"], other_law, path.parent)
-    if other_law is not None:
-        free = {name: mask for name, mask in free.items() if name in row.parameters}
+    row, values = REGISTRY[checked.law.name], checked.law.arguments
     if row.law is RestitutionMatrix and "matrix" not in values:
-        values["matrix"] = admissible_start([scene])
+        values = values | {"matrix": admissible_start([scene])}
     values = with_exponent(values, free)
     law = row.build(**values)
-    known = free_parameters_of(law)
-    bounce = [name for name in ("restitution", *OF_SPEED) if name in known]
-    free = free or dict.fromkeys(bounce or default_free(known), True)
-    experiments = _experiments(tables["data"], path, body or scene) if "data" in tables else None
-    title = str(tables.get("title", path.stem))
-    sampled = _sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {}
-    seen = tables.get("observe")
-    if seen is not None:
-        check_observed(seen, 0 if experiments is None else len(experiments.shots))
-    measured = None if seen is None else observations(scene, seen)
-    parts = (scene, law, free, bounds, experiments, values, options, sampled, measured)
-    return Study(title, *parts)
+    fittable = free_parameters_of(law)
+    bounce = [name for name in ("restitution", *OF_SPEED) if name in fittable]
+    data, observed = tables.get("data"), tables.get("observe")
+    return Study(
+        checked.title,
+        scene,
+        law,
+        free=free or dict.fromkeys(bounce or default_free(fittable), True),
+        bounds=checked.law.bounds,
+        experiments=None if data is None else _experiments(data, checked.path, body or scene),
+        parameters=values,
+        options=checked.fit_options,
+        monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
+        measured=None if observed is None else observations(scene, observed),
+    )
+
+
+def without_none(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that are not None, which means: as the study says."""
+    return {key: value for key, value in options.items() if value is not None}
 
 
 def with_exponent(values: dict[str, Any], free: Mapping[str, Any]) -> dict[str, Any]:
     """A law's values: fixed exponents are fast as numbers, free ones must be arrays."""
     if "exponent" not in values:
         return values
-    given = values["exponent"]
-    fixed = tuple(given) if isinstance(given, list) else given
-    return values | {"exponent": np.asarray(given, float) if "exponent" in free else fixed}
+    exponent = values["exponent"]
+    if "exponent" in free:
+        return values | {"exponent": np.asarray(exponent, float)}
+    return values | {"exponent": tuple(exponent) if isinstance(exponent, list) else exponent}
 
 
 def _experiments(table: Mapping[str, Any], path: Path, place: Scene | Body) -> Experiments:
     """The shots of the table [data], with the scenes that they have of their own."""
-    check_data(table)
-    found = read_experiments(path.parent / table["file"], place, table.get("near_m", CLOSED_BELOW))
-    if found.scenes is None and isinstance(place, Scene):
-        found.scene_of(place, 0)
-    for key in ("contacts", "near_m"):
-        if key in table and found.scenes is None:
-            raise ValueError(f"`{key}` in [data] is for shots with scenes of their own.")
+    file, near = path.parent / table["file"], table.get("near_m", CLOSED_BELOW)
+    experiments = read_experiments(file, place, near)
+    if experiments.scenes is None:
+        for key in ("contacts", "near_m"):
+            if key in table:
+                raise ValueError(f"`{key}` in [data] is for shots with scenes of their own.")
+        if isinstance(place, Scene):
+            experiments.scene_of(place, 0)  # raises where their sizes differ
     if "contacts" in table:
-        kept = np.isin(found.contacts, table["contacts"])
-        if not kept.any():
+        chosen = np.isin(experiments.contacts, table["contacts"])
+        if not chosen.any():
+            numbers = ", ".join(map(str, sorted(set(experiments.contacts))))
             raise ValueError(
-                f"`contacts` in [data] must be one of {', '.join(map(str, set(found.contacts)))}, "
-                f"but is {table['contacts']}."
+                f"`contacts` in [data] must be one of {numbers}, but is {table['contacts']}."
             )
-        found = found.only(kept)
-    corrected = table.get("momentum_corrected", False)
-    scene = place if isinstance(place, Scene) else None
-    return found.momentum_corrected(scene) if corrected else found
+        experiments = experiments.only(chosen)
+    if table.get("momentum_corrected", False):
+        return experiments.momentum_corrected(place if isinstance(place, Scene) else None)
+    return experiments
 
 
 def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3) -> Experiments:
@@ -230,8 +235,8 @@ def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3
 
     def read(tables: Mapping[str, Any], file: Path) -> Experiments:
         table = {"file": tables["data"]["file"], "near_m": near}
-        own = {} if contacts is None else {"contacts": contacts}
-        return _experiments(table | own, file, body_of("[scene]", tables["scene"], AT_KEYS))
+        table |= {} if contacts is None else {"contacts": contacts}
+        return _experiments(table, file, body_of("[scene]", tables["scene"], AT_KEYS))
 
     return from_file(path, "[scene]", read)
 
@@ -242,38 +247,26 @@ def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) 
     `kind` is the name of a body's class (`Block`, `Box`, `PlanarBodies`, ..., in any case); the
     other keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
     `inertia_kg_m2`, `angle_rad`. Bodies of `PlanarBodies` are tables of this kind themselves.
-    `others` are keys of the table that belong to somebody else.
+    `others` are keys of the table that mean something else.
 
     >>> from jimpact.cli.study import body_of
     >>> body_of("[scene]", {"kind": "Block", "width_m": 0.2, "height_m": 0.6}).names
     ('x [m]', 'y [m]', 'angle [rad]')
     """
     kind, keys = body_keys(where, table, others)
-    given = {name: table[key] for key, name in keys.items() if key in table}
-    if "bodies" in given:
+    arguments = {name: table[key] for key, name in keys.items() if key in table}
+    if "bodies" in arguments:
         within = f"{where.removesuffix(']')}.bodies]"
-        given["bodies"] = [body_of(within, x) for x in given["bodies"]]
-    return _BODIES[kind](**given)
+        arguments["bodies"] = [body_of(within, x) for x in arguments["bodies"]]
+    return BODIES[kind](**arguments)
 
 
 def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
     """The scene of a study, and the body whose scene it is."""
-    check_scene(table)
     if "kind" in table:
         body = body_of("[scene]", table, AT_KEYS)
         return body.scene(table["q"], table.get("closed_below_m", CLOSED_BELOW)), body
     return chain(table["masses_kg"], table.get("wall", False), table.get("gaps_m")), None
-
-
-def law_table(
-    table: Mapping[str, Any], other: str | None, folder: Path
-) -> tuple[Row, dict[str, Any], dict[str, Any]]:
-    """Registry row, start values and bounds; of another law only what both have is kept."""
-    if "module" in table:
-        import_laws(str(table["module"]), folder)
-    name, values, bounds = law_values(table, other, REGISTRY)
-    values.pop("module", None)
-    return REGISTRY[name], values, bounds
 
 
 def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any]:
@@ -283,20 +276,28 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
     std (normal; gaps truncated at 0); law, a table of such tables by parameter; samples, seed,
     chunk, bins.
     """
-    check_sampling(table)
-    drawn = {
-        name: _distribution(f"law.{name}", value) for name, value in table.get("law", {}).items()
-    }
-    given = {
-        _ARGUMENTS.get(key, key): _distribution(key, value) if isinstance(value, dict) else value
+    laws = table.get("law", {})
+    drawn = {name: _distribution(f"law.{name}", value) for name, value in laws.items()}
+    arguments = {
+        _SAMPLING_ARGUMENTS.get(key, key): _distribution(key, value)
+        if isinstance(value, dict)
+        else value
         for key, value in table.items()
         if key != "law"
     }
-    return {"scene": scene, "law": RandomLaw(law, **drawn) if drawn else law} | given
+    return {"scene": scene, "law": RandomLaw(law, **drawn) if drawn else law} | arguments
 
 
 def _distribution(name: str, value: Any) -> Distribution:
+    """The distribution that a table of a study means."""
     return _DISTRIBUTIONS[distribution(name, value)](**value)
+
+
+def import_module_of(tables: Mapping[str, Any], folder: Path) -> None:
+    """Import the module that the table [law] of a study names, if it names one."""
+    law = tables.get("law")
+    if isinstance(law, dict) and "module" in law:
+        import_laws(str(law["module"]), folder)
 
 
 def import_laws(module: str, folder: Path) -> None:
@@ -306,10 +307,12 @@ def import_laws(module: str, folder: Path) -> None:
         return
     path = (folder / module).resolve()
     if not path.is_file():
-        raise ValueError(f"`module` must be a file or an importable module, but '{path}' is none.")
-    known = sys.modules.get(path.stem)
-    if known is not None:
-        if Path(getattr(known, "__file__", None) or "").resolve() == path:
+        raise ValueError(
+            f"`module` must be a file or an importable module, but '{path}' does not exist."
+        )
+    imported = sys.modules.get(path.stem)
+    if imported is not None:
+        if Path(getattr(imported, "__file__", None) or "").resolve() == path:
             return
         raise ValueError(f"`module` must have a new name, but another '{path.stem}' is imported.")
     spec = importlib.util.spec_from_file_location(path.stem, path)

@@ -29,7 +29,9 @@ _KINDS = {  # of columns, and their units
 _NEEDED = ("pre", "post")
 _ERRORS = ("sigma", "sigma_pre", "resolution")
 _OF_MOTIONS = {"t": {"s": 1.0, "ms": 0.001}, **dict.fromkeys(("q", "sigma_q"), _KINDS["q"])}
-_UNEVEN = 1e-3  # of a step: what rounding of times to a few digits does
+# Share of a step by which times may be off, as they are when rounded to a few digits. Ten times
+# more would pass steps that visibly differ.
+UNEVEN_STEPS = 1e-3
 _HEADER = re.compile(r"(t|[a-z_]+(?=_))(?:_([1-9][0-9]*))?\s*(?:\[([^]]*)\])?")
 _ALLOWED = (
     "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ... "
@@ -103,7 +105,7 @@ def read_positions(path: str | Path) -> Positions:
                 _check_error(where, column, here, values["sigma_q"][k, column.body - 1])
     time = values["t"][:, 0]
     steps = np.diff(time)
-    if len(time) < 2 or not (np.abs(steps - steps.mean()) <= _UNEVEN * steps.mean()).all():
+    if len(time) < 2 or not (np.abs(steps - steps.mean()) <= UNEVEN_STEPS * steps.mean()).all():
         raise ValueError(f"{path}: the times `t` must be two or more, rising in equal steps.")
     return Positions(time, values["q"], values.get("sigma_q"))
 

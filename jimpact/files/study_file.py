@@ -1,8 +1,8 @@
-"""A study file before anything is built of it: found, read, its tables and words checked.
+"""A study file before anything is built of it: located, read, its keys, words and ranges checked.
 
-JAX is not needed for that, so the command line answers a typo at once. What laws, bodies and
-methods are called and take is read from `data/names.json`, which `tests/names.py` writes from the
-classes themselves.
+JAX is not needed for that, so the command line answers a typo at once. The names of laws, bodies
+and methods, their arguments and ranges stand in `data/names.json`, which `tests/names.py` writes
+from the declarations of the classes.
 """
 
 import functools
@@ -14,11 +14,10 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
-from jimpact._checks import as_whole, check_choice, check_values
+from jimpact._checks import as_whole, check_choice, check_values, suggestion
 from jimpact.files.shots_file import read_positions, read_shots
 
-STUDY = "study.toml"  # of a folder that `jimpact new` has made
-STUDY_TABLES = ("fit", "data", "observe", "monte_carlo")
+STUDY = "study.toml"  # in a folder that `jimpact new` has made
 SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
 AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
 FIT_KEYS = ("free", "method", "loss", "starts", "seed", "max_steps", "profiles")
@@ -28,9 +27,8 @@ OBSERVE_KEYS = ("quantity", "value", "sigma", "relative", "contact", "body", "bo
 OBSERVE_SHOTS = ("velocity_m_per_s", "drop_height_m")  # one of them says what happens
 SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
 DISTRIBUTIONS = {("high", "low"): "Uniform", ("mean", "std"): "Normal"}
-FIT_METHODS = ("levenberg-marquardt", "adam", "sgd", "lbfgs")
 GRAVITY = "gravity_m_per_s2"
-MOTION_KEYS = {  # and what `simulate` calls them
+MOTION_KEYS = {  # and the arguments of `simulate` that they give
     "q0": "q0",
     "v0": "v0",
     "t_end_s": "t_end",
@@ -46,9 +44,9 @@ MOTION_KEYS = {  # and what `simulate` calls them
     "slow": "slow",
 }
 BASE_KEYS = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
-# Units of the bodies' parameters, which stand behind their names in a study. Without one are words
-# and directions, and lists that are points [m] or mix units, as the classes say: `corners` of a
-# Polygon, `planes`, `walls`, `at`.
+# Units of the bodies' arguments, which a study writes behind their names. Words and directions have
+# none, nor lists that are points [m] or mix units, as the classes say: `corners` of a Polygon,
+# `planes`, `walls`, `at`.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
@@ -64,30 +62,56 @@ T = TypeVar("T")
 
 @functools.cache
 def names() -> dict[str, Any]:
-    """Laws, bodies and methods by name, as the classes of this version have them."""
+    """Names of this version: laws, bodies and methods with what they take, words of options."""
     return json.loads((files("jimpact") / "data" / "names.json").read_text(encoding="utf-8"))
 
 
-class Words(NamedTuple):
-    """What the [law] table of a law may hold."""
-
-    arguments: tuple[str, ...]
-    parameters: tuple[str, ...]
-
-
-def known_laws() -> dict[str, Words]:
-    """Those of the package by name; others are registered by modules."""
-    rows = names()["laws"].items()
-    return {name: Words(tuple(x["arguments"]), tuple(x["parameters"])) for name, x in rows}
-
-
-def callers_laws() -> set[str]:
-    """Names of laws that who calls this from Python has registered."""
+def declared_laws() -> dict[str, dict[str, Any]]:
+    """Declarations of the laws by name; users' laws too, where they are registered already."""
     registry = sys.modules.get("jimpact.registry")
-    return set() if registry is None else registry.REGISTRY.keys() - known_laws().keys()
+    rows = {} if registry is None else registry.REGISTRY
+    ours = names()["laws"]
+    return ours | {name: row.declaration for name, row in rows.items() if name not in ours}
 
 
-# ------------------------------------------------------------------------------- finding, reading
+class LawTable(NamedTuple):
+    """The table [law] of a study: the law's name, its arguments, bounds of its parameters."""
+
+    name: str
+    arguments: dict[str, Any]
+    bounds: dict[str, Any]
+
+
+class CheckedStudy(NamedTuple):
+    """A study whose keys, words and ranges are right; `free` maps names to masks."""
+
+    path: Path
+    tables: dict[str, Any]
+    law: LawTable
+    free: dict[str, Any]
+
+    @property
+    def fitted(self) -> bool:
+        """Whether there is something to fit."""
+        return "data" in self.tables or "observe" in self.tables
+
+    @property
+    def fit_options(self) -> dict[str, Any]:
+        """The table [fit] without what is free."""
+        return {key: x for key, x in self.tables.get("fit", {}).items() if key != "free"}
+
+    @property
+    def title(self) -> str:
+        """The title, else the name of the file."""
+        return str(self.tables.get("title", self.path.stem))
+
+    @property
+    def data_file(self) -> Path:
+        """The file of the table [data]."""
+        return self.path.parent / self.tables["data"]["file"]
+
+
+# -------------------------------------------------------------------------- locating and reading
 
 
 def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Path], T]) -> T:
@@ -105,60 +129,47 @@ def from_file(path: str | Path, table: str, build: Callable[[dict[str, Any], Pat
 
 def located(path: Path, table: str) -> Path:
     """The file, that of a folder (`jimpact new`), or the bundled study of this name."""
-    if path.is_file() or (path / STUDY).is_file():
-        return path if path.is_file() else path / STUDY
+    if path.is_file():
+        return path
+    if (path / STUDY).is_file():
+        return path / STUDY
     bundled = Path(str(files("jimpact") / "data"))
     if path.parent == Path() and (bundled / path).is_file():
         return bundled / path
+    if path.is_dir():
+        raise FileNotFoundError(
+            f"Folder '{path}' holds no study: it has no {STUDY} (`jimpact new` writes one)."
+        )
     tables = sorted(bundled.glob("*.toml"))
-    found = ", ".join(p.name for p in tables if table in p.read_text(encoding="utf-8"))
-    raise FileNotFoundError(f"Study '{path}' does not exist; bundled studies are {found}.")
+    known = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
+    raise FileNotFoundError(
+        f"Study '{path}' does not exist; bundled studies are {', '.join(known)}."
+        f"{suggestion(path, known)}"
+    )
 
 
-# -------------------------------------------------------------------------------------- whole files
+# ---------------------------------------------------------------------------------- whole studies
 
 
-class Found(NamedTuple):
-    """What a study holds: number of measured shots, whether it is for sampling, for fitting."""
+def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy, int]:
+    """The study of one impact and the number of its shots, all checked; see `read_study`."""
 
-    shots: int
-    sampled: bool
-    fitted: bool
-
-
-def check_study(path: str | Path, law: str | None = None) -> Found:
-    """Refuse a study whose tables, words or shots are wrong; see `read_study`."""
-
-    def check(tables: dict[str, Any], file: Path) -> Found:
-        check_tables(tables, ("scene", "law"), STUDY_TABLES)
-        check_scene(tables["scene"])
-        _check_law(tables["law"], law, check_fit(tables.get("fit", {})))
-        shots = 0
-        if "data" in tables:
-            check_data(tables["data"])
-            shots = len(read_shots(file.parent / tables["data"]["file"]).values["pre"])
-        if "observe" in tables:
-            check_observed(tables["observe"], shots)
-        if "monte_carlo" in tables:
-            check_sampling(tables["monte_carlo"])
-        return Found(shots, "monte_carlo" in tables, bool(shots) or "observe" in tables)
+    def check(tables: dict[str, Any], file: Path) -> tuple[CheckedStudy, int]:
+        study = check_impact_tables(tables, file, law)
+        shots = read_shots(study.data_file).values["pre"] if "data" in tables else ()
+        return study, len(shots)
 
     return from_file(path, "[scene]", check)
 
 
-def check_motion_study(path: str | Path, law: str | None = None) -> bool:
-    """Refuse the study of a motion whose tables or words are wrong; see `read_motion_study`.
+def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy:
+    """The study of a motion, all checked; see `read_motion_study`."""
 
-    And whether there is something to fit.
-    """
-
-    def check(tables: dict[str, Any], file: Path) -> bool:
-        check_motion_tables(tables)
-        _check_law(tables["law"], law, check_fit(tables.get("fit", {})))
-        body_keys("[system]", tables["system"], (GRAVITY,))
+    def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
+        study = check_motion_tables(tables, file, law)
         if "data" in tables:
-            read_positions(file.parent / tables["data"]["file"])
-        return "data" in tables
+            read_positions(study.data_file)
+        return study
 
     return from_file(path, "[system]", check)
 
@@ -168,24 +179,58 @@ def is_motion(path: str | Path) -> bool:
     return from_file(path, "[law]", lambda tables, _: "motion" in tables)
 
 
-# ------------------------------------------------------------------------------------ single tables
+def check_impact_tables(
+    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool = False
+) -> CheckedStudy:
+    """The checked tables of a study of one impact.
+
+    Args:
+        tables: as read from the file.
+        path: of the file.
+        other_law: name of a law in the place of the study's; of it only what both laws know stays.
+        modules: whether the module that a study names has been imported; else a law that may be
+            registered there is not checked.
+    """
+    check_tables(tables, ("scene", "law"), ("fit", "data", "observe", "monte_carlo"))
+    check_scene(tables["scene"])
+    free = check_fit(tables.get("fit", {}))
+    if "data" in tables:
+        check_keys("[data]", tables["data"], DATA_KEYS, required=("file",))
+        _check_flag("[data]", tables["data"], "momentum_corrected")
+    if "observe" in tables:
+        if "data" in tables:
+            raise ValueError("a study must have [data] or [[observe]], but has both.")
+        check_observed(tables["observe"])
+    if "monte_carlo" in tables:
+        check_sampling(tables["monte_carlo"])
+    law, free = check_law(tables["law"], other_law, free, modules)
+    return CheckedStudy(path, tables, law, free)
 
 
-def check_motion_tables(tables: Mapping[str, Any]) -> None:
-    """Those that do not depend on law and body."""
+def check_motion_tables(
+    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool = False
+) -> CheckedStudy:
+    """The checked tables of the study of a motion; arguments as of `check_impact_tables`."""
     check_tables(tables, ("system", "law", "motion"), ("base", "fit", "data"))
-    check_keys("[motion]", tables["motion"], tuple(MOTION_KEYS), ("q0", "v0", "t_end_s"))
+    motion = tables["motion"]
+    check_keys("[motion]", motion, tuple(MOTION_KEYS), ("q0", "v0", "t_end_s"))
+    _check_word(motion, "method", "motion_methods")
     if "base" in tables:
         keys = (*BASE_KEYS, "direction")
         check_keys("[base]", tables["base"], keys, ("amplitude_m", "frequency_hz"))
-    if "fit" in tables:
-        check_fit(tables["fit"], MOTION_FIT_KEYS)
+    free = check_fit(tables.get("fit", {}), MOTION_FIT_KEYS)
     if "data" in tables:
         check_keys("[data]", tables["data"], ("file",), required=("file",))
+    body_keys("[system]", tables["system"], (GRAVITY,))
+    law, free = check_law(tables["law"], other_law, free, modules)
+    return CheckedStudy(path, tables, law, free)
+
+
+# ---------------------------------------------------------------------------------- single tables
 
 
 def check_scene(table: Mapping[str, Any]) -> None:
-    """A chain, or a body in a configuration."""
+    """Check the table [scene]: a chain, or a body in a configuration."""
     if "kind" in table:
         body_keys("[scene]", table, AT_KEYS)
         check_keys("[scene]", table, tuple(table), required=("q",))
@@ -199,17 +244,19 @@ def check_scene(table: Mapping[str, Any]) -> None:
 def body_keys(
     where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()
 ) -> tuple[str, dict[str, str]]:
-    """The class of a body, and its arguments' names by key; `others` belong to somebody else."""
+    """The class of a body, and its arguments by key; `others` are keys of another meaning."""
     check_keys(where, table, tuple(table), required=("kind",))
     bodies = {name.lower(): name for name in names()["bodies"]}
     kind = bodies.get(str(table["kind"]).lower())
     if kind is None:
-        known = ", ".join(bodies.values())
-        raise ValueError(f"`kind` in {where} must be one of {known}, but is {table['kind']!r}.")
+        raise ValueError(
+            f"`kind` in {where} must be one of {', '.join(bodies.values())}, "
+            f"but is {table['kind']!r}.{suggestion(table['kind'], bodies.values())}"
+        )
     arguments = names()["bodies"][kind]
     keys = {f"{name}_{_UNITS[name]}" if name in _UNITS else name: name for name in arguments}
-    needed = tuple(key for key, name in keys.items() if arguments[name])
-    check_keys(where, table, ("kind", *keys, *others), needed)
+    required = tuple(key for key, name in keys.items() if arguments[name])
+    check_keys(where, table, ("kind", *keys, *others), required)
     if "bodies" in table and "bodies" in keys:
         within = f"{where.removesuffix(']')}.bodies]"
         if not isinstance(table["bodies"], list):
@@ -219,55 +266,67 @@ def body_keys(
     return kind, keys
 
 
-def law_values(
-    table: Mapping[str, Any], other: str | None, laws: Mapping[str, Any]
-) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """Name of the law, start values and bounds; of another law only what both have is kept."""
-    table = dict(table)
+def check_law(
+    table: Mapping[str, Any], other_law: str | None, free: dict[str, Any], modules: bool
+) -> tuple[LawTable, dict[str, Any]]:
+    """The table [law], checked by the declaration of its law, and what is free of that law.
+
+    The arguments are those of `check_impact_tables`.
+    """
     check_keys("[law]", table, tuple(table), required=("name",))
-    own = str(table.pop("name")).lower()
-    name = (other or own).lower()
-    for key in (own, name):
+    laws = declared_laws()
+    study_law = str(table["name"]).lower()
+    name = (other_law or study_law).lower()
+    bounds = table.get("bounds", {})
+    arguments = {k: x for k, x in table.items() if k not in ("name", "module", "bounds")}
+    for key in (study_law, name):
         if key not in laws:
-            raise ValueError(f"the law must be one of {', '.join(laws)}, but is {key!r}.")
-    bounds = table.pop("bounds", {})
-    check_keys("[law]", table, (*laws[own].arguments, "name", "module", "bounds"))
-    check_keys("[law.bounds]", bounds, laws[own].parameters)
-    kept = {k: v for k, v in table.items() if k in laws[name].arguments}
-    return name, kept, {k: v for k, v in bounds.items() if k in laws[name].parameters}
-
-
-def _check_law(table: Mapping[str, Any], other: str | None, free: Mapping[str, Any]) -> None:
-    """Words and ranges of the law, and what is free of it, but where only its class knows them."""
-    wanted = {str(table.get("name", "")).lower(), (other or "").lower()}
-    if "module" in table or wanted & callers_laws():
-        return
-    name, values, _ = law_values(table, other, known_laws())
-    row = names()["laws"][name]
-    for key, value in values.items():
-        if key in row["choices"]:
-            check_choice(key, value, row["choices"][key])
-        if key in row["ranges"] and isinstance(value, bool | str):
-            raise ValueError(f"Argument `{key}` must be numeric, but has value {value!r}.")
-        if key in row["ranges"] and isinstance(value, int | float):
-            low, high, open_low, high_unless = row["ranges"][key]
-            high = float("inf") if high is None or values.get(high_unless) else high
-            check_values(key, value, low=low, high=high, open_low=open_low)
-    for parameter in free if other is None else ():
-        if parameter not in row["free"]:
+            if "module" in table and not modules:
+                return LawTable(name, arguments, bounds), free
             raise ValueError(
-                f"`free` in [fit] must name parameters of {name}, {', '.join(row['free'])}, "
-                f"but has {parameter!r}."
+                f"the law must be one of {', '.join(laws)}, but is {key!r}.{suggestion(key, laws)}"
             )
+    check_keys("[law]", table, (*laws[study_law]["arguments"], "name", "module", "bounds"))
+    check_keys("[law.bounds]", bounds, tuple(laws[study_law]["parameters"]))
+    declared = laws[name]
+    arguments = {k: x for k, x in arguments.items() if k in declared["arguments"]}
+    bounds = {k: x for k, x in bounds.items() if k in declared["parameters"]}
+    _check_ranges(arguments, declared)
+    if other_law is not None:
+        free = {k: mask for k, mask in free.items() if k in declared["parameters"]}
+    elif name in names()["laws"]:  # parts of a user's law may have parameters of their own
+        for parameter in free:
+            if parameter not in declared["free"]:
+                raise ValueError(
+                    f"`free` in [fit] must name parameters of {name}, "
+                    f"{', '.join(declared['free'])}, but has {parameter!r}."
+                    f"{suggestion(parameter, declared['free'])}"
+                )
+    return LawTable(name, arguments, bounds), free
+
+
+def _check_ranges(arguments: Mapping[str, Any], declared: Mapping[str, Any]) -> None:
+    """Check words and numbers that are the arguments of a law."""
+    for key, value in arguments.items():
+        if key in declared["choices"]:
+            check_choice(key, value, declared["choices"][key])
+        if key in declared["ranges"] and isinstance(value, bool | str):
+            raise ValueError(f"Argument `{key}` must be numeric, but has value {value!r}.")
+        if key in declared["ranges"] and isinstance(value, int | float):
+            low, high, open_low, high_unless = declared["ranges"][key]
+            if high is None or arguments.get(high_unless):
+                high = float("inf")
+            check_values(key, value, low=low, high=high, open_low=open_low)
 
 
 def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dict[str, Any]:
-    """What is free, by name, nothing where nobody says; the table's words are checked."""
+    """Masks of what the table [fit] says is free, by name; the rest of the table is checked."""
     check_keys("[fit]", table, keys)
     _check_flag("[fit]", table, "profiles")
     for key, low in (("starts", 1), ("seed", 0), ("max_steps", 1)):
         as_whole(key, table.get(key, low), low)
-    check_choice("method", table.get("method", FIT_METHODS[0]), FIT_METHODS)
+    _check_word(table, "method", "fit_methods")
+    _check_word(table, "loss", "losses")
     free = table.get("free", [])
     if isinstance(free, dict):
         return free
@@ -276,35 +335,35 @@ def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dic
     raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
 
 
-def check_data(table: Mapping[str, Any]) -> None:
-    """The table [data] of shots."""
-    check_keys("[data]", table, DATA_KEYS, required=("file",))
-    _check_flag("[data]", table, "momentum_corrected")
-
-
 def _check_flag(where: str, table: Mapping[str, Any], key: str) -> None:
+    """Check that a key, if it is there, is true or false."""
     if not isinstance(table.get(key, False), bool):
         raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")
 
 
-def check_observed(tables: list[Any], shots: int) -> None:
-    """The tables [[observe]] of a study with so many shots in a file."""
-    if shots:
-        raise ValueError("a study must have [data] or [[observe]], but has both.")
+def _check_word(table: Mapping[str, Any], key: str, group: str) -> None:
+    """Check that a key, if it is there, is a word of this group of `names`."""
+    if key in table:
+        check_choice(key, table[key], names()[group])
+
+
+def check_observed(tables: list[Any]) -> None:
+    """Check the tables [[observe]]."""
     for number, table in enumerate(tables):
         where = f"[[observe]] {number + 1}"
         check_keys(where, table, (*OBSERVE_KEYS, *OBSERVE_SHOTS), ("quantity", "value"))
+        _check_word(table, "quantity", "quantities")
         _check_flag(where, table, "relative")
-        given = [key for key in OBSERVE_SHOTS if key in table]
-        if len(given) != 1:
-            told = " and ".join(given) or "none"
+        shots = [key for key in OBSERVE_SHOTS if key in table]
+        if len(shots) != 1:
             raise ValueError(
-                f"{where} must have one of {', '.join(OBSERVE_SHOTS)}, but has {told}."
+                f"{where} must have one of {', '.join(OBSERVE_SHOTS)}, "
+                f"but has {' and '.join(shots) or 'none'}."
             )
 
 
 def check_sampling(table: Mapping[str, Any]) -> None:
-    """The table [monte_carlo]."""
+    """Check the table [monte_carlo]."""
     check_keys("[monte_carlo]", table, SAMPLING_KEYS, required=("velocity_m_per_s",))
     random = table.get("law", {})
     if not isinstance(random, dict):
@@ -339,7 +398,10 @@ def check_keys(
             )
     for key in table:
         if key not in allowed:
-            raise ValueError(f"{where} may have the keys {', '.join(allowed)}, but has `{key}`.")
+            raise ValueError(
+                f"{where} may have the keys {', '.join(allowed)}, but has `{key}`."
+                f"{suggestion(key, allowed)}"
+            )
 
 
 def check_tables(
@@ -354,8 +416,8 @@ def check_tables(
             )
     check_keys("the study", study, ("title", *required, *others), required)
     for name in (*required, *others):
-        given = study.get(name, [] if name == "observe" else {})
-        if name == "observe" and not isinstance(given, list):
-            raise ValueError("`observe` must be tables, each headed by [[observe]].")
-        if name != "observe" and not isinstance(given, dict):
-            raise ValueError(f"`{name}` must be a table, but is {given!r}.")
+        if name == "observe":
+            if not isinstance(study.get(name, []), list):
+                raise ValueError("`observe` must be tables, each headed by [[observe]].")
+        elif not isinstance(study.get(name, {}), dict):
+            raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from jimpact.fits.multistart import EXACT, Search
+from jimpact.fits.multistart import EXACT, Solution
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
 
@@ -31,34 +31,34 @@ class Weighted(NamedTuple):
     shot: np.ndarray
 
 
-def unusable(problem: FitProblem, found: Search) -> np.ndarray:
+def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Shots (K,) whose impacts fail, or whose derivatives are no numbers or absurd."""
     if not isinstance(problem.residuals.observe, Shots):
         return np.zeros(1, bool)
     shots, bodies = problem.measured.shape
     weight = np.asarray(problem.residuals.weight, float)[..., None]
-    slope = np.abs(found.jacobian.reshape(shots, bodies, -1))
+    slope = np.abs(solution.jacobian.reshape(shots, bodies, -1))
     allowed = ABSURD * float(problem.residuals.unit) * weight
-    fails = [STATUS[code].name in UNUSABLE for code in found.status]
+    fails = [STATUS[code].name in UNUSABLE for code in solution.status]
     used = ~np.isnan(problem.measured).all(axis=1)
     return used & (np.array(fails) | ~(slope <= allowed).all(axis=(1, 2)))
 
 
-def weighted(problem: FitProblem, found: Search) -> Weighted:
+def weighted(problem: FitProblem, solution: Solution) -> Weighted:
     """Residuals and derivatives as the tests need them."""
     here = ~np.isnan(problem.measured)
     rows = np.arange(len(here)) if here.ndim else np.zeros(1, int)
     shot = np.broadcast_to(rows.reshape(-1, *(1,) * (here.ndim - 1)), here.shape)
     return Weighted(
-        problem.independent(problem.measured - found.seen)[here],
-        float(problem.residuals.size) * found.jacobian[here.ravel()],
+        problem.independent(problem.measured - solution.predicted)[here],
+        float(problem.residuals.size) * solution.jacobian[here.ravel()],
         shot[here],
     )
 
 
-def adequacy(problem: FitProblem, found: Search, rank: int, robust: bool) -> list[str]:
+def adequacy(problem: FitProblem, solution: Solution, rank: int, robust: bool) -> list[str]:
     """Lack of fit and suspicious shots, in words; nothing of data that are reproduced exactly."""
-    data = weighted(problem, found)
+    data = weighted(problem, solution)
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
     dtype = str(problem.residuals.offset.dtype)
     if freedom < 1 or squares <= EXACT[dtype] * float(problem.residuals.size) ** 2:

@@ -6,11 +6,8 @@ import numpy as np
 
 from jimpact._checks import as_whole
 from jimpact.fits.fitting import Fit
-from jimpact.fits.least_squares import DEFAULT_STEPS
-from jimpact.fits.multistart import run_held
-from jimpact.fits.problem import filled_up
-from jimpact.fits.profiles import Scaled, check_profiled, linearized
-from jimpact.progress import progress_bar
+from jimpact.fits.scaled import ScaledFit, check_profiled
+from jimpact.progress import Show, progress_bar
 
 _BEYOND = 1.3  # how far the picture goes, in half-widths of the region of a parabola
 
@@ -85,65 +82,77 @@ def contour(
             raise ValueError(f"Arguments `first`, `second` must be of {known}, but have {name!r}.")
     if first == second:
         raise ValueError(f"Arguments `first` and `second` must differ, but both are {first!r}.")
-    pair = (fit.names.index(first), fit.names.index(second))
-    freedom, known_noise = fit.degrees_of_freedom, fit.problem.sigma is not None
-    if known_noise or freedom < 1:
-        limit = -2 * np.log(1 - level)
-    else:
-        limit = freedom * ((1 - level) ** (-2 / freedom) - 1)
-    scaled = Scaled(fit)
+    limit, i, j = _limit(fit, level), fit.names.index(first), fit.names.index(second)
+    scaled, width = ScaledFit(fit), _BEYOND * np.sqrt(limit)
     x, y = (
-        np.linspace(*scaled.reach(i, linearized(fit, i, _BEYOND * np.sqrt(limit))), points)
-        for i in pair
+        np.linspace(*scaled.reach(k, fit.linearized_interval(k, width)), points) for k in (i, j)
     )
-    values = (x, y)
-    ends: dict[tuple[int, int], tuple[float, np.ndarray]] = {}
-    ahead: dict[tuple[int, int], np.ndarray] = {}
-    for value in (fit.value, *(start.value for start in fit.starts[1:])):
-        point = scaled.point(value)
-        row, column = (int(np.argmin(np.abs(v - point[i]))) for v, i in zip(values, pair))
-        ahead[row, column] = point
-    residuals, least = filled_up(fit.problem.residuals), fit.starts[0].sum_of_squares
     with progress_bar(progress) as show:
-        while ahead:
-            held = []
-            for cell, near in ahead.items():
-                point = near.copy()
-                point[list(pair)] = [v[k] for v, k in zip(values, cell)]
-                held.append((pair, point))
-            states = run_held(residuals, held, DEFAULT_STEPS["levenberg-marquardt"], show)
-            squares = 2 * np.asarray(states.cost, float) * scaled.size**2
-            for k, cell in enumerate(ahead):
-                ends[cell] = float(squares[k]), np.asarray(states.y[k], float)
-            least = min(least, float(squares.min()))
-            ahead = {
-                beside: ends[cell][1]
-                for cell in ahead
-                if ends[cell][0] - least <= limit * scaled.variance
-                for beside in _around(cell, points)
-                if beside not in ends
-            }
-    if min(ends.values(), key=lambda end: end[0])[0] - least > limit * scaled.variance:
+        deviance = _flood(scaled, (i, j), (x, y), limit, show)
+    if deviance.min() > limit:
         raise ValueError(
             f"Argument `points` must be larger: the region falls between {points} values of "
             f"{first} and of {second} (or take `profile`, which needs no grid)."
         )
-    deviance = np.full((points, points), np.inf)
-    for cell, (total, _) in ends.items():
-        deviance[cell] = max(total - least, 0.0) / scaled.variance
     return Contour(
         names=(first, second),
-        x=scaled.real(pair[0], x),
-        y=scaled.real(pair[1], y),
-        deviance=deviance,
-        limit=float(limit),
+        x=scaled.values(i, x),
+        y=scaled.values(j, y),
+        deviance=np.maximum(deviance, 0.0),
+        limit=limit,
         level=level,
-        best=(float(fit.value[pair[0]]), float(fit.value[pair[1]])),
-        log=(bool(scaled.log[pair[0]]), bool(scaled.log[pair[1]])),
+        best=(float(fit.value[i]), float(fit.value[j])),
+        log=(bool(scaled.log[i]), bool(scaled.log[j])),
     )
 
 
-def _around(cell: tuple[int, int], points: int) -> list[tuple[int, int]]:
-    """Cells of a square grid beside one, corners too."""
+def _limit(fit: Fit, level: float) -> float:
+    """Deviance at the boundary of the region of two parameters."""
+    freedom = fit.degrees_of_freedom
+    if fit.problem.sigma is not None or freedom < 1:
+        return float(-2 * np.log(1 - level))
+    return float(freedom * ((1 - level) ** (-2 / freedom) - 1))
+
+
+def _flood(
+    scaled: ScaledFit,
+    pair: tuple[int, int],
+    values: tuple[np.ndarray, np.ndarray],
+    limit: float,
+    show: Show,
+) -> np.ndarray:
+    """Deviances on the grid of held values, from the minima outwards; inf where not computed.
+
+    Each cell below the limit starts its neighbours from its own minimum.
+    """
+    fit, ends = scaled.fit, {}
+    squares = np.full((len(values[0]), len(values[1])), np.inf)
+    ahead: dict[tuple[int, int], np.ndarray] = {}
+    for value in (fit.value, *(minimum.value for minimum in fit.starts[1:])):
+        point = scaled.problem.point(value)
+        row, column = (int(np.argmin(np.abs(v - point[i]))) for v, i in zip(values, pair))
+        ahead[row, column] = point
+    while ahead:
+        held = []
+        for cell, near in ahead.items():
+            point = near.copy()
+            point[list(pair)] = [v[k] for v, k in zip(values, cell)]
+            held.append((pair, point))
+        totals, states = scaled.minimize(held, show)
+        for k, cell in enumerate(ahead):
+            squares[cell], ends[cell] = totals[k], np.asarray(states.y[k], float)
+        scaled.least = min(scaled.least, float(totals.min()))
+        ahead = {
+            neighbour: ends[cell]
+            for cell in ahead
+            if scaled.deviance_of(squares[cell]) <= limit
+            for neighbour in _neighbours(cell, len(squares))
+            if neighbour not in ends
+        }
+    return scaled.deviance_of(squares)
+
+
+def _neighbours(cell: tuple[int, int], points: int) -> list[tuple[int, int]]:
+    """Cells of a square grid next to one, diagonal ones too."""
     near = [(cell[0] + i, cell[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
     return [(i, j) for i, j in near if 0 <= i < points and 0 <= j < points]

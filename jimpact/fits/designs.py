@@ -9,7 +9,7 @@ import numpy as np
 from jimpact._checks import as_whole, check_kind
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit
-from jimpact.fits.least_squares import Box
+from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.multistart import quiet, repeated, run
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
@@ -114,7 +114,7 @@ def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     """`J^T J / noise^2` (K, P, P) of every shot at the parameters of the fit, in scaled form."""
     residuals, r = filled_up(problem.residuals), fit.problem.residuals
     y = fit.problem.point(fit.value)
-    ends: Any = Box(*np.broadcast_to(y.astype(r.offset.dtype), (2, len(y))))  # held there
+    ends: Any = BoxRegion(*np.broadcast_to(y.astype(r.offset.dtype), (2, len(y))))  # held there
     parts = (r.mix, r.offset, r.scale, ends.low, ends.high, ends)
     here = eqx.tree_at(
         lambda r: (r.mix, r.offset, r.scale, r.low, r.high, r.region), residuals, parts

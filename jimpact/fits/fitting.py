@@ -1,184 +1,70 @@
-"""`fit`: parameters of a law from measured velocities, with their errors and what stays unseen."""
+"""`fit`: parameters of a law from measured velocities, with their errors."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Generic, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_whole, check_choice, check_kind
+from jimpact._checks import as_whole, check_choice
 from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.least_squares import Method, check_method, default_steps
-from jimpact.fits.multistart import Minimum, Search, ends, search, search_near, settled
+from jimpact.fits.multistart import Minimum, Solution, ends, search, settled
+from jimpact.fits.page import write_page
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
-from jimpact.fits.profiles import (
-    Profile,
-    linearized,
-    needs_profiles,
-    profile,
-    quantile,
-    quick_profiles,
-)
-from jimpact.fits.report import fit_warnings, report, to_json, verdict
+from jimpact.fits.profiles import needs_profiles, profile, quick_profiles
+from jimpact.fits.report import report, verdict
+from jimpact.fits.result import FitMinimum, FitResult
+from jimpact.fits.robust import LOSSES, RobustSolution, robust_solution
+from jimpact.fits.tables import as_dict, dataset, parameters_frame
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
+from jimpact.fits.verdicts import fit_warnings
 from jimpact.scene import Scene
 
-HARDLY_WORSE = 10.0  # standard errors: intervals of all levels end before
-
+# A minimum gets standard errors up to a sum of squares this many noise standard deviations above
+# the best: intervals of all levels end before. With ten times more, only time is lost.
+HARDLY_WORSE = 10.0
 LISTED = 10  # shots that were left out, named one by one
-HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
-STUDENT = 4.0  # degrees of freedom of the tails
-MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
-ROUNDS = 50  # of weights
-SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 
 
-@dataclass(frozen=True, eq=False)
-class Start:
-    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
+class Fit(FitResult[AnyLaw]):
+    """See `FitResult`."""
 
-    `standard_error` is None where it fits so much worse that it does not matter.
-    """
-
-    sum_of_squares: float
-    value: np.ndarray
-    count: int
-    standard_error: np.ndarray | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Fit(Generic[AnyLaw]):
-    """What `fit` found. `print(fit)` is a report.
-
-    P free parameters, K shots of n velocities.
-
-    Attributes:
-        law: with the parameters found.
-        method: of minimizing, see `fit`.
-        names: of the parameters, contacts numbered from 1.
-        value: (P,) in the units of each parameter, as the next two.
-        standard_error: (P,); inf where the data cannot see a parameter, NaN where no degree of
-            freedom is left to estimate the noise from.
-        covariance: (P, P).
-        correlation: (P, P), in [-1, 1].
-        bounds: lowest and highest values (P,), (P,).
-        at_bound: (P,) boolean.
-        predicted: shaped like what was measured, (K, n) [m/s].
-        residual: measured less predicted (K, n) [m/s]; NaN where nothing was measured.
-        rms: of the residual.
-        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
-            where `sigma` was given, or, where chi^2 says that it is too small, by how much:
-            the standard errors are stretched by that.
-        degrees_of_freedom: independent measured values less `rank`.
-        rank: of the Jacobian; below P: see `identifiability`.
-        singular_values: (P,) of the scaled Jacobian.
-        identifiability: in words, what the data cannot tell apart.
-        starts: the distinct minima, best first.
-        status: (K,) codes of `jimpact.STATUS` at the minimum.
-        converged: whether the best start did.
-        steps: iterations of the best start.
-        lost_starts: how many did not converge.
-        warnings: what is wrong with data or fit, in words.
-        problem: what was solved.
-        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where nothing
-            was measured.
-        loss: see `fit`.
-        seed: of the random starts.
-        profiles: where `fit` was asked for them.
-    """
-
-    law: AnyLaw
-    method: str
-    names: tuple[str, ...]
-    value: np.ndarray
-    standard_error: np.ndarray
-    covariance: np.ndarray
-    correlation: np.ndarray
-    bounds: tuple[np.ndarray, np.ndarray]
-    at_bound: np.ndarray
-    predicted: np.ndarray
-    residual: np.ndarray
-    rms: float
-    noise: float
-    degrees_of_freedom: int
-    rank: int
-    singular_values: np.ndarray
-    identifiability: tuple[str, ...]
-    starts: tuple[Start, ...]
-    status: np.ndarray
-    converged: bool
-    steps: int
-    lost_starts: int
-    warnings: tuple[str, ...]
-    problem: FitProblem
-    jacobian: np.ndarray
-    loss: str = "squares"
-    seed: int = 0
-    profiles: tuple[Profile, ...] = ()
-
-    @property
-    def experiments(self) -> Experiments | None:
-        """The shots; None where something else was fitted."""
-        return self.problem.experiments
-
-    def intervals(self, level: float = 0.95) -> tuple[tuple[tuple[float, float], ...], ...]:
-        """The pieces, in order, of the confidence interval of each of the P parameters.
-
-        Those of `profiles`, if there are some of this level. Else linearized, cut at the bounds, a
-        piece for every minimum that fits well enough.
-
-        Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
-        freedom that are left, or of the normal law where `sigma` was given; of what is fitted in
-        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum of squares
-        is higher by d, q^2 - d / noise^2 in place of q^2.
-        """
-        if self.profiles and self.profiles[0].level == level:
-            return tuple(scan.intervals for scan in self.profiles)
-        return tuple(linearized(self, i, quantile(self, level)) for i in range(len(self.names)))
-
-    def confidence_interval(self, level: float = 0.95) -> np.ndarray:
-        """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
-        return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
+    __doc__ = FitResult.__doc__
 
     def to_dict(self) -> dict[str, Any]:
         """Everything a JSON file can hold; numbers that are not finite become None."""
-        return to_json(self)
+        return as_dict(self)
 
     @property
     def verdict(self) -> str:
-        """What was found, in one sentence: the last one of `print(fit)`."""
+        """The result in one sentence: the last one of `print(fit)`."""
         return verdict(self)
 
     def report(self, path: str | Path, profiles: bool = True) -> Path:
         """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
 
-        Parameters and intervals, profiles, correlations, residuals, what the data cannot see, what
-        is wrong with them, versions and seed.
+        Parameters and intervals, profiles, correlations, residuals, what the data do not
+        determine, warnings, versions and seed.
 
         Args:
-            path: the file, ending in .html; what is there is replaced.
-            profiles: find the profile likelihoods, too, unless the fit has them; some seconds.
+            path: the file, ending in .html; an existing file is replaced.
+            profiles: compute the profile likelihoods, too, unless the fit has them; some seconds.
 
         Returns:
             The path.
         """
-        from jimpact.fits.page import write_page
-
         return write_page(self, Path(path), profiles)
 
     def to_pandas(self) -> Any:
         """The parameters as a `pandas.DataFrame`, which must be installed."""
-        from jimpact.fits.tables import parameters_frame
-
         return parameters_frame(self)
 
     def to_xarray(self) -> Any:
         """Parameters, covariance, every shot as an `xarray.Dataset`, which must be installed."""
-        from jimpact.fits.tables import dataset
-
         return dataset(self)
 
     def __str__(self) -> str:
@@ -263,44 +149,36 @@ def fit(
         problem = law
     else:
         problem = FitProblem.from_shots(law, scene, experiments, free, bounds)  # type: ignore[arg-type]
-    found = search(problem, method, starts, seed, steps, progress)
-    while (lost := unusable(problem, found)).any() and not lost.all():
+    solution = search(problem, method, starts, seed, steps, progress)
+    while (lost := unusable(problem, solution)).any() and not lost.all():
         problem = _without(problem, lost)
-        found = search(problem, method, starts, seed, steps, progress)
-    _check_derivatives(problem, found)
+        solution = search(problem, method, starts, seed, steps, progress)
+    _check_derivatives(problem, solution)
     if problem.residuals.mixing is not None:
-        points = problem.point(np.array([end.value for end in found.minima]))
+        points = problem.point(np.array([minimum.value for minimum in solution.minima]))
         (problem,), states = settled([problem], points, method, steps)
-        found = ends(problem, states, np.array([end.starts for end in found.minima]), found.lost)
+        counts = np.array([minimum.starts for minimum in solution.minima])
+        solution = ends(problem, states, counts, solution.lost)
     robust = None
     if loss != "squares":
-        problem, robust = _robust(problem, found, loss, method, steps)
-    end = replace(as_fit(problem, found, method, robust), loss=loss, seed=seed)
+        problem, robust = robust_solution(problem, solution, loss, method, steps)
+    result = replace(as_fit(problem, solution, method, robust), loss=loss, seed=seed)
     if profiles:
-        return replace(end, profiles=profile(end, progress=progress))
-    if profiles is None and needs_profiles(end):
-        return replace(end, profiles=quick_profiles(end, progress))
-    return end
+        return replace(result, profiles=profile(result, progress=progress))
+    if profiles is None and needs_profiles(result):
+        return replace(result, profiles=quick_profiles(result, progress))
+    return result
 
 
-def _check_derivatives(problem: FitProblem, found: Search) -> None:
-    """Raise a ValueError where they are no numbers, which no shots left out could mend."""
-    lost = np.flatnonzero(~np.isfinite(found.jacobian).all(axis=1))
+def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
+    """Raise a ValueError where derivatives are NaN, which leaving out shots could not mend."""
+    lost = np.flatnonzero(~np.isfinite(solution.jacobian).all(axis=1))
     if len(lost):
-        at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, found.value))
+        at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
         which = ", ".join(str(i + 1) for i in lost[:LISTED]) + ", ..." * (len(lost) > LISTED)
         raise ValueError(
             f"Argument `law` must have derivatives that are numbers, but at {at} those of "
             f"{len(lost)} measured values ({which}) are not."
-        )
-
-
-def check_squares(name: str, found: Any) -> None:
-    """Raise an error unless this is a fit by least squares."""
-    check_kind(name, found, Fit)
-    if found.loss != "squares":
-        raise ValueError(
-            f"Argument `{name}` must be by least squares, but has loss {found.loss!r}."
         )
 
 
@@ -325,141 +203,107 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
     return replace(problem.weighed(kept), left_out=(*problem.left_out, line))
 
 
-class Robust(NamedTuple):
-    """The end of a search, factors its loss puts on the weights, noise times root of freedom."""
-
-    found: Search
-    factor: np.ndarray
-    noise: float
-
-
-def _huber(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    inside = np.abs(u) <= HUBER
-    return np.where(inside, 1.0, HUBER / np.where(inside, 1.0, np.abs(u))), inside.astype(float)
-
-
-def _student(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """psi(u) / u and psi'(u)."""
-    below = STUDENT + u**2
-    return (STUDENT + 1) / below, (STUDENT + 1) * (STUDENT - u**2) / below**2
-
-
-LOSSES = {"huber": _huber, "student": _student}
-
-
-def _robust(
-    problem: FitProblem, found: Search, loss: str, method: Method, max_steps: int
-) -> tuple[FitProblem, Robust]:
-    """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
-
-    Equation: the covariance is `s^2 mean(psi^2) / mean(psi')^2 (J^T J)^-1` (Huber, 1981).
-    """
-    here = ~np.isnan(problem.measured)
-    for _ in range(ROUNDS):
-        problem = problem.passing_errors_at(found.y)
-        error = problem.independent(problem.measured - found.seen)
-        scale = 1.0
-        if problem.sigma is None:
-            scale = max(MEDIAN * float(np.median(np.abs(error[here]))), np.finfo(float).tiny)
-        share, slope = LOSSES[loss](error / scale)
-        factor, before = np.sqrt(share), found.y
-        found = search_near(problem.weighed(factor), found.y, method, max_steps)
-        if np.abs(found.y - before).max() <= SAME:
-            break
-    else:
-        found = found._replace(converged=False)
-    psi = (share * error / scale)[here]
-    noise = scale * np.sqrt(np.sum(psi**2)) / max(slope[here].mean(), SAME)
-    return problem, Robust(found, factor, float(noise))
-
-
 def as_fit(
-    problem: FitProblem, found: Search, method: Method, robust: Robust | None = None
+    problem: FitProblem, solution: Solution, method: Method, robust: RobustSolution | None = None
 ) -> Fit[Any]:
-    """Errors, rank and warnings at the end of a search."""
-    if robust is not None:  # as without the factors, but for the place
-        found, weighed = robust.found, problem.weighed(robust.factor).residuals
-        back = float(weighed.size) / float(problem.residuals.size) / robust.factor.reshape(-1, 1)
-        left = problem.independent(problem.measured - found.seen) / float(problem.residuals.size)
-        end = Minimum(float(np.sum(left**2)), found.value, 1, back * found.jacobian)
-        found = found._replace(jacobian=end.jacobian, minima=[end])
-    residuals, names = problem.residuals, problem.names
-    size = float(residuals.size)
-    spread = _spread(problem, found, found.minima[0])
+    """The fit at the end of a search: errors, rank and warnings."""
     if robust is not None:
-        freedom, unknown = spread.degrees_of_freedom, np.nan if problem.sigma is None else 1.0
-        noise = robust.noise / np.sqrt(freedom) if freedom > 0 else unknown
-        spread = _spread(problem, found, found.minima[0], noise)
+        solution = _without_robust_factors(problem, robust)
+    best, size = solution.minima[0], float(problem.residuals.size)
+    errors = _uncertainty(problem, solution, best)
+    if robust is not None:
+        freedom = errors.degrees_of_freedom
+        noise = np.nan if problem.sigma is None else 1.0
+        if freedom > 0:
+            noise = robust.noise / np.sqrt(freedom)
+        errors = _uncertainty(problem, solution, best, noise)
     elif problem.sigma is not None:
-        times = stretch(problem, weighted(problem, found), spread.rank)
-        spread = _spread(problem, found, found.minima[0], times) if times > 1 else spread
-    residual = np.asarray(problem.measured, float) - found.seen
+        times = stretch(problem, weighted(problem, solution), errors.rank)
+        if times > 1:
+            errors = _uncertainty(problem, solution, best, times)
+    residual = np.asarray(problem.measured, float) - solution.predicted
     return Fit(
-        law=with_entries(problem.law, residuals.fields, found.entries),
+        law=with_entries(problem.law, problem.residuals.fields, solution.entries),
         method=method if isinstance(method, str) else "optax",
-        names=names,
-        value=found.value,
-        standard_error=spread.standard_error,
-        covariance=spread.covariance,
-        correlation=spread.correlation,
+        names=problem.names,
+        value=solution.value,
+        standard_error=errors.standard_error,
+        covariance=errors.covariance,
+        correlation=errors.correlation,
         bounds=(problem.domains[:, 0], problem.domains[:, 1]),
-        at_bound=found.at_bound,
-        predicted=found.seen,
+        at_bound=solution.at_bound,
+        predicted=solution.predicted,
         residual=residual,
         rms=_rms(problem, residual),
-        noise=spread.noise,
-        degrees_of_freedom=spread.degrees_of_freedom,
-        rank=spread.rank,
-        singular_values=spread.singular_values,
-        identifiability=(*problem.notes, *spread.unseen),
+        noise=errors.noise,
+        degrees_of_freedom=errors.degrees_of_freedom,
+        rank=errors.rank,
+        singular_values=errors.singular_values,
+        identifiability=(*problem.notes, *errors.undetermined),
         starts=tuple(
-            Start(size**2 * end.squares, end.value, end.starts, _error(problem, found, end, spread))
-            for end in found.minima
+            FitMinimum(
+                size**2 * minimum.squares,
+                minimum.value,
+                minimum.starts,
+                _standard_error(problem, solution, minimum, errors),
+            )
+            for minimum in solution.minima
         ),
-        status=found.status,
-        converged=found.converged,
-        steps=found.steps,
-        lost_starts=found.lost,
-        warnings=tuple(fit_warnings(problem, found, spread, robust is not None)),
+        status=solution.status,
+        converged=solution.converged,
+        steps=solution.steps,
+        lost_starts=solution.lost,
+        warnings=tuple(fit_warnings(problem, solution, errors, robust is not None)),
         problem=problem,
-        jacobian=_slopes(problem, found),
+        jacobian=_jacobian(problem, solution),
     )
 
 
-def _slopes(problem: FitProblem, found: Search) -> np.ndarray:
-    """Derivatives of what was measured in the parameters themselves; NaN where nothing was."""
-    slope = found.jacobian.reshape(*problem.measured.shape, len(problem.names)) / found.scale
+def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Solution:
+    """The minimum that the loss found, its residuals weighted as in `problem`."""
+    solution, weighed = robust.solution, problem.weighed(robust.factor).residuals
+    size = float(problem.residuals.size)
+    back = float(weighed.size) / size / robust.factor.reshape(-1, 1)
+    residual = problem.independent(problem.measured - solution.predicted) / size
+    squares, jacobian = float(np.sum(residual**2)), back * solution.jacobian
+    minimum = Minimum(squares, solution.value, 1, jacobian)
+    return solution._replace(jacobian=jacobian, minima=[minimum])
+
+
+def _jacobian(problem: FitProblem, solution: Solution) -> np.ndarray:
+    """Derivatives (K, n, P) of what was measured in the parameters; NaN where nothing was."""
+    shape = (*problem.measured.shape, len(problem.names))
+    slope = solution.jacobian.reshape(shape) / solution.scale
     return problem.errors_of(float(problem.residuals.size) * slope)
 
 
-def _spread(
-    problem: FitProblem, found: Search, end: Minimum, noise: float | None = None
+def _uncertainty(
+    problem: FitProblem, solution: Solution, minimum: Minimum, noise: float | None = None
 ) -> Uncertainty:
     """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
-    residuals = problem.residuals
-    size = float(residuals.size)
+    size = float(problem.residuals.size)
+    if noise is None and problem.sigma is not None:
+        noise = 1.0
     return uncertainty(
         names=problem.names,
-        jacobian=size * end.jacobian,
-        scale=np.where(found.log, end.value, found.scale),
-        log=found.log,
-        sum_of_squares=size**2 * end.squares,
+        jacobian=size * minimum.jacobian,
+        scale=np.where(solution.log, minimum.value, solution.scale),
+        log=solution.log,
+        sum_of_squares=size**2 * minimum.squares,
         values=problem.values,
-        noise=noise if noise is not None else None if problem.sigma is None else 1.0,
-        rank_tolerance=RANK_TOLERANCE[str(residuals.offset.dtype)],
+        noise=noise,
+        rank_tolerance=RANK_TOLERANCE[str(problem.residuals.offset.dtype)],
         value_name=problem.value_name,
     )
 
 
-def _error(
-    problem: FitProblem, found: Search, end: Minimum, spread: Uncertainty
+def _standard_error(
+    problem: FitProblem, solution: Solution, minimum: Minimum, best: Uncertainty
 ) -> np.ndarray | None:
     """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
-    if end is found.minima[0]:
-        return spread.standard_error
-    noise, size = spread.noise, float(problem.residuals.size)
-    more = size**2 * (end.squares - found.minima[0].squares)
-    if not more <= (HARDLY_WORSE * noise) ** 2:
+    if minimum is solution.minima[0]:
+        return best.standard_error
+    more = float(problem.residuals.size) ** 2 * (minimum.squares - solution.minima[0].squares)
+    if not more <= (HARDLY_WORSE * best.noise) ** 2:
         return None
-    return _spread(problem, found, end, noise).standard_error
+    return _uncertainty(problem, solution, minimum, best.noise).standard_error

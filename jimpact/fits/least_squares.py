@@ -1,11 +1,11 @@
 """Nonlinear least squares in a region: Levenberg-Marquardt, or gradient descent with optax.
 
-Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `Box` `low <= y <= high`. Steps are cut at
-the box, and a variable on a bound whose gradient points outward is left out of the step, so minima
-on a bound are found exactly. (Smooth maps of the box onto the real line put them at infinity:
-Levenberg-Marquardt then still crawled after 100 steps, every start ending elsewhere.) One pass
-evaluates residual and Jacobian together once, so that the impact is compiled once; a solve can be
-continued.
+Minimize `|r(y)|^2 / 2` for y in a `Region`, mostly the `BoxRegion` `low <= y <= high`. Steps are
+cut at the box, and a variable on a bound whose gradient points outward is left out of the step, so
+minima on a bound are found exactly. (Smooth maps of the box onto the real line put them at
+infinity: Levenberg-Marquardt then still crawled after 100 steps, every start ending elsewhere.) One
+pass evaluates residual and Jacobian together once, so that the impact is compiled once; a solve can
+be continued.
 """
 
 from collections.abc import Callable
@@ -54,7 +54,7 @@ class Region(Protocol):
         """Damped Gauss-Newton step inside the region, and the decrease it promises."""
 
 
-class Box(eqx.Module):
+class BoxRegion(eqx.Module):
     """The region `low <= y <= high`."""
 
     low: jax.Array

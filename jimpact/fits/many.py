@@ -12,11 +12,12 @@ import numpy as np
 from jimpact._checks import as_whole
 from jimpact.fits.adequacy import unusable
 from jimpact.fits.experiments import Experiments
-from jimpact.fits.fitting import Fit, as_fit, check_squares, fit
+from jimpact.fits.fitting import Fit, as_fit, fit
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import Search, at_minimum, ends, repeated, run, settled, start_points
+from jimpact.fits.multistart import Solution, at_minimum, ends, repeated, run, settled, start_points
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, Residuals, filled_up
+from jimpact.fits.result import check_squares
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
 
@@ -95,7 +96,7 @@ def fit_many(
     return [found[k] for k in range(len(problems))]
 
 
-def _searches(problems: list[FitProblem], states: SolverState) -> list[Search]:
+def _searches(problems: list[FitProblem], states: SolverState) -> list[Solution]:
     """The ends of each problem, all of which have equally many starts."""
     each = len(states.y) // len(problems)
     rows = [slice(i * each, (i + 1) * each) for i in range(len(problems))]

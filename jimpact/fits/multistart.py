@@ -1,6 +1,6 @@
 """Many starts at once, and the distinct minima they end in."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jimpact.fits.least_squares import Box, Method, SolverState
+from jimpact.fits.least_squares import BoxRegion, Method, SolverState
 from jimpact.fits.problem import (
     FEW,
     FitProblem,
@@ -18,11 +18,8 @@ from jimpact.fits.problem import (
     begin_all,
     filled_up,
     from_scaled,
-    to_scaled,
 )
-from jimpact.progress import progress_bar
-
-Show = Callable[[str, float, float], None]  # of the progress: text, how far, of how much
+from jimpact.progress import Show, progress_bar
 
 LANES, DEAR_LANES = 8, 4  # starts that run together: of shots, and of what may take longer
 PASSES = 4  # until starts that are done make room
@@ -76,7 +73,7 @@ class Minimum(NamedTuple):
     jacobian: np.ndarray  # (R, P), of the scaled parameters
 
 
-class Search(NamedTuple):
+class Solution(NamedTuple):
     """The best end point (weighted as in `Residuals`), and all distinct minima, best first."""
 
     value: np.ndarray  # of the parameters (P,)
@@ -85,7 +82,7 @@ class Search(NamedTuple):
     scale: np.ndarray  # natural size of a change of each parameter, at the value found
     log: np.ndarray  # whether it is fitted in its logarithm
     jacobian: np.ndarray  # (R, P), of the scaled parameters
-    seen: np.ndarray  # shaped like what was measured
+    predicted: np.ndarray  # shaped like what was measured
     status: np.ndarray
     converged: bool
     at_bound: np.ndarray
@@ -101,7 +98,7 @@ def search(
     seed: int,
     max_steps: int,
     progress: float | None,
-) -> Search:
+) -> Solution:
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)
     points, residuals = start_points(problem, starts, rng), filled_up(problem.residuals)
@@ -126,11 +123,11 @@ def search(
     return ends(problem, states)
 
 
-def quiet(what: str, done: float, total: float) -> None:
+def quiet(what: str, done: float, total: float | None) -> None:
     """No progress is shown."""
 
 
-def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Search:
+def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Solution:
     """The minimum next to y (Q,)."""
     residuals = repeated(filled_up(problem.residuals), 1)
     return ends(problem, run(residuals, y[None], method, max_steps, quiet))
@@ -243,7 +240,7 @@ def run_held(
         at = np.array(which, int)
         low[k, at] = high[k, at] = y[at]
     dtype = residuals.offset.dtype
-    box: Any = Box(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
+    box: Any = BoxRegion(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
     many = repeated(residuals, len(held))
     many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
     return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False)
@@ -266,15 +263,13 @@ def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray
 
 def ends(
     problem: FitProblem, states: SolverState, counts: np.ndarray | None = None, lost: int = 0
-) -> Search:
+) -> Solution:
     """Pick the best end (the states are on the host); counts: of the starts that a state is for."""
     counts = np.ones(len(states.y), int) if counts is None else counts
-    parameters, r = problem.parameters, problem.residuals
-    count, first = len(parameters.names), parameters.first
-    scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
+    r, count = problem.residuals, len(problem.names)
     y = np.asarray(states.y)[:, :count]
     squares = 2 * np.asarray(states.cost, float)
-    values = from_scaled(np.asarray(y, float), scale, log)
+    values = problem.values_at(y)
     exact = EXACT[str(y.dtype)]
     converged = at_minimum(states)
     groups = _groups(squares, y, converged, exact)
@@ -282,20 +277,20 @@ def ends(
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
     # starts that did not converge have no minimum to tell, unless they are the best there is
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
-    seen, status = states.kept
+    predicted, status = states.kept
 
     def slopes(i: int) -> np.ndarray:
         return np.asarray(states.jacobian[i][: problem.measured.size, :count], float)
 
     rows = len(problem.measured) if problem.measured.ndim else None  # without what filled up
-    return Search(
+    return Solution(
         value=values[best],
         y=np.asarray(states.y)[best],
         entries=_all_entries(r, np.asarray(states.y)[best]),
-        scale=np.where(log, values[best], scale),
-        log=log,
+        scale=np.where(problem.log, values[best], problem.scale),
+        log=problem.log,
         jacobian=slopes(best),
-        seen=np.asarray(seen[best][:rows] if rows else seen[best], float),
+        predicted=np.asarray(predicted[best][:rows] if rows else predicted[best], float),
         status=status[best][:rows],
         converged=bool(converged[best]),
         at_bound=(y[best] <= low) | (y[best] >= high),
@@ -376,12 +371,12 @@ def _valleys(
         return np.zeros((0, states.y.shape[1]))
     known = np.asarray(states.jacobian[best], float)[:, :count]
     singular = np.linalg.svd(known, compute_uv=False)
-    alone = isinstance(residuals.observe, Shots) and len(residuals.measured) <= FEW
-    if not alone or not isinstance(residuals.region, Box) or singular[-1] <= FLAT * singular[0]:
+    cheap = isinstance(residuals.observe, Shots) and len(residuals.measured) <= FEW
+    in_box = isinstance(residuals.region, BoxRegion)
+    if not cheap or not in_box or singular[-1] <= FLAT * singular[0]:
         return np.zeros((0, states.y.shape[1]))
     low, high = (np.asarray(end, float)[:count] for end in (residuals.low, residuals.high))
-    log = np.asarray(residuals.log)[problem.parameters.first]
-    center = _own(problem)
+    log, center = problem.log, problem.point(problem.start)[:count]
     reach = np.where(log, np.log(SCAN_FACTOR), START_SCALES)
     held = []
     for i in np.flatnonzero(log | ~np.isfinite(low) | ~np.isfinite(high)):
@@ -427,25 +422,17 @@ def _turns(
     return [(float(squares[k]), where[k]) for k in np.flatnonzero(least & deep & new)]
 
 
-def _own(problem: FitProblem) -> np.ndarray:
-    """The law's own values (P,), scaled."""
-    first, r = problem.parameters.first, problem.residuals
-    return to_scaled(problem.start, np.asarray(r.scale, float)[first], np.asarray(r.log)[first])
-
-
 def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
-    parameters, r = problem.parameters, problem.residuals
-    first, own = parameters.first, _own(problem)
-    log = np.asarray(r.log)[first]
-    low, high = (np.array(end, float)[: len(own)] for end in (r.low, r.high))
+    count, log, r = len(problem.names), problem.log, problem.residuals
+    own = problem.point(problem.start)
+    low, high = (np.array(end, float)[:count] for end in (r.low, r.high))
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, own - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, own + reach), high)
-    elastic = [parameters.entry_fields[i] == "restitution" for i in first]
+    low = np.where(log | np.isinf(low), np.maximum(low, own[:count] - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own[:count] + reach), high)
+    elastic = [problem.parameters.field_of(i) == "restitution" for i in range(count)]
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
-    points = np.zeros((starts, len(r.low)))
-    share = rng.random((starts, len(own)))
-    points[:, : len(own)] = low + (high - low) * share
-    points[0, : len(own)] = own
+    points = np.zeros((starts, len(own)))
+    points[:, :count] = low + (high - low) * rng.random((starts, count))
+    points[0] = own
     return points

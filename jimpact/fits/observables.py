@@ -10,7 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_choice, check_values
 from jimpact.bodies.base import STANDARD_GRAVITY
-from jimpact.fits.problem import Seen, means_nothing
+from jimpact.fits.problem import Prediction, means_nothing
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.laws.histories import History, history
@@ -71,7 +71,7 @@ class Observations(eqx.Module):
             for row in self.rows
         )
 
-    def __call__(self, law: Law) -> Seen:
+    def __call__(self, law: Law) -> Prediction:
         """What would be seen of this law."""
         if any(row.quantity in _OF_FORCES for row in self.rows):
             samples = SAMPLES if any(row.sampled for row in self.rows) else 2
@@ -93,7 +93,7 @@ class Observations(eqx.Module):
         fails = means_nothing(status)
         shot = np.array([row.shot for row in self.rows])
         bad = fails[shot] | ~jnp.isfinite(values)
-        return Seen(values, bad, status[jnp.argmax(fails)][None])
+        return Prediction(values, bad, status[jnp.argmax(fails)][None])
 
     def _value(self, row: Observation, velocity: jax.Array, seen: History | None) -> jax.Array:
         k, j = row.shot, row.place

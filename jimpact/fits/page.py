@@ -8,14 +8,15 @@ from html import escape
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import equinox as eqx
 import numpy as np
 
 import jimpact
-from jimpact.fits.profiles import can_be_profiled, profile
-from jimpact.fits.report import parameter_rows, report_blocks, shot_rows
+from jimpact.fits.profiles import profile
+from jimpact.fits.report import parameter_rows, report_blocks, shot_rows, verdict
+from jimpact.fits.result import FitResult
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,11 +37,11 @@ _SHOTS = ("shot", "velocity", "before", "measured", "fitted", "residual", "unit"
 _PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 
 
-def write_page(fit: Any, path: Path, profiles: bool) -> Path:
+def write_page(fit: FitResult, path: Path, profiles: bool) -> Path:
     """Write `Fit.report`."""
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"Argument `path` must end in .html, but is '{path}'.")
-    if profiles and not fit.profiles and can_be_profiled(fit):
+    if profiles and not fit.profiles and fit.can_be_profiled:
         fit = replace(fit, profiles=profile(fit))
     text = page(fit)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,13 +49,13 @@ def write_page(fit: Any, path: Path, profiles: bool) -> Path:
     return path
 
 
-def page(fit: Any) -> str:
+def page(fit: FitResult) -> str:
     """The page as text."""
     blocks, kind = report_blocks(fit), "profile" if fit.profiles else "linearized"
     title = escape(blocks["headline"][0])
     parts = [
         f"<h1>{title}</h1>",
-        f'<p class="verdict">{escape(fit.verdict)}</p>',
+        f'<p class="verdict">{escape(verdict(fit))}</p>',
         "<h2>Parameters</h2>",
         _table((*_PARAMETERS, f"95 % interval, {kind}", ""), parameter_rows(fit)),
         _listed("What the data cannot see", fit.identifiability),
@@ -88,7 +89,7 @@ def _listed(title: str, lines: Sequence[str]) -> str:
     return f"<h2>{escape(title)}</h2>\n<ul>\n{items}\n</ul>"
 
 
-def _pictures(fit: Any) -> list[str]:
+def _pictures(fit: FitResult) -> list[str]:
     from jimpact import plot
 
     drawn = []
@@ -118,11 +119,10 @@ def _inline(title: str, figure: "Figure", vectors: bool) -> str:
     )
 
 
-def _made_by(fit: Any) -> list[list[str]]:
-    starts = sum(start.count for start in fit.starts) + fit.lost_starts
+def _made_by(fit: FitResult) -> list[list[str]]:
     rows = [
         ["law", eqx.tree_pformat(fit.law, short_arrays=False)],
-        ["solver", f"{fit.method}, loss {fit.loss}, {starts} starts, seed {fit.seed}"],
+        ["solver", f"{fit.method}, loss {fit.loss}, {fit.start_count} starts, seed {fit.seed}"],
         ["precision", str(fit.problem.residuals.offset.dtype)],
         ["jimpact", jimpact.__version__],
     ]

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole
-from jimpact.fits.fitting import Fit, check_squares
-from jimpact.fits.least_squares import Box
+from jimpact.fits.fitting import Fit
+from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.problem import FitProblem
+from jimpact.fits.result import check_squares
 from jimpact.fits.tables import needed
 from jimpact.montecarlo.distributions import Normal, Uniform
 
@@ -81,7 +82,7 @@ def posterior(
     each = _priors(problem, dict(priors or {}), numpyro.distributions)
 
     region = problem.residuals.region
-    inner = None if isinstance(region, Box) else _Inner(problem, region)
+    inner = None if isinstance(region, BoxRegion) else _Inner(problem, region)
 
     def model() -> None:
         if inner is None:

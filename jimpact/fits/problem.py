@@ -18,7 +18,7 @@ import numpy as np
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import quick_jit
 from jimpact.fits.experiments import Experiments
-from jimpact.fits.least_squares import Box, Method, Region, SolverState, advance, begin
+from jimpact.fits.least_squares import BoxRegion, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
@@ -43,7 +43,7 @@ PENALTY = 1e3  # times the largest measured value
 FEWEST, FEW = 4, 64
 
 
-class Seen(NamedTuple):
+class Prediction(NamedTuple):
     """What a law makes visible: values, where they mean nothing, and status codes (S,)."""
 
     value: jax.Array
@@ -58,11 +58,11 @@ class Shots(eqx.Module):
     pre: jax.Array  # (K, n), further columns where scenes were made alike
     bodies: int = eqx.field(static=True)
 
-    def __call__(self, law: Law) -> Seen:
+    def __call__(self, law: Law) -> Prediction:
         """Velocities after every shot, and the status of its impact."""
         out = jax.vmap(impact, in_axes=(None, 0, 0))(law, self.scenes, self.pre)
         bad = means_nothing(out.status)
-        return Seen(out.velocity[:, : self.bodies], bad[:, None], out.status)
+        return Prediction(out.velocity[:, : self.bodies], bad[:, None], out.status)
 
 
 def means_nothing(status: jax.Array) -> jax.Array:
@@ -76,13 +76,13 @@ class Observed(eqx.Module):
 
     function: Callable[[Law], Any] = eqx.field(static=True)
 
-    def __call__(self, law: Law) -> Seen:
+    def __call__(self, law: Law) -> Prediction:
         """What the function gives; NaN means nothing."""
         value = jnp.asarray(self.function(law))
-        return Seen(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
+        return Prediction(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
 
 
-Observable = Callable[[Law], Seen]
+Observable = Callable[[Law], Prediction]
 
 
 class Residuals(eqx.Module):
@@ -116,7 +116,7 @@ class Residuals(eqx.Module):
         values = jnp.where(self.log, exponential, scaled * self.scale)
         return with_entries(self.law, self.fields, values)
 
-    def residual(self, y: jax.Array) -> tuple[jax.Array, Seen]:
+    def residual(self, y: jax.Array) -> tuple[jax.Array, Prediction]:
         """Weighted residual (R,), and what the law makes visible."""
         seen = self.observe(self.law_at(y))
         bad = jnp.broadcast_to(seen.bad, self.measured.shape)
@@ -428,19 +428,26 @@ class FitProblem:
         )
         return replace(self, residuals=residuals, measured=measured, values=self.values - lost)
 
+    @property
+    def log(self) -> np.ndarray:
+        """(P,) whether a parameter is fitted in its logarithm."""
+        return np.asarray(self.residuals.log)[self.parameters.first]
+
+    @property
+    def scale(self) -> np.ndarray:
+        """(P,) the size of a change of order 1; 1 where fitted in the logarithm."""
+        return np.asarray(self.residuals.scale, float)[self.parameters.first]
+
     def point(self, values: np.ndarray) -> np.ndarray:
         """y (..., Q) of values (..., P), on the host."""
-        r, first = self.residuals, self.parameters.first
-        y = np.zeros((*values.shape[:-1], len(r.offset)))
-        scale = np.asarray(r.scale, float)[first]
-        y[..., : len(first)] = to_scaled(values, scale, np.asarray(r.log)[first])
+        y = np.zeros((*values.shape[:-1], len(self.residuals.offset)))
+        y[..., : len(self.names)] = to_scaled(values, self.scale, self.log)
         return y
 
     def values_at(self, y: np.ndarray) -> np.ndarray:
         """Values (..., P) of y (..., Q), on the host."""
-        r, first = self.residuals, self.parameters.first
-        scale, log = np.asarray(r.scale, float)[first], np.asarray(r.log)[first]
-        return from_scaled(y[..., : len(first)], scale, log)
+        y = np.asarray(y, float)
+        return from_scaled(y[..., : len(self.names)], self.scale, self.log)
 
     def _scaled(self, x: Any) -> jax.Array:
         """y (Q,) of x (P,)."""
@@ -497,7 +504,7 @@ def _build(
     host: dict[str, Any] = {name: np.asarray(array, dtype) for name, array in arrays.items()}
     residuals = Residuals(
         law=law,
-        region=region or Box(host["low"], host["high"]),
+        region=region or BoxRegion(host["low"], host["high"]),
         log=log,  # type: ignore[arg-type]
         observe=observe,
         fields=parameters.fields,

@@ -1,15 +1,12 @@
 """Does a parameter differ from shot to shot: a random effect, estimated next to the fit."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import chdtrc, stdtr
 
 from jimpact.files.records import with_error
-
-if TYPE_CHECKING:
-    from jimpact.fits.fitting import Fit
+from jimpact.fits.result import FitResult
 
 LEAST_SHOTS = 4  # of which the scatter of one number can be told at all
 SHOWN_FROM = 8  # shots from which a report tells it unasked
@@ -78,7 +75,7 @@ class Scatter:
         return 2 * float(stdtr(len(x) - 2, -abs(slope[1]) / error))
 
 
-def scatter(fit: "Fit", name: str | None = None) -> Scatter:
+def scatter(fit: FitResult, name: str | None = None) -> Scatter:
     """A parameter that each shot draws anew, and the standard errors that follow.
 
     Equation: `r_k = J_k (x - x_fit) + j_k b_k + noise`, `b_k ~ N(0, value^2)`, j_k the column of
@@ -142,12 +139,12 @@ def scatter(fit: "Fit", name: str | None = None) -> Scatter:
     )
 
 
-def shown_scatter(fit: Any) -> Scatter | None:
+def shown_scatter(fit: FitResult) -> Scatter | None:
     """The scatter that explains why a fit is worse than sigma allows; None where it does not."""
     stretched = fit.problem.sigma is not None and fit.noise > 1 and fit.loss == "squares"
     if not stretched or fit.experiments is None or not np.isfinite(fit.standard_error).all():
         return None
-    if np.isfinite(fit.problem.measured).any(axis=1).sum() < SHOWN_FROM:
+    if fit.shot_count < SHOWN_FROM:
         return None
     try:
         found = scatter(fit)
@@ -156,7 +153,7 @@ def shown_scatter(fit: Any) -> Scatter | None:
     return found if found.chance <= SURE else None
 
 
-def _which(fit: "Fit", name: str | None) -> int:
+def _which(fit: FitResult, name: str | None) -> int:
     if fit.experiments is None:
         raise ValueError("Argument `fit` must be of shots.")
     if name is None:
@@ -171,7 +168,7 @@ def _which(fit: "Fit", name: str | None) -> int:
     return i
 
 
-def _weighted(fit: "Fit") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _weighted(fit: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals (R,) in units of sigma, their derivatives (R, P), shots (R,)."""
     problem, here = fit.problem, ~np.isnan(fit.problem.measured)
     shot = np.broadcast_to(np.arange(len(here))[:, None], here.shape)[here]

@@ -11,12 +11,14 @@ from scipy.special import chdtrc, fdtrc, stdtr
 from jimpact._checks import check_choice, check_kind
 from jimpact.files.records import as_data, number, table
 from jimpact.fits.experiments import Experiments
-from jimpact.fits.fitting import Fit, check_squares, fit
+from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.many import leave_one_out
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.multistart import EXACT
+from jimpact.fits.parameters import default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
+from jimpact.fits.result import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.lzb import LZB
@@ -348,8 +350,6 @@ def _candidates(
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
     """What is free in a caller's law: as by default, and further parameters that it has."""
-    from jimpact.fits.parameters import default_free
-
     known = free_parameters_of(law)
     return dict.fromkeys((*default_free(known), *(name for name in more if name in known)), True)
 
@@ -433,8 +433,7 @@ def _against(found: Fit) -> tuple[str, str]:
 
 def _errors_left_out(found: Fit) -> np.ndarray:
     """Of every shot what the others predict wrongly, (K, n); NaN where there is none."""
-    shots = int(np.isfinite(found.problem.measured).any(axis=1).sum())
-    if shots < 2:
+    if found.shot_count < 2:
         return np.full(found.residual.shape, np.nan)
     if len(found.residual) <= FEW:
         return found.problem.measured - leave_one_out(found, progress=False).predicted

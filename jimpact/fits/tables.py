@@ -1,4 +1,4 @@
-"""A fit as tables of pandas and xarray, where they are installed."""
+"""A fit as data for other programs: JSON, and tables of pandas and xarray where installed."""
 
 import importlib
 from types import ModuleType
@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from jimpact.files.records import as_data
+from jimpact.fits.report import verdict
+from jimpact.fits.result import FitResult
 from jimpact.status import STATUS
 
 
@@ -17,7 +20,7 @@ def needed(module: str, how: str) -> ModuleType:
         raise ImportError(f"{module} must be installed for this, but is not: {how}.") from error
 
 
-def parameters_frame(fit: Any) -> Any:
+def parameters_frame(fit: FitResult) -> Any:
     """A row a parameter: value, standard error, the ends of its 95 % interval, at its bound."""
     interval = fit.confidence_interval()
     columns = {
@@ -31,7 +34,7 @@ def parameters_frame(fit: Any) -> Any:
     return needed("pandas", "pip install pandas").DataFrame(columns, index=index)
 
 
-def dataset(fit: Any) -> Any:
+def dataset(fit: FitResult) -> Any:
     """By parameter: values and covariance; by shot and body: before, measured, fitted, residual."""
     pair = ("parameter", "parameter_2")
     arrays: dict[str, Any] = {
@@ -55,5 +58,47 @@ def dataset(fit: Any) -> Any:
         ("residual", fit.residual),
     ):
         arrays[name] = (axes, values)
-    about = {"law": type(fit.law).__name__, "verdict": fit.verdict, "rms": fit.rms}
+    about = {"law": type(fit.law).__name__, "verdict": verdict(fit), "rms": fit.rms}
     return needed("xarray", "pip install xarray").Dataset(arrays, coordinates, about)
+
+
+def as_dict(fit: FitResult) -> dict[str, Any]:
+    """Plain numbers, strings and lists; not finite numbers become None."""
+    interval = fit.confidence_interval()
+    parameters = [
+        {
+            "name": name,
+            "value": as_data(fit.value[i]),
+            "standard_error": as_data(fit.standard_error[i]),
+            "confidence_interval_95": as_data(interval[i]),
+            "at_bound": bool(fit.at_bound[i]),
+            "seen": bool(not np.isinf(fit.standard_error[i])),
+            "profile_95": as_data(fit.profiles[i].intervals) if fit.profiles else None,
+        }
+        for i, name in enumerate(fit.names)
+    ]
+    starts = [
+        {"sum_of_squares": s.sum_of_squares, "value": as_data(s.value), "count": s.count}
+        for s in fit.starts
+    ]
+    return {
+        "law": type(fit.law).__name__,
+        "method": fit.method,
+        "parameters": parameters,
+        "rms": fit.rms,
+        "noise": as_data(fit.noise),
+        "degrees_of_freedom": fit.degrees_of_freedom,
+        "rank": fit.rank,
+        "identifiability": list(fit.identifiability),
+        "warnings": list(fit.warnings),
+        "verdict": verdict(fit),
+        "seed": fit.seed,
+        "converged": fit.converged,
+        "covariance": as_data(fit.covariance),
+        "correlation": as_data(fit.correlation),
+        "starts": starts,
+        "shots": [] if fit.experiments is None else list(fit.experiments.shots),
+        "predicted": as_data(fit.predicted),
+        "residual": as_data(fit.residual),
+        "status": [STATUS[code].name for code in fit.status],
+    }

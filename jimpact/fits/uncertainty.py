@@ -1,4 +1,4 @@
-"""Covariance, rank and what the data cannot see, from the Jacobian of weighted residuals."""
+"""Covariance, rank and what the data do not determine, from the Jacobian of weighted residuals."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,11 @@ import numpy as np
 # an impact are good to about 1e-7 (float64; 1e-4 in float32), so smaller ones may be errors.
 RANK_TOLERANCE = {"float64": 1e-6, "float32": 1e-3}
 
-# A parameter takes part in an unseen combination if its share of that direction exceeds this;
+# A parameter takes part in an undetermined combination if its share of that direction exceeds this;
 # shares of parameters that take no part are errors of the derivatives, about 1e-6.
 TAKES_PART = 1e-3
 
-SMALL_CHANGE = 0.01  # the size, in natural scales, in which unseen combinations are told
+SMALL_CHANGE = 0.01  # the size, in natural scales, in which undetermined combinations are stated
 
 
 class Uncertainty(NamedTuple):
@@ -25,7 +25,7 @@ class Uncertainty(NamedTuple):
     covariance: np.ndarray
     correlation: np.ndarray
     standard_error: np.ndarray
-    unseen: tuple[str, ...]
+    undetermined: tuple[str, ...]
 
 
 def uncertainty(
@@ -72,8 +72,8 @@ def uncertainty(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = covariance / np.outer(error, error)
     np.fill_diagonal(correlation, 1.0)
-    unseen = tuple(_in_words(names, row, scale, log, value_name) for row in _reduced(null))
-    return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, unseen)
+    undetermined = tuple(_in_words(names, row, scale, log, value_name) for row in _reduced(null))
+    return Uncertainty(rank, singular, freedom, noise, covariance, correlation, error, undetermined)
 
 
 def _reduced(null: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.fits.fitting import Fit, fit
-from jimpact.fits.problem import FitProblem, Seen
+from jimpact.fits.problem import FitProblem, Prediction
 from jimpact.law import Law
 from jimpact.motion.record import MOTION_STATUS, Motion
 from jimpact.motion.simulate import simulate
@@ -28,12 +28,12 @@ class Record(eqx.Module):
     arguments: dict[str, Any]
     observe: Observe = eqx.field(static=True)
 
-    def __call__(self, law: Law) -> Seen:
+    def __call__(self, law: Law) -> Prediction:
         """What is observed of the motion with this law, and the status of the motion."""
         motion = simulate(self.system, law, **self.arguments)
         value = self.observe(motion)
         bad = jnp.asarray(_FAILS)[motion.status] | ~jnp.isfinite(value)
-        return Seen(value, bad, motion.status[None])
+        return Prediction(value, bad, motion.status[None])
 
 
 def fit_motion(

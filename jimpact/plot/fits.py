@@ -11,7 +11,7 @@ from matplotlib.patches import Patch
 
 from jimpact._checks import check_kind
 from jimpact.fits.contours import Contour
-from jimpact.fits.fitting import Fit
+from jimpact.fits.result import FitResult
 from jimpact.plot.style import (
     COLOURS,
     GREY,
@@ -27,7 +27,7 @@ from jimpact.plot.style import (
 _LABELLED = 16  # shots up to which every one gets its label
 
 
-def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> Figure:
+def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: str = "") -> Figure:
     """Velocities after every shot, or what else was measured, and fitted, above the residuals.
 
     Error bars are sigma where the data state it, else the estimated noise. `others` are further
@@ -50,7 +50,7 @@ def fit(fit: Fit, others: Mapping[str, Fit] | None = None, title: str = "") -> F
     >>> len(figure.axes)
     2
     """
-    check_kind("fit", fit, Fit)
+    check_kind("fit", fit, FitResult)
     data, measured, predicted = (
         fit.experiments,
         *map(_in_rows, (fit.problem.measured, fit.predicted)),
@@ -133,14 +133,14 @@ def _in_rows(values: np.ndarray) -> np.ndarray:
     return values.reshape(len(values) if values.ndim else 1, -1)
 
 
-def _error_bars(fit: Fit) -> np.ndarray | None:
+def _error_bars(fit: FitResult) -> np.ndarray | None:
     shape = fit.predicted.shape
     if fit.problem.sigma is not None:
         return _in_rows(np.broadcast_to(np.asarray(fit.problem.sigma, float), shape))
     return _in_rows(np.full(shape, fit.noise)) if np.isfinite(fit.noise) else None
 
 
-def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
+def _shot_axis(axes: Axes, fit: FitResult, dodge: np.ndarray) -> None:
     """Bodies on the axis of a single shot; else shots, all labelled or every so many."""
     data, labels = fit.experiments, fit.problem.labels
     if data is not None and len(labels) == 1:
@@ -155,7 +155,9 @@ def _shot_axis(axes: Axes, fit: Fit, dodge: np.ndarray) -> None:
     axes.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def _legend(figure: Figure, fit: Fit, others: Mapping[str, Fit], has_bars: bool) -> None:
+def _legend(
+    figure: Figure, fit: FitResult, others: Mapping[str, FitResult], has_bars: bool
+) -> None:
     bars = "" if not has_bars else ", ± sigma" if fit.problem.sigma is not None else ", ± noise"
     plain: dict[str, Any] = {"ls": "none", "color": "black"}
     handles = [

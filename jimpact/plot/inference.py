@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from scipy.special import ndtri
 
 from jimpact._checks import check_kind
-from jimpact.fits.fitting import Fit
 from jimpact.fits.profiles import Profile
+from jimpact.fits.result import FitResult
 from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure, new_panels
 
 _TITLE = 45  # letters of a line of a panel's title
@@ -56,7 +56,7 @@ def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
     return figure
 
 
-def correlation(fit: Fit) -> Figure:
+def correlation(fit: FitResult) -> Figure:
     """Correlations of the parameters' errors; empty where the data cannot see one of them.
 
     Args:
@@ -74,7 +74,7 @@ def correlation(fit: Fit) -> Figure:
     >>> len(ji.plot.correlation(found).axes)
     2
     """
-    check_kind("fit", fit, Fit)
+    check_kind("fit", fit, FitResult)
     count = len(fit.names)
     figure = new_figure(float(np.clip(1.8 + 0.5 * count, 3.0, 7.2)))
     axes = figure.subplots()
@@ -92,7 +92,7 @@ def correlation(fit: Fit) -> Figure:
     return figure
 
 
-def residuals(fit: Fit) -> Figure:
+def residuals(fit: FitResult) -> Figure:
     """Measured against fitted; residuals in standard errors over the speed, and their quantiles.
 
     Without sigma the standard error is the estimated noise. What the law explains leaves no trend
@@ -113,7 +113,7 @@ def residuals(fit: Fit) -> Figure:
     >>> len(ji.plot.residuals(found).axes)
     3
     """
-    check_kind("fit", fit, Fit)
+    check_kind("fit", fit, FitResult)
     problem = fit.problem
     measured = np.asarray(problem.measured, float)
     here = ~np.isnan(measured)
@@ -151,7 +151,7 @@ def residuals(fit: Fit) -> Figure:
     return figure
 
 
-def _over(fit: Fit) -> tuple[np.ndarray, str]:
+def _over(fit: FitResult) -> tuple[np.ndarray, str]:
     """What residuals are put over: of shots the fastest approach (K, 1), else the fitted values."""
     data, scene = fit.experiments, fit.problem.scene
     if data is None:

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
-from jimpact.fits.least_squares import Box
+from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.multistart import run
 from jimpact.fits.problem import filled_up
-from jimpact.fits.profiles import Scaled, quantile
+from jimpact.fits.scaled import ScaledFit
 
 PAGE = Path(__file__).parents[2] / "docs" / "coverage.md"
 PAIR, BALLS = ji.chain([1.0, 2.0]), ji.chain([1.0, 1.0, 1.0])
@@ -164,22 +164,20 @@ def covered(row, fits):
     linear = np.array(
         [[any(a <= x <= b for a, b in p) for x, p in zip(truth, f.intervals())] for f in fits]
     )
-    filled, scaled = [filled_up(f.problem.residuals) for f in fits], [Scaled(f) for f in fits]
+    filled, scaled = [filled_up(f.problem.residuals) for f in fits], [ScaledFit(f) for f in fits]
     inside = []
     for i in range(len(truth)):
         y = np.array([s.best for s in scaled])
-        y[:, i] = [s.point(truth)[i] for s in scaled]
+        y[:, i] = [s.problem.point(truth)[i] for s in scaled]
         low, high = (np.array([getattr(s, end) for s in scaled]) for end in ("low", "high"))
         low[:, i] = high[:, i] = y[:, i]
         many = jax.tree.map(lambda *x: np.stack([np.asarray(each) for each in x]), *filled)
-        box = Box(low, high)
+        box = BoxRegion(low, high)
         many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (low, high, box))
         states = run(many, y, "levenberg-marquardt", 100, lambda *told: None, rivals=False)
         squares = 2 * np.asarray(states.cost) * np.array([s.size for s in scaled]) ** 2
-        deviance = [
-            (x - f.starts[0].sum_of_squares) / s.variance for x, f, s in zip(squares, fits, scaled)
-        ]
-        inside.append(np.array(deviance) <= [quantile(f, 0.95) ** 2 for f in fits])
+        deviance = np.array([s.deviance_of(x) for x, s in zip(squares, scaled)])
+        inside.append(deviance <= [f.quantile(0.95) ** 2 for f in fits])
     return linear.mean(axis=0), np.mean(inside, axis=1)
 
 

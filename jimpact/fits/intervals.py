@@ -1,0 +1,71 @@
+"""Confidence intervals: sets of one or several pieces, and the profiles they are read from."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
+
+    `deviance` is the sum of squares with the parameter held, less its least value, over the noise
+    variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
+    `domain` is none: the data do not bound the parameter there. `better`: values of a minimum below
+    that of the fit, or None.
+    """
+
+    name: str
+    value: np.ndarray
+    deviance: np.ndarray
+    limit: float
+    level: float
+    intervals: tuple[tuple[float, float], ...]
+    domain: tuple[float, float]
+    better: np.ndarray | None = None
+
+    @property
+    def words(self) -> str:
+        """The interval in words.
+
+        >>> import numpy as np
+        >>> from jimpact.fits.intervals import Profile
+        >>> given = ("e", np.zeros(1), np.zeros(1), 4.0, 0.95)
+        >>> Profile(*given, ((0.25, 0.5), (0.75, 1.0)), (0.0, 1.0)).words
+        '0.25 to 0.5 or at least 0.75'
+        """
+        return in_words(self.intervals, self.domain)
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.words} ({100 * self.level:g} %)"
+
+
+def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    """The same set in pieces apart from each other, in order.
+
+    >>> from jimpact.fits.intervals import joined
+    >>> joined([(3.0, 4.0), (0.0, 1.0), (0.5, 2.0)])
+    ((0.0, 2.0), (3.0, 4.0))
+    """
+    found: list[tuple[float, float]] = []
+    for low, high in sorted(pieces):
+        if found and low <= found[-1][1]:
+            found[-1] = (found[-1][0], max(high, found[-1][1]))
+        else:
+            found.append((float(low), float(high)))
+    return tuple(found)
+
+
+def in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
+    """Pieces of an interval; an end at the domain is none."""
+    return " or ".join(_piece(*ends, domain) for ends in pieces)
+
+
+def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
+    open_low, open_high = low <= domain[0], high >= domain[1]
+    if open_low and open_high:
+        return "anything"
+    if open_low or open_high:
+        return f"at most {high:.5g}" if open_low else f"at least {low:.5g}"
+    return f"{low:.5g} to {high:.5g}"

@@ -1,0 +1,195 @@
+"""What a fit stores, and its confidence intervals: below every module that reads a fit."""
+
+from dataclasses import dataclass
+from typing import Any, Generic
+
+import numpy as np
+from scipy.special import ndtri, stdtrit
+
+from jimpact._checks import check_kind
+from jimpact.fits.experiments import Experiments
+from jimpact.fits.intervals import Profile, joined
+from jimpact.fits.least_squares import BoxRegion
+from jimpact.fits.parameters import AnyLaw
+from jimpact.fits.problem import FitProblem
+
+# Relative standard error of a stiffness beyond which its linearized interval is not believed.
+HARDLY_SEEN = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class FitMinimum:
+    """A minimum that starts ended in: sum of squared (weighted) residuals, values, how many.
+
+    `standard_error` is None where it fits so much worse that it does not matter.
+    """
+
+    sum_of_squares: float
+    value: np.ndarray
+    count: int
+    standard_error: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FitResult(Generic[AnyLaw]):
+    """The result of `fit`. `print(fit)` gives its report.
+
+    P free parameters, K shots of n velocities.
+
+    Attributes:
+        law: with the fitted parameters.
+        method: of minimizing, see `fit`.
+        names: of the parameters, contacts numbered from 1.
+        value: (P,) in the units of each parameter, as the next two.
+        standard_error: (P,); inf where the data do not determine a parameter, NaN where no degree
+            of freedom is left to estimate the noise from.
+        covariance: (P, P).
+        correlation: (P, P), in [-1, 1].
+        bounds: lowest and highest values (P,), (P,).
+        at_bound: (P,) boolean.
+        predicted: shaped like what was measured, (K, n) [m/s].
+        residual: measured less predicted (K, n) [m/s]; NaN where nothing was measured.
+        rms: of the residual.
+        noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
+            where `sigma` was given, or, where chi^2 says that it is too small, by how much:
+            the standard errors are stretched by that.
+        degrees_of_freedom: independent measured values less `rank`.
+        rank: of the Jacobian; below P: see `identifiability`.
+        singular_values: (P,) of the scaled Jacobian.
+        identifiability: in words, what the data do not determine.
+        starts: the distinct minima, best first.
+        status: (K,) codes of `jimpact.STATUS` at the minimum.
+        converged: whether the best start did.
+        steps: iterations of the best start.
+        lost_starts: how many did not converge.
+        warnings: what is wrong with data or fit, in words.
+        problem: what was solved.
+        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where nothing
+            was measured.
+        loss: see `fit`.
+        seed: of the random starts.
+        profiles: where `fit` was asked for them.
+    """
+
+    law: AnyLaw
+    method: str
+    names: tuple[str, ...]
+    value: np.ndarray
+    standard_error: np.ndarray
+    covariance: np.ndarray
+    correlation: np.ndarray
+    bounds: tuple[np.ndarray, np.ndarray]
+    at_bound: np.ndarray
+    predicted: np.ndarray
+    residual: np.ndarray
+    rms: float
+    noise: float
+    degrees_of_freedom: int
+    rank: int
+    singular_values: np.ndarray
+    identifiability: tuple[str, ...]
+    starts: tuple[FitMinimum, ...]
+    status: np.ndarray
+    converged: bool
+    steps: int
+    lost_starts: int
+    warnings: tuple[str, ...]
+    problem: FitProblem
+    jacobian: np.ndarray
+    loss: str = "squares"
+    seed: int = 0
+    profiles: tuple[Profile, ...] = ()
+
+    @property
+    def experiments(self) -> Experiments | None:
+        """The shots; None where something else was fitted."""
+        return self.problem.experiments
+
+    @property
+    def shot_count(self) -> int:
+        """Shots (or rows of what was measured) with at least one value that was used."""
+        measured = np.isfinite(self.problem.measured)
+        return int(measured.any(axis=tuple(range(1, measured.ndim))).sum())
+
+    @property
+    def start_count(self) -> int:
+        """Starts, those that did not converge included."""
+        return sum(minimum.count for minimum in self.starts) + self.lost_starts
+
+    def intervals(self, level: float = 0.95) -> tuple[tuple[tuple[float, float], ...], ...]:
+        """The pieces, in order, of the confidence interval of each of the P parameters.
+
+        Those of `profiles`, if there are some of this level. Else linearized, cut at the bounds, a
+        piece for every minimum that fits well enough.
+
+        Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
+        freedom that are left, or of the normal law where `sigma` was given; of what is fitted in
+        its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum of squares
+        is higher by d, q^2 - d / noise^2 in place of q^2.
+        """
+        if self.profiles and self.profiles[0].level == level:
+            return tuple(profile.intervals for profile in self.profiles)
+        q = self.quantile(level)
+        return tuple(self.linearized_interval(i, q) for i in range(len(self.names)))
+
+    def confidence_interval(self, level: float = 0.95) -> np.ndarray:
+        """The outermost ends (P, 2) of `intervals` at a level in (0, 1)."""
+        return np.array([(pieces[0][0], pieces[-1][1]) for pieces in self.intervals(level)])
+
+    def quantile(self, level: float) -> float:
+        """Half-width of an interval of this `level` in standard errors."""
+        if not 0 < level < 1:
+            raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+        freedom, tail = self.degrees_of_freedom, 0.5 + 0.5 * level
+        noise_is_known = self.problem.sigma is not None or freedom < 1
+        return float(ndtri(tail) if noise_is_known else stdtrit(freedom, tail))
+
+    def linearized_interval(self, i: int, q: float) -> tuple[tuple[float, float], ...]:
+        """Where parabolas at all minima let parameter `i` lie within `q` standard errors."""
+        low, high = self.bounds[0][i], self.bounds[1][i]
+        minima = [(self.value[i], self.standard_error[i], 0.0)]
+        for minimum in self.starts[1:]:
+            if minimum.standard_error is not None:
+                more = minimum.sum_of_squares - self.starts[0].sum_of_squares
+                minima.append((minimum.value[i], minimum.standard_error[i], more))
+        pieces: list[tuple[float, float]] = []
+        for value, error, more in minima:
+            if pieces and not more < (q * self.noise) ** 2:
+                continue
+            half = error * np.sqrt(q**2 - (more / self.noise**2 if more else 0.0))
+            if self.problem.log[i]:
+                ends = value * np.exp(np.array([-half, half]) / value)
+            else:
+                ends = np.array([value - half, value + half])
+            pieces.append(tuple(np.clip(ends, low, high)))
+        return joined(pieces)
+
+    @property
+    def can_be_profiled(self) -> bool:
+        """Whether parameters can be held: least squares in a box, not of an admissible matrix."""
+        return self.loss == "squares" and isinstance(self.problem.residuals.region, BoxRegion)
+
+    @property
+    def linearization_misleads(self) -> bool:
+        """Whether standard errors may mislead and profiles, which this fit lacks, would tell."""
+        if self.profiles or not self.can_be_profiled or not self.converged:
+            return False
+        if self.rank < len(self.names):
+            return True
+        if not np.isfinite(self.noise):
+            return False  # nothing says how far a value may be off
+        q = self.quantile(0.95)
+        for i in range(len(self.names)):
+            pieces = self.linearized_interval(i, q)
+            at_end = pieces[0][0] <= self.bounds[0][i] or pieces[-1][1] >= self.bounds[1][i]
+            wide = self.problem.log[i] and self.standard_error[i] > HARDLY_SEEN * self.value[i]
+            if len(pieces) > 1 or at_end or wide:
+                return True
+        return False
+
+
+def check_squares(name: str, fit: Any) -> None:
+    """Raise an error unless argument `name` is a fit by least squares."""
+    check_kind(name, fit, FitResult)
+    if fit.loss != "squares":
+        raise ValueError(f"Argument `{name}` must be by least squares, but has loss {fit.loss!r}.")

@@ -1,0 +1,113 @@
+"""Warnings that decide whether to trust a fit: defects of the data, of the law, of the search."""
+
+import numpy as np
+
+from jimpact.fits.adequacy import adequacy
+from jimpact.fits.defects import data_defects
+from jimpact.fits.matrix_fit import boundary, encloses
+from jimpact.fits.multistart import EXACT, Solution
+from jimpact.fits.problem import FitProblem
+from jimpact.fits.uncertainty import Uncertainty
+from jimpact.laws.kinematic import RestitutionMatrix
+from jimpact.status import STATUS
+
+# Minima whose sums of squares differ by less than this many noise variances fit equally well:
+# the difference is what moving by one standard error costs.
+EQUALLY_GOOD = 1.0
+
+
+def fit_warnings(
+    problem: FitProblem, solution: Solution, errors: Uncertainty, robust: bool
+) -> list[str]:
+    """All warnings, those about the data first."""
+    lines, data = list(problem.left_out), problem.experiments
+    if data is not None:
+        contacts = data.largest_scene(problem.scene).contacts
+        stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
+        lines += data_defects(data, problem.scene, stored)
+    if not solution.converged:
+        lines.append(
+            "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
+            "a kink of the law, where the sequence of contacts changes)."
+        )
+    if data is not None:
+        lines += _statuses(solution.status, data.shots)
+        lines += _matrix(problem, solution, contacts)
+    lines += _no_numbers(problem, solution)
+    lines += adequacy(problem, solution, errors.rank, robust)
+    if data is not None and problem.sigma is None and len(set(data.units)) > 1:
+        lines.append(
+            "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
+        )
+    names = problem.names
+    for i in np.flatnonzero(solution.at_bound):
+        lines.append(
+            f"{names[i]} ends at its bound {solution.value[i]:g}: its error holds for one side."
+        )
+    if errors.rank < len(names):
+        lines.append(
+            f"The data determine {errors.rank} of {len(names)} parameters (rank "
+            f"{errors.rank} of {len(names)}); the values given are one choice of many."
+        )
+    elif (several := _equally_good(problem, solution, errors)) > 1:
+        lines.append(f"{several} different minima fit equally well: see the starts.")
+    if errors.degrees_of_freedom < 1 and problem.sigma is None:
+        lines.append(
+            "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
+        )
+    if problem.residuals.offset.dtype == np.float32:
+        lines.append(
+            "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
+            'jax.config.update("jax_enable_x64", True) gives float64.'
+        )
+    return lines
+
+
+def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
+    lines = []
+    for code in np.unique(status):
+        if STATUS[code].failure:
+            at = ", ".join(shots[k] for k in np.flatnonzero(status == code)[:6])
+            count = int(np.sum(status == code))
+            lines.append(
+                f"The fitted law fails in {count} of {len(shots)} shots ({at}): "
+                f"{STATUS[code].name}, {STATUS[code].message}."
+            )
+    return lines
+
+
+def _no_numbers(problem: FitProblem, solution: Solution) -> list[str]:
+    """Where what the user's own function gives is no number at the parameters solution."""
+    if problem.experiments is not None:
+        return []
+    lost = np.flatnonzero(np.isfinite(problem.measured) & ~np.isfinite(solution.predicted))
+    if not len(lost):
+        return []
+    which = ", ".join(str(i + 1) for i in lost[:6]) + ", .." * (len(lost) > 6)
+    return [
+        f"The fitted law fails in {len(lost)} of {problem.values} values ({which}): what is "
+        "observed is no number there, and counts as a large error."
+    ]
+
+
+def _matrix(problem: FitProblem, solution: Solution, contacts: int) -> list[str]:
+    """Where the conditions on a restitution matrix hold it back, or are not asked for."""
+    edges = boundary(problem.residuals.region, solution.entries)
+    if edges:
+        return [
+            f"The matrix ends at the edge of the admissible ones ({'; '.join(edges)}): the errors "
+            "hold for the side inside."
+        ]
+    if isinstance(problem.law, RestitutionMatrix) and not encloses(problem.law, contacts):
+        return [
+            "Nothing keeps this matrix consistent for other approach velocities than the measured: "
+            "the conditions are for (m, m) matrices with admissible=True."
+        ]
+    return []
+
+
+def _equally_good(problem: FitProblem, solution: Solution, errors: Uncertainty) -> int:
+    size, dtype = float(problem.residuals.size), str(problem.residuals.offset.dtype)
+    noise = errors.noise / size if np.isfinite(errors.noise) else 0.0
+    more = max(EQUALLY_GOOD * noise**2, EXACT[dtype])
+    return sum(end.squares <= solution.minima[0].squares + more for end in solution.minima)
