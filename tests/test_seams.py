@@ -9,7 +9,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.contact import coupled_groups
-from jimpact.scene import filled_up
+from jimpact.scene import pad_scene
 from jimpact.status import CODE
 
 FOUR = ji.chain(np.ones(4))
@@ -167,17 +167,17 @@ def test_groups_are_judged_on_the_scale_of_their_impact():
 
 
 @pytest.mark.parametrize("wall", [False, "left", "right"])
-def test_a_chain_filled_up_contains_itself(wall):
+def test_a_padded_chain_contains_itself(wall):
     """Its masses, gaps and parameters are at its own places; what is added is open."""
     masses = [1.0, 2.0, 5.0]
     chain = ji.chain(masses, wall=wall, gaps=np.linspace(0.0, 0.2, 2 + bool(wall)))
-    filled = filled_up(chain, 8)
-    np.testing.assert_array_equal(filled.scene.mass[filled.coordinates], masses)
-    np.testing.assert_array_equal(filled.scene.gaps[filled.contacts], chain.gaps)
-    np.testing.assert_array_equal(filled.copied[filled.contacts], np.arange(chain.contacts))
-    whole = np.asarray(filled.scene.normals)[filled.coordinates, filled.contacts]
+    padded = pad_scene(chain, 8)
+    np.testing.assert_array_equal(padded.scene.mass[padded.coordinates], masses)
+    np.testing.assert_array_equal(padded.scene.gaps[padded.contacts], chain.gaps)
+    np.testing.assert_array_equal(padded.copied[padded.contacts], np.arange(chain.contacts))
+    whole = np.asarray(padded.scene.normals)[padded.coordinates, padded.contacts]
     np.testing.assert_array_equal(whole, chain.normals)
-    assert (np.delete(filled.scene.gaps, np.r_[: filled.scene.contacts][filled.contacts]) > 0).all()
+    assert (np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts]) > 0).all()
 
 
 @pytest.mark.slow
