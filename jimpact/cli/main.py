@@ -110,7 +110,7 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", UserWarning)
-            warnings.showwarning = call.warn
+            warnings.showwarning = call.warn  # type: ignore[assignment]
             return run_command(call, arguments)
     except BrokenPipeError:
         raise
