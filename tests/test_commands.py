@@ -582,7 +582,9 @@ def test_the_notebook_of_a_new_study_runs(tmp_path, capsys, kind):
     assert call(capsys, "new", kind, ".")[0] == 0
     place = {"metadata": {"path": str(tmp_path)}}
     notebook = nbformat.read(tmp_path / "study.ipynb", as_version=4)
-    nbclient.NotebookClient(notebook, timeout=None, kernel_name="python3", resources=place).execute()
+    nbclient.NotebookClient(
+        notebook, timeout=None, kernel_name="python3", resources=place
+    ).execute()
 
 
 def test_laws(capsys, tmp_path, monkeypatch):
