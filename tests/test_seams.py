@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.contact import coupled_groups
-from jimpact.scene import filled_up
+from jimpact.contact import contact_of, coupled_groups
+from jimpact.scene import pad_scene
 from jimpact.status import CODE
 
 FOUR = ji.chain(np.ones(4))
@@ -150,6 +150,17 @@ def test_contacts_that_do_not_feel_each_other_are_solved_apart():
     np.testing.assert_allclose(apart.impulse, whole.impulse, atol=1e-14)
 
 
+def test_open_contacts_in_space_have_no_slip():
+    """Contact-major rows, two for each contact: the first contact is open, the second closed."""
+    rng = np.random.default_rng(2)
+    normals, tangents, v = rng.normal(size=(4, 2)), rng.normal(size=(4, 4)), rng.normal(size=4)
+    scene = ji.Scene(np.ones(4), normals, tangents=tangents, gaps=[0.1, 0.0])
+    block = contact_of(scene, jnp.asarray(v)).tangential_block
+    np.testing.assert_allclose(block.slip, [0.0, 0.0, *(tangents[:, 2:].T @ v)], atol=1e-15)
+    np.testing.assert_allclose(block.normal_tangent[0], 0.0)
+    np.testing.assert_allclose(block.normal_tangent[1, 2:], normals[:, 1] @ tangents[:, 2:])
+
+
 class Gains(ji.Law):
     """gamma+ = -1.001 gamma-: a thousandth more energy than before."""
 
@@ -167,17 +178,17 @@ def test_groups_are_judged_on_the_scale_of_their_impact():
 
 
 @pytest.mark.parametrize("wall", [False, "left", "right"])
-def test_a_chain_filled_up_contains_itself(wall):
+def test_a_padded_chain_contains_itself(wall):
     """Its masses, gaps and parameters are at its own places; what is added is open."""
     masses = [1.0, 2.0, 5.0]
     chain = ji.chain(masses, wall=wall, gaps=np.linspace(0.0, 0.2, 2 + bool(wall)))
-    filled = filled_up(chain, 8)
-    np.testing.assert_array_equal(filled.scene.mass[filled.coordinates], masses)
-    np.testing.assert_array_equal(filled.scene.gaps[filled.contacts], chain.gaps)
-    np.testing.assert_array_equal(filled.copied[filled.contacts], np.arange(chain.contacts))
-    whole = np.asarray(filled.scene.normals)[filled.coordinates, filled.contacts]
+    padded = pad_scene(chain, 8)
+    np.testing.assert_array_equal(padded.scene.mass[padded.coordinates], masses)
+    np.testing.assert_array_equal(padded.scene.gaps[padded.contacts], chain.gaps)
+    np.testing.assert_array_equal(padded.copied[padded.contacts], np.arange(chain.contacts))
+    whole = np.asarray(padded.scene.normals)[padded.coordinates, padded.contacts]
     np.testing.assert_array_equal(whole, chain.normals)
-    assert (np.delete(filled.scene.gaps, np.r_[: filled.scene.contacts][filled.contacts]) > 0).all()
+    assert (np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts]) > 0).all()
 
 
 @pytest.mark.slow
