@@ -58,7 +58,7 @@ def test_turning_keeps_its_unit(tmp_path):
 
 
 def test_missing_values_labels_and_foreign_line_ends(tmp_path):
-    text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\nNaN,1,,2,0\r\n"
+    text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\n,1,,2,0\r\n"
     data = ji.read_experiments(written(tmp_path, text))
     np.testing.assert_array_equal(data.pre, [[2, 0], [2, 0]])
     np.testing.assert_array_equal(data.post, [[1, np.nan], [1, np.nan]])
@@ -93,6 +93,8 @@ HEAD = "pre_1[m/s],post_1[m/s]\n"
         ("pre_1[m/s],pre_1[m/s],post_1[m/s]\n1,1,1\n", r"column `pre_1\[m/s\]` must occur once"),
         (HEAD + "1,0.5\n2,fast\n", r"line 3, column `post_1\[m/s\]`: the value must be a number, but is 'fast'"),
         (HEAD + "1,inf\n", r"line 2, column `post_1\[m/s\]`: the value must be finite, but is 'inf'"),
+        (HEAD + "1,NaN\n", r"column `post_1.*finite, but is 'NaN'; leave the cell empty where nothing was"),
+        (HEAD + "nan,1\n", r"column `pre_1.*must be finite, but is 'nan'\.$"),
         (HEAD + ",1\n", r"column `pre_1\[m/s\]`: a velocity before the impact must be given"),
         (HEAD + "1,1,1\n", r"line 2: a shot must have 2 values, one per column, but has 3"),
         ("pre_1[m/s],post_1[m/s],sigma_1[cm/s]\n1,1,0\n", r"line 2, column `sigma_1\[cm/s\]`: .* must be > 0, but is 0"),
@@ -304,6 +306,21 @@ def test_the_cube():
         ValueError, match=r"`contacts` in \[data\] must be one of 1, 2, 4, but is 3"
     ):
         ji.cube_impacts(3)
+
+
+def test_a_correction_that_leaves_out_errors_before_is_reported():
+    data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.72], [0.6, 1.4]], 0.05, sigma_pre=0.05)
+    scene, line = ji.chain([1.0, 1.0]), "corrected as if `sigma_pre` were 0"
+    corrected = ji.fit(ji.Newton(0.5), scene, data.momentum_corrected(scene), starts=1)
+    assert any(line in warning for warning in corrected.warnings)
+    plain = ji.fit(ji.Newton(0.5), scene, data, starts=1)
+    assert not any(line in warning for warning in plain.warnings)
+
+
+def test_a_report_counts_what_was_not_measured():
+    data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, np.nan], [0.6, 1.4]])
+    fit = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data, starts=1)
+    assert "2 shots of 2 bodies (3 of 4 velocities measured)" in str(fit)
 
 
 def test_a_fit_passes_errors_on_by_the_law_it_finds():

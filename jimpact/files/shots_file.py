@@ -210,12 +210,12 @@ def _check_columns(where: str, columns: list[Column]) -> dict[str, int]:
 
 
 def _number(where: str, column: Column, cell: str) -> float:
-    if cell == "" or cell.lower() == "nan":
+    if cell == "":
         if column.kind in ("pre", "mass", "gap", "t"):
             what = "a velocity before the impact" if column.kind == "pre" else "this"
             raise ValueError(
-                f"{where}: {what} must be given, but the cell is "
-                f"{cell!r}; only `post` may be left empty (not measured)."
+                f"{where}: {what} must be given, but the cell is empty; "
+                "only `post` may be left empty (not measured)."
             )
         return np.nan
     try:
@@ -225,7 +225,10 @@ def _number(where: str, column: Column, cell: str) -> float:
             f"{where}: the value must be a number, but is {cell!r} ({_HOW})."
         ) from None
     if not np.isfinite(number):
-        raise ValueError(f"{where}: the value must be finite, but is {cell!r}.")
+        advice = ""
+        if np.isnan(number) and column.kind in ("post", "q"):
+            advice = "; leave the cell empty where nothing was measured"
+        raise ValueError(f"{where}: the value must be finite, but is {cell!r}{advice}.")
     return number * column.factor
 
 
