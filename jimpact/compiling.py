@@ -1,4 +1,4 @@
-"""How the library compiles the programs that it owns: soon done, a few percent slower."""
+"""How the library compiles its programs: compiled faster, run a few percent slower."""
 
 import functools
 from collections.abc import Callable, Iterator
@@ -44,51 +44,58 @@ def known_options() -> dict[str, Any]:
 
 
 @functools.cache
-def _asks() -> Callable[..., Any]:
+def _probe() -> Callable[..., Any]:
+    """A program that does nothing, with compiler options: JAX refuses them inside another one."""
     return jax.jit(lambda *x: x, compiler_options=known_options())
 
 
-def is_own(args: Any) -> bool:
-    """Whether what is called with these is a program of its own, now: JAX itself is asked.
+def is_top_level_call(*args: Any) -> bool:
+    """Whether a program called with these arguments now is compiled and run by itself.
 
-    JAX refuses options of a program that becomes part of another one: under jit, in loops, and in
-    reverse mode. Forward mode and vmap run it at once.
+    It is not where it becomes part of another program: under jit, in loops, in reverse mode.
+    Forward mode and vmap run it at once. JAX has no public question for it, but it refuses
+    compiler options (ValueError) of a program that becomes part of another one: a probe that does
+    nothing is called with those of the arguments that are traced.
     """
     traced = [x for x in jax.tree.leaves(args) if isinstance(x, jax.core.Tracer)]
     try:
-        _asks()(*traced)
+        _probe()(*traced)
     except ValueError:
         return False
     return True
 
 
 def quick_jit(function: Function) -> Function:
-    """`eqx.filter_jit(function)`, compiled quickly where it is a program of its own."""
+    """`eqx.filter_jit(function)`, compiled quickly where it is called at top level."""
     inside = eqx.filter_jit(function)
 
     @functools.cache
-    def own(whole: bool = False) -> Callable[..., Any]:
+    def program(stored: bool) -> Callable[..., Any]:
+        """The compiled function of (structure, other leaves), arrays."""
+
         def of_arrays(rest: Any, arrays: list[Any]) -> Any:
+            """`function` of its arguments taken apart."""
             tree, fixed = rest
             values = iter(arrays)
             leaves = [next(values) if x is None else x[0] for x in fixed]
-            args, given = jax.tree.unflatten(tree, leaves)
-            return function(*args, **given)
+            args, keywords = jax.tree.unflatten(tree, leaves)
+            return function(*args, **keywords)
 
         # JAX's cache goes by names, too, and must not hand out what a runner stores.
-        of_arrays.__name__ = f"whole_{function.__name__}" if whole else function.__name__
+        of_arrays.__name__ = f"whole_{function.__name__}" if stored else function.__name__
         return jax.jit(of_arrays, static_argnums=0, compiler_options=known_options())
 
     @functools.wraps(function)
-    def call(*args: Any, **given: Any) -> Any:
-        if not is_own((args, given)):
-            return inside(*args, **given)
-        leaves, tree = jax.tree.flatten((args, given))
+    def call(*args: Any, **keywords: Any) -> Any:
+        """`function`, compiled by itself or as part of the program that calls it."""
+        if not is_top_level_call(args, keywords):
+            return inside(*args, **keywords)
+        leaves, tree = jax.tree.flatten((args, keywords))
         fixed = tree, tuple(None if eqx.is_array(x) else (x,) for x in leaves)
         arrays = [x for x in leaves if eqx.is_array(x)]
         runner = _runner.get()
         if runner is None or any(isinstance(x, jax.core.Tracer) for x in arrays):
-            return own()(fixed, arrays)
-        return runner(own(whole=True), call, fixed, arrays)
+            return program(False)(fixed, arrays)
+        return runner(program(True), call, fixed, arrays)
 
     return call  # type: ignore[return-value]

@@ -9,19 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import check_kind, check_values, in_common_dtype, is_traced
-from jimpact.compiling import is_own, quick_jit
+from jimpact.compiling import is_top_level_call, quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
-from jimpact.law import Impulses, Law, check_law, is_separable, of_contacts, within_domains
-from jimpact.scene import Scene, as_velocity, filled_up, momentum, velocity_change
+from jimpact.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
+from jimpact.scene import Scene, as_velocity, momentum, pad_scene, velocity_change
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import CODE, STATUS, raise_for, sign_tolerance
 
-# Impulses up to this many times what would undo the noise of gamma- are rounding: up to twice the
-# noise is asked for, and contacts that feel each other pass it on a few times.
+# Negative impulses are rounding up to this many times the impulse that would undo the noise of
+# gamma-: a law removes up to twice the noise, and coupled contacts pass it on a few times. Ten
+# times more would hide a contact that pulls slightly.
 ROUNDING_PUSHES = 8
 
-# Contacts of the program that single impacts of fewer ones share. Compiling takes a second for each
-# number of contacts; contacts that are open cost a tenth of the impact.
+# Number of contacts of the program that single impacts of fewer contacts share. Compiling takes a
+# second for each number of contacts; padding by open contacts costs a tenth of the impact. Ten
+# times more would make every first impact slow.
 SHARED = 8
 
 
@@ -50,7 +52,7 @@ def impact(
 
     Contacts that no coordinate joins (two pairs of balls in one scene) are solved apart where the
     scene is known, not traced, and the law allows it (`Law.separable`); the outcome is the same.
-    Approach within the rounding of v- (or within `noise`) is none.
+    Approach within the rounding of v- (or within `noise`) counts as 0.
 
     Args:
         law: its parameters are scalars or have one entry per contact.
@@ -58,15 +60,15 @@ def impact(
         velocity: v- (n,) [m/s].
         noise: gap velocities () up to which are rounding, too [m/s]: in a motion v- holds the
             rounding of its largest speeds. None: of v- only.
-        approach: gap velocity () that the law is shown contacts to approach with beyond that of v-
-            [m/s]: a small one starts an impact without collision. None: 0.
+        approach: speed () by which all contacts approach faster for the law than v- says [m/s]: a
+            small one starts an impact without collision. None: 0.
 
     Returns:
         `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
         `initial_energy` (), `status` () int32, 0 = ok (`raise_on_failure`, `jimpact.STATUS`).
 
     Raises:
-        ValueError: shapes or ranges, on the host; inside jit only the status speaks. NaN in a
+        ValueError: shapes or ranges, on the host; inside jit the status reports them. NaN in a
             velocity raises when concrete, and is `not_finite` when traced.
 
     >>> import jimpact as ji
@@ -83,50 +85,50 @@ def impact(
     check_law(law, scene, v.dtype)
     check_values("noise", noise, low=0.0)
     check_values("approach", approach, low=0.0)
-    noise = None if noise is None else jnp.asarray(noise, v.dtype)
-    approach = None if approach is None else jnp.asarray(approach, v.dtype)
-    shown = noise, approach
+    offsets = _Offsets(
+        None if noise is None else jnp.asarray(noise, v.dtype),
+        None if approach is None else jnp.asarray(approach, v.dtype),
+    )
     separable = is_separable(law)
     groups = coupled_groups(scene) if separable else None
     few = scene.contacts <= SHARED and scene.walls != (True, True) and scene.tangents is None
-    alike = few and groups is None and separable and law.fills_up
-    if alike and not is_traced((law, scene, v, shown)) and is_own(()):
-        return _filled_up(law, scene, v, shown)
-    out = _impact(law, scene, v, groups, shown)
-    return _held(law, out) if is_traced(law) else out  # else the law was checked when it was made
+    pads = few and groups is None and separable and law.pads_scenes
+    if pads and not is_traced((law, scene, v, offsets)) and is_top_level_call():
+        return _impact_of_padded_scene(law, scene, v, offsets)
+    out = _impact(law, scene, v, groups, offsets)
+    # where its parameters are numbers they were checked when the law was made
+    return _flag_out_of_range(law, out) if is_traced(law) else out
 
 
-def _held(law: Law, out: Impact) -> Impact:
-    """The outcome, told as `out_of_range` where a parameter is outside its domain."""
-    told = jnp.maximum(out.status, CODE["out_of_range"])
-    return dataclasses.replace(out, status=jnp.where(within_domains(law), out.status, told))
+def _flag_out_of_range(law: Law, out: Impact) -> Impact:
+    """The outcome with the status `out_of_range` where a parameter is outside its domain."""
+    flagged = jnp.maximum(out.status, CODE["out_of_range"])
+    return dataclasses.replace(out, status=jnp.where(within_domains(law), out.status, flagged))
 
 
-# `noise` and `approach` of an impact.
-_Shown = tuple[jax.Array | None, jax.Array | None]
+class _Offsets(NamedTuple):
+    """`noise` and `approach` of `impact` [m/s]."""
+
+    noise: jax.Array | None
+    approach: jax.Array | None
+
+    def applied(self, contact: Contact) -> Contact:
+        """The contacts without gap velocities within the noise, and with the added approach."""
+        contact = contact if self.noise is None else contact.within(self.noise)
+        return contact if self.approach is None else contact.approaching(self.approach)
 
 
-def _seen(contact: Contact, shown: _Shown) -> Contact:
-    """The contacts without what is noise, and with the approach that they lack."""
-    noise, approach = shown
-    contact = contact if noise is None else contact.within(noise)
-    return contact if approach is None else contact.approaching(approach)
-
-
-def _filled_up(law: Law, scene: Scene, v: jax.Array, shown: _Shown) -> Impact:
-    """The impact by the program for SHARED contacts, only some of which are closed."""
-    filled = filled_up(scene, SHARED)
-    velocity: Any = np.zeros(filled.scene.size, v.dtype)
-    velocity[filled.coordinates] = v
-    on_host = of_contacts(jax.tree.map(np.asarray, law), filled.copied)
-    out = _impact(on_host, filled.scene, velocity, None, shown)
-    return Impact(
-        jnp.asarray(np.asarray(out.velocity)[filled.coordinates]),
-        jnp.asarray(np.asarray(out.impulse)[filled.contacts]),
-        out.tangential_impulse,
-        out.energy_change,
-        out.initial_energy,
-        out.status,
+def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> Impact:
+    """The impact by the program for SHARED contacts: those that are added are open."""
+    padded = pad_scene(scene, SHARED)
+    velocity: Any = np.zeros(padded.scene.size, v.dtype)
+    velocity[padded.coordinates] = v
+    on_host = restrict_law(jax.tree.map(np.asarray, law), padded.copied)
+    out = _impact(on_host, padded.scene, velocity, None, offsets)
+    return dataclasses.replace(
+        out,
+        velocity=jnp.asarray(np.asarray(out.velocity)[padded.coordinates]),
+        impulse=jnp.asarray(np.asarray(out.impulse)[padded.contacts]),
     )
 
 
@@ -146,14 +148,17 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
 
 
 @quick_jit
-def _impact(law: Law, scene: Scene, v: jax.Array, groups: Groups | None, shown: _Shown) -> Impact:
+def _impact(
+    law: Law, scene: Scene, v: jax.Array, groups: Groups | None, offsets: _Offsets
+) -> Impact:
+    """The outcome from the law's impulses: velocities, energy and status."""
     if groups is None:
-        contact = _seen(law.contact(scene, v), shown)
+        contact = offsets.applied(law.contact(scene, v))
         happens = contact.happens
         outcome = _resolved(law, contact, happens)
         stored = contact.stored
     else:
-        outcome, happens, stored = _in_groups(law, scene, v, groups, shown)
+        outcome, happens, stored = _in_groups(law, scene, v, groups, offsets)
     p, tangential = outcome.normal, outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
@@ -179,27 +184,25 @@ class _Resolved(NamedTuple):
 
 
 def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
-    """The law's answer; nothing where nothing happens, nor at open contacts."""
+    """The law's impulses; none where nothing happens, nor at open contacts."""
     gamma = contact.gap_velocity
-    # where nothing happens the law sees a harmless approach, so its gradients stay finite
+    # where nothing happens the law gets a harmless approach, so its gradients stay finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
-    shown = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
-    answer = Impulses(*law.impulses(shown))
+    impulses = Impulses(*law.impulses(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)))
     part = happens & (contact.closed | law.uses_gaps)
-    p = jnp.where(part, answer.normal, 0.0)
-    sides = 0 if contact.slip is None else contact.slip.shape[0]
-    tangential = jnp.zeros(sides, p.dtype)
-    if answer.tangential is not None:
+    p = jnp.where(part, impulses.normal, 0.0)
+    tangential = jnp.zeros(contact.tangents * contact.contacts, p.dtype)
+    if impulses.tangential is not None:
         rows = jnp.repeat(part, contact.tangents)
-        tangential = jnp.where(rows, answer.tangential, 0.0)
-    code = jnp.maximum(answer.status, _signs(contact, p, tangential))
+        tangential = jnp.where(rows, impulses.tangential, 0.0)
+    code = jnp.maximum(impulses.status, _signs(contact, p, tangential))
     code = jnp.where(happens, code, CODE["ok"])
     noise = jnp.sum(contact.noise * jnp.abs(p))
     return _Resolved(p, tangential, code, contact.size, noise)
 
 
 def _in_groups(
-    law: Law, scene: Scene, v: jax.Array, groups: Groups, shown: _Shown
+    law: Law, scene: Scene, v: jax.Array, groups: Groups, offsets: _Offsets
 ) -> tuple[_Resolved, jax.Array, jax.Array]:
     """All groups solved side by side; whether anything happens, and the stored energy (m,).
 
@@ -208,34 +211,34 @@ def _in_groups(
     """
     m = scene.contacts
     stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
-    of_groups = contacts_of_groups(scene, v, stored, groups)
-    all_contacts = [_seen(contact, shown) for contact in of_groups]
-    own = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in all_contacts]
-    happens = jnp.any(jnp.concatenate(own))
+    batches = [offsets.applied(c) for c in contacts_of_groups(scene, v, stored, groups)]
+    active = [jax.vmap(lambda contact: contact.happens)(contacts) for contacts in batches]
+    happens = jnp.any(jnp.concatenate(active))
     p = jnp.zeros(m, v.dtype)
     each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
     tangential = jnp.zeros((m, each), v.dtype)
-    code, square, unknown = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
-    for filled, contacts, acts in zip(groups, all_contacts, own):
-        index = jnp.asarray(filled % m)
+    code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+    for padded, contacts, acts in zip(groups, batches, active):
+        index = jnp.asarray(padded % m)
         acts = happens & (acts | law.pulls)
 
-        def of_group(index: jax.Array, contact: Contact, acts: jax.Array) -> _Resolved:
-            return _resolved(of_contacts(law, index), contact, acts)
+        def resolve_group(index: jax.Array, contact: Contact, acts: jax.Array) -> _Resolved:
+            """The impulses of one group."""
+            return _resolved(restrict_law(law, index), contact, acts)
 
         if len(index) == 1:  # without the cost of a batch
-            one = of_group(*jax.tree.map(lambda x: x[0], (index, contacts, acts)))
+            one = resolve_group(*jax.tree.map(lambda x: x[0], (index, contacts, acts)))
             part = jax.tree.map(lambda x: jnp.asarray(x)[None], one)
         else:
-            part = jax.vmap(of_group)(index, contacts, acts)
-        at = filled.reshape(-1)
+            part = jax.vmap(resolve_group)(index, contacts, acts)
+        at = padded.reshape(-1)
         p = p.at[at].set(part.normal.reshape(-1), mode="drop")
         rows = part.tangential.reshape(len(at), each)
         tangential = tangential.at[at].set(rows, mode="drop")
         code = jnp.maximum(code, jnp.max(part.status))
-        square, unknown = square + jnp.sum(part.size**2), unknown + jnp.sum(part.noise)
-    found = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), unknown)
-    return found, happens, stored
+        square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
+    outcome = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise)
+    return outcome, happens, stored
 
 
 def _signs(contact: Contact, p: jax.Array, tangential: jax.Array) -> jax.Array:

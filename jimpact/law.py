@@ -376,8 +376,8 @@ class Law(Declared):
         """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
     @property
-    def fills_up(self) -> bool:
-        """Whether open contacts cost it little beside compiling for another number of contacts."""
+    def pads_scenes(self) -> bool:
+        """Whether it is cheaper to solve more, open contacts than to compile for their number."""
         return False
 
     @property
@@ -411,6 +411,6 @@ def is_separable(law: Law) -> bool:
     return law.separable and known and not law.uses_gaps
 
 
-def of_contacts(law: Law, index: jax.Array) -> Law:
-    """The law of some contacts only: their entries of what it has one of per contact."""
-    return jax.tree.map(lambda x: x[index] if eqx.is_array(x) and x.ndim == 1 else x, law)
+def restrict_law(law: Law, contacts: jax.Array) -> Law:
+    """The law of the contacts with these indices (k,): their entries of parameters (m,)."""
+    return jax.tree.map(lambda x: x[contacts] if eqx.is_array(x) and x.ndim == 1 else x, law)

@@ -23,7 +23,9 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 
-_SYMMETRY_TOLERANCE = 1e-6  # relative asymmetry of M that rounding may cause in float32
+# Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten times more
+# would accept a mass matrix with a wrong fourth digit.
+_SYMMETRY_TOLERANCE = 1e-6
 
 _CONSTRAINTS = operator.attrgetter("constraints")
 WALLS = {
@@ -195,33 +197,34 @@ def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
         ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
             coordinates or constraints.
     """
-    if len(scenes) == 1:
+    structures = [jax.tree.flatten(s) for s in scenes]
+    if len({(tree, tuple(map(np.shape, leaves))) for leaves, tree in structures}) == 1:
         return list(scenes), 0
-    flat = [jax.tree.flatten(s) for s in scenes]
-    layouts = {(tree, tuple(map(np.shape, leaves))) for leaves, tree in flat}
-    if len(layouts) == 1:
-        return list(scenes), 0
-    each = {0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes}
-    held = {0 if s.constraints is None else s.constraints.shape[1] for s in scenes}
+    tangents = {0 if s.tangents is None else s.tangents.shape[1] // s.contacts for s in scenes}
+    constraints = {0 if s.constraints is None else s.constraints.shape[1] for s in scenes}
     sizes = {s.size for s in scenes}
-    for what, found in (("tangents a contact", each), ("constraints", held), ("bodies", sizes)):
-        if len(found) > 1:
+    for what, numbers in (
+        ("tangents a contact", tangents),
+        ("constraints", constraints),
+        ("bodies", sizes),
+    ):
+        if len(numbers) > 1:
             raise ValueError(
                 f"Argument `scenes` must have equally many {what} in all shots, but have "
-                f"{' and '.join(map(str, sorted(found)))}."
+                f"{' and '.join(map(str, sorted(numbers)))}."
             )
-    (sides,) = each
+    (each,) = tangents
     most = max(s.contacts for s in scenes)
-    extra = (most - min(s.contacts for s in scenes)) * (1 + sides)
+    extra = (most - min(s.contacts for s in scenes)) * (1 + each)
     dense = any(s.mass.ndim == 2 for s in scenes)
     return [_with_open_contacts(s, most, s.size + extra, dense) for s in scenes], extra
 
 
 def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool) -> Scene:
-    """The scene with so many contacts and coordinates, on the host.
+    """The scene padded on the host to this number of contacts and of coordinates.
 
-    What is added comes last: open contacts as heavy as the last one, between coordinates of their
-    own; units and tolerances are not moved by them.
+    The contacts that are added come last: they are open, as heavy as the last one, and between
+    coordinates of their own, so that they do not change units and tolerances.
     """
     n, m, missing = scene.size, scene.contacts, contacts - scene.contacts
     mass, normals = np.asarray(scene.mass), np.asarray(scene.normals)
@@ -229,35 +232,37 @@ def _with_open_contacts(scene: Scene, contacts: int, size: int, dense_mass: bool
     moved = last / mass if mass.ndim == 1 else np.linalg.solve(mass, last)
     columns = np.sqrt(last @ moved) * np.eye(size, dtype=mass.dtype)[:, n:]
     if dense_mass or mass.ndim == 2:
-        whole = np.eye(size, dtype=mass.dtype)
-        whole[:n, :n] = np.diag(mass) if mass.ndim == 1 else mass
+        padded_mass = np.eye(size, dtype=mass.dtype)
+        padded_mass[:n, :n] = np.diag(mass) if mass.ndim == 1 else mass
     else:
-        whole = np.pad(mass, (0, size - n), constant_values=1)
+        padded_mass = np.pad(mass, (0, size - n), constant_values=1)
 
-    def grown(matrix: Any, first: int, count: int) -> np.ndarray:
-        below = np.pad(np.asarray(matrix), ((0, size - n), (0, 0)))
-        return np.concatenate([below, columns[:, first : first + count]], axis=1)
+    def padded(matrix: Any, first: int, count: int) -> np.ndarray:
+        """A matrix (n, k) with rows of 0 below, and `count` of the new columns from `first`."""
+        above = np.pad(np.asarray(matrix), ((0, size - n), (0, 0)))
+        return np.concatenate([above, columns[:, first : first + count]], axis=1)
 
-    tangents, held = scene.tangents, scene.constraints
-    sides = 0 if tangents is None else missing * (tangents.shape[1] // m)
+    tangents, constraints = scene.tangents, scene.constraints
+    tangents_missing = 0 if tangents is None else missing * (tangents.shape[1] // m)
     return _unchecked(
-        mass=whole,
-        _normals=grown(scene.normals, 0, missing),
-        tangents=None if tangents is None else grown(tangents, missing, sides),
-        gaps=_open_behind(scene, missing),
-        constraints=None if held is None else grown(held, 0, 0),
+        mass=padded_mass,
+        _normals=padded(scene.normals, 0, missing),
+        tangents=None if tangents is None else padded(tangents, missing, tangents_missing),
+        gaps=_padded_gaps(scene, missing),
+        constraints=None if constraints is None else padded(constraints, 0, 0),
     )
 
 
-def _open_behind(scene: Scene, missing: int) -> Any:
-    """Gaps of the scene, and of so many open contacts."""
+def _padded_gaps(scene: Scene, missing: int) -> Any:
+    """Gaps of the scene, and of 1 m at `missing` contacts after them."""
     gaps = np.ones(scene.contacts + missing, scene.mass.dtype)
     gaps[: scene.contacts] = 0.0 if scene.gaps is None else scene.gaps
     return gaps
 
 
-class Filled(NamedTuple):
-    """A scene with open contacts added, where it is in it, and which contact each is like."""
+class PaddedScene(NamedTuple):
+    """A scene with open contacts added, where its own coordinates and contacts are in it, and the
+    index (contacts,) of the contact whose parameters each one takes."""
 
     scene: Scene
     coordinates: slice
@@ -265,25 +270,24 @@ class Filled(NamedTuple):
     copied: Any
 
 
-def filled_up(scene: Scene, contacts: int) -> Filled:
-    """The scene with so many contacts, on the host: scenes of other sizes share its programs."""
+def pad_scene(scene: Scene, contacts: int) -> PaddedScene:
+    """The scene with this number of contacts, on the host: scenes of other sizes share programs."""
     n, m = scene.size, scene.contacts
     missing = contacts - m
     copied = np.minimum(np.arange(contacts), m - 1)
     if scene.walls is None:
-        size = -(-(n + missing) // contacts) * contacts
-        grown = _with_open_contacts(scene, contacts, size, False)
-        return Filled(grown, slice(n), slice(m), copied)
+        size = -(-(n + missing) // contacts) * contacts  # a multiple: few shapes, few programs
+        padded = _with_open_contacts(scene, contacts, size, False)
+        return PaddedScene(padded, slice(n), slice(m), copied)
     mass: Any = np.asarray(scene.mass)
-    gaps = _open_behind(scene, missing)
+    gaps = _padded_gaps(scene, missing)
     if scene.walls[1]:  # what is added comes before it, in mirror image
         mass = np.concatenate([np.resize(mass[1::-1], missing)[::-1], mass])
-        gaps, copied = np.roll(gaps, missing), m - 1 - copied[::-1]
-        return Filled(
-            chain_scene(mass, scene.walls, gaps), slice(missing, None), slice(missing, None), copied
-        )
+        padded = chain_scene(mass, scene.walls, np.roll(gaps, missing))
+        inside = slice(missing, None)
+        return PaddedScene(padded, inside, inside, m - 1 - copied[::-1])
     mass = np.concatenate([mass, np.resize(mass[-2:], missing)])
-    return Filled(chain_scene(mass, scene.walls, gaps), slice(n), slice(m), copied)
+    return PaddedScene(chain_scene(mass, scene.walls, gaps), slice(n), slice(m), copied)
 
 
 def as_velocity(scene: Scene, velocity: Any) -> jax.Array:

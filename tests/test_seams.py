@@ -9,6 +9,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.contact import coupled_groups
+from jimpact.scene import pad_scene
 from jimpact.status import CODE
 
 FOUR = ji.chain(np.ones(4))
@@ -165,10 +166,18 @@ def test_groups_are_judged_on_the_scale_of_their_impact():
     assert int(out.status) == CODE["energy_gain"]
 
 
-def test_each_contact_keeps_its_restitution_before_a_right_wall():
-    """The row is filled up with open contacts on its left: v2+ = 0.7 (wall), v1+ = v2+ - 0.8 * 2."""
-    out = ji.impact(ji.Newton([0.8, 0.7]), ji.chain([2.0, 5.0], wall=True), [3.0, 1.0])
-    np.testing.assert_allclose(out.velocity, [-0.7 - 1.6, -0.7], rtol=1e-13)
+@pytest.mark.parametrize("wall", [False, "left", "right"])
+def test_a_padded_chain_contains_itself(wall):
+    """Its masses, gaps and parameters are at its own places; what is added is open."""
+    masses = [1.0, 2.0, 5.0]
+    chain = ji.chain(masses, wall=wall, gaps=np.linspace(0.0, 0.2, 2 + bool(wall)))
+    padded = pad_scene(chain, 8)
+    np.testing.assert_array_equal(padded.scene.mass[padded.coordinates], masses)
+    np.testing.assert_array_equal(padded.scene.gaps[padded.contacts], chain.gaps)
+    np.testing.assert_array_equal(padded.copied[padded.contacts], np.arange(chain.contacts))
+    whole = np.asarray(padded.scene.normals)[padded.coordinates, padded.contacts]
+    np.testing.assert_array_equal(whole, chain.normals)
+    assert (np.delete(padded.scene.gaps, np.r_[: padded.scene.contacts][padded.contacts]) > 0).all()
 
 
 @pytest.mark.slow

@@ -72,10 +72,11 @@ def test_a_law_that_fails_is_named_and_comes_last():
 
 
 def test_simplest_first_is_the_order_of_advise():
-    from jimpact.methods.advice import situation, trials
+    from jimpact.methods.advice import situation_of, trials
 
-    at = situation(PAIR, np.array([1.0, 0.0]))
-    assert tuple(trials(at, 0.8, np.ones(1), 1.5)) == SIMPLEST_FIRST[:5]
+    law = ji.LZB(0.8)
+    situation = situation_of(PAIR, np.array([1.0, 0.0]), law, known=False)
+    assert tuple(trials(situation, law)) == SIMPLEST_FIRST
 
 
 @pytest.mark.parametrize(

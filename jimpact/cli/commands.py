@@ -407,7 +407,8 @@ def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
 
 # ----------------------------------------------------------------------------------------- advise
 
-_TAKEN = ("restitution", "stiffness", "exponent")  # of the study's parameters
+_TAKEN = ("restitution", "stiffness", "exponent", "friction")  # of the study's parameters
+_REFUSED = ("tangential_restitution", "initial_energy")  # these would change the outcome
 
 
 def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
@@ -438,6 +439,12 @@ def _lzb_parameters(study: Study) -> dict[str, Any]:
             f"the study must have bistiffness contacts, but has rheology {rheology!r}: of viscous "
             "contacts only the compliant law knows."
         )
+    for key in _REFUSED:
+        if np.any(study.parameters.get(key, 0.0)):
+            raise ValueError(
+                f"the study must not have `{key}`, but has {study.parameters[key]}: `jimpact "
+                "advise` compares laws without it."
+            )
     return {key: value for key, value in study.parameters.items() if key in _TAKEN}
 
 

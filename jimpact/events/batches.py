@@ -17,12 +17,12 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from jimpact.events.tangents import BESIDE, Moving, moving_with
+from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like
 
-# Impacts side by side on a CPU. A piece of a batch ends with its slowest member, and its stages
-# should stay in a core's cache: 64 are no faster, 1024 take half as long again.
+# Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
+# stay in a core's cache: 64 are no faster, 1024 take half as long again.
 CHUNK = 256
-WITH_TANGENTS = 128  # of those with tangents side by side, which take more room
+CHUNK_WITH_TANGENTS = 128  # of impacts with tangents, which take more room in the cache
 
 Arrays = tuple[jax.Array, ...]
 columns_p = Primitive("columns")
@@ -35,30 +35,29 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     Where it is differentiated all its results are floating-point numbers.
     `function` is hashable and compares equal where it does the same (a function of a module, or a
     frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
-    `shapes`, if it has one, tells the shapes of its results from those of its arguments.
+    `shapes`, if it has one, returns the shapes of its results from those of its arguments.
     """
     return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
 
 
-def _smooth(
-    function: Callable[..., Arrays], marked: tuple[bool, ...], given: Arrays
+def _partial(
+    function: Callable[..., Arrays], marked: tuple[bool, ...], arguments: Arrays
 ) -> tuple[Callable[..., Arrays], Arrays]:
     """`function` of its marked arguments alone, and their values."""
 
-    def smooth(*values: jax.Array) -> Arrays:
-        moved = iter(values)
-        every = [next(moved) if mark else x for x, mark in zip(given, marked)]
-        return tuple(function(*every))
+    def of_marked(*values: jax.Array) -> Arrays:
+        replaced = iter(values)
+        return tuple(function(*(next(replaced) if m else x for x, m in zip(arguments, marked))))
 
-    return smooth, tuple(x for x, mark in zip(given, marked) if mark)
+    return of_marked, tuple(x for x, mark in zip(arguments, marked) if mark)
 
 
 @dataclasses.dataclass(frozen=True)
 class Tangent:
-    """Tangents of `function` from its arguments and the tangents of those marked.
+    """Tangents of the results of `function`, from its arguments and the tangents of those marked.
 
-    `many`: these have a leading axis, along which the arguments are the same.
-    A `function` that is `beside` takes arguments that are `Moving`, and gives such results.
+    `many`: the tangents have a leading axis of directions; the arguments have none.
+    A `function` that `takes_duals` also returns them.
     """
 
     function: Callable[..., Arrays]
@@ -67,20 +66,20 @@ class Tangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
-        given, along = arrays[:count], arrays[count:]
-        if getattr(self.function, "beside", False):
-            along = along if self.many else tuple(x[None] for x in along)
-            beside = iter(jnp.moveaxis(x, 0, BESIDE) for x in along)
-            mixed = [Moving(x, next(beside)) if m else x for x, m in zip(given, self.marked)]
-            outs = [moving_with(mixed, x) for x in self.function(*mixed)]
-            rates = [jnp.moveaxis(x.along, BESIDE, 0) for x in outs]
+        primals, tangents = arrays[:count], arrays[count:]
+        if getattr(self.function, "takes_duals", False):
+            tangents = tangents if self.many else tuple(x[None] for x in tangents)
+            inner = iter(jnp.moveaxis(x, 0, TANGENT_AXIS) for x in tangents)
+            duals = [Dual(x, next(inner)) if m else x for x, m in zip(primals, self.marked)]
+            outs = [dual_like(duals, x) for x in self.function(*duals)]
+            rates = [jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in outs]
             return tuple(rates if self.many else (x[0] for x in rates))
-        smooth, values = _smooth(self.function, self.marked, given)
+        of_marked, values = _partial(self.function, self.marked, primals)
 
-        def push(*given: jax.Array) -> Arrays:
-            return jax.jvp(smooth, values, given)[1]
+        def push(*tangents: jax.Array) -> Arrays:
+            return jax.jvp(of_marked, values, tangents)[1]
 
-        return (jax.vmap(push) if self.many else push)(*along)
+        return (jax.vmap(push) if self.many else push)(*tangents)
 
 
 def reversible(function: Any) -> Any:
@@ -101,11 +100,11 @@ class Cotangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         count = len(self.marked)
-        smooth, values = _smooth(reversible(self.function), self.marked, arrays[:count])
-        _, back = jax.vjp(smooth, *values)
+        of_marked, values = _partial(reversible(self.function), self.marked, arrays[:count])
+        _, back = jax.vjp(of_marked, *values)
 
-        def pull(*given: jax.Array) -> Arrays:
-            return back(given)
+        def pull(*cotangents: jax.Array) -> Arrays:
+            return back(cotangents)
 
         return (jax.vmap(pull) if self.many else pull)(*arrays[count:])
 
@@ -115,19 +114,19 @@ def tangents_in_columns(
 ) -> Arrays:
     """Tangents of `in_columns(function, *arrays)`, without its value."""
     marked = tuple(not isinstance(t, SymbolicZero) for t in tangents)
-    moving = (t for t, mark in zip(tangents, marked) if mark)
-    return in_columns(Tangent(function, marked), *arrays, *moving)
+    nonzero = (t for t, mark in zip(tangents, marked) if mark)
+    return in_columns(Tangent(function, marked), *arrays, *nonzero)
 
 
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
-    count = -(-size // (WITH_TANGENTS if isinstance(function, Tangent) else CHUNK))
+    count = -(-size // (CHUNK_WITH_TANGENTS if isinstance(function, Tangent) else CHUNK))
     if count == 1:
         return tuple(function(*arrays))
     width = -(-size // count)
 
-    def pieces(*given: jax.Array) -> Arrays:
+    def pieces(*whole: jax.Array) -> Arrays:
         def cut(x: jax.Array) -> jax.Array:
             filled = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, count * width - size)], mode="edge")
             return jnp.moveaxis(filled.reshape(*x.shape[:-1], count, width), -2, 0)
@@ -136,38 +135,40 @@ def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
             joined = jnp.moveaxis(x, 0, -2)
             return joined.reshape(*joined.shape[:-2], count * width)[..., :size]
 
-        mapped = jax.lax.map(lambda piece: tuple(function(*piece)), tuple(map(cut, given)))
+        mapped = jax.lax.map(lambda piece: tuple(function(*piece)), tuple(map(cut, whole)))
         return tuple(map(join, mapped))
 
     return jax.lax.platform_dependent(
-        *arrays, cpu=pieces, default=lambda *given: tuple(function(*given))
+        *arrays, cpu=pieces, default=lambda *whole: tuple(function(*whole))
     )
 
 
 @functools.cache
 def _compiled(function: Callable[..., Arrays]) -> Callable[..., Arrays]:
+    """The function compiled, once for all calls with equal functions."""
     return jax.jit(functools.partial(_in_chunks, function))
 
 
 @columns_p.def_impl
 def _run(*arrays: jax.Array, function: Callable[..., Arrays]) -> Arrays:
+    """Values of the primitive."""
     return _compiled(function)(*arrays)
 
 
 @columns_p.def_abstract_eval
 def _shapes(*shapes: Any, function: Callable[..., Arrays]) -> list[Any]:
-    """Tracing takes as long as lowering: nothing is traced whose shapes are known without."""
+    """Shapes of the results, without tracing `function` where they are known: it takes long."""
     known = [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
     if isinstance(function, Tangent | Cotangent):
-        given, along = known[: len(function.marked)], shapes[len(function.marked) :]
+        primals, rest = known[: len(function.marked)], shapes[len(function.marked) :]
         if isinstance(function, Tangent):
-            outs = _shapes(*given, function=function.function)
+            outs = _shapes(*primals, function=function.function)
         else:
-            outs = [x for x, mark in zip(given, function.marked) if mark]
-        many = along[0].shape[:1] if function.many else ()
+            outs = [x for x, mark in zip(primals, function.marked) if mark]
+        many = rest[0].shape[:1] if function.many else ()
         return [jax.core.ShapedArray((*many, *x.shape), x.dtype) for x in outs]
-    told = getattr(function, "shapes", None) or functools.partial(jax.eval_shape, function)
-    return [jax.core.ShapedArray(x.shape, x.dtype) for x in told(*known)]
+    shapes_of = getattr(function, "shapes", None) or functools.partial(jax.eval_shape, function)
+    return [jax.core.ShapedArray(x.shape, x.dtype) for x in shapes_of(*known)]
 
 
 mlir.register_lowering(columns_p, mlir.lower_fun(_run, multiple_results=True))
@@ -176,17 +177,17 @@ mlir.register_lowering(columns_p, mlir.lower_fun(_run, multiple_results=True))
 def _wider(
     arrays: Any, axes: Any, *, function: Callable[..., Arrays]
 ) -> tuple[list[jax.Array], list[int]]:
-    """The batch of `vmap` becomes part of the last axis."""
+    """Rule of `vmap`: its batch becomes part of the last axis."""
     size = next(x.shape[axis] for x, axis in zip(arrays, axes) if axis is not None)
     if isinstance(function, Tangent | Cotangent) and not function.many:
         count = len(function.marked)
         if all(axis is None for axis in axes[:count]):
-            # many directions at one point: its steps are found once
-            along = [
+            # many directions at one point: its steps are computed once
+            rest = [
                 jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
                 for x, axis in zip(arrays[count:], axes[count:])
             ]
-            outs = in_columns(dataclasses.replace(function, many=True), *arrays[:count], *along)
+            outs = in_columns(dataclasses.replace(function, many=True), *arrays[:count], *rest)
             return list(outs), [0] * len(outs)
 
     def wide(x: jax.Array, axis: int | None) -> jax.Array:
@@ -197,8 +198,8 @@ def _wider(
         return x.reshape(*x.shape[:-2], size * x.shape[-1])
 
     outs = in_columns(function, *map(wide, arrays, axes))
-    apart = [out.reshape(*out.shape[:-1], size, out.shape[-1] // size) for out in outs]
-    return [jnp.moveaxis(out, -2, 0) for out in apart], [0] * len(apart)
+    split = [out.reshape(*out.shape[:-1], size, out.shape[-1] // size) for out in outs]
+    return [jnp.moveaxis(out, -2, 0) for out in split], [0] * len(split)
 
 
 batching.primitive_batchers[columns_p] = _wider
@@ -207,16 +208,18 @@ batching.primitive_batchers[columns_p] = _wider
 def _jvp(
     primals: Any, tangents: Any, *, function: Callable[..., Arrays]
 ) -> tuple[list[Any], list[Any]]:
+    """Rule of the forward mode."""
     outs = columns_p.bind(*primals, function=function)
     marked = tuple(type(t) is not ad.Zero for t in tangents)
-    moving = [t for t, mark in zip(tangents, marked) if mark]
-    return outs, columns_p.bind(*primals, *moving, function=Tangent(function, marked))
+    nonzero = [t for t, mark in zip(tangents, marked) if mark]
+    return outs, columns_p.bind(*primals, *nonzero, function=Tangent(function, marked))
 
 
 ad.primitive_jvps[columns_p] = _jvp
 
 
 def _transpose(cotangents: Any, *arrays: Any, function: Callable[..., Arrays]) -> list[Any]:
+    """Rule of the reverse mode: the transpose of a map that is linear in some arguments."""
     linear = tuple(ad.is_undefined_primal(x) for x in arrays)
 
     def zeros(x: Any) -> jax.Array:
@@ -227,13 +230,13 @@ def _transpose(cotangents: Any, *arrays: Any, function: Callable[..., Arrays]) -
         function.marked
     ):
         # the transpose of a tangent map is the pull back of its function
-        given = list(arrays[: len(function.marked)])
+        primals = list(arrays[: len(function.marked)])
         back = Cotangent(function.function, function.marked, function.many)
     else:
         # linear in what is undefined: its derivative at 0 is the map itself
-        given = [zeros(x) if undefined else x for x, undefined in zip(arrays, linear)]
+        primals = [zeros(x) if undefined else x for x, undefined in zip(arrays, linear)]
         back = Cotangent(function, linear)
-    pulled = iter(columns_p.bind(*given, *filled, function=back))
+    pulled = iter(columns_p.bind(*primals, *filled, function=back))
     return [next(pulled) if u else None for u in linear]
 
 
@@ -251,6 +254,7 @@ def over_lanes(count: jax.Array) -> jax.Array:
 
 @over_lanes.def_vmap
 def _over_lanes(size: int, batched: Any, count: jax.Array) -> tuple[jax.Array, bool]:
+    """Rule of `vmap`: the sum over its lanes."""
     return over_lanes(jnp.sum(count, axis=0, dtype=count.dtype)), False
 
 

@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events.stepper import any_of
+from jimpact.solvers.tridiagonal import tridiagonal_product
 
 OPEN, COMPRESSION, EXPANSION, SLACK = 0, 1, 2, 3
 
@@ -102,21 +103,16 @@ class Viscous(NamedTuple):
 class Chain(NamedTuple):
     """The coupling of a chain: G without its unit diagonal, (m - 1, B)."""
 
-    beside: jax.Array
+    off_diagonal: jax.Array
 
     def times(self, f: jax.Array) -> jax.Array:
-        none = jnp.zeros_like(f[:1])
-        return (
-            f
-            + jnp.concatenate([none, self.beside * f[:-1]])
-            + jnp.concatenate([self.beside * f[1:], none])
-        )
+        return tridiagonal_product(f, self.off_diagonal, f)
 
     def magnitude(self) -> "Chain":
-        return Chain(jnp.abs(self.beside))
+        return Chain(jnp.abs(self.off_diagonal))
 
     def pull(self) -> "Chain":
-        return Chain(jnp.minimum(self.beside, 0.0))
+        return Chain(jnp.minimum(self.off_diagonal, 0.0))
 
 
 class Dense(NamedTuple):
@@ -127,14 +123,14 @@ class Dense(NamedTuple):
     def times(self, f: jax.Array) -> jax.Array:
         return times(self.matrix, f)
 
-    def _beside(self) -> jax.Array:
+    def _off_diagonal(self) -> jax.Array:
         return self.matrix * (1 - unit(self.matrix))
 
     def magnitude(self) -> "Dense":
-        return Dense(jnp.abs(self._beside()) + unit(self.matrix))
+        return Dense(jnp.abs(self._off_diagonal()) + unit(self.matrix))
 
     def pull(self) -> "Dense":
-        return Dense(jnp.minimum(self._beside(), 0.0) + unit(self.matrix))
+        return Dense(jnp.minimum(self._off_diagonal(), 0.0) + unit(self.matrix))
 
 
 def unit(matrix: jax.Array) -> jax.Array:
@@ -162,7 +158,7 @@ class Frozen(NamedTuple):
     scale: jax.Array  # (m, B) s_j = gamma / g
 
 
-class Measured(NamedTuple):
+class ContactStates(NamedTuple):
     """Of a state F, x, p, gamma (m, B), lambda, its impulse, slip (t, B), rate of time (1, B)."""
 
     force: jax.Array
@@ -363,12 +359,12 @@ class ContactFlow:
 
     # ---- what is looked at
 
-    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+    def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
         """Forces, velocities and the rate of time in a state."""
         const, none = ContactFlow.constants(self, modes), y[:0]
         x, g, p = self.rows(y)
         force = self.force(const, x, g)
-        return Measured(force, x, p, const.scale * g, none, none, none, const.unit)
+        return ContactStates(force, x, p, const.scale * g, none, none, none, const.unit)
 
     def change(self, y: jax.Array) -> jax.Array:
         """What the impulses of a state change of the gap velocities (m, B)."""

@@ -27,8 +27,8 @@ from jimpact.events.contact_flow import (
     OPEN,
     SNAP,
     ContactFlow,
+    ContactStates,
     Frozen,
-    Measured,
     as_pytree,
     times,
     unit,
@@ -106,7 +106,7 @@ def _refined_rate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
     return z, refined(k, share, dright - times(dk, z))
 
 
-class Modes(NamedTuple):
+class FrictionConstants(NamedTuple):
     """What of the field does not change while the modes last."""
 
     frozen: Frozen
@@ -117,7 +117,7 @@ class Modes(NamedTuple):
     share: jax.Array  # beside its diagonal (m, B)
 
 
-class Forces(NamedTuple):
+class FrictionForces(NamedTuple):
     """Forces and what follows from them, (m, B) each."""
 
     normal: jax.Array  # F
@@ -182,7 +182,7 @@ class FrictionFlow(ContactFlow):
         stick = (slip == 0) & self.loaded(modes)
         drag = -slip.astype(self.friction.dtype) * self.friction
         k = jnp.where(stick[:, None] & stick[None], self.along, 0.0)
-        return Modes(
+        return FrictionConstants(
             frozen=super().constants(modes),
             stick=stick,
             drag=drag,
@@ -191,7 +191,7 @@ class FrictionFlow(ContactFlow):
             share=jnp.where(stick, ridge(k.dtype), 1.0),
         )
 
-    def forces(self, const: Modes, y: jax.Array) -> Forces:
+    def forces(self, const: FrictionConstants, y: jax.Array) -> FrictionForces:
         """The forces in a state."""
         x, g, _ = self.rows(y)
         f = self.force(const.frozen, x, g)
@@ -204,7 +204,7 @@ class FrictionFlow(ContactFlow):
         some = const.stick & (largest + size > 0)
         room = jnp.where(some, (largest - size) / jnp.where(some, largest + size, 1.0), 1.0)
         rate = jnp.where(const.stick, 0.0, pull + times(self.along, hold))
-        return Forces(f, const.drag * f + hold, rate, room)
+        return FrictionForces(f, const.drag * f + hold, rate, room)
 
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         frozen, found = const.frozen, self.forces(const, y)
@@ -277,11 +277,11 @@ class FrictionFlow(ContactFlow):
         top = jnp.max(f, axis=0, keepdims=True)
         return f / jnp.where(top > 0, top, 1.0)
 
-    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+    def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
         m, side = self.contacts, self.forces(self.constants(modes), y).side
         return (
             super()
-            .measured(modes, y)
+            .contact_states(modes, y)
             ._replace(tangential_force=side, tangential_impulse=y[4 * m : 5 * m], slip=self.slip(y))
         )
 

@@ -29,7 +29,7 @@ from jimpact.events.contact_flow import (
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
-from jimpact.events.tangents import through, value_of
+from jimpact.events.tangents import pushforward, value_of
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -47,9 +47,9 @@ ILL = 10.0  # rtol that two runs may differ by
 
 
 class Problem(NamedTuple):
-    """What the dimensionless outcome depends on, arrays (m,); `beside` of a chain (m - 1,)."""
+    """What the dimensionless outcome depends on, arrays (m,) but `off_diagonal`."""
 
-    beside: jax.Array  # off-diagonal entries of G: of a chain, or the upper triangle
+    off_diagonal: jax.Array  # of G: (m - 1,) of a chain, or the upper triangle
     omega: jax.Array
     restitution: jax.Array
     exponent: jax.Array | None
@@ -70,7 +70,7 @@ class Sides(NamedTuple):
     friction: jax.Array  # mu (m,)
 
 
-class Units(NamedTuple):
+class ImpactUnits(NamedTuple):
     """Scales back to SI: Q [m/s sqrt(kg)], time [s], `sqrt(W_jj)`, x_ref [m], the error [m/s] that
     `rtol` allows."""
 
@@ -96,7 +96,7 @@ def dimensionless(
     rtol: float,
     gaps: jax.Array | None = None,
     closed: jax.Array | None = None,
-) -> tuple[Problem, Units]:
+) -> tuple[Problem, ImpactUnits]:
     """The dimensionless problem and the units to return from it; `closed`: those that take part."""
     m, dtype = gamma.shape[0], gamma.dtype
     eta = jnp.broadcast_to(jnp.asarray(exponent, dtype), (m,))
@@ -113,14 +113,14 @@ def dimensionless(
     omega = time / t_ref
     closeness = jax.lax.stop_gradient(jnp.minimum(1.0, WIDE_SPREAD * jnp.min(omega)))
     g = scaled(delassus, 1 / root)
-    beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
+    off_diagonal = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
     count = jnp.full((), m, dtype) if closed is None else jnp.sum(closed, dtype=dtype)
     count = jnp.maximum(count, 1)
     step = jax.lax.stop_gradient(rtol * jnp.minimum(1.0, 2 / count) / jnp.max(weight))
     problem = Problem(
-        beside=beside,
+        off_diagonal=off_diagonal,
         omega=omega,
         restitution=restitution * ones,
         exponent=exponent * ones if isinstance(exponent, jax.Array) else None,
@@ -131,10 +131,10 @@ def dimensionless(
         taking_part=count[None],
         step=step[None],
     )
-    return problem, Units(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
+    return problem, ImpactUnits(q, time, root, x_ref, jax.lax.stop_gradient(rtol * fastest))
 
 
-def sides_of(contact: Contact, friction: jax.Array, units: Units) -> Sides:
+def sides_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Sides:
     """The tangential block of the contacts in the units of the normal one."""
     assert contact.tangential_block is not None  # see `check_law`
     block = contact.tangential_block.scaled(units.root, units.velocity)
@@ -147,12 +147,12 @@ def flow_of(
     """The flow of a problem in columns (.., B), and its first modes and state."""
     m, dtype = problem.omega.shape[0], problem.omega.dtype
     batch = problem.omega.shape[1:]
-    coupling: Chain | Dense = Chain(problem.beside)
+    coupling: Chain | Dense = Chain(problem.off_diagonal)
     if not chain or m <= DENSE_CHAIN:
         i, j = jnp.triu_indices(m, 1)
         if chain:
             i, j = jnp.arange(m - 1), jnp.arange(1, m)
-        upper = jnp.zeros((m, m, *batch), dtype).at[i, j].set(problem.beside)
+        upper = jnp.zeros((m, m, *batch), dtype).at[i, j].set(problem.off_diagonal)
         coupling = Dense(unit(upper) + upper + jnp.swapaxes(upper, 0, 1))
     eta: Any = exponent if problem.exponent is None else problem.exponent
     viscous = problem.viscous
@@ -186,7 +186,7 @@ DENSE_CHAIN = 4  # contacts: up to so many a dense product is faster than shifts
 
 
 @dataclasses.dataclass(frozen=True)
-class Outcome:
+class ImpulseProgram:
     """From the leaves of a `Problem` in columns to impulses (m, B), (t, B), and of (1, B) the time
     (of the last event; of the end where `whole`: no closed form ends it), status and passes."""
 
@@ -213,11 +213,11 @@ class Outcome:
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
 
     @property
-    def beside(self) -> bool:
+    def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
         return self.smooth and not self.repeats
 
-    def reversible(self) -> "Outcome":
+    def reversible(self) -> "ImpulseProgram":
         """The same in a form that both modes go through."""
         return dataclasses.replace(self, repeats=self.smooth)
 
@@ -225,9 +225,11 @@ class Outcome:
         problem = jax.tree.unflatten(self.tree, leaves)
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         given = jax.lax.stop_gradient(problem) if self.repeats else problem
-        flow, modes, y = through(lambda problem: self.flow(problem, tighten), given)
+        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), given)
         gamma = value_of(problem.gamma)
-        end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not self.beside)
+        end = to_the_end(
+            flow, gamma, modes, y, self.most, keeps=self.finely and not self.takes_duals
+        )
         state, dp = end.carry.y, end.impulse
         if self.repeats:
             flow, _, y = self.flow(problem, tighten)
@@ -235,14 +237,14 @@ class Outcome:
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
         if self.smooth:
             last = flow, problem.gamma, state
-            dp = through(lambda f, g, y: remainder(f, g, y, end.carries), *last)
+            dp = pushforward(lambda f, g, y: remainder(f, g, y, end.carries), *last)
         rows = 3 * gamma.shape[0]
 
         def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
             p = state[rows - len(gamma) : rows] + dp
             return p, state[rows + self.sides : -1][: self.sides], state[-1:]
 
-        p, *rest = through(parts, state, dp)
+        p, *rest = pushforward(parts, state, dp)
         if self.smooth:
             return p, *rest
         p = stepper.with_plan(p, end.plan) if self.finely else p
@@ -253,7 +255,7 @@ class Dynamics(NamedTuple):
     """What a law with impact dynamics gives: its problem, the units, and what is compiled in."""
 
     problem: Problem
-    units: Units
+    units: ImpactUnits
     exponent: Exponent
     chain: bool
 
@@ -274,39 +276,57 @@ class Dynamics(NamedTuple):
 
 
 def solve(
-    given: Dynamics, max_steps: int, method: str = "time", doubted: Contact | None = None
+    dynamics: Dynamics,
+    max_steps: int,
+    method: str = "time",
+    condition_check: Contact | None = None,
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
     """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
-    `doubted`: a second run beside the first one says whether the outcome is `ill_conditioned`.
-    Differentiable in both modes; method 'time' in all orders.
+    `condition_check`: the contacts, if a second run is to show whether the outcome is
+    `ill_conditioned`. Differentiable in both modes; method 'time' in all orders.
     """
-    units, static = given.units, given.static_exponent
+    units, exponent = dynamics.units, dynamics.static_exponent
     if method == "impulse":
-        p, code = impulse_form.solve(given.problem, static, given.chain, max_steps)
+        p, code = impulse_form.solve(dynamics.problem, exponent, dynamics.chain, max_steps)
         return p * units.momentum, None, code
-    leaves, tree = given.columns()
-    if doubted is not None:
-        second = given._replace(problem=otherwise(given.problem)).columns()[0]
+    leaves, tree = dynamics.columns()
+    if condition_check is not None:
+        second = dynamics._replace(problem=perturbed(dynamics.problem)).columns()[0]
         leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
-    found = outcome(Outcome(tree, static, given.chain, max_steps, given.tangents), leaves)
-    p, side, _, code, _ = found
+    program = ImpulseProgram(tree, exponent, dynamics.chain, max_steps, dynamics.tangents)
+    p, side, _, code, _ = evaluate(program, leaves)
     p, code = p * units.momentum[:, None], code[0]
-    sides = None
-    if given.tangents > 0:
-        sides = side * jnp.repeat(units.momentum, given.tangents // len(units.root))[:, None]
-    if doubted is not None:
-        apart = None if sides is None else sides[:, 1] - sides[:, 0]
-        change = velocity_changes(doubted, p[:, 1] - p[:, 0], apart)
-        same = jnp.all(jnp.abs(change) <= ILL * units.error) & (code[1] <= CODE["plastic_limit"])
-        code = jnp.maximum(code, jnp.where(same, CODE["ok"], CODE["ill_conditioned"]))
-    return p[:, 0], None if sides is None else sides[:, 0], code[0]
+    tangential = None
+    if dynamics.tangents > 0:
+        rows = dynamics.tangents // len(units.root)
+        tangential = side * jnp.repeat(units.momentum, rows)[:, None]
+    if condition_check is not None:
+        ill = is_ill_conditioned(condition_check, p, tangential, code, units.error)
+        code = jnp.maximum(code, jnp.where(ill, CODE["ill_conditioned"], CODE["ok"]))
+    return p[:, 0], None if tangential is None else tangential[:, 0], code[0]
 
 
-def otherwise(problem: Problem) -> Problem:
+def is_ill_conditioned(
+    contact: Contact,
+    p: jax.Array,
+    tangential: jax.Array | None,
+    code: jax.Array,
+    error: jax.Array,
+) -> jax.Array:
+    """Whether two runs, the columns of (m, 2) and (t, 2), differ by more than ILL times `error`.
+
+    Also where the second one ends with a failure (`code` (2,)).
+    """
+    difference = None if tangential is None else tangential[:, 1] - tangential[:, 0]
+    change = velocity_changes(contact, p[:, 1] - p[:, 0], difference)
+    return ~(jnp.all(jnp.abs(change) <= ILL * error) & (code[1] <= CODE["plastic_limit"]))
+
+
+def perturbed(problem: Problem) -> Problem:
     """The same at another tolerance, gamma- and omega changed in the last digits that can be held.
 
-    That tells what errors grow to also where it is rounding, not the tolerance, that limits them.
+    This shows how far errors grow also where rounding limits them, not the tolerance.
     """
     still = jax.lax.stop_gradient(problem)
     gamma, tolerance = still.gamma, still.tolerance
@@ -330,7 +350,7 @@ def velocity_changes(contact: Contact, p: jax.Array, sides: jax.Array | None) ->
     return jnp.concatenate([contact.delassus @ p + cross @ sides, cross.T @ p + tangent @ sides])
 
 
-def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
     """`function(*leaves)` in columns; derivatives walk the accepted steps once more."""
 
     @jax.custom_jvp
@@ -340,7 +360,7 @@ def outcome(function: Outcome, leaves: tuple[jax.Array, ...]) -> tuple[jax.Array
     def rule(primals: Any, tangents: Any) -> Any:
         # values keep the steps for the reverse mode: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
-        outs = outcome(fine, primals)
+        outs = evaluate(fine, primals)
         along = dataclasses.replace(fine, smooth=True)
         rates = tangents_in_columns(along, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]

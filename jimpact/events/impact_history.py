@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events import stepper
-from jimpact.events.contact_flow import Measured
-from jimpact.events.impact_dynamics import Outcome
+from jimpact.events.contact_flow import ContactStates
+from jimpact.events.impact_dynamics import ImpulseProgram
 from jimpact.events.plastic_limit import to_the_end
 
 
@@ -15,11 +15,11 @@ from jimpact.events.plastic_limit import to_the_end
 class Samples:
     """From the leaves of a `Problem` in columns to rows of samples (s, .., B) in time.
 
-    Results: the times (s, 1, B), twice the energy (s, m, B), the rows of `Measured`, the largest
-    force of each contact (m, B), the status (1, B) as a floating-point number.
+    Results: the times (s, 1, B), twice the energy (s, m, B), the rows of `ContactStates`, the
+    largest force of each contact (m, B), the status (1, B) as a floating-point number.
     """
 
-    outcome: Outcome  # `whole`: no closed form ends it
+    outcome: ImpulseProgram  # `whole`: no closed form ends it
     samples: int
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
@@ -38,7 +38,7 @@ class Samples:
         times = states[:, -1]  # (steps + 1, B)
         no_target = jnp.zeros(end.step.target.shape, bool)
 
-        def at(part: jax.Array) -> tuple[jax.Array, jax.Array, Measured]:
+        def at(part: jax.Array) -> tuple[jax.Array, jax.Array, ContactStates]:
             """A sample is one more step, in time, from the state before it."""
             t = part * times[-1:]
             before = jnp.sum((times <= jax.lax.stop_gradient(t)).astype(jnp.int32), axis=0) - 1
@@ -47,16 +47,16 @@ class Samples:
                 return jnp.take_along_axis(rows, before[None, None], axis=0)[0]
 
             state, now = of(states), of(phases)
-            rate = moving.measured(now, state).rate
+            rate = moving.contact_states(now, state).rate
             ahead = jnp.where(rate > 0, (t - state[-1:]) / jnp.where(rate > 0, rate, 1.0), 0.0)
             step = stepper.Step(now, no_target, of(clocks))
             state = stepper.between(moving, step, state, ahead)
-            seen = moving.measured(now, state)
+            seen = moving.contact_states(now, state)
             x = jnp.maximum(seen.indentation, 0.0)
             return state[-1:], moving.energy(x, jnp.zeros_like(x)), seen._replace(indentation=x)
 
         parts = jnp.linspace(0.0, 1.0, self.samples, dtype=y.dtype)
         time, energy, seen = jax.lax.map(at, parts)
-        force = jax.lax.map(lambda both: moving.measured(*both).force, (phases, states))
+        force = jax.lax.map(lambda both: moving.contact_states(*both).force, (phases, states))
         code = ended.status.astype(y.dtype)
         return time, energy, *seen, jnp.max(force, axis=0), code

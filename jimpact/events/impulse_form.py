@@ -111,10 +111,12 @@ def walk(flow: Rule, dp: jax.Array, max_steps: int, gamma: jax.Array, energy: ja
 def rule_of(problem: Any, exponent: Any, chain: bool) -> Rule:
     """The rule of a dimensionless problem (see `impact_dynamics.py`)."""
     m, eta = problem.gamma.shape[0], exponent if problem.exponent is None else problem.exponent
-    coupling: Symmetric = Tridiagonal(jnp.ones_like(problem.gamma), problem.beside)
+    coupling: Symmetric = Tridiagonal(jnp.ones_like(problem.gamma), problem.off_diagonal)
     if not chain:
         upper = (
-            jnp.zeros((m, m), problem.gamma.dtype).at[jnp.triu_indices(m, 1)].set(problem.beside)
+            jnp.zeros((m, m), problem.gamma.dtype)
+            .at[jnp.triu_indices(m, 1)]
+            .set(problem.off_diagonal)
         )
         coupling = jnp.eye(m, dtype=problem.gamma.dtype) + upper + upper.T
     return Rule(coupling, problem.omega, problem.restitution, eta)

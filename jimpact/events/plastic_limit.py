@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jimpact.events import stepper
 from jimpact.events.contact_flow import ContactFlow
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
-from jimpact.events.tangents import moving_with, through, value_of
+from jimpact.events.tangents import dual_like, pushforward, value_of
 from jimpact.status import CODE
 
 QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
@@ -42,10 +42,10 @@ class Rest(NamedTuple):
     ended: jax.Array  # (1, B): by a state that returned as a part of itself
 
 
-class End(NamedTuple):
+class ImpactEnd(NamedTuple):
     """An impact at its end, finished but for the impulse of the contacts at rest."""
 
-    carry: stepper.Carry
+    carry: stepper.StepperState
     pen: stepper.Recorder | None
     rest: Rest
     begun: jax.Array  # ()
@@ -61,7 +61,7 @@ class End(NamedTuple):
         return jnp.where(self.carries, self.rest.rows[2], 0.0)
 
     @property
-    def plan(self) -> stepper.Plan:
+    def plan(self) -> stepper.AcceptedSteps:
         """The steps that were kept."""
         assert self.pen is not None
         return self.pen.plan
@@ -85,7 +85,7 @@ class End(NamedTuple):
 
 def to_the_end(
     flow: Any, gamma: jax.Array, modes: jax.Array, y: Any, most: int, keeps: bool
-) -> End:
+) -> ImpactEnd:
     """From gap velocities gamma (m, B) to the end; `keeps` the plan of the steps.
 
     What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents.
@@ -96,9 +96,9 @@ def to_the_end(
     no = jnp.zeros(gamma.shape, bool)
     rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
     rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
-    start = End(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
+    start = ImpactEnd(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
 
-    def on(end: End) -> End:
+    def on(end: ImpactEnd) -> ImpactEnd:
         finished = (end.carry.plan[2:3] == OVER) & end.begun
         if end.pen is None:
             carry, pen = stepper.run(flow, end.carry, most), None
@@ -111,7 +111,7 @@ def to_the_end(
         def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
             return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
 
-        carry = carry._replace(y=moving_with(carry.y, through(at_end, flow, carry.y)))
+        carry = carry._replace(y=dual_like(carry.y, pushforward(at_end, flow, carry.y)))
         seen = seen._replace(y=jax.lax.stop_gradient(value_of(carry.y)))
         rest = jax.lax.cond(
             jnp.any(paused | quiet),
@@ -120,14 +120,14 @@ def to_the_end(
         )
         settled = jnp.where(rest.ended, OVER, GOES_ON)
         plan = carry.plan.at[2:3].set(jnp.where(paused, settled, carry.plan[2:3]))
-        return End(carry._replace(plan=plan), pen, rest, jnp.asarray(True))
+        return ImpactEnd(carry._replace(plan=plan), pen, rest, jnp.asarray(True))
 
     return jax.lax.while_loop(
         lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start
     )
 
 
-def at_rest(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
+def at_rest(flow: ContactFlow, end: stepper.StepperState) -> jax.Array:
     """Contacts (m, B) as good as at rest where some of them re-closed again and again."""
     m, modes = flow.contacts, end.step.modes
     gamma = flow.scales(modes) * flow.rows(end.y)[1]
@@ -137,7 +137,7 @@ def at_rest(flow: ContactFlow, end: stepper.Carry) -> jax.Array:
 
 
 def looked(
-    flow: ContactFlow, gamma: jax.Array, carry: stepper.Carry, seen: Rest, quiet: jax.Array
+    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, seen: Rest, quiet: jax.Array
 ) -> Rest:
     """Who is at rest at the end, or would come to rest from a pause.
 

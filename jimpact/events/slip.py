@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.contact_flow import ContactFlow, Frozen, Measured, as_pytree, times, unit
+from jimpact.events.contact_flow import ContactFlow, ContactStates, Frozen, as_pytree, times, unit
 from jimpact.events.friction_flow import FrictionFlow, inverse, solve
 from jimpact.events.stepper import any_of, total
 from jimpact.solvers.friction import distribute
@@ -66,7 +66,7 @@ class Reduced(NamedTuple):
     carried: jax.Array  # (t, t, B)
 
 
-class Motion(NamedTuple):
+class SlipRates(NamedTuple):
     """Forces and the rates of slip in the flow's own time before it is shortened."""
 
     force: jax.Array  # F (m, B)
@@ -207,7 +207,7 @@ class SlipFlow(FrictionFlow):
             carried=carried,
         )
 
-    def motion(self, const: Reduced, modes: jax.Array, y: jax.Array) -> Motion:
+    def motion(self, const: Reduced, modes: jax.Array, y: jax.Array) -> SlipRates:
         """Forces, and how fast slip changes."""
         frozen = const.frozen
         x, g, _ = self.rows(y)
@@ -236,7 +236,7 @@ class SlipFlow(FrictionFlow):
         stiffness = c * jnp.stack([own[j, 0, j, 0] + own[j, 1, j, 1] for j in range(len(c))]) / 2
         haste = 1 + total(over_r * (length(a) + 2 * stiffness))
         holding = -(times(const.held, f) + times(const.carried, side))
-        return Motion(f, side, jnp.where(twice(stick), holding, 0.0), rate, stiffness, haste)
+        return SlipRates(f, side, jnp.where(twice(stick), holding, 0.0), rate, stiffness, haste)
 
     def _blocks(self, const: Reduced) -> jax.Array:
         """K_tt (m, 2, m, 2, B)."""
@@ -299,12 +299,12 @@ class SlipFlow(FrictionFlow):
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
-    def measured(self, modes: jax.Array, y: jax.Array) -> Measured:
+    def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
         m, (x, g, p) = self.contacts, self.rows(y)
         const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
         motion = self.motion(const, modes, y)
         turned = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
-        return Measured(
+        return ContactStates(
             force=motion.force,
             indentation=x,
             impulse=p,

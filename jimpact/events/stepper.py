@@ -52,7 +52,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.tableaux import DOP853
-from jimpact.events.tangents import Moving, moving_with, through, value_of
+from jimpact.events.tangents import Dual, dual_like, pushforward, value_of
 
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
@@ -164,7 +164,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
         return const, jax.lax.stop_gradient(c0), start, length, rooted, nowhere
 
-    const, c0, start, length, rooted, nowhere = through(frame, flow, y)
+    const, c0, start, length, rooted, nowhere = pushforward(frame, flow, y)
     count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
@@ -200,7 +200,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         slopes, added, *margins = carry
         i, a, c = at
         change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
-        new, (value, dc) = through(evaluated, flow, const, start, length, y, change, (i, c))
+        new, (value, dc) = pushforward(evaluated, flow, const, start, length, y, change, (i, c))
         slopes = _kept(slopes, new[: len(blocks)], i)
         added = _kept(added, new[len(blocks) :], i)
         if ends:
@@ -208,16 +208,16 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
         return (slopes, added, *margins), None
 
     none = [jnp.zeros((count, k, *batch), dtype) for k in (drives, adds + 1)]
-    carry = [moving_with((flow, y), k) for k in none]
+    carry = [dual_like((flow, y), k) for k in none]
     margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     (slopes, added, *margins), _ = jax.lax.scan(stage, (*carry, *margins), rows)
     sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in (slopes, added)]
     inner, outer = (
-        Moving(x[0], jnp.tensordot(weights[0], k.along, axes=1)) if isinstance(k, Moving) else x[0]
+        Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1)) if isinstance(k, Dual) else x[0]
         for x, k in zip(sums, (slopes, added))
     )
-    change = through(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
+    change = pushforward(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
     errors = value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)[:, :n]
     return change, errors, c0, margins
 
@@ -229,34 +229,34 @@ def _kept(table: Any, new: list[Any], i: jax.Array) -> Any:
     """
     value = value_of(table)
     value = _put(value, jnp.concatenate(value_of(new)), i)
-    if not isinstance(table, Moving):
+    if not isinstance(table, Dual):
         return value
-    along, first, none = table.along, 0, jnp.zeros((), i.dtype)
+    along, first, none = table.tangents, 0, jnp.zeros((), i.dtype)
     for block in new:
-        if isinstance(block, Moving):  # else its tangents are 0
+        if isinstance(block, Dual):  # else its tangents are 0
             at = (i, jnp.asarray(first, i.dtype), none, none)
             along = jax.lax.dynamic_update_slice(
-                along, block.along[None], at, allow_negative_indices=False
+                along, block.tangents[None], at, allow_negative_indices=False
             )
         first += len(value_of(block))
-    return Moving(value, along)
+    return Dual(value, along)
 
 
 GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
 
 
-class Carry(NamedTuple):
+class StepperState(NamedTuple):
     """What one pass hands to the next."""
 
-    y: Any  # (n, B), which may be `Moving`
+    y: Any  # (n, B), which may be `Dual`
     step: Step  # the one to try
     # (4, B): time it is expected to take, landing aimed at twice, GOES_ON | OVER | PAUSED, passes
     plan: jax.Array
 
 
-def begin(flow: Any, modes: jax.Array, start: Any) -> Carry:
+def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
     """The first step: short, in the root of time, for forces set in like a power of it."""
-    start = moving_with((flow, start), start)
+    start = dual_like((flow, start), start)
     flow, y = value_of((flow, start))
     one = jnp.ones_like(y[:1])
     clock = jnp.concatenate([0 * one, FIRST**0.5 * one, one, 0 * one])
@@ -264,20 +264,20 @@ def begin(flow: Any, modes: jax.Array, start: Any) -> Carry:
     step = Step(modes, jnp.zeros(targets, bool), clock)
     over = flow.over(modes, y, 0 * one)
     state = jnp.where(over, OVER, GOES_ON).astype(y.dtype)
-    return Carry(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
+    return StepperState(start, step, jnp.concatenate([FIRST * one, 0 * one, state, 0 * one]))
 
 
-def goes_on(carry: Carry, most: int) -> jax.Array:
+def goes_on(carry: StepperState, most: int) -> jax.Array:
     """Impacts (1, B) that are neither over nor given up nor looked at."""
     return (carry.plan[2:3] == GOES_ON) & (carry.plan[3:4] < most)
 
 
-def unwatched(carry: Carry, most: int) -> jax.Array:
+def unwatched(carry: StepperState, most: int) -> jax.Array:
     """Whether () some impact goes on and none wants to be looked at."""
     return jnp.any(goes_on(carry, most)) & ~jnp.any(carry.plan[2:3] == PAUSED)
 
 
-def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
+def advance(flow: Flow, carry: StepperState, most: int) -> tuple[StepperState, jax.Array]:
     """One pass: try a step; accept it, or aim at what lies in its middle, or shorten it.
 
     Every margin gets one number, in units of the step tried, and the least one decides:
@@ -350,8 +350,8 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
         modes, end = flow.switch(s.modes, y + change[:n], which)
         return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
-    modes, end = through(after, moving, start, change)
-    end = moving_with(start, end)
+    modes, end = pushforward(after, moving, start, change)
+    end = dual_like(start, end)
     y = value_of(end)
     # the next step
     in_root = in_root & ~lands
@@ -389,7 +389,7 @@ def advance(flow: Flow, carry: Carry, most: int) -> tuple[Carry, jax.Array]:
             passes,
         ]
     )
-    return Carry(end, *jax.lax.stop_gradient((Step(modes, target, clock), plan))), accept
+    return StepperState(end, *jax.lax.stop_gradient((Step(modes, target, clock), plan))), accept
 
 
 def _root_of_cubic(
@@ -407,7 +407,7 @@ def _root_of_cubic(
     return u
 
 
-def run(flow: Flow, carry: Carry, most: int) -> Carry:
+def run(flow: Flow, carry: StepperState, most: int) -> StepperState:
     """On to the end, the first pause, or the limit of passes; `finish` is not yet applied."""
     return jax.lax.while_loop(
         lambda c: unwatched(c, most), lambda c: advance(flow, c, most)[0], carry
@@ -417,7 +417,7 @@ def run(flow: Flow, carry: Carry, most: int) -> Carry:
 # ---- derivatives: the accepted steps once more -------------------------------------------------
 
 
-class Plan(NamedTuple):
+class AcceptedSteps(NamedTuple):
     """Accepted steps in order, at most BLOCKS * BLOCK; nothing kept: zeros."""
 
     marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 where a step is kept
@@ -429,15 +429,15 @@ class Plan(NamedTuple):
 class Recorder(NamedTuple):
     """A plan while it is written, and rows used."""
 
-    plan: Plan
+    plan: AcceptedSteps
     used: jax.Array
 
 
-def recorder(carry: Carry) -> Recorder:
+def recorder(carry: StepperState) -> Recorder:
     """A plan without a step."""
     modes, target, clock = carry.step
     size, rows = BLOCKS * BLOCK, len(modes) + len(target) + 1
-    plan = Plan(
+    plan = AcceptedSteps(
         jnp.zeros((size, rows, *clock.shape[1:]), jnp.int8),
         jnp.zeros((size, *clock.shape), clock.dtype),
         jnp.zeros(clock[:1].shape, bool),
@@ -445,11 +445,13 @@ def recorder(carry: Carry) -> Recorder:
     return Recorder(plan, jnp.zeros((), jnp.uint32))
 
 
-def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, Recorder]:
+def record(
+    flow: Flow, carry: StepperState, pen: Recorder, most: int
+) -> tuple[StepperState, Recorder]:
     """As `run`, and the plan of its steps."""
     size = BLOCKS * BLOCK
 
-    def body(state: tuple[Carry, Recorder]) -> tuple[Carry, Recorder]:
+    def body(state: tuple[StepperState, Recorder]) -> tuple[StepperState, Recorder]:
         carry, (plan, count) = state
         after, accept = advance(flow, carry, most)
         s = carry.step
@@ -458,7 +460,7 @@ def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, R
         )
         # a pass that no impact of the batch accepts leaves its row to the next one
         index = jnp.minimum(count, size - 1)
-        plan = Plan(
+        plan = AcceptedSteps(
             _put(plan.marks, jnp.where(accept, marks, 0), index),
             _put(plan.clock, jnp.where(accept, s.clock, 0.0), index),
             plan.lost | (accept & (count >= size)),
@@ -469,7 +471,7 @@ def record(flow: Flow, carry: Carry, pen: Recorder, most: int) -> tuple[Carry, R
     return jax.lax.while_loop(lambda state: unwatched(state[0], most), body, (carry, pen))
 
 
-def with_plan(x: jax.Array, plan: Plan) -> jax.Array:
+def with_plan(x: jax.Array, plan: AcceptedSteps) -> jax.Array:
     """x, of a program that has to keep the plan although nothing else is asked of it.
 
     Values and their derivatives record the same steps. The compiler makes one loop of two that are
@@ -479,12 +481,12 @@ def with_plan(x: jax.Array, plan: Plan) -> jax.Array:
     return jnp.where((marks < 0) | (clock < 0), jnp.nan, x)
 
 
-def repeat(flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan) -> jax.Array:
+def repeat(flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps) -> jax.Array:
     """The state that `run` ends with, as a smooth function of `flow` and `y`."""
     return _walk(flow, modes, y, plan, states=False)[0]
 
 
-def path(flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan) -> jax.Array:
+def path(flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps) -> jax.Array:
     """States (steps + 1, n, B) at the beginning and after each step of the plan, smooth as well."""
     after: Any = _walk(flow, modes, y, plan, states=True)[1]
     return jnp.concatenate([y[None], after.reshape(-1, *y.shape)])
@@ -519,7 +521,7 @@ def step_of(row: Row, modes: int) -> tuple[Step, jax.Array]:
 
 
 def _walk(
-    flow: Flow, modes: jax.Array, y: jax.Array, plan: Plan, states: bool
+    flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps, states: bool
 ) -> tuple[jax.Array, jax.Array | None]:
     """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
     y = jnp.where(plan.lost, jnp.nan, 1.0) * y

@@ -1,9 +1,8 @@
-"""Tangents side by side: many directions at one point, beside the lanes of a batch.
+"""Dual numbers with many tangents: all directions D of a derivative at one point.
 
-`vmap` over the directions of a derivative puts them first, before the stages of a step. Every sum
-over stages then has to turn the whole table of slopes. Here tangents lie next to the batch,
-(.., D, B) beside values (.., B): a loop is written once, for values alone or with tangents, and
-what is inside of it goes `through`.
+`vmap` over the directions would put their axis first, before the stages of a step, and every sum
+over stages would transpose the whole table of slopes. Here values are (.., B) and their tangents
+(.., D, B). A loop is written once, for values alone or with tangents; its body calls `pushforward`.
 """
 
 from collections.abc import Callable
@@ -13,63 +12,64 @@ import jax
 import jax.numpy as jnp
 from jax.interpreters import ad
 
-BESIDE = -2  # the axis of the directions
+TANGENT_AXIS = -2  # the axis of the directions
 
 
-class Moving(NamedTuple):
+class Dual(NamedTuple):
     """A value (.., B) with its tangents (.., D, B)."""
 
     value: jax.Array
-    along: jax.Array
+    tangents: jax.Array
 
 
-def moves(x: Any) -> bool:
-    """Whether it has tangents."""
-    return isinstance(x, Moving)
+def is_dual(x: Any) -> bool:
+    """Whether x has tangents."""
+    return isinstance(x, Dual)
 
 
 def value_of(tree: Any) -> Any:
-    """Values alone."""
-    return jax.tree.map(lambda x: x.value if moves(x) else x, tree, is_leaf=moves)
+    """The tree with each `Dual` replaced by its value."""
+    return jax.tree.map(lambda x: x.value if is_dual(x) else x, tree, is_leaf=is_dual)
 
 
-def through(function: Callable[..., Any], *args: Any) -> Any:
-    """`function(*args)`; where leaves of args are `Moving`, so are those that depend on them."""
-    leaves, tree = jax.tree.flatten(args, is_leaf=moves)
-    at = [i for i, x in enumerate(leaves) if moves(x)]
-    if not at:
+def pushforward(function: Callable[..., Any], *args: Any) -> Any:
+    """`function(*args)`; results that depend on a leaf that is a `Dual` are `Dual`, too."""
+    leaves, tree = jax.tree.flatten(args, is_leaf=is_dual)
+    duals = [i for i, x in enumerate(leaves) if is_dual(x)]
+    if not duals:
         return function(*args)
-    carried: list[bool] = []
+    depends: list[bool] = []  # of each result, whether it depends on a dual
 
-    def smooth(*values: jax.Array) -> tuple[list[Any], Any]:
-        given = dict(zip(at, values))
-        outs = function(*jax.tree.unflatten(tree, [given.get(i, x) for i, x in enumerate(leaves)]))
-        flat, after = jax.tree.flatten(outs)
-        flat = [jnp.asarray(x) for x in flat]
-        carried[:] = [isinstance(x, ad.JVPTracer) and _smooth(x) for x in flat]
-        return flat, after
+    def of_values(*values: jax.Array) -> tuple[list[Any], Any]:
+        replaced = dict(zip(duals, values))
+        args = jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
+        results, result_tree = jax.tree.flatten(function(*args))
+        results = [jnp.asarray(x) for x in results]
+        depends[:] = [isinstance(x, ad.JVPTracer) and _is_float(x) for x in results]
+        return results, result_tree
 
-    values = tuple(leaves[i].value for i in at)
+    values = tuple(leaves[i].value for i in duals)
 
-    def push(*along: jax.Array) -> list[jax.Array]:
-        rates = jax.jvp(lambda *v: smooth(*v)[0], values, along)[1]
-        return [rate for rate, moved in zip(rates, carried) if moved]
+    def push(*tangents: jax.Array) -> list[jax.Array]:
+        rates = jax.jvp(lambda *v: of_values(*v)[0], values, tangents)[1]
+        return [rate for rate, needed in zip(rates, depends) if needed]
 
-    outs, after = smooth(*values)
-    rates = iter(jax.vmap(push, BESIDE, BESIDE)(*(leaves[i].along for i in at)))
+    results, result_tree = of_values(*values)
+    rates = iter(jax.vmap(push, TANGENT_AXIS, TANGENT_AXIS)(*(leaves[i].tangents for i in duals)))
     return jax.tree.unflatten(
-        after, [Moving(x, next(rates)) if moved else x for x, moved in zip(outs, carried)]
+        result_tree, [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)]
     )
 
 
-def _smooth(x: jax.Array) -> bool:
+def _is_float(x: jax.Array) -> bool:
+    """Whether x is an array of floating-point numbers."""
     return bool(jnp.issubdtype(x.dtype, jnp.floating))
 
 
-def moving_with(tree: Any, x: jax.Array | Moving) -> Any:
-    """x with tangents, of 0, if anything in the tree has some."""
-    found = [leaf for leaf in jax.tree.leaves(tree, is_leaf=moves) if moves(leaf)]
-    if not found or isinstance(x, Moving):
+def dual_like(tree: Any, x: jax.Array | Dual) -> Any:
+    """x with tangents of 0 if a leaf of the tree is a `Dual`, otherwise x."""
+    duals = [leaf for leaf in jax.tree.leaves(tree, is_leaf=is_dual) if is_dual(leaf)]
+    if not duals or isinstance(x, Dual):
         return x
-    many = found[0].along.shape[BESIDE]
-    return Moving(x, jnp.zeros((*x.shape[:-1], many, x.shape[-1]), x.dtype))
+    directions = duals[0].tangents.shape[TANGENT_AXIS]
+    return Dual(x, jnp.zeros((*x.shape[:-1], directions, x.shape[-1]), x.dtype))

@@ -104,8 +104,8 @@ class Compliant(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
-        doubted = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.max_steps, doubted=doubted))
+        checked = contact if self.check_conditioning else None
+        return Impulses(*solve(self.dynamics(contact), self.max_steps, condition_check=checked))
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

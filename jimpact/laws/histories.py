@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jimpact._checks import as_whole, check_values, in_common_dtype
 from jimpact.compiling import quick_jit
 from jimpact.events.batches import in_columns
-from jimpact.events.contact_flow import Measured
-from jimpact.events.impact_dynamics import Outcome
+from jimpact.events.contact_flow import ContactStates
+from jimpact.events.impact_dynamics import ImpulseProgram
 from jimpact.events.impact_history import Samples
 from jimpact.law import Law, check_law
 from jimpact.laws.compliant import Compliant
@@ -93,12 +93,12 @@ def _history(law: LZB | Compliant, scene: Scene, v: jax.Array, samples: int) -> 
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     given = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
     leaves, tree = given.columns()
-    outcome = Outcome(
+    outcome = ImpulseProgram(
         tree, given.static_exponent, given.chain, law.max_steps, given.tangents, whole=True
     )
     time, energy, *rest = in_columns(Samples(outcome, samples), *leaves)
     *rows, maximum, code = (x[..., 0] for x in rest)
-    seen, units = Measured(*rows), given.units
+    seen, units = ContactStates(*rows), given.units
     force, side = units.momentum / units.time, jnp.repeat(units.root, given.tangents // len(gamma))
 
     def live(x: jax.Array, before: Any = 0.0) -> jax.Array:

@@ -149,7 +149,7 @@ class LZB(Law):
         check_rtol(self.rtol, dtype)
 
     @property
-    def fills_up(self) -> bool:
+    def pads_scenes(self) -> bool:
         """Without friction, by the stepper."""
         return self.method == "time" and self.friction is None
 
@@ -173,5 +173,5 @@ class LZB(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
-        doubted = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method, doubted))
+        checked = contact if self.check_conditioning else None
+        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method, checked))

@@ -88,9 +88,9 @@ class VelocityDependent(Law):
         return self.law.separable
 
     @property
-    def fills_up(self) -> bool:
+    def pads_scenes(self) -> bool:
         """As the law."""
-        return self.law.fills_up
+        return self.law.pads_scenes
 
     @property
     def stored(self) -> jax.Array:

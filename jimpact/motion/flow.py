@@ -378,7 +378,7 @@ def one_pass(
         sizes=jax.lax.stop_gradient(_errors(flow, settings, allowed, flight) / flow.rtol)[:, None],
     )
     # passes are counted here: their number does not lower the tolerance
-    carry = stepper.Carry(_rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0))
+    carry = stepper.StepperState(_rows(flow, state), flight.aim, flight.plan.at[2:].set(0.0))
     after, accept = stepper.advance(flow, carry, 2)
     accept = accept[0, 0] & flies
     landed = flight.aim.target[:, 0] & accept

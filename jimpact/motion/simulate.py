@@ -20,7 +20,7 @@ from jimpact._checks import (
     in_common_dtype,
     is_traced,
 )
-from jimpact.compiling import is_own, quick_jit
+from jimpact.compiling import is_top_level_call, quick_jit
 from jimpact.law import Law
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
@@ -195,7 +195,7 @@ def simulate(
 
 def _on_host(given: Any) -> bool:
     """Whether what follows from it is known at once: not within jit, vmap or derivatives."""
-    return not is_traced(given) and is_own(())
+    return not is_traced(given) and is_top_level_call()
 
 
 def _waited(run: Callable[..., Motion], given: Any, progress: float | None) -> Motion:

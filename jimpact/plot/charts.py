@@ -418,7 +418,7 @@ def advice(found: Advice, title: str = "") -> Figure:
     bottom.set_yscale("log")
     bottom.set_ylim(found.tolerance / 1000, 30)  # room above for the legend
     logarithmic(bottom, "y")
-    bottom.set_ylabel("error of v+ / max |v-|")
+    bottom.set_ylabel("error of v+ (energy norm)")
     top.set_ylabel("velocity after the impact [m/s]")
     named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(names, rows)]
     bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)

@@ -7,6 +7,16 @@ import jax.numpy as jnp
 Triple = tuple[jax.Array, jax.Array, jax.Array]
 
 
+def tridiagonal_product(
+    on_diagonal: jax.Array, off_diagonal: jax.Array, vector: jax.Array
+) -> jax.Array:
+    """`A vector` (m, ..) of a symmetric tridiagonal A, given what its diagonal makes of it."""
+    none = jnp.zeros_like(vector[:1])
+    lower = jnp.concatenate([none, off_diagonal * vector[:-1]])
+    upper = jnp.concatenate([off_diagonal * vector[1:], none])
+    return on_diagonal + lower + upper
+
+
 class Tridiagonal(eqx.Module):
     """Symmetric tridiagonal matrix: `diagonal` (m,), `off_diagonal` (m - 1,).
 
@@ -19,10 +29,7 @@ class Tridiagonal(eqx.Module):
 
     def __matmul__(self, vector: jax.Array) -> jax.Array:
         """Matrix-vector product in O(m); batches in further axes of all three."""
-        none = jnp.zeros_like(vector[:1])
-        lower = jnp.concatenate([none, self.off_diagonal * vector[:-1]])
-        upper = jnp.concatenate([self.off_diagonal * vector[1:], none])
-        return self.diagonal * vector + lower + upper
+        return tridiagonal_product(self.diagonal * vector, self.off_diagonal, vector)
 
     def solve(self, vector: jax.Array) -> jax.Array:
         """`A^-1 vector` for a positive definite matrix, in O(m)."""

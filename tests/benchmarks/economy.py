@@ -123,8 +123,8 @@ def by_groups(balls, count):
 
 def compiled_without_closed_form(function, k):
     """`function` compiled with every contact integrated to its end."""
-    whole = functools.partial(impact_dynamics.Outcome, whole=True)
-    with mock.patch.object(impact_dynamics, "Outcome", whole):
+    whole = functools.partial(impact_dynamics.ImpulseProgram, whole=True)
+    with mock.patch.object(impact_dynamics, "ImpulseProgram", whole):
         jax.clear_caches()
         run = jax.jit(function).lower(k).compile()
     jax.clear_caches()

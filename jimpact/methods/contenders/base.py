@@ -18,7 +18,7 @@ from jimpact._checks import as_float_array, in_common_dtype
 from jimpact.contact import Contact
 from jimpact.events import impact_dynamics
 from jimpact.events.contact_flow import power
-from jimpact.events.impact_dynamics import Dynamics, Units
+from jimpact.events.impact_dynamics import Dynamics, ImpactUnits
 from jimpact.events.impulse_form import Rule, rule_of
 from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
@@ -80,7 +80,7 @@ class GivenImpact(NamedTuple):
         return self.dynamics.problem
 
     @property
-    def units(self) -> Units:
+    def units(self) -> ImpactUnits:
         """Scales back to SI."""
         return self.dynamics.units
 

@@ -33,7 +33,7 @@ import jax.numpy as jnp
 
 from jimpact.events import impulse_form
 from jimpact.events.contact_flow import power
-from jimpact.events.impact_dynamics import Outcome, outcome
+from jimpact.events.impact_dynamics import ImpulseProgram, evaluate
 from jimpact.events.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
@@ -52,9 +52,11 @@ from jimpact.status import CODE
 def _solve_aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     given = problem(law, scene, velocity, setting)
     leaves, tree = given.dynamics.columns()
-    function = Outcome(tree, given.dynamics.static_exponent, given.dynamics.chain, given.max_steps)
-    p, _, _, code, passes = outcome(function, leaves)
-    _, _, t, _, _ = outcome(dataclasses.replace(function, whole=True), leaves)
+    function = ImpulseProgram(
+        tree, given.dynamics.static_exponent, given.dynamics.chain, given.max_steps
+    )
+    p, _, _, code, passes = evaluate(function, leaves)
+    _, _, t, _, _ = evaluate(dataclasses.replace(function, whole=True), leaves)
     return in_si(given, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0])
 
 
