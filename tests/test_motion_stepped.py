@@ -387,6 +387,49 @@ def test_a_motion_is_in_the_widest_precision_given():
         assert stepped(system, ji.Moreau(1.0), *start).q.dtype == jnp.float64
 
 
+class Apart(ji.Body):
+    """Two balls on a line, whose gap grows again once they have passed each other."""
+
+    def gap_function(self, q):
+        return jnp.abs(q[1:] - q[:1]) - 0.2
+
+    @property
+    def mass(self):
+        return jnp.ones(2)
+
+
+LINE = (1.0, -1.0)
+PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0)
+DISCS = ji.PlanarBodies([ji.Disc(0.1), ji.Disc(0.1)], planes=[])
+
+
+@pytest.mark.parametrize(
+    ("body", "way", "speed", "expected"),
+    [
+        (Apart(), LINE, 50.0, "coarse_step"),
+        (DISCS, PLANE, 50.0, "coarse_step"),
+        (DISCS, PLANE, 3.0, "ok"),
+    ],
+)
+def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, expected):
+    """Steps of .01 s; the status does not depend on where in a step they meet."""
+    way = jnp.array(way)
+
+    @jax.jit
+    @jax.vmap
+    def run(start):
+        return ji.simulate(
+            ji.System(body), ji.Moreau(0.5), -start * way, speed * way, 0.1,
+            samples=2, method="time_stepping", step=1e-2,
+        )  # fmt: skip
+
+    motion = run(0.12 + jnp.array([0.0, 0.1, 0.3, 0.7, 0.9, 1.3]) * 0.5 * speed / 50)
+    passed = motion.velocity[:, -1, -len(way) // 2] < 0
+    reported = motion.status == MOTION_CODE["coarse_step"]
+    assert (reported == passed).all()
+    assert bool(passed.any()) == (expected == "coarse_step")
+
+
 def test_steps_too_many_to_count_are_refused():
     with pytest.raises(ValueError, match="`step` must give at most"):
         ji.simulate(

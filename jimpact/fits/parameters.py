@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
-from jimpact.laws.lzb import LZB
-from jimpact.laws.velocity_dependent import VelocityDependent
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
@@ -175,13 +173,9 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
-    """Whether a common factor of all stiffnesses is invisible: LZB with equal exponents."""
-    law = law.law if isinstance(law, VelocityDependent) else law
-    if not isinstance(law, LZB):
-        return False
-    exponents = np.unique(np.asarray(law.exponent, dtype=float))
+    """Whether a common factor of all stiffnesses is invisible, in the fit too."""
     stay_equal = "exponent" not in labels or len(set(labels["exponent"].flat)) == 1
-    return len(exponents) == 1 and stay_equal
+    return law.only_stiffness_ratios and stay_equal
 
 
 def bounds_of(

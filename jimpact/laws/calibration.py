@@ -14,6 +14,7 @@ import optimistix as optx
 from jimpact._checks import as_float_array, check_per_contact, check_values
 from jimpact.contact import delassus_matrix
 from jimpact.impacts import impact
+from jimpact.law import with_parameter
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
 from jimpact.methods.comparison import Comparison, compare
@@ -24,7 +25,6 @@ RTOL = {"float64": 1e-11}  # of the pair's impact; else the law's default
 LEAST = 0.05  # restitution: below, the dampers are so strong that e hardly depends on them
 STRONGEST = 0.99  # s = d / (1 + d) of the largest dimensionless damping d that is tried
 BISECTIONS = 60  # halvings of s, to rounding
-CRITICAL = 1e-4  # |zeta - 1| below which damped and overdamped motions are one series
 
 
 def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
@@ -50,13 +50,8 @@ def measured_restitution(force: Force, mass: Any, speed: Any) -> jax.Array:
     m, v = as_float_array("mass", mass), as_float_array("speed", speed)
     check_values("mass", m, low=0.0, open_low=True)
     check_values("speed", v, low=0.0, open_low=True)
-    if isinstance(force, Bistiffness):
-        shape = jnp.broadcast_shapes(m.shape, v.shape, force.restitution.shape)
-        return jnp.broadcast_to(force.restitution, shape)
-    if isinstance(force, KelvinVoigt):
-        zeta = force.damping / (2 * jnp.sqrt(force.stiffness * m))
-        return _damped_spring(zeta) + jnp.zeros_like(v)
-    return _each(_integrated, force, m, v)
+    known = force.pair_restitution(m, v)
+    return _each(_integrated, force, m, v) if known is None else known
 
 
 def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
@@ -85,17 +80,17 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
     0.9
     """
     e = as_float_array("restitution", restitution)
-    if isinstance(force, Bistiffness):
-        return Bistiffness(force.stiffness, force.exponent, e)
-    if not isinstance(force, KelvinVoigt | HuntCrossley | KuwabaraKono):
-        raise TypeError(f"Argument `force` must have a damping to find, but is {force!r}.")
+    if force.bistiffness is not None:
+        return with_parameter(force.bistiffness, "restitution", e)
     check_values("restitution", e, low=LEAST, high=1.0)
     m, v = as_float_array("mass", mass), as_float_array("speed", speed)
     check_values("mass", m, low=0.0, open_low=True)
     check_values("speed", v, low=0.0, open_low=True)
-    undamped = eqx.tree_at(lambda f: f.damping, force, jnp.zeros_like(force.stiffness))
-    damping = _each(_damping, undamped, m, v, e)
-    return eqx.tree_at(lambda f: f.damping, force, damping)
+    strong = force.damping_scale(m, v)
+    if strong is None:
+        raise TypeError(f"Argument `force` must have a damping to find, but is {force!r}.")
+    undamped = with_parameter(force, "damping", jnp.zeros_like(strong))
+    return with_parameter(force, "damping", _each(_damping, undamped, m, v, e))
 
 
 def compare_rheologies(
@@ -171,46 +166,22 @@ def _each(function: Any, force: Force, *values: jax.Array) -> jax.Array:
 
 
 def _integrated(force: Force, mass: jax.Array, speed: jax.Array) -> jax.Array:
+    """e of one pair by its impact against a wall; NaN where it does not end."""
     law = Compliant(force, rtol=RTOL.get(str(jnp.result_type(mass, speed))))
     out = impact(law, chain(mass[None], wall=True), speed[None])
     return jnp.where(out.status == 0, -out.velocity[0] / speed, jnp.nan)
 
 
-def _damped_spring(zeta: jax.Array) -> jax.Array:
-    """e of `k x + c x'`, cut where it would pull: Schwager and Poeschel (2007), (17)-(19)."""
-    near = jnp.abs(zeta - 1) < CRITICAL
-    away = jnp.where(near, 0.5, zeta)  # any harmless value
-    under = away < 1
-    z = jnp.where(under, away, 0.5)
-    w = jnp.sqrt(1 - z**2)
-    swinging = -z / w * (jnp.pi - jnp.arctan2(2 * z * w, 1 - 2 * z**2))
-    z = jnp.where(under, 2.0, away)
-    w = jnp.sqrt(z**2 - 1)
-    creeping = -2 * z / w * jnp.log(z + w)  # (z + w)(z - w) = 1
-    series = -2 - 4 / 3 * (zeta - 1)
-    return jnp.exp(jnp.where(near, series, jnp.where(under, swinging, creeping)))
-
-
-def _damping(
-    force: KelvinVoigt | HuntCrossley | KuwabaraKono,
-    mass: jax.Array,
-    speed: jax.Array,
-    e: jax.Array,
-) -> jax.Array:
-    k = force.stiffness
-    if isinstance(force, KelvinVoigt):
-        unit = 2 * jnp.sqrt(k * mass)
-    elif isinstance(force, HuntCrossley):
-        unit = 1 / speed
-    else:
-        unit = (mass**2 / (k**2 * speed)) ** 0.2
+def _damping(force: Force, mass: jax.Array, speed: jax.Array, e: jax.Array) -> jax.Array:
+    """The damping with which one pair has the restitution e, all arguments scalars."""
+    unit = force.damping_scale(mass, speed)
 
     def excess(s: jax.Array, args: Any) -> jax.Array:
+        """e less that of the damping `unit s / (1 - s)`: from 0 on, s from 0 to 1."""
         force, mass, speed, e, unit = args
-        damped = eqx.tree_at(lambda f: f.damping, force, unit * s / (1 - s))
-        if isinstance(damped, KelvinVoigt):
-            return e - _damped_spring(damped.damping / (2 * jnp.sqrt(damped.stiffness * mass)))
-        return e - _integrated(damped, mass, speed)
+        damped = with_parameter(force, "damping", unit * s / (1 - s))
+        known = damped.pair_restitution(mass, speed)
+        return e - (_integrated(damped, mass, speed) if known is None else known)
 
     solver = optx.Bisection(rtol=0.0, atol=float(jnp.finfo(e.dtype).eps), flip=False)
     ends = {"lower": jnp.zeros_like(e), "upper": jnp.full_like(e, STRONGEST)}

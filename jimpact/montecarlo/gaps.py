@@ -13,9 +13,6 @@ from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness
-from jimpact.laws.lzb import LZB
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
@@ -78,7 +75,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
 
     Args:
         scene: its gaps, None: all closed.
-        law: a `Compliant` or an `LZB`.
+        law: a `Compliant`, an `LZB`, or another one with a `contact_force`.
         velocity: v- (n,) [m/s].
 
     Returns:
@@ -95,17 +92,18 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     """
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
-    if not isinstance(law, Compliant | LZB):
+    force = law.contact_force
+    if force is None:
         raise TypeError(
-            f"Argument `law` must be a Compliant or an LZB, whose contacts indent, but is {law!r}."
+            "Argument `law` must have a `contact_force`, by which its contacts indent (Compliant, "
+            f"LZB), but is {law!r}."
         )
-    force = law.force if isinstance(law, Compliant) else Bistiffness(law.stiffness, law.exponent)
     check_law(law, scene, v.dtype)
     speed = jnp.maximum(jnp.max(-gap_velocity(scene, v)), 0.0)
     work = 2 / diagonal(delassus_matrix(scene)) * speed**2
-    if isinstance(force, Bistiffness):
-        eta = jnp.asarray(force.exponent, work.dtype)
-        delta = (work / force.stiffness) ** (1 / (eta + 1))
+    if force.bistiffness is not None:
+        eta = jnp.asarray(force.bistiffness.exponent, work.dtype)
+        delta = (work / force.bistiffness.stiffness) ** (1 / (eta + 1))
     else:
         delta = force.indentation_scale(0.5 * work)
     gaps = jnp.zeros_like(work) if scene.gaps is None else scene.gaps
@@ -120,7 +118,7 @@ class Crossover(eqx.Module):
     status: jax.Array
 
 
-def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Crossover:
+def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
     """Outcome of a two-contact scene against the difference of its gaps.
 
     Which contact closes first decides what follows; laws of instantaneous collisions jump where
@@ -128,7 +126,7 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
 
     Args:
         scene: with two contacts; the mean of its gaps (none: closed) is widened as needed.
-        law: a `Compliant`.
+        law: a `Compliant`, or another one with a `contact_force` that uses gaps.
         velocity: v- (n,) [m/s].
         offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
 
@@ -148,8 +146,10 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
     """
     if scene.contacts != 2:
         raise ValueError(f"Argument `scene` must have two contacts, but has {scene.contacts}.")
-    if not isinstance(law, Compliant):
-        raise TypeError(f"Argument `law` must be a Compliant, but is {law!r}.")
+    if not law.uses_gaps or law.contact_force is None:
+        raise TypeError(
+            f"Argument `law` must use gaps and have a `contact_force` (Compliant), but is {law!r}."
+        )
     s = as_float_array("offset", offset)
     if s.ndim != 1:
         raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")

@@ -12,7 +12,6 @@ import numpy as np
 
 from jimpact._checks import in_common_dtype
 from jimpact.law import Law
-from jimpact.laws.compliant import Compliant
 from jimpact.montecarlo.executors import Executor, as_executor
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.montecarlo.planning import BINS, CHUNK, Run, Sources, planned_run
@@ -170,7 +169,9 @@ def _interrupted(run: Run, store: Store | None, done: int) -> str:
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
     """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
     law, velocity = sources.law, sources.velocity
-    if not (isinstance(law, Compliant) and isinstance(velocity, jax.Array)):
+    if not (isinstance(law, Law) and isinstance(velocity, jax.Array)):
+        return None
+    if not law.uses_gaps or law.contact_force is None:
         return None
     law, scene, velocity = in_common_dtype(law, scene, velocity)
     delta = np.asarray(gap_scale(scene, law, velocity).delta, float)

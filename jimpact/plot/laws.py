@@ -12,8 +12,7 @@ from scipy.integrate import solve_ivp
 from jimpact._checks import check_kind
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness, Force
+from jimpact.laws.forces import Force
 from jimpact.laws.histories import History
 from jimpact.methods.comparison import Comparison
 from jimpact.plot.style import (
@@ -112,14 +111,14 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
 
     Args:
-        found: of `compare_rheologies`, or of `compare` with `Compliant` laws.
+        found: of `compare_rheologies`, or of `compare` with laws that have a `contact_force`.
         title: above the picture.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: a law that is not `Compliant`.
+        TypeError: a law without a `contact_force`.
 
     >>> import jimpact as ji
     >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
@@ -127,11 +126,13 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     >>> len(ji.plot.rheologies(found).axes)
     2
     """
-    forces = {
-        name: e.law.force for name, e in found.entries.items() if isinstance(e.law, Compliant)
-    }
-    if len(forces) < len(found.entries):
-        raise TypeError("Argument `found` must hold `Compliant` laws only.")
+    forces = {name: e.law.contact_force for name, e in found.entries.items()}
+    without = [name for name, force in forces.items() if force is None]
+    if without:
+        raise TypeError(
+            "Argument `found` must hold laws with a `contact_force` only, but "
+            f"{without[0]} does not have one."
+        )
     mass = 1 / float(diagonal(delassus_matrix(found.scene))[0])
     speed = float(np.max(-np.asarray(gap_velocity(found.scene, found.velocity))))
     figure = new_figure(6.8)
@@ -230,11 +231,12 @@ def history(found: History, title: str = "") -> Figure:
 
 def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
     """Indentation and force of one pair's collision."""
-    if isinstance(force, Bistiffness):
-        k, eta = float(force.stiffness), float(np.asarray(force.exponent))
+    loop = force.bistiffness
+    if loop is not None:
+        k, eta = float(loop.stiffness), float(np.asarray(loop.exponent))
         deepest = ((eta + 1) * mass * speed**2 / (2 * k)) ** (1 / (eta + 1))
         part = np.linspace(0, 1, _SAMPLES)
-        residual = (1 - float(force.restitution) ** 2) * deepest
+        residual = (1 - float(loop.restitution) ** 2) * deepest
         loading, unloading = part * deepest, residual + part[::-1] * (deepest - residual)
         f = k * deepest**eta * part**eta
         return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
