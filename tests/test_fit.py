@@ -133,6 +133,23 @@ def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
         assert "Suspicious: shot 18," in told(found)
 
 
+def test_honest_shots_are_seldom_suspicious():
+    """The level holds for all shots of a data set together: 1 in 100 sets, not 1 in 5."""
+    pre, named = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1), 0
+    for seed in range(40):
+        post = simulated_at_once(0.9, pre) + 0.005 * np.random.default_rng(seed).normal(
+            size=(24, 2)
+        )
+        named += "Suspicious" in told(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)))
+    assert named <= 3
+
+
+def simulated_at_once(e, pre):
+    """Of `PAIR`: v1+ = v1 - 2 p / 2, v2+ = v2 + p / 2 in units of their approach."""
+    p = (1 + e) * (pre[:, 0] - pre[:, 1]) * 2 / 3
+    return pre + np.stack([-p, p / 2], axis=1)
+
+
 def test_robust_losses_minimize_what_they_say():
     post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.05)
     problem = ji.FitProblem.from_shots(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.contact import coupled_groups
+from jimpact.contact import contact_of, coupled_groups
 from jimpact.scene import pad_scene
 from jimpact.status import CODE
 
@@ -148,6 +148,17 @@ def test_contacts_that_do_not_feel_each_other_are_solved_apart():
     apart = ji.impact(ji.Newton(e), balls, v)
     np.testing.assert_allclose(apart.velocity, whole.velocity, atol=1e-14)
     np.testing.assert_allclose(apart.impulse, whole.impulse, atol=1e-14)
+
+
+def test_open_contacts_in_space_have_no_slip():
+    """Contact-major rows, two for each contact: the first contact is open, the second closed."""
+    rng = np.random.default_rng(2)
+    normals, tangents, v = rng.normal(size=(4, 2)), rng.normal(size=(4, 4)), rng.normal(size=4)
+    scene = ji.Scene(np.ones(4), normals, tangents=tangents, gaps=[0.1, 0.0])
+    block = contact_of(scene, jnp.asarray(v)).tangential_block
+    np.testing.assert_allclose(block.slip, [0.0, 0.0, *(tangents[:, 2:].T @ v)], atol=1e-15)
+    np.testing.assert_allclose(block.normal_tangent[0], 0.0)
+    np.testing.assert_allclose(block.normal_tangent[1, 2:], normals[:, 1] @ tangents[:, 2:])
 
 
 class Gains(ji.Law):
