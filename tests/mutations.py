@@ -109,6 +109,8 @@ MUTATIONS = [
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_contract.py", "test_values.py", "test_friction.py")),
     Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py", "test_contract.py")),
     # --- fits
+    Mutation("a stiffness that nobody freed is fitted", r"fields\.remove\(\"stiffness\"\)", "pass", ("test_fit.py",)),
+    Mutation("a correction without sigma_pre is not reported", r"if data\.lost_freedom and data\.sigma_pre is not None", "if False", ("test_experiments.py",)),
     Mutation("freedom counted with parameters, not rank", r"freedom = values - rank\n", "freedom = values - len(names)\n", ("test_fit.py",)),
     Mutation("rank tolerance too coarse", r"\"float64\": 1e-6", '"float64": 1e-1', ("test_fit.py",)),
     Mutation("standard errors without noise", r"covariance = noise\*\*2 \* ", "covariance = noise * ", ("test_fit.py",)),

@@ -267,6 +267,30 @@ def test_layout(name):
             assert silent or categories or labelled(label), (axis, label, beside)
 
 
+def test_a_histogram_is_in_per_cent():
+    bars = samples(True).axes[0].patches[0].get_data().values
+    assert bars.sum() == pytest.approx(100.0)
+
+
+def test_residuals_are_drawn_over_what_was_fitted():
+    fitted, measured = canned(50), ji.plot.residuals(canned(50)).axes[0]
+    here = ~np.isnan(fitted.residual)
+    dots = measured.lines[-1]
+    np.testing.assert_array_equal(dots.get_xdata(), fitted.predicted[here])
+    np.testing.assert_allclose(dots.get_ydata(), (fitted.predicted + fitted.residual)[here])
+
+
+def test_a_loop_encloses_the_energy_lost():
+    """(1 - e^2) m v^2 / 2 of a pair of two balls of 1 kg, m = 1/2; k x^2.5 / 2.5 = m v^2 / 2."""
+    law = ji.Compliant(ji.Bistiffness(3.0, 1.5, 0.6))
+    found = Comparison(ji.chain([1.0, 1.0]), np.array([2.0, 0.0]), {"plastic": entry(law)})
+    x, force = ji.plot.rheologies(found).axes[0].lines[0].get_data()
+    deepest = (2.5 / 3.0) ** 0.4
+    assert x.max() == pytest.approx(deepest)
+    assert force.max() == pytest.approx(3.0 * deepest**1.5)
+    assert np.trapezoid(force, x) == pytest.approx((1 - 0.6**2) * 1.0, rel=1e-3)
+
+
 def test_every_kind_of_picture_is_here():
     known = {name.split(" ")[0].rstrip(",") for name in PICTURES}
     assert known | {"animation"} == set(ji.plot.__all__)
