@@ -111,6 +111,8 @@ MUTATIONS = [
     Mutation("friction along the slip", r"drag = -(\w+\.astype\(self\.friction\.dtype\))", r"drag = \1", ("test_friction.py",)),
     Mutation("friction of the other contact", r"(drag = [^\n]* \* self\.friction)\n", r"\1[::-1]\n", ("test_friction.py",)),
     # --- impact
+    Mutation("a law around another one has no capabilities", r"setattr\(around, name, _forwarded\(name\)\)", "setattr(around, name, getattr(around, name))", ("test_own_law.py",)),
+    Mutation("a contact force that is not used", r"force = law\.contact_force\n", "force = getattr(law, 'force', None)\n", ("test_own_law.py",)),
     Mutation("energy gain is not reported", r"change > total \+ tolerance", "change > total + jnp.inf", ("test_contract.py", "test_values.py", "test_complementarity.py")),
     Mutation("pulling is not reported", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", ("test_contract.py", "test_values.py")),
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_contract.py", "test_values.py", "test_friction.py")),
