@@ -241,10 +241,10 @@ def test_calibration_is_differentiable():
 
 def test_linear_forces_reach_the_indentation_of_hertz(monkeypatch):
     """Without losses `k_h x^2.5 / 2.5 = k x^2 / 2 = m v^2 / 2` at the deepest x."""
-    calibration = sys.modules[ji.compare_rheologies.__module__]
-    monkeypatch.setattr(calibration, "calibrate", lambda force, *_: force)
+    rheologies = sys.modules[ji.compare_rheologies.__module__]
+    monkeypatch.setattr(rheologies, "calibrate", lambda force, *_: force)
     scene, speed, k = ji.chain([1.0, 3.0, 0.5]), 2.0, jnp.array([5.0, 7.0])
-    forces = calibration.forces_of_equal_restitution(scene, [2.0, 0.0, 0.0], 0.9, k)
+    forces = rheologies.forces_of_equal_restitution(scene, [2.0, 0.0, 0.0], 0.9, k)
     mass = np.array([3 / 4, 3 / 7])  # reduced masses of the pairs
     deepest = (1.25 * mass * speed**2 / np.array([5.0, 7.0])) ** 0.4
     np.testing.assert_allclose(k * deepest**2.5 / 2.5, mass * speed**2 / 2)

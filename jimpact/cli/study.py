@@ -144,7 +144,7 @@ def _build(checked: CheckedStudy) -> Study:
         checked.title,
         scene,
         law,
-        free=free or dict.fromkeys(bounce or default_free(fittable), True),
+        free=free or dict.fromkeys(bounce or default_free(law), True),
         bounds=checked.law.bounds,
         experiments=None if data is None else _experiments(data, checked.path, body or scene),
         parameters=values,
