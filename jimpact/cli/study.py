@@ -122,6 +122,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     """
 
     def build(tables: dict[str, Any], file: Path) -> Study:
+        """The study of these tables."""
         import_module_of(tables, file.parent)
         return _build(check_impact_tables(tables, file, law, modules=True))
 
@@ -217,6 +218,7 @@ def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3
     path = Path(str(files("jimpact") / "data" / "tossed_cube.toml"))
 
     def read(tables: Mapping[str, Any], file: Path) -> Experiments:
+        """The shots of these tables."""
         table = {"file": tables["data"]["file"], "near_m": near}
         table |= {} if contacts is None else {"contacts": contacts}
         return _experiments(table, file, body_of("[scene]", tables["scene"], AT_KEYS))

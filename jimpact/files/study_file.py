@@ -191,6 +191,7 @@ def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy,
     """The study of one impact and the number of its shots, all checked; see `read_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> tuple[CheckedStudy, int]:
+        """Check the tables and the shots."""
         study = check_impact_tables(tables, file, law)
         shots = read_shots(study.data_file).values["pre"] if "data" in tables else ()
         return study, len(shots)
@@ -202,6 +203,7 @@ def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy
     """The study of a motion, all checked; see `read_motion_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
+        """Check the tables and the positions."""
         study = check_motion_tables(tables, file, law)
         if "data" in tables:
             read_positions(study.data_file)
