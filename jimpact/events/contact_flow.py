@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events.stepper import any_of
+from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.solvers.tridiagonal import tridiagonal_product
 
 OPEN, COMPRESSION, EXPANSION, SLACK = 0, 1, 2, 3
@@ -39,7 +40,6 @@ PATIENCE = 2000  # passes per contact after which an impact may end at WIDENED t
 WIDENED = 100.0
 DRAGGING = 100  # passes per contact, which few impacts need
 OFTEN = 8  # closings of a contact, from which on they may be endless
-UNROLLED = 8  # products with a matrix of this size are written out, without a reduction
 LARGE = 6.0  # exponents below it that are whole or half are products
 
 T = TypeVar("T")
@@ -131,21 +131,6 @@ class Dense(NamedTuple):
 
     def pull(self) -> "Dense":
         return Dense(jnp.minimum(self._off_diagonal(), 0.0) + unit(self.matrix))
-
-
-def unit(matrix: jax.Array) -> jax.Array:
-    """The unit matrix (m, m, 1) beside a matrix (m, m, B)."""
-    return jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
-        *matrix.shape[:2], *[1] * (matrix.ndim - 2)
-    )
-
-
-def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """`matrix @ vector` for (a, b, B) and (b, B)."""
-    if matrix.shape[1] > UNROLLED:
-        return jnp.sum(matrix * vector[None], axis=1)
-    columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[1])]
-    return functools.reduce(jnp.add, columns)
 
 
 class Frozen(NamedTuple):
@@ -267,7 +252,7 @@ class ContactFlow:
             functools.reduce(
                 lambda a, b: jnp.where(b < a, b, a), [s[j : j + 1] for j in range(self.contacts)]
             )
-            if self.contacts <= UNROLLED
+            if self.contacts <= COLUMNS_WRITTEN_OUT
             else jnp.take_along_axis(s, jnp.argmin(s, axis=0, keepdims=True), axis=0)
         )
         ratio = jnp.where(s > 0, least / jnp.where(s > 0, s, 1.0), 1.0)
