@@ -82,8 +82,8 @@ MUTATIONS = [
     # --- the stepper
     Mutation(  # the last event first, and none watched on the way; either alone repairs itself
         "events in the wrong order",
-        r"(?s)free = ~s\.target\n(.*)    first = jnp\.min\(at, axis=0, keepdims=True\)",
-        r"free = ~s.target & ~lands\n\1    first = jnp.max(jnp.where(at <= 1, at, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(at, axis=0, keepdims=True))",
+        r"(?s)free = ~s\.target\n(.*)    first = jnp\.min\(order, axis=0, keepdims=True\)",
+        r"free = ~s.target & ~lands\n\1    first = jnp.max(jnp.where(order <= AHEAD, order, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(order, axis=0, keepdims=True))",
         FLOW,
         "stepper.py",
     ),

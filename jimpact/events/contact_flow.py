@@ -28,7 +28,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.stepper import any_of
+from jimpact.events.stepper import Flow, any_of
 from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.solvers.tridiagonal import tridiagonal_product
 
@@ -168,8 +168,8 @@ def as_pytree(flow: type[T]) -> type[T]:
 
 @as_pytree
 @dataclasses.dataclass
-class ContactFlow:
-    """Contacts without friction, an instance of the protocol of `stepper.py`."""
+class ContactFlow(Flow):
+    """Contacts without friction."""
 
     coupling: Chain | Dense
     omega: jax.Array  # (m, B)
@@ -182,8 +182,7 @@ class ContactFlow:
     gapped: bool = False
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
 
-    longest = math.inf  # no rate is large beside the others
-    near = 0.0  # landings start from anywhere in a step
+    longest = math.inf  # no rate is much larger than the others
 
     @property
     def exponent(self) -> Exponent:
@@ -239,10 +238,6 @@ class ContactFlow:
         return jnp.where(modes[: self.contacts] == EXPANSION, self.restitution, 1.0)
 
     # ---- the protocol
-
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
-        """Tolerances that the error of each row may be."""
-        return 1.0
 
     def constants(self, modes: jax.Array) -> Frozen:
         phase, s = modes[: self.contacts], self.scales(modes)

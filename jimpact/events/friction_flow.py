@@ -70,7 +70,7 @@ class FrictionForces(NamedTuple):
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class FrictionFlow(ContactFlow):
-    """Contacts with planar friction, an instance of the protocol of `stepper.py`."""
+    """Contacts with planar friction."""
 
     across: jax.Array  # K_nt (m, m, B)
     along: jax.Array  # K_tt (m, m, B)

@@ -118,7 +118,7 @@ def dot(a: jax.Array, b: jax.Array) -> jax.Array:
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class SlipFlow(FrictionFlow):
-    """Contacts with friction in space, an instance of the protocol of `stepper.py`."""
+    """Contacts with friction in space."""
 
     # across: K_nt (m, 2 m, B); along: K_tt (2 m, 2 m, B)
 
