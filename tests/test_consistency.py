@@ -325,6 +325,15 @@ def test_stored_energy_is_no_gain():
         assert found.broken == (["energetic"] if gain else [])
 
 
+def test_open_contacts_may_approach():
+    """Ball 2 flies towards ball 3, which it has not reached."""
+    scene, v = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1]), [1.0, 0.0, 0.0]
+    out = ji.Impact(
+        *(jnp.array(x) for x in ([0.0, 1.0, 0.0], [1.0, 0.0], [0.0][:0], 0.0, 0.0)), jnp.int32(0)
+    )
+    assert ji.audit(scene, v, out).broken == []
+
+
 def test_audit_in_words_and_in_float32():
     text = str(audit_matrix(CHAIN, [[1.2, 0.0], [0.0, -0.2]]))
     assert text.splitlines()[0].startswith("restitution matrix: NOT admissible")

@@ -15,6 +15,8 @@ import pytest
 from programs import failed, names
 
 import jimpact as ji
+from jimpact.methods.advice import situation_of
+from jimpact.methods.validity import ValidityMap
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import stability_reference
@@ -424,6 +426,73 @@ def test_gaps(gap, tolerance, name):
     assert np.abs(got - exact).max() <= tolerance
 
 
+def test_distance_is_a_ratio_of_energy_norms():
+    """sqrt(dv^T M dv) / sqrt(v-^T M v-): no unit of an angle enters."""
+    metres = situation_of(ji.Scene([4.0, 1.0], np.eye(2)), np.array([1.0, 0.0]), ji.LZB(0.5), False)
+    assert metres.distance(np.array([0.1, 0.2])) == pytest.approx(math.sqrt(0.04 + 0.04) / 2)
+    degrees = ji.Scene([4.0, 0.01], np.diag([1.0, 0.1]))  # the second coordinate ten times larger
+    scaled = situation_of(degrees, np.array([1.0, 0.0]), ji.LZB(0.5), False)
+    assert scaled.distance(np.array([0.1, 2.0])) == pytest.approx(math.sqrt(0.08) / 2)
+
+
+def test_far_contacts_take_no_part():
+    """The upper corners of a block on its base; the gaps of a chain always count."""
+    block = ji.Block(0.2, 0.6, 2.0)
+    scene, v, law = block.scene(block.touching()), np.array([0.3, -0.1, -1.0]), ji.LZB(0.1, 1e8)
+    for known in (False, True):
+        at = situation_of(scene, v, law, known)
+        assert at.far.tolist() == [False, False, True, True]
+        assert [b.contacts for b in at.blocks] == [(0, 1)]
+        assert not at.gapped.any()
+        assert np.isinf(at.touching.gaps[2:]).all()
+    tilted = situation_of(block.scene(block.touching(1e-5)), v, law, True)  # 2 micrometres
+    assert tilted.far.tolist() == [False, False, True, True]
+    assert tilted.gapped.tolist() == [True, False, False, False]
+    chain = ji.chain([1.0] * 3, gaps=[0.0, 5.0])
+    assert not situation_of(chain, np.array(STRIKE), HERTZ, True).far.any()
+
+
+def test_friction_couples_contacts_with_decoupled_normals():
+    """A ball in a right corner: friction at one wall loads the other."""
+    scene = ji.Scene([1.0, 1.0], np.eye(2), tangents=[[0.0, 1.0], [1.0, 0.0]])
+    v = np.array([-1.0, -0.5])
+    for friction, blocks in ((None, [(0,), (1,)]), (0.3, [(0, 1)])):
+        at = situation_of(scene, v, ji.LZB(0.5, friction=friction), False)
+        assert [b.contacts for b in at.blocks] == blocks
+
+
+@pytest.mark.slow  # laws with friction compile for half a minute
+def test_friction_is_part_of_every_law():
+    """A block that slides as it strikes; its upper corners are too far away to take part."""
+    block = ji.Block(0.2, 0.6, 2.0)
+    scene, v = block.scene(block.touching()), [0.3, -0.1, -1.0]
+    advice = quick(scene, v, restitution=0.1, friction=0.5, stiffness=1e8)
+    assert (advice.name, advice.reference, advice.far) == ("moreau", "lzb", (2, 3))
+    np.testing.assert_allclose(advice.candidates["lzb"].velocity[2], -0.835, atol=1e-6)
+    np.testing.assert_allclose(
+        ji.impact(advice.law, advice.scene, v).velocity,
+        advice.candidates["lzb"].velocity,
+        atol=1e-6,
+    )
+    assert "Moreau(0.1, friction=0.5), within 1 %" in str(advice)
+    assert "contacts 3, 4 too far open to close during the impact" in str(advice).replace("\n", " ")
+
+
+def test_contacts_that_close_again():
+    """Two balls at a wall: LZB re-closes at once, Compliant waits for its gap and is right."""
+    options = {"exponent": 1.0, "stiffness": 1.0, "tolerance": 5e-3}
+    advice = quick(ji.chain([1.0, 1.0], wall=True), [1.0, 0.0], **options)
+    at_once = [-0.97547042321005322912, -0.22013053727822418238]  # integrated piece by piece
+    waiting = [-0.976928618648904904, -0.213566088283562787]
+    np.testing.assert_allclose(advice.candidates["lzb"].velocity, at_once, atol=1e-7)
+    np.testing.assert_allclose(advice.candidates["compliant"].velocity, waiting, atol=1e-7)
+    apart = np.linalg.norm(np.subtract(at_once, waiting))  # equal masses, |v-| = 1
+    assert advice.reclosing == pytest.approx(apart, rel=1e-4)
+    assert (advice.name, advice.reference) == ("compliant", "compliant")
+    assert advice.candidates["lzb"].worst == pytest.approx(apart, rel=1e-4)
+    assert "contacts open and close again" in advice.reason
+
+
 @pytest.mark.release
 def test_several_ratios():
     """Five unknown ratios: which of them matters."""
@@ -451,6 +520,8 @@ def test_several_ratios():
             ValueError,
             r"`stiffness` must be given .* \(contact 2\)",
         ),
+        ({"friction": 0.3}, ValueError, "must have tangents where LZB has `friction`"),
+        ({"friction": -0.3}, ValueError, "`friction` must lie in"),
     ],
 )
 def test_advice_refuses(options, error, message):
@@ -485,6 +556,19 @@ RATIOS = [1e-6, 1e-3, *EXACT, 1e3, 1e6]
 @pytest.fixture(scope="module")
 def valid():
     return ji.validity_map(BALLS, STRIKE, RATIOS, (1.0, 1.5, 2.0, 3.0))
+
+
+def test_limits_are_of_the_unbroken_run_from_their_end():
+    """Binary collisions hold for small ratios, Moreau's law for large ones."""
+    ratios, after = np.array([0.01, 0.1, 1.0, 10.0, 100.0]), np.zeros((5, 3))
+    after[:, 0] = [0.0, 0.001, 0.5, 0.999, 1.0]
+    ends = {"binary": np.zeros(3), "moreau": np.array([1.0, 0.0, 0.0])}
+    found = ValidityMap(
+        BALLS, np.array(STRIKE), ratios, np.ones(1), after[None], after[None, :, 0],
+        np.zeros((1, 5), int), ends, dict.fromkeys(ends, 0.0),
+    )  # fmt: skip
+    assert found.limit("binary").tolist() == [0.1]
+    assert found.limit("moreau").tolist() == [10.0]
 
 
 @pytest.mark.slow

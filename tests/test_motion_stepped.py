@@ -145,6 +145,19 @@ def test_an_impact_is_in_the_middle_of_its_step():
     np.testing.assert_allclose(motion.velocity[1], [0.0, after], rtol=1e-9, atol=1e-12)
 
 
+def test_a_superball_leaves_with_its_slip_reversed():
+    """`u+ = -e_t u-` of the contact point, with friction enough: one impact, and free flight."""
+    disc, e_t = ji.Disc(0.5), 0.6
+    law = ji.Moreau(0.8, friction=50.0, tangential_restitution=e_t)
+    motion = ji.simulate(
+        ji.System(disc, potential=disc.gravity(G)), law, [0.0, 0.5, 0.0], [1.0, -5.0, 3.0], 0.02,
+        samples=2, method="time_stepping", step=1e-3,
+    )  # fmt: skip
+    x, _, spin = motion.velocity[-1]
+    np.testing.assert_allclose(x + 0.5 * spin, -e_t * (1.0 + 0.5 * 3.0), rtol=1e-6)
+    np.testing.assert_allclose(x - 1.0, 0.5 * 0.5 * (spin - 3.0), rtol=1e-6)  # m x' r = I spin
+
+
 # -------------------------------------------------------------------------- bodies in space
 
 
@@ -385,6 +398,49 @@ def test_a_motion_is_in_the_widest_precision_given():
     start = np.array([0.0, 0.3, 0.6], np.float32), np.zeros(3, np.float32)
     with jax.numpy_dtype_promotion("standard"):
         assert stepped(system, ji.Moreau(1.0), *start).q.dtype == jnp.float64
+
+
+class Apart(ji.Body):
+    """Two balls on a line, whose gap grows again once they have passed each other."""
+
+    def gap_function(self, q):
+        return jnp.abs(q[1:] - q[:1]) - 0.2
+
+    @property
+    def mass(self):
+        return jnp.ones(2)
+
+
+LINE = (1.0, -1.0)
+PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0)
+DISCS = ji.PlanarBodies([ji.Disc(0.1), ji.Disc(0.1)], planes=[])
+
+
+@pytest.mark.parametrize(
+    ("body", "way", "speed", "expected"),
+    [
+        (Apart(), LINE, 50.0, "coarse_step"),
+        (DISCS, PLANE, 50.0, "coarse_step"),
+        (DISCS, PLANE, 3.0, "ok"),
+    ],
+)
+def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, expected):
+    """Steps of .01 s; the status does not depend on where in a step they meet."""
+    way = jnp.array(way)
+
+    @jax.jit
+    @jax.vmap
+    def run(start):
+        return ji.simulate(
+            ji.System(body), ji.Moreau(0.5), -start * way, speed * way, 0.1,
+            samples=2, method="time_stepping", step=1e-2,
+        )  # fmt: skip
+
+    motion = run(0.12 + jnp.array([0.0, 0.1, 0.3, 0.7, 0.9, 1.3]) * 0.5 * speed / 50)
+    passed = motion.velocity[:, -1, -len(way) // 2] < 0
+    reported = motion.status == MOTION_CODE["coarse_step"]
+    assert (reported == passed).all()
+    assert bool(passed.any()) == (expected == "coarse_step")
 
 
 def test_steps_too_many_to_count_are_refused():

@@ -1,7 +1,8 @@
-"""No more model than a scene needs: the simplest law within a tolerance, and why."""
+"""The simplest law that suffices for an impact within a tolerance, and the evidence."""
 
 import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -15,7 +16,7 @@ from jimpact._checks import as_whole, check_per_contact, check_shape, check_valu
 from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
-from jimpact.law import Law
+from jimpact.law import Law, check_law, free_parameters_of
 from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
@@ -27,22 +28,46 @@ from jimpact.methods.advice_report import Advice, Block, Candidate, Unknown
 from jimpact.methods.timing import in_turns
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
-from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change, with_gaps
+from jimpact.scene import (
+    Scene,
+    as_velocity,
+    dense_mass,
+    gap_velocity,
+    solve_mass,
+    velocity_change,
+    with_gaps,
+)
 from jimpact.status import STATUS
 
-FINEST_TOLERANCE = 100  # times the reference's own tolerance
-RTOL_PART = 10  # the advised rtol is this part of the tolerance, or a little less
+# Smallest tolerance over the reference's own rtol. Ten times more would refuse 1e-6; ten times
+# less would let the reference's error enter.
+FINEST_TOLERANCE = 100
+# A law's own error, and the distance between LZB and Compliant, count as small below the tolerance
+# over this. Ten times more costs time; ten times less moves the verdict.
+SMALL_PART = 10
+# Largest rtol that is advised: beyond, the steps of the integrator are no longer fewer.
 COARSEST_RTOL = 1e-3
 
-UNKNOWN_RANGE = (0.1, 10.0)  # plausible ratio of two stiffnesses where nothing is said
-# cos(kinetic angle) below so many roundings is 0: the rounding of normals and of M^-1
+# Range of the ratio of two stiffnesses where nothing is known: contacts of bodies of one kind.
+UNKNOWN_RANGE = (0.1, 10.0)
+# Contacts whose directions have a cosine below so many roundings do not feel each other: the
+# rounding of normals and of M^-1. Ten times more could hide a weak coupling of 1e-13.
 DECOUPLED_IN_EPS = 64
-CORNERS = 64  # rows with every ratio at an end of its range; of more, random ones
-ALONE = (0.0, 1 / 3, 2 / 3, 1.0)  # parts of a ratio's range (in its logarithm) tried alone
-NUDGE = 0.02  # change of ln k for the sensitivity; its square is far below what is told
+# Stiffnesses with every ratio at an end of its range, all of them up to this number, else as many
+# at random.
+CORNERS = 64
+ALONE = (0.0, 1 / 3, 2 / 3, 1.0)  # places in a ratio's range (of its logarithm) tried by itself
+NUDGE = 0.02  # change of ln k for the sensitivity; its square is far below what is printed
+
+# Open contacts of a body that turns (all but chains) take part where they can close while others
+# are at work: within this time [s], longer than hard bodies touch ...
+LONGEST_CONTACT = 1e-2
+# ... or, where the stiffness is known, within so many times delta_c / v, about a third of the
+# duration of one collision. Ten times more: contacts far away ask for a stiffness.
+CONTACT_TIMES = 10
 
 CHUNK = 64  # rows computed together
-CHEAP = 8  # contacts up to which a chunk is always full
+FEW_CONTACTS = 8  # up to so many contacts a chunk is always full, so that it compiles once
 LANES = 2048  # impacts of a batch, over m^2, of the laws that take no time
 ROUNDS = 7  # of the timing
 
@@ -50,8 +75,9 @@ ROUNDS = 7  # of the timing
 class Situation(NamedTuple):
     """Scene and v- with what decides about the laws.
 
-    `touching` is the scene with all contacts closed that take part; `gapped` (m,) marks the open
-    contacts that can close and meet others at work.
+    `scene` is as asked for, but contacts too far to take part (`far`, (m,)) have an infinite gap;
+    `touching` has all contacts closed that take part; `gapped` (m,) marks the open contacts that
+    can close while others are at work.
     """
 
     scene: Scene
@@ -60,24 +86,21 @@ class Situation(NamedTuple):
     gap_velocity: np.ndarray
     blocks: tuple[Block, ...]
     gapped: np.ndarray
-
-    @property
-    def scale(self) -> float:
-        """max |v-|, 1 at rest."""
-        return float(np.abs(self.velocity).max()) or 1.0
-
-    @property
-    def at_work(self) -> tuple[Block, ...]:
-        """Blocks in which a contact approaches."""
-        return tuple(block for block in self.blocks if block.approaches)
+    far: np.ndarray
 
     @property
     def coupled(self) -> tuple[Block, ...]:
-        """Blocks at work of two contacts and more."""
-        return tuple(block for block in self.at_work if len(block.contacts) > 1)
+        """Blocks of two contacts and more in which one approaches."""
+        return tuple(b for b in self.blocks if b.approaches and len(b.contacts) > 1)
+
+    def distance(self, change: np.ndarray) -> np.ndarray:
+        """Energy norm of differences of velocities (..., n), over that of v- (of 1 at rest)."""
+        mass = dense_mass(self.scene)
+        before = float(np.sqrt(self.velocity @ mass @ self.velocity)) or 1.0
+        return np.sqrt(np.sum((change @ mass) * change, axis=-1)) / before
 
 
-class Rows(NamedTuple):
+class Samples(NamedTuple):
     """Stiffnesses (r, m) to try; row 0 is the nominal one, `random` are the last rows.
 
     `alone[i]` are the rows in which only unknown i leaves its nominal value, `nudged[i]` the two
@@ -92,10 +115,11 @@ class Rows(NamedTuple):
 
 
 class Outcomes(NamedTuple):
-    """v+ (r, n), p (r, m), status (r,) of a batch; JAX, then numpy."""
+    """v+ (r, n), p (r, m), p_t (r, t) or None, status (r,) of a batch; JAX, then numpy."""
 
     velocity: Any
     impulse: Any
+    tangential: Any
     status: Any
 
 
@@ -106,21 +130,21 @@ class Trial(NamedTuple):
     scene: Scene
 
     @property
-    def knows_stiffness(self) -> bool:
+    def has_stiffness(self) -> bool:
         """Whether stiffnesses are parameters of the law."""
-        return isinstance(self.law, LZB | Compliant)
+        return "stiffness" in free_parameters_of(self.law)
 
     def lanes(self, rows: int) -> int:
         """Impacts computed together for so many rows of stiffness: enough to hide a call's cost."""
-        return rows if self.knows_stiffness else max(1, LANES // self.scene.contacts**2)
+        return rows if self.has_stiffness else max(1, LANES // self.scene.contacts**2)
 
-    def run(self, at: Situation, stiffness: np.ndarray) -> Outcomes:
-        """v+, p and status over rows of stiffness, or of the same impact many times."""
-        v = jnp.tile(jnp.asarray(at.velocity), (self.lanes(len(stiffness)), 1))
+    def run(self, velocity: np.ndarray, stiffness: np.ndarray) -> Outcomes:
+        """Outcomes over rows of stiffness, or of the same impact many times."""
+        v = jnp.tile(jnp.asarray(velocity), (self.lanes(len(stiffness)), 1))
         scene = self.scene
         if scene.gaps is None:  # scenes with and without gaps share one compiled program
             scene = with_gaps(scene, jnp.zeros(scene.contacts, scene.mass.dtype))
-        rows = jnp.asarray(stiffness, v.dtype) if self.knows_stiffness else None
+        rows = jnp.asarray(stiffness, v.dtype) if self.has_stiffness else None
         return _batch(self.law, scene, v, rows)
 
 
@@ -132,25 +156,33 @@ def advise(
     restitution: Any = 1.0,
     stiffness: Any = None,
     exponent: Any = 1.5,
+    friction: Any = None,
     stiffness_range: tuple[float, float] | None = None,
     samples: int = 128,
     seed: int = 0,
     timing: bool = True,
     progress: float | None = None,
 ) -> Advice:
-    """The simplest law whose v+ is within a tolerance of LZB on this scene, with the evidence.
+    """The simplest law whose v+ is within a tolerance of contacts with bistiffness springs.
 
-    Every law is compared with LZB over the stiffness ratios that are not known: one at a time, at
-    the corners of their ranges, and log-uniformly. Where open contacts can meet others at work
-    the reference is `Compliant` with these gaps, and the absolute stiffness must be given.
+    Equation: the error of a law is `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the difference between
+    its v+ and the reference's: a ratio of energy norms, which does not mix m/s and rad/s.
+
+    The reference is `LZB`, or `Compliant` where the two differ: LZB lets a contact that has opened
+    close again at once, `Compliant` when its gap is closed (as with a wall), and only `Compliant`
+    follows open contacts that can close while others are at work; the absolute stiffness must then
+    be given. Every law is compared with it over the stiffness ratios that are not known: one at a
+    time, at the corners of their ranges, and log-uniformly. Open contacts of bodies that turn (of
+    all scenes but chains) that cannot close during the impact take no part.
 
     Args:
-        scene: n coordinates, m contacts. Friction is left out.
+        scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
-        tolerance: of v+, relative to max |v-|; at least 100 times the reference's own 1e-8.
+        tolerance: of the error; at least 100 times the reference's own 1e-8.
         restitution: e in [0, 1], scalar or (m,).
         stiffness: k > 0, scalar or (m,) [N / m^eta]; None: only their ratio's range is known.
         exponent: eta >= 1, as in `LZB`.
+        friction: Coulomb's mu >= 0, scalar or (m,), of every law (e_t = 0); None: no friction.
         stiffness_range: low and high factor on every stiffness ratio (k_j over that of the first
             contact of its block; on every k_j where not only ratios count); default: (0.1, 10)
             where no stiffness is given, else (1, 1).
@@ -163,85 +195,97 @@ def advise(
         `Advice`; `print` gives half a page.
 
     Raises:
-        ValueError: shapes or ranges; gaps that matter, or unequal exponents, without stiffness.
+        ValueError: shapes or ranges; friction on a scene without tangents; gaps that matter, or
+            unequal exponents, without stiffness.
         RuntimeError: the reference fails on this scene.
 
     Source: the kind of Brogliato, Nonsmooth Mechanics (2016), section 6.3.3.
 
     >>> import jimpact as ji
-    >>> found = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
-    >>> found.name, found.reason
+    >>> advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
+    >>> advice.name, advice.reason
     ('newton', "single contact: every law is Newton's")
     """
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
-    known = stiffness is not None
-    k = stiffness if known else 1.0
-    for name, value in (("restitution", restitution), ("stiffness", k), ("exponent", exponent)):
+    k = np.ones(()) if stiffness is None else stiffness
+    parameters = {"restitution": restitution, "stiffness": k, "exponent": exponent}
+    if friction is not None:
+        parameters["friction"] = friction
+    for name, value in parameters.items():
         check_per_contact(name, value, scene.contacts)
-    span = span_of(stiffness_range, known)
+    factors = _checked_range(stiffness_range, stiffness is not None)
     finest = FINEST_TOLERANCE * default_rtol("time", v.dtype)
     check_shape("tolerance", tolerance, (), "one number")
     check_values("tolerance", tolerance, low=finest, high=1.0)
     as_whole("samples", samples, 1)
     as_whole("seed", seed, 0)
-    at = situation(scene, np.asarray(v))
+    law = LZB(restitution, k, exponent, friction=friction)
+    check_law(law, scene, v.dtype)
+    situation = situation_of(scene, np.asarray(v), law, stiffness is not None)
     mixed = len(np.unique(np.asarray(exponent, float))) > 1
-    absolute = bool(at.gapped.any()) or (mixed and bool(at.coupled))
-    if absolute and not known:
-        raise ValueError(missing_stiffness(at))
-    k = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
-    laws = trials(at, restitution, k, exponent)
-    tried = rows(k, unknowns(at, k, span, absolute), samples, seed)
-    return _found(at, laws, tried, float(tolerance), timing, progress)
+    absolute = bool(situation.gapped.any()) or (mixed and bool(situation.coupled))
+    if absolute and stiffness is None:
+        raise ValueError(_missing_stiffness(situation))
+    nominal = np.broadcast_to(np.asarray(k, v.dtype), (scene.contacts,))
+    unknown = _unknown_stiffnesses(situation, nominal, factors, absolute)
+    tried = _samples(nominal, unknown, samples, seed)
+    return _advice(situation, trials(situation, law), tried, float(tolerance), timing, progress)
 
 
-def _found(
-    at: Situation,
+def _advice(
+    situation: Situation,
     laws: dict[str, Trial],
-    tried: Rows,
+    tried: Samples,
     tolerance: float,
     timing: bool,
     progress: float | None,
 ) -> Advice:
-    name = list(laws)[-1]
-    own = {key: outcomes(law, at, tried.stiffness, progress) for key, law in laws.items()}
-    reference = _usable_rows(own[name], name)
-    evidence = {
-        key: candidate(law, at, own[key], reference, tried.random) for key, law in laws.items()
+    """Runs every law, chooses the reference and the simplest law near it."""
+    v, k = situation.velocity, tried.stiffness
+    outcomes = {name: _outcomes(law, v, k, progress) for name, law in laws.items()}
+    apart = _reclosing(situation, outcomes)
+    follows_gaps = situation.gapped.any() or apart > tolerance / SMALL_PART
+    name = "compliant" if follows_gaps else "lzb"
+    reference = _usable_rows(outcomes[name], name)
+    candidates = {
+        key: _candidate(law, situation, outcomes[key], reference, tried.random)
+        for key, law in laws.items()
     }
     if timing:
-        for key, cost in costs(laws, at, tried.stiffness).items():
-            evidence[key] = replace(evidence[key], cost=cost)
-    fit = [key for key, c in evidence.items() if c.usable and c.worst <= tolerance]
-    chosen = fit[0] if fit else name
-    if laws[chosen].knows_stiffness:
-        evidence[chosen] = _loosened(evidence[chosen], at, reference, tolerance)
+        for key, cost in _costs(laws, v, k).items():
+            candidates[key] = replace(candidates[key], cost=cost)
+    suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
+    chosen = suffice[0] if suffice else name
+    if laws[chosen].has_stiffness:
+        candidates[chosen] = _loosened(candidates[chosen], situation, reference, tolerance)
     gap_ratio = None
-    if at.gapped.any():
-        scale = gap_scale(at.scene, laws["compliant"].law, at.velocity)
-        gap_ratio = np.asarray(scale.ratio)[at.gapped]
+    if situation.gapped.any():
+        scale = gap_scale(situation.scene, laws["compliant"].law, v)
+        gap_ratio = np.asarray(scale.ratio)[situation.gapped]
     return Advice(
         name=chosen,
         tolerance=tolerance,
-        within=bool(fit),
+        within=bool(suffice),
         reference=name,
-        velocity=at.velocity,
-        gap_velocity=at.gap_velocity,
-        candidates=evidence,
-        blocks=_blocks(at, evidence, own, reference, tolerance),
-        stiffness=tried.stiffness[0],
-        unknown=_effects(at, tried, reference, tolerance),
-        rows=len(tried.stiffness),
+        velocity=v,
+        gap_velocity=situation.gap_velocity,
+        candidates=candidates,
+        blocks=_with_simplest_laws(situation, candidates, outcomes, reference, tolerance),
+        stiffness=k[0],
+        unknown=_effects(situation, tried, reference, tolerance),
+        rows=len(k),
         gap_ratio=gap_ratio,
+        far=tuple(np.flatnonzero(situation.far).tolist()),
+        reclosing=apart,
     )
 
 
-def span_of(given: tuple[float, float] | None, known: bool) -> tuple[float, float]:
+def _checked_range(factors: tuple[float, float] | None, known: bool) -> tuple[float, float]:
     """The range of a stiffness ratio, as factors."""
-    if given is None:
+    if factors is None:
         return (1.0, 1.0) if known else UNKNOWN_RANGE
-    ends = np.asarray(given)
+    ends = np.asarray(factors)
     check_shape("stiffness_range", ends, (2,), "low and high factor")
     check_values("stiffness_range", ends, low=0.0, open_low=True)
     low, high = float(ends[0]), float(ends[1])
@@ -252,30 +296,30 @@ def span_of(given: tuple[float, float] | None, known: bool) -> tuple[float, floa
     return low, high
 
 
-def missing_stiffness(at: Situation) -> str:
+def _missing_stiffness(situation: Situation) -> str:
     """The message where ratios of stiffnesses are not enough."""
-    if at.gapped.any():
-        named = ", ".join(str(j + 1) for j in np.flatnonzero(at.gapped))
+    if situation.gapped.any():
+        named = ", ".join(str(j + 1) for j in np.flatnonzero(situation.gapped))
         return (
-            "Argument `stiffness` must be given [N/m^eta] where open contacts can meet others at "
-            f"work (contact {named}): gaps count in units of the indentation."
+            "Argument `stiffness` must be given [N/m^eta] where open contacts can close while "
+            f"others are at work (contact {named}): gaps count in units of the indentation. "
+            "Set their gaps to inf if they take no part."
         )
-    return "Argument `stiffness` must be given where exponents differ: ratios then say nothing."
+    return "Argument `stiffness` must be given where exponents differ: ratios do not suffice then."
 
 
 # ------------------------------------------------------- the scene, and what is tried on it
 
 
-def situation(scene: Scene, velocity: np.ndarray) -> Situation:
-    """Blocks and gaps of a scene at the velocity v- (n,)."""
+def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> Situation:
+    """Blocks and gaps of a scene at v- (n,); `known`: the stiffness of `law` was given."""
     gamma = np.asarray(gap_velocity(scene, velocity))
-    angle = np.degrees(np.asarray(kinetic_angles(scene)))
-    rounding = DECOUPLED_IN_EPS * np.finfo(angle.dtype).eps
-    touch = np.abs(np.cos(np.radians(angle))) > rounding
-    label = components(touch | np.eye(len(gamma), dtype=bool))
-    together = [tuple(np.flatnonzero(label == first).tolist()) for first in np.unique(label)]
-    blocks = tuple(_block(members, gamma, angle, touch) for members in together)
     opened = ~np.asarray(scene.closed)
+    far = opened & ~_can_close(scene, velocity, law, known)
+    if far.any():
+        assert scene.gaps is not None
+        scene = with_gaps(scene, jnp.where(jnp.asarray(far), jnp.inf, scene.gaps))
+    blocks = _blocks(scene, gamma, np.flatnonzero(~far), law.friction is not None)
     acting = np.zeros(len(gamma), bool)
     gapped = np.zeros(len(gamma), bool)
     for block in blocks:
@@ -286,42 +330,88 @@ def situation(scene: Scene, velocity: np.ndarray) -> Situation:
     if scene.gaps is not None:
         gaps = jnp.where(jnp.asarray(acting), 0.0, scene.gaps).astype(scene.gaps.dtype)
         touching = with_gaps(scene, gaps)
-    return Situation(scene, touching, np.asarray(velocity), gamma, blocks, gapped)
+    return Situation(scene, touching, np.asarray(velocity), gamma, blocks, gapped, far)
 
 
-def _block(
-    members: tuple[int, ...], gamma: np.ndarray, angle: np.ndarray, touch: np.ndarray
-) -> Block:
-    pairs = [angle[i, j] for i, j in itertools.combinations(members, 2) if touch[i, j]]
-    angles = (float(min(pairs)), float(max(pairs))) if pairs else None
-    return Block(members, bool((gamma[list(members)] < 0).any()), angles)
+def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.ndarray:
+    """Which contacts (m,) can close while others are at work; in a chain all, geometry is fixed.
+
+    No gap velocity exceeds `sqrt(W_jj 2 T)` as long as no energy is gained.
+    """
+    if scene.walls is not None or scene.gaps is None:
+        return np.ones(scene.contacts, bool)
+    mass, normals = dense_mass(scene), np.asarray(scene.normals)
+    inverse = np.sum(normals * np.asarray(solve_mass(scene, scene.normals)), axis=0)
+    fastest = np.sqrt(inverse * (velocity @ mass @ velocity))
+    duration = LONGEST_CONTACT
+    approach = float(-np.min(normals.T @ velocity))
+    if known and approach > 0:
+        delta = np.asarray(gap_scale(scene, law, velocity).delta)[np.asarray(scene.closed)]
+        duration = CONTACT_TIMES * float(delta.max(initial=0.0)) / approach
+    return np.asarray(scene.gaps) <= fastest * duration
 
 
-def unknowns(
-    at: Situation, stiffness: np.ndarray, span: tuple[float, float], absolute: bool
+def _blocks(
+    scene: Scene, gamma: np.ndarray, contacts: np.ndarray, friction: bool
+) -> tuple[Block, ...]:
+    """These contacts in blocks that feel each other."""
+    cosine = _largest_cosines(scene, friction)[np.ix_(contacts, contacts)]
+    angle = np.degrees(np.asarray(kinetic_angles(scene)))
+    touch = cosine > DECOUPLED_IN_EPS * np.finfo(cosine.dtype).eps
+    label = components(touch | np.eye(len(contacts), dtype=bool))
+    blocks = []
+    for first in np.unique(label):
+        members = np.flatnonzero(label == first)
+        pairs = [(i, j) for i, j in itertools.combinations(members, 2) if touch[i, j]]
+        angles = [float(angle[contacts[i], contacts[j]]) for i, j in pairs]
+        ends = (min(angles), max(angles)) if angles else None
+        joined = contacts[members]
+        blocks.append(Block(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends))
+    return tuple(blocks)
+
+
+def _largest_cosines(scene: Scene, friction: bool) -> np.ndarray:
+    """Largest |cosine| (m, m) between normals of two contacts, with friction tangents, too."""
+    if not friction:
+        return np.abs(np.cos(np.asarray(kinetic_angles(scene))))
+    assert scene.tangents is not None
+    columns = jnp.concatenate([scene.normals, scene.tangents], axis=1)
+    w = np.asarray(columns.T @ solve_mass(scene, columns))
+    size, m = np.sqrt(np.diag(w)), scene.contacts
+    contact = np.concatenate([np.arange(m), np.repeat(np.arange(m), (len(w) - m) // m)])
+    largest = np.zeros((m, m))
+    np.maximum.at(largest, (contact[:, None], contact[None, :]), np.abs(w / np.outer(size, size)))
+    return largest
+
+
+def _unknown_stiffnesses(
+    situation: Situation, stiffness: np.ndarray, factors: tuple[float, float], absolute: bool
 ) -> tuple[Unknown, ...]:
-    """What is not known of the stiffnesses; `absolute`: not only ratios count."""
-    if span[0] == span[1]:
+    """The stiffnesses or ratios that are not known; `absolute`: not only ratios count."""
+    if factors[0] == factors[1]:
         return ()
-    found = []
-    for block in at.coupled:
+    unknown = []
+    for block in situation.coupled:
         base = None if absolute else block.contacts[0]
         for j in block.contacts if absolute else block.contacts[1:]:
             nominal = float(stiffness[j] / (1.0 if base is None else stiffness[base]))
-            found.append(Unknown(j, base, nominal, nominal * span[0], nominal * span[1]))
-    return tuple(found)
+            unknown.append(Unknown(j, base, nominal, nominal * factors[0], nominal * factors[1]))
+    return tuple(unknown)
 
 
-def rows(stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed: int) -> Rows:
+def _samples(
+    stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed: int
+) -> Samples:
     """Nominal, one at a time, corners of the ranges, and a log-uniform sample of them."""
     count, random = len(unknown), np.random.default_rng(seed)
     if count == 0:
-        return Rows(stiffness[None, :], (), np.zeros((0, 0), int), np.zeros((0, 2), int), slice(1))
+        none = np.zeros((0, 2), int)
+        return Samples(stiffness[None, :], (), none, none, slice(1))
     low = np.log([u.low / u.nominal for u in unknown])
     high = np.log([u.high / u.nominal for u in unknown])
-    part = np.eye(count)[:, None, :]
-    alone = (part * (low + np.array(ALONE)[:, None] * (high - low))[None]).reshape(-1, count)
-    nudged = (part * np.array([[NUDGE], [-NUDGE]])[None]).reshape(-1, count)
+    one = np.eye(count)[:, None, :]
+    alone = (one * (low + np.array(ALONE)[:, None] * (high - low))[None]).reshape(-1, count)
+    nudged = (one * np.array([[NUDGE], [-NUDGE]])[None]).reshape(-1, count)
     if 2**count <= CORNERS:
         ends = np.array(list(itertools.product((0.0, 1.0), repeat=count)))
     else:
@@ -334,48 +424,53 @@ def rows(stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed
         tried[:, u.contact] *= np.exp(change[:, i])
     first = 1 + np.arange(len(alone)).reshape(count, -1)
     second = 1 + len(alone) + np.arange(len(nudged)).reshape(count, 2)
-    return Rows(tried, unknown, first, second, slice(len(change) - samples, None))
+    return Samples(tried, unknown, first, second, slice(len(change) - samples, None))
+
+
+def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
+    """Laws with the parameters of `law` by name, the simplest first, with their scenes."""
+    v, m = situation.velocity, situation.scene.contacts
+    e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
+    mu, touching = law.friction, situation.touching
+    gapped = bool(situation.gapped.any())
+    laws: Mapping[str, Law] = {
+        "newton": Newton(e, mu),
+        "moreau": Moreau(e, mu),
+        "poisson": Poisson(e, mu),
+        "binary": Binary(e, "earliest" if gapped else "fastest", friction=mu),
+        "lzb": LZB(e, k, law.exponent, friction=mu),
+        "compliant": Compliant(Bistiffness(k, law.exponent, e), friction=mu),
+    }
+    scenes = dict.fromkeys(laws, touching)
+    if gapped:
+        scenes |= dict.fromkeys(("binary", "compliant"), situation.scene)
+    return {name: Trial(laws[name], scenes[name]) for name in SIMPLEST_FIRST}
+
+
+# -------------------------------------------------------------------------- running the laws
 
 
 @eqx.filter_jit
 def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | None) -> Outcomes:
+    """The law at velocities (r, n), and at rows of stiffness (r, m) if it has one."""
+
     def one(v: jax.Array, k: jax.Array | None) -> Outcomes:
         out = impact(law if k is None else with_entries(law, ("stiffness",), k), scene, v)
-        return Outcomes(out.velocity, out.impulse, out.status)
+        return Outcomes(out.velocity, out.impulse, out.tangential_impulse, out.status)
 
     return jax.vmap(one)(velocity, stiffness)
 
 
-def trials(at: Situation, restitution: Any, stiffness: np.ndarray, eta: Any) -> dict[str, Trial]:
-    """Laws by name with their scenes; the last one is the reference."""
-    e, k = (
-        jnp.broadcast_to(jnp.asarray(x, at.gap_velocity.dtype), at.gap_velocity.shape)
-        for x in (restitution, stiffness)
-    )
-    gapped = bool(at.gapped.any())
-    found = {
-        "newton": Trial(Newton(e), at.touching),
-        "moreau": Trial(Moreau(e), at.touching),
-        "poisson": Trial(Poisson(e), at.touching),
-        "binary": Trial(Binary(e, "earliest" if gapped else "fastest"), at.touching),
-        "lzb": Trial(LZB(e, k, eta), at.touching),
-    }
-    if gapped:
-        found["binary"] = found["binary"]._replace(scene=at.scene)
-        found["compliant"] = Trial(Compliant(Bistiffness(k, eta, e)), at.scene)
-    return {name: found[name] for name in SIMPLEST_FIRST if name in found}
-
-
-def outcomes(
-    trial: Trial, at: Situation, stiffness: np.ndarray, progress: float | None
+def _outcomes(
+    trial: Trial, velocity: np.ndarray, stiffness: np.ndarray, progress: float | None
 ) -> Outcomes:
-    """Outcomes over rows of stiffness (r, m), a chunk at a time; one of a law that knows none."""
-    r, chunk = len(stiffness) if trial.knows_stiffness else 1, _chunk(stiffness)
+    """Outcomes over rows of stiffness (r, m), a chunk at a time; one row of a law without it."""
+    r, chunk = len(stiffness) if trial.has_stiffness else 1, _chunk(stiffness)
     parts = []
     with counting_bar(r, "impacts", progress) as advance:
         for first in range(0, r, chunk):
             chosen = np.minimum(np.arange(first, first + chunk), r - 1)
-            parts.append(jax.device_get(trial.run(at, stiffness[chosen])))
+            parts.append(jax.device_get(trial.run(velocity, stiffness[chosen])))
             advance(min(chunk, r - first))
     return jax.tree.map(lambda *x: np.concatenate(x)[:r], *parts)
 
@@ -383,96 +478,137 @@ def outcomes(
 def _chunk(stiffness: np.ndarray) -> int:
     """Rows computed together: one size where impacts are cheap, so that it compiles once."""
     r, m = stiffness.shape
-    return CHUNK if m <= CHEAP else min(r, CHUNK)
+    return CHUNK if m <= FEW_CONTACTS else min(r, CHUNK)
 
 
-def candidate(
-    trial: Trial, at: Situation, own: Outcomes, reference: Outcomes, random: slice
-) -> Candidate:
-    """The record of a law with the outcomes `own` (one row for all, or one each)."""
-    error = np.abs(own.velocity[:1] - reference.velocity).max(axis=1) / at.scale
-    return Candidate(
-        law=trial.law,
-        scene=trial.scene,
-        velocity=own.velocity[0],
-        low=np.nanmin(own.velocity, axis=0),
-        high=np.nanmax(own.velocity, axis=0),
-        median=float(np.nanmedian(error[random])),
-        worst=float(np.nanmax(error)),
-        status=STATUS[int(own.status[0])].name,
-    )
-
-
-def costs(laws: dict[str, Trial], at: Situation, stiffness: np.ndarray) -> dict[str, float]:
+def _costs(laws: dict[str, Trial], velocity: np.ndarray, stiffness: np.ndarray) -> dict[str, float]:
     """Time of one impact in a batch over the cheapest law's: medians, side by side."""
     few = stiffness[np.arange(_chunk(stiffness)) % len(stiffness)]
-    taken = in_turns([partial(trial.run, at, few) for trial in laws.values()], ROUNDS)
-    each = [np.median(t) / trial.lanes(len(few)) for t, trial in zip(taken, laws.values())]
+    times = in_turns([partial(trial.run, velocity, few) for trial in laws.values()], ROUNDS)
+    each = [np.median(t) / trial.lanes(len(few)) for t, trial in zip(times, laws.values())]
     return {name: float(x / min(each)) for name, x in zip(laws, each)}
 
 
 # -------------------------------------------------------------------------- the evidence
 
 
-def _loosened(found: Candidate, at: Situation, reference: Outcomes, tolerance: float) -> Candidate:
-    """The law with an rtol for this tolerance, tightened until its own error is small beside it."""
-    rtol = min(10.0 ** math.floor(math.log10(tolerance / RTOL_PART)), COARSEST_RTOL)
-    exact, best = reference.velocity[0], default_rtol("time", at.velocity.dtype)
-    while True:
-        rtol = max(rtol, best)
-        law: Any = replace(found.law, rtol=rtol)  # type: ignore[call-arg]
-        own = np.asarray(impact(law, found.scene, at.velocity).velocity)
-        error = float(np.abs(own - exact).max()) / at.scale
-        if rtol == best or error <= tolerance / RTOL_PART:
-            return replace(found, law=law, worst=max(found.worst, error))
-        rtol /= 10
+def _failed(outcomes: Outcomes) -> np.ndarray:
+    """Which rows (r,) have a status that is a failure."""
+    return np.array([STATUS[int(code)].failure for code in outcomes.status])
+
+
+def _reclosing(situation: Situation, outcomes: dict[str, Outcomes]) -> float:
+    """Largest distance between LZB and Compliant, both on contacts without gaps."""
+    lzb, compliant = outcomes["lzb"], outcomes["compliant"]
+    usable = ~(_failed(lzb) | _failed(compliant))
+    if situation.gapped.any() or not usable.any():
+        return 0.0
+    return float(situation.distance((lzb.velocity - compliant.velocity)[usable]).max())
 
 
 def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
     """The reference with NaN where it failed; at the nominal stiffness it must not."""
-    failed = np.array([STATUS[int(code)].failure for code in reference.status])
+    failed = _failed(reference)
     if failed[0]:
         raise RuntimeError(
             f"The reference law {name} fails on this scene: "
             f"{STATUS[int(reference.status[0])].message}."
         )
-    lost = failed[:, None]
-    v, p = (np.where(lost, np.nan, x) for x in (reference.velocity, reference.impulse))
-    return reference._replace(velocity=v, impulse=p)
+
+    def usable(rows: Any) -> Any:
+        return None if rows is None else np.where(failed[:, None], np.nan, rows)
+
+    return reference._replace(
+        velocity=usable(reference.velocity),
+        impulse=usable(reference.impulse),
+        tangential=usable(reference.tangential),
+    )
 
 
-def _blocks(
-    at: Situation,
-    evidence: dict[str, Candidate],
-    own: dict[str, Outcomes],
+def _candidate(
+    trial: Trial, situation: Situation, outcomes: Outcomes, reference: Outcomes, random: slice
+) -> Candidate:
+    """The record of a law with its outcomes (one row for all, or one each)."""
+    error = situation.distance(outcomes.velocity[:1] - reference.velocity)
+    return Candidate(
+        law=trial.law,
+        scene=trial.scene,
+        velocity=outcomes.velocity[0],
+        low=np.nanmin(outcomes.velocity, axis=0),
+        high=np.nanmax(outcomes.velocity, axis=0),
+        median=float(np.nanmedian(error[random])),
+        worst=float(np.nanmax(error)),
+        status=STATUS[int(outcomes.status[0])].name,
+    )
+
+
+def _loosened(
+    candidate: Candidate, situation: Situation, reference: Outcomes, tolerance: float
+) -> Candidate:
+    """The law with an rtol for this tolerance, tightened until its own error is small beside it."""
+    rtol = min(10.0 ** math.floor(math.log10(tolerance / SMALL_PART)), COARSEST_RTOL)
+    finest = default_rtol("time", situation.velocity.dtype)
+    while True:
+        rtol = max(rtol, finest)
+        law: Any = replace(candidate.law, rtol=rtol)  # type: ignore[call-arg]
+        v = np.asarray(impact(law, candidate.scene, situation.velocity).velocity)
+        change = float(situation.distance(v - candidate.velocity))
+        if rtol == finest or change <= tolerance / SMALL_PART:
+            error = float(situation.distance(v - reference.velocity[0]))
+            return replace(candidate, law=law, worst=max(candidate.worst, error))
+        rtol /= 10
+
+
+def _with_simplest_laws(
+    situation: Situation,
+    candidates: dict[str, Candidate],
+    outcomes: dict[str, Outcomes],
     reference: Outcomes,
     tolerance: float,
 ) -> tuple[Block, ...]:
     """The blocks, each with the simplest law whose impulses there move v+ within tolerance."""
-    of_impulse = jax.vmap(partial(velocity_change, at.scene))
-    change = np.asarray(of_impulse(jnp.eye(len(at.gap_velocity), dtype=at.velocity.dtype)))
+    scene, exact = situation.scene, _all_impulses(reference)
+    moved = jax.vmap(partial(_velocity_change, scene))
+    change = np.asarray(moved(jnp.eye(exact.shape[1], dtype=situation.velocity.dtype)))
+    contact = np.arange(scene.contacts)
+    sides = (exact.shape[1] - scene.contacts) // scene.contacts
+    contact = np.concatenate([contact, np.repeat(contact, sides)])
 
     def error(name: str, block: Block) -> float:
-        here = list(block.contacts)
-        wrong = own[name].impulse[:1, here] - reference.impulse[:, here]
-        return float(np.nanmax(np.abs(wrong @ change[here]))) / at.scale
+        entries = np.isin(contact, block.contacts)
+        wrong = _all_impulses(outcomes[name])[:1, entries] - exact[:, entries]
+        return float(np.nanmax(situation.distance(wrong @ change[entries])))
 
     def simplest(block: Block) -> str | None:
-        known = (name for name, c in evidence.items() if c.status != "order_dependent")
-        return next((name for name in known if error(name, block) <= tolerance), None)
+        for name, candidate in candidates.items():
+            if candidate.status != "order_dependent" and error(name, block) <= tolerance:
+                return name
+        return None
 
-    return tuple(b._replace(law=simplest(b)) if b.approaches else b for b in at.blocks)
+    return tuple(b._replace(law=simplest(b)) if b.approaches else b for b in situation.blocks)
+
+
+def _all_impulses(outcomes: Outcomes) -> np.ndarray:
+    """Normal, then tangential impulses (r, m + t)."""
+    parts = [outcomes.impulse, outcomes.tangential]
+    return np.concatenate([x for x in parts if x is not None], axis=1)
+
+
+def _velocity_change(scene: Scene, impulses: jax.Array) -> jax.Array:
+    """v+ - v- (n,) of normal, then tangential impulses (m + t,), or normal ones alone."""
+    m = scene.contacts
+    return velocity_change(scene, impulses[:m], impulses[m:] if len(impulses) > m else None)
 
 
 def _effects(
-    at: Situation, tried: Rows, reference: Outcomes, tolerance: float
+    situation: Situation, tried: Samples, reference: Outcomes, tolerance: float
 ) -> tuple[Unknown, ...]:
     """The unknown stiffnesses with what each does by itself."""
-    v, found = reference.velocity, []
-    for i, unknown in enumerate(tried.unknown):
-        alone = float(np.nanmax(np.abs(v[tried.alone[i]] - v[0]))) / at.scale
+    v, unknown = reference.velocity, []
+    for i, each in enumerate(tried.unknown):
+        alone = float(np.nanmax(situation.distance(v[tried.alone[i]] - v[0])))
         up, down = v[tried.nudged[i]]
-        slope = float(np.abs(up - down).max()) / (2 * NUDGE) / at.scale
+        slope = float(situation.distance(up - down)) / (2 * NUDGE)
         needed = tolerance / slope if slope > 0 else math.inf
-        found.append(unknown._replace(alone=alone, slope=slope, needed=needed))
-    return tuple(found)
+        unknown.append(each._replace(alone=alone, slope=slope, needed=needed))
+    return tuple(unknown)

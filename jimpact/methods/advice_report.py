@@ -1,4 +1,4 @@
-"""What `advise` found, in words with the numbers of the scene: half a page."""
+"""What `advise` reports, in words with the numbers of the scene: half a page."""
 
 import math
 import textwrap
@@ -8,24 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jimpact.files.records import as_data, fields_as_data, number, table
-from jimpact.law import Law
+from jimpact.law import Declared, Law, parameters_of
 from jimpact.laws import REGISTRY
-from jimpact.laws.binary import Binary
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.kinematic import Newton
-from jimpact.laws.lzb import LZB
 from jimpact.montecarlo.gaps import NEARLY_TOUCHING, WIDE
 from jimpact.scene import Scene
 from jimpact.status import CODE, STATUS
 
-_WIDTH = 80  # of the printed lines
-_BODIES = 5  # in the printed table
-
-_TOLD = 4  # stiffness ratios named one by one
-_PERCENT_FROM = 1e-4
-_ROUNDING = 1e-12
-_NONE = 1e-6  # a change of v+ below, relative to max |v-|, is told as none
-_PARAMETERS = ("restitution", "stiffness", "exponent")  # that an advice tells
+_WIDTH = 80  # characters of the printed lines
+_BODIES = 5  # velocities in the printed table
+_NAMED = 4  # stiffness ratios named one by one; the others are "..."
+_PERCENT_FROM = 1e-4  # smaller errors are printed as 2e-05, not as 0.002 %
+_ROUNDING = 1e-12  # errors up to this are printed as "rounding"
+_NO_CHANGE = 1e-6  # a relative change of v+ up to this is reported as no difference
+_POSITIONAL = ("restitution", "stiffness", "exponent")  # parameters of a law as it is printed
+_KEYWORDS = ("friction", "order", "rtol")  # the same, by name, where they are not the default
 NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
 
 
@@ -46,9 +42,9 @@ class Block(NamedTuple):
 class Unknown(NamedTuple):
     """A stiffness known within a range only: of `contact`, over that of `base` (None: SI).
 
-    What it does to v+ by itself, relative to max |v-|: `alone`: largest change over its range;
-    `slope`: |d v+ / d ln k|; `needed`: relative accuracy of k at which it moves v+ by the
-    tolerance (inf: it does not).
+    What it does to v+ by itself, in the energy norm over that of v-: `alone`: largest change over
+    its range; `slope`: |d v+ / d ln k|; `needed`: relative accuracy of k at which it moves v+ by
+    the tolerance (inf: it does not).
     """
 
     contact: int
@@ -71,8 +67,8 @@ class Candidate:
     """A law, the scene to use it on (contacts taken as closed or not), and how it fares.
 
     `velocity` (n,) at the nominal stiffness; `low`, `high` (n,) over the unknown ratios; `median`
-    and `worst` error of v+ against the reference over them, relative to max |v-|; `cost` per
-    impact in a batch, in units of the cheapest law's (None: not timed).
+    and `worst` error of v+ against the reference over them, in the energy norm over that of v-;
+    `cost` per impact in a batch, in units of the cheapest law's (None: not timed).
     """
 
     law: Law
@@ -94,21 +90,25 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Advice:
-    """What `advise` found; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
+    """The result of `advise`; `ji.impact(advice.law, advice.scene, advice.velocity)` applies it.
 
     Attributes:
         name: of the simplest law; `reason` says why, in words.
         tolerance: as asked for.
-        within: whether that law keeps it.
-        reference: name of the law that all are compared with.
+        within: whether that law is within it.
+        reference: name of the law that all are compared with, 'lzb' or 'compliant'.
         velocity: v- (n,) [m/s].
         gap_velocity: gamma- (m,) [m/s].
-        candidates: the evidence by law, from the simplest to the reference.
+        candidates: the evidence by law, the simplest first.
         blocks: contacts that feel each other.
         stiffness: nominal ones (m,).
         unknown: the stiffnesses that are not known and what they do.
         rows: how many stiffnesses were tried.
-        gap_ratio: gaps at work in units of delta_c (m,), or None.
+        gap_ratio: gaps that can close while other contacts are at work, in units of delta_c
+            (`ji.gap_scale`), or None.
+        far: open contacts (from 0) that cannot close during the impact and take no part.
+        reclosing: largest difference between LZB and Compliant on contacts without gaps: LZB lets
+            opened contacts close again at once.
     """
 
     name: str
@@ -123,6 +123,8 @@ class Advice:
     unknown: tuple[Unknown, ...]
     rows: int
     gap_ratio: np.ndarray | None
+    far: tuple[int, ...] = ()
+    reclosing: float = 0.0
 
     @property
     def law(self) -> Law:
@@ -155,7 +157,8 @@ class Advice:
         unknown = [{"name": u.name} | as_data(u._asdict()) for u in self.unknown]
         for each in unknown:
             del each["contact"], each["base"]
-        parts = {"laws": laws, "blocks": blocks, "unknown": unknown}
+        far = [j + 1 for j in self.far]
+        parts = {"laws": laws, "blocks": blocks, "unknown": unknown, "far": far}
         return words | fields_as_data(self, "name", "candidates", *parts) | parts
 
     def __str__(self) -> str:
@@ -172,22 +175,31 @@ class Advice:
         return "\n".join([*lines, "", *self._table(), "", self._footnote()])
 
     def _table(self) -> list[str]:
-        shown = min(len(self.velocity), _BODIES)
-        heads = ["law", "median", "worst", "cost", *(f"v{i + 1}+" for i in range(shown)), "status"]
+        """A row for each law."""
+        bodies = min(len(self.velocity), _BODIES)
+        heads = ["law", "median", "worst", "cost"]
+        heads += [*(f"v{i + 1}+" for i in range(bodies)), "status"]
         rows = []
         for name, c in self.candidates.items():
-            v = [f"{x:.4f}" for x in c.velocity[:shown]]
+            v = [f"{x:.4f}" for x in c.velocity[:bodies]]
             cost = number(c.cost, ".1f" if (c.cost or 0) < 10 else ".0f")
             mark = "*" if name == self.name else " "
             rows.append([mark + name, share(c.median), share(c.worst), cost, *v, c.status])
         return table(heads, rows, left=["status"])
 
     def _footnote(self) -> str:
-        over = f"; median and worst over {self.rows} stiffnesses" if self.rows > 1 else ""
-        timed = all(c.cost is not None for c in self.candidates.values())
-        cost = "; cost of an impact in a batch, cheapest = 1" if timed else ""
-        words = f"Error of v+ against {title(self.reference)}, relative to max |v-|{over}{cost}."
-        return textwrap.fill(words, _WIDTH)
+        """What the columns of the table mean."""
+        words = (
+            f"Error of v+ against {title(self.reference)}: sqrt(dv^T M dv) over "
+            "sqrt(v-^T M v-), dv the difference of v+"
+        )
+        if self.rows > 1:
+            words += f"; median and worst over {self.rows} stiffnesses"
+        if all(c.cost is not None for c in self.candidates.values()):
+            words += "; cost of an impact in a batch, cheapest = 1"
+        if self.gap_ratio is not None:
+            words += "; delta_c: the indentation scale of a contact, see ji.gap_scale"
+        return textwrap.fill(f"{words}.", _WIDTH)
 
 
 def _wrapped(key: str, text: str) -> list[str]:
@@ -203,44 +215,50 @@ def title(name: str) -> str:
 
 
 def share(x: float) -> str:
-    """A part of max |v-|, rounded up to two digits: 2 %, 3e-05.
+    """A relative error, rounded up to two digits: 2 %, 3e-05.
 
     >>> from jimpact.methods.advice_report import share
     >>> share(0.0191), share(2.01e-5), share(0.0)
     ('2 %', '2.1e-05', 'rounding')
     """
-    if not x > _ROUNDING:
-        return "rounding" if x <= _ROUNDING else "nan"
+    if math.isnan(x):
+        return "nan"
+    if x <= _ROUNDING:
+        return "rounding"
     unit = 10.0 ** (math.floor(math.log10(x)) - 1)
     up = math.ceil(x / unit * (1 - _ROUNDING)) * unit
     return f"{100 * up:.3g} %" if x >= _PERCENT_FROM else f"{up:.2g}"
 
 
-def as_code(law: Law) -> str:
+def as_code(law: Declared) -> str:
     """The law as one writes it: `LZB(0.9, 1, 1.5, rtol=0.001)`."""
-
-    def value(x: object) -> str:
-        array = np.asarray(x)
-        if array.size and (array == array.flat[0]).all():
-            return f"{array.flat[0]:.6g}"
-        return f"[{', '.join(f'{z:.6g}' for z in array)}]"
-
-    holder = law.force if isinstance(law, Compliant) else law
-    names = [field.name for field in fields(holder) if field.name in _PARAMETERS]
-    words = [value(getattr(holder, name)) for name in names]
-    if holder is not law:
-        words = [f"{type(holder).__name__}({', '.join(words)})"]
-    if isinstance(law, Binary) and law.order != "fastest":
-        words.append(repr(law.order))
-    if isinstance(law, LZB | Compliant) and law.rtol is not None:
-        words.append(f"rtol={law.rtol:g}")
-    return f"{type(law).__name__}({', '.join(words)})"
+    words, keywords = [], []
+    for field in fields(law):
+        value = getattr(law, field.name)
+        if isinstance(value, Declared):
+            words.append(as_code(value))
+        elif field.name in _POSITIONAL:
+            words.append(_in_code(value))
+        elif field.name in _KEYWORDS and value is not None:
+            if not isinstance(value, str):
+                keywords.append(f"{field.name}={_in_code(value)}")
+            elif value != field.default:
+                keywords.append(f"{field.name}={value!r}")
+    return f"{type(law).__name__}({', '.join(words + keywords)})"
 
 
-def structure(found: Advice) -> str:
+def _in_code(value: Any) -> str:
+    """A number, or a list of them unless all are equal."""
+    array = np.asarray(value)
+    if array.size and (array == array.flat[0]).all():
+        return f"{array.flat[0]:.6g}"
+    return f"[{', '.join(f'{x:.6g}' for x in array)}]"
+
+
+def structure(advice: Advice) -> str:
     """Which contacts are coupled: one sentence a block of several, one for all others."""
     words = []
-    for block in found.at_work:
+    for block in advice.at_work:
         if block.angles is None:
             continue
         low, high = block.angles
@@ -248,147 +266,176 @@ def structure(found: Advice) -> str:
         law = f"{title(block.law)} is enough" if block.law else "no law is within tolerance"
         words.append(f"contacts {block.name} are coupled (kinetic {angle} degrees): {law}")
     groups: dict[str, list[int]] = {}
-    for block in found.blocks:
+    for block in advice.blocks:
         if not block.approaches:
             what = "without an approach"
         elif len(block.contacts) == 1:
             what = f"decoupled: {title(block.law or 'no law')} is enough"
         else:
             continue
-        groups.setdefault(what, []).extend(j + 1 for j in block.contacts)
+        groups.setdefault(what, []).extend(block.contacts)
+    if advice.far:
+        groups["too far open to close during the impact"] = list(advice.far)
     for what, contacts in groups.items():
-        named = ", ".join(str(j) for j in contacts)
+        named = ", ".join(str(j + 1) for j in contacts)
         words.append(f"contact{'s' * (len(contacts) > 1)} {named} {what}")
     return "; ".join(words)
 
 
-def effects(found: Advice) -> str:
+def effects(advice: Advice) -> str:
     """What each unknown stiffness does by itself, the strongest first."""
-    strongest = sorted(found.unknown, key=lambda u: -u.alone)[:_TOLD]
-    words = [
-        f"{e.name} {share(e.alone)}"
-        + (f" (know it within {100 * e.needed:.2g} %)" if e.needed < 1 else "")
-        for e in strongest
-    ]
+    words = []
+    for unknown in sorted(advice.unknown, key=lambda u: -u.alone)[:_NAMED]:
+        needed = f" (know it within {100 * unknown.needed:.2g} %)" if unknown.needed < 1 else ""
+        words.append(f"{unknown.name} {share(unknown.alone)}{needed}")
     return f"alone they move v+ by: {', '.join(words)}"
 
 
-def agreeing(found: Advice) -> str:
-    """Other laws, not more complex than the reference, that keep the tolerance too."""
+def agreeing(advice: Advice) -> str:
+    """Other laws, simpler than the reference, that are within tolerance too."""
+    names = list(advice.candidates)
+    simpler = names[: names.index(advice.reference)] if advice.within else []
     others = [
         title(name)
-        for name, c in found.candidates.items()
-        if name not in (found.name, found.reference)
-        and c.usable
-        and c.worst <= found.tolerance
-        and found.within
+        for name in simpler
+        if name != advice.name
+        and advice.candidates[name].usable
+        and advice.candidates[name].worst <= advice.tolerance
     ]
-    return f"within {share(found.tolerance)}: {', '.join(others)}" if others else ""
+    return f"within {share(advice.tolerance)}: {', '.join(others)}" if others else ""
 
 
-def ratios(found: Advice) -> str:
+def ratios(advice: Advice) -> str:
     """The stiffness ratios this advice is about."""
-    if found.unknown:
-        names = [u.name for u in found.unknown[:_TOLD]]
-        more = ", ..." if len(found.unknown) > _TOLD else ""
-        ends = {(u.low, u.high) for u in found.unknown}
-        first = found.unknown[0]
-        where = f"in [{first.low:.3g}, {first.high:.3g}]" if len(ends) == 1 else "in their ranges"
-        many = len(found.unknown) > 1
-        kind = "stiffness" + (" ratio" + "s" * many if first.base is not None else "es" * many)
-        return f"{kind} {', '.join(names)}{more} {where}"
-    pairs = [(b.contacts[0], j) for b in found.at_work for j in b.contacts[1:]]
-    names = [f"k{j + 1}/k{i + 1}" for i, j in pairs[:_TOLD]]
-    values = [f"{found.stiffness[j] / found.stiffness[i]:.3g}" for i, j in pairs[:_TOLD]]
-    more = ", ..." if len(pairs) > _TOLD else ""
-    return f"stiffness ratio{'s' * (len(pairs) > 1)} {', '.join(names)} = {', '.join(values)}{more}"
+    if advice.unknown:
+        names = [u.name for u in advice.unknown]
+        ends = {(u.low, u.high) for u in advice.unknown}
+        first = advice.unknown[0]
+        values = f"in [{first.low:.3g}, {first.high:.3g}]" if len(ends) == 1 else "in their ranges"
+        ending = "es" if first.base is None else "s"
+        kind = "stiffness" if first.base is None else "stiffness ratio"
+    else:
+        pairs = [(b.contacts[0], j) for b in advice.at_work for j in b.contacts[1:]]
+        names = [f"k{j + 1}/k{i + 1}" for i, j in pairs]
+        each = [f"{advice.stiffness[j] / advice.stiffness[i]:.3g}" for i, j in pairs[:_NAMED]]
+        values = f"= {', '.join(each)}"
+        kind, ending = "stiffness ratio", "s"
+    more = ", ..." if len(names) > _NAMED else ""
+    plural = ending if len(names) > 1 else ""
+    return f"{kind}{plural} {', '.join(names[:_NAMED])}{more} {values}"
 
 
-def reason(found: Advice) -> str:
+def reason(advice: Advice) -> str:
     """Why this law, in one sentence or two."""
-    if not found.at_work:
-        slowest = float(found.gap_velocity.min())
+    if not advice.at_work:
+        slowest = float(advice.gap_velocity.min())
         return f"no approach: nothing happens (smallest gap velocity {slowest:.3g} m/s)"
-    head = _head(found)
-    closest = _closest_simpler(found)
-    return f"{head}; {closest}" if closest else head
+    main = _main_reason(advice)
+    closest = _closest_simpler(advice)
+    return f"{main}; {closest}" if closest else main
 
 
-def _head(found: Advice) -> str:
-    name, worst = found.name, share(found.candidates[found.name].worst)
-    if all(len(block.contacts) == 1 for block in found.at_work):
-        if len(found.gap_velocity) == 1:
-            return "single contact: every law is Newton's"
-        if len(found.at_work) == 1:
-            only = f"only contact {found.at_work[0].name} takes part: a single contact"
-        else:
-            only = "contacts decoupled: kinetic angle 90 degrees"
-        if name == "newton":
-            return f"{only}, all laws agree"
-        return f"{only}; {title(name)} leaves separating contacts alone"
-    if not found.within:
-        return _undecided(found)
-    if found.reference == "compliant":
-        return _gaps(found, worst)
+def _main_reason(advice: Advice) -> str:
+    """Why the advised law is within tolerance, or why none is."""
+    name, worst = advice.name, share(advice.candidates[advice.name].worst)
+    verb = f"{title(name)} is within {worst}"
+    if all(len(block.contacts) == 1 for block in advice.at_work):
+        return _single_contacts(advice, verb)
+    if not advice.within:
+        return _undecided(advice)
+    if advice.gap_ratio is not None:
+        return _gaps(advice, verb)
+    if advice.reference == "compliant":
+        return f"{_reclosing(advice)}: {verb}"
     if name == "lzb":
-        if not found.unknown:
-            return f"{ratios(found)}: no simpler law is within {share(found.tolerance)}"
-        return f"{ratios(found)}: whatever they are, LZB at the nominal ones is within {worst}"
-    if isinstance(found.law, Newton) and not np.asarray(found.law.restitution).any():
-        return f"plastic contacts (restitution 0) that stay together: Newton is within {worst}"
-    return f"{ratios(found)}{_idle(found)}: {title(name)} is within {worst}"
+        if not advice.unknown:
+            return f"{ratios(advice)}: no simpler law is within {share(advice.tolerance)}"
+        return f"{ratios(advice)}: whatever they are, LZB at the nominal ones is within {worst}"
+    if name == "newton" and not np.any(parameters_of(advice.law)["restitution"].value):
+        return f"plastic contacts (restitution 0) that stay together: {verb}"
+    return f"{ratios(advice)}{_no_difference(advice)}: {verb}"
 
 
-def _idle(found: Advice) -> str:
+def _single_contacts(advice: Advice, verb: str) -> str:
+    """The reason where no two contacts at work feel each other."""
+    if len(advice.gap_velocity) == 1:
+        words = "single contact"
+    elif len(advice.at_work) == 1:
+        words = f"only contact {advice.at_work[0].name} takes part: a single contact"
+    else:
+        words = "contacts decoupled: kinetic angle 90 degrees"
+    if _has_friction(advice):
+        return f"{words}, with friction: {verb}"
+    if len(advice.gap_velocity) == 1:
+        return f"{words}: every law is Newton's"
+    if advice.name == "newton":
+        return f"{words}, all laws agree"
+    return f"{words}; {title(advice.name)} leaves separating contacts alone"
+
+
+def _has_friction(advice: Advice) -> bool:
+    """Whether the laws have friction."""
+    return parameters_of(advice.law)["friction"].value is not None
+
+
+def _reclosing(advice: Advice) -> str:
+    """Why Compliant is the reference although no contact has a gap."""
+    return (
+        "contacts open and close again: LZB lets them close at once, Compliant when the gap is "
+        f"closed, and they are up to {share(advice.reclosing)} apart"
+    )
+
+
+def _no_difference(advice: Advice) -> str:
     """Where unknown ratios make no difference, and where angles above 90 degrees explain it."""
-    if not found.unknown or max(u.alone for u in found.unknown) > _NONE:
+    if not advice.unknown or max(u.alone for u in advice.unknown) > _NO_CHANGE:
         return ""
-    wide = [b.angles[1] for b in found.at_work if b.angles is not None]
-    why = ""
-    if max(wide) > 90 + _NONE:
-        why = f" (kinetic angle {max(wide):.4g} degrees: pushing one contact opens the other)"
-    return f" make{'s' * (len(found.unknown) == 1)} no difference{why}"
+    widest = max(b.angles[1] for b in advice.at_work if b.angles is not None)
+    words = " makes no difference" if len(advice.unknown) == 1 else " make no difference"
+    if widest > 90 + _NO_CHANGE and not _has_friction(advice):
+        words += f" (kinetic angle {widest:.4g} degrees: pushing one contact opens the other)"
+    return words
 
 
-def _gaps(found: Advice, worst: str) -> str:
+def _gaps(advice: Advice, verb: str) -> str:
     """Where gaps matter: how wide they are, and what that allows."""
-    assert found.gap_ratio is not None
-    low, high = (float(f(found.gap_ratio)) for f in (np.min, np.max))
+    assert advice.gap_ratio is not None
+    low, high = float(np.min(advice.gap_ratio)), float(np.max(advice.gap_ratio))
     both = f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
-    verb = f"{title(found.name)} is within {worst}"
-    if found.name == "binary" and low > WIDE:
+    if advice.name == "binary" and low > WIDE:
         return f"gaps exceed {WIDE:g} delta_c (they are {both} delta_c): {verb}"
-    if found.name == "compliant":
+    if advice.name == "compliant":
         return f"gaps of {both} delta_c decide the outcome: only contacts with real gaps follow"
     if high < NEARLY_TOUCHING:
         return f"gaps below {NEARLY_TOUCHING:g} delta_c ({both}) are much as if touching: {verb}"
     return f"gaps of {both} delta_c: {verb}"
 
 
-def _undecided(found: Advice) -> str:
+def _undecided(advice: Advice) -> str:
     """Nothing is within tolerance, because the stiffnesses are not known."""
-    moved, bound = share(found.candidates[found.name].worst), share(found.tolerance)
-    many = len(found.unknown) > 1
+    moved, bound = share(advice.candidates[advice.name].worst), share(advice.tolerance)
+    most = max(advice.unknown, key=lambda u: u.alone)
+    if len(advice.unknown) > 1:
+        return (
+            f"{ratios(advice)} decide: no law is within {bound}, because they move v+ by up to "
+            f"{moved}; measure {most.name} first (alone {share(most.alone)})"
+        )
     words = (
-        f"{ratios(found)} decide{'' if many else 's'}: no law is within {bound}, because "
-        f"{'they move' if many else 'it moves'} v+ by up to {moved}"
+        f"{ratios(advice)} decides: no law is within {bound}, because it moves v+ by up to {moved}"
     )
-    most = max(found.unknown, key=lambda u: u.alone)
-    if many:
-        return f"{words}; measure {most.name} first (alone {share(most.alone)})"
     if most.needed < 1:
-        return f"{words}; it would have to be known within {100 * most.needed:.2g} %"
+        words += f"; it would have to be known within {100 * most.needed:.2g} %"
     return words
 
 
-def _closest_simpler(found: Advice) -> str:
-    """How far off the best of the simpler laws is, or what it breaks."""
-    names = list(found.candidates)
-    simpler = names[: names.index(found.name)]
+def _closest_simpler(advice: Advice) -> str:
+    """How far off the best of the simpler laws is, or what it violates."""
+    names = list(advice.candidates)
+    simpler = {name: advice.candidates[name] for name in names[: names.index(advice.name)]}
     if not simpler:
         return ""
-    best = min(simpler, key=lambda n: (not found.candidates[n].usable, found.candidates[n].worst))
-    other = found.candidates[best]
-    if not other.usable:
-        return f"{title(best)} fails: {other.status}"
-    return f"of the simpler laws {title(best)} comes closest and is off by {share(other.worst)}"
+    best = min(simpler, key=lambda name: (not simpler[name].usable, simpler[name].worst))
+    if not simpler[best].usable:
+        return f"{title(best)} fails: {simpler[best].status}"
+    error = share(simpler[best].worst)
+    return f"of the simpler laws {title(best)} comes closest and is off by {error}"

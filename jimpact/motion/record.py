@@ -30,8 +30,8 @@ MOTION_STATUS = (
     Status("not_finite", "the motion or its input is NaN or infinite", True),
     Status(
         "coarse_step",
-        "steps are too long: within 3 a contact is struck again, or in one a disc of a pile moves "
-        "by more than the least radius",
+        "steps are too long: within 3 a contact is struck again, or in one bodies pass each other, "
+        "or a disc of a pile moves by more than the least radius",
         False,
     ),
     Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
