@@ -703,7 +703,7 @@ def test_contour_of_a_valley_is_its_length():
     assert (expected[~seen] > region.limit).all()
     for names, message in (
         (("one", "one"), "must differ"),
-        (("one", "e"), "must be of one, other"),
+        (("one", "e"), "`second` must be one of one, other"),
     ):
         with pytest.raises(ValueError, match=message):
             ji.contour(found, *names)
@@ -713,8 +713,8 @@ def test_contour_of_a_valley_is_its_length():
     ("options", "message"),
     [
         ({"level": 95}, r"`level` must lie in \(0, 1\)"),
-        ({"points": 2}, "`points` must be at least 3"),
-        ({"names": "stiffness"}, "`names` must be among restitution"),
+        ({"points": 2}, "`points` must be an int >= 3"),
+        ({"names": "stiffness"}, "`names` must be one of restitution"),
     ],
 )
 def test_bad_profiles(options, message):
@@ -932,7 +932,9 @@ def test_no_degree_of_freedom_leaves_errors_unknown():
 
 def test_a_progress_bar_can_be_asked_for(capsys):
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
-    ji.fit(ji.Newton(0.9), PAIR, data, progress=True)
-    assert "starts done" in capsys.readouterr().err
+    fit = ji.fit(ji.Newton(0.9), PAIR, data, progress=True)
+    count = fit.start_count  # what the report counts
+    assert f"{count} of {count} starts" in str(fit)
+    assert f"{count} of {count} starts done" in capsys.readouterr().err
     ji.fit(ji.Newton(0.9), PAIR, data)  # no terminal: no bar
     assert capsys.readouterr().err == ""
