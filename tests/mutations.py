@@ -132,6 +132,12 @@ MUTATIONS = [
     Mutation("restitution not in the base's frame", r"relative = state\.v - carried\n    out = impact", "relative = state.v\n    out = impact", ("test_motion.py::test_the_base_works_at_its_own_speed",)),
     Mutation("bodies that pass each other are not reported", r"again \| \(\(course", "again | (False & (course", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
+    # --- the command line
+    Mutation("the newest programs go first", r"in sorted\(files\):", "in sorted(files, reverse=True):", ("test_program_cache.py",), "program_cache.py"),
+    Mutation("unwritable places pass", r"with tempfile\.TemporaryFile\(dir=above\):", "if above:", ("test_commands.py::test_unwritable_places_are_refused_before_anything_is_computed",), "options.py"),
+    Mutation("NaN cells go unreported", r"if cells:", "if not cells:", ("test_commands.py::test_nan_cells_are_reported_once",), "shots_file.py"),
+    Mutation("bodies at rest collide", r"(before\)\)) >= 0", r"\1 > 0", ("test_commands.py::test_velocities_without_an_impact_are_refused",), "commands.py"),
+    Mutation("ranges wait for the classes", r"\n    _check_ranges\(arguments, declared\)", "", ("test_commands.py::test_typos_are_reported_before_jax_is_imported",), "study_file.py"),
     # --- mistakes that no default test noticed in version 0.2
     Mutation("audit forgets stored energy", r"gain = \(change - out\.initial_energy\)", "gain = change", ("test_consistency.py::test_stored_energy_is_not_an_energy_gain",)),
     Mutation("an impact at the beginning of its step", r"jnp\.where\(strikes, 0\.5 \* h", "jnp.where(strikes, 0.0 * h", ("test_motion_stepped.py::test_an_impact_is_in_the_middle_of_its_step",)),
