@@ -108,6 +108,24 @@ def test_data_that_another_law_made_are_told():
         assert "Suspicious" not in told(right)
 
 
+def test_lack_of_fit_is_reported_from_its_level_on():
+    """F with 23 and 12 degrees of freedom: 12 shots of three balls, one momentum each, one e."""
+    rng = np.random.default_rng(0)
+    pre = rng.uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))
+    exact, noise = simulated(ji.Newton(0.8), BALLS, pre), 0.01 * rng.normal(size=(12, 3))
+    momentum = np.repeat(noise.mean(axis=1, keepdims=True), 3, axis=1)
+
+    def fit(times):
+        post = exact + momentum + times * (noise - momentum)
+        return ji.fit(ji.Newton(0.8), BALLS, ji.Experiments(pre, post))
+
+    left = np.sum(fit(1.0).residual ** 2) - np.sum(momentum**2)
+    ratio = left / 23 / (np.sum(momentum**2) / 12)
+    edge = np.sqrt(stats.f.isf(0.01, 23, 12) / ratio)
+    assert "noise that momentum" not in told(fit(0.98 * edge))
+    assert "noise that momentum" in told(fit(1.02 * edge))
+
+
 WALLED = ji.chain([1.0, 2.0], wall=True)
 
 

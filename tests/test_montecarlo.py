@@ -324,7 +324,7 @@ def test_failed_impacts_are_kept_apart():
     assert [bad.index for bad in found.bad] == [1, 3, 5, 7]
     np.testing.assert_array_equal(found.bad[0].velocity, rows[1])
     with pytest.raises(
-        RuntimeError, match="Not one of the first 8 samples gave a usable outcome: 8 max_steps"
+        RuntimeError, match="None of the first 8 samples gave a usable outcome: 8 max_steps"
     ):
         monte_carlo(law, BALLS, rows[1:2].repeat(8, axis=0), [0.0, 1e-6], chunk=8)
 
@@ -373,7 +373,7 @@ def test_interrupted_runs_continue_with_the_same_bits(tmp_path, whole):
     assert again.resumed == 1000
     assert same(again, whole)
     assert "all read from the folder" in str(again)
-    with pytest.raises(KeyboardInterrupt, match="nothing is kept, because no `folder` was given"):
+    with pytest.raises(KeyboardInterrupt, match="nothing is stored, because no `folder` was given"):
         sampled(executor=Stops(1))
 
 
@@ -514,10 +514,11 @@ def test_the_linearization_beside_monte_carlo():
     close = gap_sensitivity(law, BALLS, BEFORE, narrow.gap_mean, narrow)
     np.testing.assert_allclose(close.explained, 1.0, atol=0.02)
     assert "nearly linear" in str(close)
-    scale = gap_scale(BALLS, law, BEFORE).delta  # the report tells gaps in units of it
+    scale = gap_scale(BALLS, law, BEFORE).delta  # the report has gaps in units of it
     np.testing.assert_array_equal(narrow.gap_scale, scale)
-    in_scales = f"in gap scales of {scale[0]:.3g} m: {narrow.gap_mean[0] / scale[0]:.3g} and "
-    assert in_scales in str(narrow)
+    ratio = narrow.gap_mean[0] / scale[0]
+    assert f"in units of delta_c = {scale[0]:.3g} m: {ratio:.3g} and " in str(narrow)
+    assert "delta_c: how deep a contact is indented" in str(narrow)
     assert narrow.to_dict()["gap_scale"] == scale.tolist()
     wide = sampled(gaps=Uniform([0.0, 0.0], [3.0, 3.0]), **sampler)
     across = gap_sensitivity(law, BALLS, BEFORE, wide.gap_mean, wide)

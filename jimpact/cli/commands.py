@@ -125,12 +125,10 @@ def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndar
     return study, np.asarray(data.pre[shot]), np.asarray(data.post[shot])
 
 
-def _titled(study: Study, before: Any) -> str:
+def _titled(study: Study, before: np.ndarray) -> str:
     """The first line of what is printed: the study and its velocities before the impact."""
     unit = "m/s" if study.scene.walls is not None else "m/s, rad/s"
-    if isinstance(before, Sequence | np.ndarray):
-        before = f"({', '.join(f'{x:g}' for x in np.asarray(before))})"
-    return f"{study.title}: v- = {before} {unit}"
+    return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) {unit}"
 
 
 # -------------------------------------------------------------------------------------------- fit
@@ -348,8 +346,8 @@ def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResul
     columns = result.mean, result.standard_error, result.std, result.minimum, result.maximum
     heads = ["coordinate", "mean", "standard_error", "std", "least", "largest"]
     rows = [[i + 1, *row] for i, row in enumerate(zip(*columns))]
-    title = _titled(study, study.monte_carlo["velocity"])
-    return CommandResult(title, result.to_dict(), str(result), {path: picture}, table=(heads, rows))
+    text, pictures = str(result), {path: picture}
+    return CommandResult(study.title, result.to_dict(), text, pictures, table=(heads, rows))
 
 
 def _sampling(study: Study, command: options.MonteCarloCommand) -> dict[str, Any]:
