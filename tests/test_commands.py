@@ -1,6 +1,7 @@
 """One end-to-end call a command; what is refused is one line on stderr and exit code 2."""
 
 import csv
+import inspect
 import json
 import math
 import os
@@ -21,7 +22,9 @@ import pytest
 
 import jimpact as ji
 from jimpact.cli.main import keep_programs, main
-from jimpact.cli.study import body_of
+from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
+from jimpact.files import study_file
+from jimpact.motion.system import HarmonicBase
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
 STUDY = """
@@ -493,7 +496,7 @@ def test_simulate_in_space(tmp_path, capsys):
         (
             'kind = "block"',
             'kind = "car"',
-            "must be one of Block, Polygon, Disc, Dimer, PlanarBodies",
+            "must be one of Block, Box, Column, Corner, Dimer, Disc, Discs",
         ),
         ('kind = "block"', 'kind = "planarbodies"', "[system] must have the key `bodies`"),
         ('kind = "block"', 'kind = "pendulumcradle"', "must have the key `masses_kg`"),
@@ -708,9 +711,7 @@ def test_nan_cells_are_reported_once(tmp_path, capsys):
     shots = SHOTS.replace("0.21,", "NaN,")
     path = written(tmp_path, STUDY, shots)
     _, said = call(capsys, "compare", path, "--velocity", "0", "0")  # read twice, then refused
-    assert "1 cells are NaN" in said.err
-    assert "line 2, column `post_1[m/s]`" in said.err
-    assert said.err.count("NaN") == 1
+    assert said.err.count("shots.csv, line 2, column `post_1[m/s]`: the cell is NaN") == 1
 
 
 @pytest.mark.parametrize("velocity", [["0", "0", "0"], ["-1", "0", "1"]])
@@ -723,6 +724,29 @@ def test_velocities_without_an_impact_are_refused(capsys, velocity):
 def test_names_of_studies_are_those_of_the_classes():
     """`python tests/names.py` writes the file anew."""
     assert names.PATH.read_text(encoding="utf-8") == names.as_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "function"),
+    [
+        (study_file.MOTION_KEYS.values(), ji.simulate),
+        (study_file.FIT.allowed, ji.fit),
+        (study_file.MOTION_TABLES["fit"].allowed, ji.fit_motion),
+        (study_file.BASE_KEYS.values(), HarmonicBase),
+        ([SAMPLING_ARGUMENTS.get(x, x) for x in study_file.SAMPLING.allowed], ji.monte_carlo),
+    ],
+)
+def test_keys_of_studies_are_arguments_of_functions(arguments, function):
+    parameters = inspect.signature(function).parameters
+    passed_on = any(x.kind is x.VAR_KEYWORD for x in parameters.values())
+    assert passed_on or set(arguments) <= set(parameters)
+
+
+def test_nothing_imports_the_command_line():
+    package = Path(ji.__file__).parent
+    for path in package.rglob("*.py"):
+        if path.parent.name != "cli":
+            assert "jimpact.cli" not in path.read_text(encoding="utf-8"), path
 
 
 def test_typos_are_reported_before_jax_is_imported(tmp_path):

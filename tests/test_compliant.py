@@ -241,10 +241,10 @@ def test_calibration_is_differentiable():
 
 def test_linear_forces_reach_the_indentation_of_hertz(monkeypatch):
     """Without losses `k_h x^2.5 / 2.5 = k x^2 / 2 = m v^2 / 2` at the deepest x."""
-    calibration = sys.modules[ji.compare_rheologies.__module__]
-    monkeypatch.setattr(calibration, "calibrate", lambda force, *_: force)
+    rheologies = sys.modules[ji.compare_rheologies.__module__]
+    monkeypatch.setattr(rheologies, "calibrate", lambda force, *_: force)
     scene, speed, k = ji.chain([1.0, 3.0, 0.5]), 2.0, jnp.array([5.0, 7.0])
-    forces = calibration.forces_of_equal_restitution(scene, [2.0, 0.0, 0.0], 0.9, k)
+    forces = rheologies.forces_of_equal_restitution(scene, [2.0, 0.0, 0.0], 0.9, k)
     mass = np.array([3 / 4, 3 / 7])  # reduced masses of the pairs
     deepest = (1.25 * mass * speed**2 / np.array([5.0, 7.0])) ** 0.4
     np.testing.assert_allclose(k * deepest**2.5 / 2.5, mass * speed**2 / 2)
@@ -343,6 +343,19 @@ def test_distributing_rule():
     np.testing.assert_allclose(rule * rule.T, 1.0, rtol=1e-14)
     rule = ji.distributing_rule([1.0, 0.3], [1.0, 2.0], 1.5)
     np.testing.assert_allclose(rule[1, 0], 0.640744299507361192, rtol=1e-14)
+
+
+def test_history_of_one_ball_on_a_linear_spring():
+    """Half a period of `x = v / w sin(w t)`, of 1 kg, k = 2 N/m and 1 m/s."""
+    history = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])
+    w, t = np.sqrt(2.0), np.asarray(history.time)
+    x = np.sin(w * t) / w
+    np.testing.assert_allclose(t[-1], np.pi / w, rtol=1e-7)
+    np.testing.assert_allclose(history.indentation[:, 0], x, atol=1e-7)
+    np.testing.assert_allclose(history.force[:, 0], 2 * x, atol=1e-7)
+    np.testing.assert_allclose(history.energy[:, 0], x**2, atol=1e-7)
+    np.testing.assert_allclose(history.gap_velocity[:, 0], -np.cos(w * t), atol=1e-7)
+    np.testing.assert_allclose(history.impulse[:, 0], 1 - np.cos(w * t), atol=1e-7)
 
 
 def test_hertz_stiffness_of_the_steel_beads():

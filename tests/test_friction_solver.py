@@ -32,8 +32,8 @@ def test_friction_of_many_contacts_has_a_round_cone():
     """In space it is against the slip (3, 4), of length mu p, in every direction."""
     one = jnp.ones((1, 3))
     rate, mu, start = jnp.array([[-1.0, 3.0, 4.0]]), jnp.array(0.5), 0 * one
-    found = solve_many(lambda x: x, one, rate, mu, start, jnp.array(1.0), 1e-9, 1000)
-    close(found.impulse, [[1.0, -0.3, -0.4]], atol=1e-8)
+    solution = solve_many(lambda x: x, one, rate, mu, start, jnp.array(1.0), 1e-9, 1000)
+    close(solution.impulse, [[1.0, -0.3, -0.4]], atol=1e-8)
 
 
 def padded(rows, scenes):

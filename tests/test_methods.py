@@ -563,12 +563,12 @@ def test_limits_are_of_the_unbroken_run_from_their_end():
     ratios, after = np.array([0.01, 0.1, 1.0, 10.0, 100.0]), np.zeros((5, 3))
     after[:, 0] = [0.0, 0.001, 0.5, 0.999, 1.0]
     ends = {"binary": np.zeros(3), "moreau": np.array([1.0, 0.0, 0.0])}
-    found = ValidityMap(
+    validity = ValidityMap(
         BALLS, np.array(STRIKE), ratios, np.ones(1), after[None], after[None, :, 0],
         np.zeros((1, 5), int), ends, dict.fromkeys(ends, 0.0),
     )  # fmt: skip
-    assert found.limit("binary").tolist() == [0.1]
-    assert found.limit("moreau").tolist() == [10.0]
+    assert validity.limit("binary").tolist() == [0.1]
+    assert validity.limit("moreau").tolist() == [10.0]
 
 
 @pytest.mark.slow

@@ -506,11 +506,11 @@ PLATE = ji.ball_system(2.0, base=ji.HarmonicBase(A_BASE, 1.5))
 def test_gaps_are_seen_from_the_base():
     """f = q - y_b, f' = v - y_b', and f'' = -y_b'' where q'' = 0."""
     t = 0.1
-    found = kinematics(PLATE, jnp.array([0.5]), jnp.array([-1.0]), jnp.asarray(t))
+    gap = kinematics(PLATE, jnp.array([0.5]), jnp.array([-1.0]), jnp.asarray(t))
     sine, cosine = A_BASE * np.sin(W_BASE * t), A_BASE * np.cos(W_BASE * t)
-    np.testing.assert_allclose(found.value, [0.5 - sine], rtol=1e-14)
-    np.testing.assert_allclose(found.rate, [-1.0 - W_BASE * cosine], rtol=1e-14)
-    np.testing.assert_allclose(found.drift, [W_BASE**2 * sine], rtol=1e-13)
+    np.testing.assert_allclose(gap.value, [0.5 - sine], rtol=1e-14)
+    np.testing.assert_allclose(gap.rate, [-1.0 - W_BASE * cosine], rtol=1e-14)
+    np.testing.assert_allclose(gap.drift, [W_BASE**2 * sine], rtol=1e-13)
 
 
 def test_the_base_works_at_its_own_speed():

@@ -287,8 +287,8 @@ def test_residuals_are_drawn_over_what_was_fitted():
 def test_a_loop_encloses_the_energy_lost():
     """(1 - e^2) m v^2 / 2 of a pair of two balls of 1 kg, m = 1/2; k x^2.5 / 2.5 = m v^2 / 2."""
     law = ji.Compliant(ji.Bistiffness(3.0, 1.5, 0.6))
-    found = Comparison(ji.chain([1.0, 1.0]), np.array([2.0, 0.0]), {"plastic": entry(law)})
-    x, force = ji.plot.rheologies(found).axes[0].lines[0].get_data()
+    comparison = Comparison(ji.chain([1.0, 1.0]), np.array([2.0, 0.0]), {"plastic": entry(law)})
+    x, force = ji.plot.rheologies(comparison).axes[0].lines[0].get_data()
     deepest = (2.5 / 3.0) ** 0.4
     assert x.max() == pytest.approx(deepest)
     assert force.max() == pytest.approx(3.0 * deepest**1.5)

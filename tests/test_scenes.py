@@ -228,8 +228,8 @@ def test_balls_roll_around_a_disk():
     v = np.array([0.2, -0.5, 3.0, 0.7, 0.1, -2.0, -0.3, 0.4, 5.0])
     for contact, angle in enumerate(phi):
         along = np.array([-np.sin(angle), np.cos(angle)])
-        own = v[3 * contact + 3 : 3 * contact + 6]
-        slip = (own[:2] - v[:2]) @ along - ball[contact] * own[2] - disk * v[2]
+        rolling = v[3 * contact + 3 : 3 * contact + 6]
+        slip = (rolling[:2] - v[:2]) @ along - ball[contact] * rolling[2] - disk * v[2]
         np.testing.assert_allclose(scene.tangents[:, contact] @ v, slip, atol=1e-14)
 
 

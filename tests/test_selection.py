@@ -288,18 +288,18 @@ def test_the_chance_of_scatter_is_half_that_of_chi_squared():
     s = sigma / np.sqrt((2 / 3) ** 2 + (1 / 3) ** 2)  # error of the e of one shot
     ratio = e.var(ddof=1) / s**2
     gain = 11 * (ratio - 1 - np.log(ratio))
-    told = ji.scatter(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post, sigma)))
-    assert told.value == pytest.approx(s * np.sqrt(ratio - 1), rel=1e-4)
-    assert told.chance == pytest.approx(0.5 * stats.chi2.sf(gain, 1), rel=1e-4)
+    scatter = ji.scatter(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post, sigma)))
+    assert scatter.value == pytest.approx(s * np.sqrt(ratio - 1), rel=1e-4)
+    assert scatter.chance == pytest.approx(0.5 * stats.chi2.sf(gain, 1), rel=1e-4)
 
 
 def test_a_trend_over_the_shots_has_two_sides():
     """With equal errors it is the t test of a regression line."""
     x = np.arange(8.0)
     y = 0.7 - 0.01 * x + 0.02 * np.cos(3 * x)
-    found = Scatter("e", 0.0, 1.0, ("e",), y[:1], y[:1], 1.0, 7, y, np.full(8, 0.02))
-    assert found.trend(x) == pytest.approx(stats.linregress(x, y).pvalue)
-    assert found.trend(-x) == pytest.approx(stats.linregress(x, y).pvalue)
+    scatter = Scatter("e", 0.0, 1.0, ("e",), y[:1], y[:1], 1.0, 7, y, np.full(8, 0.02))
+    assert scatter.trend(x) == pytest.approx(stats.linregress(x, y).pvalue)
+    assert scatter.trend(-x) == pytest.approx(stats.linregress(x, y).pvalue)
 
 
 def test_no_scatter_is_said():
@@ -309,7 +309,7 @@ def test_no_scatter_is_said():
     assert told.chance > 0.01
     assert "shows no scatter" in str(told)
     assert told.mean[0] == pytest.approx(found.value[0], abs=0.5 * found.standard_error[0])
-    with pytest.raises(ValueError, match="`name` must be among restitution"):
+    with pytest.raises(ValueError, match="`name` must be one of restitution"):
         ji.scatter(found, "friction")
 
 

@@ -110,6 +110,7 @@ def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
     """
 
     def build(tables: dict[str, Any], file: Path) -> MotionStudy:
+        """The study of these tables."""
         import_module_of(tables, file.parent)
         return _build(check_motion_tables(tables, file, law, modules=True))
 
