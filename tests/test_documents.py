@@ -245,7 +245,9 @@ COMPILING = ("03", "04", "05", "08")  # takes most of the time of these
 def test_notebook_runs(path, tmp_path):
     notebook = nbformat.read(path, as_version=4)
     place = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=300, kernel_name="python3", resources=place).execute()
+    nbclient.NotebookClient(
+        notebook, timeout=None, kernel_name="python3", resources=place
+    ).execute()
 
 
 def test_every_script_has_its_notebook():

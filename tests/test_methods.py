@@ -16,6 +16,7 @@ from programs import failed, names
 
 import jimpact as ji
 from jimpact.methods.advice import situation_of
+from jimpact.methods.validity import ValidityMap
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import stability_reference
@@ -555,6 +556,19 @@ RATIOS = [1e-6, 1e-3, *EXACT, 1e3, 1e6]
 @pytest.fixture(scope="module")
 def valid():
     return ji.validity_map(BALLS, STRIKE, RATIOS, (1.0, 1.5, 2.0, 3.0))
+
+
+def test_limits_are_of_the_unbroken_run_from_their_end():
+    """Binary collisions hold for small ratios, Moreau's law for large ones."""
+    ratios, after = np.array([0.01, 0.1, 1.0, 10.0, 100.0]), np.zeros((5, 3))
+    after[:, 0] = [0.0, 0.001, 0.5, 0.999, 1.0]
+    ends = {"binary": np.zeros(3), "moreau": np.array([1.0, 0.0, 0.0])}
+    validity = ValidityMap(
+        BALLS, np.array(STRIKE), ratios, np.ones(1), after[None], after[None, :, 0],
+        np.zeros((1, 5), int), ends, dict.fromkeys(ends, 0.0),
+    )  # fmt: skip
+    assert validity.limit("binary").tolist() == [0.1]
+    assert validity.limit("moreau").tolist() == [10.0]
 
 
 @pytest.mark.slow

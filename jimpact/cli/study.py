@@ -10,16 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.bodies.assemblies import PlanarBodies
+import jimpact as ji
 from jimpact.bodies.base import CLOSED_BELOW, Body
-from jimpact.bodies.blocks import Block
-from jimpact.bodies.dimers import Dimer, SpatialDimer
-from jimpact.bodies.discs import DiskBalls
-from jimpact.bodies.particles import Column, Corner
-from jimpact.bodies.pendulums import PendulumCradle
-from jimpact.bodies.piles import Discs
-from jimpact.bodies.polygons import Disc, Polygon
-from jimpact.bodies.solids import Box, Sphere
 from jimpact.files.study_file import (
     AT_KEYS,
     NO_DATA,
@@ -38,20 +30,11 @@ from jimpact.fits.problem import FitProblem
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
+from jimpact.montecarlo.distributions import Distribution, RandomLaw
 from jimpact.scene import Scene, chain
 
 # Keys of [monte_carlo] that `monte_carlo` calls otherwise.
-_SAMPLING_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
-_DISTRIBUTIONS: dict[str, Any] = {"Uniform": Uniform, "Normal": Normal}
-BODIES: dict[str, type[Body]] = {
-    body.__name__: body
-    for body in (
-        *(Block, Polygon, Disc, Dimer, PlanarBodies),
-        *(Box, Sphere, SpatialDimer),
-        *(Column, Corner, PendulumCradle, Discs, DiskBalls),
-    )
-}
+SAMPLING_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
 
 
 @dataclass(frozen=True)
@@ -161,7 +144,7 @@ def _build(checked: CheckedStudy) -> Study:
         checked.title,
         scene,
         law,
-        free=free or dict.fromkeys(bounce or default_free(fittable), True),
+        free=free or dict.fromkeys(bounce or default_free(law), True),
         bounds=checked.law.bounds,
         experiments=None if data is None else _experiments(data, checked.path, body or scene),
         parameters=values,
@@ -258,7 +241,7 @@ def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) 
     if "bodies" in arguments:
         within = f"{where.removesuffix(']')}.bodies]"
         arguments["bodies"] = [body_of(within, x) for x in arguments["bodies"]]
-    return BODIES[kind](**arguments)
+    return getattr(ji, kind)(**arguments)
 
 
 def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
@@ -279,7 +262,7 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
     laws = table.get("law", {})
     drawn = {name: _distribution(f"law.{name}", value) for name, value in laws.items()}
     arguments = {
-        _SAMPLING_ARGUMENTS.get(key, key): _distribution(key, value)
+        SAMPLING_ARGUMENTS.get(key, key): _distribution(key, value)
         if isinstance(value, dict)
         else value
         for key, value in table.items()
@@ -290,7 +273,7 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
 
 def _distribution(name: str, value: Any) -> Distribution:
     """The distribution that a table of a study means."""
-    return _DISTRIBUTIONS[distribution(name, value)](**value)
+    return getattr(ji, distribution(name, value))(**value)
 
 
 def import_module_of(tables: Mapping[str, Any], folder: Path) -> None:

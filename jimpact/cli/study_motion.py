@@ -19,7 +19,7 @@ from jimpact.files.study_file import (
 )
 from jimpact.fits.fitting import Fit
 from jimpact.fits.parameters import default_free
-from jimpact.law import Law, free_parameters_of
+from jimpact.law import Law
 from jimpact.laws import REGISTRY
 from jimpact.motion.fitting_motion import fit_motion
 from jimpact.motion.record import Motion
@@ -127,7 +127,7 @@ def _build(checked: CheckedStudy) -> MotionStudy:
         law,
         arguments={MOTION_KEYS[key]: value for key, value in tables["motion"].items()},
         measured=read_positions(checked.data_file) if "data" in tables else None,
-        free=free or dict.fromkeys(default_free(free_parameters_of(law))[:1], True),
+        free=free or dict.fromkeys(default_free(law)[:1], True),
         bounds=checked.law.bounds,
         options=checked.fit_options,
     )

@@ -83,7 +83,7 @@ def design(
         known = ", ".join(fit.names)
         raise ValueError(f"Argument `target` must be one of {known}, but has value {target!r}.")
     own = fit.problem.scene if scene is None else scene
-    problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.free)
+    problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.parameters.labels)
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
     noise = fit.noise
     if fit.experiments.sigma is not None:  # which weigh candidates of other units as `fit` does

@@ -180,7 +180,8 @@ class Experiments(eqx.Module):
 
         Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
         (sigma = 1 where unknown). For equal masses in a chain: the mean excess is taken from each
-        component. Shots with missing values stay as they are. `scene`: where shots carry none.
+        component. Shots with missing values stay as they are. v- are taken as exact: `fit` warns
+        where they have a `sigma_pre`. `scene`: where shots carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -364,9 +365,9 @@ def read_experiments(
     (standard errors of `post`), `sigma_pre_1[m/s]` (of `pre`), `resolution_1[m/s]` (steps of the
     readings, see `Experiments`) and `shot` (a label). Units: m/s, cm/s, mm/s, km/h, in/s, ft/s,
     converted to m/s; rad/s, deg/s, converted to rad/s. An empty `post` cell is a value that was
-    not measured. Scenes that differ from shot to shot: `mass_1[kg]` (kg, g) of every body and
-    `gap_1[m]` (m, cm, mm, um) of every contact of a chain; `q_1[m]`, `q_2[rad]`, ... (lengths, rad,
-    deg, 1) are the configuration of a body.
+    not measured; so is NaN, with a warning. Scenes that differ from shot to shot: `mass_1[kg]`
+    (kg, g) of every body and `gap_1[m]` (m, cm, mm, um) of every contact of a chain; `q_1[m]`,
+    `q_2[rad]`, ... (lengths, rad, deg, 1) are the configuration of a body.
 
     Args:
         path: of the file.

@@ -93,7 +93,8 @@ def fit(
     Args:
         law: start values. A scalar field is one value for all contacts (tied), an (m,) field is
             free contact by contact. The stiffnesses of `LZB` with equal exponents: only their
-            ratios matter, so contact 1 is held, and a scalar stiffness cannot be fitted.
+            ratios matter, so that of contact 1 is held; a scalar stiffness is held by default, and
+            naming it in `free` is an error.
             The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
             approach velocity, at every evaluation and with every method; the start must be so.
             Or a `FitProblem`, which holds the next three arguments and `bounds`.
@@ -122,8 +123,8 @@ def fit(
         `Fit`; `print` gives its report, `ji.plot.fit` a picture.
 
     Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
-    absurd, are left out, and `Fit.warnings` names them. There is told, too, whether the law fits
-    at all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
+    absurd, are left out, and `Fit.warnings` names them. It also says whether the law fits at
+    all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
 
     Raises:
         ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of

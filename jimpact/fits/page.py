@@ -58,7 +58,7 @@ def page(fit: FitResult) -> str:
         f'<p class="verdict">{escape(verdict(fit))}</p>',
         "<h2>Parameters</h2>",
         _table((*_PARAMETERS, f"95 % interval, {kind}", ""), parameter_rows(fit)),
-        _listed("What the data cannot see", fit.identifiability),
+        _listed("What the data do not determine", fit.identifiability),
         _listed("Defects of the data, warnings", fit.warnings or ("None.",)),
         _listed("Scatter from shot to shot", [x.strip(" -") for x in blocks["scatter"][1:]]),
         _listed("Quality", [*blocks["quality"], *blocks["minima"]]),

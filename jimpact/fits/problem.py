@@ -158,7 +158,7 @@ class FitProblem:
     factor of C (J of the start; `fit` takes J of the law it finds).
 
     Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where nothing
-    was), `sigma`, `experiments` and `scene` or None, what is `free`, how many independent `values`
+    was), `sigma`, `experiments` and `scene` or None, how many independent `values`
     were measured; in words, `notes` on what was held instead of fitted, and shots `left_out`; and
     for the solvers `residuals` and `parameters`.
 
@@ -178,7 +178,6 @@ class FitProblem:
     measured: np.ndarray  # NaN where not
     sigma: np.ndarray | None
     values: int  # independent measured values
-    free: Any  # as asked for
     experiments: Experiments | None = None
     scene: Scene | None = None
     left_out: tuple[str, ...] = ()  # which shots, in words
@@ -511,7 +510,7 @@ def _build(
         **host,
     )
     count, domains = int(here.sum()), np.stack(limits, axis=1)
-    return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count, free)
+    return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count)
 
 
 def _scales(

@@ -351,7 +351,7 @@ def _candidates(
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
     """What is free in a caller's law: as by default, and further parameters that it has."""
     known = free_parameters_of(law)
-    return dict.fromkeys((*default_free(known), *(name for name in more if name in known)), True)
+    return dict.fromkeys((*default_free(law), *(name for name in more if name in known)), True)
 
 
 def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> dict[str, Candidate]:

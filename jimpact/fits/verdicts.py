@@ -25,6 +25,11 @@ def fit_warnings(
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
         lines += data_defects(data, problem.scene, stored)
+        if data.lost_freedom and data.sigma_pre is not None:
+            lines.append(
+                "The momentum was corrected as if `sigma_pre` were 0, and the fit weighs the shots "
+                "as if they were not corrected: chi^2 and standard errors are approximate."
+            )
     if not solution.converged:
         lines.append(
             "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "

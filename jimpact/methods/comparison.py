@@ -1,5 +1,6 @@
 """Every law on one scene, side by side."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +20,8 @@ from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity, kinetic_energy, momentum
 from jimpact.status import STATUS
 
-_REPEATS = 20  # of the timing; its median is told
+_REPEATS = 20  # of the timing, whose median is reported
+AS_CLOSE = 1.01  # distances from the measured velocities up to this ratio count as equal
 
 
 def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:
@@ -121,6 +123,23 @@ class Comparison:
     left_out: dict[str, str] = field(default_factory=dict)
     measured: np.ndarray | None = None
 
+    @property
+    def distances(self) -> dict[str, float]:
+        """Root mean square difference [m/s] of each law's v+ from the measured one, if any."""
+        if self.measured is None:
+            return {}
+        after = {name: entry.outcome.velocity for name, entry in self.entries.items()}
+        return {
+            name: float(np.sqrt(np.nanmean((np.asarray(v) - self.measured) ** 2)))
+            for name, v in after.items()
+        }
+
+    @property
+    def closest(self) -> tuple[str, ...]:
+        """The law closest to the measured velocities, and those that are as close to 1 %."""
+        least = min(self.distances.values(), default=math.nan)
+        return tuple(name for name, x in self.distances.items() if x <= AS_CLOSE * least)
+
     def to_dict(self) -> dict[str, Any]:
         """The laws' rows, as a JSON file can hold them."""
         return as_data(self.entries)
@@ -135,6 +154,10 @@ class Comparison:
         if self.measured is not None:
             rows.append(["measured", *self._cells(self.measured), "", ""])
         lines = table(heads, rows, left=["audit"])
+        if self.closest:
+            rms = self.distances[self.closest[0]]
+            named = ", ".join(self.closest)
+            lines.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
         lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         quiet = nothing_approaches(self.scene, self.velocity)
         return "\n".join(lines + ([] if quiet is None else [f"no impact: {quiet}"]))
