@@ -43,8 +43,8 @@ ji.plot.system(ji.chain([0.0665] * 3, gaps=[1e-6, 1e-6]), before, "Gaps not to s
 # %% [markdown]
 # ## Describe what is uncertain
 #
-# Gaps matter only for a law in which contacts take time: `Compliant`. The gap scale is the
-# indentation up to which a gap counts. Here it is about ten times the gaps, so they are neither
+# Gaps matter only for a law in which contacts take time: `Compliant`. The gap scale delta_c is the
+# indentation up to which a gap matters. Here it is six times the largest gap, so the gaps are neither
 # negligible nor decisive.
 
 # %%
@@ -83,9 +83,10 @@ runs = {
     "gaps": ji.monte_carlo(nominal, balls, before, gaps=gaps, samples=8192),
     "both": ji.monte_carlo(fitted_law, balls, before, gaps=gaps, samples=8192),
 }
-print("random       mean v+ [m/s]              standard deviation [m/s]")
+print("random      mean v+ [m/s]              standard deviation [m/s]")
 for name, run in runs.items():
-    print(f"{name:12s} {np.round(run.mean, 4)}   {np.round(run.std, 4)}")
+    columns = "".join(f"{x:9.4f}" for x in (*run.mean, *run.std))
+    print(f"{name:12s}{columns}")
 
 # %% [markdown]
 # The variances of small independent causes add up. If they do not, the gaps act differently for
@@ -93,8 +94,8 @@ for name, run in runs.items():
 
 # %%
 parameters, gaps_only, both = (run.std**2 for run in runs.values())
-print("sum of the two variances / variance of both:", (parameters + gaps_only) / both)
-print("share of the gaps:", gaps_only / (parameters + gaps_only))
+print("sum of the two variances / variance of both:", ((parameters + gaps_only) / both).round(2))
+print("share of the gaps:", (gaps_only / (parameters + gaps_only)).round(3))
 
 # %% [markdown]
 # ## The prediction
@@ -119,7 +120,7 @@ low, high = runs["both"].quantile([0.025, 0.975])[:, 2]
 print(f"the last ball leaves with {low:.3f} to {high:.3f} m/s (95 %)")
 
 # %% [markdown]
-# To improve the prediction, reduce the larger share first. If that is the gaps, a better fit does
-# not help.
+# The gaps limit the prediction of balls 1 and 2; a better fit would not help there. The last ball hardly
+# depends on the gaps: more shots would improve its prediction.
 #
 # *Next: [millions of samples on several processes](10_a_large_run_on_dask.ipynb).*

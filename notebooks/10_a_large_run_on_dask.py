@@ -24,12 +24,15 @@
 
 # %%
 # %matplotlib inline
+import logging
 import time
+import warnings
 from pathlib import Path
 from tempfile import mkdtemp
 
 import jax
 
+logging.getLogger("distributed").setLevel("ERROR")  # how Dask ends its workers is of no interest
 jax.config.update("jax_enable_x64", True)
 
 import numpy as np
@@ -76,13 +79,11 @@ except ValueError as error:
 # %% [markdown]
 # ## A damaged file
 #
-# Each file has a checksum. Overwrite one, as a full disk or a failing cable might, and call again:
+# Each file has a checksum. Truncate one, as a failing disk might, and call again:
 # a warning names the file, and only its chunk is computed again. This time without Dask, because
 # the executor does not affect the result.
 
 # %%
-import warnings
-
 damaged = sorted(folder.glob("chunk*"))[7]
 damaged.write_bytes(damaged.read_bytes()[:1000])
 with warnings.catch_warnings(record=True) as caught:
