@@ -257,6 +257,16 @@ class Declared(eqx.Module):
             if isinstance(value, dataclasses.Field) and _KEY in value.metadata:
                 value.metadata[_KEY].name = name
 
+    def __repr__(self) -> str:
+        """The call that makes it, with numbers; `(static)`: compiled in, never a derivative."""
+        words = []
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            default = field.default is not dataclasses.MISSING and value is field.default
+            if not (default and isinstance(field.metadata.get(_KEY), Option)):
+                words.append(f"{field.name}={_in_words(value)}")
+        return f"{type(self).__name__}({', '.join(words)})"
+
     def __check_init__(self) -> None:
         for field in dataclasses.fields(self):
             declared = field.metadata.get(_KEY)
@@ -266,6 +276,17 @@ class Declared(eqx.Module):
                 if value is None and not optional:
                     as_float_array(field.name, value)  # raises
                 declared.of(self).check(value)
+
+
+def _in_words(value: Any) -> str:
+    """The numbers of a field; of what is traced its shape."""
+    if isinstance(value, StaticNumber | StaticNumbers):
+        return f"{value!r} (static)"
+    if eqx.is_array(value) and not is_traced(value):
+        digits: Any = {"float_kind": lambda x: f"{x:.6g}"}
+        text = np.array2string(np.asarray(value), separator=", ", threshold=20, formatter=digits)
+        return " ".join(text.split())
+    return eqx.tree_pformat(value) if eqx.is_array(value) else repr(value)
 
 
 class Parameter(NamedTuple):

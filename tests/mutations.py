@@ -90,8 +90,8 @@ MUTATIONS = [
     # --- the stepper
     Mutation(  # the last event first, and none watched on the way; either alone repairs itself
         "events in the wrong order",
-        r"(?s)free = ~s\.target\n(.*)    first = jnp\.min\(at, axis=0, keepdims=True\)",
-        r"free = ~s.target & ~lands\n\1    first = jnp.max(jnp.where(at <= 1, at, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(at, axis=0, keepdims=True))",
+        r"(?s)free = ~s\.target\n(.*)    first = jnp\.min\(order, axis=0, keepdims=True\)",
+        r"free = ~s.target & ~lands\n\1    first = jnp.max(jnp.where(order <= AHEAD, order, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(order, axis=0, keepdims=True))",
         FLOW,
         "stepper.py",
     ),
@@ -180,7 +180,7 @@ MUTATIONS = [
     Mutation("numbers of bad samples", r"task\.number \* len\(samples\[\"status\"\]\) \+ lanes", "task.number * count + lanes", ("test_montecarlo.py::test_bad_samples_are_numbered_over_all_chunks",)),
     Mutation("gap scale of a single ball", r"work = 2 / diagonal", "work = 1 / diagonal", ("test_compliant.py::test_gap_scale",)),
     # --- fits
-    Mutation("degrees of freedom of the noise swapped", r"fdtrc\(rest, count, ratio\)", "fdtrc(count, rest, ratio)", ("test_fit.py::test_data_that_another_law_made_are_told",)),
+    Mutation("degrees of freedom of the noise swapped", r"fdtrc\(rest, count, ratio\)", "fdtrc(count, rest, ratio)", ("test_fit.py::test_lack_of_fit_is_reported_from_its_level_on",)),
     Mutation("many shots tested each at the full level", r"LEVEL / count\)", "LEVEL)", ("test_fit.py::test_honest_shots_are_seldom_suspicious",)),
     Mutation("region of two parameters with estimated noise", r"\(-2 / freedom\) - 1\)", "(-1 / freedom) - 1)", ("test_fit.py::test_contours_of_linear_problems_are_ellipses",)),
     Mutation("chance of scatter not halved", r"chance=0\.5 \* float\(chdtrc", "chance=float(chdtrc", ("test_selection.py::test_the_chance_of_scatter_is_half_that_of_chi_squared",)),
@@ -213,7 +213,7 @@ MUTATIONS = [
     Mutation("off-diagonal of a chain's Delassus matrix shifted", r"off_diagonal \* vector\[1:\], none", "off_diagonal * vector[:-1], none", ("test_scenes.py::test_chain_is_the_dense_scene",)),
     Mutation("friction of many contacts in a box, not a disc", r"length = jnp\.sqrt\(jnp\.sum\(side\*\*2, axis=1, keepdims=True\)\)", "length = jnp.max(jnp.abs(side), axis=1, keepdims=True)", ("test_friction_solver.py::test_friction_of_many_contacts_has_a_round_cone",)),
     # --- further rooms
-    Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py",)),
+    Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py::test_compare",)),
     Mutation("vertical and horizontal bases exchanged", r"\(0 \* y, y\) if self\.direction == \"vertical\"", '(0 * y, y) if self.direction == "horizontal"', (examples("motion.system"),)),
     Mutation("limits of validity from the wrong end", r"if law == \"moreau\" else slice", 'if law == "binary" else slice', ("test_methods.py::test_limits_are_of_the_unbroken_run_from_their_end",)),
     Mutation("dispersion of n instead of n - 1", r"jnp\.asarray\(scene\.size - 1, v\.dtype\)", "jnp.asarray(scene.size, v.dtype)", ("test_methods.py::test_dispersion_index_and_energy_ratio",)),
@@ -227,7 +227,7 @@ MUTATIONS = [
     Mutation("bootstrap without the noise", r"fit\.noise \* np\.moveaxis", "np.moveaxis", (examples("fits.many"),)),
     Mutation("given samples of the next chunk", r"values\[number \* size : \(number \+ 1\) \* size\]", "values[(number + 1) * size : (number + 2) * size]", ("test_montecarlo.py::test_given_samples_are_used_row_by_row",)),
     Mutation("friction that pushes along the sliding", r"modes\.sign \* mu, 0\.0", "-modes.sign * mu, 0.0", ("test_motion.py::test_sliding_block_comes_to_stick",)),
-    Mutation("elastic energy of a history doubled", r"0\.5 \* units\.velocity\*\*2 \* energy", "units.velocity**2 * energy", ("test_compliant.py",)),
+    Mutation("elastic energy of a history doubled", r"0\.5 \* units\.velocity\*\*2 \* energy", "units.velocity**2 * energy", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
     # --- pictures
     Mutation("histogram in shares, not per cent", r"100 \* bars / max", "bars / max", ("test_pictures.py::test_a_histogram_is_in_per_cent",)),
     Mutation("measured and fitted exchanged in a picture", r"first\.plot\(fit\.predicted\[here\], measured\[here\]", "first.plot(measured[here], fit.predicted[here]", ("test_pictures.py::test_residuals_are_drawn_over_what_was_fitted",)),

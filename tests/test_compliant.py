@@ -345,6 +345,19 @@ def test_distributing_rule():
     np.testing.assert_allclose(rule[1, 0], 0.640744299507361192, rtol=1e-14)
 
 
+def test_history_of_one_ball_on_a_linear_spring():
+    """Half a period of `x = v / w sin(w t)`, of 1 kg, k = 2 N/m and 1 m/s."""
+    history = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])
+    w, t = np.sqrt(2.0), np.asarray(history.time)
+    x = np.sin(w * t) / w
+    np.testing.assert_allclose(t[-1], np.pi / w, rtol=1e-7)
+    np.testing.assert_allclose(history.indentation[:, 0], x, atol=1e-7)
+    np.testing.assert_allclose(history.force[:, 0], 2 * x, atol=1e-7)
+    np.testing.assert_allclose(history.energy[:, 0], x**2, atol=1e-7)
+    np.testing.assert_allclose(history.gap_velocity[:, 0], -np.cos(w * t), atol=1e-7)
+    np.testing.assert_allclose(history.impulse[:, 0], 1 - np.cos(w * t), atol=1e-7)
+
+
 def test_hertz_stiffness_of_the_steel_beads():
     """8 mm beads, E = 216 GPa, nu = 0.276: the constants of the bead column within 0.02 %."""
     radius = 4e-3

@@ -108,6 +108,24 @@ def test_data_that_another_law_made_are_told():
         assert "Suspicious" not in told(right)
 
 
+def test_lack_of_fit_is_reported_from_its_level_on():
+    """F with 23 and 12 degrees of freedom: 12 shots of three balls, one momentum each, one e."""
+    rng = np.random.default_rng(0)
+    pre = rng.uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))
+    exact, noise = simulated(ji.Newton(0.8), BALLS, pre), 0.01 * rng.normal(size=(12, 3))
+    momentum = np.repeat(noise.mean(axis=1, keepdims=True), 3, axis=1)
+
+    def fit(times):
+        post = exact + momentum + times * (noise - momentum)
+        return ji.fit(ji.Newton(0.8), BALLS, ji.Experiments(pre, post))
+
+    left = np.sum(fit(1.0).residual ** 2) - np.sum(momentum**2)
+    ratio = left / 23 / (np.sum(momentum**2) / 12)
+    edge = np.sqrt(stats.f.isf(0.01, 23, 12) / ratio)
+    assert "noise that momentum" not in told(fit(0.98 * edge))
+    assert "noise that momentum" in told(fit(1.02 * edge))
+
+
 WALLED = ji.chain([1.0, 2.0], wall=True)
 
 
@@ -703,7 +721,7 @@ def test_contour_of_a_valley_is_its_length():
     assert (expected[~seen] > region.limit).all()
     for names, message in (
         (("one", "one"), "must differ"),
-        (("one", "e"), "must be of one, other"),
+        (("one", "e"), "`second` must be one of one, other"),
     ):
         with pytest.raises(ValueError, match=message):
             ji.contour(found, *names)
@@ -713,8 +731,8 @@ def test_contour_of_a_valley_is_its_length():
     ("options", "message"),
     [
         ({"level": 95}, r"`level` must lie in \(0, 1\)"),
-        ({"points": 2}, "`points` must be at least 3"),
-        ({"names": "stiffness"}, "`names` must be among restitution"),
+        ({"points": 2}, "`points` must be an int >= 3"),
+        ({"names": "stiffness"}, "`names` must be one of restitution"),
     ],
 )
 def test_bad_profiles(options, message):
@@ -932,7 +950,9 @@ def test_no_degree_of_freedom_leaves_errors_unknown():
 
 def test_a_progress_bar_can_be_asked_for(capsys):
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
-    ji.fit(ji.Newton(0.9), PAIR, data, progress=True)
-    assert "starts done" in capsys.readouterr().err
+    fit = ji.fit(ji.Newton(0.9), PAIR, data, progress=True)
+    count = fit.start_count  # what the report counts
+    assert f"{count} of {count} starts" in str(fit)
+    assert f"{count} of {count} starts done" in capsys.readouterr().err
     ji.fit(ji.Newton(0.9), PAIR, data)  # no terminal: no bar
     assert capsys.readouterr().err == ""

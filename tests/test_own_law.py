@@ -193,6 +193,39 @@ def test_it_is_named_in_a_study(registered, tmp_path, capsys):
     assert "blended" in capsys.readouterr().out
 
 
+def test_a_law_is_printed_with_its_numbers():
+    """Also a gradient, in which what is compiled in is no derivative; traced ones by their shape."""
+    law = ji.LZB([0.9, 0.8], 2e9, rtol=1e-6)
+    assert str(law) == (
+        "LZB(restitution=[0.9, 0.8], stiffness=2e+09, exponent=1.5 (static), initial_energy=0, "
+        "friction=None, rtol=1e-06)"
+    )
+    slope = jax.grad(lambda law: jnp.sum(law.restitution**2))(law)
+    assert "restitution=[1.8, 1.6], stiffness=0, exponent=1.5 (static)" in str(slope)
+    texts = []
+    jax.jit(lambda law: texts.append(str(law)) or law.restitution)(law)
+    assert "restitution=f64[2]" in texts[0]
+    assert "force=Bistiffness(stiffness=3," in str(ji.Compliant(ji.Hertz(3.0)))
+
+
+def test_lists_of_traced_numbers():
+    """`[1.0, k]` under grad and jit, in laws, scenes and velocities: as `jnp.stack` of them."""
+
+    def listed(x):
+        scene = ji.chain([1.0, x, 2.0], gaps=[0.0, 0.0 * x])
+        return ji.impact(ji.Newton([0.9, 0.1 * x]), scene, [x, 0.0, -1.0]).velocity[1]
+
+    def stacked(x):
+        one = jnp.ones(())
+        scene = ji.chain(jnp.stack([one, x, 2 * one]))
+        law = ji.Newton(jnp.stack([0.9 * one, 0.1 * x]))
+        return ji.impact(law, scene, jnp.stack([x, 0 * one, -one])).velocity[1]
+
+    np.testing.assert_allclose(jax.jit(jax.grad(listed))(3.0), jax.grad(stacked)(3.0), rtol=1e-12)
+    dense = jax.grad(lambda m: ji.kinetic_energy(ji.Scene([m, 1.0], [[-1.0], [m / m]]), [2.0, 0.0]))
+    assert float(dense(3.0)) == 2.0
+
+
 def test_declared_parameters_of_our_laws():
     """Every registered law's parameters have a domain, and its required ones are few."""
     for name, row in ji.REGISTRY.items():

@@ -309,7 +309,7 @@ def test_no_scatter_is_said():
     assert told.chance > 0.01
     assert "shows no scatter" in str(told)
     assert told.mean[0] == pytest.approx(found.value[0], abs=0.5 * found.standard_error[0])
-    with pytest.raises(ValueError, match="`name` must be among restitution"):
+    with pytest.raises(ValueError, match="`name` must be one of restitution"):
         ji.scatter(found, "friction")
 
 

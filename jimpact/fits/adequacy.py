@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from jimpact.fits.multistart import EXACT, Solution
+from jimpact.fits.multistart import Solution
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
 
@@ -51,7 +51,7 @@ def weighted(problem: FitProblem, solution: Solution) -> Weighted:
     shot = np.broadcast_to(rows.reshape(-1, *(1,) * (here.ndim - 1)), here.shape)
     return Weighted(
         problem.independent(problem.measured - solution.predicted)[here],
-        float(problem.residuals.size) * solution.jacobian[here.ravel()],
+        problem.size * solution.jacobian[here.ravel()],
         shot[here],
     )
 
@@ -60,8 +60,7 @@ def adequacy(problem: FitProblem, solution: Solution, rank: int, robust: bool) -
     """Lack of fit and suspicious shots, in words; nothing of data that are reproduced exactly."""
     data = weighted(problem, solution)
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
-    dtype = str(problem.residuals.offset.dtype)
-    if freedom < 1 or squares <= EXACT[dtype] * float(problem.residuals.size) ** 2:
+    if freedom < 1 or squares <= problem.exact_squares:
         return []
     lines = []
     if problem.sigma is not None:

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jimpact._checks import as_whole, check_kind
+from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import BoxRegion
@@ -79,9 +79,8 @@ def design(
     as_whole("count", count, 1)
     if fit.experiments is None or not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must be to shots, with a known noise.")
-    if target is not None and target not in fit.names:
-        known = ", ".join(fit.names)
-        raise ValueError(f"Argument `target` must be one of {known}, but has value {target!r}.")
+    if target is not None:
+        check_choice("target", target, fit.names)
     own = fit.problem.scene if scene is None else scene
     problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.parameters.labels)
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
@@ -122,5 +121,5 @@ def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     states = run(repeated(here, 1), y[None], "levenberg-marquardt", 1, quiet)
     shape = (*problem.measured.shape, -1)
     slopes = np.asarray(states.jacobian[0][: problem.measured.size], float)
-    rows = slopes.reshape(shape)[..., : len(fit.names)] * float(problem.residuals.size) / noise
+    rows = slopes.reshape(shape)[..., : len(fit.names)] * problem.size / noise
     return np.einsum("kip,kiq->kpq", rows, rows)

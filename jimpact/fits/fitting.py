@@ -210,7 +210,7 @@ def as_fit(
     """The fit at the end of a search: errors, rank and warnings."""
     if robust is not None:
         solution = _without_robust_factors(problem, robust)
-    best, size = solution.minima[0], float(problem.residuals.size)
+    best, size = solution.minima[0], problem.size
     errors = _uncertainty(problem, solution, best)
     if robust is not None:
         freedom = errors.degrees_of_freedom
@@ -263,7 +263,7 @@ def as_fit(
 def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Solution:
     """The minimum that the loss found, its residuals weighted as in `problem`."""
     solution, weighed = robust.solution, problem.weighed(robust.factor).residuals
-    size = float(problem.residuals.size)
+    size = problem.size
     back = float(weighed.size) / size / robust.factor.reshape(-1, 1)
     residual = problem.independent(problem.measured - solution.predicted) / size
     squares, jacobian = float(np.sum(residual**2)), back * solution.jacobian
@@ -275,14 +275,14 @@ def _jacobian(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Derivatives (K, n, P) of what was measured in the parameters; NaN where nothing was."""
     shape = (*problem.measured.shape, len(problem.names))
     slope = solution.jacobian.reshape(shape) / solution.scale
-    return problem.errors_of(float(problem.residuals.size) * slope)
+    return problem.errors_of(problem.size * slope)
 
 
 def _uncertainty(
     problem: FitProblem, solution: Solution, minimum: Minimum, noise: float | None = None
 ) -> Uncertainty:
     """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
-    size = float(problem.residuals.size)
+    size = problem.size
     if noise is None and problem.sigma is not None:
         noise = 1.0
     return uncertainty(
@@ -293,7 +293,7 @@ def _uncertainty(
         sum_of_squares=size**2 * minimum.squares,
         values=problem.values,
         noise=noise,
-        rank_tolerance=RANK_TOLERANCE[str(problem.residuals.offset.dtype)],
+        rank_tolerance=RANK_TOLERANCE[problem.precision],
         value_name=problem.value_name,
     )
 
@@ -304,7 +304,7 @@ def _standard_error(
     """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
     if minimum is solution.minima[0]:
         return best.standard_error
-    more = float(problem.residuals.size) ** 2 * (minimum.squares - solution.minima[0].squares)
+    more = problem.size**2 * (minimum.squares - solution.minima[0].squares)
     if not more <= (HARDLY_WORSE * best.noise) ** 2:
         return None
     return _uncertainty(problem, solution, minimum, best.noise).standard_error

@@ -6,6 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 
+def check_level(level: float) -> None:
+    """Raise a ValueError unless this is a confidence level."""
+    if not 0 < level < 1:
+        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+
+
 @dataclass(frozen=True, eq=False)
 class Profile:
     """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.

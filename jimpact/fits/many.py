@@ -13,6 +13,7 @@ from jimpact._checks import as_whole
 from jimpact.fits.adequacy import unusable
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit, as_fit, fit
+from jimpact.fits.intervals import check_level
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
 from jimpact.fits.multistart import Solution, at_minimum, ends, repeated, run, settled, start_points
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
@@ -118,8 +119,7 @@ class Refits:
 
     def interval(self, level: float = 0.95) -> np.ndarray:
         """Quantiles (P, 2) between which the share `level` of the values lies."""
-        if not 0 < level < 1:
-            raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+        check_level(level)
         return np.quantile(self.value, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0).T
 
 

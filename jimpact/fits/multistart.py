@@ -10,6 +10,7 @@ import numpy as np
 
 from jimpact.fits.least_squares import BoxRegion, Method, SolverState
 from jimpact.fits.problem import (
+    EXACT,
     FEW,
     FitProblem,
     Residuals,
@@ -56,9 +57,6 @@ FLAT = 1e-6  # singular values below this share: a valley, where there is nothin
 # hundred times what solvers leave, and far below what a measurement resolves.
 SAME_COST = 1e-6
 SAME_VALUE = 1e-3
-# Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
-# tolerance of the impact.
-EXACT = {"float64": 1e-14, "float32": 1e-8}
 # A start has converged when a full Gauss-Newton step would lower the sum of squares by less than
 # this share: it is then a thousandth of a standard error away from the minimum.
 CONVERGED = 1e-6
@@ -101,7 +99,7 @@ def search(
 ) -> Solution:
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)
-    points, residuals = start_points(problem, starts, rng), filled_up(problem.residuals)
+    points, residuals, lost = start_points(problem, starts, rng), filled_up(problem.residuals), 0
     with progress_bar(progress) as show:
         states = run(repeated(residuals, len(points)), points, method, max_steps, show)
         for _ in range(ROUNDS if starts > 1 else 0):
@@ -110,17 +108,27 @@ def search(
             if 2 * least <= EXACT[str(states.y.dtype)] or not _smooth(states, best):
                 break
             points = _near(residuals, states, best, min(starts, LANES), rng)
-            more = run(repeated(residuals, len(points)), points, method, max_steps, show)
-            states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
+            more = run(
+                repeated(residuals, len(points)), points, method, max_steps, show, len(states.y)
+            )
+            states = _joined(states, more)
             if np.nanmin(more.cost) > (1 - SLOW) * least:
                 break
         if starts > 1 and method == "levenberg-marquardt":
             points = _valleys(problem, residuals, states, show)
             if len(points):
-                more = run(repeated(residuals, len(points)), points, method, max_steps, show)
-                kept = at_minimum(more)
-                states = jax.tree.map(lambda a, b: np.concatenate([a, b[kept]]), states, more)
-    return ends(problem, states)
+                more = run(
+                    repeated(residuals, len(points)), points, method, max_steps, show, len(states.y)
+                )
+                converged = at_minimum(more)
+                states = _joined(states, jax.tree.map(lambda x: x[converged], more))
+                lost = int(np.sum(~converged))
+    return ends(problem, states, lost=lost)
+
+
+def _joined(states: SolverState, more: SolverState) -> SolverState:
+    """Both batches of states, one after the other."""
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
 
 
 def quiet(what: str, done: float, total: float | None) -> None:
@@ -186,11 +194,14 @@ def run(
     method: Method,
     max_steps: int,
     show: Show,
+    earlier: int = 0,
     rivals: bool = True,
+    what: str = "starts",
 ) -> SolverState:
     """Solve S problems from points (S, Q), a few at a time; the states come back to the host.
 
-    Rivals are starts of one problem: those far behind the best are given up sooner.
+    Rivals are starts of one problem: those far behind the best are given up sooner. Progress
+    counts `what`, with those of `earlier` runs of the same search.
     """
     few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
     most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
@@ -206,13 +217,18 @@ def run(
     states = jax.tree.map(lambda *x: np.concatenate(x)[: len(points)], *begun)
     active = list(range(len(points)))
     before, since = states.cost.copy(), states.steps.copy()
+
+    def show_count() -> None:
+        count, total = earlier + len(points) - len(active), earlier + len(points)
+        steps = int(states.steps.max())
+        text = f"fit: {count} of {total} {what} done, step {steps} of at most {max_steps}"
+        show(text, steps, max_steps)
+
     while active:
         for rows in _batches(active, lanes):
             some = advance_all(_rows(problems, rows), _rows(states, rows), method, limit, PASSES)
             states = jax.tree.map(partial(_with_rows, rows), states, jax.device_get(some))
-            ready, steps = len(points) - len(active), int(states.steps.max())
-            counts = f"{ready} of {len(points)} starts done, step {steps} of at most {max_steps}"
-            show(f"fit: {counts}", steps, max_steps)
+            show_count()
         ended = states.done | (states.steps >= max_steps)
         if method == "levenberg-marquardt":
             behind = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
@@ -222,6 +238,7 @@ def run(
             before = np.where(due, states.cost, before)
             since = np.where(due, states.steps, since)
         active = [i for i in active if not ended[i]]
+    show_count()
     return states
 
 
@@ -243,7 +260,8 @@ def run_held(
     box: Any = BoxRegion(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
     many = repeated(residuals, len(held))
     many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
-    return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False)
+    what = "held values"
+    return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False, what=what)
 
 
 def _batches(every: list[int], lanes: int) -> list[list[int]]:

@@ -123,7 +123,7 @@ def _made_by(fit: FitResult) -> list[list[str]]:
     rows = [
         ["law", eqx.tree_pformat(fit.law, short_arrays=False)],
         ["solver", f"{fit.method}, loss {fit.loss}, {fit.start_count} starts, seed {fit.seed}"],
-        ["precision", str(fit.problem.residuals.offset.dtype)],
+        ["precision", fit.problem.precision],
         ["jimpact", jimpact.__version__],
     ]
     for name in _PACKAGES:

@@ -38,6 +38,10 @@ from jimpact.status import CODE
 UNUSABLE = ("infeasible", "max_steps", "not_finite")
 PENALTY = 1e3  # times the largest measured value
 
+# Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
+# tolerance of the impact.
+EXACT = {"float64": 1e-14, "float32": 1e-8}
+
 # Shots are filled up to 4, 16, 64 and then 128, 256, ... of them: a program serves all numbers in
 # between, and the copies that fill up cost far less than compiling another one.
 FEWEST, FEW = 4, 64
@@ -373,7 +377,7 @@ class FitProblem:
     @property
     def weight(self) -> np.ndarray:
         """1 / sigma, shaped like `measured`; 0 where nothing was."""
-        return np.asarray(self.residuals.weight, float) * float(self.residuals.size)
+        return np.asarray(self.residuals.weight, float) * self.size
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
         """Errors of what was measured, in units of sigma and as independent ones.
@@ -426,6 +430,21 @@ class FitProblem:
             lambda r: (r.weight, r.size, r.mixing), r, arrays, is_leaf=lambda x: x is None
         )
         return replace(self, residuals=residuals, measured=measured, values=self.values - lost)
+
+    @property
+    def size(self) -> float:
+        """Weighted residuals of the solvers times this are in units of sigma."""
+        return float(self.residuals.size)
+
+    @property
+    def precision(self) -> str:
+        """'float64' or 'float32', in which all is computed."""
+        return str(self.residuals.offset.dtype)
+
+    @property
+    def exact_squares(self) -> float:
+        """Sum of squares (in units of sigma) up to which data count as reproduced exactly."""
+        return EXACT[self.precision] * self.size**2
 
     @property
     def log(self) -> np.ndarray:

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jimpact.fits.intervals import Profile
+from jimpact._checks import as_whole, check_choice
+from jimpact.fits.intervals import Profile, check_level
 from jimpact.fits.least_squares import DEFAULT_STEPS
 from jimpact.fits.problem import FEW
 from jimpact.fits.result import FitResult
@@ -64,16 +65,12 @@ def profile(
     >>> print(*ji.profile(found))
     restitution: at least 0.97321 (95 %)
     """
-    if not 0 < level < 1:
-        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
-    if points < 3:
-        raise ValueError(f"Argument `points` must be at least 3, but has value {points}.")
+    check_level(level)
+    as_whole("points", points, 3)
     check_profiled(fit)
     wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
     for name in wanted:
-        if name not in fit.names:
-            known = ", ".join(fit.names)
-            raise ValueError(f"Argument `names` must be among {known}, but has {name!r}.")
+        check_choice("names", name, fit.names)
     with progress_bar(progress) as show:
         scans = _Scans(fit, [fit.names.index(name) for name in wanted], level, show)
         scans.scan(points, FAR, whole=True)
@@ -195,7 +192,7 @@ class _Scans(ScaledFit):
                 self.solved[i][float(y[i])] = ends[-1]
         every = (end for solved in self.solved.values() for end in solved.values())
         best = min(every, key=_squares)
-        if best[0] < self.least * (1 - SAME) - self.exact:
+        if best[0] < self.least * (1 - SAME) - self.problem.exact_squares:
             self.least, self.lower = best
         return ends
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, stdtr
 
+from jimpact._checks import check_choice
 from jimpact.files.records import with_error
 from jimpact.fits.result import FitResult
 
@@ -159,9 +160,7 @@ def _which(fit: FitResult, name: str | None) -> int:
     if name is None:
         bounce = [i for i, x in enumerate(fit.names) if x.startswith("restitution")]
         return bounce[0] if bounce else 0
-    if name not in fit.names:
-        known = ", ".join(fit.names)
-        raise ValueError(f"Argument `name` must be among {known}, but has {name!r}.")
+    check_choice("name", name, fit.names)
     i = fit.names.index(name)
     if np.isinf(fit.standard_error[i]):
         raise ValueError(f"Argument `name` must be a parameter that the data see, but is {name!r}.")

@@ -14,14 +14,12 @@ from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.many import leave_one_out
 from jimpact.fits.matrix_fit import admissible_start
-from jimpact.fits.multistart import EXACT
-from jimpact.fits.parameters import default_free
+from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.result import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws import SIMPLEST_FIRST
-from jimpact.laws.lzb import LZB
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar
 from jimpact.registry import registered_laws
@@ -214,9 +212,7 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
         return NestedTest(gain, more, None, float(chdtrc(more, gain)), names)
     if rest < 1:
         return NestedTest(np.nan, more, rest, 1.0, names)
-    least = EXACT[str(full.problem.residuals.offset.dtype)]
-    floor = least * float(full.problem.residuals.size) ** 2  # of what is reproduced exactly
-    ratio = gain / more / (max(left, floor) / rest)
+    ratio = gain / more / (max(left, full.problem.exact_squares) / rest)
     return NestedTest(ratio, more, rest, float(fdtrc(more, rest, ratio)), names)
 
 
@@ -369,7 +365,7 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
     one, each_own = np.ones(contacts, int), np.arange(1, contacts + 1)
     coefficients = {"": one} | ({", e per contact": each_own} if alike else {})
     ratios: dict[str, Any] = {"": np.zeros(contacts, int)}
-    if alike and isinstance(law, LZB):  # of others the stiffness is one in SI units
+    if alike and law.only_stiffness_ratios:  # of others the stiffness is one in SI units
         ratios[", free stiffness ratios"] = each_own
     return {
         f"{a}{b}": (
@@ -497,8 +493,7 @@ def _by_residuals(found: Fit, best: Fit) -> float:
     gain = (found.starts[0].sum_of_squares - best.starts[0].sum_of_squares) / more
     if not np.isfinite(variance) or gain <= 0:
         return 1.0
-    exact = EXACT[str(best.problem.residuals.offset.dtype)]
-    least = exact * float(best.problem.residuals.size) ** 2  # of what is reproduced exactly
+    least = best.problem.exact_squares
     return float(fdtrc(more, best.degrees_of_freedom, gain / max(variance, least)))
 
 
@@ -520,8 +515,7 @@ def _aicc(found: Fit) -> float:
     if found.problem.sigma is not None:
         return squares + 2 * count
     k = count + 1  # and the noise
-    exact = EXACT[str(found.problem.residuals.offset.dtype)]
-    if n - k - 1 < 1 or squares <= exact * float(found.problem.residuals.size) ** 2:
+    if n - k - 1 < 1 or squares <= found.problem.exact_squares:
         return np.nan
     return float(n * np.log(squares / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
 
@@ -534,7 +528,7 @@ def _speed_test(
     speeds = data.approach_speed(scene)
     speeds = speeds[speeds > 0]
     known = free_parameters_of(law)
-    if "restitution" not in known or isinstance(law, VelocityDependent):
+    if "restitution" not in known or known.keys() & set(OF_SPEED):
         return None
     if len(speeds) < 2 or np.ptp(speeds) == 0:
         return None

@@ -5,8 +5,8 @@ import numpy as np
 from jimpact.fits.adequacy import adequacy
 from jimpact.fits.defects import data_defects
 from jimpact.fits.matrix_fit import boundary, encloses
-from jimpact.fits.multistart import EXACT, Solution
-from jimpact.fits.problem import FitProblem
+from jimpact.fits.multistart import Solution
+from jimpact.fits.problem import EXACT, FitProblem
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import STATUS
@@ -60,7 +60,7 @@ def fit_warnings(
         lines.append(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
-    if problem.residuals.offset.dtype == np.float32:
+    if problem.precision == "float32":
         lines.append(
             "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
             'jax.config.update("jax_enable_x64", True) gives float64.'
@@ -112,7 +112,6 @@ def _matrix(problem: FitProblem, solution: Solution, contacts: int) -> list[str]
 
 
 def _equally_good(problem: FitProblem, solution: Solution, errors: Uncertainty) -> int:
-    size, dtype = float(problem.residuals.size), str(problem.residuals.offset.dtype)
-    noise = errors.noise / size if np.isfinite(errors.noise) else 0.0
-    more = max(EQUALLY_GOOD * noise**2, EXACT[dtype])
+    noise = errors.noise / problem.size if np.isfinite(errors.noise) else 0.0
+    more = max(EQUALLY_GOOD * noise**2, EXACT[problem.precision])
     return sum(end.squares <= solution.minima[0].squares + more for end in solution.minima)
