@@ -14,7 +14,7 @@
 # %% [markdown]
 # # A block on a shaken base: does it overturn?
 #
-# *Course, part 14, the last. Before: [fit a motion](13_fit_a_motion.ipynb).*
+# *Course, part 14. Before: [fit a motion](13_fit_a_motion.ipynb).*
 #
 # You will simulate a batch of motions in one call: a block that rocks freely, and blocks on a base
 # that shakes with different accelerations.
