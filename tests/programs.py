@@ -34,6 +34,7 @@ class Row:
     slope: float = 1e-10  # of forward against reverse derivatives
     by_order: bool = False  # the order of the contacts is part of the law
     reverse: bool = True  # whether reverse derivatives are compiled as well; else its code is LZB's
+    through_w: bool = True  # whether contacts influence each other through W only
     flagged: float = 0.05  # most of the contract's random states that may be flagged as failures
 
 

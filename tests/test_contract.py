@@ -201,6 +201,10 @@ def test_order_of_contacts_does_not_matter(name):
 @each_law
 def test_decoupled_contacts_are_solved_as_if_alone(name):
     """Two pairs of balls in one scene, and each with another pair that separates."""
+    if not LAWS[name].through_w:
+        pytest.skip(
+            f"contacts of {name} influence each other whatever W is (see tests/programs.py)"
+        )
     pairs = np.array([[-1, 0], [1, 0], [0, -1], [0, 1.0]])
     mass = np.diag([1, 2, 3, 0.5])
 
