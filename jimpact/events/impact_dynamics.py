@@ -24,12 +24,12 @@ from jimpact.events.contact_flow import (
     Exponent,
     Viscous,
     per_row,
-    unit,
 )
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import pushforward, value_of
+from jimpact.solvers.dense import unit
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
