@@ -135,7 +135,7 @@ MUTATIONS = [
     # --- the command line
     Mutation("the newest programs go first", r"in sorted\(files\):", "in sorted(files, reverse=True):", ("test_program_cache.py",), "program_cache.py"),
     Mutation("unwritable places pass", r"with tempfile\.TemporaryFile\(dir=above\):", "if above:", ("test_commands.py::test_unwritable_places_are_refused_before_anything_is_computed",), "options.py"),
-    Mutation("NaN cells go unreported", r"if cells:", "if not cells:", ("test_commands.py::test_nan_cells_are_reported_once",), "shots_file.py"),
+    Mutation("NaN cells go unreported", r"if not_numbers:", "if not not_numbers:", ("test_commands.py::test_nan_cells_are_reported_once",), "shots_file.py"),
     Mutation("bodies at rest collide", r"(before\)\)) >= 0", r"\1 > 0", ("test_commands.py::test_velocities_without_an_impact_are_refused",), "commands.py"),
     Mutation("ranges wait for the classes", r"\n    _check_ranges\(arguments, declared\)", "", ("test_commands.py::test_typos_are_reported_before_jax_is_imported",), "study_file.py"),
     # --- mistakes that no default test noticed in version 0.2
