@@ -453,8 +453,8 @@ def test_fit_of_a_body(tmp_path, capsys):
     )
     code, said = call(capsys, "fit", path, "--json")
     assert code == 0
-    found = json.loads(said.out)["fits"]["as measured"]["parameters"][0]
-    np.testing.assert_allclose(found["value"], 0.5, atol=1e-6)
+    parameter = json.loads(said.out)["fits"]["as measured"]["parameters"][0]
+    np.testing.assert_allclose(parameter["value"], 0.5, atol=1e-6)
     for old, new, message in (
         ("q = [0.0, 0.3, 0.0]", "", "[scene] must have the key `q`"),
         ("width_m = 0.2", "masses_kg = 1", "[scene] must have the key `width_m`"),
@@ -559,8 +559,7 @@ def test_a_new_study(tmp_path, capsys, kind):
     if kind == "simulate":
         assert ji.read_motion_study(study).title
     else:
-        found = ji.read_study(study)
-        assert (found.experiments is None) == (kind == "montecarlo")
+        assert (ji.read_study(study).experiments is None) == (kind == "montecarlo")
     cells = nbformat.read(study.with_suffix(".ipynb"), as_version=4).cells
     code_cells = [cell.source for cell in cells if cell.cell_type == "code"]
     for source in code_cells:

@@ -459,8 +459,8 @@ def _advise_parameters(study: Study) -> dict[str, Any]:
     rheology = study.parameters.get("rheology", "bistiffness")
     if rheology != "bistiffness":
         raise ValueError(
-            f"the study must have bistiffness contacts, but has rheology {rheology!r}: of viscous "
-            "contacts only the compliant law knows."
+            f"the study must have bistiffness contacts, but has rheology {rheology!r}: only the "
+            "compliant law handles viscous contacts."
         )
     for key in _ADVISE_REFUSED:
         if np.any(study.parameters.get(key, 0.0)):

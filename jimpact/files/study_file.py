@@ -81,8 +81,8 @@ MOTION_TABLES = {
     "data": TableKeys(("file",), ("file",)),
 }
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
-# none, nor lists that are points [m] or mix units, as the classes say: `corners` of a Polygon,
-# `planes`, `walls`, `at`.
+# no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
+# `walls`, `at`), which the classes document.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
@@ -177,10 +177,10 @@ def located(path: Path, table: str) -> Path:
             f"Folder '{path}' holds no study: it has no {STUDY} (`jimpact new` writes one)."
         )
     tables = sorted(bundled.glob("*.toml"))
-    known = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
+    choices = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
     raise FileNotFoundError(
-        f"Study '{path}' does not exist; bundled studies are {', '.join(known)}."
-        f"{suggestion(path, known)}"
+        f"Study '{path}' does not exist; bundled studies are {', '.join(choices)}."
+        f"{suggestion(path, choices)}"
     )
 
 
@@ -225,7 +225,8 @@ def check_impact_tables(
     Args:
         tables: as read from the file.
         path: of the file.
-        other_law: name of a law in the place of the study's; of it only what both laws know stays.
+        other_law: name of a law in the place of the study's; values that it does not take are left
+            out.
         modules: whether the module that a study names has been imported; else a law that may be
             registered there is not checked.
     """
