@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_kind, check_shape, check_values
+from jimpact._checks import as_float_array, check_kind, check_shape, check_values, in_common_dtype
 from jimpact.bodies.base import Body
 from jimpact.compiling import quick_jit
 from jimpact.contact import delassus_matrix
@@ -23,6 +23,7 @@ from jimpact.motion.flow import (
     Settings,
     State,
     allowed_errors,
+    check_rtol,
     first_flight,
     longest_step,
     no_samples,
@@ -335,7 +336,8 @@ def turning_impact(
         Forward derivatives (motions by contact forces have no reverse ones).
 
     Raises:
-        ValueError: sizes, NaN, penetration, a mass that is not positive. TypeError: no `Force`.
+        ValueError: sizes, NaN, penetration, a mass that is not positive, an `rtol` that single
+            precision cannot reach. TypeError: no `Force`.
 
     >>> import jimpact as ji
     >>> block, q, v = ji.Block(1.0, 1.0), [0.0, 0.5, 0.0], [0.0, -0.5, -1.0]
@@ -347,7 +349,8 @@ def turning_impact(
     check_shape("velocity", v, position.shape, "one per coordinate")
     check_values("velocity", v)
     check_kind("force", force, Force)
-    system = System(gap_function, mass)
+    system, force, position, v = in_common_dtype(System(gap_function, mass), force, position, v)
+    check_rtol(rtol, position.dtype)
     scene = system.body.scene(position)  # and its checks
     gamma = gap_velocity(scene, v)
     speed = jnp.max(jnp.where(gamma < 0, -gamma, 0.0))
