@@ -34,7 +34,7 @@ def three_balls(
     """Velocities of three equal balls in a row after the first struck, against a parameter.
 
     `make` takes the parameter, and returns the law, or law, scene and velocity. Grey: the status
-    says that the outcome is none to use. `shares`: velocities over the striker's.
+    is a failure. `shares`: velocities over the striker's.
     """
 
     def outcome(x):
@@ -70,7 +70,7 @@ def three_balls(
 
 @picture
 def law_lzb():
-    """Three touching Hertz balls, e = 0.9: the stiffness ratio decides who takes the velocity."""
+    """Three touching Hertz balls, e = 0.9: the stiffness ratio decides which one moves on."""
     return three_balls(
         lambda ratio: ji.LZB(0.9, jnp.stack([1.0, ratio])),
         np.geomspace(0.1, 10, 121),
@@ -196,7 +196,8 @@ def gaps_decide():
     """Three steel balls, the outer ones strike: gaps of up to 0.1 mm decide the outcome."""
     law, balls = ji.Compliant(ji.Hertz(1.06e10)), ji.chain([0.0167, 0.0669, 0.0167])
     before, gaps = [1.0, 0.0, -1.0], ji.Uniform(0.0, 100e-6)
-    return ji.plot.monte_carlo(ji.monte_carlo(law, balls, before, gaps=gaps, samples=20_000))
+    result = ji.monte_carlo(law, balls, before, gaps=gaps, samples=20_000)
+    return ji.plot.monte_carlo(result, "Two balls strike a third one at 1 m/s, from both sides")
 
 
 @picture

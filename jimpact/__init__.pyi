@@ -60,7 +60,6 @@ from .laws import REGISTRY as REGISTRY, register as register
 from .laws.binary import Binary as Binary
 from .laws.calibration import (
     calibrate as calibrate,
-    compare_rheologies as compare_rheologies,
     measured_restitution as measured_restitution,
 )
 from .laws.compliant import Compliant as Compliant
@@ -92,6 +91,7 @@ from .methods.comparison import (
     dispersion_index as dispersion_index,
     energy_ratio as energy_ratio,
 )
+from .methods.rheologies import compare_rheologies as compare_rheologies
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform

@@ -30,10 +30,14 @@ def as_float_array(name: str, value: Any) -> "jax.Array":
 
     if isinstance(value, jax.Array):
         array = value
+    elif is_traced(value):  # a list of numbers, some of them traced
+        array = jnp.asarray(value)
     else:
         host = np.asarray(value)
         if host.dtype.kind not in "fiub":
-            raise TypeError(f"Argument `{name}` must be numeric, but has value {shown(value)}.")
+            raise TypeError(
+                f"Argument `{name}` must be numeric, but has value {short_repr(value)}."
+            )
         array = jnp.asarray(value)
     if jnp.issubdtype(array.dtype, jnp.complexfloating):
         raise TypeError(f"Argument `{name}` must be real, but has dtype {array.dtype}.")
@@ -113,12 +117,12 @@ def check_kind(name: str, value: Any, kind: type) -> None:
     """Raise a TypeError unless `value` is an instance of `kind`."""
     if not isinstance(value, kind):
         raise TypeError(
-            f"Argument `{name}` must be of type {kind.__name__}, but is {shown(value)}."
+            f"Argument `{name}` must be of type {kind.__name__}, but is {short_repr(value)}."
         )
 
 
-def shown(value: Any) -> str:
-    """A value in a message: its type where it takes more than a line."""
+def short_repr(value: Any) -> str:
+    """The value as messages show it: its type where it takes more than 80 characters."""
     text = repr(value)
     return text if "\n" not in text and len(text) < 80 else f"a {type(value).__name__}"
 

@@ -93,8 +93,9 @@ class Contact(eqx.Module):
         self.stored = zero if stored is None else stored
         self.norm = jnp.sqrt(diagonal(self.delassus)) if norm is None else norm
         self.noise = zero if noise is None else noise
-        block = tangential_block
-        self.tangential_block = None if block is None else TangentialBlock(*block)
+        self.tangential_block = None
+        if tangential_block is not None:
+            self.tangential_block = TangentialBlock(*map(jnp.asarray, tangential_block))
 
     @property
     def contacts(self) -> int:
@@ -137,9 +138,14 @@ class Contact(eqx.Module):
         return self.gap_velocity / self.norm
 
     @property
+    def normal_delassus(self) -> jax.Array:
+        """W (m, m) [1/kg] as an array, of a chain too."""
+        return as_matrix(self.delassus)
+
+    @property
     def whole_delassus(self) -> jax.Array:
         """[[W, W_nt], [W_tn, W_tt]] (m + t, m + t); W where there are no tangents."""
-        w = as_matrix(self.delassus)
+        w = self.normal_delassus
         if self.tangential_block is None:
             return w
         cross, tangent, _ = self.tangential_block

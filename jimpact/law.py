@@ -29,6 +29,8 @@ LARGEST_EXPONENT = 5.0
 
 _KEY = "jimpact"  # of what a field declares, in its metadata
 
+AnyLaw = TypeVar("AnyLaw", bound="Law")
+
 
 @jax.tree_util.register_static
 class StaticNumber(float):
@@ -41,6 +43,8 @@ class StaticNumbers(tuple[float, ...]):
 
 
 if TYPE_CHECKING:
+    from jimpact.events.impact_dynamics import Dynamics
+
     # What a parameter takes and what it is read as; type checkers see both in such a descriptor.
     Numbers = jax.typing.ArrayLike | Sequence[Any]
     Taken = TypeVar("Taken", contravariant=True)
@@ -253,6 +257,16 @@ class Declared(eqx.Module):
             if isinstance(value, dataclasses.Field) and _KEY in value.metadata:
                 value.metadata[_KEY].name = name
 
+    def __repr__(self) -> str:
+        """The call that makes it, with numbers; `(static)`: compiled in, never a derivative."""
+        words = []
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            default = field.default is not dataclasses.MISSING and value is field.default
+            if not (default and isinstance(field.metadata.get(_KEY), Option)):
+                words.append(f"{field.name}={_in_words(value)}")
+        return f"{type(self).__name__}({', '.join(words)})"
+
     def __check_init__(self) -> None:
         for field in dataclasses.fields(self):
             declared = field.metadata.get(_KEY)
@@ -262,6 +276,17 @@ class Declared(eqx.Module):
                 if value is None and not optional:
                     as_float_array(field.name, value)  # raises
                 declared.of(self).check(value)
+
+
+def _in_words(value: Any) -> str:
+    """The numbers of a field; of what is traced its shape."""
+    if isinstance(value, StaticNumber | StaticNumbers):
+        return f"{value!r} (static)"
+    if eqx.is_array(value) and not is_traced(value):
+        digits: Any = {"float_kind": lambda x: f"{x:.6g}"}
+        text = np.array2string(np.asarray(value), separator=", ", threshold=20, formatter=digits)
+        return " ".join(text.split())
+    return eqx.tree_pformat(value) if eqx.is_array(value) else repr(value)
 
 
 class Parameter(NamedTuple):
@@ -317,7 +342,7 @@ def options_of(kind: type[eqx.Module]) -> tuple[str, ...]:
 
 
 class Impulses(NamedTuple):
-    """What a law answers.
+    """What `Law.impulses` returns.
 
     Args:
         normal: p (m,) [N s], >= 0 pushes.
@@ -340,22 +365,29 @@ class Law(Declared):
     A law is a pytree: grad of a law is a law, vmap over a law is a batch. Fields are declared with
     `ji.parameter`; two of them mean the same in every law: `friction`, Coulomb's mu (the scene
     must have tangents unless it is None), and `initial_energy`, stored in the contacts before the
-    impact [J]. `impact` asks a law only where something happens, has left out open contacts and
-    taken rounding for 0, and adds to the status what it sees itself (not finite, negative impulse,
-    inadmissible velocity, energy gain).
+    impact [J]. `impact` calls `impulses` only where something happens; it leaves out open contacts,
+    takes rounding for 0, and adds to the status what it checks itself (not finite, negative
+    impulse, inadmissible velocity, energy gain).
+
+    A law declares what else it can do; by default it only returns impulses.
 
     Class attributes:
         uses_gaps: open contacts take part, at their gaps.
-        pulls: separating contacts, too, if anything happens anywhere.
+        pulls: separating contacts take part, too, if anything happens anywhere.
         separable: contacts that W does not couple may be solved apart: the law itself couples
             none, and its parameters are scalars or (m,).
+        pads_scenes: open contacts may be added, so that scenes of few contacts share a program.
+        contact_force: the `Force` by which its contacts indent (`gap_scale`, `crossover`).
+        has_history: whether `dynamics` may be sampled over the impact's time (`history`).
+        only_stiffness_ratios: whether a common factor of all stiffnesses changes nothing (`fit`
+            then holds the first one).
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
-    >>> class Plastic(ji.Law):  # all contacts of a pair of bodies stop
+    >>> class Plastic(ji.Law):  # all contacts of a pair of bodies stop, without friction
     ...     def impulses(self, contact):
-    ...         p = jnp.linalg.solve(contact.whole_delassus, -contact.gap_velocity)
-    ...         return ji.Impulses(p)
+    ...         w = contact.normal_delassus
+    ...         return ji.Impulses(jnp.linalg.solve(w, -contact.gap_velocity))
     >>> ji.impact(Plastic(), ji.chain([1.0, 1.0]), [1.0, 0.0]).velocity.tolist()
     [0.5, 0.5]
     """
@@ -363,28 +395,51 @@ class Law(Declared):
     uses_gaps: ClassVar[bool] = False
     pulls: ClassVar[bool] = False
     separable: ClassVar[bool] = False
+    pads_scenes: ClassVar[bool] = False
+    has_history: ClassVar[bool] = False
+    only_stiffness_ratios: ClassVar[bool] = False
 
     @abc.abstractmethod
     def impulses(self, contact: Contact) -> Impulses:
-        """Impulses of what `contact` shows, and the law's own status code."""
+        """Impulses from what `contact` holds, and the law's own status code."""
 
     def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """What the law is shown of the scene at a velocity; to override where it must see more."""
+        """What `impulses` gets of a scene at a velocity v- (n,); to override to add to it."""
         return contact_of(scene, velocity, self.stored, self.uses_gaps)
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """To override: raise where the law does not fit the scene, or the precision `dtype`."""
 
+    def dynamics(self, contact: Contact) -> "Dynamics":
+        """To override where `has_history`: the impact dynamics at what `contact` holds."""
+        raise NotImplementedError
+
     @property
-    def pads_scenes(self) -> bool:
-        """Whether it is cheaper to solve more, open contacts than to compile for their number."""
-        return False
+    def contact_force(self) -> Any:
+        """The `Force` by which its contacts indent; None: they do not."""
+        return None
 
     @property
     def stored(self) -> jax.Array:
         """Energy stored in the contacts before the impact, () or (m,) [J]."""
         stored = getattr(self, "initial_energy", None)
         return jnp.zeros(()) if stored is None else stored
+
+
+def forwards_to_law(around: type[AnyLaw]) -> type[AnyLaw]:
+    """Class decorator of a law around another one, its field `law`.
+
+    Members of `Law` that the class does not define itself become those of the other law.
+    """
+    for name in vars(Law):
+        if not name.startswith("_") and name not in vars(around):
+            setattr(around, name, _forwarded(name))
+    return around
+
+
+def _forwarded(name: str) -> property:
+    """The property that is this member of the field `law`."""
+    return property(lambda self: getattr(self.law, name), doc="That of the law within.")
 
 
 def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:

@@ -156,14 +156,14 @@ def _place(law: type[Law]) -> tuple[str, str]:
 
 
 def registered_laws(values: Mapping[str, Any]) -> tuple[dict[str, Law], dict[str, str]]:
-    """One law of each kind of the registry, from parameters by name; and why others are left out.
+    """A law of each row of the registry, from parameters by name; and why others are left out.
 
     >>> import jimpact as ji
     >>> from jimpact.registry import registered_laws
     >>> assert ji.REGISTRY  # our own laws are registered where they are imported
     >>> laws, left_out = registered_laws({"restitution": 0.9})
-    >>> sorted(laws), left_out["restitution_matrix"]
-    (['binary', 'lzb', 'moreau', 'newton', 'poisson'], 'needs `matrix`')
+    >>> laws["newton"], left_out["restitution_matrix"]
+    (Newton(restitution=0.9, friction=None, tangential_restitution=None), 'needs `matrix`')
     """
     laws, left_out = {}, {}
     for name, row in REGISTRY.items():

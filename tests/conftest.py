@@ -1,14 +1,15 @@
 """Strict JAX flags for every test, and the count of the programs that the tests compile.
 
-Compiling is what the suite's time goes into. So tests compile with little optimization, in half the
-time; `programs.values`, the held values and tests marked `long_run` with all of it. A session tells
-the tests that compile most; one of the whole default suite fails beyond BUDGET programs.
+The suite spends most of its time on compiling. So tests compile with little optimization, in half
+the time; `programs.values`, the held values and tests marked `long_run` compile with all of it. A
+session reports the tests with the largest programs; the whole default suite fails if it compiles
+more than BUDGET programs.
 """
 
+import hashlib
 import os
 import random
 import tempfile
-import time
 from collections import Counter
 from pathlib import Path
 
@@ -17,6 +18,8 @@ import matplotlib
 import numpy as np
 import programs as programs_of_laws
 import pytest
+
+from jimpact.compiling import known_options
 
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -30,11 +33,12 @@ MANY_MAPS = 30_000
 # Processes side by side share the programs that took longer than this to compile.
 WORTH_SHARING = "0.2"  # seconds
 
-# A program counts if its compilation took longer; single operations, run eagerly, take less.
-COUNTS_FROM = 0.2  # CPU seconds, which a busy machine does not change
-# Programs of the default suite, over all processes. 250 are aimed at.
-BUDGET = 320
-LOWERED = "/jax/core/compile/jaxpr_to_mlir_module_duration"  # just before
+# A program counts if it has at least this many operations before the compiler optimizes them; single
+# operations that run eagerly have a few. Programs are counted by their text, each once, so that
+# neither the count nor BUDGET depends on how fast the machine is or which process runs which test.
+COUNTS_FROM = 200  # operations of StableHLO
+# Programs of the default suite, over all processes.
+BUDGET = 10_000
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
 BY_LAW = ("test_contract", "test_systems")  # a law's tests share its programs
@@ -54,18 +58,22 @@ DEAR = (  # groups that take longest begin first, so that no process is left alo
     "test_fit",
 )
 
-programs, seconds = Counter(), Counter()  # of each test, in this process
-running, begun = ["imports"], [0.0]
+operations = {}  # of each program that counts, by its test and the hash of its text
+running = ["imports"]  # the test that runs in this process
+texts = tempfile.TemporaryDirectory(prefix="jimpact-programs-")  # where JAX writes programs down
 
 
 def compiled(event, duration, **_):
-    if event == LOWERED:
-        begun[0] = time.process_time()
-    elif event == COMPILED:
-        took = time.process_time() - begun[0]
-        if took > COUNTS_FROM:
-            programs[running[0]] += 1
-            seconds[running[0]] += took
+    """Take note of the programs that JAX has written down, and remove their texts."""
+    if event != COMPILED:
+        return
+    for path in Path(texts.name).iterdir():
+        text = path.read_bytes()
+        path.unlink()
+        count = text.count(b" = ")  # one a line that computes something
+        name = hashlib.sha256(text).hexdigest()
+        if count >= COUNTS_FROM and name not in operations:
+            operations[name] = running[0], count
 
 
 def optimize(fully):
@@ -76,11 +84,16 @@ def optimize(fully):
 
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
+    jax.config.update("jax_dump_ir_to", texts.name)
+    jax.config.update("jax_include_debug_info_in_dumps", False)
     jax.monitoring.register_event_duration_secs_listener(compiled)
     optimize(False)
     if hasattr(config, "workerinput"):
         return
     config.pluginmanager.register(Workers())
+    # The processes of xdist read this when they start; it nearly halves the time of compiling.
+    flags = [f"--{name}={str(value).lower()}" for name, value in known_options().items()]
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = tempfile.TemporaryDirectory(prefix="jimpact-tests-")
         config.add_cleanup(folder.cleanup)
@@ -96,16 +109,13 @@ class Workers:
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node, error):
-        told = getattr(node, "workeroutput", {})
-        programs.update(told.get("programs", {}))
-        seconds.update(told.get("seconds", {}))
+        operations.update(getattr(node, "workeroutput", {}).get("operations", {}))
 
 
 def pytest_sessionfinish(session, exitstatus):
     if hasattr(session.config, "workeroutput"):
-        session.config.workeroutput["programs"] = dict(programs)
-        session.config.workeroutput["seconds"] = dict(seconds)
-    elif whole_suite(session.config) and programs.total() > BUDGET:
+        session.config.workeroutput["operations"] = operations
+    elif whole_suite(session.config) and len(operations) > BUDGET:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
@@ -119,13 +129,16 @@ def files(config):
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    write, total = terminalreporter.write_line, programs.total()
+    write, programs, size = terminalreporter.write_line, Counter(), Counter()
+    for test, count in operations.values():
+        programs[test] += 1
+        size[test] += count
     terminalreporter.section("programs")
-    write(f"{total} programs took {seconds.total():.0f} CPU s to compile (budget {BUDGET})")
-    for name, count in sorted(programs.items(), key=lambda item: -seconds[item[0]])[:10]:
-        write(f"{seconds[name]:6.1f} s {count:3d}  {name}")
-    if whole_suite(config) and total > BUDGET:
-        write(f"FAILED: {total} programs are more than the budget of {BUDGET}")
+    write(f"{len(operations)} programs of {size.total()} operations (budget {BUDGET} programs)")
+    for test, count in size.most_common(10):
+        write(f"{count:7d} operations in {programs[test]:3d} programs: {test}")
+    if whole_suite(config) and len(operations) > BUDGET:
+        write(f"FAILED: {len(operations)} programs are more than the budget of {BUDGET}")
 
 
 def group(nodeid):

@@ -48,8 +48,14 @@ class Mutation:
     marks: str = "not slow and not release"
 
 
-VALUES = ("test_values.py", "test_systems.py::test_outcomes")
+def examples(module):
+    """The examples in the docstrings of a module of the package."""
+    return f"test_documents.py::test_docstrings_run[jimpact.{module}]"
+
+
+# The cheapest tests first: a run ends with the first that fails.
 FLOW = (
+    examples("impacts"),
     "test_values.py::test_lzb_values",
     "test_values.py::test_lzb_edges",
     "test_values.py::test_light_and_stiff_chains",
@@ -63,6 +69,8 @@ KINEMATIC = (
     "test_complementarity.py",
     "test_contract.py::test_promises[moreau]",
 )
+
+
 MUTATIONS = [
     # --- the flow of LZB and Compliant
     Mutation("sign in the flow", r"-ratio \* self\.omega", "ratio * self.omega", FLOW),
@@ -82,8 +90,8 @@ MUTATIONS = [
     # --- the stepper
     Mutation(  # the last event first, and none watched on the way; either alone repairs itself
         "events in the wrong order",
-        r"(?s)free = ~s\.target\n(.*)    first = jnp\.min\(at, axis=0, keepdims=True\)",
-        r"free = ~s.target & ~lands\n\1    first = jnp.max(jnp.where(at <= 1, at, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(at, axis=0, keepdims=True))",
+        r"(?s)free = ~s\.target\n(.*)    first = jnp\.min\(order, axis=0, keepdims=True\)",
+        r"free = ~s.target & ~lands\n\1    first = jnp.max(jnp.where(order <= AHEAD, order, -jnp.inf), axis=0, keepdims=True); first = jnp.where(first > -jnp.inf, first, jnp.min(order, axis=0, keepdims=True))",
         FLOW,
         "stepper.py",
     ),
@@ -99,29 +107,39 @@ MUTATIONS = [
     # --- laws
     Mutation("1 + e becomes 1 + 2 e", r"return \(1 \+ e\) \* gamma\n", "return (1 + 2 * e) * gamma\n", KINEMATIC),
     Mutation("Poisson without the supplement", r"compression\.z \+ returned \+ supplement\.z", "compression.z + returned", KINEMATIC),
-    Mutation("fastest becomes first", r"level = rivals & \(speed \+ noise >= fastest\)", "level = rivals", ("test_binary.py", "test_values.py")),
+    Mutation("fastest becomes first", r"level = rivals & \(speed \+ noise >= fastest\)", "level = rivals", ("test_binary.py::test_against_the_plain_reference[fastest]",)),
     # --- friction
-    Mutation("friction along the slip", r"drag = -(\w+\.astype\(self\.friction\.dtype\))", r"drag = \1", ("test_friction.py",)),
-    Mutation("friction of the other contact", r"(drag = [^\n]* \* self\.friction)\n", r"\1[::-1]\n", ("test_friction.py",)),
+    Mutation("friction along the slip", r"drag = -(\w+\.astype\(self\.friction\.dtype\))", r"drag = \1", ("test_friction.py::test_disk_in_closed_form[lzb]",)),
+    Mutation("friction of the other contact", r"(drag = [^\n]* \* self\.friction)\n", r"\1[::-1]\n", ("test_friction.py::test_lzb_in_the_plane",)),
     # --- impact
-    Mutation("energy gain is not reported", r"change > total \+ tolerance", "change > total + jnp.inf", ("test_contract.py", "test_values.py", "test_complementarity.py")),
-    Mutation("pulling is not reported", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", ("test_contract.py", "test_values.py")),
-    Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_contract.py", "test_values.py", "test_friction.py")),
-    Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py", "test_contract.py")),
+    Mutation("a law around another one has no capabilities", r"setattr\(around, name, _forwarded\(name\)\)", "setattr(around, name, getattr(around, name))", ("test_own_law.py",)),
+    Mutation("a contact force that is not used", r"force = law\.contact_force\n", "force = getattr(law, 'force', None)\n", ("test_own_law.py",)),
+    Mutation("energy gain is not reported", r"change > total \+ tolerance", "change > total + jnp.inf", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
+    Mutation("pulling is not reported", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", (examples("impacts"),)),
+    Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
+    Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
     # --- fits
-    Mutation("freedom counted with parameters, not rank", r"freedom = values - rank\n", "freedom = values - len(names)\n", ("test_fit.py",)),
-    Mutation("rank tolerance too coarse", r"\"float64\": 1e-6", '"float64": 1e-1', ("test_fit.py",)),
-    Mutation("standard errors without noise", r"covariance = noise\*\*2 \* ", "covariance = noise * ", ("test_fit.py",)),
+    Mutation("a stiffness that nobody freed is fitted", r"fields\.remove\(\"stiffness\"\)", "pass", ("test_fit.py",)),
+    Mutation("a correction without sigma_pre is not reported", r"if data\.lost_freedom and data\.sigma_pre is not None", "if False", ("test_experiments.py",)),
+    Mutation("freedom counted with parameters, not rank", r"freedom = values - rank\n", "freedom = values - len(names)\n", ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three",)),
+    Mutation("rank tolerance too coarse", r"\"float64\": 1e-6", '"float64": 1e-1', ("test_fit.py::test_one_shot_of_three_balls_determines_two_of_three", "test_fit.py::test_what_is_seen_weakly_is_seen")),
+    Mutation("standard errors without noise", r"covariance = noise\*\*2 \* ", "covariance = noise * ", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
     Mutation("a bound of a parameter", r"(restitution: [^\n]* = parameter\(low=0\.0, high=)1\.0\)(\n    stiffness)", r"\g<1>2.0)\2", ("test_errors.py",)),
     # --- data, sampling, motion
     Mutation("a unit", r"\"in/s\": 0\.0254", '"in/s": 0.254', ("test_experiments.py",)),
-    Mutation("the seed of a chunk", r"jax\.random\.fold_in\(key, np\.uint32\(task\.number\)\)", "key", ("test_montecarlo.py",)),
-    Mutation("variance by n", r"self\.products / \(self\.count - 1\)", "self.products / self.count", ("test_montecarlo.py",)),
-    Mutation("restitution not in the base's frame", r"relative = state\.v - carried\n    out = impact", "relative = state.v\n    out = impact", ("test_motion.py", "validation/test_validation.py")),
+    Mutation("the seed of a chunk", r"jax\.random\.fold_in\(key, np\.uint32\(task\.number\)\)", "key", ("test_montecarlo.py::test_random_parameters_velocities_and_their_analytic_moments", "test_montecarlo.py::test_each_sample_is_the_impact_of_its_gaps")),
+    Mutation("variance by n", r"self\.products / \(self\.count - 1\)", "self.products / self.count", ("test_montecarlo.py::test_chunks_of_unequal_size_are_merged",)),
+    Mutation("restitution not in the base's frame", r"relative = state\.v - carried\n    out = impact", "relative = state.v\n    out = impact", ("test_motion.py::test_the_base_works_at_its_own_speed",)),
     Mutation("bodies that pass each other are not reported", r"again \| \(\(course", "again | (False & (course", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
+    # --- the command line
+    Mutation("the newest programs go first", r"in sorted\(files\):", "in sorted(files, reverse=True):", ("test_program_cache.py",), "program_cache.py"),
+    Mutation("unwritable places pass", r"with tempfile\.TemporaryFile\(dir=above\):", "if above:", ("test_commands.py::test_unwritable_places_are_refused_before_anything_is_computed",), "options.py"),
+    Mutation("NaN cells go unreported", r"if not_numbers:", "if not not_numbers:", ("test_commands.py::test_nan_cells_are_reported_once",), "shots_file.py"),
+    Mutation("bodies at rest collide", r"(before\)\)) >= 0", r"\1 > 0", ("test_commands.py::test_velocities_without_an_impact_are_refused",), "commands.py"),
+    Mutation("ranges wait for the classes", r"\n    _check_ranges\(arguments, declared\)", "", ("test_commands.py::test_typos_are_reported_before_jax_is_imported",), "study_file.py"),
     # --- mistakes that no default test noticed in version 0.2
-    Mutation("audit forgets stored energy", r"gain = \(change - out\.initial_energy\)", "gain = change", ("test_consistency.py::test_stored_energy_is_no_gain",)),
+    Mutation("audit forgets stored energy", r"gain = \(change - out\.initial_energy\)", "gain = change", ("test_consistency.py::test_stored_energy_is_not_an_energy_gain",)),
     Mutation("an impact at the beginning of its step", r"jnp\.where\(strikes, 0\.5 \* h", "jnp.where(strikes, 0.0 * h", ("test_motion_stepped.py::test_an_impact_is_in_the_middle_of_its_step",)),
     Mutation("hops below the rounding of gaps are resolved", r"jnp\.maximum\(slowly, jnp\.sqrt\(least_hop\)\)", "slowly", ("test_motion.py::test_hops_below_the_rounding_of_gaps_are_passed",)),
     Mutation("the median deviation taken for sigma", r"MEDIAN = 1\.4826", "MEDIAN = 1.0", ("test_fit.py::test_the_scale_of_robust_losses_is_that_of_normal_errors",)),
@@ -134,6 +152,86 @@ MUTATIONS = [
     Mutation("sign of e_t in Poisson's expansion", r"\(1 \+ e_t\) \* contact\.", "(1 - e_t) * contact.", ("test_friction.py::test_disk_in_closed_form[poisson]",)),
     Mutation("nested accumulations without the root", r"jnp\.sqrt\(settings\.accumulation\)", "settings.accumulation", ("test_motion.py::test_nested_accumulations_are_passed_below_the_root_of_slow",)),
     Mutation("moments of inertia of a box with 1/10", r"\(jnp\.sum\(square\) - square\) / 12", "(jnp.sum(square) - square) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",)),
+    # --- bodies
+    Mutation("a disc rolls backwards", r"q\[0\] \+ self\.rim \* q\[2\]", "q[0] - self.rim * q[2]", ("test_bodies.py::test_an_unbalanced_disc",)),
+    Mutation("disk and balls roll in the same sense", r"- self\.disk_radius \* q\[2\]", "+ self.disk_radius * q[2]", ("test_scenes.py::test_balls_roll_around_a_disk",)),
+    Mutation("a rod's inertia about its end", r"self\.length\*\*2 / 12", "self.length**2 / 3", ("test_scenes.py",)),
+    Mutation("inertia of a dimer about its axis halved", r"0\.8 \* body\.sphere_mass", "0.4 * body.sphere_mass", ("test_scenes.py::test_dimer_in_space",)),
+    Mutation("pendulums without the square of their length", r"self\.masses \* self\.length\*\*2", "self.masses * self.length", (examples("bodies.pendulums"),)),
+    Mutation("sign of the Coriolis terms", r"0\.5 \* (jax\.grad\(lambda x: v @ momentum\(x\)\)\(q\) - change)", r"-0.5 * \1", ("test_bodies.py::test_inertial_forces_keep_the_energy",)),
+    Mutation("closed contacts of a measured height counted from zero", r"gaps <= gaps\.min\(axis=1, keepdims=True\) \+ near", "gaps <= near", ("test_experiments.py",)),
+    # --- contacts and scenes
+    Mutation("tangents of open contacts confused in space", r"rows = jnp\.repeat\(part, each\)", "rows = jnp.tile(part, each)", ("test_seams.py::test_open_contacts_in_space_have_no_slip",)),
+    Mutation("kinetic angles without pi", r"jnp\.pi - jnp\.arccos\(jnp\.clip", "jnp.arccos(jnp.clip", ("test_scenes.py::test_normalized_quantities_and_kinetic_angles",)),
+    Mutation("norm of constrained contacts", r"moved = solve_mass\(without_constraints\(scene\), scene\.normals\)", "moved = solve_mass(scene, scene.normals)", ("test_scenes.py::test_constraints_reduce_and_distort",)),
+    Mutation("impulses at the other wall", r"jnp\.pad\(impulse, \(int\(not left\), int\(not right\)\)\)", "jnp.pad(impulse, (int(not right), int(not left)))", ("test_scenes.py::test_chain_is_the_dense_scene",)),
+    # --- laws
+    Mutation("yield speed not squared", r"y\*\*2 \+ \(1 - y\*\*2\) \* power\*\*2", "y + (1 - y) * power**2", ("test_selection.py::test_restitution_by_speed_is_what_it_says",)),
+    Mutation("reference speed upside down", r"ratio = safe / self\.reference_speed", "ratio = self.reference_speed / safe", ("test_selection.py::test_restitution_by_speed_is_what_it_says",)),
+    Mutation("Hertz stiffness without the root of the radius", r"\(compliance \* jnp\.sqrt\(curvature\)\)", "(compliance * curvature)", ("test_compliant.py::test_hertz_stiffness_of_the_steel_beads",)),
+    Mutation("damping of Kuwabara and Kono", r"root \* \(x \+ 1\.5 \* self", "root * (x + 1.0 * self", (examples("laws.forces"),)),
+    Mutation("critical damping", r"series = -2 - 4 / 3", "series = -2 + 4 / 3", ("test_compliant.py::test_restitution_of_a_damped_spring",)),
+    # --- Monte Carlo
+    Mutation("mean of merged chunks weighed the other way", r"a\.mean \+ d \* \(b\.count / count\)", "a.mean + d * (a.count / count)", ("test_montecarlo.py::test_chunks_of_unequal_size_are_merged",)),
+    Mutation("products of merged chunks", r"\(a\.count \* b\.count / count\)", "(a.count + b.count) / 4", ("test_montecarlo.py::test_chunks_of_unequal_size_are_merged",)),
+    Mutation("values outside the bins counted inside", r"np\.clip\(place, -1, bins\)", "np.clip(place, 0, bins - 1)", ("test_montecarlo.py::test_histograms_hold_what_lies_outside_the_first_range",)),
+    Mutation("normal gaps truncated at their mean", r"key, -mean / std, jnp\.inf", "key, 0 * mean, jnp.inf", ("test_montecarlo.py::test_truncated_normal_gaps",)),
+    Mutation("random parameters draw the same numbers", r"jax\.random\.fold_in\(key, i\)", "key", ("test_montecarlo.py::test_random_parameters_are_independent",)),
+    Mutation("numbers of bad samples", r"task\.number \* len\(samples\[\"status\"\]\) \+ lanes", "task.number * count + lanes", ("test_montecarlo.py::test_bad_samples_are_numbered_over_all_chunks",)),
+    Mutation("gap scale of a single ball", r"work = 2 / diagonal", "work = 1 / diagonal", ("test_compliant.py::test_gap_scale",)),
+    # --- fits
+    Mutation("degrees of freedom of the noise swapped", r"fdtrc\(rest, count, ratio\)", "fdtrc(count, rest, ratio)", ("test_fit.py::test_lack_of_fit_is_reported_from_its_level_on",)),
+    Mutation("many shots tested each at the full level", r"LEVEL / count\)", "LEVEL)", ("test_fit.py::test_honest_shots_are_seldom_suspicious",)),
+    Mutation("region of two parameters with estimated noise", r"\(-2 / freedom\) - 1\)", "(-1 / freedom) - 1)", ("test_fit.py::test_contours_of_linear_problems_are_ellipses",)),
+    Mutation("chance of scatter not halved", r"chance=0\.5 \* float\(chdtrc", "chance=float(chdtrc", ("test_selection.py::test_the_chance_of_scatter_is_half_that_of_chi_squared",)),
+    Mutation("one-sided test of a trend", r"return 2 \* float\(stdtr", "return float(stdtr", ("test_selection.py::test_a_trend_over_the_shots_has_two_sides",)),
+    Mutation("small-sample correction of AIC", r"2 \* k \* \(k \+ 1\) / \(n - k - 1\)", "2 * k * (k + 1) / (n - k)", ("test_selection.py::test_the_criterion_without_sigma_is_corrected_for_few_values",)),
+    Mutation("height of a bounce", r"v \* jnp\.abs\(v\) / \(2 \* STANDARD_GRAVITY\)", "v * jnp.abs(v) / STANDARD_GRAVITY", ("test_observables.py::test_energies_and_bounces",)),
+    Mutation("worth of angular errors upside down", r"masses\[~turns\]\.mean\(\) / masses\[turns\]\.mean\(\)", "masses[turns].mean() / masses[~turns].mean()", ("test_fit.py::test_turning_weighs_by_kinetic_energy",)),
+    Mutation("the best shot for another parameter", r"merit = -np\.linalg\.inv\(after\)\[:, i, i\]", "merit = -np.linalg.inv(after)[:, 0, 0]", ("test_fit.py::test_the_next_shot_is_the_one_that_tells_most",)),
+    # --- theory
+    Mutation("dissipation matrix transposed", r"matrix\.T @ jnp\.linalg\.solve\(delassus, matrix\)", "matrix @ jnp.linalg.solve(delassus, matrix.T)", ("test_consistency.py::test_energy_change_expressions", "test_consistency.py")),
+    Mutation("bound of the singular values without the root", r"1 / np\.sqrt\(np\.linalg\.cond\(g\)\)", "1 / np.linalg.cond(g)", ("test_consistency.py::test_open_contacts_are_left_out", "test_consistency.py")),
+    Mutation("rocking and half-rocking exchanged", r"leaves\[\.\.\., 1\] \+ 2 \* leaves\[\.\.\., 0\]", "leaves[..., 0] + 2 * leaves[..., 1]", ("test_rocking_dispersion.py",)),
+    Mutation("slip of a rocking block", r"after\[0\] \+ a / 2 \* after\[2\]", "after[0] - a / 2 * after[2]", ("test_rocking_dispersion.py",)),
+    Mutation("Carnot's factor upside down", r"\(1 - e\) / \(1 \+ e\) \* kinetic_energy", "(1 + e) / (1 - e) * kinetic_energy", ("test_consistency.py::test_carnot",)),
+    # --- files
+    Mutation("micrometres", r"\"um\": 1e-6", '"um": 1e-3', ("test_experiments.py::test_units_of_gaps",)),
+    Mutation("digits of a value with its error", r"error < 2 \* 10\.0\*\*power", "error < 5 * 10.0**power", (examples("files.records"),)),
+    # --- audits
+    Mutation("momentum audit with the wrong sign of friction", r"residual = residual - scene\.tangents", "residual = residual + scene.tangents", ("test_consistency.py::test_friction_is_part_of_the_momentum",)),
+    Mutation("open contacts audited", r"least = jnp\.where\(scene\.closed, ", "least = jnp.where(scene.closed | True, ", ("test_consistency.py::test_open_contacts_may_approach",)),
+    Mutation("tolerance of signs a hundred times wider", r"\"float64\": 1e-7, \"float32\": 2e-3", '"float64": 1e-5, "float32": 2e-3', ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
+    # --- methods
+    Mutation("halves of a chain off by one", r"jnp\.arange\(balls - 1\) >= middle", "jnp.arange(balls - 1) > middle", ("test_methods.py::test_halves_of_a_chain",)),
+    # --- events, motion, solvers
+    Mutation("contacts that break loose slide the wrong way", r"jnp\.where\(broke, -jnp\.sign\(side\)", "jnp.where(broke, jnp.sign(side)", ("test_friction.py::test_lzb_of_a_flat_block", "test_friction.py::test_lzb_in_the_plane", "test_friction.py::test_lzb_of_a_real_cube",)),
+    Mutation("the base moves the wrong way", r"moved\(q, -_displaced\(system, t\)\)", "moved(q, _displaced(system, t))", ("test_motion.py::test_gaps_are_seen_from_the_base",)),
+    Mutation("work of the base with the wrong sign", r"push @ carried, out\.status", "-(push @ carried), out.status", ("test_motion.py::test_the_base_works_at_its_own_speed",)),
+    Mutation("time of a hop halved", r"2 \* jnp\.abs\(p\) / safe", "jnp.abs(p) / safe", ("test_motion.py::test_finite_accumulation_is_passed",)),
+    Mutation("plastic expansion with e for its square", r"closing / e\*\*2", "closing / e", ("test_contact_forces.py::test_a_plastic_contact_returns_its_share",)),
+    Mutation("off-diagonal of a chain's Delassus matrix shifted", r"off_diagonal \* vector\[1:\], none", "off_diagonal * vector[:-1], none", ("test_scenes.py::test_chain_is_the_dense_scene",)),
+    Mutation("friction of many contacts in a box, not a disc", r"length = jnp\.sqrt\(jnp\.sum\(side\*\*2, axis=1, keepdims=True\)\)", "length = jnp.max(jnp.abs(side), axis=1, keepdims=True)", ("test_friction_solver.py::test_friction_of_many_contacts_has_a_round_cone",)),
+    # --- further rooms
+    Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py::test_compare",)),
+    Mutation("vertical and horizontal bases exchanged", r"\(0 \* y, y\) if self\.direction == \"vertical\"", '(0 * y, y) if self.direction == "horizontal"', (examples("motion.system"),)),
+    Mutation("limits of validity from the wrong end", r"if law == \"moreau\" else slice", 'if law == "binary" else slice', ("test_methods.py::test_limits_are_of_the_unbroken_run_from_their_end",)),
+    Mutation("dispersion of n instead of n - 1", r"jnp\.asarray\(scene\.size - 1, v\.dtype\)", "jnp.asarray(scene.size, v.dtype)", ("test_methods.py::test_dispersion_index_and_energy_ratio",)),
+    Mutation("Newby's ratio", r"\(3 \* n\*\*4 - 2 \* n\*\*2", "(3 * n**4 + 2 * n**2", (examples("theory.linear_chain"),)),
+    Mutation("sign of e_t in binary collisions", r"\(1 \+ friction\.restitution\[contact\]\)", "(1 - friction.restitution[contact])", ("test_friction.py::test_disk_in_closed_form[binary]",)),
+    Mutation("sign of e_t in time stepping", r"e_t\[:, None\] \* slip", "-e_t[:, None] * slip", ("test_motion_stepped.py::test_a_superball_leaves_with_its_slip_reversed",)),
+    Mutation("quasi-velocities without the mass", r"tangent\.T @ momentum\(scene, v\)", "tangent.T @ v", ("test_quasi.py",)),
+    Mutation("factor 2 of Theorem 6.2", r"reach = 2 \* _norm", "reach = _norm", ("test_consistency.py::test_friction_block_values",)),
+    Mutation("kilometres an hour", r"1 / 3\.6", "3.6", ("test_experiments.py",)),
+    Mutation("one-sided confidence intervals", r"0\.5 \+ 0\.5 \* level\n", "level\n", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
+    Mutation("bootstrap without the noise", r"fit\.noise \* np\.moveaxis", "np.moveaxis", (examples("fits.many"),)),
+    Mutation("given samples of the next chunk", r"values\[number \* size : \(number \+ 1\) \* size\]", "values[(number + 1) * size : (number + 2) * size]", ("test_montecarlo.py::test_given_samples_are_used_row_by_row",)),
+    Mutation("friction that pushes along the sliding", r"modes\.sign \* mu, 0\.0", "-modes.sign * mu, 0.0", ("test_motion.py::test_sliding_block_comes_to_stick",)),
+    Mutation("elastic energy of a history doubled", r"0\.5 \* units\.velocity\*\*2 \* energy", "units.velocity**2 * energy", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
+    # --- pictures
+    Mutation("histogram in shares, not per cent", r"100 \* bars / max", "bars / max", ("test_pictures.py::test_a_histogram_is_in_per_cent",)),
+    Mutation("measured and fitted exchanged in a picture", r"first\.plot\(fit\.predicted\[here\], measured\[here\]", "first.plot(measured[here], fit.predicted[here]", ("test_pictures.py::test_residuals_are_drawn_over_what_was_fitted",)),
+    Mutation("residual indentation in a picture with e", r"1 - float\((\w+)\.restitution\) \*\* 2", r"1 - float(\1.restitution)", ("test_pictures.py::test_a_loop_encloses_the_energy_lost",)),
 ]  # fmt: skip
 
 

@@ -5,7 +5,6 @@ import json
 from pathlib import Path
 
 import jimpact as ji
-from jimpact.cli.study import BODIES
 from jimpact.fits.fitting import LOSSES
 from jimpact.fits.least_squares import DEFAULT_STEPS
 from jimpact.fits.observables import QUANTITIES
@@ -15,10 +14,16 @@ from jimpact.motion.simulate import METHODS as MOTION_METHODS
 PATH = Path(ji.__file__).parent / "data" / "names.json"
 
 
-def body_arguments(kind):
-    """Whether each argument of a body must be given, by name."""
-    arguments = list(inspect.signature(kind.__init__).parameters.values())[1:]
-    return {x.name: x.default is x.empty for x in arguments}
+def bodies():
+    """Whether each argument must be given, by name, of each public body."""
+    public = {name: getattr(ji, name) for name in ji.__all__}
+    bodies = {k: x for k, x in public.items() if isinstance(x, type) and issubclass(x, ji.Body)}
+    arguments = {
+        name: list(inspect.signature(kind.__init__).parameters.values())[1:]
+        for name, kind in bodies.items()
+        if kind not in (ji.Body, ji.Solid)  # of which the others are made
+    }
+    return {k: {x.name: x.default is x.empty for x in rows} for k, rows in arguments.items()}
 
 
 def names():
@@ -26,7 +31,7 @@ def names():
     ours = {k: row for k, row in ji.REGISTRY.items() if row.law.__module__.startswith("jimpact.")}
     return {
         "laws": {name: row.declaration for name, row in ours.items()},
-        "bodies": {name: body_arguments(kind) for name, kind in BODIES.items()},
+        "bodies": bodies(),
         "methods": {name: method.jax for name, method in METHODS.items()},
         "fit_methods": list(DEFAULT_STEPS),
         "losses": ["squares", *LOSSES],

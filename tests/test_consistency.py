@@ -314,15 +314,33 @@ def test_open_contacts_are_left_out():
     close(gamma, found.worst_normal_velocity)
 
 
-def test_stored_energy_is_no_gain():
+def test_stored_energy_is_not_an_energy_gain():
     """Two balls of 1 kg pressed together by 0.25 J part at 0.5 m/s each; by 0.2 J they cannot."""
     scene, v, half = ji.chain([1.0, 1.0]), [0.0, 0.0], jnp.array([0.5])
     for stored, gain in ((0.25, 0.0), (0.2, 0.05)):
         number = jnp.asarray(stored)
         out = ji.Impact(jnp.array([-0.5, 0.5]), half, half[:0], 0.25 + 0 * number, number, 0)
-        found = ji.audit(scene, v, out)
-        close(found.energy_gain, gain / (2 * stored))
-        assert found.broken == (["energetic"] if gain else [])
+        audit = ji.audit(scene, v, out)
+        close(audit.energy_gain, gain / (2 * stored))
+        assert audit.broken == (["energetic"] if gain else [])
+
+
+def test_friction_is_part_of_the_momentum():
+    """A particle of 1 kg on the ground: p = 1.5 upwards, friction -0.3 against its slip."""
+    scene = ji.Scene([1.0, 1.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    v, after, p, zero = [1.0, -1.0], jnp.array([0.7, 0.5]), jnp.array([1.5]), jnp.zeros(())
+    for friction, broken in ((-0.3, []), (0.3, ["momentum"])):
+        out = ji.Impact(after, p, jnp.array([friction]), zero - 0.63, zero, jnp.int32(0))
+        assert ji.audit(scene, v, out).broken == broken
+
+
+def test_open_contacts_may_approach():
+    """Ball 2 flies towards ball 3, which it has not reached."""
+    scene, v = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1]), [1.0, 0.0, 0.0]
+    out = ji.Impact(
+        *(jnp.array(x) for x in ([0.0, 1.0, 0.0], [1.0, 0.0], [0.0][:0], 0.0, 0.0)), jnp.int32(0)
+    )
+    assert ji.audit(scene, v, out).broken == []
 
 
 def test_audit_in_words_and_in_float32():

@@ -59,7 +59,8 @@ def test_turning_keeps_its_unit(tmp_path):
 
 def test_missing_values_labels_and_foreign_line_ends(tmp_path):
     text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\nNaN,1,,2,0\r\n"
-    data = ji.read_experiments(written(tmp_path, text))
+    with pytest.warns(UserWarning, match=r"1 cells are NaN .* line 4, column `post_2 \[m/s\]`"):
+        data = ji.read_experiments(written(tmp_path, text))
     np.testing.assert_array_equal(data.pre, [[2, 0], [2, 0]])
     np.testing.assert_array_equal(data.post, [[1, np.nan], [1, np.nan]])
     assert data.sigma is None
@@ -232,6 +233,15 @@ def test_masses_and_gaps_of_each_shot(tmp_path):
         ji.read_experiments(path)
 
 
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("um", 1e-6)])
+def test_units_of_gaps(tmp_path, unit, metres):
+    head = MORE.replace("gap_1[mm]", f"gap_1[{unit}]")
+    data = ji.read_experiments(
+        written(tmp_path, f"{head}\n100,1,3,1,0,0,1\n"), ji.chain([1.0, 1.0])
+    )
+    np.testing.assert_allclose(data.scenes[0].gaps, [3 * metres], rtol=1e-14)
+
+
 def test_a_body_where_each_shot_found_it(tmp_path):
     head = "q_1[m],q_2[cm],q_3[deg]," + ",".join(
         f"{k}_{i}[{u}]" for k in ("pre", "post") for i, u in ((1, "m/s"), (2, "m/s"), (3, "rad/s"))
@@ -304,6 +314,21 @@ def test_the_cube():
         ValueError, match=r"`contacts` in \[data\] must be one of 1, 2, 4, but is 3"
     ):
         ji.cube_impacts(3)
+
+
+def test_a_correction_that_leaves_out_errors_before_is_reported():
+    data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.72], [0.6, 1.4]], 0.05, sigma_pre=0.05)
+    scene, line = ji.chain([1.0, 1.0]), "corrected as if `sigma_pre` were 0"
+    corrected = ji.fit(ji.Newton(0.5), scene, data.momentum_corrected(scene), starts=1)
+    assert any(line in warning for warning in corrected.warnings)
+    plain = ji.fit(ji.Newton(0.5), scene, data, starts=1)
+    assert not any(line in warning for warning in plain.warnings)
+
+
+def test_a_report_counts_what_was_not_measured():
+    data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, np.nan], [0.6, 1.4]])
+    fit = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data, starts=1)
+    assert "2 shots of 2 bodies (3 of 4 velocities measured)" in str(fit)
 
 
 def test_a_fit_passes_errors_on_by_the_law_it_finds():

@@ -13,6 +13,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.solvers.friction import solve
+from jimpact.solvers.many_contacts import solve_many
 from jimpact.status import CODE
 
 PLANAR, SPATIAL, LANES = 3, 2, 128
@@ -25,6 +26,14 @@ def question(rows, complementary):
 
 
 ASK = {key: question(*key) for key in itertools.product((1, 2), (True, False))}
+
+
+def test_friction_of_many_contacts_has_a_round_cone():
+    """In space it is against the slip (3, 4), of length mu p, in every direction."""
+    one = jnp.ones((1, 3))
+    rate, mu, start = jnp.array([[-1.0, 3.0, 4.0]]), jnp.array(0.5), 0 * one
+    solution = solve_many(lambda x: x, one, rate, mu, start, jnp.array(1.0), 1e-9, 1000)
+    close(solution.impulse, [[1.0, -0.3, -0.4]], atol=1e-8)
 
 
 def padded(rows, scenes):

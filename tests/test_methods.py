@@ -16,6 +16,8 @@ from programs import failed, names
 
 import jimpact as ji
 from jimpact.methods.advice import situation_of
+from jimpact.methods.stability import chain_of
+from jimpact.methods.validity import ValidityMap
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
 import stability_reference
@@ -216,6 +218,16 @@ def test_points_are_those_of_the_script():
     assert len(HELD["points"]) == 300
     np.testing.assert_allclose(HELD["points"], stability_reference.points(), rtol=1e-12)
     assert HELD["uncertainty"][np.isfinite(HELD["uncertainty"])].max() < 0.1 * HONEST * RTOL
+
+
+def test_halves_of_a_chain():
+    """Of N balls the ball N // 2 + 1 is the middle one, and contact j > N // 2 in the right half."""
+    for balls, mass, stiffness in (
+        (4, [1.0, 1.0, 0.5, 1.0], [1.0, 1.0, 10.0]),
+        (5, [1.0, 1.0, 0.5, 1.0, 1.0], [1.0, 1.0, 10.0, 10.0]),
+    ):
+        found = chain_of(10.0, 0.5, balls)
+        assert [x.tolist() for x in found] == [mass, stiffness]
 
 
 # 10 and 30 equal Hertz balls by the oracle of tests/benchmarks/lzb_oracle.cpp
@@ -555,6 +567,19 @@ RATIOS = [1e-6, 1e-3, *EXACT, 1e3, 1e6]
 @pytest.fixture(scope="module")
 def valid():
     return ji.validity_map(BALLS, STRIKE, RATIOS, (1.0, 1.5, 2.0, 3.0))
+
+
+def test_limits_are_of_the_unbroken_run_from_their_end():
+    """Binary collisions hold for small ratios, Moreau's law for large ones."""
+    ratios, after = np.array([0.01, 0.1, 1.0, 10.0, 100.0]), np.zeros((5, 3))
+    after[:, 0] = [0.0, 0.001, 0.5, 0.999, 1.0]
+    ends = {"binary": np.zeros(3), "moreau": np.array([1.0, 0.0, 0.0])}
+    validity = ValidityMap(
+        BALLS, np.array(STRIKE), ratios, np.ones(1), after[None], after[None, :, 0],
+        np.zeros((1, 5), int), ends, dict.fromkeys(ends, 0.0),
+    )  # fmt: skip
+    assert validity.limit("binary").tolist() == [0.1]
+    assert validity.limit("moreau").tolist() == [10.0]
 
 
 @pytest.mark.slow

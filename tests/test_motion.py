@@ -12,9 +12,11 @@ from programs import OPTIMIZED, both_ways
 
 import jimpact as ji
 from jimpact.motion import event_driven
+from jimpact.motion.dynamics import kinematics
 from jimpact.motion.flow import status_at_start
 from jimpact.motion.record import MOTION_STATUS
 from jimpact.motion.simulate import CHUNK
+from jimpact.motion.transitions import impact_jump
 
 G = 9.80665
 LEGS = np.array([[0.3, 0.2], [0.3, -0.2], [-0.3, 0.2], [-0.3, -0.2]])
@@ -493,6 +495,37 @@ def test_nested_accumulations_are_passed_below_the_root_of_slow(slides):
     assert 1e-4 < approach[last].max() / approach.max() < 2.5e-3
     np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
     np.testing.assert_allclose(motion.gaps[-1, :2], 0, atol=1e-12)
+
+
+# ------------------------------------------------------------------------- a moving base
+
+A_BASE, W_BASE = 0.1, 2 * np.pi * 1.5  # of a plate at A sin(w t)
+PLATE = ji.ball_system(2.0, base=ji.HarmonicBase(A_BASE, 1.5))
+
+
+def test_gaps_are_seen_from_the_base():
+    """f = q - y_b, f' = v - y_b', and f'' = -y_b'' where q'' = 0."""
+    t = 0.1
+    gap = kinematics(PLATE, jnp.array([0.5]), jnp.array([-1.0]), jnp.asarray(t))
+    sine, cosine = A_BASE * np.sin(W_BASE * t), A_BASE * np.cos(W_BASE * t)
+    np.testing.assert_allclose(gap.value, [0.5 - sine], rtol=1e-14)
+    np.testing.assert_allclose(gap.rate, [-1.0 - W_BASE * cosine], rtol=1e-14)
+    np.testing.assert_allclose(gap.drift, [W_BASE**2 * sine], rtol=1e-13)
+
+
+def test_the_base_works_at_its_own_speed():
+    """p u with p = m (1 + e) (u - v): T+ - T- is that and what restitution takes."""
+    u, v, e = A_BASE * W_BASE, -1.0, 0.5
+    state = SimpleNamespace(q=jnp.zeros(1), v=jnp.array([v]))
+    zero = jnp.zeros(())
+    jump = impact_jump(PLATE, ji.Newton(e), zero, state, jnp.array([True]), zero, None)
+    p = 2.0 * (1 + e) * (u - v)
+    np.testing.assert_allclose(jump.v, [v + p / 2.0], rtol=1e-14)
+    np.testing.assert_allclose(jump.base_work, p * u, rtol=1e-14)
+    np.testing.assert_allclose(jump.energy[0], [-(1 - e**2) * (u - v) ** 2], rtol=1e-14)
+    np.testing.assert_allclose(
+        jump.base_work + jump.energy.sum(), jump.v[0] ** 2 - v**2, rtol=1e-13
+    )
 
 
 # -------------------------------------------------------------------- time stepping

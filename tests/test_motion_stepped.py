@@ -145,6 +145,19 @@ def test_an_impact_is_in_the_middle_of_its_step():
     np.testing.assert_allclose(motion.velocity[1], [0.0, after], rtol=1e-9, atol=1e-12)
 
 
+def test_a_superball_leaves_with_its_slip_reversed():
+    """`u+ = -e_t u-` of the contact point, with friction enough: one impact, and free flight."""
+    disc, e_t = ji.Disc(0.5), 0.6
+    law = ji.Moreau(0.8, friction=50.0, tangential_restitution=e_t)
+    motion = ji.simulate(
+        ji.System(disc, potential=disc.gravity(G)), law, [0.0, 0.5, 0.0], [1.0, -5.0, 3.0], 0.02,
+        samples=2, method="time_stepping", step=1e-3,
+    )  # fmt: skip
+    x, _, spin = motion.velocity[-1]
+    np.testing.assert_allclose(x + 0.5 * spin, -e_t * (1.0 + 0.5 * 3.0), rtol=1e-6)
+    np.testing.assert_allclose(x - 1.0, 0.5 * 0.5 * (spin - 3.0), rtol=1e-6)  # m x' r = I spin
+
+
 # -------------------------------------------------------------------------- bodies in space
 
 

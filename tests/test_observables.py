@@ -42,7 +42,7 @@ def test_energies_and_bounces(tmp_path):
 @pytest.mark.parametrize(
     ("row", "message"),
     [
-        ('quantity = "force"\nvalue = 1\ndrop_height_m = 1', r"`quantity in \[\[observe\]\] 1` must be one of peak_force"),
+        ('quantity = "force"\nvalue = 1\ndrop_height_m = 1', r"`quantity` must be one of peak_force"),
         ('quantity = "peak_force"\nvalue = 1\ndrop_height_m = 1', r"a peak_force needs `contact`, from 1 to 3"),
         ('quantity = "peak_force"\ncontact = 4\nvalue = 1\ndrop_height_m = 1', r"`contact` must lie in \[1, 3\]"),
         ('quantity = "duration"\nvalue = 1', r"must have one of velocity_m_per_s, drop_height_m, but has none"),

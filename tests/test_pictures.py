@@ -22,6 +22,7 @@ from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
 from jimpact.methods.comparison import Comparison, Entry
 from jimpact.methods.stability import Confirmation, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
+from jimpact.plot.charts import _styles
 from jimpact.plot.style import SMALL, WIDTH
 
 BALLS, STRIKE = ji.chain([1.0, 1.0, 1.0]), np.array([1.0, 0.0, 0.0])
@@ -92,6 +93,9 @@ def chart(gradients):
     )
 
 
+NO_TIME = Timing(1.0, 1.0, 1.0)
+SETTING = Point("", 0.1, {}, 1.0, "ok", NO_TIME, NO_TIME)
+LAW = dataclasses.replace(SETTING, setting=None)
 AXES = {
     "setting": np.linspace(0, 1, 5),
     "stiffness_ratio": np.logspace(-6, 6, 7),
@@ -267,14 +271,60 @@ def test_layout(name):
             assert silent or categories or labelled(label), (axis, label, beside)
 
 
+def test_a_histogram_is_in_per_cent():
+    bars = samples(True).axes[0].patches[0].get_data().values
+    assert bars.sum() == pytest.approx(100.0)
+
+
+def test_residuals_are_drawn_over_what_was_fitted():
+    fitted, measured = canned(50), ji.plot.residuals(canned(50)).axes[0]
+    here = ~np.isnan(fitted.residual)
+    dots = measured.lines[-1]
+    np.testing.assert_array_equal(dots.get_xdata(), fitted.predicted[here])
+    np.testing.assert_allclose(dots.get_ydata(), (fitted.predicted + fitted.residual)[here])
+
+
+def test_a_loop_encloses_the_energy_lost():
+    """(1 - e^2) m v^2 / 2 of a pair of two balls of 1 kg, m = 1/2; k x^2.5 / 2.5 = m v^2 / 2."""
+    law = ji.Compliant(ji.Bistiffness(3.0, 1.5, 0.6))
+    comparison = Comparison(ji.chain([1.0, 1.0]), np.array([2.0, 0.0]), {"plastic": entry(law)})
+    x, force = ji.plot.rheologies(comparison).axes[0].lines[0].get_data()
+    deepest = (2.5 / 3.0) ** 0.4
+    assert x.max() == pytest.approx(deepest)
+    assert force.max() == pytest.approx(3.0 * deepest**1.5)
+    assert np.trapezoid(force, x) == pytest.approx((1 - 0.6**2) * 1.0, rel=1e-3)
+
+
 def test_every_kind_of_picture_is_here():
     known = {name.split(" ")[0].rstrip(",") for name in PICTURES}
     assert known | {"animation"} == set(ji.plot.__all__)
 
 
+def test_no_two_lines_of_a_chart_look_alike():
+    styles = _styles({f"method {i}": (SETTING,) for i in range(10)} | {"law": (LAW,), "b": (LAW,)})
+    looks = [(style["color"], style["marker"], style["ls"]) for style in styles.values()]
+    assert len(set(looks)) == len(looks)
+    assert len({style["color"] for style in styles.values()}) == 11  # laws are grey
+
+
+def test_the_law_closest_to_the_measured_velocities_is_named():
+    after = {"far": AFTER + 0.1, "near": AFTER + 0.01, "as near": AFTER - 0.01}
+    entries = {
+        name: dataclasses.replace(entry(ji.Newton(0.5)), outcome=outcome(v))
+        for name, v in after.items()
+    }
+    result = Comparison(BALLS, STRIKE, entries, measured=AFTER)
+    assert result.closest == ("near", "as near")
+    assert result.distances["far"] == pytest.approx(0.1)
+    assert "closest to the measured velocities: near, as near (rms 0.01 m/s)" in str(result)
+    labels = [x.get_text() for x in ji.plot.comparison(result).legends[0].get_texts()]
+    assert "closest to the measured velocities" in labels
+    assert dataclasses.replace(result, measured=None).closest == ()
+
+
 def test_a_history_must_be_one():
     batch = jax.tree.map(lambda x: np.stack([x, x]), impact_history())
-    with pytest.raises(ValueError, match="`found` must be of one impact, but is a batch"):
+    with pytest.raises(ValueError, match="`result` must be of one impact, but is a batch"):
         ji.plot.history(batch)
     with pytest.raises(TypeError, match="`shown` must be a chain"):
         ji.plot.system(ji.Scene([1.0], [[1.0]]), [1.0])

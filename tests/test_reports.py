@@ -79,7 +79,14 @@ def test_picture_of_a_fit(shots, tmp_path):
 
 def test_report_of_a_fit():
     text = str(canned(4))
-    for words in ("restitution[1]", "0.6", "unseen", "rank", "1 of 2", "6 degrees of freedom"):
+    for words in (
+        "restitution[1]",
+        "0.6",
+        "undetermined",
+        "rank",
+        "1 of 2",
+        "6 degrees of freedom",
+    ):
         assert words in text, words
     assert "The data gain energy." in text
     assert "NOT converged" in str(canned(4, converged=False))
@@ -93,11 +100,11 @@ def test_a_fit_in_one_sentence():
     assert str(canned(4)).endswith(f"\n\n{canned(4).verdict}")
     both = canned(1)
     assert both.verdict == (
-        "restitution[1] = 0.600 ± 0.010; stiffness[1] cannot be told from this shot."
+        "restitution[1] = 0.600 ± 0.010; stiffness[1] cannot be determined from this shot."
     )
     held = replace(both.problem, notes=("stiffness[1] is held at its start.",))
     ratio = canned(1, problem=held, names=("restitution[1]", "stiffness[2]"))
-    assert "the stiffness ratio stiffness[2] / stiffness[1] cannot be told" in ratio.verdict
+    assert "the stiffness ratio stiffness[2] / stiffness[1] cannot be determined" in ratio.verdict
     assert canned(4, converged=False).verdict.startswith("No answer")
     bad = canned(4, warnings=("Lack of fit: the residuals are large.",))
     assert bad.verdict.startswith("LZB does not fit these 4 shots; it comes nearest with restit")
@@ -107,7 +114,7 @@ def test_a_fit_in_one_sentence():
     flat = replace(open_end, name="stiffness[1]", intervals=((0.0, 1.0),))
     told = canned(4, profiles=(open_end, flat), standard_error=np.array([0.01, 1.0]))
     assert told.verdict == (
-        "restitution[1] = 0.600 ± 0.010, at least 0.97 (95 %); stiffness[1] cannot be told from these 4 shots."
+        "restitution[1] = 0.600 ± 0.010, at least 0.97 (95 %); stiffness[1] cannot be determined from these 4 shots."
     )
 
 
@@ -115,7 +122,13 @@ def test_page_of_a_fit(tmp_path):
     """One file: nothing is loaded from elsewhere."""
     found = canned(4)
     text = found.report(tmp_path / "fit.html", profiles=False).read_text(encoding="utf-8")
-    for words in ("The data gain energy.", "unseen", "seed 0", "jimpact", "cannot be told"):
+    for words in (
+        "The data gain energy.",
+        "undetermined",
+        "seed 0",
+        "jimpact",
+        "cannot be determined",
+    ):
         assert words in text, words
     assert text.count("<img") == text.count('src="data:image/') == 3
     for tag in ("<script", "<link", "@import", 'src="http'):

@@ -221,6 +221,18 @@ def test_bodies_that_are_chains():
     np.testing.assert_allclose(dense(ji.delassus_matrix(scene)), w, atol=1e-13)
 
 
+def test_balls_roll_around_a_disk():
+    """Sliding is the difference of the two bodies' velocities where they touch."""
+    phi, disk, ball = np.array([0.3, 1.9]), 0.3, np.array([0.1, 0.2])
+    scene = built(ji.disk_balls, phi, disk_radius=disk, ball_radius=ball)
+    v = np.array([0.2, -0.5, 3.0, 0.7, 0.1, -2.0, -0.3, 0.4, 5.0])
+    for contact, angle in enumerate(phi):
+        along = np.array([-np.sin(angle), np.cos(angle)])
+        rolling = v[3 * contact + 3 : 3 * contact + 6]
+        slip = (rolling[:2] - v[:2]) @ along - ball[contact] * rolling[2] - disk * v[2]
+        np.testing.assert_allclose(scene.tangents[:, contact] @ v, slip, atol=1e-14)
+
+
 def test_cradle_gaps():
     length, radius, gaps = 0.4, jnp.array([0.02, 0.03, 0.02]), [0.0, 1e-3]
     cradle = ji.PendulumCradle([1.0, 1.0, 1.0], length, radius, gaps)

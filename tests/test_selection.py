@@ -13,6 +13,7 @@ from scipy.special import chdtrc, erf
 import jimpact as ji
 from jimpact.cli.study import read_study
 from jimpact.fits.posterior import _priors
+from jimpact.fits.scatter import Scatter
 from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.velocity_dependent import approach_speed
 
@@ -53,6 +54,14 @@ def test_laws_that_agree_are_listed_by_what_they_must_know(every):
     heads, rows = every.rows()
     assert len(heads) == len(rows[0])
     assert [row[0] for row in rows] == ["newton", "moreau"]
+
+
+def test_the_criterion_without_sigma_is_corrected_for_few_values():
+    """AICc of 24 values, one parameter and the noise (Hurvich and Tsai)."""
+    data = ji.Experiments(PRE, after(np.full(12, 0.8), 0.01))
+    best = ji.fit_laws(PAIR, data, ["newton"]).best
+    n, k, squares = 24, 2, float(np.sum(best.fit.residual**2))
+    assert best.aicc == pytest.approx(n * np.log(squares / n) + 2 * k * n / (n - k - 1))
 
 
 def test_a_law_that_fails_is_named_and_comes_last():
@@ -271,6 +280,28 @@ def test_scatter_between_shots():
     assert "It depends on the speed" in str(ji.fit(ji.Newton(0.5), PAIR, falling))
 
 
+def test_the_chance_of_scatter_is_half_that_of_chi_squared():
+    """Shots alike: `deviance(t) = (K - 1) log(s^2 + t^2) + S / (s^2 + t^2)`, least at S / (K - 1)."""
+    sigma, e = 0.02, 0.7 + 0.04 * np.sin(np.arange(12.0))
+    pre = np.tile([1.0, 0.0], (12, 1))
+    post = np.stack([(1 - 2 * e) / 3, (1 + e) / 3], axis=1)
+    s = sigma / np.sqrt((2 / 3) ** 2 + (1 / 3) ** 2)  # error of the e of one shot
+    ratio = e.var(ddof=1) / s**2
+    gain = 11 * (ratio - 1 - np.log(ratio))
+    scatter = ji.scatter(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post, sigma)))
+    assert scatter.value == pytest.approx(s * np.sqrt(ratio - 1), rel=1e-4)
+    assert scatter.chance == pytest.approx(0.5 * stats.chi2.sf(gain, 1), rel=1e-4)
+
+
+def test_a_trend_over_the_shots_has_two_sides():
+    """With equal errors it is the t test of a regression line."""
+    x = np.arange(8.0)
+    y = 0.7 - 0.01 * x + 0.02 * np.cos(3 * x)
+    scatter = Scatter("e", 0.0, 1.0, ("e",), y[:1], y[:1], 1.0, 7, y, np.full(8, 0.02))
+    assert scatter.trend(x) == pytest.approx(stats.linregress(x, y).pvalue)
+    assert scatter.trend(-x) == pytest.approx(stats.linregress(x, y).pvalue)
+
+
 def test_no_scatter_is_said():
     data = ji.Experiments(PRE, after(np.full(12, 0.7), 0.01))
     found = ji.fit(ji.Newton(0.5), PAIR, data)
@@ -278,7 +309,7 @@ def test_no_scatter_is_said():
     assert told.chance > 0.01
     assert "shows no scatter" in str(told)
     assert told.mean[0] == pytest.approx(found.value[0], abs=0.5 * found.standard_error[0])
-    with pytest.raises(ValueError, match="`name` must be among restitution"):
+    with pytest.raises(ValueError, match="`name` must be one of restitution"):
         ji.scatter(found, "friction")
 
 

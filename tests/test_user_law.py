@@ -27,7 +27,7 @@ class Sluggish(ji.Law):
 
     def impulses(self, contact):
         e = self.restitution - self.loss
-        return ji.Impulses(jnp.linalg.solve(contact.whole_delassus, -(1 + e) * contact.gap_velocity))
+        return ji.Impulses(jnp.linalg.solve(contact.normal_delassus, -(1 + e) * contact.gap_velocity))
 
 
 @ji.register("needy", summary="needs two parameters")

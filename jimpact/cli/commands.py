@@ -1,10 +1,10 @@
-"""What the commands of the command line do: each takes its options, and hands back an answer.
+"""What the commands of the command line do: each takes its options and returns a result.
 
 Public names are taken from `jimpact` itself, so that a command imports no more than it needs.
 """
 
+import re
 import sys
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -21,10 +21,9 @@ import jimpact as ji
 from jimpact.cli import options
 from jimpact.cli.program_cache import stored_programs
 from jimpact.cli.starting import as_csv
-from jimpact.cli.study import Study, read_study
+from jimpact.cli.study import Study, read_study, without_none
 from jimpact.files.records import as_data, table
 from jimpact.files.study_file import is_motion
-from jimpact.fits.fitting import Fit
 from jimpact.progress import Steps, waiting, wrapped
 from jimpact.registry import registered_laws
 
@@ -33,172 +32,202 @@ if TYPE_CHECKING:
 
     from jimpact.cli.study_motion import MotionStudy
 
-DPI = 150
+DPI = 150  # of pictures that are pixels: readable on paper, a few hundred kB
 Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 
+# Words of the printed results (regular expressions), and the sentences that explain them there.
+GLOSSARY = {
+    r"\brank\b": "Rank: how many combinations of the free parameters the data determine.",
+    r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they conserve "
+    "momentum.",
+    r"\bparoxysm\b": "Accumulation: infinitely many impacts in a finite time. Friction: a contact "
+    "begins to stick or to slip. Paroxysm: friction jams a sliding contact, an impact without "
+    "collision.",
+    r"\bdispersion\b": "Dispersion: 0 all energy in one body, 1 equal shares.",
+    r"\blargest difference\b": "Difference: of v+ between the two references, over the largest "
+    "|v-|.",
+}
 
-class Answer(NamedTuple):
-    """What a command found: for --json, for people, as pictures; what went wrong all the same."""
+
+class CommandResult(NamedTuple):
+    """The result of a command, in all forms in which it may be printed."""
 
     title: str
-    data: dict[str, Any]
-    text: str
-    pictures: Mapping[Path, "Figure | Callable[[Path], Any]"]  # to be saved, or what draws it
-    failure: str = ""
-    table: Table | None = None  # for --csv
+    data: Any  # for --json, see `as_data`; for people too, where there is no `text`
+    picture: "Figure"
+    table: Table  # for --csv
+    text: str | None = None
+    more: Mapping[Path, "Figure | Callable[[Path], Any]"] = {}  # further pictures, or what writes
+    failure: str = ""  # what went wrong
 
 
-def run(given: options.Command, steps: Steps, folder: str | None = None) -> str:
-    """Do what a command says, and print it; what went wrong all the same, '' if nothing did.
+def run(command: options.DrawingCommand, steps: Steps, folder: str | None = None) -> str:
+    """Run a command and print its result; returns what went wrong, '' if nothing did.
 
-    Programs are kept in the folder, if there is one.
+    Compiled programs are stored in the folder, if there is one.
     """
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
     with stored_programs(folder):
-        answer = _COMMANDS[given.name()](given, steps)
-    replaced = [path for path in answer.pictures if path.exists()]
-    for path, picture in answer.pictures.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if callable(picture):
-            picture(path)
-        else:
-            whole = BytesIO()  # what is interrupted leaves no half a picture
-            picture.savefig(whole, format=path.suffix[1:], dpi=DPI)
-            path.write_bytes(whole.getvalue())
+        result = _COMMANDS[command.name()](command, steps)
+    pictures: dict[Path, Any] = {command.picture(): result.picture, **result.more}
+    replaced = [path for path in pictures if path.exists()]
+    for path, picture in pictures.items():
+        _write_picture(path, picture)
         steps(f"picture {path}")
-    pictures = [str(path) for path in answer.pictures]
-    if given.csv:
-        assert answer.table is not None  # every command has one
-        print(as_csv(*answer.table))
-    elif given.json:
-        about = {"title": answer.title, "pictures": pictures} if pictures else {}
-        print(dumps(about | answer.data, indent=2))
+    if command.csv:
+        print(as_csv(*result.table))
+    elif command.json:
+        data = {"title": result.title, "pictures": [str(path) for path in pictures]}
+        print(dumps(data | as_data(result.data), indent=2))
     else:
-        lines = [answer.title, answer.text, *(f"Picture: {path}" for path in pictures)]
+        text = str(result.data) if result.text is None else result.text
+        notes = [note for word, note in GLOSSARY.items() if re.search(word, text)]
+        places = [f"Picture: {path}" for path in pictures]
+        lines = [result.title, text, *notes, *places]
         print("\n".join(wrapped(line) for line in lines if line))
     for path in replaced:
-        print(f"jimpact {given.name()}: {path} was there before: replaced.", file=sys.stderr)
-    return answer.failure
+        print(f"jimpact {command.name()}: {path} existed and was replaced.", file=sys.stderr)
+    return result.failure
 
 
-def _shot(given: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndarray | None]:
+def _write_picture(path: Path, picture: "Figure | Callable[[Path], Any]") -> None:
+    """Save a figure, whole or not at all; or call the function that writes the file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if callable(picture):
+        picture(path)
+        return
+    content = BytesIO()
+    picture.savefig(content, format=path.suffix[1:], dpi=DPI)
+    path.write_bytes(content.getvalue())
+
+
+def _impact_of(command: options.ShotCommand) -> tuple[Study, np.ndarray, np.ndarray | None]:
     """The study, in the scene of the shot where shots have their own, v-, and v+ if measured."""
-    study, shot = read_study(given.study), given.shot - 1
-    if given.velocity:
-        return study, np.asarray(given.velocity, float), None
+    study, shot = read_study(command.study), command.shot - 1
+    if command.velocity:
+        before = np.asarray(command.velocity, float)
+        separates = np.asarray(ji.gap_velocity(study.scene, before)) >= 0
+        if separates.all() and "initial_energy" not in study.parameters:
+            raise ValueError(
+                "--velocity must let bodies approach each other, but no contact closes: there is "
+                "no impact (positive velocities of a chain point to the right)."
+            )
+        return study, before, None
     data = study.experiments
     assert data is not None  # `ShotCommand.check`
     if shot >= len(data.shots):
-        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {given.shot}.")
+        raise ValueError(f"--shot must lie in [1, {len(data.shots)}], but is {command.shot}.")
     study = replace(study, scene=data.scene_of(study.scene, shot))
     return study, np.asarray(data.pre[shot]), np.asarray(data.post[shot])
 
 
 def _titled(study: Study, before: np.ndarray) -> str:
-    """The first line of what is printed of one impact."""
+    """The first line of what is printed: the study and its velocities before the impact."""
     unit = "m/s" if study.scene.walls is not None else "m/s, rad/s"
     return f"{study.title}: v- = ({', '.join(f'{x:g}' for x in before)}) {unit}"
 
 
 # -------------------------------------------------------------------------------------------- fit
 
-OF_FRICTION = ("friction", "tangential_restitution")
+FRICTION_PARAMETERS = ("friction", "tangential_restitution")
 RAW, CORRECTED, YARDSTICK, ALL_FREE = "as measured", "momentum corrected", "Newton", "all free"
 
 
-def fit(given: options.FitCommand, steps: Steps) -> Answer:
+def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
     """The study's fit and its yardsticks; or every law, side by side."""
-    if given.law == options.EVERY_LAW:
-        return _every_law(given, steps)
-    path = given.picture()
-    chosen = {"starts": given.starts, "seed": given.seed, "progress": steps.patience}
+    if command.law == options.EVERY_LAW:
+        return _fit_every_law(command, steps)
+    chosen = {"starts": command.starts, "seed": command.seed, "progress": steps.patience}
     study: Study | MotionStudy
-    if is_motion(given.study):
+    if is_motion(command.study):
         from jimpact.cli.study_motion import read_motion_study
 
-        study = read_motion_study(given.study, given.law)
+        study = read_motion_study(command.study, command.law)
         fits = {RAW: study.fit(**chosen)}
-        steps(_in_words(RAW, fits[RAW]))
+        steps(_fit_in_words(RAW, fits[RAW]))
     else:
-        study = read_study(given.study, given.law)
-        fits = _all_fits(study, chosen | {"method": given.method}, steps)
+        study = read_study(command.study, command.law)
+        fits = _fit_and_yardsticks(study, chosen | {"method": command.method}, steps)
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     picture = ji.plot.fit(fits[RAW], others, study.title)
-    text = "\n".join([*_summary(fits), "", str(fits[RAW]), ""])
+    text = "\n".join([*_fits_table(fits), "", str(fits[RAW]), ""])
     heads = ["fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank"]
     rows = [
-        [what, type(x.law).__name__, name, x.value[i], x.standard_error[i], x.rms, x.rank]
-        for what, x in fits.items()
-        for i, name in enumerate(x.names)
+        [name, type(x.law).__name__, parameter, x.value[i], x.standard_error[i], x.rms, x.rank]
+        for name, x in fits.items()
+        for i, parameter in enumerate(x.names)
     ]
-    pictures = {path: picture} | _page(fits[RAW], given.report)
-    return Answer(study.title, as_data({"fits": fits}), text, pictures, table=(heads, rows))
+    page = {} if command.report is None else {command.report: fits[RAW].report}
+    return CommandResult(study.title, {"fits": fits}, picture, (heads, rows), text, page)
 
 
-def _page(found: Fit, path: Path | None) -> dict[Path, Any]:
-    return {} if path is None else {path: found.report}
-
-
-def _every_law(given: options.FitCommand, steps: Steps) -> Answer:
+def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
     """All laws on the study's data; picture and page are those of the first one."""
-    path, study = given.picture(), read_study(given.study)
-    found = _laws_fitted(study, steps, given.starts, given.seed)
-    picture = ji.plot.fit(found.best.fit, None, f"{study.title}: {found.best.name}")
-    pictures = {path: picture} | _page(found.best.fit, given.report)
-    return Answer(study.title, found.to_dict(), str(found), pictures, table=found.rows())
+    study = read_study(command.study)
+    fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
+    best = fits.best
+    picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
+    page = {} if command.report is None else {command.report: best.fit.report}
+    return CommandResult(study.title, fits, picture, fits.rows(), more=page)
 
 
-def _laws_fitted(
-    study: Study, steps: Steps, starts: int | None = None, seed: int | None = None
-) -> ji.LawFits:
-    """Every law on the study's data, and whether e depends on the speed."""
+def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "ji.LawFits":
+    """Every law on the study's data, and whether e depends on the speed.
+
+    `chosen`: starts and seed in the place of the study's.
+    """
     assert study.experiments is not None  # `FitCommand.check`
-    kept = {key: x for key, x in study.parameters.items() if key != "restitution"}
-    given = {"starts": starts, "seed": seed}
-    chosen = {key: study.options.get(key) if x is None else x for key, x in given.items()}
-    chosen = {key: x for key, x in chosen.items() if x is not None}
+    values = {key: x for key, x in study.parameters.items() if key != "restitution"}
+    searches = {key: x for key, x in study.options.items() if key in ("starts", "seed")}
+    friction = [name for name in study.free if name in FRICTION_PARAMETERS]
 
-    def done(name: str, fit: Fit) -> None:
-        steps(_in_words(name, fit))
+    def done(name: str, fit: "ji.Fit") -> None:
+        """Count a law as a step."""
+        steps(_fit_in_words(name, fit))
 
-    also = [name for name in study.free if name in OF_FRICTION]
     return ji.fit_laws(
-        study.scene, study.experiments, free=also, speed=True, done=done, **(kept | chosen)
+        study.scene,
+        study.experiments,
+        free=friction,
+        speed=True,
+        done=done,
+        **(values | searches | without_none(chosen)),
     )
 
 
-def _all_fits(study: Study, options: dict[str, Any], steps: Steps) -> dict[str, Fit]:
+def _fit_and_yardsticks(study: Study, chosen: dict[str, Any], steps: Steps) -> dict[str, "ji.Fit"]:
     """The study's fit and its yardsticks; fits of one law share one compiled program."""
-    own, everything = _per_contact(study)
-    fits: dict[str, Fit] = {}
+    study, all_free = _per_contact(study)
+    fits: dict[str, ji.Fit] = {}
 
     def run(name: str, study: Study) -> None:
-        profiles = None if name == RAW else False  # which only the report of this one tells
-        fits[name] = study.run(**options, profiles=profiles)
-        steps(_in_words(name, fits[name]))
+        """Fit, and count it as a step."""
+        profiles = None if name == RAW else False  # only the report of this fit shows them
+        fits[name] = study.run(**chosen, profiles=profiles)
+        steps(_fit_in_words(name, fits[name]))
 
-    run(RAW, own)
-    if study.measured is not None:  # other laws know no forces, and no times
+    run(RAW, study)
+    if study.measured is not None:  # the other laws know no forces and no times
         return fits
     if any("break momentum" in line for line in fits[RAW].warnings):
         assert study.experiments is not None  # it was fitted
         data = study.experiments.momentum_corrected(study.scene)
-        run(CORRECTED, replace(own, experiments=data))
+        run(CORRECTED, replace(study, experiments=data))
     if not isinstance(study.law, ji.Newton):
         friction = getattr(study.law, "friction", None)
         shared = [name for name in ("restitution", "friction") if name in study.free]
         free: dict[str, Any] = dict.fromkeys(shared or ["restitution"], True)
-        newton = replace(study, law=ji.Newton(0.5, friction), free=free, bounds={})
-        run(YARDSTICK, newton)
-    if everything is not None:
-        run(ALL_FREE, everything)
+        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), free=free, bounds={}))
+    if all_free is not None:
+        run(ALL_FREE, all_free)
     return fits
 
 
 def _per_contact(study: Study) -> tuple[Study, Study | None]:
     """The study of an LZB law with one value per contact, tied where it had one for all.
 
-    And the study with every e and stiffness ratio free, None where that is no LZB or no more.
+    And the study with every e and stiffness ratio free; None where the law is another one, or
+    where they are free already.
     """
     law, contacts = study.law, study.scene.contacts
     fields = ("restitution", "stiffness")
@@ -212,164 +241,160 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
         tied[name] = np.broadcast_to(labels, (contacts,))
     e, k = (np.broadcast_to(getattr(law, name), (contacts,)) for name in fields)
     law = ji.LZB(e, k, exponent=law.exponent, initial_energy=law.initial_energy)
-    own = replace(study, law=law, free=tied)
+    study = replace(study, law=law, free=tied)
     if len(np.unique(tied["restitution"])) == contacts and tied["stiffness"].all():
-        return own, None
-    return own, replace(own, free=dict.fromkeys(fields, True))
+        return study, None
+    return study, replace(study, free=dict.fromkeys(fields, True))
 
 
-def _summary(fits: dict[str, Fit]) -> list[str]:
-    """A line a parameter of each fit, and what the data see of all parameters."""
+def _fits_table(fits: dict[str, "ji.Fit"]) -> list[str]:
+    """A line for each parameter of each fit, and what the data determine with all of them free."""
     rows = []
-    for what, found in fits.items():
-        data = "corrected" if what == CORRECTED else RAW
-        last = [
-            f"{found.rms:.4f}" if found.experiments is not None else f"{found.rms:.4g}",
-            f"{found.rank} of {len(found.names)}",
-        ]
-        for i, name in enumerate(found.names):
-            first = [type(found.law).__name__, data] if i == 0 else ["", ""]
-            rows.append([*first, name, _value(found, i), *(last if i == 0 else ["", ""])])
-    speeds = all(found.experiments is not None for found in fits.values())
-    rms = "rms [m/s]" if speeds else "rms"
-    heads = ["law", "data", "parameter", "value", rms, "rank"]
+    for name, fit in fits.items():
+        data = "corrected" if name == CORRECTED else RAW
+        rms = f"{fit.rms:.4f}" if fit.experiments is not None else f"{fit.rms:.4g}"
+        first = [type(fit.law).__name__, data], [rms, f"{fit.rank} of {len(fit.names)}"]
+        for i, parameter in enumerate(fit.names):
+            left, right = first if i == 0 else (["", ""], ["", ""])
+            rows.append([*left, parameter, _value(fit, i), *right])
+    speeds = all(fit.experiments is not None for fit in fits.values())
+    heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
     lines = table(heads, rows, left=["data", "parameter", "value"])
-    if CORRECTED in fits:
-        lines.append("corrected: changed as little as possible so that momentum is conserved")
-    if everything := fits.get(ALL_FREE):
-        names = everything.names
-        lines.append(f"With {', '.join(names)} free the rank is {everything.rank} of {len(names)}.")
-        lines += everything.identifiability
+    if ALL_FREE in fits:
+        fit = fits[ALL_FREE]
+        names = ", ".join(fit.names)
+        lines.append(f"With {names} free the rank is {fit.rank} of {len(fit.names)}.")
+        lines += fit.identifiability
     return lines
 
 
-def _in_words(name: str, found: Fit) -> str:
-    values = ", ".join(f"{x} {_value(found, i)}" for i, x in enumerate(found.names))
-    unit = "" if found.experiments is None else " m/s"
-    return f"{name}: {values}, rms {found.rms:.4g}{unit}"
+def _fit_in_words(name: str, fit: "ji.Fit") -> str:
+    """The values of a fit in one line."""
+    values = ", ".join(f"{x} {_value(fit, i)}" for i, x in enumerate(fit.names))
+    unit = "" if fit.experiments is None else " m/s"
+    return f"{name}: {values}, rms {fit.rms:.4g}{unit}"
 
 
-def _value(found: Fit, i: int) -> str:
-    error = found.standard_error[i]
-    if found.at_bound[i]:
-        return f"{found.value[i]:.5g} (bound)"
-    spread = "unseen" if np.isinf(error) else "± unknown" if np.isnan(error) else f"± {error:.2g}"
-    return f"{found.value[i]:.5g} {spread}"
+def _value(fit: "ji.Fit", i: int) -> str:
+    """A fitted value with its standard error."""
+    error = fit.standard_error[i]
+    if fit.at_bound[i]:
+        spread = "(bound)"
+    elif np.isinf(error):
+        spread = "(not determined)"
+    elif np.isnan(error):
+        spread = "± unknown"
+    else:
+        spread = f"± {error:.2g}"
+    return f"{fit.value[i]:.5g} {spread}"
 
 
 # ---------------------------------------------------------------------------------------- compare
 
 
-def compare(given: options.CompareCommand, steps: Steps) -> Answer:
+def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
     """Every law on one scene."""
-    path = given.picture()
-    study, before, measured = _shot(given)
+    study, before, measured = _impact_of(command)
     laws, left_out = registered_laws(study.parameters)
     with waiting("comparing laws", steps.patience):
-        found = ji.compare(study.scene, before, laws)
+        result = ji.compare(study.scene, before, laws)
     steps(f"{len(laws)} laws compared")
-    found = replace(found, left_out=left_out, measured=measured)
-    fits = _laws_fitted(study, steps) if given.fit and study.experiments is not None else None
+    result = replace(result, left_out=left_out, measured=measured)
+    fits = _laws_fitted(study, steps) if command.fit and study.experiments is not None else None
     values = ", ".join(f"{key} = {value}" for key, value in study.parameters.items())
     lines = [
-        str(found),
+        str(result),
         *([] if fits is None else ["", "Fitted to all shots:", str(fits), ""]),
         f"Parameters: {values}.",
-        "Dispersion: 0 all energy in one body, 1 equal shares. Time: one compiled call, its "
-        "argument checks included.",
+        "T+/T-: kinetic energy after over before. Time (us): one compiled call with its argument "
+        "checks.",
     ]
-    data = {"velocity": before, "laws": found, "fits": fits, "left_out": left_out}
-    picture = ji.plot.comparison(found, measured, study.title)
+    data = {"velocity": before, "laws": result, "fits": fits, "left_out": left_out}
+    picture = ji.plot.comparison(result, measured, study.title)
     bodies = [f"v_{i + 1}_plus" for i in range(len(before))]
     heads = ["law", *bodies, "energy_ratio", "dispersion", "time_s", "audit"]
-    told = attrgetter("energy_ratio", "dispersion_index", "time", "verdict")
-    rows = [[name, *np.asarray(x.outcome.velocity), *told(x)] for name, x in found.entries.items()]
-    text = "\n".join(lines)
-    return Answer(_titled(study, before), as_data(data), text, {path: picture}, table=(heads, rows))
+    columns = attrgetter("energy_ratio", "dispersion_index", "time", "verdict")
+    rows = [
+        [name, *np.asarray(x.outcome.velocity), *columns(x)] for name, x in result.entries.items()
+    ]
+    return CommandResult(_titled(study, before), data, picture, (heads, rows), "\n".join(lines))
 
 
 # ------------------------------------------------------------------------------------- montecarlo
 
 
-def montecarlo(given: options.MonteCarloCommand, steps: Steps) -> Answer:
+def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResult:
     """Random gaps, velocities, parameters."""
-    path = given.picture()
-    study = read_study(given.study)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", UserWarning)
-        found = ji.monte_carlo(**_sampling(study, given), progress=steps.patience)
-    steps(f"{found.samples:,} samples")
-    for warning in caught:
-        print(f"jimpact montecarlo: {warning.message}", file=sys.stderr)
-    picture = ji.plot.monte_carlo(found, study.title)
-    columns = found.mean, found.standard_error, found.std, found.minimum, found.maximum
+    study = read_study(command.study)
+    result = ji.monte_carlo(**_sampling(study, command), progress=steps.patience)
+    steps(f"{result.samples:,} samples")
+    picture = ji.plot.monte_carlo(result, study.title)
+    columns = result.mean, result.standard_error, result.std, result.minimum, result.maximum
     heads = ["coordinate", "mean", "standard_error", "std", "least", "largest"]
     rows = [[i + 1, *row] for i, row in enumerate(zip(*columns))]
-    return Answer(study.title, found.to_dict(), str(found), {path: picture}, table=(heads, rows))
+    return CommandResult(study.title, result, picture, (heads, rows))
 
 
-def _sampling(study: Study, given: options.MonteCarloCommand) -> dict[str, Any]:
-    """Of `monte_carlo`: those of the study, or in their place those of the command line."""
-    executor: Any = given.executor
-    if given.scheduler is not None:
+def _sampling(study: Study, command: options.MonteCarloCommand) -> dict[str, Any]:
+    """Arguments of `monte_carlo`: the study's, or in their place those of the command line."""
+    executor: Any = command.executor
+    if command.scheduler is not None:
         from jimpact.montecarlo.executors import DaskExecutor
 
-        executor = DaskExecutor(given.scheduler)
-    options = {"samples": given.samples, "key": given.seed, "folder": given.folder}
-    chosen = {name: value for name, value in options.items() if value is not None}
-    return study.monte_carlo | chosen | {"executor": executor, "keep_samples": given.keep_samples}
+        executor = DaskExecutor(command.scheduler)
+    chosen = {"samples": command.samples, "key": command.seed, "folder": command.folder}
+    computing = {"executor": executor, "keep_samples": command.keep_samples}
+    return study.monte_carlo | without_none(chosen) | computing
 
 
 # ------------------------------------------------------------------------------------------ chart
 
-QUICK = "\nThis is the quick look; --full does all of it."
+QUICK = "\nThis is the quick look; --full computes everything."
 QUICK_METHODS = ("dop853", "verlet", "impulse_euler")
 QUICK_LAWS = ("moreau", "binary")
 
 
-def chart(given: options.ChartCommand, steps: Steps) -> Answer:
+def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     """Speed against accuracy on one scene."""
-    path = given.picture()
-    study, before, _ = _shot(given)
+    study, before, _ = _impact_of(command)
     law = _lzb(study)
-    known, _ = registered_laws({"restitution": law.restitution})
-    found = ji.work_precision(
+    laws, _ = registered_laws({"restitution": law.restitution})
+    result = ji.work_precision(
         study.scene,
         before,
         law,
-        given.methods or (None if given.full else _quick_methods(law)),
-        laws=None if given.full else {x: known[x] for x in QUICK_LAWS},
-        batch=given.batch,
-        repeats=given.repeats,
-        gradients=given.full,
-        durations=given.full,
+        command.methods or (None if command.full else _quick_methods(law)),
+        laws=None if command.full else {x: laws[x] for x in QUICK_LAWS},
+        batch=command.batch,
+        repeats=command.repeats,
+        gradients=command.full,
+        durations=command.full,
         progress=steps.patience,
     )
-    picture = ji.plot.work_precision(found, study.title)
-    text = str(found) + ("" if given.full or given.methods else QUICK)
+    picture = ji.plot.work_precision(result, study.title)
+    text = str(result) + ("" if command.full or command.methods else QUICK)
     from jimpact.methods.chart import QUANTITIES
 
     heads = ["method", "setting", *QUANTITIES, "evaluations", "alone_s", "batch_s", "status"]
-    told = attrgetter("evaluations", "single.median", "batched.median", "status")
+    columns = attrgetter("evaluations", "single.median", "batched.median", "status")
     rows = [
-        [name, x.setting, *(x.error[q] for q in QUANTITIES), *told(x)]
-        for name, points in found.points.items()
+        [name, x.setting, *(x.error[q] for q in QUANTITIES), *columns(x)]
+        for name, points in result.points.items()
         for x in points
     ]
-    title = _titled(study, before)
-    return Answer(title, found.to_dict(), text, {path: picture}, table=(heads, rows))
+    return CommandResult(_titled(study, before), result, picture, (heads, rows), text)
 
 
-def _lzb(study: Study) -> ji.LZB:
-    """The study's law, or LZB with what the study says of its parameters (restitution: 1)."""
+def _lzb(study: Study) -> "ji.LZB":
+    """The study's law, or LZB with the study's values of its parameters (restitution: 1)."""
     if isinstance(study.law, ji.LZB):
         return study.law
-    known = {"restitution": 1.0} | study.parameters
-    return ji.LZB(**{key: known[key] for key in ji.REGISTRY["lzb"].parameters if key in known})
+    values = {"restitution": 1.0} | study.parameters
+    return ji.LZB(**{key: values[key] for key in ji.REGISTRY["lzb"].parameters if key in values})
 
 
-def _quick_methods(law: ji.LZB) -> list[str]:
-    """Those that compile soon and can solve the impact."""
+def _quick_methods(law: "ji.LZB") -> list[str]:
+    """Methods that compile soon and can solve the impact."""
     from jimpact.methods.contenders import METHODS
 
     return [name for name in QUICK_METHODS if METHODS[name].supports(law) is None]
@@ -377,104 +402,104 @@ def _quick_methods(law: ji.LZB) -> list[str]:
 
 # -------------------------------------------------------------------------------------- stability
 
-STEPS = 5_000  # of a run
+MAX_STEPS = 5_000  # of a run; ten times more would only wait longer for those that do not end
 QUICK_RESOLUTION, FULL_RESOLUTION, FULL_SAMPLES = 7, 9, 300
 TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at a time"
 
 
-def stability(given: options.StabilityCommand, steps: Steps) -> Answer:
-    """Maps of methods; the picture of single axes, and of pairs, one more beside it a method."""
-    path = given.picture()
-    if not given.full:  # three balls: a program a method
+def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
+    """Maps of methods: a picture of single axes, with --full one of pairs for each method."""
+    if not command.full:  # three balls: one program for each method
         from jimpact.methods.stability import default_axes
 
         axes = default_axes(QUICK_RESOLUTION).items()
         size: dict[str, Any] = {"axes": {name: x for name, x in axes if name != "balls"}}
     else:
         size = {"resolution": FULL_RESOLUTION, "slices": "pairs", "samples": FULL_SAMPLES}
-    found = ji.stability_map(
-        given.methods or None, **size, max_steps=STEPS, progress=steps.patience
+    result = ji.stability_map(
+        command.methods or None, **size, max_steps=MAX_STEPS, progress=steps.patience
     )
-    pictures = {path: ji.plot.stability_map(found, TITLE)}
-    for name in found.methods if given.full else ():
-        beside = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
-        pictures[beside] = ji.plot.stability_pairs(found, name)
-    text = str(found) + ("" if given.full else QUICK)
-    counts = [[name, *found.counts(name).values()] for name in found.methods]
-    table = ["method", *found.counts(found.methods[0])], counts
-    return Answer("", found.to_dict(), text, pictures, table=table)
+    path, pairs = command.picture(), {}
+    for name in result.methods if command.full else ():
+        file = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
+        pairs[file] = ji.plot.stability_pairs(result, name)
+    text = str(result) + ("" if command.full else QUICK)
+    counts = [[name, *result.counts(name).values()] for name in result.methods]
+    table = ["method", *result.counts(result.methods[0])], counts
+    return CommandResult("", result, ji.plot.stability_map(result, TITLE), table, text, pairs)
 
 
 # ----------------------------------------------------------------------------------------- advise
 
-_TAKEN = ("restitution", "stiffness", "exponent", "friction")  # of the study's parameters
-_REFUSED = ("tangential_restitution", "initial_energy")  # these would change the outcome
+_ADVISE_PARAMETERS = ("restitution", "stiffness", "exponent", "friction")  # that `ji.advise` takes
+_ADVISE_REFUSED = ("tangential_restitution", "initial_energy")  # these would change the outcome
 
 
-def advise(given: options.AdviseCommand, steps: Steps) -> Answer:
+def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
     """The simplest law that a scene needs."""
-    path = given.picture()
-    study, before, _ = _shot(given)
-    found = ji.advise(
+    study, before, _ = _impact_of(command)
+    result = ji.advise(
         study.scene,
         before,
-        given.tolerance,
-        stiffness_range=given.stiffness_range,
-        samples=given.samples,
-        seed=given.seed,
+        command.tolerance,
+        stiffness_range=command.stiffness_range,
+        samples=command.samples,
+        seed=command.seed,
         progress=steps.patience,
-        **_lzb_parameters(study),
+        **_advise_parameters(study),
     )
-    picture = ji.plot.advice(found, study.title)
+    picture = ji.plot.advice(result, study.title)
     title, heads = _titled(study, before), ["law", "worst", "chosen"]
-    rows = [[name, x.worst, name == found.name] for name, x in found.candidates.items()]
-    return Answer(title, found.to_dict(), str(found), {path: picture}, table=(heads, rows))
+    rows = [[name, x.worst, name == result.name] for name, x in result.candidates.items()]
+    return CommandResult(title, result, picture, (heads, rows))
 
 
-def _lzb_parameters(study: Study) -> dict[str, Any]:
-    """Of the study's law what LZB has too."""
+def _advise_parameters(study: Study) -> dict[str, Any]:
+    """The study's parameters that `ji.advise` takes; others that matter are refused."""
     rheology = study.parameters.get("rheology", "bistiffness")
     if rheology != "bistiffness":
         raise ValueError(
-            f"the study must have bistiffness contacts, but has rheology {rheology!r}: of viscous "
-            "contacts only the compliant law knows."
+            f"the study must have bistiffness contacts, but has rheology {rheology!r}: only the "
+            "compliant law handles viscous contacts."
         )
-    for key in _REFUSED:
+    for key in _ADVISE_REFUSED:
         if np.any(study.parameters.get(key, 0.0)):
             raise ValueError(
                 f"the study must not have `{key}`, but has {study.parameters[key]}: `jimpact "
                 "advise` compares laws without it."
             )
-    return {key: value for key, value in study.parameters.items() if key in _TAKEN}
+    return {key: value for key, value in study.parameters.items() if key in _ADVISE_PARAMETERS}
 
 
 # --------------------------------------------------------------------------------------- simulate
 
 
-def simulate(given: options.SimulateCommand, steps: Steps) -> Answer:
+def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
     from jimpact.cli.study_motion import read_motion_study
 
-    path, portrait = given.picture(), given.portrait
-    study = read_motion_study(given.study)
+    study = read_motion_study(command.study)
     system, title = study.system, study.title
-    run = study.run(t_end=given.t_end, samples=given.samples, progress=steps.patience)
-    found = jax.block_until_ready(run)
+    motion = jax.block_until_ready(
+        study.run(t_end=command.t_end, samples=command.samples, progress=steps.patience)
+    )
     steps("motion computed")
-    pictures: dict[Path, Any] = {path: ji.plot.motion(found, title, system=system)}
-    if portrait is not None:
-        which = None if given.coordinate is None else given.coordinate - 1
-        pictures[portrait] = ji.plot.phase_portrait(found, which, title, system=system)
-    if given.gif is not None:
-        pictures[given.gif] = partial(
-            ji.plot.animation, system, found, title=title, progress=steps.patience
+    more: dict[Path, Any] = {}
+    if command.portrait is not None:
+        which = None if command.coordinate is None else command.coordinate - 1
+        more[command.portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
+    if command.gif is not None:
+        more[command.gif] = partial(
+            ji.plot.animation, system, motion, title=title, progress=steps.patience
         )
     heads = ["time [s]", *system.body.names, *system.body.velocity_names]
-    table = heads, np.column_stack([found.time, found.q, found.velocity]).tolist()
-    return Answer(title, found.to_dict(), str(found), pictures, _failure(found), table)
+    table = heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist()
+    picture = ji.plot.motion(motion, title, system=system)
+    return CommandResult(title, motion, picture, table, more=more, failure=_failure(motion))
 
 
 def _failure(motion: "ji.Motion") -> str:
+    """Why a motion failed, '' if it did not."""
     try:
         ji.raise_on_failed_motion(motion)
     except RuntimeError as error:
@@ -482,7 +507,7 @@ def _failure(motion: "ji.Motion") -> str:
     return ""
 
 
-_COMMANDS: dict[str, Callable[[Any, Steps], Answer]] = {
+_COMMANDS: dict[str, Callable[[Any, Steps], CommandResult]] = {
     command.__name__: command
     for command in (fit, compare, montecarlo, chart, stability, advise, simulate)
 }

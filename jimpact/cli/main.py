@@ -1,7 +1,7 @@
-"""The command line. Heavy imports wait until a command runs, and the study was checked.
+"""The program `jimpact`. Heavy imports wait until a command runs and its study is checked.
 
 Ctrl-C ends a command at once, whatever it does: XLA cannot be interrupted by an exception while
-it compiles. What is done is told, and what is on the disk is kept.
+it compiles. The message says which steps are done and what remains on the disk.
 """
 
 import contextlib
@@ -11,13 +11,17 @@ import shutil
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 BAD_INPUT, FAILURE = 2, 1  # exit codes
 INTERRUPTED = 130  # what a shell expects of a program that ctrl-C ended
-WORTH_KEEPING = "0"  # seconds of compiling: also single operations, of which there are many
-RARELY = 100_000  # new objects until garbage is collected: imports and tracing make many that stay
+# Seconds of compiling from which JAX keeps a program: also single operations, which are many.
+LEAST_COMPILE_TIME = "0"
+# New objects until garbage is collected (Python: 700). Imports and tracing make many that live on,
+# and each collection would search them again.
+COLLECT_EVERY = 100_000
 SHOW_CURSOR = b"\r\n\x1b[?25h"  # which a progress bar had hidden
 
 WELCOME = """\
@@ -29,54 +33,63 @@ jimpact: differentiable laws for impacts with several contacts.
   jimpact montecarlo   random gaps, velocities and parameters
   jimpact advise       the simplest law and method that an impact needs
   jimpact chart        how exact and how fast the methods are
-  jimpact stability    where they fail
-  jimpact laws         what the laws say, and when they are right
+  jimpact stability    where the methods fail
+  jimpact laws         what each law assumes, and when it is right
 
 Your own data: `jimpact new fit` writes a study, a CSV file and a notebook to
 start from; then `jimpact fit my_fit`.
 
-`jimpact COMMAND --help` tells all options, `jimpact --version` the version.
+`jimpact COMMAND --help` lists all options, `jimpact --version` the version.
 """
 
 
 class Call:
-    """What the program was asked, and what it has done of it."""
+    """One call of the program: the command with its options, and its steps."""
 
-    given: Any = None  # the command with its options, once they are read
+    command: Any = None  # until the options are parsed
     steps: Any = None
+
+    def __init__(self) -> None:
+        self.warnings: set[str] = set()
 
     @property
     def name(self) -> str:
-        """What messages begin with."""
-        return "jimpact" if self.given is None else f"jimpact {self.given.name()}"
+        """The words that messages begin with."""
+        return "jimpact" if self.command is None else f"jimpact {self.command.name()}"
 
-    def farewell(self) -> str:
-        """What is said to one who interrupts."""
+    def interrupt_message(self) -> str:
+        """What ctrl-C leaves behind."""
         done = f" after: {'; '.join(self.steps.done)}" if self.steps and self.steps.done else ""
-        kept = "" if self.given is None else self.given.kept()
-        return f"{self.name}: stopped{done}. {kept}".rstrip()
+        remains = "" if self.command is None else self.command.remains()
+        return f"{self.name}: stopped{done}. {remains}".rstrip()
 
-    def refused(self, reason: Any, code: int) -> int:
-        """The exit code, after the reason is told."""
+    def warn(self, message: Any, *_: Any) -> None:
+        """Print a warning, once: a file may be read twice. In the place of `showwarning`."""
+        if str(message) not in self.warnings:
+            self.warnings.add(str(message))
+            print(f"{self.name}: {message}", file=sys.stderr)
+
+    def fail(self, reason: Any, code: int) -> int:
+        """Print the reason; the exit code."""
         print(f"{self.name}: {reason}", file=sys.stderr)
         return code
 
 
 def program() -> int:
-    """The entry point of the program `jimpact`; what `main` does, and ctrl-C ends it."""
-    gc.set_threshold(RARELY)
+    """The entry point of the program `jimpact`: `main`, which ctrl-C ends at once."""
+    gc.set_threshold(COLLECT_EVERY)
     call = Call()
-    end_on_interrupt(call.farewell)
-    # what is piped or kept in a file has no terminal to ask for its width
+    end_on_interrupt(call.interrupt_message)
+    # a pipe or a file has no terminal to ask for its width
     os.environ.setdefault("COLUMNS", str(shutil.get_terminal_size((80, 24)).columns))
     try:
         code = main(call=call)
         sys.stdout.flush()
-    except BrokenPipeError:  # whoever read has read enough, as `head` does
+    except BrokenPipeError:  # the reader stopped reading, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     except KeyboardInterrupt:  # where signals cannot be waited for
-        print(call.farewell(), file=sys.stderr)
+        print(call.interrupt_message(), file=sys.stderr)
         code = INTERRUPTED
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done; the interpreter may clean up
     return code
@@ -94,36 +107,52 @@ def main(arguments: list[str] | None = None, call: Call | None = None) -> int:
     if not arguments:
         print(WELCOME, end="")
         return 0
-    given = call.given = parsed(arguments)
     try:
-        given.check()
-        if given.light:
-            return given.run()
-        folder = keep_programs(given.no_cache)
-        from jimpact.cli.commands import run
-        from jimpact.progress import Steps
-
-        call.steps = Steps(call.name)
-        failure = run(given, call.steps, folder)
-        return call.refused(failure, FAILURE) if failure else 0
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = call.warn  # type: ignore[assignment]
+            return run_command(call, arguments)
     except BrokenPipeError:
         raise
     except (ValueError, TypeError, OSError, ImportError) as error:
-        return call.refused(error, BAD_INPUT)
+        return call.fail(error, BAD_INPUT)
     except RuntimeError as error:
-        return call.refused(error, FAILURE)
+        return call.fail(error, FAILURE)
 
 
-def parsed(arguments: list[str]) -> Any:
-    """The options of the command that these arguments mean."""
+def run_command(call: Call, arguments: list[str]) -> int:
+    """Parse, check and run; the exit code."""
+    command = call.command = parse(arguments)
+    command.check()
+    if command.light:
+        return command.run()
+    folder = keep_programs(command.no_cache)
+    from jimpact.cli.commands import run
+    from jimpact.progress import Steps
+
+    call.steps = Steps(call.name)
+    failure = run(command, call.steps, folder)
+    return call.fail(failure, FAILURE) if failure else 0
+
+
+def parse(arguments: list[str]) -> Any:
+    """The command of these arguments, with its options."""
     import functools
     import operator
     from typing import Annotated
 
     import tyro
 
+    from jimpact._checks import suggestion
     from jimpact.cli.options import COMMANDS
 
+    names = [x.name() for x in COMMANDS]
+    word = arguments[0]
+    if not word.startswith("-") and word not in names:
+        raise ValueError(
+            f"the command must be one of {', '.join(names)}, but is {word!r}."
+            f"{suggestion(word, names)}"
+        )
     commands: list[Any] = [Annotated[x, tyro.conf.subcommand(x.name())] for x in COMMANDS]
     return tyro.cli(
         functools.reduce(operator.or_, commands),
@@ -135,10 +164,10 @@ def parsed(arguments: list[str]) -> Any:
 
 
 def keep_programs(no_cache: bool) -> str | None:
-    """Have JAX keep what it compiles, before it is imported; settings of the user's own stay.
+    """Tell JAX, before it is imported, where to keep what it compiles, unless the user has done so.
 
-    In the folder `JIMPACT_CACHE` (empty: nowhere), else in the user's cache folder. Returns the
-    folder for programs that are kept whole, in which JAX has its own.
+    The place is in the folder `JIMPACT_CACHE` (empty: nowhere), else in the user's cache folder.
+    Returns the folder for whole programs, which contains JAX's own; None: nowhere.
     """
     root = os.environ.get("JIMPACT_CACHE")
     if no_cache:
@@ -151,11 +180,12 @@ def keep_programs(no_cache: bool) -> str | None:
     root = root or platformdirs.user_cache_dir("jimpact")
     folder = os.path.join(root, f"programs-{_processor()}")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", os.path.join(folder, "jax"))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", WORTH_KEEPING)
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", LEAST_COMPILE_TIME)
     return folder
 
 
 def _processor() -> str:
+    """A short name for this kind of processor: compiled programs run on no other."""
     import hashlib
     import platform
 
@@ -165,30 +195,32 @@ def _processor() -> str:
     return hashlib.sha256(kind.encode()).hexdigest()[:8]
 
 
-def end_on_interrupt(farewell: Callable[[], str]) -> None:
-    """From now on ctrl-C says farewell and ends the process, also amid compiled code.
+def end_on_interrupt(message: Callable[[], str]) -> None:
+    """From now on ctrl-C prints a message and ends the process, also within compiled code.
 
     A thread waits for the signal: Python's own handlers run only between two instructions of the
-    main thread, which a compiler may keep for ten seconds, and an exception raised amid calls of
-    XLA is lost or fatal. Where ctrl-C is ignored it stays so.
+    main thread, which a compiler may keep for ten seconds, and an exception raised within calls of
+    XLA is lost or fatal. Where ctrl-C was ignored it remains ignored.
     """
     if os.name != "posix" or signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         return
     once = threading.Lock()
-    listen, tell = os.pipe()
-    os.set_blocking(tell, False)
+    reading_end, writing_end = os.pipe()
+    os.set_blocking(writing_end, False)
 
     def end(*_: Any) -> None:
+        """Print the message and end, once."""
         if once.acquire(blocking=False):
-            text = farewell().encode() + b"\n"
+            text = message().encode() + b"\n"
             os.write(2, (SHOW_CURSOR if os.isatty(2) else b"") + text)
             os._exit(INTERRUPTED)
 
     def wait() -> None:
-        while os.read(listen, 1)[0] != signal.SIGINT:
+        """Until the pipe delivers an interrupt."""
+        while os.read(reading_end, 1)[0] != signal.SIGINT:
             pass
         end()
 
     signal.signal(signal.SIGINT, end)
-    signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    signal.set_wakeup_fd(writing_end, warn_on_full_buffer=False)
     threading.Thread(target=wait, daemon=True).start()

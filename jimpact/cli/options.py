@@ -1,4 +1,4 @@
-"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, a class a command.
+"""Options of `jimpact fit`, `compare`, `montecarlo` and so on, one class for each command.
 
 `check` refuses what is wrong before JAX is imported, that is at once.
 """
@@ -6,6 +6,7 @@
 import dataclasses
 import json
 import os
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,34 +16,36 @@ from jimpact._checks import check_choice
 from jimpact.cli import starting
 from jimpact.files import study_file
 
-Method = Literal["levenberg-marquardt", "adam", "sgd", "lbfgs"]
 EVERY_LAW = "all"  # in the place of a law's name
 PICTURES = (".png", ".pdf", ".svg")
 
 
-def _own(shown: str, kind: Any = None) -> Any:
-    """How an option is shown whose text tells its default, and what makes its value of text."""
-    return tyro.conf.arg(metavar=shown, constructor=kind, help_behavior_hint="")
+def _option(metavar: str, constructor: Any = None) -> Any:
+    """How --help names a value whose default the text explains, and what makes it of a string."""
+    return tyro.conf.arg(metavar=metavar, constructor=constructor, help_behavior_hint="")
 
 
 StudyFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="[STUDY.toml]")]
 Flag = Annotated[bool, tyro.conf.arg(help_behavior_hint="")]
-File = Annotated[Path | None, _own("FILE", Path)]
-Count = Annotated[int | None, _own("N", int)]
+File = Annotated[Path | None, _option("FILE", Path)]
+Folder = Annotated[Path | None, _option("DIR", Path)]
+Count = Annotated[int | None, _option("N", int)]
+Name = Annotated[str | None, _option("NAME", str)]
+Names = Annotated[tuple[str, ...], _option("NAME ...")]
 
 
 @dataclasses.dataclass(frozen=True)
 class Command:
     """Options of every command."""
 
-    light: ClassVar[bool] = False  # whether it has a `run` of its own
+    light: ClassVar[bool] = False  # whether it needs no JAX and has a method `run`
 
     json: Flag = False
     """Print JSON instead of text."""
     csv: Flag = False
     """Print the table as CSV instead of text."""
-    # Compile anew. Else compiled programs are kept whole in the user's cache folder, or in the
-    # folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
+    # Compile anew. Else compiled programs are kept in the user's cache folder (up to 1 GB), or in
+    # the folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
     no_cache: Flag = False
 
     @classmethod
@@ -55,8 +58,8 @@ class Command:
         if self.json and self.csv:
             raise ValueError("--json and --csv must not both be given.")
 
-    def kept(self) -> str:
-        """What is left of an interrupted command."""
+    def remains(self) -> str:
+        """What remains of an interrupted command."""
         cached = os.environ.get("JAX_COMPILATION_CACHE_DIR") and not self.no_cache
         return "Compiled programs are kept, nothing else." if cached else "Nothing is kept."
 
@@ -66,36 +69,52 @@ class DrawingCommand(Command):
     """Options of a command that draws a picture."""
 
     # Picture (.png, .pdf, .svg), or a folder for it; default: ./jimpact-<command>.png,
-    # with a study named ./jimpact-<command>-<study>.png. What is there is replaced, and told.
-    out: Annotated[Path, _own("FILE", Path)] = Path()
+    # with a study named ./jimpact-<command>-<study>.png. A message says if a file is replaced.
+    out: Annotated[Path, _option("FILE", Path)] = Path()
 
     def check(self) -> None:
-        """Also the picture's kind."""
+        """Also the picture."""
         super().check()
         self.picture()
 
     def picture(self) -> Path:
         """The file --out, or the command's own in the directory --out, named after the study."""
-        if self.out.suffix:
-            return checked_picture(self.out)
+        if self.out.suffix and not self.out.is_dir():
+            return checked_file("--out", self.out, PICTURES, " or be a directory")
         study, default = (getattr(x, "study", None) for x in (self, type(self)))
         named = "" if study is None or study == default else f"-{study.absolute().stem}"
-        return self.out / f"jimpact-{self.name()}{named}.png"
+        return checked_file("--out", self.out / f"jimpact-{self.name()}{named}.png", PICTURES)
 
 
-def checked_picture(path: Path, option: str = "--out") -> Path:
-    """The path of a picture; other endings are refused."""
-    if path.suffix not in PICTURES:
-        raise ValueError(
-            f"{option} must end in .png, .pdf or .svg or be a directory, but is '{path}'."
-        )
+def checked_file(option: str, path: Path, endings: tuple[str, ...], or_else: str = "") -> Path:
+    """The path; other endings, and places where no file can be written, are refused."""
+    if path.suffix not in endings:
+        *others, last = endings
+        listed = f"{', '.join(others)} or {last}" if others else last
+        raise ValueError(f"{option} must end in {listed}{or_else}, but is '{path}'.")
+    if path.is_dir():
+        raise ValueError(f"{option} must be a file, but '{path}' is a directory.")
+    check_writable(option, path.parent)
+    if path.exists() and not os.access(path, os.W_OK):
+        raise ValueError(f"{option} must be writable, but '{path}' is not.")
     return path
 
 
-def check_methods(methods: tuple[str, ...], known: tuple[str, ...]) -> None:
-    """Raise a ValueError unless all methods are known."""
+def check_writable(option: str, folder: Path) -> None:
+    """Refuse a folder in which no file can be made; one that is missing will be made."""
+    above = next(x for x in (folder, *folder.absolute().parents) if x.exists())
+    try:
+        with tempfile.TemporaryFile(dir=above):
+            pass
+    except OSError as error:
+        reason = (error.strerror or str(error)).lower()
+        raise ValueError(f"{option} must be writable, but '{folder}' is not: {reason}.") from None
+
+
+def check_methods(methods: tuple[str, ...], choices: tuple[str, ...]) -> None:
+    """Raise a ValueError unless all methods are among the choices."""
     for method in methods:
-        check_choice("methods", method, known)
+        check_choice("methods", method, choices)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +123,7 @@ class ShotCommand(DrawingCommand):
 
     study: StudyFile = Path("three_balls.toml")
     """Study file, or the name of a bundled one; its [data] may be missing."""
-    velocity: Annotated[tuple[float, ...], _own("V ...")] = ()
+    velocity: Annotated[tuple[float, ...], _option("V ...")] = ()
     """Velocities before the impact [m/s], one a body; default: those of a measured shot."""
     shot: int = 1
     """Which measured shot, counted from 1."""
@@ -128,10 +147,10 @@ class FitCommand(DrawingCommand):
     # Study file, its folder, or a bundled one (three_balls.toml, air_track.toml, tossed_cube.toml,
     # bead_column.toml, ...); also the study of a motion with [data].
     study: StudyFile = Path("three_balls.toml")
-    law: Annotated[str | None, _own("NAME", str)] = None
+    law: Name = None
     """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
-    method: Annotated[Method | None, _own("METHOD", Method)] = None
-    """levenberg-marquardt, adam, sgd or lbfgs; default: the study's, or the first."""
+    method: Annotated[str | None, _option("METHOD", str)] = None
+    """levenberg-marquardt (the default), adam, sgd or lbfgs, in the place of the study's."""
     starts: Count = None
     """Number of starts; default: the study's, or 8."""
     seed: Count = None
@@ -142,8 +161,10 @@ class FitCommand(DrawingCommand):
     def check(self) -> None:
         """Also the study, which must have data, and the report's kind."""
         super().check()
-        if self.report is not None and self.report.suffix not in (".html", ".htm"):
-            raise ValueError(f"--report must end in .html, but is '{self.report}'.")
+        if self.report is not None:
+            checked_file("--report", self.report, (".html", ".htm"))
+        if self.method is not None:
+            check_choice("method", self.method, study_file.names()["fit_methods"])
         law = None if self.law == EVERY_LAW else self.law
         if study_file.is_motion(self.study):
             if self.method is not None or self.law == EVERY_LAW:
@@ -176,11 +197,11 @@ class MonteCarloCommand(DrawingCommand):
     seed: Count = None
     """Seed; default: the study's, or 0."""
     executor: Literal["serial", "devices", "dask"] = "serial"
-    """Where: one chunk after another, all devices of the process, or Dask workers."""
-    scheduler: Annotated[str | None, _own("ADDRESS", str)] = None
+    """Compute one chunk after another, on all devices of the process, or on Dask workers."""
+    scheduler: Annotated[str | None, _option("ADDRESS", str)] = None
     """Address of a Dask scheduler; default: workers on this machine."""
-    folder: Annotated[Path | None, _own("DIR", Path)] = None
-    """Where finished chunks are kept; the same command again continues there."""
+    folder: Folder = None
+    """Folder of finished chunks; the same command again continues from there."""
     keep_samples: Flag = False
     """Keep the raw samples in the folder, too."""
 
@@ -192,9 +213,11 @@ class MonteCarloCommand(DrawingCommand):
             raise ValueError(f"the study '{self.study}' must have a [monte_carlo] table.")
         if self.scheduler is not None and self.executor != "dask":
             raise ValueError(f"--scheduler needs --executor dask, but it is {self.executor}.")
+        if self.folder is not None:
+            check_writable("--folder", self.folder)
 
-    def kept(self) -> str:
-        """Finished chunks are."""
+    def remains(self) -> str:
+        """Finished chunks, where a folder was given."""
         if self.folder is None:
             return "Nothing is kept, because no --folder was given."
         return f"Finished chunks are in '{self.folder}': the same command continues from there."
@@ -204,12 +227,12 @@ class MonteCarloCommand(DrawingCommand):
 class ChartCommand(ShotCommand):
     """Speed against accuracy: methods of integration and laws on one scene."""
 
-    methods: Annotated[tuple[str, ...], _own("NAME ...")] = ()
+    methods: Names = ()
     """Methods by name; default: three that compile soon, as far as the scene allows."""
     full: Flag = False
     """Every method and algebraic law, durations, and the errors of the derivatives."""
     batch: int = 256
-    """Impacts solved side by side."""
+    """Impacts solved together."""
     repeats: int = 5
     """Timings of each entry, taken in turn."""
 
@@ -223,7 +246,7 @@ class ChartCommand(ShotCommand):
 class StabilityCommand(DrawingCommand):
     """Where methods of integration are right, wrong, gain energy or do not end."""
 
-    methods: Annotated[tuple[str, ...], _own("NAME ...")] = ()
+    methods: Names = ()
     """Methods by name; default: default, rk4, verlet and impulse_euler."""
     full: Flag = False
     """Also other numbers of balls, all pairs of axes, 300 points between them."""
@@ -231,7 +254,8 @@ class StabilityCommand(DrawingCommand):
     def check(self) -> None:
         """Also the methods' names."""
         super().check()
-        batched = [name for name, jax in study_file.names()["methods"].items() if jax]
+        methods = study_file.names()["methods"]
+        batched = [name for name, in_jax in methods.items() if in_jax]
         check_methods(self.methods, ("default", *batched))
 
 
@@ -241,7 +265,7 @@ class AdviseCommand(ShotCommand):
 
     tolerance: float = 1e-2
     """Model error that is allowed, over the largest velocity before."""
-    stiffness_range: Annotated[tuple[float, float] | None, _own("LOW HIGH")] = None
+    stiffness_range: Annotated[tuple[float, float] | None, _option("LOW HIGH")] = None
     """Factors by which each stiffness may be off; default 0.1 10."""
     samples: int = 128
     """Draws of the unknown stiffnesses."""
@@ -256,7 +280,7 @@ class SimulateCommand(DrawingCommand):
     # Study with a [motion], its folder, or a bundled one (cradle_motion.toml, shaken_dimer.toml,
     # rocking_block.toml, tossed_brick.toml, discs_in_a_box.toml).
     study: StudyFile = Path("cradle_motion.toml")
-    t_end: Annotated[float | None, _own("TIME", float)] = None
+    t_end: Annotated[float | None, _option("TIME", float)] = None
     """End of the motion [s]; default: the study's."""
     samples: Count = None
     """Instants in the record; default: the study's, or 201."""
@@ -271,19 +295,21 @@ class SimulateCommand(DrawingCommand):
         """Also the other pictures and the study."""
         super().check()
         if self.portrait is not None:
-            checked_picture(self.portrait, "--portrait")
-        if self.gif is not None and self.gif.suffix != ".gif":
-            raise ValueError(f"--gif must end in .gif, but is '{self.gif}'.")
-        if self.portrait == (path := self.picture()):
-            raise ValueError(f"--portrait and --out must be two files, but are both '{path}'.")
+            checked_file("--portrait", self.portrait, PICTURES)
+        if self.gif is not None:
+            checked_file("--gif", self.gif, (".gif",))
+        if self.portrait == self.picture():
+            raise ValueError(
+                f"--portrait and --out must be two files, but are both '{self.portrait}'."
+            )
         study_file.check_motion_study(self.study)
 
 
 @dataclasses.dataclass(frozen=True)
 class LawsCommand(Command):
-    """List the laws: what they say, when they are right and when they fail."""
+    """List the laws: what they assume, when they are right and when they fail."""
 
-    module: Annotated[str | None, _own("FILE", str)] = None
+    module: Annotated[str | None, _option("FILE", str)] = None
     """File (.py) or module that registers further laws, see `ji.register`."""
     bibtex: Flag = False
     """Print the references as BibTeX."""
@@ -318,11 +344,11 @@ class NewCommand:
 
     kind: Annotated[Literal["fit", "compare", "montecarlo", "simulate"], tyro.conf.Positional]
     """What the study is for."""
-    folder: Annotated[Path | None, tyro.conf.Positional, _own("[DIR]")] = None
-    """Where it is written; default: ./my_<kind>. What is there is never replaced."""
+    folder: Annotated[Path | None, tyro.conf.Positional, _option("[DIR]")] = None
+    """Where it is written; default: ./my_<kind>. Files that exist are never replaced."""
 
-    like: Annotated[str | None, _own("STUDY.toml", str)] = None
-    """A study to begin with, as rocking_block.toml; default: three balls, or a cradle."""
+    like: Annotated[str | None, _option("STUDY.toml", str)] = None
+    """Bundled study to begin with (rocking_block.toml, ...); default: three balls, or a cradle."""
 
     light: ClassVar[bool] = True
 
@@ -332,14 +358,14 @@ class NewCommand:
         return "new"
 
     def check(self) -> None:
-        """Nothing to refuse beforehand."""
+        """Nothing is refused beforehand."""
 
-    def kept(self) -> str:
+    def remains(self) -> str:
         """Files are written whole or not at all."""
         return ""
 
     def run(self) -> int:
-        """Write the files, and say what comes next."""
+        """Write the files, and print the next command."""
         folder = self.folder or Path(f"my_{self.kind}")
         for path in starting.begin(self.kind, folder, self.like):
             print(f"written: {path}")

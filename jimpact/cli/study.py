@@ -10,16 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from jimpact.bodies.assemblies import PlanarBodies
+import jimpact as ji
 from jimpact.bodies.base import CLOSED_BELOW, Body
-from jimpact.bodies.blocks import Block
-from jimpact.bodies.dimers import Dimer, SpatialDimer
-from jimpact.bodies.discs import DiskBalls
-from jimpact.bodies.particles import Column, Corner
-from jimpact.bodies.pendulums import PendulumCradle
-from jimpact.bodies.piles import Discs
-from jimpact.bodies.polygons import Disc, Polygon
-from jimpact.bodies.solids import Box, Sphere
 from jimpact.files.study_file import (
     AT_KEYS,
     NO_DATA,
@@ -38,20 +30,11 @@ from jimpact.fits.problem import FitProblem
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
-from jimpact.montecarlo.distributions import Distribution, Normal, RandomLaw, Uniform
+from jimpact.montecarlo.distributions import Distribution, RandomLaw
 from jimpact.scene import Scene, chain
 
 # Keys of [monte_carlo] that `monte_carlo` calls otherwise.
-_SAMPLING_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
-_DISTRIBUTIONS: dict[str, Any] = {"Uniform": Uniform, "Normal": Normal}
-BODIES: dict[str, type[Body]] = {
-    body.__name__: body
-    for body in (
-        *(Block, Polygon, Disc, Dimer, PlanarBodies),
-        *(Box, Sphere, SpatialDimer),
-        *(Column, Corner, PendulumCradle, Discs, DiskBalls),
-    )
-}
+SAMPLING_ARGUMENTS = {"velocity_m_per_s": "velocity", "gaps_m": "gaps", "seed": "key"}
 
 
 @dataclass(frozen=True)
@@ -102,7 +85,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     """A study from its TOML file: scene, law, what is free, and the data, ready to be fitted.
 
     Args:
-        path: of the file, or the name of a bundled study (`three_balls.toml`).
+        path: path of the file or of its folder, or the name of a bundled study
+            (`three_balls.toml`).
         law: name of another law in the place of the study's.
 
     The tables of the file:
@@ -120,9 +104,9 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
       can be compared, not fitted.
     - `[[observe]]`, in the place of `[data]`: quantity (peak_force [N], arrival_time [s] of a
       contact; duration [s] of a contact or of all; energy_ratio; bounce_height [m] of a body),
-      contact or body (from 1), value and sigma, numbers or lists, with relative = true those over
-      the first one; velocity_m_per_s, one a body, or drop_height_m; bodies (so many, those next to
-      the wall), a number or one a value.
+      contact or body (from 1), value and sigma (numbers or lists; with relative = true divided by
+      the first value); velocity_m_per_s, one for each body, or drop_height_m; bodies (how many,
+      counted from the wall), a number or one for each value.
     - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
       `monte_carlo`.
 
@@ -131,7 +115,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
 
     Raises:
         FileNotFoundError: no such study or data file.
-        ValueError: no TOML, unknown or missing keys, and whatever scene, law or data refuse.
+        ValueError: the file is not TOML; a key is unknown or missing; scene, law or data refuse
+            a value.
 
     >>> import jimpact as ji
     >>> ji.read_study("three_balls.toml").title
@@ -139,6 +124,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     """
 
     def build(tables: dict[str, Any], file: Path) -> Study:
+        """The study of these tables."""
         import_module_of(tables, file.parent)
         return _build(check_impact_tables(tables, file, law, modules=True))
 
@@ -161,7 +147,7 @@ def _build(checked: CheckedStudy) -> Study:
         checked.title,
         scene,
         law,
-        free=free or dict.fromkeys(bounce or default_free(fittable), True),
+        free=free or dict.fromkeys(bounce or default_free(law), True),
         bounds=checked.law.bounds,
         experiments=None if data is None else _experiments(data, checked.path, body or scene),
         parameters=values,
@@ -234,6 +220,7 @@ def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3
     path = Path(str(files("jimpact") / "data" / "tossed_cube.toml"))
 
     def read(tables: Mapping[str, Any], file: Path) -> Experiments:
+        """The shots of these tables."""
         table = {"file": tables["data"]["file"], "near_m": near}
         table |= {} if contacts is None else {"contacts": contacts}
         return _experiments(table, file, body_of("[scene]", tables["scene"], AT_KEYS))
@@ -258,7 +245,7 @@ def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) 
     if "bodies" in arguments:
         within = f"{where.removesuffix(']')}.bodies]"
         arguments["bodies"] = [body_of(within, x) for x in arguments["bodies"]]
-    return BODIES[kind](**arguments)
+    return getattr(ji, kind)(**arguments)
 
 
 def _scene(table: Mapping[str, Any]) -> tuple[Scene, Body | None]:
@@ -279,7 +266,7 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
     laws = table.get("law", {})
     drawn = {name: _distribution(f"law.{name}", value) for name, value in laws.items()}
     arguments = {
-        _SAMPLING_ARGUMENTS.get(key, key): _distribution(key, value)
+        SAMPLING_ARGUMENTS.get(key, key): _distribution(key, value)
         if isinstance(value, dict)
         else value
         for key, value in table.items()
@@ -290,7 +277,7 @@ def _sampling(table: Mapping[str, Any], law: Law, scene: Scene) -> dict[str, Any
 
 def _distribution(name: str, value: Any) -> Distribution:
     """The distribution that a table of a study means."""
-    return _DISTRIBUTIONS[distribution(name, value)](**value)
+    return getattr(ji, distribution(name, value))(**value)
 
 
 def import_module_of(tables: Mapping[str, Any], folder: Path) -> None:

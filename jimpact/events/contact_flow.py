@@ -28,7 +28,8 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.stepper import any_of
+from jimpact.events.stepper import Flow, any_of
+from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.solvers.tridiagonal import tridiagonal_product
 
 OPEN, COMPRESSION, EXPANSION, SLACK = 0, 1, 2, 3
@@ -39,7 +40,6 @@ PATIENCE = 2000  # passes per contact after which an impact may end at WIDENED t
 WIDENED = 100.0
 DRAGGING = 100  # passes per contact, which few impacts need
 OFTEN = 8  # closings of a contact, from which on they may be endless
-UNROLLED = 8  # products with a matrix of this size are written out, without a reduction
 LARGE = 6.0  # exponents below it that are whole or half are products
 
 T = TypeVar("T")
@@ -133,21 +133,6 @@ class Dense(NamedTuple):
         return Dense(jnp.minimum(self._off_diagonal(), 0.0) + unit(self.matrix))
 
 
-def unit(matrix: jax.Array) -> jax.Array:
-    """The unit matrix (m, m, 1) beside a matrix (m, m, B)."""
-    return jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
-        *matrix.shape[:2], *[1] * (matrix.ndim - 2)
-    )
-
-
-def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """`matrix @ vector` for (a, b, B) and (b, B)."""
-    if matrix.shape[1] > UNROLLED:
-        return jnp.sum(matrix * vector[None], axis=1)
-    columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[1])]
-    return functools.reduce(jnp.add, columns)
-
-
 class Frozen(NamedTuple):
     """What of the field does not change while the modes last."""
 
@@ -183,8 +168,8 @@ def as_pytree(flow: type[T]) -> type[T]:
 
 @as_pytree
 @dataclasses.dataclass
-class ContactFlow:
-    """Contacts without friction, an instance of the protocol of `stepper.py`."""
+class ContactFlow(Flow):
+    """Contacts without friction."""
 
     coupling: Chain | Dense
     omega: jax.Array  # (m, B)
@@ -197,8 +182,7 @@ class ContactFlow:
     gapped: bool = False
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
 
-    longest = math.inf  # no rate is large beside the others
-    near = 0.0  # landings start from anywhere in a step
+    longest = math.inf  # no rate is much larger than the others
 
     @property
     def exponent(self) -> Exponent:
@@ -255,10 +239,6 @@ class ContactFlow:
 
     # ---- the protocol
 
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
-        """Tolerances that the error of each row may be."""
-        return 1.0
-
     def constants(self, modes: jax.Array) -> Frozen:
         phase, s = modes[: self.contacts], self.scales(modes)
         # the least one makes e = 0 regular; of several one of them, whole: min() would share its
@@ -267,7 +247,7 @@ class ContactFlow:
             functools.reduce(
                 lambda a, b: jnp.where(b < a, b, a), [s[j : j + 1] for j in range(self.contacts)]
             )
-            if self.contacts <= UNROLLED
+            if self.contacts <= COLUMNS_WRITTEN_OUT
             else jnp.take_along_axis(s, jnp.argmin(s, axis=0, keepdims=True), axis=0)
         )
         ratio = jnp.where(s > 0, least / jnp.where(s > 0, s, 1.0), 1.0)

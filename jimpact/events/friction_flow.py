@@ -14,7 +14,6 @@ break loose together.
 
 import dataclasses
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -30,80 +29,22 @@ from jimpact.events.contact_flow import (
     ContactStates,
     Frozen,
     as_pytree,
-    times,
-    unit,
 )
 from jimpact.events.stepper import any_of
+from jimpact.solvers.dense import load_shares, regularized_once, times
 from jimpact.solvers.friction import distribute
 
 AHEAD = 1e-6  # of the unit of time: at the first touch there are no forces yet to decide by
-# Forces of sticking minimize sum lambda^2 / (mu F) with this weight beside K_tt, in square roots of
-# rounding: it decides where K_tt is singular only, and a refinement removes what it changes
-# elsewhere.
-SHARING = 1.0
-REFINEMENTS = 1
 LEFT = 0.1  # of the tolerance: a loaded contact with less energy ends the impact all the same
 
 
 def ridge(dtype: Any) -> float:
-    """The weight."""
-    return SHARING * math.sqrt(float(jnp.finfo(dtype).eps))
+    """Weight of sum lambda^2 / (mu F), which forces of sticking minimize, beside K_tt.
 
-
-def solve(matrix: jax.Array, *right: jax.Array) -> list[jax.Array]:
-    """`matrix^-1 right` of (n, n, B) and right sides (n, B), entry by entry.
-
-    Gauss-Jordan without pivots, which what is similar to a positive definite matrix does not need.
+    It decides only where K_tt is singular. A refinement removes what it changes elsewhere, so that
+    rounding is least at the square root of that of a number.
     """
-    n = len(matrix)
-    rows = [[*matrix[i], *(b[i] for b in right)] for i in range(n)]
-    for k in range(n):
-        pivot = 1 / rows[k][k]
-        rows[k] = [x * pivot if j > k else x for j, x in enumerate(rows[k])]
-        for i in range(n):
-            if i != k:
-                pairs = zip(rows[i], rows[k])
-                factor = rows[i][k]
-                rows[i] = [x - factor * y if j > k else x for j, (x, y) in enumerate(pairs)]
-    return [jnp.stack([row[n + c] for row in rows]) for c in range(len(right))]
-
-
-def inverse(matrix: jax.Array) -> jax.Array:
-    """The inverse (n, n, B)."""
-    eye = jnp.broadcast_to(unit(matrix), matrix.shape)
-    return jnp.stack(solve(matrix, *(eye[:, j] for j in range(len(matrix)))), axis=1)
-
-
-def regularized(
-    matrix: jax.Array,
-    right: jax.Array,
-    ridge: jax.Array,
-    refinements: int,
-    invert: Callable[[jax.Array], jax.Array] = inverse,
-) -> jax.Array:
-    """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) beside it.
-
-    Each refinement takes out what the ridge changes where the matrix is regular, and makes the
-    derivatives right in one order more: the inverse has none.
-    """
-    inverted = jax.lax.stop_gradient(invert(matrix + unit(matrix) * ridge[:, None]))
-    z = times(inverted, right)
-    for _ in range(refinements):
-        z = z + times(inverted, right - times(matrix, z))
-    return z
-
-
-@jax.custom_jvp
-def refined(k: jax.Array, share: jax.Array, right: jax.Array) -> jax.Array:
-    """As `regularized`, with tangents by the same equations: one inverse does for both."""
-    return regularized(k, right, share, REFINEMENTS)
-
-
-@refined.defjvp
-def _refined_rate(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
-    (k, share, right), (dk, _, dright) = primals, tangents
-    z = refined(k, share, right)
-    return z, refined(k, share, dright - times(dk, z))
+    return math.sqrt(float(jnp.finfo(dtype).eps))
 
 
 class FrictionConstants(NamedTuple):
@@ -129,7 +70,7 @@ class FrictionForces(NamedTuple):
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class FrictionFlow(ContactFlow):
-    """Contacts with planar friction, an instance of the protocol of `stepper.py`."""
+    """Contacts with planar friction."""
 
     across: jax.Array  # K_nt (m, m, B)
     along: jax.Array  # K_tt (m, m, B)
@@ -197,8 +138,9 @@ class FrictionFlow(ContactFlow):
         f = self.force(const.frozen, x, g)
         most, pull = self.friction * f, times(const.pull, f)
         largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
-        weight = most / jnp.where(largest > 0, largest, 1.0)
-        held = refined(const.along * weight[None], const.share, jnp.where(const.stick, -pull, 0.0))
+        weight = load_shares(most)
+        right = jnp.where(const.stick, -pull, 0.0)
+        held = regularized_once(const.along * weight[None], const.share, right)
         hold, size = weight * held, jnp.abs(held)
         # in parts of the force: those of a contact that opens vanish together
         some = const.stick & (largest + size > 0)

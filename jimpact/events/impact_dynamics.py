@@ -24,12 +24,12 @@ from jimpact.events.contact_flow import (
     Exponent,
     Viscous,
     per_row,
-    unit,
 )
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import pushforward, value_of
+from jimpact.solvers.dense import unit
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -258,6 +258,7 @@ class Dynamics(NamedTuple):
     units: ImpactUnits
     exponent: Exponent
     chain: bool
+    max_steps: int
 
     @property
     def static_exponent(self) -> float | tuple[float, ...] | None:
@@ -276,17 +277,14 @@ class Dynamics(NamedTuple):
 
 
 def solve(
-    dynamics: Dynamics,
-    max_steps: int,
-    method: str = "time",
-    condition_check: Contact | None = None,
+    dynamics: Dynamics, method: str = "time", condition_check: Contact | None = None
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
     """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
     `condition_check`: the contacts, if a second run is to show whether the outcome is
     `ill_conditioned`. Differentiable in both modes; method 'time' in all orders.
     """
-    units, exponent = dynamics.units, dynamics.static_exponent
+    units, exponent, max_steps = dynamics.units, dynamics.static_exponent, dynamics.max_steps
     if method == "impulse":
         p, code = impulse_form.solve(dynamics.problem, exponent, dynamics.chain, max_steps)
         return p * units.momentum, None, code

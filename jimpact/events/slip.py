@@ -22,15 +22,16 @@ creeps with r = 0. Sticking forces are eliminated from the field once a step.
 """
 
 import dataclasses
-import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jimpact.events.contact_flow import ContactFlow, ContactStates, Frozen, as_pytree, times, unit
-from jimpact.events.friction_flow import FrictionFlow, inverse, solve
+from jimpact.events.contact_flow import ContactFlow, ContactStates, Frozen, as_pytree
+from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.stepper import any_of, total
+from jimpact.solvers.dense import product, pseudoinverse, solve, times, unit
 from jimpact.solvers.friction import distribute
 
 STICKS, SLIPS, CREEPS = 0, 1, 2
@@ -46,8 +47,6 @@ RELAXES = 1.0  # rate at which the angle of creep returns to the corrected one
 STABLE = 4.0
 LOOSE = 1e-3  # most that errors of ln r and angle may be, however slow the slip
 SLOW_ANGLE = 1e-2  # square roots of the tolerance that the angle of creep, soon corrected, may err
-SINGULAR = 4.0  # square roots of rounding: smaller parts of K_tt than that are none
-REFINEMENTS = 3
 LEAST_STIFFNESS = 1e-10  # of the largest, where friction does not turn directions back at all
 
 
@@ -116,28 +115,10 @@ def dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1]
 
 
-def product(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Matrices (n, k, B) times (k, l, B)."""
-    return jnp.stack([times(a, b[:, j]) for j in range(b.shape[1])], axis=1)
-
-
-def pseudoinverse(k: jax.Array, held: jax.Array) -> jax.Array:
-    """Of the positive semidefinite rows and columns `held` of (t, t, B): least forces."""
-    both = held[:, None] & held[None]
-    k = jnp.where(both, k, 0.0)
-    size = jnp.max(jnp.abs(k), axis=(0, 1), keepdims=True)
-    part = SINGULAR * math.sqrt(float(jnp.finfo(k.dtype).eps)) * jnp.where(size > 0, size, 1.0)
-    damped = inverse(k + unit(k) * jnp.where(held[:, None], part, 1.0))
-    z = product(damped, product(k, damped))
-    for _ in range(REFINEMENTS):  # of Newton and Schulz
-        z = 2 * z - product(z, product(k, z))
-    return z
-
-
 @as_pytree
 @dataclasses.dataclass(kw_only=True)
 class SlipFlow(FrictionFlow):
-    """Contacts with friction in space, an instance of the protocol of `stepper.py`."""
+    """Contacts with friction in space."""
 
     # across: K_nt (m, 2 m, B); along: K_tt (2 m, 2 m, B)
 
@@ -232,8 +213,8 @@ class SlipFlow(FrictionFlow):
         rate = jnp.where(
             self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
         )
-        own = self._blocks(const)
-        stiffness = c * jnp.stack([own[j, 0, j, 0] + own[j, 1, j, 1] for j in range(len(c))]) / 2
+        own = pairs(const.along[np.arange(len(side)), np.arange(len(side))])
+        stiffness = c * (own[:, 0] + own[:, 1]) / 2
         haste = 1 + total(over_r * (length(a) + 2 * stiffness))
         holding = -(times(const.held, f) + times(const.carried, side))
         return SlipRates(f, side, jnp.where(twice(stick), holding, 0.0), rate, stiffness, haste)
@@ -291,11 +272,13 @@ class SlipFlow(FrictionFlow):
         j, eye = j / size[None], unit(j)
         turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
         away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
-        drift, newton = solve(j + eye * (growth + away)[:, None], changes, turns)
+        both = jnp.stack([changes, turns], axis=1)
+        both = solve(j + eye * (growth + away)[:, None], both)
+        drift, newton = both[:, 0], both[:, 1]
         lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
             j + eye * (2 * growth + away)[:, None]
         )
-        (lag,) = solve(lagging + eye * LEAST_STIFFNESS, r * drift / size)
+        lag = solve(lagging + eye * LEAST_STIFFNESS, (r * drift / size)[:, None])[:, 0]
         correction = jnp.clip(newton - lag, -1.0, 1.0)
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 

@@ -3,24 +3,8 @@
 LAYOUT   Rows first, batch last: state y (n, B), margins (k, B), modes (m, B) whole numbers; what is
 one number an impact is (1, B). One impact is a batch of one.
 
-PROTOCOL   A flow is a pytree of parameters (arrays (.., B)) with
-
-    constants(modes)           what of the field does not change while the modes last
-    field(const, modes, y)     -> dy (n, B), in the flow's own time
-    margins(const, modes, y)   -> c (k, B): each is >= 0 while its mode lasts
-    rooted(modes)              -> (k, B): margins whose root is the variable of a landing
-    switch(modes, y, which)    -> (modes, y) after the events `which` (k, B), one-hot
-    begins(before, after)      -> (1, B): forces set in like powers of t, so steps begin in its root
-    coasts(modes)              -> (1, B): the field is constant, steps of any length are exact
-    over(modes, y, passes)     -> (1, B): nothing is left to integrate
-    pauses(before, after, passes)  -> (1, B): the caller wants to look now; None: never
-    finish(modes, y)           -> (modes, y) where it is over
-    allowance(modes, y)        -> (n, B) or 1: tolerances that the error of each row may be
-    driving, adding            blocks of rows (none: one block); those that only add up come last
-    longest                    the longest step in the flow's own time that is stable
-    tolerance (1, B), snap (1, B)
-    taking_part (1, B)             contacts, of which some may be open for good
-    near                       share of a step from which landings start, 0: from anywhere
+PROTOCOL   A flow is a pytree of parameters (arrays (.., B)): see `Flow`. It defines `field`,
+`margins`, `switch`, `over` and a tolerance, and overrides those of the defaults that it needs.
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
 
@@ -31,8 +15,8 @@ for, and its length is differentiated. An event where a step begins is a landing
 explicit Runge-Kutta step of length 0 has the right derivatives up to its order, so there are no
 jump rules, also where events coincide.
 
-WHAT COMES NEXT   Every margin gets one number, in units of the step just tried, and the least of
-them decides (`advance`).
+WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a distance in units of
+the step just tried; the most urgent one decides (`advance`).
 
 DERIVATIVES   Forward ones go along with the steps: the state carries tangents (`tangents.py`) while
 values alone decide. For the reverse mode the run records its accepted steps, and `repeat` walks
@@ -44,15 +28,16 @@ b gives margins and their rates at the end of a step), and what is one number an
 two arrays.
 """
 
+import abc
 from itertools import pairwise
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.tableaux import DOP853
-from jimpact.events.tangents import Dual, dual_like, pushforward, value_of
+from jimpact.events.tangents import Dual, dual_like, is_dual, pushforward, value_of
 
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
 FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
@@ -79,41 +64,75 @@ _NODES = np.array([*DOP853.c, 1.0])
 _WEIGHTS = np.array([DOP853.b, DOP853.error_high, DOP853.error_low])
 
 
-class Flow(Protocol):
-    """What the stepper asks of a flow (see above)."""
+class Flow(abc.ABC):
+    """What the stepper integrates: a state y and modes whose changes are events."""
 
-    longest: Any  # a number, or ()
-    near: float
+    tolerance: jax.Array  # (1, B) error of a step
+    taking_part: jax.Array | int  # (1, B) contacts, without those that are open for good
+    longest: Any  # the longest step in the flow's own time that is stable, or inf
 
-    @property
-    def driving(self) -> tuple[int, ...]: ...
-    @property
-    def adding(self) -> tuple[int, ...]: ...
+    near: float = 0.0  # share of a step from which landings start, 0: from anywhere
 
     @property
-    def tolerance(self) -> jax.Array: ...
+    def driving(self) -> tuple[int, ...]:
+        """Sizes of the blocks of rows that the field depends on; () is one block."""
+        return ()
+
     @property
-    def taking_part(self) -> jax.Array | int: ...
+    def adding(self) -> tuple[int, ...]:
+        """Sizes of the blocks of rows that only add up; they come last."""
+        return ()
+
     @property
-    def snap(self) -> jax.Array: ...
-    def constants(self, modes: jax.Array) -> Any: ...
-    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array: ...
-    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array: ...
-    def rooted(self, modes: jax.Array) -> jax.Array: ...
+    @abc.abstractmethod
+    def snap(self) -> jax.Array:
+        """Margins closer to 0 than this (1, B) are 0."""
+
+    @abc.abstractmethod
+    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """dy (n, B) in the flow's own time."""
+
+    @abc.abstractmethod
+    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """(k, B): each is >= 0 while its mode lasts."""
+
+    @abc.abstractmethod
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
-    ) -> tuple[jax.Array, jax.Array]: ...
-    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float: ...
-    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array: ...
-    def coasts(self, modes: jax.Array) -> jax.Array | None: ...
-    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array: ...
-    def pauses(
-        self, before: jax.Array, after: jax.Array, passes: jax.Array
-    ) -> jax.Array | None: ...
-    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]: ...
+    ) -> tuple[jax.Array, jax.Array]:
+        """Modes and state after the events `which` (k, B), one-hot."""
 
+    @abc.abstractmethod
+    def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
+        """Whether (1, B) nothing is left to integrate."""
 
-F = TypeVar("F", bound=Flow)
+    def constants(self, modes: jax.Array) -> Any:
+        """What of the field does not change while the modes last."""
+        return None
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
+        """Tolerances (n, B) that the error of each row may be."""
+        return 1.0
+
+    def rooted(self, modes: jax.Array) -> jax.Array:
+        """Margins (k, B) whose root is the variable of a landing: by default none."""
+        return jnp.zeros((1, 1), bool)
+
+    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
+        """Whether (1, B) forces set in like powers of time, so that steps begin in its root."""
+        return jnp.zeros((1, 1), bool)
+
+    def coasts(self, modes: jax.Array) -> jax.Array | None:
+        """Whether (1, B) the field is constant, so that steps of any length are exact; None: no."""
+        return None
+
+    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
+        """Whether (1, B) the caller is to look at the state after this event; None: never."""
+        return None
+
+    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Modes and state at the end, where it is over."""
+        return modes, y
 
 
 def total(x: jax.Array) -> jax.Array:
@@ -126,7 +145,13 @@ def any_of(x: jax.Array) -> jax.Array:
     return jnp.any(x, axis=0, keepdims=True)
 
 
+def _rows(x: jax.Array) -> list[jax.Array]:
+    """The rows (1, B) of an array."""
+    return [x[i : i + 1] for i in range(len(x))]
+
+
 def _put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
+    """The buffer with `value` in the row `index`."""
     return jax.lax.dynamic_update_slice_in_dim(
         buffer, value[None], index, 0, allow_negative_indices=False
     )
@@ -140,6 +165,61 @@ class Step(NamedTuple):
     clock: jax.Array  # (4, B): xi at the beginning, length, whether xi is a root, whether it lands
 
 
+class _Frame(NamedTuple):
+    """The variable xi of a step, (1, B) each."""
+
+    start: Any  # xi at the beginning
+    length: Any  # of the step in xi
+    rooted: Any  # whether xi is a root
+    nowhere: Any  # a landing of length 0
+
+
+def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _Frame]:
+    """Constants of the flow, margins (k, B) at the beginning, and the variable of the step."""
+    begun, h, in_root, lands = _rows(s.clock)
+    const = flow.constants(s.modes)
+    c0 = flow.margins(const, s.modes, y)
+    # from a margin that is 0 already a landing has length 0, and no root
+    root = flow.rooted(s.modes) & (c0 > flow.snap)
+    xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
+    xi0 = total(jnp.where(s.target, xi0, 0.0))
+    rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + in_root
+    start = jnp.where(lands > 0, xi0, begun)
+    # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
+    nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
+    length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
+    return const, jax.lax.stop_gradient(c0), _Frame(start, length, rooted, nowhere)
+
+
+def _slopes(
+    flow: Flow, const: Any, frame: _Frame, s: Step, y: jax.Array, stage: Any, ends: np.ndarray
+) -> tuple[list[jax.Array], tuple[jax.Array, jax.Array]]:
+    """dy/dxi in blocks of rows that end at `ends`, dt/dxi, margins and their rates, in a stage.
+
+    The stage is its number, its node, and the sum of slopes that leads to its state.
+    """
+    i, node, change = stage
+    lands = s.clock[3:4]
+    xi = frame.start + node * frame.length
+    now = y[: len(change)] + frame.length * change
+    dy = flow.field(const, s.modes, now)
+
+    def rates_of_margins() -> tuple[jax.Array, jax.Array]:
+        return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy[: len(now)],))
+
+    if flow.near:  # of costly margins: steps in time need them at their ends only
+        needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
+        none = jnp.zeros_like(s.target, now.dtype)
+        value, dc = jax.lax.cond(needed, rates_of_margins, lambda: (none, none))
+    else:
+        value, dc = rates_of_margins()
+    rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
+    rate = jnp.where(frame.nowhere & (rate == 0), jnp.inf, rate)
+    dt = (1 + frame.rooted * (2 * xi - 1)) / rate
+    rows = [dy[first:last] * dt for first, last in pairwise(ends)]
+    return [*rows, dt], jax.lax.stop_gradient((value, dc))
+
+
 def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     """Change of y and of time (n + 1, B); both estimates of its error (2, n, B); margins (k, B) at
     the beginning, and where it `ends`: rates at the beginning, margins and rates at the end.
@@ -148,101 +228,78 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     """
     plain, state = value_of((flow, y))
     n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
-    begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
-
-    def frame(flow: Flow, y: jax.Array) -> tuple[Any, ...]:
-        const = flow.constants(s.modes)
-        c0 = flow.margins(const, s.modes, y)
-        # from a margin that is 0 already a landing has length 0, and no root
-        root = flow.rooted(s.modes) & (c0 > flow.snap)
-        xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
-        xi0 = total(jnp.where(s.target, xi0, 0.0))
-        rooted = total(jnp.where(s.target, root.astype(dtype), 0.0)) + in_root
-        start = jnp.where(lands > 0, xi0, begun)
-        # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
-        nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
-        length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
-        return const, jax.lax.stop_gradient(c0), start, length, rooted, nowhere
-
-    const, c0, start, length, rooted, nowhere = pushforward(frame, flow, y)
+    const, c0, frame = pushforward(lambda flow, y: _frame(flow, s, y), flow, y)
     count = STAGES + 1 if ends else STAGES  # the 13th evaluation, that of the end, has no weight
     table = jnp.asarray(np.pad(_TABLE[:count], ((0, 0), (0, count - STAGES))), dtype)
     weights = jnp.asarray(np.pad(_WEIGHTS, ((0, 0), (0, count - STAGES))), dtype)
     adds = sum(plain.adding)
-    drives = n - adds
-    blocks = plain.driving or (drives,)
+    blocks = plain.driving or (n - adds,)
     ends_of = np.cumsum([0, *blocks, *plain.adding])
 
-    def evaluated(
-        flow: Flow, const: Any, start: Any, length: Any, y: jax.Array, change: jax.Array, at: Any
-    ) -> tuple[list[jax.Array], tuple[jax.Array, jax.Array]]:
-        i, c = at
-        xi = start + c * length
-        now = y[:drives] + length * change
-        dy = flow.field(const, s.modes, now)
-
-        def seen() -> tuple[jax.Array, jax.Array]:
-            return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy[:drives],))
-
-        if flow.near:  # of costly margins: steps in time need them at their ends only
-            needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)
-            none = jnp.zeros_like(s.target, dtype)
-            value, dc = jax.lax.cond(needed, seen, lambda: (none, none))
-        else:
-            value, dc = seen()
-        rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
-        rate = jnp.where(nowhere & (rate == 0), jnp.inf, rate)
-        dt = (1 + rooted * (2 * xi - 1)) / rate
-        rows = [dy[first:last] * dt for first, last in pairwise(ends_of)]
-        return [*rows, dt], jax.lax.stop_gradient((value, dc))
-
-    def stage(carry: Any, at: Any) -> tuple[Any, None]:
+    def stage(carry: Any, row: Any) -> tuple[Any, None]:
         slopes, added, *margins = carry
-        i, a, c = at
+        i, a, node = row
         change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
-        new, (value, dc) = pushforward(evaluated, flow, const, start, length, y, change, (i, c))
-        slopes = _kept(slopes, new[: len(blocks)], i)
-        added = _kept(added, new[len(blocks) :], i)
+        new, (value, dc) = pushforward(
+            lambda flow, const, frame, y, change: _slopes(
+                flow, const, frame, s, y, (i, node, change), ends_of
+            ),
+            *(flow, const, frame, y, change),
+        )
+        slopes = _with_row(slopes, new[: len(blocks)], i)
+        added = _with_row(added, new[len(blocks) :], i)
         if ends:
             margins = [jnp.where(i == 0, dc, margins[0]), value, dc]
         return (slopes, added, *margins), None
 
-    none = [jnp.zeros((count, k, *batch), dtype) for k in (drives, adds + 1)]
+    none = [jnp.zeros((count, k, *batch), dtype) for k in (n - adds, adds + 1)]
     carry = [dual_like((flow, y), k) for k in none]
     margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
     (slopes, added, *margins), _ = jax.lax.scan(stage, (*carry, *margins), rows)
-    sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in (slopes, added)]
+    change, errors = _weighted([slopes, added], weights, frame.length)
+    return change, errors[:, :n], c0, margins
+
+
+def _weighted(tables: list[Any], weights: jax.Array, length: Any) -> tuple[Any, jax.Array]:
+    """Change over a step (n + 1, B), and estimates of its error (2, n + 1, B), from all slopes."""
+    sums = [jnp.tensordot(weights, value_of(k), axes=1) for k in tables]
     inner, outer = (
-        Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1)) if isinstance(k, Dual) else x[0]
-        for x, k in zip(sums, (slopes, added))
+        Dual(x[0], jnp.tensordot(weights[0], k.tangents, axes=1)) if is_dual(k) else x[0]
+        for x, k in zip(sums, tables)
     )
     change = pushforward(lambda h, *k: h * jnp.concatenate(k), length, inner, outer)
-    errors = value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)[:, :n]
-    return change, errors, c0, margins
+    return change, value_of(length)[None] * jnp.concatenate([x[1:] for x in sums], axis=1)
 
 
-def _kept(table: Any, new: list[Any], i: jax.Array) -> Any:
+def _with_row(table: Any, new: list[Any], i: jax.Array) -> Any:
     """The table with a new row of slopes, in blocks.
 
     Each block of tangents is a kernel: one for all would compute them entry by entry.
     """
     value = value_of(table)
     value = _put(value, jnp.concatenate(value_of(new)), i)
-    if not isinstance(table, Dual):
+    if not is_dual(table):
         return value
-    along, first, none = table.tangents, 0, jnp.zeros((), i.dtype)
+    tangents, first, none = table.tangents, 0, jnp.zeros((), i.dtype)
     for block in new:
-        if isinstance(block, Dual):  # else its tangents are 0
+        if is_dual(block):  # else its tangents are 0
             at = (i, jnp.asarray(first, i.dtype), none, none)
-            along = jax.lax.dynamic_update_slice(
-                along, block.tangents[None], at, allow_negative_indices=False
+            tangents = jax.lax.dynamic_update_slice(
+                tangents, block.tangents[None], at, allow_negative_indices=False
             )
         first += len(value_of(block))
-    return Dual(value, along)
+    return Dual(value, tangents)
 
 
+# What an impact does: it goes on, is over, or waits for the caller to look at it
 GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
+
+# What the next step does about a margin, the most urgent first, and what its distance means. The
+# numbers leave room for distances from 0 to 1 between them: their sum is the order of urgency.
+SHORTEN = -2.0  # it dips, or cannot be landed on from here: at this part of the step
+LAND = 0.0  # it vanishes at this part of the step: repeat the step as a landing on it
+AHEAD = 1.0  # it is expected to vanish so many steps ahead: land on it if the next step reaches it
 
 
 class StepperState(NamedTuple):
@@ -277,41 +334,76 @@ def unwatched(carry: StepperState, most: int) -> jax.Array:
     return jnp.any(goes_on(carry, most)) & ~jnp.any(carry.plan[2:3] == PAUSED)
 
 
-def advance(flow: Flow, carry: StepperState, most: int) -> tuple[StepperState, jax.Array]:
-    """One pass: try a step; accept it, or aim at what lies in its middle, or shorten it.
+def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, jax.Array]:
+    """One pass, and whether (1, B) the step tried is accepted.
 
-    Every margin gets one number, in units of the step tried, and the least one decides:
-        -2 .. -1   it dips, or cannot be landed on from here: shorten the step to CUT * (at + 2)
-         0 ..  1   it vanishes inside the step: repeat the step as a landing on it
-         1 .. inf  it is expected to vanish so far ahead: land on it if the next step reaches it
+    A step with an event in its middle is not accepted: it is repeated as a landing on the event, or
+    shortened where it cannot land.
     """
-    moving, start, s = flow, carry.y, carry.step
+    duals, start, s = flow, state.y, state.step
     flow, y = value_of((flow, start))
-    n, dtype = y.shape[0], y.dtype
-    expected, again, done, passes = (carry.plan[i : i + 1] for i in range(4))
-    begun, h, in_root, lands = (s.clock[i : i + 1] for i in range(4))
-    in_root, lands = in_root > 0, lands > 0
-    change, errors, c0, (d0, c1, d1) = _stages(moving, s, start, ends=True)
+    n = y.shape[0]
+    expected, again, done, passes = _rows(state.plan)
+    _, h, _, lands = _rows(s.clock)
+    change, errors, c0, (d0, c1, d1) = _stages(duals, s, start, ends=True)
+    error2 = _squared_error(flow, s, y, errors, passes)
+    ok = error2 <= 1
     taken = value_of(change)[n:]
-    eps = float(jnp.finfo(dtype).eps)
+    span = jnp.where(ok & (taken > 0), taken, expected)
+    urgent = _most_urgent(*_intentions(flow, s, again, c0, d0 * span, c1, d1 * span))
+    active = goes_on(state, most)
+    accept = ok & (urgent.intention == AHEAD) & active
+    landed = accept & (lands > 0)
+    which = s.target & landed
+    # however short the step, the field has no value: given up, for the status to say
+    broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
+
+    def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+        modes, end = flow.switch(s.modes, y + change[:n], which)
+        return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
+
+    modes, end = pushforward(after, duals, start, change)
+    end = dual_like(start, end)
+    step, due = _next_step(flow, s, modes, urgent, accept, error2, span)
+    passes = passes + active.astype(y.dtype)
+    pauses = flow.pauses(s.modes, modes, passes)
+    done = done if pauses is None else jnp.where(landed & pauses, PAUSED, done)
+    over = flow.over(modes, value_of(end), passes) | broken
+    aimed_twice = (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < AHEAD)
+    done = jnp.where(over, OVER, done)
+    plan = jnp.concatenate([due, aimed_twice.astype(y.dtype), done, passes])
+    return StepperState(end, *jax.lax.stop_gradient((step, plan))), accept
+
+
+def _squared_error(
+    flow: Flow, s: Step, y: jax.Array, errors: jax.Array, passes: jax.Array
+) -> jax.Array:
+    """Hairer's error (1, B) of a step, squared, in tolerances."""
+    eps, tiny = float(jnp.finfo(y.dtype).eps), float(jnp.finfo(y.dtype).tiny)
     full = FULL * flow.taking_part
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
-    # Hairer's error, squared, in tolerances
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
-    tiny = float(jnp.finfo(dtype).tiny)  # a landing of length 0 has no errors
+    # `tiny`: a landing of length 0 has no errors
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + tiny)
     # small by chance where the fifth order is: a landing from a maximum, a step of half a period
-    error2 = jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
-    ok = error2 <= 1
-    factor = jnp.clip(
-        SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20)))), SHRINK, GROWTH
-    )
-    factor = jnp.where(error2 < jnp.inf, factor, SHRINK)
-    span = jnp.where(ok & (taken > 0), taken, expected)
-    # what each margin does in this step, and after it
-    d0, d1 = d0 * span, d1 * span
-    snap = flow.snap
+    return jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
+
+
+def _intentions(
+    flow: Flow,
+    s: Step,
+    again: jax.Array,
+    c0: jax.Array,
+    d0: jax.Array,
+    c1: jax.Array,
+    d1: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """Intention and distance of each margin (k, B), from its values c and slopes d.
+
+    At the beginning (0) and the end (1) of a step; slopes are in units of the step.
+    """
+    snap, lands = flow.snap, s.clock[3:4] > 0
     free = ~s.target
     crossed, turns = free & (c1 < -snap), free & (d0 < 0) & (d1 > 0) & (c0 > snap)
     top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
@@ -327,38 +419,58 @@ def advance(flow: Flow, carry: StepperState, most: int) -> tuple[StepperState, j
     dipped = turns & (low < DOUBT * (d1 - d0) - snap)
     at_once = (c0 <= snap) & (d0 <= 0)
     direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > snap))
+    direct = direct & (again == 0)
     # ahead by a parabola: a margin that only creeps towards 0 is not about to reach it
     left = d1 * d1 - 2 * (d1 - d0) * c1
     ahead = free & ~turns & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
     soon = 2 * c1 / (jnp.sqrt(jnp.where(ahead, left, 1.0)) - jnp.where(ahead, d1, 0.0))
-    at = jnp.where(
-        crossed,
-        jnp.where(direct & (again == 0), jnp.where(at_once, 0.0, u), u - 2),
-        jnp.where(dipped, u - 2, jnp.where(ahead, 1 + soon, jnp.inf)),
-    )
-    at = at + TIE * jnp.arange(c0.shape[0], dtype=dtype)[:, None]
-    first = jnp.min(at, axis=0, keepdims=True)
-    event = first <= 1
-    active = goes_on(carry, most)
-    accept = ok & ~event & active
-    landed = accept & lands
-    which = s.target & landed
-    # however short the step, the field has no value: given up, for the status to say
-    broken = active & ~lands & ~(error2 < jnp.inf) & (h < SHORTEST)
+    soon = jnp.where(ahead, soon, jnp.inf)
+    intention = jnp.where(dipped, SHORTEN, AHEAD)
+    intention = jnp.where(crossed, jnp.where(direct, LAND, SHORTEN), intention)
+    inside = jnp.where(crossed & direct & at_once, 0.0, u)
+    return intention, jnp.where(crossed | dipped, inside, soon)
 
-    def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
-        modes, end = flow.switch(s.modes, y + change[:n], which)
-        return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
-    modes, end = pushforward(after, moving, start, change)
-    end = dual_like(start, end)
-    y = value_of(end)
-    # the next step
-    in_root = in_root & ~lands
+class _Urgent(NamedTuple):
+    """The margin that decides about the next step."""
+
+    intention: jax.Array  # (1, B)
+    distance: jax.Array  # (1, B)
+    target: jax.Array  # (k, B) one-hot
+
+
+def _most_urgent(intention: jax.Array, distance: jax.Array) -> _Urgent:
+    """The least intention and, of equal ones, the least distance; ties go by the row."""
+    order = intention + distance + TIE * jnp.arange(len(distance), dtype=distance.dtype)[:, None]
+    first = jnp.min(order, axis=0, keepdims=True)
+    chosen = jnp.where(first < LAND, SHORTEN, jnp.where(first <= AHEAD, LAND, AHEAD))
+    return _Urgent(chosen, first - chosen, order == first)
+
+
+def _next_step(
+    flow: Flow,
+    s: Step,
+    modes: jax.Array,
+    urgent: _Urgent,
+    accept: jax.Array,
+    error2: jax.Array,
+    span: jax.Array,
+) -> tuple[Step, jax.Array]:
+    """The step to try after `s`, and the time it is expected to take (1, B).
+
+    `span` is the time that `s` takes, `error2` its error in tolerances, squared.
+    """
+    begun, h, in_root, lands = _rows(s.clock)
+    ok, event, shorten = error2 <= 1, urgent.intention < AHEAD, urgent.intention == SHORTEN
+    factor = SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20))))
+    factor = jnp.where(error2 < jnp.inf, jnp.clip(factor, SHRINK, GROWTH), SHRINK)
+    lands = lands > 0
+    in_root = (in_root > 0) & ~lands
     xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
-    cut = jnp.where(ok & (first < 0), (1 - flow.near if flow.near else CUT) * (first + 2), 0.5)
+    part = 1 - flow.near if flow.near else CUT
+    cut = jnp.where(ok & shorten, part * urgent.distance, 0.5)
     shorter = jnp.where(in_root, jnp.sqrt(cut) * h, cut * jnp.where(lands, span, h))
-    kept = jnp.where(first < 0, shorter, h)
+    kept = jnp.where(shorten, shorter, h)
     h = jnp.where(ok & event, kept, jnp.where(lands, jnp.where(ok, h, shorter), factor * h))
     fresh = accept & flow.begins(s.modes, modes)
     restart = jnp.sqrt(jnp.minimum(RESTART * span, FIRST))
@@ -367,29 +479,16 @@ def advance(flow: Flow, carry: StepperState, most: int) -> tuple[StepperState, j
     h = jnp.where(in_root, h, jnp.minimum(h, flow.longest))
     new_span = jnp.where(in_root, (xi + h) ** 2 - xi**2, h)
     coasts = flow.coasts(s.modes)
-    reached = (first - 1) * span < new_span
-    reached = reached if coasts is None else reached | (coasts & (first < jnp.inf))
+    reached = urgent.distance * span < new_span
+    reached = reached if coasts is None else reached | (coasts & (urgent.distance < jnp.inf))
     if flow.near:
-        reached = reached & (first - 1 < 5 * flow.near)
-    aim = ok & jnp.where(event, first >= 0, ~lands & reached)
-    target = aim & (at == first)
+        reached = reached & (urgent.distance < 5 * flow.near)
+    aim = ok & jnp.where(event, ~shorten, ~lands & reached)
     h = jnp.where(aim & in_root, new_span, h)
     in_root = in_root & ~aim
-    due = jnp.where(event, first, first - 1) * span
-    clock = jnp.concatenate([xi, h, in_root.astype(dtype), aim.astype(dtype)])
-    passes = passes + active.astype(dtype)
-    pauses = flow.pauses(s.modes, modes, passes)
-    done = done if pauses is None else jnp.where(landed & pauses, PAUSED, done)
-    over = flow.over(modes, y, passes) | broken
-    plan = jnp.concatenate(
-        [
-            jnp.where(aim, due, new_span),
-            (aim & lands & event).astype(dtype),
-            jnp.where(over, OVER, done),
-            passes,
-        ]
-    )
-    return StepperState(end, *jax.lax.stop_gradient((Step(modes, target, clock), plan))), accept
+    clock = jnp.concatenate([xi, h, in_root.astype(h.dtype), aim.astype(h.dtype)])
+    due = jnp.where(aim, urgent.distance * span, new_span)
+    return Step(modes, aim & urgent.target, clock), due
 
 
 def _root_of_cubic(

@@ -1,4 +1,4 @@
-"""What results have in common: as data for a JSON file, as a table in text."""
+"""Results as data for a JSON file and as tables and numbers in text."""
 
 import dataclasses
 import shutil
@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-_LEAST = 20  # characters of a column whose text is wrapped
+_LEAST_WIDTH = 20  # characters of a column whose text is wrapped; narrower ones are not readable
 
 
 def as_data(value: Any) -> Any:
@@ -41,7 +41,7 @@ def fields_as_data(record: Any, *left_out: str) -> dict[str, Any]:
 
 
 def number(value: float | None, form: str) -> str:
-    """The number in this format, nothing where there is none.
+    """The number in this format, '' for None and NaN.
 
     >>> from jimpact.files.records import number
     >>> number(0.25, ".1f"), number(float("nan"), ".1f"), number(None, ".1f")
@@ -51,7 +51,7 @@ def number(value: float | None, form: str) -> str:
 
 
 def readable_unit(unit: str, largest: float) -> tuple[str, float]:
-    """The decimal part of an SI unit that a quantity is read best in, and its size.
+    """The multiple of an SI unit in which a quantity has 1 to 3 digits before the point, its size.
 
     >>> from jimpact.files.records import readable_unit
     >>> readable_unit("m", 3e-5), readable_unit("s", 2.0)
@@ -80,8 +80,8 @@ def table(
 ) -> list[str]:
     """Lines of a table; the first column and those with a head in `left` are text, others numbers.
 
-    On a terminal that is too narrow the columns are told in several tables, one below the other,
-    each with the first columns, as many as `keys`; text at the end of a line is wrapped.
+    On a terminal that is too narrow the columns are split into several tables, one below the other,
+    each with the first `keys` columns; text at the end of a line is wrapped.
 
     >>> from jimpact.files.records import table
     >>> table(["law", "e", "status"], [["newton", "0.5", "ok"]], left=["status"])
@@ -100,7 +100,7 @@ def table(
                 row[i].ljust(widths[i]) if is_text[i] else row[i].rjust(widths[i]) for i in part
             )
             line = "  ".join(cells).rstrip()
-            wrapped = is_text[part[-1]] and len(line) > room > before + _LEAST
+            wrapped = is_text[part[-1]] and len(line) > room > before + _LEAST_WIDTH
             lines += (
                 textwrap.wrap(line, room, subsequent_indent=" " * before) if wrapped else [line]
             )

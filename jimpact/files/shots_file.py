@@ -1,13 +1,14 @@
-"""Shots as a CSV file holds them: columns with units. Read and checked without JAX."""
+"""Shots and motions in CSV files whose columns carry units; read and checked without JAX."""
 
 import csv
 import re
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-UNITS = {  # of velocities, in m/s, and rad/s of bodies that turn
+UNITS = {  # of velocities, in m/s or rad/s
     "m/s": 1.0,
     "cm/s": 0.01,
     "mm/s": 0.001,
@@ -17,17 +18,18 @@ UNITS = {  # of velocities, in m/s, and rad/s of bodies that turn
     "rad/s": 1.0,
     "deg/s": np.pi / 180,
 }
-LINEAR, ANGULAR = "m/s", "rad/s"  # to which all are converted
+LINEAR, ANGULAR = "m/s", "rad/s"  # the units after reading
 _LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}
 _ANGLES = {"rad": 1.0, "deg": np.pi / 180}
-_KINDS = {  # of columns, and their units
+_KINDS = {  # of columns, with their units
     **dict.fromkeys(("pre", "post", "sigma", "sigma_pre", "resolution"), UNITS),
     "mass": {"kg": 1.0, "g": 0.001},
     "gap": _LENGTHS,
     "q": _LENGTHS | _ANGLES | {"1": 1.0},
 }
 _NEEDED = ("pre", "post")
-_ERRORS = ("sigma", "sigma_pre", "resolution")
+# Standard errors, and the kinds of column whose errors they are.
+_ERRORS = {"sigma": "post", "sigma_pre": "pre", "resolution": "post", "sigma_q": "q"}
 _OF_MOTIONS = {"t": {"s": 1.0, "ms": 0.001}, **dict.fromkeys(("q", "sigma_q"), _KINDS["q"])}
 # Share of a step by which times may be off, as they are when rounded to a few digits. Ten times
 # more would pass steps that visibly differ.
@@ -41,34 +43,23 @@ _HOW = "columns are separated by commas, numbers have a decimal point"
 _ALLOWED_OF_MOTIONS = "`t[s]`, `q_1[unit]`, `sigma_q_1[unit]`, and so on for coordinates 2, 3, ..."
 
 
-class Table(NamedTuple):
-    """What a file of shots holds, in SI units, by kind of column; (K, n) where n has no name."""
+class ShotTable(NamedTuple):
+    """The columns of a file of shots in SI units, by kind, each (K, number of bodies)."""
 
     values: dict[str, np.ndarray]
     units: list[str]  # of the velocities
     shots: list[str] | None  # labels
 
 
-def read_shots(path: str | Path) -> Table:
-    """Read and check a file of shots, see `ji.read_experiments`."""
+def read_shots(path: str | Path) -> ShotTable:
+    """Read and check a file of shots, see `ji.read_experiments`; a warning reports NaN cells."""
     where, columns, rows = _read(path, _KINDS, _ALLOWED, "shot")
     counts = _check_columns(where, columns)
-    values = {kind: np.full((len(rows), n), np.nan) for kind, n in counts.items()}
-    shots = []
-    for k, (where, row) in enumerate(rows):
-        for column, cell in zip(columns, row):
-            if column.kind == "shot":
-                shots.append(cell or str(k + 1))
-            else:
-                number = _number(f"{where}, column `{column.header}`", column, cell)
-                values[column.kind][k, column.body - 1] = number
-        for column in columns:
-            if column.kind in _ERRORS:
-                measured = column.kind == "sigma_pre" or values["post"][k, column.body - 1]
-                error = values[column.kind][k, column.body - 1]
-                _check_error(where, column, not np.isnan(measured), error)
+    values = _values(columns, rows, counts)
+    labels = [i for i, column in enumerate(columns) if column.kind == "shot"]
+    shots = [row[i] or str(k + 1) for i in labels for k, (_, row) in enumerate(rows)]
     units = {column.body: column.unit for column in columns if column.kind == "pre"}
-    return Table(values, [units[i + 1] for i in range(len(units))], shots or None)
+    return ShotTable(values, [units[i + 1] for i in range(len(units))], shots or None)
 
 
 class Positions(NamedTuple):
@@ -85,24 +76,16 @@ def read_positions(path: str | Path) -> Positions:
     Times are equally spaced; an empty `q` cell was not measured.
     """
     where, columns, rows = _read(path, _OF_MOTIONS, _ALLOWED_OF_MOTIONS, "sample")
-    found = [(c.kind, c.body) for c in columns]
-    size = max(body for _, body in found)
-    kinds = [kind for kind in ("q", "sigma_q") if kind == "q" or any(k == kind for k, _ in found)]
-    wanted = [("t", 1), *((kind, i + 1) for kind in kinds for i in range(size))]
-    if sorted(found) != sorted(wanted):
+    keys = [(c.kind, c.body) for c in columns]
+    size = max(body for _, body in keys)
+    kinds = [kind for kind in ("q", "sigma_q") if kind == "q" or any(k == kind for k, _ in keys)]
+    required = [("t", 1), *((kind, i + 1) for kind in kinds for i in range(size))]
+    if sorted(keys) != sorted(required):
         raise ValueError(
-            f"{where}: the columns must be {', '.join(f'`{k}_{i}`' for k, i in wanted[1:])} and "
+            f"{where}: the columns must be {', '.join(f'`{k}_{i}`' for k, i in required[1:])} and "
             f"`t`, each once, but are {', '.join(c.header for c in columns)}."
         )
-    values = {kind: np.full((len(rows), size), np.nan) for kind in ("t", *kinds)}
-    for k, (where, row) in enumerate(rows):
-        for column, cell in zip(columns, row):
-            number = _number(f"{where}, column `{column.header}`", column, cell)
-            values[column.kind][k, column.body - 1] = number
-        for column in columns:
-            if column.kind == "sigma_q":
-                here = not np.isnan(values["q"][k, column.body - 1])
-                _check_error(where, column, here, values["sigma_q"][k, column.body - 1])
+    values = _values(columns, rows, dict.fromkeys(("t", *kinds), size))
     time = values["t"][:, 0]
     steps = np.diff(time)
     if len(time) < 2 or not (np.abs(steps - steps.mean()) <= UNEVEN_STEPS * steps.mean()).all():
@@ -112,11 +95,11 @@ def read_positions(path: str | Path) -> Positions:
 
 def _read(
     path: str | Path, kinds: dict[str, dict[str, float]], allowed: str, what: str
-) -> tuple[str, list["Column"], list[tuple[str, list[str]]]]:
-    """Where the header is, its columns, and the lines below with where they are."""
+) -> tuple[str, list["CsvColumn"], list[tuple[str, list[str]]]]:
+    """Place of the header, its columns, and the lines below with their places."""
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"Data file '{path}' does not exist or is no file.")
+        raise FileNotFoundError(f"Data file '{path}' does not exist or is not a file.")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:
@@ -139,29 +122,30 @@ def _read(
     return where, columns, rows[1:]
 
 
-class Column(NamedTuple):
-    """One column: what it holds, of which body (from 1), its unit in SI units, and which."""
+class CsvColumn(NamedTuple):
+    """A column: its kind, of which body (from 1), and its unit."""
 
     header: str
     kind: str
     body: int
-    factor: float
-    unit: str
+    factor: float  # SI units in one of the file's
+    unit: str  # LINEAR or ANGULAR, of velocities
 
 
 def _column(
     where: str, index: int, header: str, kinds: dict[str, dict[str, float]], allowed: str
-) -> Column:
+) -> CsvColumn:
+    """The column of a header cell."""
     if header == "shot" and kinds is _KINDS:
-        return Column(header, "shot", 0, 1.0, "")
+        return CsvColumn(header, "shot", 0, 1.0, "")
     match = _HEADER.fullmatch(header)
     kind, body, unit = match.groups() if match else ("", None, "")
     if kind not in kinds or (body is None) != (kind == "t"):
         separated = ";" in header or "\t" in header
-        told = _HOW if separated else "the first line names columns, bodies count from 1"
+        advice = _HOW if separated else "the first line names columns, bodies count from 1"
         raise ValueError(
             f"{where}: column {index + 1} must be one of {allowed}, but has name {header!r} "
-            f"({told})."
+            f"({advice})."
         )
     units, name = kinds[kind], kind if body is None else f"{kind}_{body}"
     if not unit:
@@ -175,15 +159,15 @@ def _column(
             f"but is {unit!r}."
         )
     base = ANGULAR if unit.strip() in ("rad/s", "deg/s") else LINEAR
-    return Column(header, kind, int(body or 1), units[unit.strip()], base)
+    return CsvColumn(header, kind, int(body or 1), units[unit.strip()], base)
 
 
-def _check_columns(where: str, columns: list[Column]) -> dict[str, int]:
-    """How many columns of each kind; every kind has each of its columns once."""
-    found = [(c.kind, c.body) for c in columns]
+def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
+    """Number of columns of each kind, each of which must occur once."""
+    keys = [(c.kind, c.body) for c in columns]
     velocities = [c for c in columns if c.kind in (*_NEEDED, *_ERRORS)]
-    for column, key in zip(columns, found):
-        if found.count(key) > 1:
+    for column, key in zip(columns, keys):
+        if keys.count(key) > 1:
             raise ValueError(f"{where}: column `{column.header}` must occur once, but is repeated.")
         others = {c.unit for c in velocities if c.body == column.body}
         if column in velocities and len(others) > 1:
@@ -191,16 +175,16 @@ def _check_columns(where: str, columns: list[Column]) -> dict[str, int]:
                 f"{where}: all columns of velocity {column.body} must be in m/s or all in rad/s, "
                 "but some are in each."
             )
-    kinds = [kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in found)]
+    kinds = [kind for kind in _KINDS if kind in _NEEDED or any(x == kind for x, _ in keys)]
     bodies = max(1, *(c.body for c in velocities)) if velocities else 1
     counts = {
         kind: bodies
         if kind in (*_NEEDED, *_ERRORS, "mass")
-        else max(body for other, body in found if other == kind)
+        else max(body for other, body in keys if other == kind)
         for kind in kinds
     }
     each = [(i + 1, k) for i in range(max(counts.values())) for k in kinds if i < counts[k]]
-    missing = [f"{kind}_{i}" for i, kind in each if (kind, i) not in found]
+    missing = [f"{kind}_{i}" for i, kind in each if (kind, i) not in keys]
     if missing:
         raise ValueError(
             f"{where}: column `{missing[0]}[unit]` is missing; every body from 1 to {bodies} needs "
@@ -209,8 +193,42 @@ def _check_columns(where: str, columns: list[Column]) -> dict[str, int]:
     return counts
 
 
-def _number(where: str, column: Column, cell: str) -> float:
-    if cell == "" or cell.lower() == "nan":
+def _values(
+    columns: list[CsvColumn], rows: list[tuple[str, list[str]]], counts: dict[str, int]
+) -> dict[str, np.ndarray]:
+    """The cells in SI units, checked, by kind; a warning reports those that say NaN."""
+    values = {kind: np.full((len(rows), n), np.nan) for kind, n in counts.items()}
+    not_numbers = []
+    for k, (line, row) in enumerate(rows):
+        for column, cell in zip(columns, row):
+            if column.kind == "shot":
+                continue
+            where = f"{line}, column `{column.header}`"
+            values[column.kind][k, column.body - 1] = _number(where, column, cell)
+            if _is_nan(cell):
+                not_numbers.append(where)
+        for column in columns:
+            if column.kind in _ERRORS:
+                measured = values[_ERRORS[column.kind]][k, column.body - 1]
+                error = values[column.kind][k, column.body - 1]
+                _check_error(line, column, not np.isnan(measured), error)
+    if not_numbers:
+        warnings.warn(
+            f"{not_numbers[0]}: the cell is NaN and counts as not measured, as an empty one does; "
+            f"{len(not_numbers)} cells of the file are.",
+            stacklevel=1,  # one place for all callers: Python reports it once
+        )
+    return values
+
+
+def _is_nan(cell: str) -> bool:
+    """Whether a cell says NaN."""
+    return cell.lower() == "nan"
+
+
+def _number(where: str, column: CsvColumn, cell: str) -> float:
+    """The cell in SI units, NaN where nothing was measured."""
+    if cell == "" or _is_nan(cell):
         if column.kind in ("pre", "mass", "gap", "t"):
             what = "a velocity before the impact" if column.kind == "pre" else "this"
             raise ValueError(
@@ -229,11 +247,12 @@ def _number(where: str, column: Column, cell: str) -> float:
     return number * column.factor
 
 
-def _check_error(where: str, column: Column, measured: bool, error: float) -> None:
+def _check_error(where: str, column: CsvColumn, measured: bool, error: float) -> None:
+    """Refuse a measured value whose standard error is missing or not positive."""
     exact = column.kind == "sigma_pre" and error == 0  # as of what is at rest
     if measured and not error > 0 and not exact:
-        given = "is empty" if np.isnan(error) else f"is {error / column.factor:g}"
+        value = "is empty" if np.isnan(error) else f"is {error / column.factor:g}"
         raise ValueError(
             f"{where}, column `{column.header}`: the error of a measured value must be > 0, "
-            f"but {given}."
+            f"but {value}."
         )

@@ -18,14 +18,40 @@ from jimpact._checks import as_whole, check_choice, check_values, suggestion
 from jimpact.files.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
-SCENE_KEYS = ("masses_kg", "wall", "gaps_m")
+
+
+class TableKeys(NamedTuple):
+    """The keys that a table of a study may and must have, and what is checked of them at once."""
+
+    allowed: tuple[str, ...]
+    required: tuple[str, ...] = ()
+    flags: tuple[str, ...] = ()  # true or false
+    whole: Mapping[str, int] = {}  # ints, with their smallest value
+    words: Mapping[str, str] = {}  # with the group of `names` that has the choices
+
+
+CHAIN = TableKeys(("masses_kg", "wall", "gaps_m"), ("masses_kg",))
 AT_KEYS = ("q", "closed_below_m")  # of a scene that is a body in a configuration
-FIT_KEYS = ("free", "method", "loss", "starts", "seed", "max_steps", "profiles")
-MOTION_FIT_KEYS = tuple(key for key in FIT_KEYS if key != "method")
-DATA_KEYS = ("file", "momentum_corrected", "near_m", "contacts")
-OBSERVE_KEYS = ("quantity", "value", "sigma", "relative", "contact", "body", "bodies")
+FIT = TableKeys(
+    ("free", "method", "loss", "starts", "seed", "max_steps", "profiles"),
+    flags=("profiles",),
+    whole={"starts": 1, "seed": 0, "max_steps": 1},
+    words={"method": "fit_methods", "loss": "losses"},
+)
+DATA = TableKeys(
+    ("file", "momentum_corrected", "near_m", "contacts"), ("file",), flags=("momentum_corrected",)
+)
 OBSERVE_SHOTS = ("velocity_m_per_s", "drop_height_m")  # one of them says what happens
-SAMPLING_KEYS = ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins")
+OBSERVE = TableKeys(
+    ("quantity", "value", "sigma", "relative", "contact", "body", "bodies", *OBSERVE_SHOTS),
+    ("quantity", "value"),
+    flags=("relative",),
+    words={"quantity": "quantities"},
+)
+SAMPLING = TableKeys(
+    ("velocity_m_per_s", "gaps_m", "law", "samples", "seed", "chunk", "bins"),
+    ("velocity_m_per_s",),
+)
 DISTRIBUTIONS = {("high", "low"): "Uniform", ("mean", "std"): "Normal"}
 GRAVITY = "gravity_m_per_s2"
 MOTION_KEYS = {  # and the arguments of `simulate` that they give
@@ -43,10 +69,20 @@ MOTION_KEYS = {  # and the arguments of `simulate` that they give
     "rtol": "rtol",
     "slow": "slow",
 }
+MOTION = TableKeys(tuple(MOTION_KEYS), ("q0", "v0", "t_end_s"), words={"method": "motion_methods"})
 BASE_KEYS = {"amplitude_m": "amplitude", "frequency_hz": "frequency", "phase_rad": "phase"}
+BASE = TableKeys((*BASE_KEYS, "direction"), ("amplitude_m", "frequency_hz"))
+# Tables of a study besides title, [law] and [scene] or [system], whose keys depend on their kind.
+IMPACT_TABLES = {"fit": FIT, "data": DATA, "monte_carlo": SAMPLING}
+MOTION_TABLES = {
+    "motion": MOTION,
+    "base": BASE,
+    "fit": FIT._replace(allowed=tuple(key for key in FIT.allowed if key != "method")),
+    "data": TableKeys(("file",), ("file",)),
+}
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
-# none, nor lists that are points [m] or mix units, as the classes say: `corners` of a Polygon,
-# `planes`, `walls`, `at`.
+# no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
+# `walls`, `at`), which the classes document.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
@@ -141,10 +177,10 @@ def located(path: Path, table: str) -> Path:
             f"Folder '{path}' holds no study: it has no {STUDY} (`jimpact new` writes one)."
         )
     tables = sorted(bundled.glob("*.toml"))
-    known = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
+    choices = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
     raise FileNotFoundError(
-        f"Study '{path}' does not exist; bundled studies are {', '.join(known)}."
-        f"{suggestion(path, known)}"
+        f"Study '{path}' does not exist; bundled studies are {', '.join(choices)}."
+        f"{suggestion(path, choices)}"
     )
 
 
@@ -155,6 +191,7 @@ def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy,
     """The study of one impact and the number of its shots, all checked; see `read_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> tuple[CheckedStudy, int]:
+        """Check the tables and the shots."""
         study = check_impact_tables(tables, file, law)
         shots = read_shots(study.data_file).values["pre"] if "data" in tables else ()
         return study, len(shots)
@@ -166,6 +203,7 @@ def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy
     """The study of a motion, all checked; see `read_motion_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
+        """Check the tables and the positions."""
         study = check_motion_tables(tables, file, law)
         if "data" in tables:
             read_positions(study.data_file)
@@ -187,41 +225,34 @@ def check_impact_tables(
     Args:
         tables: as read from the file.
         path: of the file.
-        other_law: name of a law in the place of the study's; of it only what both laws know stays.
+        other_law: name of a law in the place of the study's; values that it does not take are left
+            out.
         modules: whether the module that a study names has been imported; else a law that may be
             registered there is not checked.
     """
-    check_tables(tables, ("scene", "law"), ("fit", "data", "observe", "monte_carlo"))
+    check_tables(tables, ("scene", "law"), IMPACT_TABLES, ("observe",))
     check_scene(tables["scene"])
-    free = check_fit(tables.get("fit", {}))
-    if "data" in tables:
-        check_keys("[data]", tables["data"], DATA_KEYS, required=("file",))
-        _check_flag("[data]", tables["data"], "momentum_corrected")
     if "observe" in tables:
-        if "data" in tables:
-            raise ValueError("a study must have [data] or [[observe]], but has both.")
-        check_observed(tables["observe"])
+        check_observed(tables)
     if "monte_carlo" in tables:
         check_sampling(tables["monte_carlo"])
-    law, free = check_law(tables["law"], other_law, free, modules)
-    return CheckedStudy(path, tables, law, free)
+    return _with_law(tables, path, other_law, modules)
 
 
 def check_motion_tables(
     tables: dict[str, Any], path: Path, other_law: str | None, modules: bool = False
 ) -> CheckedStudy:
     """The checked tables of the study of a motion; arguments as of `check_impact_tables`."""
-    check_tables(tables, ("system", "law", "motion"), ("base", "fit", "data"))
-    motion = tables["motion"]
-    check_keys("[motion]", motion, tuple(MOTION_KEYS), ("q0", "v0", "t_end_s"))
-    _check_word(motion, "method", "motion_methods")
-    if "base" in tables:
-        keys = (*BASE_KEYS, "direction")
-        check_keys("[base]", tables["base"], keys, ("amplitude_m", "frequency_hz"))
-    free = check_fit(tables.get("fit", {}), MOTION_FIT_KEYS)
-    if "data" in tables:
-        check_keys("[data]", tables["data"], ("file",), required=("file",))
+    check_tables(tables, ("system", "law", "motion"), MOTION_TABLES)
     body_keys("[system]", tables["system"], (GRAVITY,))
+    return _with_law(tables, path, other_law, modules)
+
+
+def _with_law(
+    tables: dict[str, Any], path: Path, other_law: str | None, modules: bool
+) -> CheckedStudy:
+    """The study, after its law and what is free of it are checked, too."""
+    free = masks(tables.get("fit", {}).get("free", []))
     law, free = check_law(tables["law"], other_law, free, modules)
     return CheckedStudy(path, tables, law, free)
 
@@ -233,9 +264,9 @@ def check_scene(table: Mapping[str, Any]) -> None:
     """Check the table [scene]: a chain, or a body in a configuration."""
     if "kind" in table:
         body_keys("[scene]", table, AT_KEYS)
-        check_keys("[scene]", table, tuple(table), required=("q",))
+        check_keys("[scene]", table, tuple(table), ("q",))
         return
-    check_keys("[scene]", table, SCENE_KEYS, required=("masses_kg",))
+    check_table("[scene]", table, CHAIN)
     wall = table.get("wall", False)
     if not isinstance(wall, bool | str):
         raise ValueError(f"`wall` must be true, false or a side, but is {wall!r}.")
@@ -319,15 +350,8 @@ def _check_ranges(arguments: Mapping[str, Any], declared: Mapping[str, Any]) -> 
             check_values(key, value, low=low, high=high, open_low=open_low)
 
 
-def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dict[str, Any]:
-    """Masks of what the table [fit] says is free, by name; the rest of the table is checked."""
-    check_keys("[fit]", table, keys)
-    _check_flag("[fit]", table, "profiles")
-    for key, low in (("starts", 1), ("seed", 0), ("max_steps", 1)):
-        as_whole(key, table.get(key, low), low)
-    _check_word(table, "method", "fit_methods")
-    _check_word(table, "loss", "losses")
-    free = table.get("free", [])
+def masks(free: Any) -> dict[str, Any]:
+    """What is free, by name: True, or a mask over contacts."""
     if isinstance(free, dict):
         return free
     if isinstance(free, list) and all(isinstance(name, str) for name in free):
@@ -335,25 +359,15 @@ def check_fit(table: Mapping[str, Any], keys: tuple[str, ...] = FIT_KEYS) -> dic
     raise ValueError(f"`free` must be a list of names or a table of masks, but is {free!r}.")
 
 
-def _check_flag(where: str, table: Mapping[str, Any], key: str) -> None:
-    """Check that a key, if it is there, is true or false."""
-    if not isinstance(table.get(key, False), bool):
-        raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")
-
-
-def _check_word(table: Mapping[str, Any], key: str, group: str) -> None:
-    """Check that a key, if it is there, is a word of this group of `names`."""
-    if key in table:
-        check_choice(key, table[key], names()[group])
-
-
-def check_observed(tables: list[Any]) -> None:
-    """Check the tables [[observe]]."""
-    for number, table in enumerate(tables):
+def check_observed(tables: Mapping[str, Any]) -> None:
+    """Check the tables [[observe]] of a study."""
+    if "data" in tables:
+        raise ValueError("a study must have [data] or [[observe]], but has both.")
+    if not isinstance(tables["observe"], list):
+        raise ValueError("`observe` must be tables, each headed by [[observe]].")
+    for number, table in enumerate(tables["observe"]):
         where = f"[[observe]] {number + 1}"
-        check_keys(where, table, (*OBSERVE_KEYS, *OBSERVE_SHOTS), ("quantity", "value"))
-        _check_word(table, "quantity", "quantities")
-        _check_flag(where, table, "relative")
+        check_table(where, table, OBSERVE)
         shots = [key for key in OBSERVE_SHOTS if key in table]
         if len(shots) != 1:
             raise ValueError(
@@ -363,8 +377,7 @@ def check_observed(tables: list[Any]) -> None:
 
 
 def check_sampling(table: Mapping[str, Any]) -> None:
-    """Check the table [monte_carlo]."""
-    check_keys("[monte_carlo]", table, SAMPLING_KEYS, required=("velocity_m_per_s",))
+    """Check the distributions in the table [monte_carlo]."""
     random = table.get("law", {})
     if not isinstance(random, dict):
         raise ValueError(f"[monte_carlo.law] must be a table, but is {random!r}.")
@@ -383,6 +396,19 @@ def distribution(name: str, value: Any) -> str:
             f"`{name}` in [monte_carlo] must have low and high, or mean and std, but is {value!r}."
         )
     return kind
+
+
+def check_table(where: str, table: Mapping[str, Any], keys: TableKeys) -> None:
+    """Raise a ValueError for unknown or missing keys, and for values that are not allowed."""
+    check_keys(where, table, keys.allowed, keys.required)
+    for key in keys.flags:
+        if not isinstance(table.get(key, False), bool):
+            raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")
+    for key, low in keys.whole.items():
+        as_whole(key, table.get(key, low), low)
+    for key, group in keys.words.items():
+        if key in table:
+            check_choice(key, table[key], names()[group])
 
 
 def check_keys(
@@ -405,19 +431,23 @@ def check_keys(
 
 
 def check_tables(
-    study: Mapping[str, Any], required: tuple[str, ...], others: tuple[str, ...]
+    study: Mapping[str, Any],
+    required: tuple[str, ...],
+    tables: Mapping[str, TableKeys],
+    others: tuple[str, ...] = (),
 ) -> None:
-    """Raise a ValueError unless a study has these tables, and besides them a title at most."""
+    """Raise a ValueError for tables that are unknown, missing or wrong; a title is allowed, too."""
     for scene, system, kind in (("scene", "system", "a motion"), ("system", "scene", "one impact")):
         if system in required and system not in study and scene in study:
             raise ValueError(
                 f"the study must be of {kind}, with [{system}], but has [{scene}]: "
                 "`jimpact simulate` takes [system], other commands [scene]."
             )
-    check_keys("the study", study, ("title", *required, *others), required)
-    for name in (*required, *others):
-        if name == "observe":
-            if not isinstance(study.get(name, []), list):
-                raise ValueError("`observe` must be tables, each headed by [[observe]].")
-        elif not isinstance(study.get(name, {}), dict):
+    allowed = dict.fromkeys(("title", *required, *tables, *others))
+    check_keys("the study", study, tuple(allowed), required)
+    for name in (*required, *tables):
+        if not isinstance(study.get(name, {}), dict):
             raise ValueError(f"`{name}` must be a table, but is {study[name]!r}.")
+    for name, keys in tables.items():
+        if name in study:
+            check_table(f"[{name}]", study[name], keys)

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jimpact._checks import as_whole
+from jimpact._checks import as_whole, check_choice
 from jimpact.fits.fitting import Fit
+from jimpact.fits.intervals import check_level
 from jimpact.fits.scaled import ScaledFit, check_profiled
 from jimpact.progress import Show, progress_bar
 
@@ -67,19 +68,16 @@ def contour(
     >>> import jimpact as ji
     >>> pre, post = [[1.0, 0.0, -1.0], [2.0, 0.0, 0.0]], [[-0.8, 0.1, 0.7], [0.1, 1.8, 0.1]]
     >>> data = ji.Experiments(pre, post, sigma=0.1)
-    >>> found = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data)
-    >>> region = ji.contour(found, "restitution[1]", "restitution[2]", points=5)
+    >>> result = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data)
+    >>> region = ji.contour(result, "restitution[1]", "restitution[2]", points=5)
     >>> region.deviance.shape, round(region.limit, 2)
     ((5, 5), 5.99)
     """
-    if not 0 < level < 1:
-        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+    check_level(level)
     as_whole("points", points, 3)
     check_profiled(fit)
-    for name in (first, second):
-        if name not in fit.names:
-            known = ", ".join(fit.names)
-            raise ValueError(f"Arguments `first`, `second` must be of {known}, but have {name!r}.")
+    for argument, name in (("first", first), ("second", second)):
+        check_choice(argument, name, fit.names)
     if first == second:
         raise ValueError(f"Arguments `first` and `second` must differ, but both are {first!r}.")
     limit, i, j = _limit(fit, level), fit.names.index(first), fit.names.index(second)

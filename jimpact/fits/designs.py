@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jimpact._checks import as_whole, check_kind
+from jimpact._checks import as_whole, check_choice, check_kind
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import BoxRegion
@@ -34,8 +34,8 @@ class Design:
     def __str__(self) -> str:
         lines = []
         for shot, errors in zip(self.shots, self.standard_error):
-            told = ", ".join(f"{name} +- {x:.2g}" for name, x in zip(self.names, errors))
-            lines.append(f"shot {shot}: {told}")
+            text = ", ".join(f"{name} +- {x:.2g}" for name, x in zip(self.names, errors))
+            lines.append(f"shot {shot}: {text}")
         return "\n".join(lines)
 
 
@@ -70,8 +70,8 @@ def design(
     >>> import jimpact as ji
     >>> balls = ji.chain([1.0, 1.0, 1.0])
     >>> data = ji.Experiments([[1.0, 0.0, 0.0]], [[-0.2, 0.6, 0.6]], sigma=0.01)
-    >>> found = ji.fit(ji.Newton([0.8, 0.8]), balls, data, starts=1)  # contact 2 is not seen
-    >>> print(ji.design(found, ji.Experiments([[2.0, 0, 0], [0, 0, -1.0]], [[0.0] * 3] * 2)))
+    >>> result = ji.fit(ji.Newton([0.8, 0.8]), balls, data, starts=1)  # contact 2 is not seen
+    >>> print(ji.design(result, ji.Experiments([[2.0, 0, 0], [0, 0, -1.0]], [[0.0] * 3] * 2)))
     shot 2: restitution[1] +- 0.012, restitution[2] +- 0.012
     """
     check_kind("fit", fit, Fit)
@@ -79,11 +79,10 @@ def design(
     as_whole("count", count, 1)
     if fit.experiments is None or not np.isfinite(fit.noise):
         raise ValueError("Argument `fit` must be to shots, with a known noise.")
-    if target is not None and target not in fit.names:
-        known = ", ".join(fit.names)
-        raise ValueError(f"Argument `target` must be one of {known}, but has value {target!r}.")
+    if target is not None:
+        check_choice("target", target, fit.names)
     own = fit.problem.scene if scene is None else scene
-    problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.free)
+    problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.parameters.labels)
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
     noise = fit.noise
     if fit.experiments.sigma is not None:  # which weigh candidates of other units as `fit` does
@@ -122,5 +121,5 @@ def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     states = run(repeated(here, 1), y[None], "levenberg-marquardt", 1, quiet)
     shape = (*problem.measured.shape, -1)
     slopes = np.asarray(states.jacobian[0][: problem.measured.size], float)
-    rows = slopes.reshape(shape)[..., : len(fit.names)] * float(problem.residuals.size) / noise
+    rows = slopes.reshape(shape)[..., : len(fit.names)] * problem.size / noise
     return np.einsum("kip,kiq->kpq", rows, rows)

@@ -93,7 +93,8 @@ def fit(
     Args:
         law: start values. A scalar field is one value for all contacts (tied), an (m,) field is
             free contact by contact. The stiffnesses of `LZB` with equal exponents: only their
-            ratios matter, so contact 1 is held, and a scalar stiffness cannot be fitted.
+            ratios matter, so that of contact 1 is held; a scalar stiffness is held by default, and
+            naming it in `free` is an error.
             The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
             approach velocity, at every evaluation and with every method; the start must be so.
             Or a `FitProblem`, which holds the next three arguments and `bounds`.
@@ -122,8 +123,8 @@ def fit(
         `Fit`; `print` gives its report, `ji.plot.fit` a picture.
 
     Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
-    absurd, are left out, and `Fit.warnings` names them. There is told, too, whether the law fits
-    at all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
+    absurd, are left out, and `Fit.warnings` names them. It also says whether the law fits at
+    all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
 
     Raises:
         ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of
@@ -131,8 +132,8 @@ def fit(
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
-    >>> found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> round(float(found.law.restitution), 4)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> round(float(result.law.restitution), 4)
     0.4
     """
     check_method(method)
@@ -199,8 +200,8 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
         f"{', ...' * (len(labels) > LISTED)}), whose impacts fail, or whose derivatives cannot be "
         "used."
     )
-    kept = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
-    return replace(problem.weighed(kept), left_out=(*problem.left_out, line))
+    used = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
+    return replace(problem.weighed(used), left_out=(*problem.left_out, line))
 
 
 def as_fit(
@@ -209,7 +210,7 @@ def as_fit(
     """The fit at the end of a search: errors, rank and warnings."""
     if robust is not None:
         solution = _without_robust_factors(problem, robust)
-    best, size = solution.minima[0], float(problem.residuals.size)
+    best, size = solution.minima[0], problem.size
     errors = _uncertainty(problem, solution, best)
     if robust is not None:
         freedom = errors.degrees_of_freedom
@@ -262,7 +263,7 @@ def as_fit(
 def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Solution:
     """The minimum that the loss found, its residuals weighted as in `problem`."""
     solution, weighed = robust.solution, problem.weighed(robust.factor).residuals
-    size = float(problem.residuals.size)
+    size = problem.size
     back = float(weighed.size) / size / robust.factor.reshape(-1, 1)
     residual = problem.independent(problem.measured - solution.predicted) / size
     squares, jacobian = float(np.sum(residual**2)), back * solution.jacobian
@@ -274,14 +275,14 @@ def _jacobian(problem: FitProblem, solution: Solution) -> np.ndarray:
     """Derivatives (K, n, P) of what was measured in the parameters; NaN where nothing was."""
     shape = (*problem.measured.shape, len(problem.names))
     slope = solution.jacobian.reshape(shape) / solution.scale
-    return problem.errors_of(float(problem.residuals.size) * slope)
+    return problem.errors_of(problem.size * slope)
 
 
 def _uncertainty(
     problem: FitProblem, solution: Solution, minimum: Minimum, noise: float | None = None
 ) -> Uncertainty:
     """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
-    size = float(problem.residuals.size)
+    size = problem.size
     if noise is None and problem.sigma is not None:
         noise = 1.0
     return uncertainty(
@@ -292,7 +293,7 @@ def _uncertainty(
         sum_of_squares=size**2 * minimum.squares,
         values=problem.values,
         noise=noise,
-        rank_tolerance=RANK_TOLERANCE[str(problem.residuals.offset.dtype)],
+        rank_tolerance=RANK_TOLERANCE[problem.precision],
         value_name=problem.value_name,
     )
 
@@ -303,7 +304,7 @@ def _standard_error(
     """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
     if minimum is solution.minima[0]:
         return best.standard_error
-    more = float(problem.residuals.size) ** 2 * (minimum.squares - solution.minima[0].squares)
+    more = problem.size**2 * (minimum.squares - solution.minima[0].squares)
     if not more <= (HARDLY_WORSE * best.noise) ** 2:
         return None
     return _uncertainty(problem, solution, minimum, best.noise).standard_error

@@ -10,6 +10,7 @@ import numpy as np
 
 from jimpact.fits.least_squares import BoxRegion, Method, SolverState
 from jimpact.fits.problem import (
+    EXACT,
     FEW,
     FitProblem,
     Residuals,
@@ -56,9 +57,6 @@ FLAT = 1e-6  # singular values below this share: a valley, where there is nothin
 # hundred times what solvers leave, and far below what a measurement resolves.
 SAME_COST = 1e-6
 SAME_VALUE = 1e-3
-# Mean squares (relative to the velocities) below this are a perfect fit: rounding and the
-# tolerance of the impact.
-EXACT = {"float64": 1e-14, "float32": 1e-8}
 # A start has converged when a full Gauss-Newton step would lower the sum of squares by less than
 # this share: it is then a thousandth of a standard error away from the minimum.
 CONVERGED = 1e-6
@@ -101,7 +99,7 @@ def search(
 ) -> Solution:
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)
-    points, residuals = start_points(problem, starts, rng), filled_up(problem.residuals)
+    points, residuals, lost = start_points(problem, starts, rng), filled_up(problem.residuals), 0
     with progress_bar(progress) as show:
         states = run(repeated(residuals, len(points)), points, method, max_steps, show)
         for _ in range(ROUNDS if starts > 1 else 0):
@@ -110,17 +108,27 @@ def search(
             if 2 * least <= EXACT[str(states.y.dtype)] or not _smooth(states, best):
                 break
             points = _near(residuals, states, best, min(starts, LANES), rng)
-            more = run(repeated(residuals, len(points)), points, method, max_steps, show)
-            states = jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
+            more = run(
+                repeated(residuals, len(points)), points, method, max_steps, show, len(states.y)
+            )
+            states = _joined(states, more)
             if np.nanmin(more.cost) > (1 - SLOW) * least:
                 break
         if starts > 1 and method == "levenberg-marquardt":
             points = _valleys(problem, residuals, states, show)
             if len(points):
-                more = run(repeated(residuals, len(points)), points, method, max_steps, show)
-                kept = at_minimum(more)
-                states = jax.tree.map(lambda a, b: np.concatenate([a, b[kept]]), states, more)
-    return ends(problem, states)
+                more = run(
+                    repeated(residuals, len(points)), points, method, max_steps, show, len(states.y)
+                )
+                converged = at_minimum(more)
+                states = _joined(states, jax.tree.map(lambda x: x[converged], more))
+                lost = int(np.sum(~converged))
+    return ends(problem, states, lost=lost)
+
+
+def _joined(states: SolverState, more: SolverState) -> SolverState:
+    """Both batches of states, one after the other."""
+    return jax.tree.map(lambda a, b: np.concatenate([a, b]), states, more)
 
 
 def quiet(what: str, done: float, total: float | None) -> None:
@@ -149,8 +157,8 @@ def settled(
     each = len(points) // len(problems)
     best = np.arange(0, len(points), each)
     if many is None:
-        every = [filled_up(problem.residuals) for problem in problems for _ in range(each)]
-        many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *every)
+        copies = [filled_up(problem.residuals) for problem in problems for _ in range(each)]
+        many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *copies)
     for _ in range(SETTLING):
         if many.mixing is not None:
             problems = [p.passing_errors_at(points[b]) for p, b in zip(problems, best)]
@@ -168,6 +176,7 @@ def settled(
 
 
 def _weights(residuals: Residuals) -> tuple[Any, ...]:
+    """The parts of residuals that errors of v- change."""
     return residuals.weight, residuals.size, residuals.mixing
 
 
@@ -175,6 +184,7 @@ def repeated(residuals: Residuals, count: int) -> Residuals:
     """So many times the same problem, without copies."""
 
     def each(leaf: Any) -> Any:
+        """The array without copies."""
         return np.broadcast_to(leaf, (count, *np.shape(leaf))) if eqx.is_array(leaf) else leaf
 
     return jax.tree.map(each, residuals)
@@ -186,11 +196,14 @@ def run(
     method: Method,
     max_steps: int,
     show: Show,
+    earlier: int = 0,
     rivals: bool = True,
+    what: str = "starts",
 ) -> SolverState:
     """Solve S problems from points (S, Q), a few at a time; the states come back to the host.
 
-    Rivals are starts of one problem: those far behind the best are given up sooner.
+    Rivals are starts of one problem: those far behind the best are given up sooner. Progress
+    counts `what`, with those of `earlier` runs of the same search.
     """
     few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
     most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
@@ -206,13 +219,19 @@ def run(
     states = jax.tree.map(lambda *x: np.concatenate(x)[: len(points)], *begun)
     active = list(range(len(points)))
     before, since = states.cost.copy(), states.steps.copy()
+
+    def show_count() -> None:
+        """Show how many are done."""
+        count, total = earlier + len(points) - len(active), earlier + len(points)
+        steps = int(states.steps.max())
+        text = f"fit: {count} of {total} {what} done, step {steps} of at most {max_steps}"
+        show(text, steps, max_steps)
+
     while active:
         for rows in _batches(active, lanes):
             some = advance_all(_rows(problems, rows), _rows(states, rows), method, limit, PASSES)
             states = jax.tree.map(partial(_with_rows, rows), states, jax.device_get(some))
-            ready, steps = len(points) - len(active), int(states.steps.max())
-            counts = f"{ready} of {len(points)} starts done, step {steps} of at most {max_steps}"
-            show(f"fit: {counts}", steps, max_steps)
+            show_count()
         ended = states.done | (states.steps >= max_steps)
         if method == "levenberg-marquardt":
             behind = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
@@ -222,6 +241,7 @@ def run(
             before = np.where(due, states.cost, before)
             since = np.where(due, states.steps, since)
         active = [i for i in active if not ended[i]]
+    show_count()
     return states
 
 
@@ -243,20 +263,23 @@ def run_held(
     box: Any = BoxRegion(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
     many = repeated(residuals, len(held))
     many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
-    return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False)
+    what = "held values"
+    return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False, what=what)
 
 
-def _batches(every: list[int], lanes: int) -> list[list[int]]:
+def _batches(items: list[int], lanes: int) -> list[list[int]]:
     """Lists of so many; the last repeats its last one."""
-    firsts = range(0, len(every), lanes)
-    return [[every[min(i + j, len(every) - 1)] for j in range(lanes)] for i in firsts]
+    firsts = range(0, len(items), lanes)
+    return [[items[min(i + j, len(items) - 1)] for j in range(lanes)] for i in firsts]
 
 
 def _rows(tree: Any, rows: list[int]) -> Any:
+    """These rows of all arrays."""
     return jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, tree)
 
 
 def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """The array with new rows, in place."""
     leaf[rows] = new
     return leaf
 
@@ -277,9 +300,10 @@ def ends(
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
     # starts that did not converge have no minimum to tell, unless they are the best there is
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
-    predicted, status = states.kept
+    predicted, status = states.aux
 
     def slopes(i: int) -> np.ndarray:
+        """The Jacobian at an end, without what filled up."""
         return np.asarray(states.jacobian[i][: problem.measured.size, :count], float)
 
     rows = len(problem.measured) if problem.measured.ndim else None  # without what filled up
@@ -312,6 +336,7 @@ def at_minimum(states: SolverState) -> np.ndarray:
 
 
 def _all_entries(residuals: Residuals, y: np.ndarray) -> np.ndarray:
+    """All entries (Q,) of the fields at y."""
     scaled = np.asarray(residuals.offset, float) + np.asarray(residuals.mix, float) @ y
     return from_scaled(scaled, np.asarray(residuals.scale, float), np.asarray(residuals.log))
 
@@ -388,13 +413,13 @@ def _valleys(
         return np.zeros((0, states.y.shape[1]))
     passes = 1 if count == 1 else SCAN_PASSES
     scan = run_held(residuals, held, passes, show)
-    found = []
+    valleys = []
     for k in range(0, len(held), SCANNED):
         rows = slice(k, k + SCANNED)
         part = jax.tree.map(lambda x, rows=rows: x[rows], scan)
-        found += _turns(held[k][0], count, part, np.asarray(states.y[best], float))
-    found.sort(key=lambda valley: valley[0])
-    return np.array([y for _, y in found[:FOLLOWED]]).reshape(-1, states.y.shape[1])
+        valleys += _turns(held[k][0], count, part, np.asarray(states.y[best], float))
+    valleys.sort(key=lambda valley: valley[0])
+    return np.array([y for _, y in valleys[:FOLLOWED]]).reshape(-1, states.y.shape[1])
 
 
 def _turns(
@@ -425,14 +450,14 @@ def _turns(
 def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
     count, log, r = len(problem.names), problem.log, problem.residuals
-    own = problem.point(problem.start)
+    own_values = problem.point(problem.start)
     low, high = (np.array(end, float)[:count] for end in (r.low, r.high))
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, own[:count] - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, own[:count] + reach), high)
+    low = np.where(log | np.isinf(low), np.maximum(low, own_values[:count] - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own_values[:count] + reach), high)
     elastic = [problem.parameters.field_of(i) == "restitution" for i in range(count)]
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
-    points = np.zeros((starts, len(own)))
+    points = np.zeros((starts, len(own_values)))
     points[:, :count] = low + (high - low) * rng.random((starts, count))
-    points[0] = own
+    points[0] = own_values
     return points

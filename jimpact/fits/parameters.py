@@ -1,15 +1,13 @@
 """Which entries of a law are free, their names, bounds and natural scales."""
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 
 from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
-from jimpact.laws.lzb import LZB
-from jimpact.laws.velocity_dependent import VelocityDependent
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
@@ -28,11 +26,16 @@ class Parameters:
     group are held. (All entries are kept so that a compiled fit does not depend on the groups.)
     """
 
-    fields: tuple[str, ...]
+    labels: dict[str, np.ndarray]  # of each field: 0 is held, entries with equal numbers are tied
     names: tuple[str, ...]
     groups: tuple[tuple[int, ...], ...]
     entry_fields: tuple[str, ...]  # of each entry
     log: np.ndarray  # (Q,) entries that are fitted in their logarithm
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields."""
+        return tuple(self.labels)
 
     @property
     def first(self) -> list[int]:
@@ -46,8 +49,8 @@ class Parameters:
 
 def value_of(law: Law, field: str) -> Any:
     """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
-    found = parameters_of(law).get(field)
-    return None if found is None else found.value
+    parameter = parameters_of(law).get(field)
+    return None if parameter is None else parameter.value
 
 
 def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
@@ -71,26 +74,32 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
 
     `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
     """
-    known = list(free_parameters_of(law))
-    labels, notes = {}, []
-    for field, choice in _as_mapping(free, known).items():
+    known = free_parameters_of(law)
+    labels, held = {}, ""
+    if free is DEFAULT_FREE:
+        free = default_free(law, absolute)
+        if "stiffness" in known and "stiffness" not in free:
+            held = "stiffness"
+    choices = dict(free) if isinstance(free, Mapping) else dict.fromkeys(_as_names(free), True)
+    for field, choice in choices.items():
         if field not in known:
-            raise ValueError(_unknown_field(law, field, known))
+            raise ValueError(_unknown_field(law, field, list(known)))
         labels[field] = _as_labels(field, choice, np.shape(value_of(law, field)))
     ratios = not absolute and _only_ratios(law, labels)
     if ratios and "stiffness" in labels and labels["stiffness"].all():
-        held = labels["stiffness"] == labels["stiffness"].flat[0]
-        if held.all():
+        tied = labels["stiffness"] == labels["stiffness"].flat[0]
+        if tied.all():
             raise ValueError(
                 "Argument `free` must not hold a scalar `stiffness` (or one for all contacts): "
                 "with equal exponents a common factor of all stiffnesses changes nothing, so the "
                 "data cannot determine it. Give the law one stiffness per contact to fit their "
                 "ratios, or free only `restitution`."
             )
-        labels["stiffness"][held] = 0
-        notes.append(
-            "stiffness[1] is held at its start: with equal exponents only stiffness ratios matter."
-        )
+        labels["stiffness"][tied] = 0
+        held = "stiffness[1]"
+    notes = []
+    if held:
+        notes = [f"{held} is held at its start: with equal exponents only stiffness ratios matter."]
     names, groups, start = [], [], 0
     for field, label in labels.items():
         for value in dict.fromkeys(label[label > 0].tolist()):
@@ -102,7 +111,7 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
         raise ValueError("Argument `free` must name a parameter to fit, but leaves none free.")
     owners = tuple(field for field, label in labels.items() for _ in range(label.size))
     log = np.array([parameters_of(law)[field].domain.log for field in owners])
-    return Parameters(tuple(labels), tuple(names), tuple(groups), owners, log), notes
+    return Parameters(labels, tuple(names), tuple(groups), owners, log), notes
 
 
 def _name(field: str, members: np.ndarray, size: int) -> str:
@@ -112,22 +121,26 @@ def _name(field: str, members: np.ndarray, size: int) -> str:
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
 
 
-def _as_mapping(free: Any, known: list[str]) -> dict[str, Any]:
-    if isinstance(free, Mapping):
-        return dict(free)
-    names = (free,) if isinstance(free, str) else tuple(free)
-    if names == DEFAULT_FREE:  # the default serves laws without these, too
-        names = default_free(known)
-    return dict.fromkeys(names, True)
+def _as_names(free: Any) -> tuple[str, ...]:
+    """The names of one or several fields."""
+    return (free,) if isinstance(free, str) else tuple(free)
 
 
-def default_free(known: Collection[str]) -> tuple[str, ...]:
-    """What is fitted of a law with these parameters where nobody says: how its contacts bounce."""
-    bounce = tuple(name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in known)
-    return bounce or tuple(known)
+def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
+    """The fields that are fitted by default: how the contacts bounce, or else all.
+
+    A single stiffness of which only ratios matter is left out; `absolute`: see `free_parameters`.
+    """
+    known = free_parameters_of(law)
+    fields = [name for name in (*DEFAULT_FREE, "matrix", *OF_SPEED) if name in known] or list(known)
+    single = "stiffness" in fields and np.size(value_of(law, "stiffness")) == 1
+    if single and not absolute and _only_ratios(law, {}):
+        fields.remove("stiffness")
+    return tuple(fields)
 
 
 def _unknown_field(law: Law, field: str, known: list[str]) -> str:
+    """What is wrong with a field that is not free."""
     name = type(law).__name__
     if isinstance(value_of(law, field), (float, tuple)):
         return (
@@ -161,22 +174,18 @@ def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _only_ratios(law: Law, labels: Mapping[str, np.ndarray]) -> bool:
-    """Whether a common factor of all stiffnesses is invisible: LZB with equal exponents."""
-    law = law.law if isinstance(law, VelocityDependent) else law
-    if not isinstance(law, LZB):
-        return False
-    exponents = np.unique(np.asarray(law.exponent, dtype=float))
+    """Whether a common factor of all stiffnesses is invisible, in the fit too."""
     stay_equal = "exponent" not in labels or len(set(labels["exponent"].flat)) == 1
-    return len(exponents) == 1 and stay_equal
+    return law.only_stiffness_ratios and stay_equal
 
 
 def bounds_of(
     parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds (P,): the user's, or else the field's domain."""
-    given = dict(bounds or {})
+    chosen = dict(bounds or {})
     known = {parameters.field_of(i) for i in range(len(parameters.names))}
-    for field in given:
+    for field in chosen:
         if field not in known:
             raise ValueError(
                 f"Argument `bounds` must name free parameters, {', '.join(sorted(known))}, "
@@ -186,8 +195,8 @@ def bounds_of(
     ends = np.empty((2, len(values)))
     for field in parameters.fields:
         inside = np.array([owner == field for owner in parameters.entry_fields])
-        if field in given:
-            ends[:, inside] = _bound_pair(field, given[field], law)
+        if field in chosen:
+            ends[:, inside] = _bound_pair(field, chosen[field], law)
         elif parameters_of(law)[field].domain.log:
             ends[:, inside] = values[inside] / LOG_RANGE, values[inside] * LOG_RANGE
         else:

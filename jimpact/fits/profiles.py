@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jimpact.fits.intervals import Profile
+from jimpact._checks import as_whole, check_choice
+from jimpact.fits.intervals import Profile, check_level
 from jimpact.fits.least_squares import DEFAULT_STEPS
 from jimpact.fits.problem import FEW
 from jimpact.fits.result import FitResult
@@ -41,7 +42,7 @@ def profile(
 
     Held values cover the whole domain and the neighbourhood of the minima; from each minimum they
     are reached one after the other in both directions, all parameters side by side; far above the
-    limit they are told only roughly. Where a scan finds a further valley, it is followed to its
+    limit they are computed only roughly. Where a scan finds a further valley, it is followed to its
     minimum. Without sigma and with no degree of freedom left, the interval is that of the values
     which reproduce the data exactly.
 
@@ -60,20 +61,16 @@ def profile(
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.01, 0.98], [0.0, 2.01]], sigma=0.02)
-    >>> found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> print(*ji.profile(found))
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> print(*ji.profile(result))
     restitution: at least 0.97321 (95 %)
     """
-    if not 0 < level < 1:
-        raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
-    if points < 3:
-        raise ValueError(f"Argument `points` must be at least 3, but has value {points}.")
+    check_level(level)
+    as_whole("points", points, 3)
     check_profiled(fit)
     wanted = fit.names if names is None else (names,) if isinstance(names, str) else tuple(names)
     for name in wanted:
-        if name not in fit.names:
-            known = ", ".join(fit.names)
-            raise ValueError(f"Argument `names` must be among {known}, but has {name!r}.")
+        check_choice("names", name, fit.names)
     with progress_bar(progress) as show:
         scans = _Scans(fit, [fit.names.index(name) for name in wanted], level, show)
         scans.scan(points, FAR, whole=True)
@@ -193,9 +190,9 @@ class _Scans(ScaledFit):
             ends.append((float(squares[k]), with_entry(np.asarray(states.y[k]), i, y[i])))
             if not squares[k] >= self.solved[i].get(float(y[i]), (np.inf, y))[0]:
                 self.solved[i][float(y[i])] = ends[-1]
-        every = (end for solved in self.solved.values() for end in solved.values())
-        best = min(every, key=_squares)
-        if best[0] < self.least * (1 - SAME) - self.exact:
+        all_ends = (end for solved in self.solved.values() for end in solved.values())
+        best = min(all_ends, key=_squares)
+        if best[0] < self.least * (1 - SAME) - self.problem.exact_squares:
             self.least, self.lower = best
         return ends
 

@@ -1,6 +1,4 @@
-"""What a fit says: warnings that decide whether to trust it, a report as text and as JSON."""
-
-from typing import Any
+"""A fit as text: parameters with errors, quality, minima, warnings, shots and a verdict."""
 
 import numpy as np
 
@@ -10,13 +8,13 @@ from jimpact.fits.result import FitResult
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.status import STATUS
 
-_VELOCITIES_SHOWN = 24
+_VELOCITIES_SHOWN = 24  # in the table of shots
 _MINIMA_SHOWN = 5
-_PARAMETERS_TOLD = 6  # in one sentence
+_PARAMETERS_NAMED = 6  # in one sentence; of more, the least certain
 
 
 def report(fit: FitResult) -> str:
-    """Parameters with errors, quality, what stays unseen, minima, warnings, shots, the verdict."""
+    """The whole report: its blocks, an empty line between them."""
     return "\n\n".join("\n".join(block) for block in report_blocks(fit).values() if block)
 
 
@@ -26,7 +24,7 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
         "headline": [_headline(fit)],
         "parameters": _parameters(fit),
         "quality": _quality(fit),
-        "unseen": _section("What the data cannot see", fit.identifiability),
+        "undetermined": _section("What the data do not determine", fit.identifiability),
         "minima": _minima(fit),
         "scatter": _scatter(fit),
         "warnings": _section("Warnings", fit.warnings),
@@ -36,74 +34,79 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
 
 
 def verdict(fit: FitResult) -> str:
-    """One sentence: the values with their errors, what cannot be told, whether to believe it."""
-    law, data = type(fit.law).__name__, _these(fit)
+    """One sentence: the values with their errors, what is undetermined, whether to believe it."""
+    law, data = type(fit.law).__name__, _data_name(fit)
     if not fit.converged:
         return f"No answer: the search for the parameters of {law} has not converged."
-    known = [i for i in range(len(fit.names)) if _is_told(fit, i)]
-    unseen = [_called(fit, i) for i in range(len(fit.names)) if i not in known]
-    parts = [_told(fit, i) for i in known]
-    if len(known) > _PARAMETERS_TOLD:
-        relative = np.nan_to_num(fit.standard_error[known])
-        worst = known[int(np.argmax(relative))]
-        parts = [f"{len(known)} parameters are found, the least certain {_told(fit, worst)}"]
-    if unseen:
-        parts.append(f"{' and '.join(unseen)} cannot be told from {data}")
+    determined = [i for i in range(len(fit.names)) if _is_determined(fit, i)]
+    others = [_full_name(fit, i) for i in range(len(fit.names)) if i not in determined]
+    parts = [_with_error(fit, i) for i in determined]
+    if len(determined) > _PARAMETERS_NAMED:
+        worst = determined[int(np.argmax(np.nan_to_num(fit.standard_error[determined])))]
+        least_certain = _with_error(fit, worst)
+        parts = [f"{len(determined)} parameters are fitted, the least certain {least_certain}"]
+    if others:
+        parts.append(f"{' and '.join(others)} cannot be determined from {data}")
     if any("different minima fit equally well" in line for line in fit.warnings):
         parts.append("other values fit equally well")
-    told = "; ".join(parts)
-    scattering = shown_scatter(fit)
-    if scattering is not None and scattering.explains:
-        return f"{law} fits {data} if {scattering}"
-    if scattering is not None:
-        told += f"; {scattering.name} scatters by {scattering.value:.2g} from shot to shot"
-    nearest = f"it comes nearest with {told}" if known else told
+    sentence = "; ".join(parts)
+    scatter = shown_scatter(fit)
+    if scatter is not None and scatter.explains:
+        return f"{law} fits {data} if {scatter}"
+    if scatter is not None:
+        sentence += f"; {scatter.name} scatters by {scatter.value:.2g} from shot to shot"
+    nearest = f"it comes nearest with {sentence}" if determined else sentence
     if any(line.startswith("Lack of fit") for line in fit.warnings):
         return f"{law} does not fit {data}; {nearest}."
     if any(line.startswith("The fitted law fails") for line in fit.warnings):
         return f"{law} fails in some of these {'shots' if fit.experiments else 'data'}; {nearest}."
-    return f"{told}."
+    return f"{sentence}."
 
 
-def _is_told(fit: FitResult, i: int) -> bool:
+def _is_determined(fit: FitResult, i: int) -> bool:
+    """Whether the data say anything about a parameter."""
     anything = bool(fit.profiles) and fit.profiles[i].words == "anything"
     return not (np.isinf(fit.standard_error[i]) or anything)
 
 
-def _these(fit: FitResult) -> str:
+def _data_name(fit: FitResult) -> str:
+    """What was fitted, as in "these 4 shots"."""
     if fit.experiments is None:
         return "these data"
     return "this shot" if fit.shot_count == 1 else f"these {fit.shot_count} shots"
 
 
-def _called(fit: FitResult, i: int) -> str:
+def _full_name(fit: FitResult, i: int) -> str:
     """The name of a parameter; a stiffness is one over that of a contact which is held."""
     name = fit.names[i]
     held = any(note.startswith("stiffness[1] is held") for note in fit.problem.notes)
     return f"the stiffness ratio {name} / stiffness[1]" if "stiffness" in name and held else name
 
 
-def _told(fit: FitResult, i: int) -> str:
+def _with_error(fit: FitResult, i: int) -> str:
     """A parameter with its error, and the interval where that is one-sided or of several pieces."""
-    value, error, name = fit.value[i], fit.standard_error[i], _called(fit, i)
+    value, error, name = fit.value[i], fit.standard_error[i], _full_name(fit, i)
     if np.isnan(error):
         return f"{name} = {value:.5g}, its error unknown"
-    told = f"{value:g}" if fit.at_bound[i] else with_error(value, error)
+    text = f"{value:g}" if fit.at_bound[i] else with_error(value, error)
     if fit.profiles:
         words = fit.profiles[i].words
         if words.startswith("at ") or " or " in words:
-            return f"{name} = {told}, {words} ({100 * fit.profiles[i].level:g} %)"
-    return f"{name} = {told}{', the end of what is allowed' if fit.at_bound[i] else ''}"
+            return f"{name} = {text}, {words} ({100 * fit.profiles[i].level:g} %)"
+    return f"{name} = {text}{', the end of what is allowed' if fit.at_bound[i] else ''}"
 
 
 def _headline(fit: FitResult) -> str:
-    values, law = int(np.isfinite(fit.problem.measured).sum()), type(fit.law).__name__
+    """The law, how many values were measured, the method."""
+    measured, law = np.isfinite(fit.problem.measured), type(fit.law).__name__
+    values = int(measured.sum())
     if fit.experiments is None:
         return f"Fit of {law} to {values} measured values, {fit.method}"
     shots, bodies = fit.predicted.shape
+    count = f"{values}" if measured.all() else f"{values} of {measured.size}"
     return (
         f"Fit of {law} to {shots} shot{'s' * (shots > 1)} of {bodies} bodies "
-        f"({values} measured velocities), {fit.method}"
+        f"({count} velocities measured), {fit.method}"
     )
 
 
@@ -112,15 +115,20 @@ def parameter_rows(fit: FitResult) -> list[list[str]]:
     rows = []
     for i, pieces in enumerate(fit.intervals()):
         error = fit.standard_error[i]
-        word = "unseen" if np.isinf(error) else "unknown" if np.isnan(error) else f"{error:.3g}"
-        told = np.isfinite(error) or bool(fit.profiles)
-        interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i])) if told else "-"
+        if np.isinf(error):
+            error_text = "undetermined"
+        else:
+            error_text = "unknown" if np.isnan(error) else f"{error:.3g}"
+        interval = "-"
+        if np.isfinite(error) or fit.profiles:
+            interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
         note = "at its bound" if fit.at_bound[i] else ""
-        rows.append([fit.names[i], f"{fit.value[i]:.6g}", word, interval, note])
+        rows.append([fit.names[i], f"{fit.value[i]:.6g}", error_text, interval, note])
     return rows
 
 
 def _parameters(fit: FitResult) -> list[str]:
+    """The table of parameters."""
     width = max(9, *(len(name) for name in fit.names))
     head = ["parameter", "value", "std. error", "95 % interval" + " (profile)" * bool(fit.profiles)]
     lines = [
@@ -128,57 +136,66 @@ def _parameters(fit: FitResult) -> list[str]:
         for name, value, error, *rest in [head, *parameter_rows(fit)]
     ]
     if fit.linearization_misleads:
-        lines.append("A parabola at the minimum may mislead here: see `ji.profile(fit)`.")
+        lines.append(
+            "These intervals take the sum of squares for a parabola, which may mislead here: "
+            "`ji.profile(fit)` does not."
+        )
     return lines
 
 
 def _quality(fit: FitResult) -> list[str]:
+    """Residuals, noise, how many parameters the data determine, the solver."""
     unit, one = (" m/s", "velocity") if fit.experiments is not None else ("", "value")
     lines = [f"rms residual   {fit.rms:.4g}{unit}"]
     if fit.problem.sigma is not None:
         squares = f"{fit.starts[0].sum_of_squares:.4g} with {fit.degrees_of_freedom}"
         lines.append(f"chi^2          {squares} degrees of freedom (sigma given)")
-        lines += _said_of_sigma(fit.experiments)
+        lines += _sigma_sources(fit)
         if fit.noise > 1 and fit.loss == "squares":
             lines.append(
-                f"errors         stretched by {fit.noise:.3g}, the root of chi^2 over that"
+                f"errors         {fit.noise:.3g} times those of sigma, which chi^2 rejects"
             )
     elif np.isfinite(fit.noise):
         lines.append(
             f"noise          {fit.noise:.4g}{unit} a {one}, estimated with "
             f"{fit.degrees_of_freedom} degrees of freedom"
         )
-    lines.append(f"rank           {fit.rank} of {len(fit.names)} parameters")
+    lines.append(
+        f"determined     {fit.rank} of {len(fit.names)} parameters (rank of the derivatives)"
+    )
     state = "converged" if fit.converged else "NOT converged"
     return [*lines, f"solver         {state}, at most {fit.steps} steps a start"]
 
 
-def _said_of_sigma(data: Any) -> list[str]:
-    """What went into the stated errors."""
+def _sigma_sources(fit: FitResult) -> list[str]:
+    """What went into the stated errors beside sigma."""
+    data = fit.experiments
     if data is None:
         return []
     lines = []
     if data.resolution is not None:
         steps = np.unique(np.asarray(data.resolution)[data.measured])
-        told = f"{steps[0]:.3g}" if len(steps) == 1 else f"{steps[0]:.3g} to {steps[-1]:.3g}"
-        lines.append(f"               with that of readings in steps of {told}: step / sqrt(12)")
+        size = f"{steps[0]:.3g}" if len(steps) == 1 else f"{steps[0]:.3g} to {steps[-1]:.3g}"
+        lines.append(f"               with that of readings in steps of {size}: step / sqrt(12)")
     if data.sigma_pre is not None:
         lines.append("               with those of the velocities before, passed on by the law")
     return lines
 
 
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:
+    """A list below its title; nothing where it is empty."""
     return [title, *(f"  - {line}" for line in lines)] if lines else []
 
 
 def _scatter(fit: FitResult) -> list[str]:
-    found = shown_scatter(fit)
-    if found is None:
+    """The scatter of a parameter from shot to shot, where it explains the residuals."""
+    scatter = shown_scatter(fit)
+    if scatter is None:
         return []
-    lines = ["Scatter from shot to shot", f"  - {found}"]
+    lines = ["Scatter from shot to shot", f"  - {scatter}"]
     assert fit.experiments is not None
     speed = fit.experiments.approach_speed(fit.problem.scene)
-    chance = found.trend(np.log(np.where(speed > 0, speed, 1.0)))
+    chance = scatter.trend(np.log(np.where(speed > 0, speed, 1.0)))
     if chance < SURE:
         lines.append(
             f"  - It depends on the speed (chance without that {chance:.1g}): see "
@@ -188,48 +205,54 @@ def _scatter(fit: FitResult) -> list[str]:
 
 
 def _minima(fit: FitResult) -> list[str]:
-    total = fit.start_count
-    late = f"{fit.lost_starts} of {total} starts did not converge." if fit.lost_starts else ""
+    """Where the starts ended."""
+    total, lost = fit.start_count, fit.lost_starts
+    unfinished = f"{lost} of {total} starts did not converge." if lost else ""
     if len(fit.starts) == 1:
-        one = f"{total - fit.lost_starts} of {total} starts ended in this minimum. {late}"
+        one = f"{total - lost} of {total} starts ended in this minimum. {unfinished}"
         return [one.rstrip()] if total > 1 else []
-    what = "minima" if fit.rank == len(fit.names) else "end points in a valley"
-    lines = [f"{len(fit.starts)} {what} of {total} starts:  sum of squares, starts, values"]
-    for start in fit.starts[:_MINIMA_SHOWN]:
-        values = ", ".join(f"{name} {v:.4g}" for name, v in zip(fit.names, start.value))
-        lines.append(f"  {start.sum_of_squares:12.5g} {start.count:4d}   {values}")
+    where = f"{len(fit.starts)} minima"
+    if fit.rank < len(fit.names):
+        where = f"{len(fit.starts)} points of one valley"
+    lines = [f"{total} starts ended in {where}:  sum of squares, number of starts, values"]
+    for minimum in fit.starts[:_MINIMA_SHOWN]:
+        values = ", ".join(f"{name} {v:.4g}" for name, v in zip(fit.names, minimum.value))
+        lines.append(f"  {minimum.sum_of_squares:12.5g} {minimum.count:4d}   {values}")
     if len(fit.starts) > _MINIMA_SHOWN:
         lines.append(f"  ... and {len(fit.starts) - _MINIMA_SHOWN} more")
-    return [*lines, late] if late else lines
+    return [*lines, unfinished] if unfinished else lines
 
 
 def shot_rows(fit: FitResult, most: int | None = None) -> list[list[str]]:
-    """Label, number, before, measured, fitted, residual, unit, status; of so many shots."""
+    """Label, number, before, measured, fitted, residual, unit, status; of at most `most` shots."""
     data = fit.experiments
     assert data is not None
     before, measured = np.asarray(data.pre, float), np.asarray(data.post, float)
     rows = []
     for k, i in np.ndindex(*before[:most].shape):
-        seen = ["-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"]
+        value = "-" if np.isnan(measured[k, i]) else f"{measured[k, i]:.6g}"
         residual = "-" if np.isnan(fit.residual[k, i]) else f"{fit.residual[k, i]:.3g}"
-        values = [f"{before[k, i]:.6g}", *seen, f"{fit.predicted[k, i]:.6g}", residual]
-        told = "" if fit.status[k] == 0 or i else STATUS[int(fit.status[k])].name
-        rows.append([data.shots[k] if i == 0 else "", str(i + 1), *values, data.units[i], told])
+        label = data.shots[k] if i == 0 else ""
+        status = STATUS[int(fit.status[k])].name if fit.status[k] and i == 0 else ""
+        velocities = [f"{before[k, i]:.6g}", value, f"{fit.predicted[k, i]:.6g}", residual]
+        rows.append([label, str(i + 1), *velocities, data.units[i], status])
     return rows
 
 
 def _shots(fit: FitResult) -> list[str]:
+    """The table of the first shots."""
     data = fit.experiments
     if data is None:
         return []
     mixed = len(set(data.units)) > 1
-    unit = "" if mixed else f" [{data.units[0]}]"
-    lines = [f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}{unit}"]
+    common_unit = "" if mixed else f" [{data.units[0]}]"
+    head = f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
+    lines = [head + common_unit]
     shots, bodies = data.pre.shape
-    shown = max(1, _VELOCITIES_SHOWN // bodies)
-    for label, body, before, seen, fitted, _, own, told in shot_rows(fit, shown):
-        row = f"{label:>8s} {body:>5s} {before:>12s} {seen:>12s} {fitted:>12s}"
-        lines.append(f"{row}{' ' + own if mixed else ''}{'   ' + told if told else ''}")
-    if shots > shown:
-        lines.append(f"     ... and {shots - shown} more shots")
+    rows_shown = max(1, _VELOCITIES_SHOWN // bodies)
+    for label, body, before, value, fitted, _, unit, status in shot_rows(fit, rows_shown):
+        row = f"{label:>8s} {body:>5s} {before:>12s} {value:>12s} {fitted:>12s}"
+        lines.append(f"{row}{' ' + unit if mixed else ''}{'   ' + status if status else ''}")
+    if shots > rows_shown:
+        lines.append(f"     ... and {shots - rows_shown} more shots")
     return lines

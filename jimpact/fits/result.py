@@ -8,7 +8,7 @@ from scipy.special import ndtri, stdtrit
 
 from jimpact._checks import check_kind
 from jimpact.fits.experiments import Experiments
-from jimpact.fits.intervals import Profile, joined
+from jimpact.fits.intervals import Profile, check_level, joined
 from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.parameters import AnyLaw
 from jimpact.fits.problem import FitProblem
@@ -138,8 +138,7 @@ class FitResult(Generic[AnyLaw]):
 
     def quantile(self, level: float) -> float:
         """Half-width of an interval of this `level` in standard errors."""
-        if not 0 < level < 1:
-            raise ValueError(f"Argument `level` must lie in (0, 1), but has value {level}.")
+        check_level(level)
         freedom, tail = self.degrees_of_freedom, 0.5 + 0.5 * level
         noise_is_known = self.problem.sigma is not None or freedom < 1
         return float(ndtri(tail) if noise_is_known else stdtrit(freedom, tail))

@@ -7,7 +7,7 @@ import numpy as np
 
 from jimpact._checks import check_kind
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import EXACT, START_SCALES, run_held
+from jimpact.fits.multistart import START_SCALES, run_held
 from jimpact.fits.problem import filled_up, from_scaled, to_scaled
 from jimpact.fits.result import FitResult
 from jimpact.progress import Show
@@ -21,11 +21,10 @@ class ScaledFit:
         self.residuals = filled_up(fit.problem.residuals)
         r, self.scale, self.log = self.residuals, fit.problem.scale, fit.problem.log
         self.low, self.high = np.asarray(r.low, float), np.asarray(r.high, float)
-        self.size = float(r.size)
-        self.exact = EXACT[str(r.offset.dtype)] * self.size**2
+        self.size = self.problem.size
         # of the weighted residuals; where nothing determines it, what is exact up to rounding
         known = np.isfinite(fit.noise) and fit.noise > 0
-        self.variance = float(fit.noise**2) if known else self.exact
+        self.variance = float(fit.noise**2) if known else self.problem.exact_squares
         self.least = fit.starts[0].sum_of_squares
         self.best = self.problem.point(fit.value)
 

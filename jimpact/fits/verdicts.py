@@ -5,8 +5,8 @@ import numpy as np
 from jimpact.fits.adequacy import adequacy
 from jimpact.fits.defects import data_defects
 from jimpact.fits.matrix_fit import boundary, encloses
-from jimpact.fits.multistart import EXACT, Solution
-from jimpact.fits.problem import FitProblem
+from jimpact.fits.multistart import Solution
+from jimpact.fits.problem import EXACT, FitProblem
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.status import STATUS
@@ -25,6 +25,11 @@ def fit_warnings(
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
         lines += data_defects(data, problem.scene, stored)
+        if data.lost_freedom and data.sigma_pre is not None:
+            lines.append(
+                "The momentum was corrected as if `sigma_pre` were 0, and the fit weighs the shots "
+                "as if they were not corrected: chi^2 and standard errors are approximate."
+            )
     if not solution.converged:
         lines.append(
             "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
@@ -55,7 +60,7 @@ def fit_warnings(
         lines.append(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
-    if problem.residuals.offset.dtype == np.float32:
+    if problem.precision == "float32":
         lines.append(
             "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
             'jax.config.update("jax_enable_x64", True) gives float64.'
@@ -64,6 +69,7 @@ def fit_warnings(
 
 
 def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
+    """Which shots the fitted law fails in."""
     lines = []
     for code in np.unique(status):
         if STATUS[code].failure:
@@ -107,7 +113,7 @@ def _matrix(problem: FitProblem, solution: Solution, contacts: int) -> list[str]
 
 
 def _equally_good(problem: FitProblem, solution: Solution, errors: Uncertainty) -> int:
-    size, dtype = float(problem.residuals.size), str(problem.residuals.offset.dtype)
-    noise = errors.noise / size if np.isfinite(errors.noise) else 0.0
-    more = max(EQUALLY_GOOD * noise**2, EXACT[dtype])
+    """How many minima fit as well as the best."""
+    noise = errors.noise / problem.size if np.isfinite(errors.noise) else 0.0
+    more = max(EQUALLY_GOOD * noise**2, EXACT[problem.precision])
     return sum(end.squares <= solution.minima[0].squares + more for end in solution.minima)

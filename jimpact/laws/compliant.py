@@ -67,9 +67,18 @@ class Compliant(Law):
                 "Argument `force` must be a contact force such as Hertz(k), "
                 f"but has value {self.force!r}."
             )
-
-        if not isinstance(self.force, Bistiffness):  # their energy is no function of x alone
+        if self.force.bistiffness is None:  # the energy of others is not a function of x alone
             check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
+
+    @property
+    def contact_force(self) -> Force:
+        """The force."""
+        return self.force
+
+    @property
+    def has_history(self) -> bool:  # type: ignore[override]
+        """Not with a viscous force."""
+        return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """A tolerance that the precision can hold."""
@@ -78,8 +87,9 @@ class Compliant(Law):
     def dynamics(self, contact: Contact) -> Dynamics:
         """The dynamics of the contact's whole encounter in units of their own."""
         gamma, force, viscous = contact.gap_velocity, self.force, None
-        if isinstance(force, Bistiffness):
-            k, e, exponent = force.stiffness, force.restitution, force.exponent
+        bistiffness = force.bistiffness
+        if bistiffness is not None:
+            k, e, exponent = bistiffness.stiffness, bistiffness.restitution, bistiffness.exponent
         else:  # in units of a spring that stores the impact's energy at the force's indentation
             q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus)))
             k = (q / force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))) ** 2
@@ -94,18 +104,18 @@ class Compliant(Law):
             self.rtol or default_rtol("time", gamma.dtype),
             contact.gaps,
         )
-        if not isinstance(force, Bistiffness):
+        if bistiffness is None:
             speed = units.velocity * units.root
             viscous = Viscous(force, units.indentation, speed, units.momentum / units.time)
         problem = problem._replace(viscous=viscous)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, exponent, contact.chain)
+        return Dynamics(problem, units, exponent, contact.chain, self.max_steps)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
         checked = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.max_steps, condition_check=checked))
+        return Impulses(*solve(self.dynamics(contact), condition_check=checked))
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

@@ -17,12 +17,17 @@ from jimpact.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, para
 
 _SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
 _BISECTIONS = 50  # of them, to about 1e-13 decades
+# |zeta - 1| below which e of damped and overdamped springs is one series; its error is the square.
+_CRITICAL = 1e-4
 
 
 class Force(Declared):
     """A contact force; `force` and, where it may slacken, `onset` (of the same sign, smooth).
 
-    A force of your own with declared parameters inherits it; `UserForce` takes a function.
+    A force of your own with declared parameters inherits it; `UserForce` takes a function. What
+    else it can do it declares: `slackens`, the force may end before the indentation does;
+    `bistiffness`, for forces that are one; `damping_scale` and a parameter `damping`, for
+    `calibrate`; `pair_restitution`, where it is known in closed form.
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
@@ -44,6 +49,19 @@ class Force(Declared):
     def onset(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """Sign of the force at x > 0 and rate x'."""
         return self.force(x, rate)
+
+    @property
+    def bistiffness(self) -> "Bistiffness | None":
+        """The same force as a `Bistiffness`, which stores energy and has a history; else None."""
+        return None
+
+    def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
+        """A strong `damping` of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: no such."""
+        return None
+
+    def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
+        """e of a pair of reduced `mass` [kg] at a `speed` [m/s]; None: to be integrated."""
+        return None
 
     def indentation_scale(self, energy: jax.Array) -> jax.Array:
         """Indentation (m,) [m] at which about `energy` (m,) [J] is stored: x F(x, 0) = 2 energy."""
@@ -88,6 +106,16 @@ class Bistiffness(Force):
         low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
     )
     restitution: Values = parameter(low=0.0, high=1.0, default=1.0)
+
+    @property
+    def bistiffness(self) -> "Bistiffness":
+        """Itself."""
+        return self
+
+    def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
+        """e, whatever the mass and the speed."""
+        shape = jnp.broadcast_shapes(mass.shape, speed.shape, self.restitution.shape)
+        return jnp.broadcast_to(self.restitution, shape)
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """Loading branch."""
@@ -175,6 +203,15 @@ class KelvinVoigt(Force):
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
     damping: Values = parameter(low=0.0)
 
+    def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
+        """Critical damping [N s/m]."""
+        return 2 * jnp.sqrt(self.stiffness * mass)
+
+    def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
+        """e of the damped spring, at every speed."""
+        zeta = self.damping / (2 * jnp.sqrt(self.stiffness * mass))
+        return _damped_spring(zeta) + jnp.zeros_like(speed)
+
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x + c x'`."""
         return self.stiffness * x + self.damping * rate
@@ -201,6 +238,10 @@ class HuntCrossley(Force):
     exponent: StaticOrValues = parameter(
         low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
     )
+
+    def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
+        """`1 / v` [s/m]."""
+        return 1 / speed
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k x^eta (1 + d x')`."""
@@ -229,6 +270,10 @@ class KuwabaraKono(Force):
 
     stiffness: Values = parameter(low=0.0, open_low=True, log=True)
     damping: Values = parameter(low=0.0)
+
+    def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
+        """About the time of an impact, `(m^2 / (k^2 v))^(1/5)` [s]."""
+        return (mass**2 / (self.stiffness**2 * speed)) ** 0.2
 
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`k sqrt(x) (x + 1.5 A x')`."""
@@ -269,3 +314,18 @@ class UserForce(Force):
     def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
         """`function(x, rate, parameters)`."""
         return self.function(x, rate, self.parameters)
+
+
+def _damped_spring(zeta: jax.Array) -> jax.Array:
+    """e of `k x + c x'`, cut where it would pull: Schwager and Poeschel (2007), (17)-(19)."""
+    near = jnp.abs(zeta - 1) < _CRITICAL
+    away = jnp.where(near, 0.5, zeta)  # any harmless value
+    under = away < 1
+    z = jnp.where(under, away, 0.5)
+    w = jnp.sqrt(1 - z**2)
+    swinging = -z / w * (jnp.pi - jnp.arctan2(2 * z * w, 1 - 2 * z**2))
+    z = jnp.where(under, 2.0, away)
+    w = jnp.sqrt(z**2 - 1)
+    creeping = -2 * z / w * jnp.log(z + w)  # (z + w)(z - w) = 1
+    series = -2 - 4 / 3 * (zeta - 1)
+    return jnp.exp(jnp.where(near, series, jnp.where(under, swinging, creeping)))

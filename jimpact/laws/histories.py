@@ -13,9 +13,6 @@ from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImpulseProgram
 from jimpact.events.impact_history import Samples
 from jimpact.law import Law, check_law
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness
-from jimpact.laws.lzb import LZB
 from jimpact.scene import Scene, as_velocity, velocity_change
 
 
@@ -44,15 +41,16 @@ class History(eqx.Module):
 
 
 def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> History:
-    """Sample the impact of an `LZB` or `Compliant` law at equal intervals of impact time.
+    """Sample the impact of a law that has a history at equal intervals of impact time.
 
     Equation: `gamma' = W F`, `p' = F`, `F_j = k_j x_j^eta_j`; between the steps of the
-    integrator a sample is one more step of the same method. (With friction in space intervals are
-    equal only nearly: `time` tells.)
+    integrator a sample is one more step of the same method. (With friction in space the intervals
+    are only nearly equal: see `time`.)
 
     Args:
         law: an `LZB` with method 'time', or a `Compliant` with a power law or a `Bistiffness`
-            (gaps included: `indentation` is 0 while a contact is open); stiffness in SI units
+            (gaps included: `indentation` is 0 while a contact is open), a `VelocityDependent` of
+            these, or a law of your own with `has_history` and `dynamics`; a stiffness in SI units
             makes time and force SI.
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
@@ -71,56 +69,55 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     >>> round(float(h.duration), 3), round(float(h.maximum_force[0]), 3)  # pi/sqrt(k), sqrt(k)
     (2.221, 1.414)
     """
-    compliant = isinstance(law, Compliant) and isinstance(law.force, Bistiffness)
-    if not compliant and not (isinstance(law, LZB) and law.method == "time"):
+    if not law.has_history:
         raise TypeError(
-            "Argument `law` must be an LZB law with method='time' or a Compliant law with a "
-            "Bistiffness force (others have no impact dynamics that are sampled), "
-            f"but is {law!r}."
+            "Argument `law` must have a history (`has_history`: LZB with method='time', Compliant "
+            f"with a Bistiffness force, a law of your own with `dynamics`), but is {law!r}."
         )
     as_whole("samples", samples, 2)
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
-    return _history(law, scene, v, samples)  # type: ignore[arg-type]
+    return _history(law, scene, v, samples)
 
 
 @quick_jit
-def _history(law: LZB | Compliant, scene: Scene, v: jax.Array, samples: int) -> History:
+def _history(law: Law, scene: Scene, v: jax.Array, samples: int) -> History:
+    """The samples of the dimensionless flow, in SI units."""
     contact = law.contact(scene, v)
     happens, gamma = contact.happens, contact.gap_velocity
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
-    given = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
-    leaves, tree = given.columns()
-    outcome = ImpulseProgram(
-        tree, given.static_exponent, given.chain, law.max_steps, given.tangents, whole=True
+    dynamics = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
+    leaves, tree = dynamics.columns()
+    t, units = dynamics.tangents, dynamics.units
+    program = ImpulseProgram(
+        tree, dynamics.static_exponent, dynamics.chain, dynamics.max_steps, t, whole=True
     )
-    time, energy, *rest = in_columns(Samples(outcome, samples), *leaves)
+    time, energy, *rest = in_columns(Samples(program, samples), *leaves)
     *rows, maximum, code = (x[..., 0] for x in rest)
-    seen, units = ContactStates(*rows), given.units
-    force, side = units.momentum / units.time, jnp.repeat(units.root, given.tangents // len(gamma))
+    states = ContactStates(*rows)
+    force, root = units.momentum / units.time, jnp.repeat(units.root, t // len(gamma))
 
     def live(x: jax.Array, before: Any = 0.0) -> jax.Array:
-        """Nothing happens: as before."""
+        """Sampled values; where nothing happens those before the impact."""
         return jnp.where(happens, x, before)
 
-    impulse = live(seen.impulse * units.momentum[None])
-    tangential = live(seen.tangential_impulse * (units.velocity / side)[None])
-    change = jax.vmap(lambda p, q: velocity_change(scene, p, q if given.tangents else None))
-    none = jnp.zeros(0, v.dtype)
-    before = none if contact.slip is None or not given.tangents else contact.slip
+    impulse = live(states.impulse * units.momentum[None])
+    tangential = live(states.tangential_impulse * (units.velocity / root)[None])
+    change = jax.vmap(lambda p, q: velocity_change(scene, p, q if t else None))
+    slip = jnp.zeros(0, v.dtype) if contact.slip is None or not t else contact.slip
     return History(
         time=live(time[:, 0, 0] * units.time),
-        force=live(seen.force * force[None]),
-        indentation=live(seen.indentation * units.indentation[None]),
+        force=live(states.force * force[None]),
+        indentation=live(states.indentation * units.indentation[None]),
         energy=live(0.5 * units.velocity**2 * energy[..., 0]),
         impulse=impulse,
-        gap_velocity=live(seen.gap_velocity * (units.velocity * units.root)[None], gamma[None]),
+        gap_velocity=live(states.gap_velocity * (units.velocity * units.root)[None], gamma[None]),
         velocity=v[None] + change(impulse, tangential),
-        tangential_force=live(seen.tangential_force * (units.velocity / side / units.time)[None]),
+        tangential_force=live(states.tangential_force * (units.velocity / root / units.time)[None]),
         tangential_impulse=tangential,
-        slip=live(seen.slip * (units.velocity * side)[None], before[None]),
+        slip=live(states.slip * (units.velocity * root)[None], slip[None]),
         duration=live(time[-1, 0, 0] * units.time),
         maximum_force=live(maximum * force),
         status=live(code[0]).astype(jnp.int32),

@@ -11,12 +11,12 @@ from jimpact._checks import check_shape, is_traced
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields, frictional_impulses
+from jimpact.quasi_space import check_independent, quasi_basis
 from jimpact.scene import Scene, momentum
+from jimpact.solvers.dense import solve_symmetric
 from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.linear import solve_symmetric
 from jimpact.solvers.tridiagonal import as_matrix, diagonal, is_regular
 from jimpact.status import CODE
-from jimpact.theory.quasi_velocities import check_independent, quasi_basis
 
 
 class Kinematic(Law):

@@ -4,6 +4,7 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
@@ -18,6 +19,7 @@ from jimpact.law import (
     option,
     parameter,
 )
+from jimpact.laws.forces import Bistiffness
 from jimpact.scene import Scene
 
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
@@ -149,9 +151,24 @@ class LZB(Law):
         check_rtol(self.rtol, dtype)
 
     @property
-    def pads_scenes(self) -> bool:
+    def pads_scenes(self) -> bool:  # type: ignore[override]
         """Without friction, by the stepper."""
         return self.method == "time" and self.friction is None
+
+    @property
+    def has_history(self) -> bool:  # type: ignore[override]
+        """By the stepper."""
+        return self.method == "time"
+
+    @property
+    def only_stiffness_ratios(self) -> bool:  # type: ignore[override]
+        """With equal exponents."""
+        return len(np.unique(np.asarray(self.exponent, float))) == 1
+
+    @property
+    def contact_force(self) -> Bistiffness:
+        """That of its contacts; in SI units where the stiffness is."""
+        return Bistiffness(self.stiffness, self.exponent, self.restitution)
 
     def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
         """The dynamics of a contact in units of their own; `rtol` in place of the law's."""
@@ -169,9 +186,9 @@ class LZB(Law):
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, self.exponent, contact.chain)
+        return Dynamics(problem, units, self.exponent, contact.chain, self.max_steps)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
         checked = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.max_steps, self.method, checked))
+        return Impulses(*solve(self.dynamics(contact), self.method, checked))

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.friction import friction_fields
+from jimpact.solvers.dense import null_projector
 from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.linear import null_projector
 from jimpact.solvers.tridiagonal import as_matrix, is_regular
 from jimpact.status import CODE
 

@@ -8,23 +8,25 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_kind
 from jimpact.contact import Contact
+from jimpact.events.impact_dynamics import Dynamics
 from jimpact.law import (
     Impulses,
     Law,
     OptionalValues,
     Values,
+    forwards_to_law,
     free_parameters_of,
     parameter,
     with_parameter,
 )
 from jimpact.registry import REGISTRY
-from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import as_matrix, diagonal
 
 # |cos(kinetic angle)| below so many roundings is 0: contacts then do not feel each other
 DECOUPLED_IN_EPS = 64
 
 
+@forwards_to_law
 class VelocityDependent(Law):
     """A law whose restitution falls with the speed of the approach, and is 1 below the yield speed.
 
@@ -73,42 +75,9 @@ class VelocityDependent(Law):
             )
 
     @property
-    def uses_gaps(self) -> bool:  # type: ignore[override]
-        """As the law."""
-        return self.law.uses_gaps
-
-    @property
-    def pulls(self) -> bool:  # type: ignore[override]
-        """As the law."""
-        return self.law.pulls
-
-    @property
-    def separable(self) -> bool:  # type: ignore[override]
-        """As the law."""
-        return self.law.separable
-
-    @property
-    def pads_scenes(self) -> bool:
-        """As the law."""
-        return self.law.pads_scenes
-
-    @property
-    def stored(self) -> jax.Array:
-        """As the law."""
-        return self.law.stored
-
-    @property
     def friction(self) -> jax.Array | None:
-        """As the law."""
+        """Coulomb's mu of the law; None: no friction."""
         return getattr(self.law, "friction", None)
-
-    def contact(self, scene: Scene, velocity: jax.Array) -> Contact:
-        """As the law."""
-        return self.law.contact(scene, velocity)
-
-    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """As the law."""
-        self.law.check(scene, dtype)
 
     def restitution_at(self, speed: Any) -> jax.Array:
         """e at a `speed` of approach [m/s], of its shape; an entry each contact where e is (m,)."""
@@ -136,12 +105,17 @@ class VelocityDependent(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Those of the law with e at this speed."""
-        e = self._at(approach_speed(contact))
-        return self.law_with(e).impulses(contact)
+        return self._law_at(contact).impulses(contact)
 
-    def law_with(self, restitution: jax.Array) -> Law:
-        """The law with this restitution e (m,)."""
-        return with_parameter(self.law, "restitution", restitution)
+    def dynamics(self, contact: Contact) -> Dynamics:
+        """Those of the law with e at this speed."""
+        return self._law_at(contact).dynamics(contact)
+
+    def _law_at(self, contact: Contact) -> Law:
+        """The law with e (m,) at the speed of approach."""
+        restitution = self._at(approach_speed(contact))
+        law: Law = with_parameter(self.law, "restitution", restitution)
+        return law
 
 
 def approach_speed(contact: Contact) -> jax.Array:

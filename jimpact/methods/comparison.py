@@ -1,5 +1,6 @@
 """Every law on one scene, side by side."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -19,7 +20,8 @@ from jimpact.registry import registered_laws
 from jimpact.scene import Scene, as_velocity, kinetic_energy, momentum
 from jimpact.status import STATUS
 
-_REPEATS = 20  # of the timing; its median is told
+_REPEATS = 20  # of the timing, whose median is reported
+AS_CLOSE = 1.01  # distances from the measured velocities up to this ratio count as equal
 
 
 def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:
@@ -94,7 +96,9 @@ class Entry:
     def verdict(self) -> str:
         """'ok', or what is violated, and a status that is not ok."""
         broken = [f"{name} violated" for name in self.audit.broken]
-        return ", ".join(broken + [self.status] * (self.status != "ok")) or "ok"
+        if self.status != "ok":
+            broken.append(self.status)
+        return ", ".join(broken) or "ok"
 
     def to_dict(self) -> dict[str, Any]:
         """The row, as a JSON file can hold it."""
@@ -105,14 +109,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found; `print` gives a table.
+    """The result of `compare`; `print` gives a table.
 
     Attributes:
         scene: as asked for.
         velocity: v- (n,) [m/s].
         entries: outcome, audit, energy ratio, dispersion and time by law.
         left_out: why a law is missing.
-        measured: v+ (n,) [m/s] beside which the laws are put, or None.
+        measured: v+ (n,) [m/s] to compare with, or None.
     """
 
     scene: Scene
@@ -121,11 +125,29 @@ class Comparison:
     left_out: dict[str, str] = field(default_factory=dict)
     measured: np.ndarray | None = None
 
+    @property
+    def distances(self) -> dict[str, float]:
+        """Root mean square difference [m/s] of each law's v+ from the measured one, if any."""
+        if self.measured is None:
+            return {}
+        after = {name: entry.outcome.velocity for name, entry in self.entries.items()}
+        return {
+            name: float(np.sqrt(np.nanmean((np.asarray(v) - self.measured) ** 2)))
+            for name, v in after.items()
+        }
+
+    @property
+    def closest(self) -> tuple[str, ...]:
+        """The law closest to the measured velocities, and those that are as close to 1 %."""
+        least = min(self.distances.values(), default=math.nan)
+        return tuple(name for name, x in self.distances.items() if x <= AS_CLOSE * least)
+
     def to_dict(self) -> dict[str, Any]:
         """The laws' rows, as a JSON file can hold them."""
         return as_data(self.entries)
 
     def __str__(self) -> str:
+        """A row for each law, and the measured velocities."""
         bodies = [f"v{i + 1}+" for i in range(self.scene.size)]
         heads = ["law", *bodies, "T+/T-", "dispersion", "us", "audit"]
         rows = [
@@ -135,12 +157,18 @@ class Comparison:
         if self.measured is not None:
             rows.append(["measured", *self._cells(self.measured), "", ""])
         lines = table(heads, rows, left=["audit"])
+        if self.closest:
+            rms = self.distances[self.closest[0]]
+            named = ", ".join(self.closest)
+            lines.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
         lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         quiet = nothing_approaches(self.scene, self.velocity)
-        return "\n".join(lines + ([] if quiet is None else [f"no impact: {quiet}"]))
+        if quiet is not None:
+            lines.append(f"no impact: {quiet}")
+        return "\n".join(lines)
 
     def _cells(self, after: Any) -> list[str]:
-        """Velocities [m/s], energy ratio and dispersion, as far as they are known."""
+        """Velocities [m/s], energy ratio and dispersion; nothing for NaN."""
         ratio = energy_ratio(self.scene, self.velocity, after)
         spread = dispersion_index(self.scene, after)
         v = [number(x, ".5f") for x in np.asarray(after)]
@@ -157,8 +185,8 @@ def compare(
         velocity: v- (n,) [m/s].
         laws: by name; default: every law of the registry, with these
         values: parameters by name, `restitution=0.9, stiffness=..., exponent=..., matrix=...`
-            (laws that need others are left out, see `left_out`); restitution is 1 where nothing
-            is said.
+            (laws that need others are left out, see `left_out`); restitution is 1 unless
+            it is among them.
 
     Returns:
         `Comparison`: an entry for each law, `print` gives a table, `ji.plot.comparison` a picture.

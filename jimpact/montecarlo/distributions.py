@@ -23,8 +23,9 @@ class Distribution(eqx.Module):
     """Independent entries, each with its own parameters, or the same for all."""
 
     def __repr__(self) -> str:
-        given = ", ".join(f"{name}={_short(value)}" for name, value in vars(self).items())
-        return f"{type(self).__name__}({given})"
+        """The distribution as one writes it."""
+        words = ", ".join(f"{name}={_short(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({words})"
 
     @abc.abstractmethod
     def sample(self, key: jax.Array, size: int, dtype: Any, non_negative: bool) -> jax.Array:
@@ -59,6 +60,7 @@ class Uniform(Distribution):
     high: jax.Array
 
     def __init__(self, low: Any, high: Any):
+        """Check both ends."""
         self.low, self.high = as_float_array("low", low), as_float_array("high", high)
         check_values("low", self.low)
         check_values("high", self.high)
@@ -101,6 +103,7 @@ class Normal(Distribution):
     std: jax.Array
 
     def __init__(self, mean: Any, std: Any):
+        """Check both parameters."""
         self.mean, self.std = as_float_array("mean", mean), as_float_array("std", std)
         check_values("mean", self.mean)
         check_values("std", self.std, low=0.0, open_low=True)
@@ -129,6 +132,7 @@ class Rows(eqx.Module):
     values: Any
 
     def __repr__(self) -> str:
+        """How many rows they are."""
         return f"{len(self.values)} given rows"
 
 
@@ -144,7 +148,7 @@ class RandomLaw(eqx.Module):
         ValueError: no such field, or a distribution that leaves its domain (as a Normal does
             where the domain is bounded; a function `key -> Law` may do anything).
 
-    >>> import jax, jimpact as ji
+    >>> import jax
     >>> import jimpact as ji
     >>> drawn = ji.RandomLaw(ji.Newton(0.5), restitution=ji.Uniform(0.8, 0.9))(jax.random.key(0))
     >>> 0.8 <= float(drawn.restitution) <= 0.9
@@ -155,6 +159,7 @@ class RandomLaw(eqx.Module):
     parameters: dict[str, Distribution]
 
     def __init__(self, law: Law, **parameters: Distribution):
+        """Check that the law has such parameters, and that they stay in their domains."""
         known = free_parameters_of(law)
         for name, distribution in parameters.items():
             if name not in known:
@@ -171,8 +176,9 @@ class RandomLaw(eqx.Module):
         self.law, self.parameters = law, parameters
 
     def __repr__(self) -> str:
-        given = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
-        return f"{type(self.law).__name__}({given})"
+        """The law's name with its random parameters."""
+        words = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"{type(self.law).__name__}({words})"
 
     def __call__(self, key: jax.Array) -> Law:
         """The law of this key."""
@@ -212,6 +218,7 @@ def as_source(name: str, value: Any, size: int, non_negative: bool) -> Source:
 
 
 def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
+    """Raise where a distribution can leave the domain of the parameter."""
     low, high = domain.bounds
     least, most = (drawn.low, drawn.high) if isinstance(drawn, Uniform) else (-np.inf, np.inf)
     if np.min(least) < low or np.max(most) > high:
@@ -221,5 +228,6 @@ def _check_domain(name: str, drawn: Distribution, domain: Domain) -> None:
 
 
 def _short(value: jax.Array) -> str:
+    """A number, or a list of numbers."""
     entries = [f"{x:g}" for x in np.ravel(np.asarray(value))]
     return entries[0] if np.ndim(value) == 0 else f"[{', '.join(entries)}]"

@@ -15,17 +15,19 @@ from typing import Any, Protocol, runtime_checkable
 
 import jax
 
-from jimpact.montecarlo.planning import Plan
+from jimpact.montecarlo.planning import SamplingPlan
 from jimpact.montecarlo.statistics import Chunk, Task
 
-AHEAD = 3  # chunks enqueued for each thread of the cluster
+# Chunks enqueued for each thread of a cluster: with one, threads wait for the network; ten times
+# more costs memory.
+AHEAD = 3
 
 
 @runtime_checkable
 class Executor(Protocol):
     """Computes chunks; pulls tasks only as fast as it works, so that memory stays bounded."""
 
-    def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
+    def run(self, plan: SamplingPlan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """`plan(task)` for every task, in any order."""
         ...
 
@@ -46,7 +48,7 @@ def as_executor(value: Any) -> Executor:
 class Serial:
     """The default: the device computes the next chunk while the host reduces the last one."""
 
-    def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
+    def run(self, plan: SamplingPlan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """Chunks in order."""
         end: list[Any] = [None]
         under_way = itertools.chain(map(plan.start, tasks), end)
@@ -64,7 +66,7 @@ class Devices:
 
     devices: Sequence[jax.Device] | None = None
 
-    def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
+    def run(self, plan: SamplingPlan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """Chunks in order."""
         devices = list(self.devices or jax.devices())
         free: queue.SimpleQueue[jax.Device] = queue.SimpleQueue()
@@ -72,6 +74,7 @@ class Devices:
             free.put(device)
 
         def compute(task: Task) -> Chunk:
+            """One chunk on a device that is free."""
             device = free.get()
             try:
                 return plan(task, device)
@@ -106,7 +109,7 @@ class DaskExecutor:
 
     client: Any = None
 
-    def run(self, plan: Plan, tasks: Iterator[Task]) -> Iterator[Chunk]:
+    def run(self, plan: SamplingPlan, tasks: Iterator[Task]) -> Iterator[Chunk]:
         """Chunks as they are completed."""
         try:
             import cloudpickle  # type: ignore[import-untyped]
@@ -116,12 +119,11 @@ class DaskExecutor:
                 "The executor 'dask' needs the extra `distributed`: "
                 "pip install 'jimpact[distributed]'"
             ) from None
-        own = self.client is None or isinstance(self.client, str)
         client = self.client
-        if self.client is None:
+        if client is None:
             client = Client(threads_per_worker=1, dashboard_address=None)
-        elif own:
-            client = Client(self.client)
+        elif isinstance(client, str):
+            client = Client(client)
         try:
             shipped = cloudpickle.dumps(plan)
             window = AHEAD * max(1, sum(client.nthreads().values()))
@@ -133,16 +135,17 @@ class DaskExecutor:
             for future in running:
                 yield future.result()
         finally:
-            if own:
+            if client is not self.client:
                 client.close()  # and with it the cluster that it started
 
 
 def _compute(shipped: bytes, x64: bool, task: Task) -> Chunk:
+    """One chunk, on a worker."""
     return _plan(shipped, x64)(task)
 
 
 @functools.lru_cache(maxsize=4)
-def _plan(shipped: bytes, x64: bool) -> Plan:
+def _plan(shipped: bytes, x64: bool) -> SamplingPlan:
     """The same object for the same bytes, so that a worker compiles a run only once."""
     with jax.enable_x64(x64):  # else a worker would read float64 arrays as float32
         return pickle.loads(shipped)

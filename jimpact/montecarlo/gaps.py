@@ -13,17 +13,17 @@ from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.impacts import impact
 from jimpact.law import Law, check_law
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness
-from jimpact.laws.lzb import LZB
+from jimpact.montecarlo.planning import DELTA_C
 from jimpact.montecarlo.results import MonteCarlo
 from jimpact.scene import Scene, as_velocity, gap_velocity, with_gaps
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import STATUS
 
-NEARLY_TOUCHING, WIDE = 0.1, 2.0  # gaps below and above so many delta_c are told in these words
+# Gaps over delta_c that are described as touching (below) and as wide (above): the crossover
+# between the two is about 2 delta_c wide.
+NEARLY_TOUCHING, WIDE = 0.1, 2.0
 
-# Linearized and sampled standard deviations that differ by more than this are reported.
+# Linearized over sampled standard deviation, less 1, up to which the outcome is called linear.
 AGREES = 0.2
 CONSTANT = 1e-12  # a standard deviation below this, relative to the velocities, is rounding
 
@@ -40,15 +40,16 @@ class GapScale(eqx.Module):
         return self.gaps / self.delta
 
     def __str__(self) -> str:
+        """A line for each gap, and what delta_c is."""
         if is_traced(self.delta):
             return repr(self)
-        return "\n".join(
-            f"gap {j + 1} is {_in_words(gap, delta)}"
-            for j, (gap, delta) in enumerate(zip(np.asarray(self.gaps), np.asarray(self.delta)))
-        )
+        rows = enumerate(zip(np.asarray(self.gaps), np.asarray(self.delta)))
+        lines = [f"gap {j + 1} is {_in_words(gap, delta)}" for j, (gap, delta) in rows]
+        return "\n".join([*lines, DELTA_C])
 
 
 def _in_words(gap: float, delta: float) -> str:
+    """A gap in units of delta_c, and what that means."""
     if delta == 0:
         return f"{_length(gap)}: nothing approaches"
     scale = f"delta_c = {_length(delta)}"
@@ -65,6 +66,7 @@ def _in_words(gap: float, delta: float) -> str:
 
 
 def _length(metres: float) -> str:
+    """A length in the unit that it is read best in."""
     unit, size = readable_unit("m", metres or 1.0)
     return f"{metres / size:.3g} {unit}"
 
@@ -78,7 +80,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
 
     Args:
         scene: its gaps, None: all closed.
-        law: a `Compliant` or an `LZB`.
+        law: a `Compliant`, an `LZB`, or another one with a `contact_force`.
         velocity: v- (n,) [m/s].
 
     Returns:
@@ -92,20 +94,22 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     >>> print(ji.gap_scale(scene, ji.Compliant(ji.Hertz(1.2e10)), [1.0, 0.0, 0.0]))
     gap 1 is closed (delta_c = 31.4 µm)
     gap 2 is 3.18 delta_c (delta_c = 31.4 µm): wide, its collisions come one after another
+    delta_c: how deep a contact is indented at the largest approach speed of the scene
     """
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
-    if not isinstance(law, Compliant | LZB):
+    force = law.contact_force
+    if force is None:
         raise TypeError(
-            f"Argument `law` must be a Compliant or an LZB, whose contacts indent, but is {law!r}."
+            "Argument `law` must have a `contact_force`, by which its contacts indent (Compliant, "
+            f"LZB), but is {law!r}."
         )
-    force = law.force if isinstance(law, Compliant) else Bistiffness(law.stiffness, law.exponent)
     check_law(law, scene, v.dtype)
     speed = jnp.maximum(jnp.max(-gap_velocity(scene, v)), 0.0)
     work = 2 / diagonal(delassus_matrix(scene)) * speed**2
-    if isinstance(force, Bistiffness):
-        eta = jnp.asarray(force.exponent, work.dtype)
-        delta = (work / force.stiffness) ** (1 / (eta + 1))
+    if force.bistiffness is not None:
+        eta = jnp.asarray(force.bistiffness.exponent, work.dtype)
+        delta = (work / force.bistiffness.stiffness) ** (1 / (eta + 1))
     else:
         delta = force.indentation_scale(0.5 * work)
     gaps = jnp.zeros_like(work) if scene.gaps is None else scene.gaps
@@ -120,7 +124,7 @@ class Crossover(eqx.Module):
     status: jax.Array
 
 
-def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Crossover:
+def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
     """Outcome of a two-contact scene against the difference of its gaps.
 
     Which contact closes first decides what follows; laws of instantaneous collisions jump where
@@ -128,7 +132,7 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
 
     Args:
         scene: with two contacts; the mean of its gaps (none: closed) is widened as needed.
-        law: a `Compliant`.
+        law: a `Compliant`, or another one with a `contact_force` that uses gaps.
         velocity: v- (n,) [m/s].
         offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
 
@@ -142,14 +146,17 @@ def crossover(scene: Scene, law: Compliant, velocity: Any, offset: Any) -> Cross
 
     >>> import jimpact as ji
     >>> balls = ji.chain([0.25, 1.0, 0.25])
-    >>> found = ji.crossover(balls, ji.Compliant(ji.Hertz(1.0)), [1.0, 0.0, -1.0], [-9.0, 0.0, 9.0])
-    >>> (found.velocity.round(4) + 0.0).tolist()  # one by one, both at once, the mirror image
+    >>> law = ji.Compliant(ji.Hertz(1.0))
+    >>> result = ji.crossover(balls, law, [1.0, 0.0, -1.0], [-9.0, 0.0, 9.0])
+    >>> (result.velocity.round(4) + 0.0).tolist()  # one by one, both at once, the mirror image
     [[-0.6, -0.16, 1.24], [-1.0, 0.0, 1.0], [-1.24, 0.16, 0.6]]
     """
     if scene.contacts != 2:
         raise ValueError(f"Argument `scene` must have two contacts, but has {scene.contacts}.")
-    if not isinstance(law, Compliant):
-        raise TypeError(f"Argument `law` must be a Compliant, but is {law!r}.")
+    if not law.uses_gaps or law.contact_force is None:
+        raise TypeError(
+            f"Argument `law` must use gaps and have a `contact_force` (Compliant), but is {law!r}."
+        )
     s = as_float_array("offset", offset)
     if s.ndim != 1:
         raise ValueError(f"Argument `offset` must have shape (s,), but has shape {s.shape}.")
@@ -197,6 +204,7 @@ class GapSensitivity:
             return linear / self.sampled.std
 
     def __str__(self) -> str:
+        """The linearized outcome, beside the sampled spread if there is one."""
         m = len(self.gaps)
         at = ", ".join(f"{gap:g}" for gap in self.gaps)
         lines = [f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"]
@@ -206,6 +214,7 @@ class GapSensitivity:
         return "\n".join(lines + ([] if self.sampled is None else self._comparison()))
 
     def _comparison(self) -> list[str]:
+        """Lines on whether the linearization explains the sampled spread."""
         assert self.sampled is not None
         ratio = self.explained
         largest = np.max(np.abs([self.sampled.minimum, self.sampled.maximum]), initial=0.0)
@@ -232,7 +241,7 @@ class GapSensitivity:
 def gap_sensitivity(
     law: Law, scene: Scene, velocity: Any, gaps: Any, sampled: MonteCarlo | None = None
 ) -> GapSensitivity:
-    """Jacobian of the outcome in the gaps, and the linearized covariance beside Monte Carlo's.
+    """Jacobian of the outcome in the gaps, and the linearized covariance next to Monte Carlo's.
 
     Equation: `J = d v+ / d gap`, `cov(v+) ~ J Sigma J^T`. It holds where the outcome is nearly
     linear over the spread of the gaps, so not across a crossover of the order of contacts; for
@@ -247,7 +256,7 @@ def gap_sensitivity(
         sampled: a run of `monte_carlo` with random gaps to compare with.
 
     Returns:
-        `GapSensitivity`; `print` puts the linearized beside the sampled spread.
+        `GapSensitivity`; `print` puts the linearized next to the sampled spread.
 
     Raises:
         ValueError: not one gap per contact, gaps < 0; what `impact` refuses.
@@ -262,6 +271,7 @@ def gap_sensitivity(
     check_values("gaps", at, low=0.0)
 
     def outcome(gaps: jax.Array) -> tuple[jax.Array, Any]:
+        """v+, and v+ and status again as auxiliary data."""
         out = impact(law, with_gaps(scene, gaps), v)
         return out.velocity, (out.velocity, out.status)
 

@@ -28,8 +28,10 @@ from jimpact.montecarlo.store import fingerprint
 from jimpact.scene import Scene, with_gaps
 
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
-SAMPLES = 100_000
-BINS = 1000
+_WRITTEN = 6  # velocities that the report lists
+DELTA_C = "delta_c: how deep a contact is indented at the largest approach speed of the scene"
+SAMPLES = 100_000  # of a run that states no number; ten times more: quantiles three times finer
+BINS = 1000  # of a histogram; ten times more: quantiles finer than 100 000 samples determine them
 
 
 class Sources(eqx.Module):
@@ -75,6 +77,7 @@ def draw(
 
 
 def _entries(source: Source, size: int, keys: jax.Array, non_negative: bool) -> Any:
+    """Draws (C, size) of a source, or its constant."""
     if isinstance(source, Distribution):
         dtype = jnp.result_type(*jax.tree.leaves(source))
         return jax.vmap(lambda key: source.sample(key, size, dtype, non_negative))(keys)
@@ -93,6 +96,7 @@ def impacts(drawn: Drawn, scene: Scene, lanes: jax.Array) -> tuple[jax.Array, ja
 def _outcome(
     law: Law, velocity: jax.Array, gaps: jax.Array | None, scene: Scene
 ) -> tuple[jax.Array, jax.Array]:
+    """v+ (n,) and status () of one sample; a bad draw has a code of its own."""
     code = jnp.where(within_domains(law), 0, BAD_LAW)
     code = jnp.where(jnp.all(jnp.isfinite(velocity)), code, BAD_VELOCITY)
     if gaps is not None:
@@ -104,7 +108,7 @@ def _outcome(
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class SamplingPlan:
     """Everything that determines the chunks; `plan(task)` computes one."""
 
     sources: Sources
@@ -128,6 +132,7 @@ class Plan:
             velocity, status = impacts(drawn, scene, lanes)
 
         def finish() -> Chunk:
+            """Wait for the outcomes and reduce them."""
             empty = np.zeros((self.size, 0))
             samples = {
                 "velocity": np.asarray(velocity),
@@ -144,11 +149,12 @@ class Plan:
         with self._flags():
             drawn, _, _ = self._drawn(task, None)
 
-        def own(part: Any, varies: bool) -> Any:
+        def of_lane(part: Any, varies: bool) -> Any:
+            """The entries of the sample, where they vary."""
             return jax.tree.map(lambda x: x[lane] if varies and eqx.is_array(x) else x, part)
 
         parts = (drawn.law, drawn.velocity, drawn.gaps)
-        law, velocity, gaps = map(own, parts, drawn.varies)
+        law, velocity, gaps = map(of_lane, parts, drawn.varies)
         return law, velocity, gaps
 
     @contextlib.contextmanager
@@ -173,7 +179,7 @@ class Plan:
 class Run:
     """A plan, how many samples, and the rows of given samples, which travel with the tasks."""
 
-    plan: Plan
+    plan: SamplingPlan
     samples: int
     rows: dict[str, np.ndarray]
 
@@ -188,8 +194,8 @@ class Run:
         count = min(size, self.samples - number * size)
         rows = {}
         for name, values in self.rows.items():
-            own = values[number * size : (number + 1) * size]
-            rows[name] = np.pad(own, ((0, size - len(own)), (0, 0)), mode="edge")
+            part = values[number * size : (number + 1) * size]
+            rows[name] = np.pad(part, ((0, size - len(part)), (0, 0)), mode="edge")
         return Task(number, count, ends, rows)
 
     def sample(self, index: int) -> tuple[Law, Scene, jax.Array]:
@@ -230,11 +236,14 @@ class Run:
                 rows = self.rows.get(what)
                 drawn = _source(source) if rows is None else f"{len(rows)} given rows"
                 text += f"; {what}: {drawn}"
+        if not is_random(sources.velocity):
+            unit = "m/s" if scene.walls is not None else "m/s, rad/s"
+            text += f"; v- = {_in_brackets(sources.velocity)} {unit}"
         return text
 
 
 def planned_run(
-    given: Sources,
+    sources: Sources,
     scene: Scene,
     samples: int | None,
     key: Any,
@@ -244,7 +253,7 @@ def planned_run(
 ) -> Run:
     """The run of these arguments; raises where one of them is bad."""
     check_kind("scene", scene, Scene)
-    sources = _sources(given, scene)
+    sources = _checked_sources(sources, scene)
     chunk = as_whole("chunk", chunk, 1)
     bins = as_whole("bins", bins, 1)
     rows = {
@@ -263,7 +272,7 @@ def planned_run(
                 f"value {samples}."
             )
     data, kind = _key(key)
-    plan = Plan(
+    plan = SamplingPlan(
         sources=eqx.tree_at(_row_values, sources, replace_fn=lambda x: x[:0]),
         scene=scene,
         key=data,
@@ -278,16 +287,16 @@ def planned_run(
 
 
 def _row_values(sources: Sources) -> list[Any]:
+    """The arrays of given samples: they travel with the tasks, not with the plan."""
     return [s.values for s in (sources.velocity, sources.gaps) if isinstance(s, Rows)]
 
 
-def _sources(given: Sources, scene: Scene) -> Sources:
+def _checked_sources(sources: Sources, scene: Scene) -> Sources:
     """Checked sources, all floating-point values in the widest type among them."""
-    law = given.law
+    law, gaps = sources.law, sources.gaps
     if not isinstance(law, Law) and not callable(law):
         raise TypeError(f"Argument `law` must be a Law or a function key -> Law, but is {law!r}.")
-    velocity = as_source("velocity", given.velocity, scene.size, non_negative=False)
-    gaps = given.gaps
+    velocity = as_source("velocity", sources.velocity, scene.size, non_negative=False)
     if gaps is not None:
         gaps = as_source("gaps", gaps, scene.contacts, non_negative=True)
     elif not (is_random(law) or is_random(velocity)):
@@ -302,6 +311,7 @@ def _sources(given: Sources, scene: Scene) -> Sources:
 
 
 def _source(source: Any) -> str:
+    """A source in words."""
     if isinstance(source, eqx.Module):
         return repr(source)
     return f"function {getattr(source, '__qualname__', type(source).__name__)}"
@@ -320,5 +330,13 @@ def _key(key: Any) -> tuple[np.ndarray, str]:
     return np.asarray(jax.random.key_data(key)), str(jax.random.key_impl(key))
 
 
+def _in_brackets(velocity: Any) -> str:
+    """Velocities as (1, 0, -1), the first few of many."""
+    entries = [f"{x:g}" for x in np.asarray(velocity)]
+    more = [f"... {len(entries)} in all"] if len(entries) > _WRITTEN else []
+    return f"({', '.join(entries[:_WRITTEN] + more)})"
+
+
 def _flag(name: str) -> bool:
+    """The setting of JAX."""
     return bool(getattr(jax.config, name))

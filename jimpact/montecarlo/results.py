@@ -9,7 +9,7 @@ import numpy as np
 from jimpact._checks import check_values
 from jimpact.files.records import as_data, fields_as_data, table
 from jimpact.law import Law
-from jimpact.montecarlo.planning import Run
+from jimpact.montecarlo.planning import DELTA_C, Run
 from jimpact.montecarlo.statistics import (
     OUTCOMES,
     Chunk,
@@ -55,7 +55,7 @@ class MonteCarlo:
         statuses: number of samples by status.
         bad: the first failed samples; `replay(sample.index)` gives one to run again.
         first: the first samples, for pictures: gaps, velocity_before, velocity, status.
-        gap_scale: delta_c (m,) [m], where the law has one.
+        gap_scale: delta_c (m,) [m], the indentation of a contact (`ji.gap_scale`), or None.
         rate: samples computed a second [1/s].
         resumed: samples that were read from the folder.
         description: law, scene and distributions, in words.
@@ -119,6 +119,7 @@ class MonteCarlo:
         return fields_as_data(self, "first", "run", "description") | as_data(derived)
 
     def __str__(self) -> str:
+        """The report."""
         heads = ["[m/s]", "mean", "± error", "std", *(f"{100 * q:g} %" for q in REPORTED)]
         columns = [self.std, *self.quantile(REPORTED), self.minimum, self.maximum]
         rows = [
@@ -138,25 +139,27 @@ class MonteCarlo:
         return "\n".join(lines)
 
     def _rate(self) -> str:
+        """Samples a second, and how many were read."""
         if self.resumed == self.samples:
             return "all read from the folder"
         text = f"{self.rate:,.0f} samples/s"
         return text + (f", {self.resumed:,} read from the folder" if self.resumed else "")
 
     def _gap_lines(self) -> list[str]:
+        """Mean and standard deviation of the random gaps."""
         lines = []
         for j, mean in enumerate(self.gap_mean):
             std = np.sqrt(self.gap_covariance[j, j])
             line = f"gap {j + 1}: mean {mean:.4g} m, std {std:.4g} m"
             if self.gap_scale is not None:
                 scale = self.gap_scale[j]
-                line += (
-                    f"; in gap scales of {scale:.3g} m: {mean / scale:.3g} and {std / scale:.3g}"
-                )
+                line += f"; in units of delta_c = {scale:.3g} m: "
+                line += f"{mean / scale:.3g} and {std / scale:.3g}"
             lines.append(line)
-        return lines
+        return lines if self.gap_scale is None or not lines else [*lines, DELTA_C]
 
     def _status_lines(self) -> list[str]:
+        """How often each status occurred, and the first failed samples."""
         lines = []
         for name, count in self.statuses.items():
             left_out = ", left out" if _OUTCOMES[name].failure else ""
@@ -167,10 +170,10 @@ class MonteCarlo:
         return lines
 
 
-def result(
+def result_of(
     run: Run, total: Chunk, resumed: int, rate: float, gap_scale: np.ndarray | None
 ) -> MonteCarlo:
-    """What is known of a run from the statistics of all its chunks."""
+    """The result of a run from the statistics of all its chunks."""
     n, bad = len(total.ends), total.bad
     mean, covariance = total.moments.mean, total.moments.covariance
     return MonteCarlo(

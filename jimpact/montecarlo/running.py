@@ -12,11 +12,10 @@ import numpy as np
 
 from jimpact._checks import in_common_dtype
 from jimpact.law import Law
-from jimpact.laws.compliant import Compliant
 from jimpact.montecarlo.executors import Executor, as_executor
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.montecarlo.planning import BINS, CHUNK, Run, Sources, planned_run
-from jimpact.montecarlo.results import MonteCarlo, result
+from jimpact.montecarlo.results import MonteCarlo, result_of
 from jimpact.montecarlo.statistics import Chunk, joined
 from jimpact.montecarlo.store import Store
 from jimpact.progress import counting_bar
@@ -51,13 +50,13 @@ def monte_carlo(
             `key -> (n,)`, given samples (S, n).
         gaps: likewise (m entries) [m], none negative: `Normal` is truncated at 0; None: the
             scene's.
-        samples: how many; default: as many as are given, or 100 000.
+        samples: how many; default: the number of given samples, or 100 000.
         key: a JAX random key, or an integer seed.
         chunk: samples computed together; part of what determines the draws.
         executor: 'serial', 'devices' (all of this process), 'dask', or `DaskExecutor(client)`.
-        folder: where every finished chunk is kept; the same call again continues there, and may
-            ask for more samples.
-        keep_samples: keep the raw samples in the folder, too (`read_samples`).
+        folder: where every finished chunk is stored; the same call again continues from it, and
+            may ask for more samples.
+        keep_samples: store the raw samples in the folder, too (`read_samples`).
         bins: of the histograms, between the ends of the first chunk's range plus a tenth.
         progress: a progress bar on stderr; None: on a terminal, for long runs.
 
@@ -66,8 +65,8 @@ def monte_carlo(
 
     Raises:
         ValueError: bad arguments, gaps that can be negative, a folder of another run.
-        RuntimeError: not one sample of the first chunk could be used.
-        OSError: the folder cannot be written; what is there is intact.
+        RuntimeError: no sample of the first chunk could be used.
+        OSError: the folder cannot be written; what was written before is intact.
         KeyboardInterrupt: with a message that says how to continue.
 
     Warns: where samples failed, or a file of the folder is damaged or foreign (not used).
@@ -76,8 +75,8 @@ def monte_carlo(
     >>> balls = ji.chain([0.25, 1.0, 0.25])
     >>> law = ji.Binary(1.0, order="earliest")
     >>> gaps = ji.Uniform(0.0, 1e-5)
-    >>> found = ji.monte_carlo(law, balls, [1.0, 0.0, -1.0], gaps=gaps, samples=1000)
-    >>> [round(float(v), 2) for v in found.quantile(0.9)]  # one of two mirror images
+    >>> result = ji.monte_carlo(law, balls, [1.0, 0.0, -1.0], gaps=gaps, samples=1000)
+    >>> [round(float(v), 2) for v in result.quantile(0.9)]  # one of two mirror images
     [-0.6, 0.16, 1.24]
     """
     run = planned_run(Sources(law, velocity, gaps), scene, samples, key, chunk, bins, keep_samples)
@@ -88,16 +87,16 @@ def monte_carlo(
     begin = time.perf_counter()
     total, resumed = _total(run, chosen, store, progress)
     rate = (run.samples - resumed) / (time.perf_counter() - begin)
-    found = result(run, total, resumed, rate, _gap_scale(run.plan.sources, scene))
-    failed = found.samples - found.count
+    result = result_of(run, total, resumed, rate, _gap_scale(run.plan.sources, scene))
+    failed = result.samples - result.count
     if failed:
-        text = ", ".join(f"{count} {name}" for name, count in found.statuses.items())
+        text = ", ".join(f"{count} {name}" for name, count in result.statuses.items())
         warnings.warn(
-            f"{failed} of {found.samples} samples failed and are left out of the statistics "
+            f"{failed} of {result.samples} samples failed and are left out of the statistics "
             f"({text}); see `bad` and `replay`.",
             stacklevel=2,
         )
-    return found
+    return result
 
 
 def _total(
@@ -107,6 +106,7 @@ def _total(
     keep = run.plan.keep_samples
 
     def read(number: int) -> Chunk | None:
+        """The chunk as it is stored, if it is."""
         return store.read(number, run.task(number).count, keep) if store is not None else None
 
     missing = [number for number in range(run.chunks) if read(number) is None]
@@ -116,6 +116,7 @@ def _total(
     total: Chunk | None = None
 
     def join_ready() -> None:
+        """Join all chunks that are next in order."""
         nonlocal total
         number = 0 if total is None else total.number + 1
         while number in waiting or number in known:
@@ -139,7 +140,7 @@ def _total(
             join_ready()
     except KeyboardInterrupt:
         raise KeyboardInterrupt(_interrupted(run, store, finished)) from None
-    assert total is not None  # there is a chunk
+    assert total is not None  # a run has at least one chunk
     return total, resumed
 
 
@@ -161,16 +162,19 @@ def _computed(
 
 
 def _interrupted(run: Run, store: Store | None, done: int) -> str:
+    """The message of an interrupted run."""
     text = f"stopped after {done:,} of {run.samples:,} samples; "
     if store is None:
-        return text + "nothing is kept, because no `folder` was given."
+        return text + "nothing is stored, because no `folder` was given."
     return text + f"they are in '{store.folder}': the same call continues from there."
 
 
 def _gap_scale(sources: Sources, scene: Scene) -> np.ndarray | None:
     """delta_c (m,), where law and velocity are constant and the law's contacts indent."""
     law, velocity = sources.law, sources.velocity
-    if not (isinstance(law, Compliant) and isinstance(velocity, jax.Array)):
+    if not (isinstance(law, Law) and isinstance(velocity, jax.Array)):
+        return None
+    if not law.uses_gaps or law.contact_force is None:
         return None
     law, scene, velocity = in_common_dtype(law, scene, velocity)
     delta = np.asarray(gap_scale(scene, law, velocity).delta, float)

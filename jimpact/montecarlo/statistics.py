@@ -11,7 +11,7 @@ from jimpact.status import STATUS, Status
 MARGIN = 0.1  # of the first chunk's range, added on both sides: later chunks reach further
 FLAT = 1e-6  # relative half width of the range of a quantity that does not vary
 LISTED = 20  # bad samples of a chunk (and of a run) that are listed one by one
-SHOWN = 4096  # first samples of a run that are kept in memory for pictures
+IN_MEMORY = 4096  # first samples of a run that stay in memory, for pictures
 # Outcomes of a sample: those of an impact, and further ones where it never reached the law.
 OUTCOMES = (
     *STATUS,
@@ -131,15 +131,15 @@ def binned_quantiles(
     edges = np.column_stack([first, inner, last])
     below = np.cumsum(np.column_stack([np.zeros(len(counts)), counts]), axis=1)
     # from above: of an empty stretch between two bins the lower end is taken
-    found = [
+    quantiles = [
         np.interp(-np.asarray(q) * b[-1], -b[::-1], edge[::-1]) for b, edge in zip(below, edges)
     ]
-    return np.clip(np.stack(found, axis=-1), low, high)
+    return np.clip(np.stack(quantiles, axis=-1), low, high)
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a chunk needs beside the plan: its number, how many samples count, bins, given rows."""
+    """What a chunk needs besides the plan: its number, how many samples count, bins, given rows."""
 
     number: int
     count: int
@@ -157,7 +157,7 @@ class Chunk:
         low, high: smallest and largest velocities (n,); inf, -inf without any.
         ends, counts: histogram ranges (n, 2) and counts (n, bins + 2).
         bad: numbers, codes, gaps and velocities before of the first failed samples.
-        samples: all samples, or the first few (`SHOWN`), or none.
+        samples: all samples, or the first few (`IN_MEMORY`), or none.
     """
 
     number: int
@@ -173,8 +173,9 @@ class Chunk:
 
     def without_samples(self) -> "Chunk":
         """Without raw samples but the few first ones of a run."""
-        shown = {k: v[:SHOWN].copy() for k, v in self.samples.items()} if self.number == 0 else {}
-        return dataclasses.replace(self, samples=shown)
+        first = self.samples if self.number == 0 else {}
+        samples = {name: values[:IN_MEMORY].copy() for name, values in first.items()}
+        return dataclasses.replace(self, samples=samples)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything as named arrays, for a file."""
@@ -188,14 +189,15 @@ def chunk_from(arrays: dict[str, np.ndarray]) -> Chunk:
     """The inverse of `Chunk.arrays`."""
 
     def part(prefix: str) -> dict[str, np.ndarray]:
+        """The arrays whose names begin with `prefix.`, without it."""
         start = f"{prefix}."
         return {k.removeprefix(start): v for k, v in arrays.items() if k.startswith(start)}
 
-    own: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
-    own |= {name: int(own[name]) for name in ("number", "count")}
+    plain: dict[str, Any] = {name: arrays[name] for name in _PLAIN}
+    plain |= {name: int(plain[name]) for name in ("number", "count")}
     m = part("moments")
     whole = Moments(int(m["count"]), m["mean"], m["products"])
-    return Chunk(**own, moments=whole, bad=part("bad"), samples=part("samples"))
+    return Chunk(**plain, moments=whole, bad=part("bad"), samples=part("samples"))
 
 
 def joined(before: Chunk, chunk: Chunk) -> Chunk:
@@ -231,7 +233,10 @@ def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples:
     lanes = np.flatnonzero(failed)[:LISTED]
     bad = {"index": task.number * len(samples["status"]) + lanes}
     bad |= {name: samples[name][lanes] for name in _SAMPLE_FIELDS}
-    kept = count if keep_samples else (min(count, SHOWN) if task.number == 0 else 0)
+    if keep_samples:
+        raw = count
+    else:
+        raw = min(count, IN_MEMORY) if task.number == 0 else 0
     return Chunk(
         number=task.number,
         count=count,
@@ -242,16 +247,16 @@ def reduced(task: Task, samples: dict[str, np.ndarray], bins: int, keep_samples:
         ends=ends,
         counts=bin_counts(velocity, ends, bins),
         bad=bad,
-        samples={k: v[:kept].copy() for k, v in samples.items()} if kept else {},
+        samples={k: v[:raw].copy() for k, v in samples.items()} if raw else {},
     )
 
 
 def _first_ends(velocity: np.ndarray, status: np.ndarray) -> np.ndarray:
-    """Histogram ranges from the first chunk; an error where not one of its samples is usable."""
+    """Histogram ranges from the first chunk; an error where none of its samples is usable."""
     if velocity.shape[1] == 0:
         counts = ", ".join(f"{count} {name}" for name, count in named(np.bincount(status)).items())
         raise RuntimeError(
-            f"Not one of the first {len(status)} samples gave a usable outcome: {counts}."
+            f"None of the first {len(status)} samples gave a usable outcome: {counts}."
         )
     return bin_range(velocity)
 

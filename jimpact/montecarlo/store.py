@@ -54,14 +54,14 @@ def _parts(value: Any, inside: tuple[int, ...]) -> Iterator[bytes]:
         yield np.ascontiguousarray(array).tobytes()
     elif value is None or isinstance(value, str | bytes | int | float | complex):
         yield repr(value).encode()
-    elif (held := _held(value)) is not None:
-        for part in held:
+    elif (content := _content(value)) is not None:
+        for part in content:
             yield from _parts(part, (*inside, id(value)))
     else:
         yield _pickled(value)
 
 
-def _held(value: Any) -> Iterable[Any] | None:
+def _content(value: Any) -> Iterable[Any] | None:
     """What the value consists of; None where it has no parts that are known."""
     if isinstance(value, Mapping):
         return sorted(value.items(), key=repr)
@@ -78,12 +78,13 @@ def _held(value: Any) -> Iterable[Any] | None:
     if inspect.ismethod(value):
         return value.__func__, value.__self__
     if inspect.isfunction(value):
-        held = [cell.cell_contents for cell in value.__closure__ or ()]
-        return _name(value), _source(value), value.__defaults__, value.__kwdefaults__, held
+        closure = [cell.cell_contents for cell in value.__closure__ or ()]
+        return _name(value), _source(value), value.__defaults__, value.__kwdefaults__, closure
     return None
 
 
 def _source(function: Any) -> Any:
+    """Source of a function, or its byte code."""
     try:
         return inspect.getsource(function)
     except (OSError, TypeError):
@@ -93,6 +94,7 @@ def _source(function: Any) -> Any:
 
 
 def _pickled(value: Any) -> bytes:
+    """Bytes of a value of unknown parts; its name where it cannot be pickled."""
     try:
         return pickle.dumps(value, protocol=4)
     except Exception:
@@ -100,6 +102,7 @@ def _pickled(value: Any) -> bytes:
 
 
 def _name(value: Any) -> str:
+    """Module and qualified name."""
     return f"{getattr(value, '__module__', '')}.{getattr(value, '__qualname__', type(value))}"
 
 
@@ -112,6 +115,7 @@ class Store:
     """
 
     def __init__(self, folder: str | Path, identity: dict[str, str]):
+        """Open the folder of the run that has this identity, or begin it."""
         self.folder = Path(folder)
         self.run = hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -123,8 +127,8 @@ class Store:
             _check_same(manifest, identity)
         else:
             raise ValueError(
-                f"Folder '{self.folder}' has chunks but no {MANIFEST}, so whose they are is not "
-                "known: give another folder, or delete them."
+                f"Folder '{self.folder}' has chunks but no {MANIFEST}, so the run that they belong "
+                "to is unknown: give another folder, or delete them."
             )
 
     def path(self, number: int) -> Path:
@@ -132,12 +136,12 @@ class Store:
         return self.folder / f"chunk-{number:07d}.npz"
 
     def write(self, chunk: Chunk) -> None:
-        """Keep a chunk."""
+        """Store a chunk."""
         arrays = chunk.arrays()
         checksum = np.frombuffer(_checksum(arrays, self.run), np.uint8)
         buffer = io.BytesIO()
-        own: dict[str, Any] = {"run": np.array(self.run), "checksum": checksum}
-        np.savez(buffer, **own, **arrays)  # type: ignore[arg-type]
+        labels: dict[str, Any] = {"run": np.array(self.run), "checksum": checksum}
+        np.savez(buffer, **labels, **arrays)  # type: ignore[arg-type]
         _write(self.path(chunk.number), buffer.getvalue())
 
     def read(self, number: int, count: int, all_samples: bool) -> Chunk | None:
@@ -163,7 +167,7 @@ class Store:
 
 
 def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
-    """The raw samples that `monte_carlo(..., folder=..., keep_samples=True)` kept, by chunk.
+    """The raw samples that `monte_carlo(..., folder=..., keep_samples=True)` stored, by chunk.
 
     Args:
         folder: of the run.
@@ -175,7 +179,7 @@ def read_samples(folder: str | Path) -> Iterator[dict[str, np.ndarray]]:
     Raises:
         FileNotFoundError: no run there. ValueError: a damaged file, or chunks without samples.
 
-    >>> import tempfile, jimpact as ji
+    >>> import tempfile
     >>> import jimpact as ji
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     options = {"samples": 30, "chunk": 20, "folder": folder, "keep_samples": True}
@@ -209,6 +213,7 @@ def _checked(path: Path, run: str) -> dict[str, np.ndarray]:
 
 
 def _checksum(arrays: dict[str, np.ndarray], run: str) -> bytes:
+    """SHA-256 of all arrays, of this run."""
     digest = hashlib.sha256(run.encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -218,6 +223,7 @@ def _checksum(arrays: dict[str, np.ndarray], run: str) -> bytes:
 
 
 def _manifest(path: Path) -> dict[str, Any]:
+    """The content of a manifest, or a ValueError."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT or not isinstance(content["identity"], dict):
@@ -231,6 +237,7 @@ def _manifest(path: Path) -> dict[str, Any]:
 
 
 def _check_same(path: Path, identity: dict[str, str]) -> None:
+    """Raise where the manifest is of another run."""
     other = _manifest(path)["identity"]
     names = sorted(identity.keys() | other.keys())
     differ = [name for name in names if identity.get(name) != other.get(name)]

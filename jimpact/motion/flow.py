@@ -1,6 +1,5 @@
 """Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
 
-import abc
 import dataclasses
 from typing import Any, NamedTuple
 
@@ -110,8 +109,8 @@ def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales)
     return jnp.concatenate([normal, side])
 
 
-class MotionFlow(eqx.Module):
-    """What flights have in common; an instance of the protocol of the stepper.
+class MotionFlow(eqx.Module, stepper.Flow):
+    """What flights have in common.
 
     State (rows): q, v, t, the ledger, and what contacts remember. The last of the margins is the
     time left to the next sample. Margins are in units of their rounding.
@@ -125,17 +124,15 @@ class MotionFlow(eqx.Module):
     like: State  # of its shapes
     longest: jax.Array  # step ()
 
-    near = 0.0
-    driving = adding = ()
     spare = 0  # rows beside those of the state, which only say how long steps may be
 
     @property
-    def taking_part(self) -> int:
+    def taking_part(self) -> int:  # type: ignore[override]
         """One: the number of passes does not matter here."""
         return 1
 
     @property
-    def tolerance(self) -> jax.Array:
+    def tolerance(self) -> jax.Array:  # type: ignore[override]
         """`rtol`."""
         return jnp.full((1, 1), self.rtol, self.sizes.dtype)
 
@@ -148,18 +145,6 @@ class MotionFlow(eqx.Module):
         """Margins are in units of their rounding."""
         return jnp.ones((1, 1), self.sizes.dtype)
 
-    @abc.abstractmethod
-    def constants(self, modes: jax.Array) -> Any:
-        """What of the field does not change while the modes last."""
-
-    @abc.abstractmethod
-    def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Rates of all rows."""
-
-    @abc.abstractmethod
-    def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Each is >= 0 while its mode lasts; the last is the time left to the next sample."""
-
     def from_margins(self, margins: jax.Array, at: State) -> jax.Array:
         """Rows (k, 1) of margins, with that of the next sample."""
         return (jnp.append(margins, self.sample - at.t) / self.rounding)[:, None]
@@ -168,34 +153,15 @@ class MotionFlow(eqx.Module):
         """The state back on the constraints of its modes."""
         return at
 
-    def rooted(self, modes: jax.Array) -> jax.Array:
-        """None: forces are smooth where modes change."""
-        return jnp.zeros((self.rounding.shape[0], 1), bool)
-
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Nothing: what happens at events is decided between flights."""
         return modes, y
 
-    def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
-        """Never: see `rooted`."""
-        return jnp.zeros((1, 1), bool)
-
-    def coasts(self, modes: jax.Array) -> jax.Array | None:
-        """Never: there are loads."""
-        return None
-
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
         """Never: it is seen from outside."""
         return jnp.zeros((1, 1), bool)
-
-    def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> None:
-        """Never, as well."""
-
-    def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Nothing."""
-        return modes, y
 
     def regular(self, rates: State, at: State) -> jax.Array:
         """Rows of rates; NaN where M is not positive definite."""

@@ -9,9 +9,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jimpact.events.friction_flow import inverse, regularized
 from jimpact.motion.dynamics import (
     Kinematics,
     base_velocity,
@@ -23,9 +21,9 @@ from jimpact.motion.dynamics import (
     user_force,
 )
 from jimpact.motion.system import System
+from jimpact.solvers.dense import determinants, load_shares, regularized, solve_definite
 from jimpact.solvers.friction import solve
 from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.linear import solve_definite
 from jimpact.status import CODE
 
 # Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
@@ -35,7 +33,6 @@ _RIDGE, _REFINEMENTS = 1e-7, 3
 # contacts may err by rounding over this.
 _THIN_RIDGE = 1e-9
 _INDEPENDENT = 3  # frictionless contacts that are taken not to be redundant: legs of a table
-_WRITTEN_OUT = 4  # rows up to which it is eliminated by scalars: beyond, that takes long to compile
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
@@ -111,9 +108,7 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
         # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
         # `solvers.friction`: they break loose together
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
-        top = jnp.max(press)
-        share = jnp.where(top > 0, press / jnp.where(top > 0, top, 1.0), 1.0)
-        weight = jnp.concatenate([none + 1, jnp.maximum(share, _LEAST_SHARE)])
+        weight = jnp.concatenate([none + 1, load_shares(press, _LEAST_SHARE)])
         return _least(w, right[:, None], held, weight)[:, 0]
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
@@ -147,19 +142,8 @@ def regularity(given: Contacts, mu: jax.Array, modes: Modes) -> jax.Array:
     k = jnp.stack([w, given.delassus]) * jnp.outer(scale, scale)[None]
     eye = jnp.eye(len(held), dtype=w.dtype)[None]
     ridge = float(jnp.finfo(w.dtype).eps) ** _FAINT_RIDGE
-    with_friction, without = _determinants(jnp.where(both, k, eye) + ridge * eye)
+    with_friction, without = determinants(jnp.where(both, k, eye) + ridge * eye)
     return with_friction / without
-
-
-def _determinants(k: jax.Array) -> jax.Array:
-    """Of (N, n, n); of two contacts by minors of two rows, which is quick to compile."""
-    if k.shape[-1] != 4:
-        return jnp.linalg.det(k)
-    left, right = np.triu_indices(4, 1)
-    upper = k[..., 0, left] * k[..., 1, right] - k[..., 0, right] * k[..., 1, left]
-    lower = k[..., 2, left] * k[..., 3, right] - k[..., 2, right] * k[..., 3, left]
-    signs = jnp.asarray(np.where((left + right) % 2, 1, -1), k.dtype)
-    return jnp.sum(upper * lower[..., ::-1] * signs[None], axis=-1)
 
 
 def rest_acceleration(dtype: jnp.dtype) -> float:
@@ -181,7 +165,7 @@ def _without_friction(w: jax.Array, right: jax.Array, held: jax.Array) -> jax.Ar
 
 
 def _least(
-    w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array, beside: float = _RIDGE
+    w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array, ridge: float = _RIDGE
 ) -> jax.Array:
     """`w x = right` (k, columns) on the rows that are held; 0 elsewhere.
 
@@ -193,14 +177,8 @@ def _least(
     scaled = w * scale[:, None] * (scale * weight)[None]
     k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
-    ridge = jnp.where(held, beside, 0.0)
-    invert = inverse if len(held) <= _WRITTEN_OUT else _inverse_by_library
-    z = regularized(k[..., None], right, ridge[:, None], _REFINEMENTS, invert)
+    z = regularized(k[..., None], right, jnp.where(held, ridge, 0.0)[:, None], _REFINEMENTS)
     return (scale * weight)[:, None] * z
-
-
-def _inverse_by_library(matrix: jax.Array) -> jax.Array:
-    return jnp.linalg.inv(matrix[..., 0])[..., None]
 
 
 def constraint_impulse(

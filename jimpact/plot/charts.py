@@ -1,6 +1,6 @@
 """Pictures of error against time, of stability, of where laws are valid, and of advice."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -33,8 +33,9 @@ from jimpact.plot.style import (
 from jimpact.status import CODE, STATUS
 
 _MARKERS = "osD^vP"
-_LEAST = 1e-16  # errors below are drawn here: rounding
-_OWN = ("dop853",)  # jimpact's own method: a thick line
+_LAW_MARKERS = "*phX8d"
+_LEAST = 1e-16  # smaller errors are drawn here: rounding
+_DEFAULT = "dop853"  # what `impact` does: a thick line
 
 # right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
 # colours where a result is returned, greys where there is none
@@ -46,23 +47,23 @@ CLASS_COLOURS = (
     "#E69F00",
     "#999999",
     "#000000",
-    "#EEEEEE",
+    "#DDDDDD",
 )
 _LABELS = {"setting": "setting, 1 finest", "restitution": "restitution e", "balls": "balls N"}
 _TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
-_FLOOR = 1e-9  # errors below are drawn here
+_FLOOR = 1e-9  # smaller errors are drawn here
 
 
-def work_precision(found: WorkPrecision, title: str = "") -> Figure:
+def work_precision(result: WorkPrecision, title: str = "") -> Figure:
     """Panels: error of v+ against time and against evaluations, and that of the gradient if known.
 
-    Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker is
-    a failure by status; laws are stars at their model error; below the grey band's edge the
-    reference is no better.
+    Times are per impact in a batch, with error bars from quartile to quartile; a hollow marker on
+    a line is a failure by status; laws are grey markers at their model error; below the grey band's
+    edge the reference is no better.
 
     Args:
-        found: what `ji.work_precision` returned.
+        result: what `ji.work_precision` returned.
         title: above the picture.
 
     Returns:
@@ -74,46 +75,53 @@ def work_precision(found: WorkPrecision, title: str = "") -> Figure:
     >>> import jimpact as ji
     >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
     >>> options = {"laws": {}, "batch": 4, "gradients": False}
-    >>> found = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
-    >>> len(ji.plot.work_precision(found).axes)
+    >>> result = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
+    >>> len(ji.plot.work_precision(result).axes)
     2
     """
-    check_kind("found", found, WorkPrecision)
-    gradients = any(point.gradient is not None for row in found.points.values() for point in row)
+    check_kind("result", result, WorkPrecision)
+    gradients = any(point.gradient is not None for row in result.points.values() for point in row)
     figure, panels = new_panels(4, 3.6) if gradients else new_panels(2, 4.6)
     handles: dict[str, Any] = {}
+    styles = _styles(result.points)
     for axes, (quantity, place, x, y) in zip(panels, _PANELS):
-        for number, (name, row) in enumerate(found.points.items()):
-            drawn = _draw(axes, row, quantity, place, _style(name, number, row))
-            if drawn is not None:
-                handles.setdefault(row[0].label, drawn)
-        _finish(axes, found.reference.uncertainty[quantity], x, y)
-    for label, drawn in handles.items():
-        drawn.set_label(label)
+        for name, row in result.points.items():
+            line = _draw(axes, row, quantity, place, styles[name])
+            if line is not None:
+                handles.setdefault(row[0].label, line)
+        _finish(axes, result.reference.uncertainty[quantity], x, y)
+    for label, line in handles.items():
+        line.set_label(label)
     if not gradients:
-        legend_below(figure, list(handles.values()), 2, _note(found))
+        legend_below(figure, list(handles.values()), 2, _note(result))
     else:  # beside the three panels
         panels[3].axis("off")
-        options: dict[str, Any] = {"title": _note(found), "title_fontsize": SMALL, "loc": "center"}
+        options: dict[str, Any] = {"title": _note(result), "title_fontsize": SMALL, "loc": "center"}
         panels[3].legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)
     heading(figure, title)
     return figure
 
 
-def _style(name: str, number: int, row: tuple[Point, ...]) -> dict[str, Any]:
-    colour = COLOURS[number % len(COLOURS)]
-    if row[0].setting is None:
-        return {"marker": "*", "ms": 11, "ls": "none", "color": colour}
-    marker = _MARKERS[number % len(_MARKERS)]
-    line = "-" if number < len(COLOURS) else "--"
-    return {
-        "marker": marker,
-        "ms": 5,
-        "ls": line,
-        "lw": 2.6 if name in _OWN else 1.2,
-        "color": colour,
-        "zorder": 3 if name in _OWN else 2,
-    }
+def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]]:
+    """How each method is drawn: methods by colour, laws (one point each) grey by marker."""
+    laws = [name for name, row in points.items() if row[0].setting is None]
+    methods = [name for name in points if name not in laws]
+    styles: dict[str, dict[str, Any]] = {}
+    for number, name in enumerate(methods):
+        default = name == _DEFAULT
+        styles[name] = {
+            "marker": _MARKERS[number % len(_MARKERS)],
+            "ms": 5,
+            "ls": "-" if number < len(COLOURS) else "--",
+            "lw": 2.6 if default else 1.2,
+            "color": COLOURS[number % len(COLOURS)],
+            "zorder": 3 if default else 2,
+        }
+    for number, name in enumerate(laws):
+        marker = _LAW_MARKERS[number % len(_LAW_MARKERS)]
+        styles[name] = {"marker": marker, "ms": 10, "ls": "none", "color": GREY, "mfc": "none"}
+        styles[name] |= {"mew": 1.5}
+    return styles
 
 
 def _times(timing: Timing | None) -> tuple[float, tuple[float, float] | None]:
@@ -155,18 +163,17 @@ def _draw(
     place: Callable[[Point], tuple[float, Any]],
     style: dict[str, Any],
 ) -> Any:
-    """One line; None where no point of it has a place."""
-    points = [(point, *place(point)) for point in row]
-    kept = [
+    """One line; None where no point has a time or a count, and an error."""
+    rows = [
         (x, max(point.error[quantity], _LEAST), bar, STATUS[CODE[point.status]].failure)
-        for point, x, bar in points
+        for point, (x, bar) in ((point, place(point)) for point in row)
         if np.isfinite(x) and np.isfinite(point.error[quantity])
     ]
-    if not kept:
+    if not rows:
         return None
-    x, y, bars, failed = zip(*kept)
+    x, y, bars, failed = zip(*rows)
     spread = None if bars[0] is None else np.array(bars).T
-    drawn = axes.plot(x, y, **style)[0]
+    line = axes.plot(x, y, **style)[0]
     bar = {"elinewidth": 1, "capsize": 2, "color": style["color"]}
     axes.errorbar(x, y, xerr=spread, fmt="none", **bar)
     wrong = np.array(failed)
@@ -179,10 +186,11 @@ def _draw(
         ms=style["ms"],
         zorder=4,
     )
-    return drawn
+    return line
 
 
 def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
+    """Logarithmic axes with labels, and the grey band up to the uncertainty of the reference."""
     axes.set_yscale("log")
     axes.set_xlabel(x)
     axes.set_ylabel(y)
@@ -196,19 +204,20 @@ def _finish(axes: Axes, uncertainty: float, x: str, y: str) -> None:
     finish(axes)
 
 
-def _note(found: WorkPrecision) -> str:
+def _note(result: WorkPrecision) -> str:
+    """How to read the chart."""
     return (
-        f"errors: largest of {found.sample} impacts, stiffness\nspread over a factor "
-        f"{found.spread:g}; times: median\nand quartiles of {found.repeats}, batch of "
-        f"{found.batch};\ngrey: uncertainty of the reference;\nhollow: failed by status"
+        f"errors: largest of {result.sample} impacts, stiffness\nspread over a factor "
+        f"{result.spread:g}; times: median\nand quartiles of {result.repeats}, batch of "
+        f"{result.batch};\ngrey: uncertainty of the reference;\nhollow: failed by status"
     )
 
 
-def stability_map(found: StabilityMap, title: str = "") -> Figure:
+def stability_map(result: StabilityMap, title: str = "") -> Figure:
     """One panel an axis: a row for each method, a column for each value; other axes at the base.
 
     Args:
-        found: what `stability_map` returned.
+        result: what `stability_map` returned.
         title: above the panels.
 
     Returns:
@@ -219,29 +228,29 @@ def stability_map(found: StabilityMap, title: str = "") -> Figure:
 
     >>> import jimpact as ji
     >>> axes = {"restitution": [0.5, 1.0]}
-    >>> found = ji.stability_map(["verlet"], axes, {"balls": 2, "exponent": 1})
-    >>> len(ji.plot.stability_map(found).axes)
+    >>> result = ji.stability_map(["verlet"], axes, {"balls": 2, "exponent": 1})
+    >>> len(ji.plot.stability_map(result).axes)
     1
     """
-    check_kind("found", found, StabilityMap)
-    names = list(found.axes)
-    figure, grid = new_panels(len(names), 0.8 + 0.3 * len(found.methods), 1.2)
+    check_kind("result", result, StabilityMap)
+    names = list(result.axes)
+    figure, grid = new_panels(len(names), 0.8 + 0.3 * len(result.methods), 1.2)
     for i, (axes, name) in enumerate(zip(grid, names)):
-        _draw_classes(axes, np.array([found.slices[method][i].codes for method in found.methods]))
-        _ticks(axes, "x", name, found.axes[name])
-        labels = found.methods if i % COLUMNS == 0 else [""] * len(found.methods)
-        axes.set_yticks(range(len(found.methods)), labels, fontsize=SMALL)
-        axes.plot(_place(found, name), -0.62, "v", color="black", ms=5, clip_on=False)
-        axes.set_ylim(len(found.methods) - 0.5, -0.5)
-    _finish_map(figure, found, title)
+        _draw_classes(axes, np.array([result.slices[method][i].codes for method in result.methods]))
+        _ticks(axes, "x", name, result.axes[name])
+        labels = result.methods if i % COLUMNS == 0 else [""] * len(result.methods)
+        axes.set_yticks(range(len(result.methods)), labels, fontsize=SMALL)
+        axes.plot(_place(result, name), -0.62, "v", color="black", ms=5, clip_on=False)
+        axes.set_ylim(len(result.methods) - 0.5, -0.5)
+    _finish_map(figure, result, title)
     return figure
 
 
-def stability_pairs(found: StabilityMap, method: str, title: str = "") -> Figure:
+def stability_pairs(result: StabilityMap, method: str, title: str = "") -> Figure:
     """One panel for every pair of axes, for one method; a ring marks the base point.
 
     Args:
-        found: what `ji.stability_map(slices='pairs')` returned.
+        result: what `ji.stability_map(slices='pairs')` returned.
         method: one of its methods.
         title: above the picture; default: the method's name.
 
@@ -254,36 +263,38 @@ def stability_pairs(found: StabilityMap, method: str, title: str = "") -> Figure
     >>> import jimpact as ji
     >>> axes = {"restitution": [0.5, 1.0], "setting": [0.0, 0.8]}
     >>> options = {"base": {"balls": 2, "exponent": 1}, "slices": "pairs"}
-    >>> found = ji.stability_map(["verlet"], axes, **options)
-    >>> len(ji.plot.stability_pairs(found, "verlet").axes)
+    >>> result = ji.stability_map(["verlet"], axes, **options)
+    >>> len(ji.plot.stability_pairs(result, "verlet").axes)
     1
     """
-    pairs = [each for each in found.slices[method] if len(each.axes) == 2]
+    pairs = [each for each in result.slices[method] if len(each.axes) == 2]
     if not pairs:
-        raise ValueError("Argument `found` must be a map with slices='pairs', but has none.")
-    names = list(found.axes)
+        raise ValueError("Argument `result` must be a map with slices='pairs', but has none.")
+    names = list(result.axes)
     size = len(names) - 1
     figure = new_figure(1.6 + 1.5 * size)
     grid = figure.add_gridspec(size, size)
     for each in pairs:
         column, row = (names.index(name) for name in each.axes)
         axes = figure.add_subplot(grid[row - 1, column])
-        _pair(axes, found, each, row == size, column == 0)
-    _finish_map(figure, found, title or method)
+        _pair(axes, result, each, row == size, column == 0)
+    _finish_map(figure, result, title or method)
     return figure
 
 
-def _pair(axes: Axes, found: StabilityMap, each: Slice, bottom: bool, left: bool) -> None:
+def _pair(axes: Axes, result: StabilityMap, each: Slice, bottom: bool, left: bool) -> None:
+    """The classes over two axes; a ring marks the base point."""
     _draw_classes(axes, each.codes.T)
     axes.invert_yaxis()
     for which, name, labelled in (("x", each.axes[0], bottom), ("y", each.axes[1], left)):
-        _ticks(axes, which, name, found.axes[name], labelled, 3)
-    x, y = (_place(found, name) for name in each.axes)
+        _ticks(axes, which, name, result.axes[name], labelled, 3)
+    x, y = (_place(result, name) for name in each.axes)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="white", mew=2.5)
     axes.plot(x, y, "o", ms=7, mfc="none", mec="black", mew=1.2)
 
 
 def _draw_classes(axes: Axes, codes: np.ndarray) -> None:
+    """A coloured cell for each class code (rows, columns)."""
     colours = ListedColormap(CLASS_COLOURS)
     edges = BoundaryNorm(np.arange(len(CLASSES) + 1) - 0.5, len(CLASSES))
     axes.imshow(codes, cmap=colours, norm=edges, aspect="auto", interpolation="nearest")
@@ -303,6 +314,7 @@ def _ticks(
     labelled: bool = True,
     most: int = _TICKS,
 ) -> None:
+    """Values of a map's axis as ticks of a panel's axis 'x' or 'y'."""
     step = -(-len(values) // most)
     at = range(0, len(values), step)
     labels = [in_words(float(f"{values[i]:.2g}")) if labelled else "" for i in at]
@@ -312,32 +324,33 @@ def _ticks(
     axis.set_label_text(word, fontsize=SMALL)
 
 
-def _place(found: StabilityMap, name: str) -> float:
+def _place(result: StabilityMap, name: str) -> float:
     """Where the base lies among the values of an axis."""
-    values = found.axes[name]
-    return float(np.interp(found.base[name], values, np.arange(len(values))))
+    values = result.axes[name]
+    return float(np.interp(result.base[name], values, np.arange(len(values))))
 
 
-def _finish_map(figure: Figure, found: StabilityMap, title: str) -> None:
-    seen = {
+def _finish_map(figure: Figure, result: StabilityMap, title: str) -> None:
+    """Title, and a legend of the classes that occur."""
+    occurring = {
         int(code)
-        for name in found.methods
-        for each in found.slices[name]
+        for name in result.methods
+        for each in result.slices[name]
         for code in np.unique(each.codes)
     }
-    handles = [Patch(color=CLASS_COLOURS[code], label=CLASSES[code]) for code in sorted(seen)]
+    handles = [Patch(color=CLASS_COLOURS[code], label=CLASSES[code]) for code in sorted(occurring)]
     legend_below(figure, handles, 4)
     heading(figure, title)
 
 
-def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
+def validity_map(result: ValidityMap, tolerance: float = 1e-2, title: str = "") -> Figure:
     """Dispersion against the stiffness ratio, and the errors of the laws that do not know it.
 
     Above one curve an exponent, between the levels of binary collisions and Moreau's law; below
     how far off they are, with the tolerance.
 
     Args:
-        found: what `ji.validity_map` returned.
+        result: what `ji.validity_map` returned.
         tolerance: of v+, relative to max |v-|; a line.
         title: above the picture.
 
@@ -348,21 +361,21 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
         TypeError: something else.
 
     >>> import jimpact as ji
-    >>> found = ji.validity_map(ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0])
-    >>> len(ji.plot.validity_map(found).axes)
+    >>> result = ji.validity_map(ji.chain([1.0, 1.0, 1.0]), [1, 0, 0], [1e-3, 1.0, 1e3], [1.0])
+    >>> len(ji.plot.validity_map(result).axes)
     2
     """
-    check_kind("found", found, ValidityMap)
+    check_kind("result", result, ValidityMap)
     figure = new_figure(6.8)
     top, bottom = figure.subplots(2, 1, sharex=True)
-    for i, eta in enumerate(found.exponents):
+    for i, eta in enumerate(result.exponents):
         colour = COLOURS[i % len(COLOURS)]
-        top.plot(found.ratios, found.dispersion[i], color=colour, label=f"LZB, exponent {eta:g}")
+        top.plot(result.ratios, result.dispersion[i], color=colour, label=f"LZB, exponent {eta:g}")
         for name, style in _STYLES.items():
-            error = np.maximum(found.error(name)[i], _FLOOR)
-            bottom.plot(found.ratios, error, style, color=colour)
+            error = np.maximum(result.error(name)[i], _FLOOR)
+            bottom.plot(result.ratios, error, style, color=colour)
     for name, style in _STYLES.items():
-        top.axhline(found.law_dispersion[name], color="black", ls=style, lw=1, label=name)
+        top.axhline(result.law_dispersion[name], color="black", ls=style, lw=1, label=name)
         bottom.plot([], [], style, color="black", label=name)
     bottom.axhline(tolerance, color=GREY, lw=1, label=f"tolerance {share(tolerance)}")
     top.set_ylabel("dispersion index (0: one body has it all)")
@@ -371,7 +384,7 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     bottom.set_ylim(bottom=1e-5)
     logarithmic(bottom, "y")
     logarithmic(bottom, "x")
-    two = found.scene.contacts == 2
+    two = result.scene.contacts == 2
     bottom.set_xlabel("stiffness ratio k2/k1" if two else "stiffness ratio of neighbours")
     top.set_title(title or "Where the stiffness ratio may be left out", loc="left")
     finish(top, bottom)
@@ -380,11 +393,11 @@ def validity_map(found: ValidityMap, tolerance: float = 1e-2, title: str = "") -
     return figure
 
 
-def advice(found: Advice, title: str = "") -> Figure:
+def advice(result: Advice, title: str = "") -> Figure:
     """Outcomes of every law, with their range over the unknown ratios, above their errors.
 
     Args:
-        found: what `ji.advise` returned.
+        result: what `ji.advise` returned.
         title: above the picture.
 
     Returns:
@@ -394,13 +407,13 @@ def advice(found: Advice, title: str = "") -> Figure:
         TypeError: something else.
 
     >>> import jimpact as ji
-    >>> found = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
-    >>> len(ji.plot.advice(found).axes)
+    >>> result = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
+    >>> len(ji.plot.advice(result).axes)
     2
     """
-    check_kind("found", found, Advice)
-    names, rows = list(found.candidates), list(found.candidates.values())
-    bodies, x = len(found.velocity), np.arange(len(names))
+    check_kind("result", result, Advice)
+    names, rows = list(result.candidates), list(result.candidates.values())
+    bodies, x = len(result.velocity), np.arange(len(names))
     dodge = side_by_side(bodies)
     figure = new_figure(6.5)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
@@ -411,20 +424,22 @@ def advice(found: Advice, title: str = "") -> Figure:
         top.vlines(x + dodge[i], range_[:, 0], range_[:, 1], color=colour, lw=4, alpha=0.4)
         top.plot(x + dodge[i], v, "o", color=colour, label=f"body {i + 1}")
     worst = np.maximum([c.worst for c in rows], _FLOOR)
-    colours = [COLOURS[2] if name == found.name else GREY for name in names]
+    colours = [COLOURS[2] if name == result.name else GREY for name in names]
     bottom.bar(x, worst, 0.5, color=colours, label="worst")
     bottom.plot(x, np.maximum([c.median for c in rows], _FLOOR), "k_", ms=18, label="median")
-    bottom.axhline(found.tolerance, color=COLOURS[1], lw=1, label="tolerance")
+    bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set_yscale("log")
-    bottom.set_ylim(found.tolerance / 1000, 30)  # room above for the legend
+    bottom.set_ylim(result.tolerance / 1000, 30)  # room above for the legend
     logarithmic(bottom, "y")
     bottom.set_ylabel("error of v+ (energy norm)")
     top.set_ylabel("velocity after the impact [m/s]")
     named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(names, rows)]
     bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)
     bottom.set_xlabel("law")
-    verdict = "within" if found.within else "not within"
-    top.set_title(f"{title}\n{as_code(found.law)}: {verdict} {share(found.tolerance)}", loc="left")
+    verdict = "within" if result.within else "not within"
+    top.set_title(
+        f"{title}\n{as_code(result.law)}: {verdict} {share(result.tolerance)}", loc="left"
+    )
     finish(top, bottom, grid="y")
     handles = top.get_legend_handles_labels()[0] if bodies <= len(COLOURS) else []
     legend_below(figure, [*handles, *bottom.get_legend_handles_labels()[0]], 6)

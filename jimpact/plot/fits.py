@@ -83,11 +83,11 @@ def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: st
     return figure
 
 
-def contour(found: Contour, title: str = "") -> Figure:
+def contour(result: Contour, title: str = "") -> Figure:
     """The confidence region of two parameters, and how the deviance rises around the fit.
 
     Args:
-        found: what `ji.contour` returned.
+        result: what `ji.contour` returned.
         title: above the picture.
 
     Returns:
@@ -104,21 +104,21 @@ def contour(found: Contour, title: str = "") -> Figure:
     >>> ji.plot.contour(ji.Contour(*given)).axes[0].get_xlabel()
     'e[1]'
     """
-    check_kind("found", found, Contour)
+    check_kind("result", result, Contour)
     figure = new_figure(5.0)
     axes = figure.subplots()
-    d, limit = np.where(np.isfinite(found.deviance), found.deviance, np.nan).T, found.limit
-    axes.contourf(found.x, found.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
-    axes.contour(found.x, found.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
-    axes.contour(found.x, found.y, d, [limit / 4], colors=GREY, linewidths=0.7)
-    axes.plot(*found.best, "+", color="black", ms=9)
-    for which, log in zip("xy", found.log, strict=True):
+    d, limit = np.where(np.isfinite(result.deviance), result.deviance, np.nan).T, result.limit
+    axes.contourf(result.x, result.y, d, [0.0, limit], colors=[COLOURS[0]], alpha=0.25)
+    axes.contour(result.x, result.y, d, [limit], colors=[COLOURS[0]], linewidths=1.5)
+    axes.contour(result.x, result.y, d, [limit / 4], colors=GREY, linewidths=0.7)
+    axes.plot(*result.best, "+", color="black", ms=9)
+    for which, log in zip("xy", result.log, strict=True):
         if log:
             logarithmic(axes, which)
-    axes.set_xlabel(found.names[0])
-    axes.set_ylabel(found.names[1])
+    axes.set_xlabel(result.names[0])
+    axes.set_ylabel(result.names[1])
     handles = [
-        Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * found.level:g} % region"),
+        Patch(color=COLOURS[0], alpha=0.25, label=f"{100 * result.level:g} % region"),
         Line2D([], [], marker="+", ls="none", color="black", label="fit"),
     ]
     legend_below(figure, handles, 2)

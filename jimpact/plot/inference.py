@@ -17,11 +17,11 @@ _TOP = 3.0  # of a profile's axis, in limits: beyond, the curve says nothing mor
 _TWO_SIDED = 1.96  # standard errors with 95 % between
 
 
-def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
+def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
     """Deviance over each parameter, with the limit and the interval below it.
 
     Args:
-        found: what `ji.profile` returned.
+        result: what `ji.profile` returned.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
@@ -35,10 +35,10 @@ def profiles(found: tuple[Profile, ...] | list[Profile]) -> Figure:
     >>> len(ji.plot.profiles(ji.profile(fit)).axes)
     1
     """
-    for each in found:
-        check_kind("found", each, Profile)
-    figure, grid = new_panels(len(found), 2.8)
-    for axes, each in zip(grid, found):
+    for each in result:
+        check_kind("result", each, Profile)
+    figure, grid = new_panels(len(result), 2.8)
+    for axes, each in zip(grid, result):
         axes.plot(each.value, each.deviance, ".-", color=COLOURS[0], ms=3, lw=1)
         axes.axhline(each.limit, color=GREY, lw=0.8, ls="--")
         for low, high in each.intervals:
@@ -70,8 +70,8 @@ def correlation(fit: FitResult) -> Figure:
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([1.0, 0.0, 0.0], [-0.06, 0.1, 0.97], sigma=0.02)
-    >>> found = ji.fit(ji.LZB(0.9, [1.0, 2.0]), ji.chain([1.0, 1.0, 1.0]), data, starts=1)
-    >>> len(ji.plot.correlation(found).axes)
+    >>> result = ji.fit(ji.LZB(0.9, [1.0, 2.0]), ji.chain([1.0, 1.0, 1.0]), data, starts=1)
+    >>> len(ji.plot.correlation(result).axes)
     2
     """
     check_kind("fit", fit, FitResult)
@@ -109,8 +109,8 @@ def residuals(fit: FitResult) -> Figure:
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.5]])
-    >>> found = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
-    >>> len(ji.plot.residuals(found).axes)
+    >>> result = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    >>> len(ji.plot.residuals(result).axes)
     3
     """
     check_kind("fit", fit, FitResult)

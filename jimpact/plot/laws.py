@@ -1,5 +1,6 @@
 """Pictures of laws side by side, of contact forces and of force histories."""
 
+import dataclasses
 from collections.abc import Mapping
 
 import jax
@@ -12,13 +13,13 @@ from scipy.integrate import solve_ivp
 from jimpact._checks import check_kind
 from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
-from jimpact.laws.compliant import Compliant
-from jimpact.laws.forces import Bistiffness, Force
+from jimpact.laws.forces import Force
 from jimpact.laws.histories import History
 from jimpact.methods.comparison import Comparison
 from jimpact.plot.style import (
     COLOURS,
     GREY,
+    HIGHLIGHT,
     SMALL,
     finish,
     heading,
@@ -35,14 +36,15 @@ _SAMPLES = 120  # points of a force-indentation loop
 _UPRIGHT = 8  # names that stand side by side, at most
 
 
-def comparison(found: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
+def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
     """Velocities after the impact by law, above the energy kept and how evenly it is spread.
 
-    Measured velocities are horizontal lines; a law whose outcome fails the audit is crossed.
+    Measured velocities are horizontal lines, and the laws closest to them are highlighted; a law
+    whose outcome fails the audit is crossed.
 
     Args:
-        found: what `ji.compare` returned.
-        measured: v+ (n,) [m/s], or None.
+        result: what `ji.compare` returned.
+        measured: v+ (n,) [m/s]; None: those of `result`, if it has any.
         title: above the picture.
 
     Returns:
@@ -52,45 +54,61 @@ def comparison(found: Comparison, measured: np.ndarray | None = None, title: str
         TypeError: something else.
 
     >>> import jimpact as ji
-    >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
-    >>> len(ji.plot.comparison(found).axes)
+    >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+    >>> len(ji.plot.comparison(result).axes)
     2
     """
-    check_kind("found", found, Comparison)
-    names, entries = list(found.entries), list(found.entries.values())
-    bodies = len(found.velocity)
-    what, unit = ("body", "m/s") if found.scene.walls is not None else ("coordinate", "m/s, rad/s")
+    check_kind("result", result, Comparison)
+    if measured is not None:
+        result = dataclasses.replace(result, measured=np.asarray(measured))
+    names = list(result.entries)
     figure = new_figure(6.0)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1.4))
-    x, velocity = _dots(top, found, what)
-    fine = np.array([bool(entry.audit.consistent) for entry in entries])
-    for i in range(bodies):
-        if measured is not None and np.isfinite(measured[i]):
-            colour = COLOURS[i % len(COLOURS)]
-            top.axhline(measured[i], color=colour, lw=1, ls="--", zorder=0)
-        if not fine.all():
-            wrong = x[~fine, i], velocity[~fine, i]
-            top.plot(*wrong, "x", color="black", ms=10, label="audit failed" if i == 0 else None)
-    if measured is not None:
-        top.plot([], [], color="black", lw=1, ls="--", label="measured")
-    top.set_ylabel(f"velocity after the impact [{unit}]")
+    _velocities(top, result)
     heading(figure, title)
-    kept = [entry.energy_ratio for entry in entries]
-    spread = [entry.dispersion_index for entry in entries]
-    at = np.arange(len(names))
-    bottom.bar(at - 0.18, kept, 0.32, color=GREY, label="energy kept T+/T-")
-    bottom.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
-    bottom.set_ylabel("share of 1")
+    _energies(bottom, result)
     _laws_axis(bottom, names)
+    for name in result.closest:
+        place = names.index(name)
+        label = "closest to the measured velocities" if name == result.closest[0] else None
+        for axes in (top, bottom):
+            axes.axvspan(place - 0.48, place + 0.48, color=HIGHLIGHT, lw=0, zorder=-1, label=label)
+            label = None
     finish(top, bottom, grid="y")
     handles = [x for axes in (top, bottom) for x in axes.get_legend_handles_labels()[0]]
     legend_below(figure, handles, 4)
     return figure
 
 
-def _dots(axes: Axes, found: Comparison, what: str) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities after by every law (l, n), a dot each; where they stand."""
-    velocity = np.array([np.asarray(entry.outcome.velocity) for entry in found.entries.values()])
+def _velocities(axes: Axes, result: Comparison) -> None:
+    """Velocities after by law, measured ones as lines; crosses where the audit fails."""
+    chain = result.scene.walls is not None
+    x, velocity = _dots(axes, result, "body" if chain else "coordinate")
+    consistent = np.array([bool(entry.audit.consistent) for entry in result.entries.values()])
+    if not consistent.all():
+        wrong = x[~consistent].ravel(), velocity[~consistent].ravel()
+        axes.plot(*wrong, "x", color="black", ms=10, label="audit failed")
+    if result.measured is not None:
+        for i, v in enumerate(result.measured):
+            colour = COLOURS[i % len(COLOURS)]
+            axes.plot([-0.5, len(x) - 0.5], [v, v], color=colour, lw=1, ls="--", zorder=0)
+        axes.plot([], [], color="black", lw=1, ls="--", label="measured")
+    axes.set_ylabel(f"velocity after the impact [{'m/s' if chain else 'm/s, rad/s'}]")
+
+
+def _energies(axes: Axes, result: Comparison) -> None:
+    """Energy kept and dispersion index by law, as bars."""
+    entries, at = result.entries.values(), np.arange(len(result.entries))
+    ratio = [entry.energy_ratio for entry in entries]
+    spread = [entry.dispersion_index for entry in entries]
+    axes.bar(at - 0.18, ratio, 0.32, color=GREY, label="energy kept T+/T-")
+    axes.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
+    axes.set_ylabel("share of 1")
+
+
+def _dots(axes: Axes, result: Comparison, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities after by every law (l, n), a dot each, and their places along the axis."""
+    velocity = np.array([np.asarray(entry.outcome.velocity) for entry in result.entries.values()])
     laws, bodies = velocity.shape
     x = np.arange(laws)[:, None] + side_by_side(bodies)[None, :]
     for i in range(bodies):
@@ -108,32 +126,34 @@ def _laws_axis(axes: Axes, names: list[str]) -> None:
     axes.set_xlabel("law")
 
 
-def rheologies(found: Comparison, title: str = "") -> Figure:
+def rheologies(result: Comparison, title: str = "") -> Figure:
     """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
 
     Args:
-        found: of `compare_rheologies`, or of `compare` with `Compliant` laws.
+        result: of `compare_rheologies`, or of `compare` with laws that have a `contact_force`.
         title: above the picture.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: a law that is not `Compliant`.
+        TypeError: a law without a `contact_force`.
 
     >>> import jimpact as ji
     >>> laws = {"Hertz": ji.Compliant(ji.Bistiffness(1.0, 1.5, 0.8))}
-    >>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], laws)
-    >>> len(ji.plot.rheologies(found).axes)
+    >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], laws)
+    >>> len(ji.plot.rheologies(result).axes)
     2
     """
-    forces = {
-        name: e.law.force for name, e in found.entries.items() if isinstance(e.law, Compliant)
-    }
-    if len(forces) < len(found.entries):
-        raise TypeError("Argument `found` must hold `Compliant` laws only.")
-    mass = 1 / float(diagonal(delassus_matrix(found.scene))[0])
-    speed = float(np.max(-np.asarray(gap_velocity(found.scene, found.velocity))))
+    forces = {name: e.law.contact_force for name, e in result.entries.items()}
+    without = [name for name, force in forces.items() if force is None]
+    if without:
+        raise TypeError(
+            "Argument `result` must hold laws with a `contact_force` only, but "
+            f"{without[0]} does not have one."
+        )
+    mass = 1 / float(diagonal(delassus_matrix(result.scene))[0])
+    speed = float(np.max(-np.asarray(gap_velocity(result.scene, result.velocity))))
     figure = new_figure(6.8)
     loops, outcome = figure.subplots(2, 1)
     for (name, force), colour in zip(forces.items(), COLOURS):
@@ -145,12 +165,12 @@ def rheologies(found: Comparison, title: str = "") -> Figure:
     loops.set_title("contact 1 alone", loc="left", fontsize="medium")
     legend_within(loops)
     heading(figure, title)
-    _dots(outcome, found, "body")
-    _laws_axis(outcome, list(found.entries))
+    _dots(outcome, result, "body")
+    _laws_axis(outcome, list(result.entries))
     outcome.set_ylabel("velocity after the impact [m/s]")
     outcome.set_xlabel("force")
     outcome.set_title("all contacts together", loc="left", fontsize="medium")
-    legend_within(outcome, max(1, len(found.velocity) // 6))
+    legend_within(outcome, max(1, len(result.velocity) // 6))
     finish(loops, outcome)
     return figure
 
@@ -184,11 +204,11 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     return figure
 
 
-def history(found: History, title: str = "") -> Figure:
+def history(result: History, title: str = "") -> Figure:
     """One impact over its time: forces, gap velocities and stored energy of every contact.
 
     Args:
-        found: what `ji.history` returned, of one impact.
+        result: what `ji.history` returned, of one impact.
         title: above the picture.
 
     Returns:
@@ -202,11 +222,11 @@ def history(found: History, title: str = "") -> Figure:
     >>> [axes.get_ylabel() for axes in ji.plot.history(h).axes]
     ['force [N]', 'gap velocity [m/s]', 'stored energy [J]']
     """
-    check_kind("found", found, History)
-    if np.ndim(found.status):
-        raise ValueError("Argument `found` must be of one impact, but is a batch: pick one of it.")
-    unit, size = readable_unit("s", float(found.duration))
-    time, rows = np.asarray(found.time) / size, [found.force, found.gap_velocity, found.energy]
+    check_kind("result", result, History)
+    if np.ndim(result.status):
+        raise ValueError("Argument `result` must be of one impact, but is a batch: pick one of it.")
+    unit, size = readable_unit("s", float(result.duration))
+    time, rows = np.asarray(result.time) / size, [result.force, result.gap_velocity, result.energy]
     figure = new_figure(6.8)
     panels = figure.subplots(3, 1, sharex=True)
     words = ("force [N]", "gap velocity [m/s]", "stored energy [J]")
@@ -214,8 +234,8 @@ def history(found: History, title: str = "") -> Figure:
         for j, y in enumerate(np.asarray(values).T):
             axes.plot(time, y, color=COLOURS[j % len(COLOURS)], label=f"contact {j + 1}")
         axes.set_ylabel(label)
-    friction = np.asarray(found.tangential_force)
-    each = friction.shape[1] // found.force.shape[1]
+    friction = np.asarray(result.tangential_force)
+    each = friction.shape[1] // result.force.shape[1]
     for j, y in enumerate(friction.T):
         colour = COLOURS[j // each % len(COLOURS)]
         panels[0].plot(time, y, "--", color=colour, label="along the contact" if j == 0 else None)
@@ -230,11 +250,12 @@ def history(found: History, title: str = "") -> Figure:
 
 def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarray]:
     """Indentation and force of one pair's collision."""
-    if isinstance(force, Bistiffness):
-        k, eta = float(force.stiffness), float(np.asarray(force.exponent))
+    loop = force.bistiffness
+    if loop is not None:
+        k, eta = float(loop.stiffness), float(np.asarray(loop.exponent))
         deepest = ((eta + 1) * mass * speed**2 / (2 * k)) ** (1 / (eta + 1))
         part = np.linspace(0, 1, _SAMPLES)
-        residual = (1 - float(force.restitution) ** 2) * deepest
+        residual = (1 - float(loop.restitution) ** 2) * deepest
         loading, unloading = part * deepest, residual + part[::-1] * (deepest - residual)
         f = k * deepest**eta * part**eta
         return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])

@@ -1,6 +1,7 @@
 """Picture: distributions of the velocities, and a map of the outcome over two gaps."""
 
 import textwrap
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -13,20 +14,22 @@ from jimpact.montecarlo.results import MonteCarlo
 from jimpact.montecarlo.statistics import FAILURE
 from jimpact.plot.style import COLOURS, SMALL, finish, heading, new_figure
 
-_BARS = 100  # of a histogram in the picture
-_BODIES = 6  # with a histogram of their own; of more only the most scattered are shown
+_BARS = 30  # of a histogram: each is several pixels wide
+_MEAN_AT, _TOP = 1.12, 1.25  # height of the mean, and of the axis, over that of the highest bar
+_BODIES = 6  # histograms; of more bodies only the most scattered are drawn
 _DOT = 4.0  # area of a sample in the map [points^2]
 _TITLE = 80  # letters of a line of the title
 
 
-def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
+def monte_carlo(result: MonteCarlo, title: str = "") -> Figure:
     """Histograms of every body, and the first samples over two gaps, coloured by the outcome.
 
+    Gaps are over the indentation of the contact (delta_c of `ji.gap_scale`), where it is known.
     The map shows the two gaps that vary most and the most scattered velocity; with one random
     gap, that velocity against it; without, no map.
 
     Args:
-        found: what `ji.monte_carlo` returned.
+        result: what `ji.monte_carlo` returned.
         title: above the picture.
 
     Returns:
@@ -38,55 +41,59 @@ def monte_carlo(found: MonteCarlo, title: str = "") -> Figure:
     >>> import jimpact as ji
     >>> law, balls = ji.Binary(1.0, order="earliest"), ji.chain([1.0, 1.0, 1.0])
     >>> gaps = ji.Uniform(0.0, 1e-5)
-    >>> found = ji.monte_carlo(law, balls, [1.0, 0.0, -1.0], gaps=gaps, samples=100)
-    >>> len(ji.plot.monte_carlo(found).axes)  # three bodies, map, its colour bar
+    >>> result = ji.monte_carlo(law, balls, [1.0, 0.0, -1.0], gaps=gaps, samples=100)
+    >>> len(ji.plot.monte_carlo(result).axes)  # three bodies, map, its colour bar
     5
     """
-    check_kind("found", found, MonteCarlo)
-    scattered = np.argsort(-found.std, kind="stable")
+    check_kind("result", result, MonteCarlo)
+    scattered = np.argsort(-result.std, kind="stable")
     bodies = sorted(scattered[:_BODIES].tolist())
-    mapped = found.first["gaps"].shape[1] > 0
+    mapped = result.first["gaps"].shape[1] > 0
     figure = new_figure(max(4.8, 1.5 * len(bodies)))
     grid = figure.add_gridspec(len(bodies), 2 if mapped else 1)
     shared: Axes | None = None
     for row, body in enumerate(bodies):
         axes = figure.add_subplot(grid[row, 0], sharex=shared)
         shared = shared or axes
-        _histogram(axes, found, body)
+        _histogram(axes, result, body)
         axes.tick_params(labelbottom=row == len(bodies) - 1)
-    axes.set_xlabel("velocity after the impact [m/s]\n(line: mean, dotted: 5 % and 95 %)")
-    heading(figure, title or textwrap.fill(found.description, _TITLE))
+    axes.set_xlabel("velocity after the impact [m/s]\n(dot: mean, bar: 5 % to 95 %)")
+    heading(figure, title or textwrap.fill(result.description, _TITLE))
     if mapped:
-        _map(figure.add_subplot(grid[:, 1]), found, int(scattered[0]))
+        _map(figure.add_subplot(grid[:, 1]), result, int(scattered[0]))
     return figure
 
 
-def _histogram(axes: Axes, found: MonteCarlo, body: int) -> None:
-    """Share of the samples by velocity; mean, and the 5 % and 95 % quantiles."""
-    counts, edges = found.counts[body, 1:-1], found.edges[body]
+def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
+    """Share of the samples by velocity; above it mean, and the 5 % and 95 % quantiles."""
+    counts, edges = result.counts[body, 1:-1], result.edges[body]
     each = max(1, len(counts) // _BARS)
     whole = len(counts) // each * each
     bars = counts[:whole].reshape(-1, each).sum(axis=1)
     bars[-1] += counts[whole:].sum()
+    share = 100 * bars / max(result.count, 1)
     colour = COLOURS[body % len(COLOURS)]
     ends = np.append(edges[:whole:each], edges[-1])
-    axes.stairs(100 * bars / max(found.count, 1), ends, color=colour, fill=True, alpha=0.75)
-    axes.axvline(found.mean[body], color="black", lw=1)
-    for limit in found.quantile([0.05, 0.95])[:, body]:
-        axes.axvline(limit, color="black", lw=0.8, ls=":")
-    label = f"body {body + 1}: {found.mean[body]:.3f} ± {found.std[body]:.3f} m/s"
+    axes.stairs(share, ends, color=colour, fill=True)
+    top = float(share.max())
+    mean, (low, high) = result.mean[body], result.quantile([0.05, 0.95])[:, body]
+    style: dict[str, Any] = {"color": "black", "ms": 4, "lw": 1, "capsize": 3}
+    axes.errorbar(mean, _MEAN_AT * top, xerr=[[mean - low], [high - mean]], fmt="o", **style)
+    axes.set_ylim(0, _TOP * top)
+    label = f"body {body + 1}: {mean:.3f} ± {result.std[body]:.3f} m/s"
     axes.set_title(label, loc="left", fontsize=SMALL, color=colour)
     axes.set_ylabel("samples [%]")
     finish(axes, grid="y")
 
 
-def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
-    first = found.first
+def _map(axes: Axes, result: MonteCarlo, body: int) -> None:
+    """The first samples over the two gaps that vary most, coloured by the velocity of a body."""
+    first = result.first
     fine = np.isfinite(first["velocity"]).all(axis=1) & ~FAILURE[first["status"]]
     velocity = first["velocity"][fine, body]
-    vary = np.argsort(-np.diag(found.gap_covariance), kind="stable")[:2]
+    vary = np.argsort(-np.diag(result.gap_covariance), kind="stable")[:2]
     gaps = sorted(vary.tolist())
-    x = [_in_units(found, first["gaps"][fine, gap], gap) for gap in gaps]
+    x = [_in_units(result, first["gaps"][fine, gap], gap) for gap in gaps]
     axes.set_xlabel(x[0][1])
     axes.set_title(f"{fine.sum():,} samples", loc="left", fontsize=SMALL)
     axes.spines[["top", "right"]].set_visible(False)
@@ -102,12 +109,13 @@ def _map(axes: Axes, found: MonteCarlo, body: int) -> None:
     axes.set_aspect("equal" if _alike(x[0][0], x[1][0]) else "auto")
 
 
-def _in_units(found: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.ndarray, str]:
-    """Gaps in gap scales where there are such, else in the metric unit that fits, and the label."""
+def _in_units(result: MonteCarlo, gap: np.ndarray, contact: int) -> tuple[np.ndarray, str]:
+    """Gaps in units of delta_c where it is known, else in the metric unit that fits; the label."""
     name = f"gap {contact + 1}"
-    if found.gap_scale is not None:
-        scale = found.gap_scale[contact]
-        return gap / scale, f"{name} / {scale * 1e6:.3g} µm (gap scale)"
+    if result.gap_scale is not None:
+        scale = result.gap_scale[contact]
+        unit, size = readable_unit("m", scale)
+        return gap / scale, f"{name} / indentation ({scale / size:.3g} {unit})"
     unit, size = readable_unit("m", np.max(gap, initial=0.0))
     return gap / size, f"{name} [{unit}]"
 

@@ -114,11 +114,11 @@ def _labels(
 
 def _by_unit(names: list[str]) -> dict[str, list[tuple[int, str]]]:
     """Unit -> (index, word) of what has it."""
-    found: dict[str, list[tuple[int, str]]] = {}
+    result: dict[str, list[tuple[int, str]]] = {}
     for i, name in enumerate(names):
         word, unit = split_name(name)
-        found.setdefault(unit, []).append((i, word))
-    return found
+        result.setdefault(unit, []).append((i, word))
+    return result
 
 
 class _Course(NamedTuple):

@@ -8,15 +8,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-# Okabe and Ito's palette without yellow: told apart with every common colour blindness.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+# Okabe and Ito's palette without yellow, distinct with every common colour blindness; then three of
+# Paul Tol's muted colours, for charts of more than seven lines.
+COLOURS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000"),
+    *("#882255", "#999933", "#332288"),
+)
 GREY = "#777777"
+HIGHLIGHT = "#FFF3C4"  # behind what a picture points out
+PLATE = "white"  # behind every picture: axes and words are dark, so that dark pages need a plate
 SPREAD = 0.6  # width that the bodies of one group take, of the distance between groups
 
-# Width of every picture [in] and its smallest font: read at half a page's width, too.
-WIDTH = 7.2
-COLUMNS = 2  # panels beside each other
-SMALL = 8.5  # points
+WIDTH = 7.2  # of every picture [in]: legible at half a page's width
+COLUMNS = 2  # panels side by side
+SMALL = 8.5  # smallest font [points]
 
 _DECADES = 100.0  # an axis that spans less is labelled within its decades, too
 _PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
@@ -24,22 +29,22 @@ _PLAIN = (1e-3, 1e5)  # numbers within are written without a power of ten
 
 def new_figure(height: float) -> Figure:
     """A figure of the common width, `height` [in] high."""
-    return Figure(figsize=(WIDTH, height), layout="constrained")
+    return Figure(figsize=(WIDTH, height), facecolor=PLATE, layout="constrained")
 
 
 def new_panels(count: int, height: float, more: float = 0.0, **shared: Any) -> tuple[Figure, Any]:
-    """A figure of so many panels, two beside each other; a row is `height` [in] high."""
+    """A figure of `count` panels, two side by side; a row is `height` [in] high."""
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     figure = new_figure(more + height * rows)
-    every = figure.subplots(rows, columns, squeeze=False, **shared).ravel()
-    for spare in every[count:]:
+    panels = figure.subplots(rows, columns, squeeze=False, **shared).ravel()
+    for spare in panels[count:]:
         spare.remove()
-    return figure, every[:count]
+    return figure, panels[:count]
 
 
 def side_by_side(bodies: int) -> np.ndarray:
-    """Where the bodies of one group stand (bodies,), around its place."""
+    """Offsets (bodies,) of the bodies of one group from its place."""
     return (np.arange(bodies) - (bodies - 1) / 2) * SPREAD / bodies
 
 
@@ -71,7 +76,7 @@ def legend_below(figure: Figure, handles: Sequence[Any], columns: int, note: str
 
 
 def legend_within(axes: Axes, columns: int = 1) -> None:
-    """The legend of one panel, where it hides least."""
+    """The legend of one panel, where it hides little."""
     axes.legend(frameon=False, fontsize=SMALL, ncols=columns, handlelength=1.4, columnspacing=1.0)
 
 

@@ -36,7 +36,7 @@ _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as
 
 
 def admissible_set(
-    found: AdmissibleSet, outcomes: Mapping[str, Any] | None = None, title: str = ""
+    result: AdmissibleSet, outcomes: Mapping[str, Any] | None = None, title: str = ""
 ) -> Figure:
     """The set of admissible outcomes, and labelled outcomes v+ (n,) of laws.
 
@@ -46,7 +46,7 @@ def admissible_set(
     energy kept; for one contact, against the energy kept.
 
     Args:
-        found: what `admissible_set` returned.
+        result: what `admissible_set` returned.
         outcomes: label -> v+ (n,) [m/s], an `Impact.velocity` for instance; drawn even when they
             are not admissible (hollow).
         title: empty for a default one.
@@ -58,51 +58,51 @@ def admissible_set(
         ValueError: an outcome of another size.
 
     >>> import jimpact as ji
-    >>> found = ji.theory.admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
-    >>> len(ji.plot.admissible_set(found, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
+    >>> result = ji.theory.admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+    >>> len(ji.plot.admissible_set(result, {"Newton's cradle": [0.0, 0.0, 1.0]}).axes)
     1
     """
     marked = {}
     for name, velocity in (outcomes or {}).items():
         v = np.asarray(velocity, float)
-        if v.shape != (found.scene.size,):
+        if v.shape != (result.scene.size,):
             raise ValueError(
-                f"Argument `outcomes` must have arrays of shape ({found.scene.size},), but "
+                f"Argument `outcomes` must have arrays of shape ({result.scene.size},), but "
                 f"{name!r} has shape {v.shape}."
             )
         marked[name] = v
-    closed = np.flatnonzero(np.asarray(found.scene.closed))
-    plane = found.dimension == 2 and len(closed) == 2
-    closed = closed if len(closed) else np.arange(found.scene.contacts)
-    figure = _plane(found, marked, closed) if plane else _projections(found, marked, closed)
+    closed = np.flatnonzero(np.asarray(result.scene.closed))
+    plane = result.dimension == 2 and len(closed) == 2
+    closed = closed if len(closed) else np.arange(result.scene.contacts)
+    figure = _plane(result, marked, closed) if plane else _projections(result, marked, closed)
     default = "Admissible: unilateral contact, pushing impulses, no energy gained"
     heading(figure, title or default)
     return figure
 
 
-def _plane(found: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray) -> Figure:
-    frame = _Frame(found, closed)
+def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray) -> Figure:
+    frame = _Frame(result, closed)
     figure = new_figure(7.6)
     axes = figure.subplots()
     circle = np.linspace(0, 2 * np.pi, 400)
     r = frame.radius
     axes.plot(r * np.cos(circle), r * np.sin(circle), color=GREY, lw=0.8, ls=(0, (4, 3)))
-    axes.fill(*frame(found.boundary(400)).T, color=_FILL, lw=0)
+    axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
     for k in (0, 1):
         _line(
             axes, frame, np.zeros(2), frame.walls[k], f"contact {closed[k] + 1} stays closed", "-"
         )
         away = frame.push[1 - k]
         _line(axes, frame, frame.before, away, f"no impulse at contact {closed[k] + 1}", ":")
-    arc = frame(found.conserving_arc(200))
+    arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
     _write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
     for name, end in (("A", arc[0]), ("B", arc[-1])):
         _write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
     axes.plot(*frame.before, "o", color="black", ms=8, ls="none", label="before the impact")
-    _mark(axes, frame(found.plastic), "plastic, least energy", -1, True)
+    _mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
     for i, (name, v) in enumerate(marked.items()):
-        _mark(axes, frame(v), name, i, bool(found.contains(v)))
+        _mark(axes, frame(v), name, i, bool(result.contains(v)))
     axes.set_aspect("equal")
     axes.set_xlim(-1.22 * r, 1.22 * r)
     axes.set_ylim(-1.22 * r, 1.22 * r)
@@ -142,11 +142,11 @@ def _legend(figure: Figure, axes: Axes, columns: int) -> None:
 class _Frame:
     """Kinetic coordinates turned so that the outcomes with gamma+ >= 0 open upwards."""
 
-    def __init__(self, found: AdmissibleSet, closed: np.ndarray):
-        self._found = found
-        self._metric = found.axes.T @ dense_mass(found.scene)
-        self.radius = found.coordinates.radius
-        normals = np.asarray(found.scene.normals, float)[:, closed].T @ found.axes
+    def __init__(self, result: AdmissibleSet, closed: np.ndarray):
+        self._found = result
+        self._metric = result.axes.T @ dense_mass(result.scene)
+        self.radius = result.coordinates.radius
+        normals = np.asarray(result.scene.normals, float)[:, closed].T @ result.axes
         push = normals / np.linalg.norm(normals, axis=1, keepdims=True)
         up = push.sum(0) / np.linalg.norm(push.sum(0))
         right = np.array([up[1], -up[0]])
@@ -157,7 +157,7 @@ class _Frame:
         # along wall k contact k stays closed and the other one opens
         walls = np.stack([[-p[1], p[0]] for p in self.push])
         self.walls = walls * np.sign(np.sum(walls * self.push[::-1], axis=1))[:, None]
-        self.before = self(found.velocity)
+        self.before = self(result.velocity)
 
     def __call__(self, velocity: np.ndarray) -> np.ndarray:
         """(..., n) -> (..., 2)."""
@@ -182,12 +182,12 @@ def _line(
 
 
 def _projections(
-    found: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray
+    result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray
 ) -> Figure:
     shown = closed[:_MOST_CONTACTS]
-    samples = found.sample(0, _SAMPLES)
-    unit = np.asarray(found.scene.normals / kinetic_norm(found.scene)[None, :], float)[:, shown]
-    cloud, kept = samples @ unit, _energy_kept(found, samples)
+    samples = result.sample(0, _SAMPLES)
+    unit = np.asarray(result.scene.normals / kinetic_norm(result.scene)[None, :], float)[:, shown]
+    cloud, kept = samples @ unit, _energy_kept(result, samples)
     pairs = list(combinations(range(len(shown)), 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8)
     for axes, (i, j) in zip(grid, pairs):
@@ -196,8 +196,8 @@ def _projections(
         dots = axes.scatter(cloud[:, i], y, c=kept, s=5, cmap="viridis", lw=0, vmin=0, vmax=1)
         for k, (name, v) in enumerate(marked.items()):
             point = v @ unit
-            height = _energy_kept(found, v) if single else point[j]
-            _mark(axes, (point[i], height), name, k, bool(found.contains(v)))
+            height = _energy_kept(result, v) if single else point[j]
+            _mark(axes, (point[i], height), name, k, bool(result.contains(v)))
         axes.set_xlabel(_gap_label(shown[i]), fontsize=SMALL)
         energy = "energy kept $T^+ / T^-$"
         axes.set_ylabel(energy if single else _gap_label(shown[j]), fontsize=SMALL)
@@ -207,22 +207,22 @@ def _projections(
     return figure
 
 
-def _energy_kept(found: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
-    energy = 0.5 * np.sum(velocity @ dense_mass(found.scene) * velocity, axis=-1)
-    return energy / found.energy if found.energy else np.ones_like(energy)
+def _energy_kept(result: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
+    energy = 0.5 * np.sum(velocity @ dense_mass(result.scene) * velocity, axis=-1)
+    return energy / result.energy if result.energy else np.ones_like(energy)
 
 
 def _gap_label(contact: int) -> str:
     return f"normalized gap velocity {contact + 1} after [√J]"
 
 
-def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
+def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     """|y_A'+ / y_B'-| against the kinetic angle: a panel for each mu, a line for each e.
 
     The dotted line is `critical_kinetic_angle`.
 
     Args:
-        found: what `ji.theory.rocking_dispersion` returned.
+        result: what `ji.theory.rocking_dispersion` returned.
         title: above the picture.
 
     Returns:
@@ -236,26 +236,26 @@ def rocking_dispersion(found: RockingDispersion, title: str = "") -> Figure:
     >>> len(ji.plot.rocking_dispersion(d).axes)
     1
     """
-    figure, panels = _panels(found, title)
-    theta, size = np.degrees(found.kinetic_angle), np.abs(found.dispersion)
+    figure, panels = _panels(result, title)
+    theta, size = np.degrees(result.kinetic_angle), np.abs(result.dispersion)
     for j, axes in enumerate(panels):
-        for k, e in enumerate(np.asarray(found.restitution)):
+        for k, e in enumerate(np.asarray(result.restitution)):
             colour = COLOURS[k % len(COLOURS)]
             axes.plot(theta, size[:, j, k], color=colour, lw=1.6, label=f"e = {e:g}")
     panels[0].set_ylim(bottom=0)  # shared by all, so last
     finish(*panels)
-    _angle_axes(found, panels, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
+    _angle_axes(result, panels, r"dispersion $|\dot y_A^+ / \dot y_B^-|$")
     legend_below(figure, panels[0].get_legend_handles_labels()[0], 6)
     return figure
 
 
-def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = STAYS) -> Figure:
+def rocking_outcomes(result: RockingDispersion, title: str = "", stays: float = STAYS) -> Figure:
     """Rest, rocking, half-rocking, free over the kinetic angle and e: a panel for each mu.
 
     The dotted line is `critical_kinetic_angle`; `stays` as in `RockingDispersion.outcomes`.
 
     Args:
-        found: what `ji.theory.rocking_dispersion` returned.
+        result: what `ji.theory.rocking_dispersion` returned.
         title: above the picture.
         stays: largest speed, over |gamma_B-|, of a corner that stays.
 
@@ -270,31 +270,31 @@ def rocking_outcomes(found: RockingDispersion, title: str = "", stays: float = S
     >>> len(ji.plot.rocking_outcomes(d).axes)
     1
     """
-    figure, panels = _panels(found, title)
-    codes = found.outcomes(stays)
+    figure, panels = _panels(result, title)
+    codes = result.outcomes(stays)
     colours = ListedColormap(_OUTCOME_COLOURS)
     norm = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES))
-    theta, e = np.degrees(found.kinetic_angle), np.asarray(found.restitution)
+    theta, e = np.degrees(result.kinetic_angle), np.asarray(result.restitution)
     for j, axes in enumerate(panels):
         axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
-    _angle_axes(found, panels, "restitution e")
+    _angle_axes(result, panels, "restitution e")
     shown = np.unique(codes)
     legend_below(figure, [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in shown], 5)
     return figure
 
 
-def _panels(found: RockingDispersion, title: str) -> tuple[Figure, Any]:
+def _panels(result: RockingDispersion, title: str) -> tuple[Figure, Any]:
     """A panel for each mu."""
-    figure, every = new_panels(len(found.friction), 2.8, 0.6, sharex=True, sharey=True)
-    for axes, mu in zip(every, np.asarray(found.friction)):
+    figure, every = new_panels(len(result.friction), 2.8, 0.6, sharex=True, sharey=True)
+    for axes, mu in zip(every, np.asarray(result.friction)):
         axes.set_title(f"mu = {mu:g}", loc="left", fontsize="medium")
     heading(figure, title)
     return figure, every
 
 
-def _angle_axes(found: RockingDispersion, panels: np.ndarray, label: str) -> None:
+def _angle_axes(result: RockingDispersion, panels: np.ndarray, label: str) -> None:
     """Critical angles; labels on the left, and below the last panel of each column."""
-    for axes, mu in zip(panels, np.asarray(found.friction)):
+    for axes, mu in zip(panels, np.asarray(result.friction)):
         critical = float(np.degrees(critical_kinetic_angle(mu)))
         axes.axvline(critical, color="black", ls=":", lw=1)
     for axes in panels[::COLUMNS]:

@@ -12,7 +12,6 @@ singular on the modes (both corners of a block lying flat), sticking contacts sh
 in proportion to mu p, and normal impulses are the least, wherever that is allowed.
 """
 
-import functools
 import itertools
 from typing import NamedTuple
 
@@ -20,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.solvers.dense import block_inverse, load_shares, times
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.status import CODE
 
@@ -271,55 +271,15 @@ def _turned(problem: _Problem, modes: _Modes, x: jax.Array) -> _Modes:
 def _solved(problem: _Problem, modes: _Modes) -> jax.Array:
     """x (m, b, N) on modes, contact by contact; wrong where their equations are singular.
 
-    Blocks that cannot be inverted are perturbed, which refinements undo.
+    Refinements undo what `block_inverse` perturbs.
     """
     matrix, right = _equations(problem, modes)
-    perturbed = float(jnp.finfo(matrix.dtype).eps) ** (1 / 3)
-    m, unit = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
-
-    def pivot(i: jax.Array, inverse: jax.Array) -> jax.Array:
-        here = (jnp.arange(m) == i)[:, None, None, None]
-        column, row = inverse[:, :, i], inverse[i]
-        block = _inverse(column[i], perturbed)
-        column = jnp.where(here, -unit[None], column)
-        row = jnp.where(here[:, 0][None], unit[:, None], row)
-        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)
-        gone = here[..., None] | here[None, None, :, 0]
-        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
-        return jnp.where(gone, 0.0, inverse) - spread
-
-    inverse = jax.lax.fori_loop(0, m, pivot, matrix)
+    inverse = block_inverse(matrix)
 
     def refine(_: int, x: jax.Array) -> jax.Array:
         return x + _times(inverse, right - _times(matrix, x))
 
     return jax.lax.fori_loop(0, 3, refine, jnp.zeros_like(right))
-
-
-def _inverse(block: jax.Array, perturbed: float) -> jax.Array:
-    """Inverses of blocks (b, b, N) by cofactors, b = 2 or 3."""
-    b = len(block)
-
-    def cofactors(a: jax.Array) -> jax.Array:
-        if b == 2:
-            return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
-        return jnp.stack(
-            [
-                jnp.cross(a[1], a[2], axis=0),
-                jnp.cross(a[2], a[0], axis=0),
-                jnp.cross(a[0], a[1], axis=0),
-            ],
-            axis=1,
-        )
-
-    def determinant(a: jax.Array) -> jax.Array:
-        return jnp.sum(a[0] * cofactors(a)[:, 0], axis=0)
-
-    small = jnp.abs(determinant(block)) < perturbed
-    unit = jnp.eye(b, dtype=block.dtype)[..., None]
-    block = block + jnp.where(small, perturbed, 0.0)[None, None] * unit
-    whole = determinant(block)
-    return cofactors(block) / jnp.where(whole == 0, 1.0, whole)[None, None]
 
 
 # ------------------------------------------------------------------- the decision
@@ -434,9 +394,7 @@ def _inverted(problem: _Problem, modes: _Modes, x: jax.Array) -> _Inverted:
 
 def _weights(problem: _Problem, x: jax.Array) -> jax.Array:
     """(m, b) of the squares of impulses in what is least where they are shared."""
-    bound = _bound(problem, x[..., None])
-    largest = jax.lax.stop_gradient(bound.max())
-    share = jnp.maximum(bound / jnp.where(largest > 0, largest, 1.0), _LEAST_SHARE)
+    share = load_shares(_bound(problem, x[..., None]), _LEAST_SHARE)
     return jnp.concatenate([jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1)
 
 
@@ -621,18 +579,13 @@ def distribute(
     matrix = jnp.where(each[:, None] & each[None], matrix, 0.0)
     rate = jnp.where(each, rate, 0.0)
     force = _relaxed(matrix, rate, limit)
-    slip = rate + _times_rows(matrix, force)
+    slip = rate + times(matrix, force)
     stick = _lengths(force, rows) < (1 - _INSIDE) * limit
     if rows == 1:
         scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
         stick = stick | (jnp.abs(slip) <= _INSIDE * scale)
     pushed = jnp.repeat(_lengths(force, rows) > 0, rows, axis=0)
     return asked & stick, jnp.where(pushed, -force, slip)
-
-
-def _times_rows(matrix: jax.Array, force: jax.Array) -> jax.Array:
-    """`K lambda` (t, B)."""
-    return functools.reduce(jnp.add, [matrix[:, i] * force[i][None] for i in range(len(force))])
 
 
 def _lengths(force: jax.Array, rows: int) -> jax.Array:
@@ -642,21 +595,26 @@ def _lengths(force: jax.Array, rows: int) -> jax.Array:
 
 def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
     """lambda (t, B) by projected Gauss-Seidel sweeps."""
-    rows = len(rate) // len(limit)
+    m, (t, *batch) = len(limit), rate.shape
+    rows = t // m
     least = _SETTLED * jnp.max(limit, axis=0, keepdims=True)
+    of_contacts = matrix.reshape(m, rows, t, *batch)
+    own = matrix[np.arange(t), np.arange(t)].reshape(m, rows, *batch)
+    stiffness = own[:, 0] if rows == 1 else own[:, 0] + own[:, 1]
+    stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[:, None]  # no step is too long
     State = tuple[jax.Array, jax.Array, jax.Array]
+
+    def relax(j: jax.Array, force: jax.Array) -> jax.Array:
+        here = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
+        change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(of_contacts[j], force)
+        tried, most = here - change / stiffness[j], limit[j][None]
+        length = _lengths(tried, rows)
+        shrink = jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
+        return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
 
     def sweep(state: State) -> State:
         before, _, count = state
-        force = before
-        for j in range(len(limit)):
-            at, most = slice(rows * j, rows * (j + 1)), limit[j : j + 1]
-            stiffness = functools.reduce(jnp.add, [matrix[i, i] for i in range(at.start, at.stop)])
-            stiffness = jnp.where(stiffness > 0, stiffness, 1.0)[None]  # no step is too long
-            tried = force[at] - (rate[at] + _times_rows(matrix[at], force)) / stiffness
-            length = _lengths(tried, rows)
-            shrink = jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
-            force = force.at[at].set(tried * shrink)
+        force = jax.lax.fori_loop(0, m, relax, before)
         return force, jnp.any(jnp.abs(force - before) > least), count + 1
 
     start = (jnp.zeros_like(rate), jnp.any(limit > 0), jnp.asarray(0))

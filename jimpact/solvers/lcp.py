@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.solvers.linear import null_projector
+from jimpact.solvers.dense import null_projector
 from jimpact.status import CODE
 
 # The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Then

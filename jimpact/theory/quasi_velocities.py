@@ -1,31 +1,16 @@
 """Kinetic quasi-velocities: normal and tangential to the contacts in the kinetic metric."""
 
-from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, is_traced
-from jimpact.compiling import quick_jit
+from jimpact._checks import as_float_array, check_shape
 from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_velocity
-from jimpact.scene import Scene, as_velocity, dense_mass, gap_velocity, momentum, velocity_change
+from jimpact.quasi_space import quasi_basis as quasi_basis
+from jimpact.scene import Scene, as_velocity, gap_velocity, momentum, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix
-
-# Normals count as dependent when the matrix of their cosines has an eigenvalue below this
-# multiple of eps times its size.
-_SINGULAR = 100.0
-
-# Coordinates whose shares of the tangent space differ by less than this are equal but for
-# rounding; the first one is taken, so that a basis does not depend on the last digit.
-_EQUAL_SHARE = 1e-3
-
-_REDUNDANT = (
-    "Argument `scene` must have independent contact normals and constraints to define "
-    "quasi-velocities, but has {}."
-)
 
 
 class ContactPower(eqx.Module):
@@ -35,55 +20,6 @@ class ContactPower(eqx.Module):
     coupling: jax.Array
     tangential: jax.Array
     total: jax.Array
-
-
-def quasi_basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
-    """Bases `n_q` (n, m) and `t_q` (n, n - m - b) of the kinetic quasi-velocities.
-
-    Equation: `n_q = M^-1 N diag(1 / |grad f_j|)`, `t_q^T M n_q = 0`, `t_q^T grad h = 0`,
-    `t_q^T M t_q = I` (so that `D_t = I`).
-
-    Column i of t_q comes from a coordinate: the n - m - b coordinates with the largest shares
-    (in the kinetic metric) in the tangent space are projected onto it and orthonormalized in
-    their order; each column forms an acute angle with what is left of its coordinate. A chain
-    without walls: `(1, ..., 1) / sqrt(sum m)`.
-
-    Args:
-        scene: n coordinates, m contacts, b bilateral constraints.
-
-    Returns:
-        n_q [1 / sqrt(kg)], t_q [1 / sqrt(kg)].
-
-    Raises:
-        ValueError: redundant contacts, whose n_q are not independent (NaN or noise if traced).
-
-    Differentiable in the scene, but for the moments when another coordinate takes over.
-
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.22)-(6.23).
-
-    >>> import jimpact as ji
-    >>> normal, tangent = ji.theory.quasi_basis(ji.chain([2.0, 2.0]))
-    >>> [round(float(x), 6) for x in normal[:, 0]], [round(float(x), 6) for x in tangent[:, 0]]
-    ([-0.5, 0.5], [0.5, 0.5])
-    """
-    check_independent(scene)
-    return _basis(scene)
-
-
-@quick_jit
-def _basis(scene: Scene) -> tuple[jax.Array, jax.Array]:
-    fixed = _directions(scene)
-    metric = jax.vmap(partial(momentum, scene), 1, 1)  # M X
-    gram = as_matrix(normalized_delassus(fixed))
-    unit = jnp.eye(fixed.contacts, dtype=gram.dtype) / kinetic_norm(fixed)[:, None]
-    held = jax.vmap(partial(velocity_change, fixed), 1, 1)(unit)  # M^-1 (N, grad h), unit columns
-    identity = jnp.eye(scene.size, dtype=gram.dtype)
-    free = identity - held @ jnp.linalg.solve(gram, metric(held).T)
-    chosen = _coordinates(metric(free), metric(identity), scene.size - fixed.contacts)
-    tangent = free[:, chosen]
-    triangle = jnp.linalg.cholesky(tangent.T @ metric(tangent))
-    tangent = jax.scipy.linalg.solve_triangular(triangle, tangent.T, lower=True).T
-    return held[:, : scene.contacts], tangent
 
 
 def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Array]:
@@ -215,47 +151,3 @@ def contact_power(
     coupling = qn @ jnp.linalg.solve(as_matrix(normalized_delassus(scene)), pushed_normal)
     tangential = qt @ (tangent.T @ (scene.tangents @ side))
     return ContactPower(normal, coupling, tangential, normal + coupling + tangential)
-
-
-def _directions(scene: Scene) -> Scene:
-    """The scene with its bilateral constraints as further contacts."""
-    fixed = scene.normals
-    if scene.constraints is not None:
-        fixed = jnp.concatenate([fixed, scene.constraints], axis=1)
-    if fixed.shape[1] > scene.size:
-        raise ValueError(_REDUNDANT.format(f"{fixed.shape[1]} of them for {scene.size} velocities"))
-    return Scene(scene.mass, fixed)
-
-
-def check_independent(scene: Scene) -> None:
-    """Raise a ValueError where contact normals and constraints are dependent (if concrete)."""
-    fixed = _directions(scene)
-    if is_traced((fixed.normals, fixed.mass)):
-        return
-    normals = np.asarray(fixed.normals, float)
-    gram = normals.T @ np.linalg.solve(dense_mass(fixed), normals)
-    norm = np.sqrt(np.diag(gram))
-    smallest = np.linalg.eigvalsh(gram / np.outer(norm, norm))[0]
-    if smallest < _SINGULAR * np.finfo(gram.dtype).eps * len(gram):
-        raise ValueError(
-            _REDUNDANT.format(f"redundant ones: smallest eigenvalue of G {smallest:.3g}")
-        )
-
-
-def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
-    """The `count` coordinates that span the tangent space best, ascending.
-
-    Pivoted Cholesky factorization of the Gram matrix of the projected coordinate directions.
-    """
-    scale = 1 / jnp.sqrt(jnp.diagonal(mass))
-    gram = jax.lax.stop_gradient(shares * scale[:, None] * scale[None, :])
-
-    def choose(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        rest, chosen = state
-        left = jnp.diagonal(rest)
-        pivot = jnp.argmax(left >= (1 - _EQUAL_SHARE) * jnp.max(left)).astype(jnp.int32)
-        column = rest[:, pivot]
-        return rest - jnp.outer(column, column) / left[pivot], chosen.at[i].set(pivot)
-
-    start = (gram, jnp.zeros(count, jnp.int32))
-    return jnp.sort(jax.lax.fori_loop(0, count, choose, start)[1])

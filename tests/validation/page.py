@@ -5,16 +5,16 @@ import sys
 from pathlib import Path
 
 PAGE = Path(__file__).parents[2] / "docs" / "validation.md"
-HEAD = """# Numbers by others
+HEAD = """# Comparison with published results
 
-Closed forms and published constants that no one here made up, beside what jimpact gives. Written by
-`python tests/validation/page.py`; a test holds the page to the rows of `tests/validation/rows.py`.
+Closed forms and published constants, and the values that jimpact computes. Written by
+`python tests/validation/page.py`; a test compares the page with the rows of `tests/validation/rows.py`.
 The error is relative to 1 or to the number, whichever is larger, and rounded up to a power of ten.
 """
 
 
 def decade(error):
-    """Rounded up to a power of ten; differences of rounding are none."""
+    """Rounded up to a power of ten; differences within rounding are 0."""
     if error < 1e-14:
         return "0"
     return f"1e{math.ceil(math.log10(error)):+03d}"
@@ -22,14 +22,14 @@ def decade(error):
 
 def lines(case, rows):
     """Markdown of a case."""
-    told = [f"## {case.title}", "", f"{case.source}.", ""]
+    text = [f"## {case.title}", "", f"{case.source}.", ""]
     if case.note:
-        told[-1:] = ["", case.note, ""]
-    told += ["| | theirs | ours | error |", "|---|---|---|---|"]
+        text[-1:] = ["", case.note, ""]
+    text += ["| | published | jimpact | error |", "|---|---|---|---|"]
     for row in rows:
         theirs, ours = (f"{x:.{row.digits}f}" for x in (row.theirs, row.ours))
-        told.append(f"| {row.what} | {theirs} | {ours} | {decade(row.error)} |")
-    return [*told, ""]
+        text.append(f"| {row.what} | {theirs} | {ours} | {decade(row.error)} |")
+    return [*text, ""]
 
 
 def page(computed):

@@ -1,6 +1,6 @@
-"""How often what a fit says is true: intervals, false alarms, power. Writes `docs/coverage.md`.
+"""Coverage and false alarms of fits: intervals, false alarms, power. Writes `docs/coverage.md`.
 
-`python tests/validation/simulated.py 500` simulates 500 data sets a row.
+`python tests/validation/simulated.py 500` simulates 500 data sets for each row.
 """
 
 import sys
@@ -213,12 +213,12 @@ def page(count, honest=HONEST, spoiled=SPOILED, ratios=(8.0, 40.0), print=print)
         first.append(f"| {row.what} | {percent(linear)} | {percent(profiled)} |")
         second.append(f"| {row.what} | {' | '.join(percent(x) for x in alarms(fits).values())} |")
         print(first[-1], second[-1])
-    third = ["| simulated | the warning | comes |", "|---|---|---|"]
+    third = ["| simulated | warning | how often |", "|---|---|---|"]
     for row in spoiled:
         share = alarms(fitted(row, count))[row.expected]
         third.append(f"| {row.what} | {row.expected} | {percent(share)} |")
         print(third[-1])
-    fourth = ["| k2/k1 | pieces hold it | pieces, on average |", "|---|---|---|"]
+    fourth = ["| k2/k1 | contained | pieces, on average |", "|---|---|---|"]
     few = -(-count // 5)
     for gamma in ratios:
         share, pieces = preimages(gamma, few)
@@ -236,27 +236,27 @@ def page(count, honest=HONEST, spoiled=SPOILED, ratios=(8.0, 40.0), print=print)
     )
 
 
-TEXT = """# How often what a fit says is true
+TEXT = """# Coverage and false alarms of fits
 
-Written by `python tests/validation/simulated.py {count}`: {count} simulated data sets a row, of 6 shots where
-nothing else is said, noise 0.01 m/s on velocities of about 1 m/s; all numbers in percent.
+Written by `python tests/validation/simulated.py {count}`: {count} simulated data sets for each row, of 6 shots unless
+stated otherwise, with noise of 0.01 m/s on velocities of about 1 m/s. All numbers are percentages.
 
 ## Intervals
 
-How many of the 95 % intervals hold the true value, parameter by parameter: those of
-`Fit.intervals()` without profiles, and those of `ji.profile` (the deviance of the true value, all others
-free, is below the limit).
+The share of 95 % intervals that contain the true value, for each parameter: intervals of `Fit.intervals()`
+without profiles, and of `ji.profile` (the deviance of the true value, with all others free, is below the
+limit).
 
 {first}
 
 One shot of three equal elastic balls, sigma = 0.001 m/s: several stiffness ratios give the same
-velocities. How many of {few} unions of intervals hold the true one:
+velocities. The share of {few} unions of intervals that contain the true one:
 
 {fourth}
 
 ## False alarms
 
-Data that the fitted law made:
+The data come from the fitted law, so each warning is a false alarm:
 
 {second}
 

@@ -1,0 +1,240 @@
+"""Small dense systems: elimination, singular matrices, and how redundant contacts share forces.
+
+LAYOUT   Flows keep the batch in the last axis: matrices (n, n, B), vectors (n, B). The functions
+`solve_definite`, `null_projector`, `solve_symmetric`, `determinants` have no batch.
+
+COMPILING   Elimination is a loop over the pivots, and products of more than `COLUMNS_WRITTEN_OUT`
+columns are reductions: programs do not grow with the number of contacts.
+
+SINGULAR MATRICES   Where contacts are redundant, many forces give the same motion. Velocities never
+depend on the choice; it decides which contact reaches its friction cone first:
+
+    sticking contacts, in the plane   in proportion to mu F: `load_shares` weight a `regularized`
+                                      system. They break loose together.
+    sticking contacts, in space       least sum of squares: `pseudoinverse`, taken once a step,
+                                      when the normal forces of its stages are not known yet
+    normal forces and impulses        least sum of squares, in the scaling with unit diagonal
+"""
+
+import functools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+# Rows up to which one system is solved by the loop, not by LAPACK: in a batch that is three to six
+# times as fast. With ten times more the cubic cost of many contacts would not be blocked.
+_BY_LOOP = 4
+# Columns up to which products are written out: a reduction does not fuse with what follows it. Ten
+# times more would make large programs of long chains.
+COLUMNS_WRITTEN_OUT = 8
+# With a unit diagonal a matrix of m rows counts as singular when it has an eigenvalue below this
+# multiple of its rounding errors, eps m. Ten times more: nearly parallel contacts are redundant.
+_SINGULAR = 100.0
+# Parts of a matrix below this multiple of sqrt(eps) of its largest entry are none in its
+# pseudoinverse. Ten times more would drop small, regular parts.
+_NEGLIGIBLE_PART = 4.0
+_NEWTON_SCHULZ = 3  # iterations, each of which squares the error; ten times more only cost time
+
+
+# ---- products
+
+
+def unit(matrix: jax.Array) -> jax.Array:
+    """The unit matrix (n, n, 1) to be added to a matrix (n, n, B)."""
+    return jnp.eye(len(matrix), dtype=matrix.dtype).reshape(
+        *matrix.shape[:2], *[1] * (matrix.ndim - 2)
+    )
+
+
+def times(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+    """`matrix @ vector` (a, B) of (a, b, B) and (b, B)."""
+    if matrix.shape[1] > COLUMNS_WRITTEN_OUT:
+        return jnp.sum(matrix * vector[None], axis=1)
+    columns = [matrix[:, j] * vector[j : j + 1] for j in range(matrix.shape[1])]
+    return functools.reduce(jnp.add, columns)
+
+
+def product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """`a @ b` (n, l, B) of (n, k, B) and (k, l, B)."""
+    if a.shape[1] > COLUMNS_WRITTEN_OUT:
+        return jnp.sum(a[:, :, None] * b[None], axis=1)
+    return functools.reduce(jnp.add, [a[:, j, None] * b[j][None] for j in range(a.shape[1])])
+
+
+# ---- elimination
+
+
+def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """`matrix^-1 right` (n, c, B) of (n, n, B) and right sides (n, c, B).
+
+    Gauss-Jordan in a loop over the pivots, which are not chosen: matrices that are similar to a
+    positive definite one do not need that.
+    """
+    n = len(matrix)
+    number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
+
+    def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
+        row = jax.lax.dynamic_index_in_dim(rows, k, 0)
+        row = row * (1 / jax.lax.dynamic_index_in_dim(row, k, 1))
+        factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        return jnp.where(number == k, row, rows - factor * row)
+
+    return jax.lax.fori_loop(0, n, eliminate, jnp.concatenate([matrix, right], axis=1))[:, n:]
+
+
+def inverse(matrix: jax.Array) -> jax.Array:
+    """The inverse (n, n, B), without pivots as in `solve`."""
+    return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
+
+
+def solve_definite(g: jax.Array, right: jax.Array) -> jax.Array:
+    """`G x = right` for a symmetric positive definite G (m, m); right sides (m,) or (m, c)."""
+    if len(g) > _BY_LOOP:
+        return jnp.linalg.solve(g, right)
+    return solve(g[..., None], right.reshape(len(g), -1, 1)).reshape(right.shape)
+
+
+def block_inverse(matrix: jax.Array) -> jax.Array:
+    """Inverses of (m, b, m, b, N), block by block, b = 2 or 3, without pivots.
+
+    A singular block is perturbed by eps^(1/3), which refinements by the caller undo.
+    """
+    perturbation = float(jnp.finfo(matrix.dtype).eps) ** (1 / 3)
+    m, eye = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
+
+    def eliminate(i: jax.Array, inverse: jax.Array) -> jax.Array:
+        here = (jnp.arange(m) == i)[:, None, None, None]
+        column, row = inverse[:, :, i], inverse[i]
+        block = _small_inverse(column[i], perturbation)
+        column = jnp.where(here, -eye[None], column)
+        row = jnp.where(here[:, 0][None], eye[:, None], row)
+        row = jnp.sum(block[:, :, None, None] * row[None], axis=1)
+        replaced = here[..., None] | here[None, None, :, 0]
+        spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
+        return jnp.where(replaced, 0.0, inverse) - spread
+
+    return jax.lax.fori_loop(0, m, eliminate, matrix)
+
+
+def _small_inverse(block: jax.Array, perturbation: float) -> jax.Array:
+    """Inverses of blocks (b, b, N) by cofactors, b = 2 or 3."""
+    small = jnp.abs(_small_determinant(block)) < perturbation
+    eye = jnp.eye(len(block), dtype=block.dtype)[..., None]
+    block = block + jnp.where(small, perturbation, 0.0)[None, None] * eye
+    whole = _small_determinant(block)
+    return _cofactors(block) / jnp.where(whole == 0, 1.0, whole)[None, None]
+
+
+def _small_determinant(a: jax.Array) -> jax.Array:
+    """Determinants (N,) of (b, b, N), b = 2 or 3."""
+    return jnp.sum(a[0] * _cofactors(a)[:, 0], axis=0)
+
+
+def _cofactors(a: jax.Array) -> jax.Array:
+    """Adjugates (b, b, N) of (b, b, N), b = 2 or 3."""
+    if len(a) == 2:
+        return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])])
+    sides = [jnp.cross(a[i], a[j], axis=0) for i, j in ((1, 2), (2, 0), (0, 1))]
+    return jnp.stack(sides, axis=1)
+
+
+def determinants(k: jax.Array) -> jax.Array:
+    """Of (N, n, n); those of four rows by minors of two rows, which is quicker to compile."""
+    if k.shape[-1] != 4:
+        return jnp.linalg.det(k)
+    left, right = np.triu_indices(4, 1)
+    upper = k[..., 0, left] * k[..., 1, right] - k[..., 0, right] * k[..., 1, left]
+    lower = k[..., 2, left] * k[..., 3, right] - k[..., 2, right] * k[..., 3, left]
+    signs = jnp.asarray(np.where((left + right) % 2, 1, -1), k.dtype)
+    return jnp.sum(upper * lower[..., ::-1] * signs[None], axis=-1)
+
+
+# ---- singular matrices: redundant contacts
+
+
+def load_shares(limit: jax.Array, least: float = 0.0) -> jax.Array:
+    """Weights of the contacts in the sharing of redundant forces: `limit` (m, ..) over the largest.
+
+    None is below `least`, which keeps the weights of contacts without load regular.
+    """
+    largest = jax.lax.stop_gradient(jnp.max(limit, axis=0, keepdims=True))
+    share = limit / jnp.where(largest > 0, largest, 1.0)
+    return jnp.maximum(share, least) if least > 0 else share
+
+
+def regularized(
+    matrix: jax.Array, right: jax.Array, ridge: jax.Array, refinements: int
+) -> jax.Array:
+    """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) added to it.
+
+    Each refinement removes what the ridge changes where the matrix is regular, and makes the
+    derivatives right in one order more: the inverse has none.
+    """
+    inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
+    z = times(inverted, right)
+    for _ in range(refinements):
+        z = z + times(inverted, right - times(matrix, z))
+    return z
+
+
+@jax.custom_jvp
+def regularized_once(matrix: jax.Array, ridge: jax.Array, right: jax.Array) -> jax.Array:
+    """As `regularized` with one refinement; tangents solve the same equations."""
+    return regularized(matrix, right, ridge, 1)
+
+
+@regularized_once.defjvp
+def _regularized_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+    """The tangent `dz` of `matrix z = right` solves `matrix dz = dright - dmatrix z`."""
+    (matrix, ridge, right), (dmatrix, _, dright) = primals, tangents
+    z = regularized_once(matrix, ridge, right)
+    return z, regularized_once(matrix, ridge, dright - times(dmatrix, z))
+
+
+def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
+    """Of the rows and columns `held` (n, B) of a positive semidefinite (n, n, B); 0 elsewhere.
+
+    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes.
+    """
+    both = held[:, None] & held[None]
+    k = jnp.where(both, matrix, 0.0)
+    size = jnp.max(jnp.abs(k), axis=(0, 1), keepdims=True)
+    eps = float(jnp.finfo(k.dtype).eps)
+    part = _NEGLIGIBLE_PART * math.sqrt(eps) * jnp.where(size > 0, size, 1.0)
+    damped = inverse(k + unit(k) * jnp.where(held[:, None], part, 1.0))
+    z = product(damped, product(k, damped))
+    for _ in range(_NEWTON_SCHULZ):
+        z = 2 * z - product(z, product(k, z))
+    return z
+
+
+def null_projector(g: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Orthogonal projector (m, m) on the null space of G (unit diagonal), and whether it is not 0.
+
+    Held constant in derivatives: a perturbation is taken to keep the rank.
+    """
+    eigenvalues, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(g))
+    null = eigenvalues < _SINGULAR * jnp.finfo(g.dtype).eps * g.shape[0]
+    basis = jnp.where(null[None, :], vectors, 0.0)
+    return basis @ basis.T, jnp.any(null)
+
+
+def solve_symmetric(
+    g: jax.Array, right: jax.Array, *, regular: bool = False
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`G x = right` of least norm (m,), whether G is singular, and whether no x solves it.
+
+    `g` (m, m) is symmetric positive semidefinite with a diagonal of order 1, `regular` if that is
+    known beforehand.
+    """
+    if regular:
+        no = jnp.asarray(False)
+        return solve_definite(g, right), no, no
+    projector, singular = null_projector(g)
+    x = solve_definite(g + projector, right)
+    residual = jnp.abs(g @ x - right).max()
+    missed = residual > jnp.sqrt(jnp.finfo(g.dtype).eps) * jnp.abs(right).max()
+    return x, singular, singular & missed
