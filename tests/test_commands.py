@@ -178,6 +178,7 @@ REFUSED = [
     ('["restitution"]', "1", "`free` must be a list of names or a table of masks"),
     ("shots.csv", "none.csv", "none.csv' does not exist"),
     ("file =", "path =", "[data] must have the key `file`"),
+    ('"shots.csv"', "3", "`file` in [data] must be a path, but is 3"),
     ("[scene]", "[scene", "must be a TOML file"),
     ("[scene]\nmasses_kg = [1.0, 1.0]\n", "scene = 1\n", "`scene` must be a table, but is 1"),
     ('[data]\nfile = "shots.csv"\n', "", "[data]"),
