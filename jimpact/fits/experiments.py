@@ -412,13 +412,13 @@ def _scenes_of(
     if "q" in values:
         if columns != ["q"] or not isinstance(place, Body):
             raise ValueError(
-                f"{path}: columns `q` must belong to a body, but are place "
+                f"{path}: columns `q` must belong to a body, but are given "
                 f"{'with masses or gaps' if columns != ['q'] else f'for {type(place).__name__}'}."
             )
         return place.scenes(values["q"], near)
     if not isinstance(place, Scene) or ("mass" in values and place.walls is None):
         raise ValueError(
-            f"{path}: columns `{columns[0]}` must belong to a chain that is place as `scene`, but "
+            f"{path}: columns `{columns[0]}` must belong to a chain that is given as `scene`, but "
             f"that is {type(place).__name__}."
         )
     count = len(values["pre"])
