@@ -80,14 +80,17 @@ class FrictionFlow(ContactFlow):
 
     @property
     def driving(self) -> tuple[int, ...]:
+        """x, g, p and slip."""
         m = self.contacts
         return m, m, m, self.across.shape[1]
 
     @property
     def adding(self) -> tuple[int, ...]:
+        """The tangential impulse and time."""
         return self.across.shape[1], 1
 
     def slip(self, y: jax.Array) -> jax.Array:
+        """Slip u (m, B) of a state."""
         m = self.contacts
         return y[3 * m : 4 * m]
 
@@ -114,10 +117,12 @@ class FrictionFlow(ContactFlow):
         return jnp.where(shares, jnp.maximum(ridge(y.dtype) / self.tolerance, 1.0), 1.0)
 
     def loaded(self, modes: jax.Array) -> jax.Array:
+        """Contacts (m, B) in compression or expansion."""
         phase = modes[: self.contacts]
         return (phase == COMPRESSION) | (phase == EXPANSION)
 
     def constants(self, modes: jax.Array) -> Any:
+        """Those of the normal flow, and which contacts stick or slide."""
         m = self.contacts
         slip = modes[2 * m :]
         stick = (slip == 0) & self.loaded(modes)
@@ -149,6 +154,7 @@ class FrictionFlow(ContactFlow):
         return FrictionForces(f, const.drag * f + hold, rate, room)
 
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of x, g, p, slip, its impulse and time."""
         frozen, found = const.frozen, self.forces(const, y)
         pull = self.coupling.times(found.normal) + times(self.across, found.side)
         return jnp.concatenate(
@@ -163,6 +169,7 @@ class FrictionFlow(ContactFlow):
         )
 
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Those of the normal flow, speeds of slip, room in the friction cones."""
         m = self.contacts
         slides = (modes[2 * m :] != 0) & self.loaded(modes)
         return jnp.concatenate(
@@ -174,12 +181,14 @@ class FrictionFlow(ContactFlow):
         )
 
     def rooted(self, modes: jax.Array) -> jax.Array:
+        """As in the normal flow; margins of friction have no root."""
         rooted = super().rooted(modes)
         return jnp.concatenate([rooted, jnp.zeros_like(rooted)])
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Modes after events: slip that stops and stick that breaks included."""
         m = self.contacts
         stopped, broke = which[2 * m : 3 * m], which[3 * m :]
         side = self.forces(self.constants(modes), y).side
@@ -220,6 +229,7 @@ class FrictionFlow(ContactFlow):
         return f / jnp.where(top > 0, top, 1.0)
 
     def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
+        """Forces, velocities and slip in a state."""
         m, side = self.contacts, self.forces(self.constants(modes), y).side
         return (
             super()
@@ -235,13 +245,16 @@ class FrictionFlow(ContactFlow):
     # ---- the end: a contact with friction is never alone, and no multiple of another state
 
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
+        """Never: the states of an impact with friction are not self-similar."""
         return None
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
+        """Whether no contact is at work."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
         return ~any_of(works)
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Indentations set to 0; no closed form ends an impact with friction."""
         m = self.contacts
         x = jnp.zeros_like(y[:m])
         return modes, jnp.concatenate([x, y[m:]])

@@ -201,6 +201,7 @@ class ImpulseProgram:
     repeats: bool = False  # walk the steps once more, for both modes
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
+        """The flow of a problem, its first modes and state."""
         flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
         return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
@@ -222,6 +223,7 @@ class ImpulseProgram:
         return dataclasses.replace(self, repeats=self.smooth)
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
+        """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         given = jax.lax.stop_gradient(problem) if self.repeats else problem
@@ -241,6 +243,7 @@ class ImpulseProgram:
         rows = 3 * gamma.shape[0]
 
         def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
+            """Normal impulses, tangential ones and time of the last state."""
             p = state[rows - len(gamma) : rows] + dp
             return p, state[rows + self.sides : -1][: self.sides], state[-1:]
 
@@ -353,9 +356,11 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
 
     @jax.custom_jvp
     def value(*leaves: jax.Array) -> tuple[jax.Array, ...]:
+        """The values."""
         return in_columns(function, *leaves)
 
     def rule(primals: Any, tangents: Any) -> Any:
+        """Values at the tolerance of derivatives, and their tangents."""
         # values keep the steps for the reverse mode: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
         outs = evaluate(fine, primals)

@@ -23,6 +23,7 @@ class Samples:
     samples: int
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
+        """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
         still = jax.lax.stop_gradient(problem)
         flow, modes, y = self.outcome.flow(still, 1.0)
@@ -44,6 +45,7 @@ class Samples:
             before = jnp.sum((times <= jax.lax.stop_gradient(t)).astype(jnp.int32), axis=0) - 1
 
             def of(rows: jax.Array) -> jax.Array:
+                """Rows of the step before the sample."""
                 return jnp.take_along_axis(rows, before[None, None], axis=0)[0]
 
             state, now = of(states), of(phases)

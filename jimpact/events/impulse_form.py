@@ -82,6 +82,7 @@ def emptying(flow: Rule, walk: Walk, is_primary: jax.Array, increment: jax.Array
     """
 
     def of_primary(values: jax.Array) -> jax.Array:
+        """The value of the primary contact."""
         return jnp.sum(jnp.where(is_primary, values, 0.0))
 
     gamma, energy, dp = of_primary(walk.gamma), of_primary(walk.energy), of_primary(increment)
@@ -126,6 +127,7 @@ def solve(problem: Any, exponent: Any, chain: bool, max_steps: int) -> tuple[jax
     """Dimensionless impulses and status; the step in impulse is the problem's `step`."""
 
     def run(given: Any, differentiated: bool) -> tuple[jax.Array, jax.Array]:
+        """Impulses and status, as `both_modes` takes them."""
         step = jax.lax.stop_gradient(given.step[0])
         rule = rule_of(given, exponent, chain)
         end = walk(rule, step, max_steps, given.gamma, 0.5 * given.energy)

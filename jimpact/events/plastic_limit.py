@@ -99,6 +99,7 @@ def to_the_end(
     start = ImpactEnd(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
 
     def on(end: ImpactEnd) -> ImpactEnd:
+        """On to the next pause or to the end."""
         finished = (end.carry.plan[2:3] == OVER) & end.begun
         if end.pen is None:
             carry, pen = stepper.run(flow, end.carry, most), None
@@ -109,6 +110,7 @@ def to_the_end(
         quiet = over & at_rest(still, seen)
 
         def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
+            """The state, finished where the impact is over."""
             return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
 
         carry = carry._replace(y=dual_like(carry.y, pushforward(at_end, flow, carry.y)))
@@ -184,6 +186,7 @@ def remainder(
     """The impulses of the contacts that carry at the end, as a smooth function of the rest."""
 
     def some() -> jax.Array:
+        """Impulses where a contact carries."""
         return impulse_of_rest(flow, carries, gamma + flow.change(state))
 
     return jax.lax.cond(jnp.any(carries), some, lambda: jnp.zeros_like(gamma))
@@ -194,6 +197,7 @@ def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> 
     right = jnp.where(carries, -after, 0.0)
 
     def step(carry: Any, _: None) -> tuple[Any, None]:
+        """One step of conjugate gradients."""
         z, residual, direction, size = carry
         image = jnp.where(carries, flow.coupling.times(direction), 0.0)
         curvature = total(direction * image)

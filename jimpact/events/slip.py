@@ -127,16 +127,19 @@ class SlipFlow(FrictionFlow):
     # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
 
     def slip(self, y: jax.Array) -> jax.Array:
+        """The two rows of slip (m, 2, B) of each contact."""
         m = self.contacts
         return pairs(y[3 * m : 5 * m])
 
     def with_slip(self, y: jax.Array, q: jax.Array) -> jax.Array:
+        """The state with these rows of slip."""
         m = self.contacts
         return jnp.concatenate([y[: 3 * m], flat(q), y[5 * m :]])
 
     def start_with(
         self, gamma: jax.Array, x: jax.Array, u: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Modes and state before the impact."""
         m = self.contacts
         modes, y = self.start(gamma, x)
         modes = jnp.concatenate([modes, jnp.zeros_like(modes[:m])])
@@ -170,6 +173,7 @@ class SlipFlow(FrictionFlow):
     # ---- the protocol
 
     def constants(self, modes: jax.Array) -> Any:
+        """The field without the forces of sticking."""
         stick, slips, creeps = self.sliding(modes)
         free = twice(slips | creeps | ~self.loaded(modes))
         z = pseudoinverse(self.along, twice(stick))
@@ -247,6 +251,7 @@ class SlipFlow(FrictionFlow):
         along, right = polar(angle)
 
         def acceleration(f: jax.Array, side: jax.Array) -> jax.Array:
+            """u' (m, 2, B) of normal forces and those of sliding."""
             return pairs(times(const.pull, f) + times(const.along, flat(side)))
 
         side = -c[:, None] * along
@@ -283,6 +288,7 @@ class SlipFlow(FrictionFlow):
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
     def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
+        """Forces, velocities and slip in a state."""
         m, (x, g, p) = self.contacts, self.rows(y)
         const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
         motion = self.motion(const, modes, y)
@@ -299,6 +305,7 @@ class SlipFlow(FrictionFlow):
         )
 
     def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of x, g, p, slip, its impulses and time, all in the shortened time."""
         _, g, _ = self.rows(y)
         frozen, motion = const.frozen, self.motion(const, modes, y)
         pull = times(const.coupling, motion.force) + times(const.across, motion.sliding)
@@ -333,6 +340,7 @@ class SlipFlow(FrictionFlow):
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Modes after events; slip changes its variables with the mode."""
         m = self.contacts
         stopped, ended = which[2 * m : 3 * m], which[3 * m :]
         stick, slips, creeps = self.sliding(modes)

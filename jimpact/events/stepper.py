@@ -205,6 +205,7 @@ def _slopes(
     dy = flow.field(const, s.modes, now)
 
     def rates_of_margins() -> tuple[jax.Array, jax.Array]:
+        """Margins and their rates in the flow's own time."""
         return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy[: len(now)],))
 
     if flow.near:  # of costly margins: steps in time need them at their ends only
@@ -237,6 +238,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     ends_of = np.cumsum([0, *blocks, *plain.adding])
 
     def stage(carry: Any, row: Any) -> tuple[Any, None]:
+        """One evaluation of the field."""
         slopes, added, *margins = carry
         i, a, node = row
         change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
@@ -359,6 +361,7 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, j
     broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
 
     def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Modes and state after the step, where it is accepted."""
         modes, end = flow.switch(s.modes, y + change[:n], which)
         return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
@@ -551,6 +554,7 @@ def record(
     size = BLOCKS * BLOCK
 
     def body(state: tuple[StepperState, Recorder]) -> tuple[StepperState, Recorder]:
+        """One pass, its step recorded where it is accepted."""
         carry, (plan, count) = state
         after, accept = advance(flow, carry, most)
         s = carry.step
@@ -626,9 +630,11 @@ def _walk(
     y = jnp.where(plan.lost, jnp.nan, 1.0) * y
 
     def step(y: jax.Array, row: Row) -> tuple[jax.Array, jax.Array | None]:
+        """One recorded step."""
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
+            """The state after it."""
             end = flow.switch(s.modes, step_again(flow, s, y), s.target)[1]
             return jnp.where(accept, end, y)
 
@@ -636,10 +642,14 @@ def _walk(
         return y, y if states else None
 
     def block(y: jax.Array, rows: Row) -> tuple[jax.Array, jax.Array | None]:
+        """One block of recorded steps."""
+
         def walk(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            """The state after the block."""
             return jax.lax.scan(jax.checkpoint(step), y, rows)
 
         def stay(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            """The state as it is: the block is empty."""
             return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
 
         return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, stay, y)

@@ -277,6 +277,7 @@ def _solved(problem: _Problem, modes: _Modes) -> jax.Array:
     inverse = block_inverse(matrix)
 
     def refine(_: int, x: jax.Array) -> jax.Array:
+        """One refinement by the approximate inverse."""
         return x + _times(inverse, right - _times(matrix, x))
 
     return jax.lax.fori_loop(0, 3, refine, jnp.zeros_like(right))
@@ -327,6 +328,7 @@ def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
 
     def differ(values: jax.Array) -> jax.Array:
+        """Whether consistent modes differ in these values from the chosen ones."""
         apart = jnp.abs(values - values[..., best][..., None]).max(axis=(0, 1))
         return jnp.any(good & (apart > root * _size(x[..., best])))
 
@@ -343,6 +345,7 @@ def _newton(problem: _Problem, modes: _Modes) -> tuple[_Modes, jax.Array]:
         return modes, _solved(problem, modes)
 
     def step(_: int, state: tuple[_Modes, jax.Array]) -> tuple[_Modes, jax.Array]:
+        """Impulses, and the directions of slip that follow from them."""
         x = _solved(problem, state[0])
         return _turned(problem, state[0], x), x
 
@@ -383,6 +386,7 @@ class _Inverted(NamedTuple):
 
 
 def _inverted(problem: _Problem, modes: _Modes, x: jax.Array) -> _Inverted:
+    """The equations of modes, inverted; see the class."""
     n = x.size
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
     weight = 1 / jnp.sqrt(_weights(problem, x))
@@ -423,6 +427,7 @@ def _on_modes(problem: _Problem, modes: _Modes, inverted: _Inverted, x: jax.Arra
     start = x.reshape(n) / weight
 
     def step(_: int, y: jax.Array) -> jax.Array:
+        """One chord step."""
         x = (weight * y).reshape(shape)
         matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
         shared = weight**2 * _weights(problem, x).reshape(n) * y
@@ -456,6 +461,7 @@ def _search(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     eps = float(jnp.finfo(x.dtype).eps)
 
     def refine(state: _Searched) -> _Searched:
+        """Sweeps at the next tolerance, then Newton's method on their modes."""
         level = (state.level // 2).astype(x.dtype)
         tolerance = jnp.maximum(_COARSEST * _FINER**level, 4 * eps)
         skip = started & (state.level < 0)
@@ -512,6 +518,7 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
     stiffest = jnp.where(stiffest > 0, stiffest, 1.0)
 
     def contact(i: jax.Array, x: jax.Array) -> jax.Array:
+        """The impulses of contact i so that it satisfies the law, all others given."""
         rate = problem.given[i] + jnp.sum(problem.matrix[i] * x[None], axis=(1, 2))
         p = x[i, 0] - rate[0] / own[i, 0, 0]
         p = jnp.maximum(p, 0.0) if problem.complementary else p
@@ -527,10 +534,12 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
     State = tuple[jax.Array, jax.Array, jax.Array]
 
     def going(state: State) -> jax.Array:
+        """Whether a sweep still changes something."""
         x, change, count = state
         return (change > tolerance * _size(x[..., None])[0]) & (count < _SWEEPS)
 
     def sweep(state: State) -> State:
+        """All contacts once."""
         x, _, count = state
         new = jax.lax.fori_loop(0, m, contact, x)
         return new, jnp.abs(new - x).max(), count + 1
@@ -605,6 +614,7 @@ def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
     State = tuple[jax.Array, jax.Array, jax.Array]
 
     def relax(j: jax.Array, force: jax.Array) -> jax.Array:
+        """The force of contact j after a projected step."""
         here = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
         change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(of_contacts[j], force)
         tried, most = here - change / stiffness[j], limit[j][None]
@@ -613,6 +623,7 @@ def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
         return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
 
     def sweep(state: State) -> State:
+        """All contacts once."""
         before, _, count = state
         force = jax.lax.fori_loop(0, m, relax, before)
         return force, jnp.any(jnp.abs(force - before) > least), count + 1

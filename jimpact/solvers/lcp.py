@@ -74,6 +74,7 @@ def solve_lcp(
 
 
 def _gathered(b: jax.Array) -> float:
+    """Rounding that a whole run may gather."""
     return b.shape[0] * float(jnp.finfo(b.dtype).eps) ** _POWER
 
 
@@ -119,10 +120,12 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     limit = _PIVOTS * (m + 1)
 
     def going(state: _Tableau) -> jax.Array:
+        """Whether the artificial variable is still basic."""
         inside = jnp.any(state.basis == artificial)
         return needed & inside & ~state.ray & (state.pivots < limit)
 
     def one(state: _Tableau) -> _Tableau:
+        """One pivot, unless a ray shows that there is no solution."""
         row, ray = _leaving(state, artificial, tolerance)
         moved = _pivot(state, row)
         kept = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)

@@ -25,15 +25,20 @@ def both_modes(
 
     @jax.custom_jvp
     def differentiable(inputs: Any) -> tuple[Any, Any]:
+        """The values."""
         return solve(inputs, False)
 
     def rule(primals: Any, tangents: Any) -> Any:
+        """Values and tangents by the Jacobian."""
         leaves, tree = jax.tree.flatten(primals[0])
         rates = jax.tree.leaves(tangents[0], is_leaf=lambda t: isinstance(t, SymbolicZero))
         moving = [i for i, rate in enumerate(rates) if not isinstance(rate, SymbolicZero)]
 
         def with_jacobian(at: list[jax.Array]) -> tuple[Any, Any, Any]:
+            """Outputs, their Jacobian, integers."""
+
             def outputs_of(values: list[jax.Array]) -> tuple[Any, Any]:
+                """Outputs of the perturbed inputs."""
                 moved = dict(zip(moving, values))
                 given = [moved.get(i, leaf) for i, leaf in enumerate(at)]
                 return solve(jax.tree.unflatten(tree, given), True)
@@ -41,6 +46,7 @@ def both_modes(
             values = [at[i] for i in moving]
 
             def push(directions: list[jax.Array]) -> tuple[Any, Any, Any]:
+                """Outputs and their tangent in one direction."""
                 return jax.jvp(outputs_of, (values,), (directions,), has_aux=True)
 
             return jax.vmap(push, out_axes=(None, 0, None))(_directions(values))
@@ -60,9 +66,11 @@ def without_derivatives(values: Any, why: Exception) -> Any:
 
     @jax.custom_jvp
     def same(numbers: list[Any]) -> list[Any]:
+        """The numbers as they are."""
         return numbers
 
     def rule(primals: Any, tangents: Any) -> Any:
+        """Raises where a number is perturbed."""
         rates = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
         if any(not isinstance(rate, SymbolicZero) for rate in rates):
             raise why

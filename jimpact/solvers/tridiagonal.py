@@ -37,6 +37,7 @@ class Tridiagonal(eqx.Module):
         first = jnp.ones_like(none), none, none
 
         def eliminate(row: Triple, given: Triple) -> tuple[Triple, Triple]:
+            """A row of the bidiagonal system, from the row above."""
             pivot, right, before = row  # of the row above, and its off-diagonal entry
             diagonal, known, after = given[0][None], given[1][None], given[2][None]
             factor = before / pivot
@@ -47,6 +48,7 @@ class Tridiagonal(eqx.Module):
         _, (pivot, right, after) = jax.lax.scan(eliminate, first, (self.diagonal, vector, after))
 
         def substitute(found: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+            """An unknown, from the one below."""
             pivot, right, after = row
             found = (right - after * found) / pivot
             return found, found
