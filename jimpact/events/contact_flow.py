@@ -354,7 +354,7 @@ class ContactFlow(Flow):
         phase = modes[: self.contacts]
         return ~any_of((phase == COMPRESSION) | (phase == EXPANSION))
 
-    # ---- what is looked at
+    # ---- results
 
     def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
         """Forces, velocities and the rate of time in a state."""

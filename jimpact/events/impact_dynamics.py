@@ -1,4 +1,4 @@
-"""The dynamics of an impact in units of its own: results do not depend on the user's unit system.
+"""The dynamics of an impact in its natural units: results do not depend on the user's units.
 
 With Q the largest normalized approach velocity (or stored energy) of the impact, contact j has
 
@@ -176,9 +176,9 @@ def flow_of(
     if problem.sides is None:
         flow = ContactFlow(**parts)
         return flow, *flow.start(problem.gamma, x)
-    (across, along, slip), friction = problem.sides
+    (normal_tangent, tangent, slip), friction = problem.sides
     kind = FrictionFlow if len(slip) == m else SlipFlow
-    frictional = kind(**parts, across=across, along=along, friction=friction)
+    frictional = kind(**parts, normal_tangent=normal_tangent, tangent=tangent, friction=friction)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
 
 
@@ -197,7 +197,7 @@ class ImpulseProgram:
     sides: int = 0  # tangential rows
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    smooth: bool = False  # what has derivatives alone: tangents go along with the steps
+    smooth: bool = False  # only the results that have derivatives; duals are taken
     repeats: bool = False  # walk the steps once more, for both modes
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
@@ -226,8 +226,8 @@ class ImpulseProgram:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
-        given = jax.lax.stop_gradient(problem) if self.repeats else problem
-        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), given)
+        fixed = jax.lax.stop_gradient(problem) if self.repeats else problem
+        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), fixed)
         gamma = value_of(problem.gamma)
         end = to_the_end(
             flow, gamma, modes, y, self.most, keeps=self.finely and not self.takes_duals
@@ -364,8 +364,8 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
         # values keep the steps for the reverse mode: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
         outs = evaluate(fine, primals)
-        along = dataclasses.replace(fine, smooth=True)
-        rates = tangents_in_columns(along, primals, tangents)
+        smooth = dataclasses.replace(fine, smooth=True)
+        rates = tangents_in_columns(smooth, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 

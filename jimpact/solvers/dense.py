@@ -199,7 +199,8 @@ def _regularized_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Ar
 def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
     """Of the rows and columns `held` (n, B) of a positive semidefinite (n, n, B); 0 elsewhere.
 
-    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes.
+    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes from what
+    K transmits, to rounding; in the null space of K, forces are the least ones to some percent.
     """
     both = held[:, None] & held[None]
     k = jnp.where(both, matrix, 0.0)

@@ -40,8 +40,8 @@ def both_modes(
             def outputs_of(values: list[jax.Array]) -> tuple[Any, Any]:
                 """Outputs of the perturbed inputs."""
                 moved = dict(zip(moving, values))
-                given = [moved.get(i, leaf) for i, leaf in enumerate(at)]
-                return solve(jax.tree.unflatten(tree, given), True)
+                inputs = [moved.get(i, leaf) for i, leaf in enumerate(at)]
+                return solve(jax.tree.unflatten(tree, inputs), True)
 
             values = [at[i] for i in moving]
 
@@ -52,8 +52,8 @@ def both_modes(
             return jax.vmap(push, out_axes=(None, 0, None))(_directions(values))
 
         out, jacobian, aux = with_jacobian(leaves)
-        along = jnp.concatenate([jnp.ravel(rates[i]) for i in moving])
-        rate = jax.tree.map(lambda rows: jnp.tensordot(along, rows, axes=1), jacobian)
+        tangent = jnp.concatenate([jnp.ravel(rates[i]) for i in moving])
+        rate = jax.tree.map(lambda rows: jnp.tensordot(tangent, rows, axes=1), jacobian)
         still = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), jax.dtypes.float0), aux)
         return (out, aux), (rate, still)
 
@@ -79,15 +79,15 @@ def without_derivatives(values: Any, why: Exception) -> Any:
     same.defjvp(rule, symbolic_zeros=True)
     leaves, tree = jax.tree.flatten(values)
     moving = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
-    kept = dict(zip(moving, same([leaves[i] for i in moving])))
-    return jax.tree.unflatten(tree, [kept.get(i, x) for i, x in enumerate(leaves)])
+    replaced = dict(zip(moving, same([leaves[i] for i in moving])))
+    return jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
 
 
 def _directions(values: list[jax.Array]) -> list[jax.Array]:
     """Unit perturbations (d, ...) of each entry in turn."""
     counts = [x.size for x in values]
-    unit, first, found = jnp.eye(sum(counts), dtype=values[0].dtype), 0, []
+    unit, first, directions = jnp.eye(sum(counts), dtype=values[0].dtype), 0, []
     for x, count in zip(values, counts):
-        found.append(unit[:, first : first + count].reshape(-1, *x.shape))
+        directions.append(unit[:, first : first + count].reshape(-1, *x.shape))
         first += count
-    return found
+    return directions
