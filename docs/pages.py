@@ -152,6 +152,7 @@ def law_pages() -> dict[str, str]:
 
 UNITS = (  # how a comment begins, and the unit that it states
     (r"\[([^\]]+)\]", None),
+    (r"^(m/s\^2)", None),
     (r"(?:of|in|relative to) the tolerance|tolerances\b", "tolerance"),
     (r"seconds\b|\bs\b:", "s"),
     (r"eps\b|roundings?\b", "eps"),
@@ -213,7 +214,7 @@ def constants_of(path: Path) -> list[tuple[str, str, str]]:
             above = [shared]
         comment = " ".join([*beside, *above]) if node.lineno == end else " ".join([*above, *beside])
         rows.append((", ".join(names), ast.unparse(node.value), comment))
-        last_line, shared = end, comment
+        last_line, shared = end, " ".join(above)
     return rows
 
 
@@ -251,36 +252,44 @@ def constants_page() -> dict[str, str]:
     for path, rows in constants().items():
         folder = path.split("/")[0] if "/" in path else "top level"
         if folder != room:
-            text += [f"## {folder}", ""]
+            text += ["", f"## {folder}", "", "| name | value | unit | meaning | file |"]
+            text.append("|---|---|---|---|---|")
             room = folder
-        text += [f"### {path}", "", "| name | value | unit | meaning |", "|---|---|---|---|"]
         for name, value, comment in rows:
             shown = value if len(value) <= 60 else value[:57] + "..."
             meaning = in_table(re.sub(r"^\[[^\]]+\][,:;]? *", "", comment))
             meaning = re.sub(r"([<>*_$\[\]{}])", r"\\\1", meaning)
-            text.append(f"| `{name}` | `{in_table(shown)}` | {unit_of(comment)} | {meaning} |")
-        text.append("")
+            file = path.split("/", 1)[-1]
+            columns = (f"`{name}`", f"`{in_table(shown)}`", unit_of(comment), meaning, f"`{file}`")
+            text.append(f"| {' | '.join(columns)} |")
+    text.append("")
     return {"constants.md": "\n".join(text)}
 
 
 # --------------------------------------------------------------------------------- the rooms
 
-ROOMS = (  # from above; a room imports from rows below its own, and from the left of its row
-    (("cli", "commands"),),
-    (("plot", "pictures"),),
-    (("methods", "comparison, charts"), ("montecarlo", "random gaps"), ("motion", "whole motions")),
-    (("fits", "shots, fits, verdicts"), ("theory", "outcomes, bounds"), ("files", "studies")),
-    (("laws", "one file for each law"), ("bodies", "gaps, tangents, mass")),
-    (("events", "stepper and flows"),),
-    (("heart", "scene, contact, law, impact"),),
-    (("solvers", "LCP, friction, linear"),),
+ROOMS = (  # from above: (name, task, modules); a room imports from rows below its own
+    (("cli", "commands", ("cli",)),),
+    (("plot", "pictures", ("plot",)),),
+    (("methods", "comparison, charts", ("methods",)), ("motion", "whole motions", ("motion",)),
+     ("theory", "outcomes, bounds", ("theory",))),
+    (("fits", "shots, fits, verdicts", ("fits",)),),
+    (("montecarlo", "random gaps", ("montecarlo",)),),
+    (("laws", "one file for each law", ("laws",)), ("bodies", "gaps, tangents, mass", ("bodies",)),
+     ("files", "studies, tables", ("files",))),
+    (("heart, above", "law, impact, audit, registry", ("law", "impacts", "audits", "registry")),),
+    (("events", "stepper and flows", ("events",)),),
+    (("heart, below", "scene, contact", ("scene", "contact", "quasi_space")),),
+    (("solvers", "LCP, friction, linear", ("solvers",)),),
+    (("shared", "checks, status, progress, compiling",
+      ("_checks", "status", "progress", "compiling")),),
 )  # fmt: skip
 
 
 def rooms_svg() -> str:
     """The rooms of the package, stacked; colours are those of the page, light or dark."""
     width, height, gap = 640, 40, 8
-    total = len(ROOMS) * (height + gap) + 20
+    total = len(ROOMS) * (height + gap) + 4
     ink, line = "var(--color-foreground-primary)", "var(--color-brand-primary)"
     parts = [
         f'<svg viewBox="0 0 {width} {total}" role="img" style="max-width:{width}px;width:100%" '
@@ -289,7 +298,7 @@ def rooms_svg() -> str:
     for row, rooms in enumerate(ROOMS):
         y = row * (height + gap) + 2
         each = (width - 4 - gap * (len(rooms) - 1)) / len(rooms)
-        for column, (room, task) in enumerate(rooms):
+        for column, (room, task, _) in enumerate(rooms):
             x = 2 + column * (each + gap)
             parts.append(
                 f'<rect x="{x:.0f}" y="{y}" width="{each:.0f}" height="{height}" rx="5" '
@@ -299,11 +308,7 @@ def rooms_svg() -> str:
                 f'<text x="{x + each / 2:.0f}" y="{y + 33}" text-anchor="middle" font-size="12" '
                 f'fill="{ink}">{task}</text>'
             )
-    parts.append(
-        f'<text x="{width / 2:.0f}" y="{total - 4}" text-anchor="middle" font-size="12" '
-        f'fill="{ink}">heart: scene.py contact.py law.py impacts.py audits.py registry.py '
-        "status.py</text></svg>"
-    )
+    parts.append("</svg>")
     return "\n".join(parts) + "\n"
 
 

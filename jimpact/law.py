@@ -369,8 +369,9 @@ class Law(Declared):
     takes rounding for 0, and adds to the status what it checks itself (not finite, negative
     impulse, inadmissible velocity, energy gain).
 
-    What else a law can do it declares; the defaults are those of a law of impulses only:
+    A law declares what else it can do; by default it only returns impulses.
 
+    Class attributes:
         uses_gaps: open contacts take part, at their gaps.
         pulls: separating contacts take part, too, if anything happens anywhere.
         separable: contacts that W does not couple may be solved apart: the law itself couples

@@ -1,4 +1,4 @@
-"""How far long work is, on stderr: a bar on a terminal, elsewhere a line a step."""
+"""Progress of long work on stderr: a bar on a terminal, elsewhere a line now and then."""
 
 import contextlib
 import shutil
@@ -8,16 +8,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-LONG = 2.0  # seconds after which work counts as long
-LINE_EVERY = 10.0  # seconds between two lines about one step
+LONG = 2.0  # seconds after which work counts as long: sooner, messages would only flicker
+LINE_EVERY = 10.0  # seconds between two lines about one step, a few for each minute
 
-FIRST = "compiling"  # what is told until there is something to show
+FIRST = "compiling"  # the step until the work reports one
 
 Show = Callable[[str, float, float | None], None]
 
 
 class Patience(float):
-    """Seconds after which work is told; lines about it count time from when this was made."""
+    """Seconds after which work is reported; lines about it count time from when this was made."""
 
     def __init__(self, seconds: float) -> None:
         self.begun = time.monotonic()
@@ -25,14 +25,14 @@ class Patience(float):
 
 @contextlib.contextmanager
 def progress_bar(progress: float | None) -> Iterator[Show]:
-    """Yield `show(what, done, total)`; total None: nobody knows.
+    """Yield `show(step, done, total)`; total None: not known.
 
-    `progress`: seconds after which the work is long enough to be told; True: at once; False:
+    `progress`: seconds after which the work is long enough to be reported; True: at once; False:
     never; None: after two seconds, and only on a terminal.
     """
     terminal = sys.stderr.isatty()
     if progress is False or (progress is None and not terminal):
-        yield lambda what, done, total: None
+        yield lambda step, done, total: None
         return
     after = LONG if progress is None else 0.0 if progress is True else progress
     with (_bar if terminal else _lines)(after) as show:
@@ -41,6 +41,7 @@ def progress_bar(progress: float | None) -> Iterator[Show]:
 
 @contextlib.contextmanager
 def _bar(after: float) -> Iterator[Show]:
+    """A bar that appears after so many seconds."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -57,8 +58,8 @@ def _bar(after: float) -> Iterator[Show]:
     timer.daemon = True
     timer.start()
     try:
-        yield lambda what, done, total: bar.update(
-            task, description=what, completed=done, total=total
+        yield lambda step, done, total: bar.update(
+            task, description=step, completed=done, total=total
         )
     finally:
         timer.cancel()
@@ -67,22 +68,25 @@ def _bar(after: float) -> Iterator[Show]:
 
 @contextlib.contextmanager
 def _lines(after: float) -> Iterator[Show]:
-    """A line once the work is long, then now and then; at its end where nobody waited for that."""
+    """A line after so many seconds, then now and then; one at the end where `after` is 0."""
     begun, ended = getattr(after, "begun", time.monotonic()), threading.Event()
     latest = FIRST
 
-    def tell() -> None:
+    def report() -> None:
+        """Print the latest step."""
         print(f"{latest}, {time.monotonic() - begun:.0f} s", file=sys.stderr)
 
     def run() -> None:
+        """Report until the work has ended."""
         wait = after or LINE_EVERY
         while not ended.wait(wait):
-            tell()
+            report()
             wait = LINE_EVERY
 
-    def show(what: str, done: float, total: float | None) -> None:
+    def show(step: str, done: float, total: float | None) -> None:
+        """Remember the step."""
         nonlocal latest
-        latest = what
+        latest = step
 
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
@@ -92,14 +96,14 @@ def _lines(after: float) -> Iterator[Show]:
         ended.set()
         thread.join()
         if not after:
-            tell()
+            report()
 
 
 @contextlib.contextmanager
-def waiting(what: str, progress: float | None = None) -> Iterator[None]:
-    """Progress of work that does not tell how far it is: only its time runs."""
+def waiting(step: str, progress: float | None = None) -> Iterator[None]:
+    """Progress of work that reports nothing itself: only its time runs."""
     with progress_bar(progress) as show:
-        show(what, 0.0, None)
+        show(step, 0.0, None)
         yield
 
 
@@ -107,29 +111,30 @@ def waiting(what: str, progress: float | None = None) -> Iterator[None]:
 def counting_bar(
     total: int, unit: str, progress: float | None, done: int = 0
 ) -> Iterator[Callable[[int], None]]:
-    """Yield `advance(more)`: how many of all there are; `done` before count for no rate."""
+    """Yield `advance(more)`, which counts up to a total; the rate leaves out `done` before."""
     begin, new = time.perf_counter(), 0
     with progress_bar(progress) as show:
 
         def advance(more: int) -> None:
+            """Count so many more."""
             nonlocal new
             new += more
             rate = new / max(time.perf_counter() - begin, 1e-9)
-            fast = f", {rate:,.0f}/s" if rate >= 10 else ""
-            show(f"{done + new:,} of {total:,} {unit}{fast}", done + new, total)
+            rate_text = f", {rate:,.0f}/s" if rate >= 10 else ""
+            show(f"{done + new:,} of {total:,} {unit}{rate_text}", done + new, total)
 
         yield advance
 
 
 class Steps:
-    """The steps that a command has done: each is told on stderr, once the command is long."""
+    """The steps that a command has done, each printed on stderr once the command is long."""
 
     def __init__(self, command: str):
         self.command, self.patience = command, Patience(LONG)
         self.done: list[str] = []
 
     def __call__(self, step: str) -> None:
-        """A step is done."""
+        """Record a step that is done."""
         self.done.append(step)
         seconds = time.monotonic() - self.patience.begun
         if seconds > LONG:
@@ -137,7 +142,7 @@ class Steps:
 
 
 def wrapped(text: str) -> str:
-    """The text with its sentences wrapped to the width of the terminal; tables stay as they are."""
+    """The text with its sentences wrapped to the terminal's width; tables are left unchanged."""
     width = shutil.get_terminal_size((len(text), 0)).columns
     return "\n".join(
         textwrap.fill(line, width, subsequent_indent=" " * (len(line) - len(line.lstrip(" -"))))

@@ -16,8 +16,8 @@
 #
 # *Course, part 0. Next: [fit a law to a measured cradle](01_fit_newtons_cradle.ipynb).*
 #
-# One ball strikes two that touch. You will predict what follows, see why the coefficient of
-# restitution alone does not decide it, differentiate the outcome, and fit a law to a measurement.
+# One ball strikes two that touch. You will predict the outcome, see why the coefficient of
+# restitution alone does not determine it, differentiate it, and fit a law to a measurement.
 
 # %%
 # %matplotlib inline
@@ -35,9 +35,10 @@ ji.plot.system(balls, before, "Newton's cradle: before the impact")
 # %% [markdown]
 # ## Predict
 #
-# `chain` says which bodies touch, a *law* says what a contact does. `LZB` lets the contacts be springs
-# for the instant of the impact: `restitution` is the square root of the energy that each gives back,
-# `stiffness` only counts in ratios, `exponent` 1.5 is Hertz's contact of spheres.
+# `chain` describes which bodies touch, a *law* describes the contacts. In the law of Liu, Zhao and
+# Brogliato, `LZB`, the contacts are springs during the impact. `restitution` is the square root of
+# the share of energy that each returns, only ratios of `stiffness` matter, and `exponent` 1.5 is
+# Hertz's contact of spheres.
 
 # %%
 law = ji.LZB(restitution=0.95, stiffness=[1.0, 1.0], exponent=1.5)
@@ -45,8 +46,9 @@ out = ji.impact(law, balls, before)
 print(ji.summary(out, balls, before))
 
 # %% [markdown]
-# What happened meanwhile? With stiffnesses in SI units the history has a time scale: two hard balls of
-# 1 kg touch for a quarter of a millisecond, and the second contact lets go a tenth later.
+# What are the forces during the impact? With stiffnesses in SI units the history has a time scale:
+# two hard balls of 1 kg touch for a quarter of a millisecond, and the second contact opens a little
+# later.
 
 # %%
 hard = ji.LZB(restitution=0.95, stiffness=[1e10, 1e10], exponent=1.5)  # N / m^1.5
@@ -55,8 +57,9 @@ ji.plot.history(ji.history(hard, balls, before), "Forces during the impact")
 # %% [markdown]
 # ## Compare
 #
-# The same coefficient, four laws, and what was measured on such a shot (the dashed lines). Newton's law
-# lets the two struck balls leave together; colliding pair by pair, all goes to the last one.
+# Four laws with the same coefficient, and a measured shot (dashed lines). With Newton's law the two
+# struck balls leave together. In binary collisions, one pair after another, almost all momentum
+# goes to the last ball.
 
 # %%
 laws = {
@@ -66,15 +69,15 @@ laws = {
     "Binary": ji.Binary(0.95),
 }
 measured = [-0.0605, 0.1049, 0.9978]  # m/s
-found = ji.compare(balls, before, laws)
-print(found)
-ji.plot.comparison(found, measured, "One shot, four laws")
+comparison = ji.compare(balls, before, laws)
+print(comparison)
+ji.plot.comparison(comparison, measured, "One shot, four laws")
 
 # %% [markdown]
 # ## Differentiate
 #
-# Laws, scenes and velocities are pytrees: `jax.jit`, `jax.vmap` and `jax.grad` go through all of them.
-# How does the velocity of the last ball change with the stiffness ratio of the two contacts?
+# Laws, scenes and velocities are pytrees: `jax.jit`, `jax.vmap` and `jax.grad` work with all of
+# them. How does the velocity of the last ball change with the stiffness ratio of the two contacts?
 
 
 # %%
@@ -92,8 +95,8 @@ for ratio, v, slope in zip(ratios, *last(ratios)):
 # %% [markdown]
 # ## Fit
 #
-# Which coefficient explains the measurement best, and how well is it known? `print` gives a report: it
-# says, too, that these data break the conservation of momentum by 4 %.
+# Which coefficient reproduces the measurement best, and how accurately is it known? `print` shows a
+# report. It warns that these data break the conservation of momentum by 4 %.
 
 # %%
 shots = ji.Experiments(pre=[before], post=[measured])
@@ -101,10 +104,18 @@ fit = ji.fit(ji.LZB(0.9), balls, shots, free="restitution", starts=1)
 print(fit)
 
 # %% [markdown]
-# ## From here
+# ## Next steps
 #
-# Your own data: `jimpact new fit` writes a study to start from. The course goes on with
-# [this fit in earnest](01_fit_newtons_cradle.ipynb), [random gaps](02_monte_carlo_gaps.ipynb),
-# [speed and accuracy](03_speed_accuracy_stability.ipynb), [a rocking block](04_rocking_block.ipynb),
-# [whole motions](05_whole_motions.ipynb), [what data can tell](06_what_the_data_can_tell.ipynb),
-# [a restitution matrix](07_restitution_matrix.ipynb) and [a tossed cube](08_a_tossed_cube.ipynb).
+# For your own data start with `jimpact new fit`, which creates a study, or with the notebook [your
+# own CSV file](02_your_own_csv.ipynb). The course has four parts:
+#
+# - **Fits**: [this fit in detail](01_fit_newtons_cradle.ipynb), [your own CSV
+#   file](02_your_own_csv.ipynb), [what the data can tell](03_what_the_data_can_tell.ipynb), [a
+#   restitution matrix](04_restitution_matrix.ipynb), [a tossed cube](05_a_tossed_cube.ipynb)
+# - **Choices**: [the simplest law](06_the_simplest_law.ipynb), [methods of
+#   integration](07_methods_of_integration.ipynb)
+# - **Uncertainty**: [random gaps](08_monte_carlo_gaps.ipynb), [parameters and
+#   gaps](09_parameters_and_gaps.ipynb), [a large run on Dask](10_a_large_run_on_dask.ipynb)
+# - **Motions**: [the rocking block](11_rocking_block.ipynb), [whole
+#   motions](12_whole_motions.ipynb), [a fit to a motion](13_fit_a_motion.ipynb), [a shaken
+#   block](14_a_shaken_block.ipynb)

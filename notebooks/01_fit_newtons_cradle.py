@@ -14,15 +14,14 @@
 # %% [markdown]
 # # Fit a law to a measured Newton's cradle
 #
-# *Course, part 1. Before: [five minutes](00_five_minutes.ipynb). Next:
-# [Monte Carlo over gaps](02_monte_carlo_gaps.ipynb).*
+# *Course, part 1. Before: [five minutes](00_five_minutes.ipynb). Next: [your own CSV
+# file](02_your_own_csv.ipynb).*
 #
-# You will learn to fit a law, to read what its report says of the data, to see what one shot cannot
-# tell, and to check whether the errors that a fit states are true.
+# You will fit a law, read the report, see what one shot cannot determine, and check whether the
+# stated errors are right.
 #
-# Three equal hard balls, two of them touching at rest, the first strikes them. The velocities
-# after the impact were measured once and are quoted by Brogliato, *Nonsmooth Mechanics* (2016),
-# section 6.1.2.
+# A hard ball strikes two equal ones that touch each other at rest. The measured velocities after
+# the impact are from Brogliato, *Nonsmooth Mechanics* (2016), section 6.1.2.
 
 # %%
 # %matplotlib inline
@@ -45,9 +44,9 @@ ji.plot.system(balls, measured.pre[0], "Before the impact")
 # %% [markdown]
 # ## What is wrong with the data
 #
-# No force but those between the balls acts in the instant of the impact: the total momentum must
-# stay, and the energy must not grow. Both are violated, so each velocity carries an error of at
-# least about 0.014. Every law conserves momentum; none can reproduce that part.
+# During the impact only forces between the balls act, so the total momentum is constant, and the
+# energy cannot grow. The data violate both: each velocity has an error of at least about 0.014.
+# Every law conserves momentum, so none can reproduce this part.
 
 # %%
 print("momentum after / before", measured.momentum_ratio(balls)[0])
@@ -56,17 +55,17 @@ print("energy   after / before", measured.energy_ratio(balls)[0])
 # %% [markdown]
 # ## One coefficient of restitution: LZB and Newton
 #
-# The LZB law distributes the impulse over the contacts by their stiffness ratio (here 1, Hertz
-# contacts) and takes the energetic coefficient of restitution $e$ of a contact. A scalar field of
-# a law is one value for all contacts.
+# The law of Liu, Zhao and Brogliato (LZB) distributes the impulse over the contacts by their
+# stiffness ratio (here 1, Hertz contacts). Its coefficient of restitution $e$ is the energetic one.
+# A scalar parameter of a law is one value for all contacts.
 
 # %%
 lzb = ji.fit(ji.LZB(0.95), balls, measured, free="restitution")
 print(lzb)
 
 # %% [markdown]
-# The residual is mostly the momentum defect. With a third of the excess taken from each velocity
-# (the smallest change that restores momentum) the same $e$ leaves half the residual:
+# Most of the residual is the violation of momentum. If a third of the excess is subtracted from
+# each velocity (the smallest change that restores momentum), the same $e$ leaves half the residual:
 
 # %%
 corrected = measured.momentum_corrected(balls)
@@ -78,17 +77,17 @@ for name, fit in (("LZB", lzb), ("LZB, corrected", lzb_corrected), ("Newton", ne
     )
 
 # %% [markdown]
-# Newton's law lets the two resting balls leave together, whatever $e$: it cannot disperse the
-# energy. (Grey crosses.)
+# With Newton's law the two resting balls leave together for any $e$: it cannot disperse the energy
+# (grey crosses).
 
 # %%
 ji.plot.fit(lzb, {"Newton fitted": newton}, title="Three balls, one shot")
 
 # %% [markdown]
-# ## What one shot cannot tell
+# ## What one shot cannot determine
 #
-# Give each contact its own $e$ and free the stiffness ratio $k_2/k_1$. Three velocities are
-# measured, but momentum ties them together: two numbers, three parameters.
+# Give each contact its own $e$, and fit the stiffness ratio $k_2/k_1$, too. The three measured
+# velocities satisfy conservation of momentum, so they determine two of the three parameters.
 
 # %%
 both_e = ji.LZB([0.95, 0.95], [1.0, 1.0])
@@ -98,10 +97,9 @@ print("standard errors", three.standard_error)
 print("\n".join(three.identifiability))
 
 # %% [markdown]
-# A profile shows the valley: hold the ratio, fit both $e$. Over a whole range of ratios the shot is
-# reproduced exactly; it ends only where an $e$ would have to exceed 1. The values that a solver
-# returns for such a fit are one point of this valley, which is why their standard errors are
-# infinite.
+# A profile shows the valley: fix the ratio, fit both $e$. Any ratio in a whole range reproduces the
+# shot exactly; the range ends where an $e$ would exceed 1. The result of the fit above is one point
+# of this valley, so its standard errors are infinite.
 
 # %%
 ratios = np.linspace(0.9, 1.4, 26)
@@ -131,9 +129,9 @@ figure
 # %% [markdown]
 # ## Known parameters from simulated shots
 #
-# From here on all data are **simulated**. Four kinds of shots, in which the balls come from both
-# sides, determine all three parameters; more shots of the first kind alone would not. The sum of
-# squares has other minima, in which the contacts open and close in another order: the fit starts
+# All further data are **simulated**. Four kinds of shots, in which balls come from both sides,
+# determine all three parameters; more shots of the first kind alone would not. The sum of squares
+# has other minima, in which the contacts open and close in another order. The fit therefore starts
 # from several points and lists where they end.
 
 # %%
@@ -158,11 +156,11 @@ same = ji.Experiments(np.tile(kinds[:1], (8, 1)), np.tile(exact_post[:1], (8, 1)
 print("eight shots of the first kind: rank", ji.fit(start, balls, same).rank, "of 3")
 
 # %% [markdown]
-# ## Are the stated errors true?
+# ## Are the stated errors right?
 #
-# Repeat the simulated experiment and count how often the 95 % confidence interval holds the true
-# value. With 400 repetitions the count itself scatters: 95 % ± 1.1 %. Each fit starts once, from
-# the law just found (one start from further off may end in another minimum).
+# Repeat the simulated experiment, and count how often the 95 % confidence interval contains the
+# true value. With 400 repetitions the count itself scatters: 95 % ± 1.1 %. Each fit starts once,
+# from the fitted law (a start further away may end in another minimum).
 
 # %%
 true_value = np.array([0.9, 0.95, 1.5])
@@ -192,4 +190,4 @@ for i, axes in enumerate(figure.subplots(1, 3)):
 figure
 
 # %% [markdown]
-# *Next: [gaps of micrometres that decide](02_monte_carlo_gaps.ipynb).*
+# *Next: [the same with your own file](02_your_own_csv.ipynb).*

@@ -34,20 +34,27 @@ class Row:
     slope: float = 1e-10  # of forward against reverse derivatives
     by_order: bool = False  # the order of the contacts is part of the law
     reverse: bool = True  # whether reverse derivatives are compiled as well; else its code is LZB's
+    through_w: bool = True  # whether contacts influence each other through W only
+    flagged: float = 0.05  # most of the contract's random states that may be flagged as failures
 
 
 LAWS = {
-    "newton": Row("newton", lambda e, k, eta, stored: ji.Newton(e)),
-    "moreau": Row("moreau", lambda e, k, eta, stored: ji.Moreau(e)),
-    "poisson": Row("poisson", lambda e, k, eta, stored: ji.Poisson(e, allow_above_one=True)),
+    "newton": Row("newton", lambda e, k, eta, stored: ji.Newton(e), flagged=0.8),
+    "moreau": Row("moreau", lambda e, k, eta, stored: ji.Moreau(e), flagged=0.5),
+    "poisson": Row(
+        "poisson", lambda e, k, eta, stored: ji.Poisson(e, allow_above_one=True), flagged=0.25
+    ),
     "matrix": Row(
-        "restitution_matrix", lambda e, k, eta, stored: ji.RestitutionMatrix(jnp.diag(e))
+        "restitution_matrix",
+        lambda e, k, eta, stored: ji.RestitutionMatrix(jnp.diag(e)),
+        flagged=0.8,
     ),
     "velocity": Row(
         "velocity_dependent",
         lambda e, k, eta, stored: ji.VelocityDependent(
             ji.Moreau(e), speed_exponent=0.25, yield_speed=0.0, reference_speed=1.5
         ),
+        flagged=0.5,
     ),
     "binary": Row("binary", lambda e, k, eta, stored: ji.Binary(e)),
     "binary-earliest": Row("binary", lambda e, k, eta, stored: ji.Binary(e, order="earliest")),

@@ -325,6 +325,15 @@ def test_stored_energy_is_not_an_energy_gain():
         assert audit.broken == (["energetic"] if gain else [])
 
 
+def test_friction_is_part_of_the_momentum():
+    """A particle of 1 kg on the ground: p = 1.5 upwards, friction -0.3 against its slip."""
+    scene = ji.Scene([1.0, 1.0], [[0.0], [1.0]], tangents=[[1.0], [0.0]])
+    v, after, p, zero = [1.0, -1.0], jnp.array([0.7, 0.5]), jnp.array([1.5]), jnp.zeros(())
+    for friction, broken in ((-0.3, []), (0.3, ["momentum"])):
+        out = ji.Impact(after, p, jnp.array([friction]), zero - 0.63, zero, jnp.int32(0))
+        assert ji.audit(scene, v, out).broken == broken
+
+
 def test_open_contacts_may_approach():
     """Ball 2 flies towards ball 3, which it has not reached."""
     scene, v = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1]), [1.0, 0.0, 0.0]

@@ -104,11 +104,12 @@ def test_promises(name):
     row = LAWS[name]
     entry = ji.REGISTRY[row.registered]
     out, _ = check_promises(programs.values(name), entry, row.accuracy, GENERAL + LIGHT)
-    # "right or told" is worth something only if little is told
-    most = {"newton": 0.8, "matrix": 0.8, "moreau": 0.5, "velocity": 0.5, "poisson": 0.25}.get(
-        name, 0.05
+    # "right or flagged" is worth something only if little is flagged
+    share = failed(out.status).mean()
+    assert share <= row.flagged, (
+        f"{name} flags {share:.0%} of the contract's states as failures: a law that is right on few "
+        f"scenes says so by `flagged` of its row in tests/programs.py (now {row.flagged:.0%})"
     )
-    assert failed(out.status).mean() <= most, failed(out.status).mean()
 
 
 @pytest.mark.parametrize(
@@ -200,6 +201,10 @@ def test_order_of_contacts_does_not_matter(name):
 @each_law
 def test_decoupled_contacts_are_solved_as_if_alone(name):
     """Two pairs of balls in one scene, and each with another pair that separates."""
+    if not LAWS[name].through_w:
+        pytest.skip(
+            f"contacts of {name} influence each other whatever W is (see tests/programs.py)"
+        )
     pairs = np.array([[-1, 0], [1, 0], [0, -1], [0, 1.0]])
     mass = np.diag([1, 2, 3, 0.5])
 

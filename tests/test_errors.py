@@ -266,9 +266,9 @@ SYSTEMS = [
 
 @pytest.mark.parametrize(("call", "message"), [*LAWS, *SCENES, *CALLS, *SYSTEMS])
 def test_bad_input(call, message):
-    with pytest.raises((ValueError, TypeError), match=message) as told:
+    with pytest.raises((ValueError, TypeError), match=message) as error:
         call()
-    text = str(told.value)
+    text = str(error.value)
     assert text.count("\n") == 0
     assert "Array(" not in text
     assert "Traced" not in text
@@ -276,9 +276,9 @@ def test_bad_input(call, message):
 
 @pytest.mark.parametrize(("change", "message"), MOTIONS)
 def test_bad_motions(change, message):
-    given = {"q0": [1.0], "v0": [0.0], "t_end": 1.0} | change
+    arguments = {"q0": [1.0], "v0": [0.0], "t_end": 1.0} | change
     with pytest.raises(ValueError, match=message):
-        ji.simulate(ji.ball_system(), ji.Newton(0.5), **given)
+        ji.simulate(ji.ball_system(), ji.Newton(0.5), **arguments)
 
 
 def test_python_numpy_and_jax_inputs_agree():

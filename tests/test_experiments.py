@@ -233,6 +233,15 @@ def test_masses_and_gaps_of_each_shot(tmp_path):
         ji.read_experiments(path)
 
 
+@pytest.mark.parametrize(("unit", "metres"), [("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("um", 1e-6)])
+def test_units_of_gaps(tmp_path, unit, metres):
+    head = MORE.replace("gap_1[mm]", f"gap_1[{unit}]")
+    data = ji.read_experiments(
+        written(tmp_path, f"{head}\n100,1,3,1,0,0,1\n"), ji.chain([1.0, 1.0])
+    )
+    np.testing.assert_allclose(data.scenes[0].gaps, [3 * metres], rtol=1e-14)
+
+
 def test_a_body_where_each_shot_found_it(tmp_path):
     head = "q_1[m],q_2[cm],q_3[deg]," + ",".join(
         f"{k}_{i}[{u}]" for k in ("pre", "post") for i, u in ((1, "m/s"), (2, "m/s"), (3, "rad/s"))

@@ -814,6 +814,8 @@ def test_the_next_shot_is_the_one_that_tells_most():
     same = ji.design(found, ji.Experiments(more, more), count=2, target="restitution[1]")
     assert same.index[0] == 0
     assert same.standard_error.shape == (2, 2)
+    other = ji.design(found, ji.Experiments(more, more, noise), target="restitution[2]")
+    assert other.index[0] == np.argmin(np.array(errors)[:, 1]) == 2
     with pytest.raises(ValueError, match="`target` must be one of"):
         ji.design(found, seen, target="friction")
 

@@ -16,6 +16,7 @@ from programs import failed, names
 
 import jimpact as ji
 from jimpact.methods.advice import situation_of
+from jimpact.methods.stability import chain_of
 from jimpact.methods.validity import ValidityMap
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
@@ -217,6 +218,16 @@ def test_points_are_those_of_the_script():
     assert len(HELD["points"]) == 300
     np.testing.assert_allclose(HELD["points"], stability_reference.points(), rtol=1e-12)
     assert HELD["uncertainty"][np.isfinite(HELD["uncertainty"])].max() < 0.1 * HONEST * RTOL
+
+
+def test_halves_of_a_chain():
+    """Of N balls the ball N // 2 + 1 is the middle one, and contact j > N // 2 in the right half."""
+    for balls, mass, stiffness in (
+        (4, [1.0, 1.0, 0.5, 1.0], [1.0, 1.0, 10.0]),
+        (5, [1.0, 1.0, 0.5, 1.0, 1.0], [1.0, 1.0, 10.0, 10.0]),
+    ):
+        found = chain_of(10.0, 0.5, balls)
+        assert [x.tolist() for x in found] == [mass, stiffness]
 
 
 # 10 and 30 equal Hertz balls by the oracle of tests/benchmarks/lzb_oracle.cpp

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
@@ -24,6 +25,7 @@ from jimpact.cli.starting import as_csv
 from jimpact.cli.study import Study, read_study, without_none
 from jimpact.files.records import as_data, table
 from jimpact.files.study_file import is_motion
+from jimpact.law import with_parameter
 from jimpact.progress import Steps, waiting, wrapped
 from jimpact.registry import registered_laws
 
@@ -38,16 +40,11 @@ Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 # Words of the printed results (regular expressions), and the sentences that explain them there.
 GLOSSARY = {
     r"\brank\b": "Rank: how many combinations of the free parameters the data determine.",
-    r"\bunseen\b": "Unseen: the data do not determine this parameter.",
     r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they conserve "
     "momentum.",
     r"\bparoxysm\b": "Accumulation: infinitely many impacts in a finite time. Friction: a contact "
     "begins to stick or to slip. Paroxysm: friction jams a sliding contact, an impact without "
     "collision.",
-    r"\bdelta_c\b": "delta_c: how far a contact would indent, the scale by which gaps are small or "
-    "large.",
-    r"\bgap scales\b": "Gap scale: how far the contact would indent. Much smaller gaps act as if "
-    "closed; with much larger ones the collisions come one after another.",
     r"\bdispersion\b": "Dispersion: 0 all energy in one body, 1 equal shares.",
     r"\blargest difference\b": "Difference: of v+ between the two references, over the largest "
     "|v-|.",
@@ -55,17 +52,18 @@ GLOSSARY = {
 
 
 class CommandResult(NamedTuple):
-    """The result of a command: for --json, for people, as pictures; `failure`: what went wrong."""
+    """The result of a command, in all forms in which it may be printed."""
 
     title: str
-    data: dict[str, Any]
-    text: str
-    pictures: Mapping[Path, "Figure | Callable[[Path], Any]"]  # or what writes the file
-    failure: str = ""
-    table: Table | None = None  # for --csv
+    data: Any  # for --json, see `as_data`; for people too, where there is no `text`
+    picture: "Figure"
+    table: Table  # for --csv
+    text: str | None = None
+    more: Mapping[Path, "Figure | Callable[[Path], Any]"] = {}  # further pictures, or what writes
+    failure: str = ""  # what went wrong
 
 
-def run(command: options.Command, steps: Steps, folder: str | None = None) -> str:
+def run(command: options.DrawingCommand, steps: Steps, folder: str | None = None) -> str:
     """Run a command and print its result; returns what went wrong, '' if nothing did.
 
     Compiled programs are stored in the folder, if there is one.
@@ -73,21 +71,21 @@ def run(command: options.Command, steps: Steps, folder: str | None = None) -> st
     jax.config.update("jax_enable_x64", True)  # the program's choice; the library sets none
     with stored_programs(folder):
         result = _COMMANDS[command.name()](command, steps)
-    replaced = [path for path in result.pictures if path.exists()]
-    for path, picture in result.pictures.items():
+    pictures: dict[Path, Any] = {command.picture(): result.picture, **result.more}
+    replaced = [path for path in pictures if path.exists()]
+    for path, picture in pictures.items():
         _write_picture(path, picture)
         steps(f"picture {path}")
-    pictures = [str(path) for path in result.pictures]
     if command.csv:
-        assert result.table is not None  # every command has one
         print(as_csv(*result.table))
     elif command.json:
-        data = {"title": result.title, "pictures": pictures} if pictures else {}
-        print(dumps(data | result.data, indent=2))
+        data = {"title": result.title, "pictures": [str(path) for path in pictures]}
+        print(dumps(data | as_data(result.data), indent=2))
     else:
-        notes = [note for word, note in GLOSSARY.items() if re.search(word, result.text)]
+        text = str(result.data) if result.text is None else result.text
+        notes = [note for word, note in GLOSSARY.items() if re.search(word, text)]
         places = [f"Picture: {path}" for path in pictures]
-        lines = [result.title, result.text, *notes, *places]
+        lines = [result.title, text, *notes, *places]
         print("\n".join(wrapped(line) for line in lines if line))
     for path in replaced:
         print(f"jimpact {command.name()}: {path} existed and was replaced.", file=sys.stderr)
@@ -141,7 +139,6 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
     """The study's fit and its yardsticks; or every law, side by side."""
     if command.law == options.EVERY_LAW:
         return _fit_every_law(command, steps)
-    path = command.picture()
     chosen = {"starts": command.starts, "seed": command.seed, "progress": steps.patience}
     study: Study | MotionStudy
     if is_motion(command.study):
@@ -162,23 +159,18 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         for name, x in fits.items()
         for i, parameter in enumerate(x.names)
     ]
-    pictures = {path: picture} | _report_page(fits[RAW], command.report)
-    return CommandResult(study.title, as_data({"fits": fits}), text, pictures, table=(heads, rows))
-
-
-def _report_page(fit: "ji.Fit", path: Path | None) -> dict[Path, Any]:
-    """The page of a fit, where one is asked for."""
-    return {} if path is None else {path: fit.report}
+    page = {} if command.report is None else {command.report: fits[RAW].report}
+    return CommandResult(study.title, {"fits": fits}, picture, (heads, rows), text, page)
 
 
 def _fit_every_law(command: options.FitCommand, steps: Steps) -> CommandResult:
     """All laws on the study's data; picture and page are those of the first one."""
-    path, study = command.picture(), read_study(command.study)
+    study = read_study(command.study)
     fits = _laws_fitted(study, steps, starts=command.starts, seed=command.seed)
     best = fits.best
-    pictures = {path: ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")}
-    pictures |= _report_page(best.fit, command.report)
-    return CommandResult(study.title, fits.to_dict(), str(fits), pictures, table=fits.rows())
+    picture = ji.plot.fit(best.fit, None, f"{study.title}: {best.name}")
+    page = {} if command.report is None else {command.report: best.fit.report}
+    return CommandResult(study.title, fits, picture, fits.rows(), more=page)
 
 
 def _laws_fitted(study: Study, steps: Steps, **chosen: int | None) -> "ji.LawFits":
@@ -245,12 +237,11 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
         return study, None
     tied = {}
     for name in fields:
-        choice = np.asarray(study.free.get(name, False))
-        one_each = np.arange(1, contacts + 1) if np.ndim(getattr(law, name)) else 1
+        value, choice = getattr(law, name), np.asarray(study.free.get(name, False))
+        one_each = np.arange(1, contacts + 1) if np.ndim(value) else 1
         labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
         tied[name] = np.broadcast_to(labels, (contacts,))
-    e, k = (np.broadcast_to(getattr(law, name), (contacts,)) for name in fields)
-    law = ji.LZB(e, k, exponent=law.exponent, initial_energy=law.initial_energy)
+        law = with_parameter(law, name, jnp.broadcast_to(value, (contacts,)))
     study = replace(study, law=law, free=tied)
     if len(np.unique(tied["restitution"])) == contacts and tied["stiffness"].all():
         return study, None
@@ -263,10 +254,10 @@ def _fits_table(fits: dict[str, "ji.Fit"]) -> list[str]:
     for name, fit in fits.items():
         data = "corrected" if name == CORRECTED else RAW
         rms = f"{fit.rms:.4f}" if fit.experiments is not None else f"{fit.rms:.4g}"
-        first = [type(fit.law).__name__, data], [rms, f"{fit.rank} of {len(fit.names)}"]
+        ends = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
         for i, parameter in enumerate(fit.names):
-            left, right = first if i == 0 else (["", ""], ["", ""])
-            rows.append([*left, parameter, _value(fit, i), *right])
+            rows.append([*ends[:2], parameter, _value(fit, i), *ends[2:]])
+            ends = [""] * 4  # said once
     speeds = all(fit.experiments is not None for fit in fits.values())
     heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
     lines = table(heads, rows, left=["data", "parameter", "value"])
@@ -304,7 +295,6 @@ def _value(fit: "ji.Fit", i: int) -> str:
 
 def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
     """Every law on one scene."""
-    path = command.picture()
     study, before, measured = _impact_of(command)
     laws, left_out = registered_laws(study.parameters)
     with waiting("comparing laws", steps.patience):
@@ -328,9 +318,7 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
     rows = [
         [name, *np.asarray(x.outcome.velocity), *columns(x)] for name, x in result.entries.items()
     ]
-    text = "\n".join(lines)
-    pictures = {path: picture}
-    return CommandResult(_titled(study, before), as_data(data), text, pictures, table=(heads, rows))
+    return CommandResult(_titled(study, before), data, picture, (heads, rows), "\n".join(lines))
 
 
 # ------------------------------------------------------------------------------------- montecarlo
@@ -338,7 +326,6 @@ def compare(command: options.CompareCommand, steps: Steps) -> CommandResult:
 
 def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResult:
     """Random gaps, velocities, parameters."""
-    path = command.picture()
     study = read_study(command.study)
     result = ji.monte_carlo(**_sampling(study, command), progress=steps.patience)
     steps(f"{result.samples:,} samples")
@@ -346,8 +333,7 @@ def montecarlo(command: options.MonteCarloCommand, steps: Steps) -> CommandResul
     columns = result.mean, result.standard_error, result.std, result.minimum, result.maximum
     heads = ["coordinate", "mean", "standard_error", "std", "least", "largest"]
     rows = [[i + 1, *row] for i, row in enumerate(zip(*columns))]
-    text, pictures = str(result), {path: picture}
-    return CommandResult(study.title, result.to_dict(), text, pictures, table=(heads, rows))
+    return CommandResult(study.title, result, picture, (heads, rows))
 
 
 def _sampling(study: Study, command: options.MonteCarloCommand) -> dict[str, Any]:
@@ -371,7 +357,6 @@ QUICK_LAWS = ("moreau", "binary")
 
 def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     """Speed against accuracy on one scene."""
-    path = command.picture()
     study, before, _ = _impact_of(command)
     law = _lzb(study)
     laws, _ = registered_laws({"restitution": law.restitution})
@@ -398,8 +383,7 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
         for name, points in result.points.items()
         for x in points
     ]
-    title = _titled(study, before)
-    return CommandResult(title, result.to_dict(), text, {path: picture}, table=(heads, rows))
+    return CommandResult(_titled(study, before), result, picture, (heads, rows), text)
 
 
 def _lzb(study: Study) -> "ji.LZB":
@@ -426,7 +410,6 @@ TITLE = "LZB, three equal Hertz balls, e = 0.9 (triangles), one axis changed at 
 
 def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
     """Maps of methods: a picture of single axes, with --full one of pairs for each method."""
-    path = command.picture()
     if not command.full:  # three balls: one program for each method
         from jimpact.methods.stability import default_axes
 
@@ -437,14 +420,14 @@ def stability(command: options.StabilityCommand, steps: Steps) -> CommandResult:
     result = ji.stability_map(
         command.methods or None, **size, max_steps=MAX_STEPS, progress=steps.patience
     )
-    pictures = {path: ji.plot.stability_map(result, TITLE)}
+    path, pairs = command.picture(), {}
     for name in result.methods if command.full else ():
-        pairs = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
-        pictures[pairs] = ji.plot.stability_pairs(result, name)
+        file = path.with_name(f"{path.stem}-{name.replace('_', '-')}{path.suffix}")
+        pairs[file] = ji.plot.stability_pairs(result, name)
     text = str(result) + ("" if command.full else QUICK)
     counts = [[name, *result.counts(name).values()] for name in result.methods]
     table = ["method", *result.counts(result.methods[0])], counts
-    return CommandResult("", result.to_dict(), text, pictures, table=table)
+    return CommandResult("", result, ji.plot.stability_map(result, TITLE), table, text, pairs)
 
 
 # ----------------------------------------------------------------------------------------- advise
@@ -455,7 +438,6 @@ _ADVISE_REFUSED = ("tangential_restitution", "initial_energy")  # these would ch
 
 def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
     """The simplest law that a scene needs."""
-    path = command.picture()
     study, before, _ = _impact_of(command)
     result = ji.advise(
         study.scene,
@@ -470,7 +452,7 @@ def advise(command: options.AdviseCommand, steps: Steps) -> CommandResult:
     picture = ji.plot.advice(result, study.title)
     title, heads = _titled(study, before), ["law", "worst", "chosen"]
     rows = [[name, x.worst, name == result.name] for name, x in result.candidates.items()]
-    return CommandResult(title, result.to_dict(), str(result), {path: picture}, table=(heads, rows))
+    return CommandResult(title, result, picture, (heads, rows))
 
 
 def _advise_parameters(study: Study) -> dict[str, Any]:
@@ -478,8 +460,8 @@ def _advise_parameters(study: Study) -> dict[str, Any]:
     rheology = study.parameters.get("rheology", "bistiffness")
     if rheology != "bistiffness":
         raise ValueError(
-            f"the study must have bistiffness contacts, but has rheology {rheology!r}: of viscous "
-            "contacts only the compliant law knows."
+            f"the study must have bistiffness contacts, but has rheology {rheology!r}: only the "
+            "compliant law handles viscous contacts."
         )
     for key in _ADVISE_REFUSED:
         if np.any(study.parameters.get(key, 0.0)):
@@ -497,24 +479,24 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
     """A whole motion; one that does not reach its end is drawn and printed as far as it goes."""
     from jimpact.cli.study_motion import read_motion_study
 
-    path, portrait = command.picture(), command.portrait
     study = read_motion_study(command.study)
     system, title = study.system, study.title
     motion = jax.block_until_ready(
         study.run(t_end=command.t_end, samples=command.samples, progress=steps.patience)
     )
     steps("motion computed")
-    pictures: dict[Path, Any] = {path: ji.plot.motion(motion, title, system=system)}
-    if portrait is not None:
+    more: dict[Path, Any] = {}
+    if command.portrait is not None:
         which = None if command.coordinate is None else command.coordinate - 1
-        pictures[portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
+        more[command.portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
     if command.gif is not None:
-        pictures[command.gif] = partial(
+        more[command.gif] = partial(
             ji.plot.animation, system, motion, title=title, progress=steps.patience
         )
     heads = ["time [s]", *system.body.names, *system.body.velocity_names]
     table = heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist()
-    return CommandResult(title, motion.to_dict(), str(motion), pictures, _failure(motion), table)
+    picture = ji.plot.motion(motion, title, system=system)
+    return CommandResult(title, motion, picture, table, more=more, failure=_failure(motion))
 
 
 def _failure(motion: "ji.Motion") -> str:

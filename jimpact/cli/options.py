@@ -150,7 +150,7 @@ class FitCommand(DrawingCommand):
     law: Name = None
     """Law in the place of the study's (see `jimpact laws`), or all: every law, side by side."""
     method: Annotated[str | None, _option("METHOD", str)] = None
-    """levenberg-marquardt, adam, sgd or lbfgs; default: the study's, or the first."""
+    """levenberg-marquardt (the default), adam, sgd or lbfgs, in the place of the study's."""
     starts: Count = None
     """Number of starts; default: the study's, or 8."""
     seed: Count = None

@@ -85,7 +85,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     """A study from its TOML file: scene, law, what is free, and the data, ready to be fitted.
 
     Args:
-        path: of the file, or the name of a bundled study (`three_balls.toml`).
+        path: path of the file or of its folder, or the name of a bundled study
+            (`three_balls.toml`).
         law: name of another law in the place of the study's.
 
     The tables of the file:
@@ -103,9 +104,9 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
       can be compared, not fitted.
     - `[[observe]]`, in the place of `[data]`: quantity (peak_force [N], arrival_time [s] of a
       contact; duration [s] of a contact or of all; energy_ratio; bounce_height [m] of a body),
-      contact or body (from 1), value and sigma, numbers or lists, with relative = true those over
-      the first one; velocity_m_per_s, one a body, or drop_height_m; bodies (so many, those next to
-      the wall), a number or one a value.
+      contact or body (from 1), value and sigma (numbers or lists; with relative = true divided by
+      the first value); velocity_m_per_s, one for each body, or drop_height_m; bodies (how many,
+      counted from the wall), a number or one for each value.
     - `[monte_carlo]`: velocity_m_per_s, gaps_m, law, samples, seed, chunk, bins; see
       `monte_carlo`.
 
@@ -114,7 +115,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
 
     Raises:
         FileNotFoundError: no such study or data file.
-        ValueError: no TOML, unknown or missing keys, and whatever scene, law or data refuse.
+        ValueError: the file is not TOML; a key is unknown or missing; scene, law or data refuse
+            a value.
 
     >>> import jimpact as ji
     >>> ji.read_study("three_balls.toml").title
@@ -122,6 +124,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     """
 
     def build(tables: dict[str, Any], file: Path) -> Study:
+        """The study of these tables."""
         import_module_of(tables, file.parent)
         return _build(check_impact_tables(tables, file, law, modules=True))
 
@@ -217,6 +220,7 @@ def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3
     path = Path(str(files("jimpact") / "data" / "tossed_cube.toml"))
 
     def read(tables: Mapping[str, Any], file: Path) -> Experiments:
+        """The shots of these tables."""
         table = {"file": tables["data"]["file"], "near_m": near}
         table |= {} if contacts is None else {"contacts": contacts}
         return _experiments(table, file, body_of("[scene]", tables["scene"], AT_KEYS))

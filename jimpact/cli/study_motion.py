@@ -83,7 +83,8 @@ def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
     """The study of a motion from its TOML file: system, law, initial state, perhaps data.
 
     Args:
-        path: of the file, or the name of a bundled study (`cradle_motion.toml`).
+        path: path of the file or of its folder, or the name of a bundled study
+            (`cradle_motion.toml`).
         law: name of another law in the place of the study's.
 
     The tables of the file:
@@ -102,7 +103,8 @@ def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
 
     Raises:
         FileNotFoundError: no such study or data file.
-        ValueError: no TOML, unknown or missing keys, and what system and law refuse.
+        ValueError: the file is not TOML; a key is unknown or missing; system or law refuse a
+            value.
 
     >>> import jimpact as ji
     >>> ji.read_motion_study("cradle_motion.toml").title
@@ -110,6 +112,7 @@ def read_motion_study(path: str | Path, law: str | None = None) -> MotionStudy:
     """
 
     def build(tables: dict[str, Any], file: Path) -> MotionStudy:
+        """The study of these tables."""
         import_module_of(tables, file.parent)
         return _build(check_motion_tables(tables, file, law, modules=True))
 

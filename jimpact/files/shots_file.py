@@ -28,7 +28,8 @@ _KINDS = {  # of columns, with their units
     "q": _LENGTHS | _ANGLES | {"1": 1.0},
 }
 _NEEDED = ("pre", "post")
-_ERRORS = ("sigma", "sigma_pre", "resolution")
+# Standard errors, and the kinds of column whose errors they are.
+_ERRORS = {"sigma": "post", "sigma_pre": "pre", "resolution": "post", "sigma_q": "q"}
 _OF_MOTIONS = {"t": {"s": 1.0, "ms": 0.001}, **dict.fromkeys(("q", "sigma_q"), _KINDS["q"])}
 # Share of a step by which times may be off, as they are when rounded to a few digits. Ten times
 # more would pass steps that visibly differ.
@@ -54,21 +55,9 @@ def read_shots(path: str | Path) -> ShotTable:
     """Read and check a file of shots, see `ji.read_experiments`; a warning reports NaN cells."""
     where, columns, rows = _read(path, _KINDS, _ALLOWED, "shot")
     counts = _check_columns(where, columns)
-    values = {kind: np.full((len(rows), n), np.nan) for kind, n in counts.items()}
-    shots = []
-    for k, (where, row) in enumerate(rows):
-        for column, cell in zip(columns, row):
-            if column.kind == "shot":
-                shots.append(cell or str(k + 1))
-            else:
-                number = _number(f"{where}, column `{column.header}`", column, cell)
-                values[column.kind][k, column.body - 1] = number
-        for column in columns:
-            if column.kind in _ERRORS:
-                measured = column.kind == "sigma_pre" or values["post"][k, column.body - 1]
-                error = values[column.kind][k, column.body - 1]
-                _check_error(where, column, not np.isnan(measured), error)
-    _report_nan(path, columns, rows)
+    values = _values(columns, rows, counts)
+    labels = [i for i, column in enumerate(columns) if column.kind == "shot"]
+    shots = [row[i] or str(k + 1) for i in labels for k, (_, row) in enumerate(rows)]
     units = {column.body: column.unit for column in columns if column.kind == "pre"}
     return ShotTable(values, [units[i + 1] for i in range(len(units))], shots or None)
 
@@ -96,16 +85,7 @@ def read_positions(path: str | Path) -> Positions:
             f"{where}: the columns must be {', '.join(f'`{k}_{i}`' for k, i in required[1:])} and "
             f"`t`, each once, but are {', '.join(c.header for c in columns)}."
         )
-    values = {kind: np.full((len(rows), size), np.nan) for kind in ("t", *kinds)}
-    for k, (where, row) in enumerate(rows):
-        for column, cell in zip(columns, row):
-            number = _number(f"{where}, column `{column.header}`", column, cell)
-            values[column.kind][k, column.body - 1] = number
-        for column in columns:
-            if column.kind == "sigma_q":
-                measured = not np.isnan(values["q"][k, column.body - 1])
-                _check_error(where, column, measured, values["sigma_q"][k, column.body - 1])
-    _report_nan(path, columns, rows)
+    values = _values(columns, rows, dict.fromkeys(("t", *kinds), size))
     time = values["t"][:, 0]
     steps = np.diff(time)
     if len(time) < 2 or not (np.abs(steps - steps.mean()) <= UNEVEN_STEPS * steps.mean()).all():
@@ -213,18 +193,32 @@ def _check_columns(where: str, columns: list[CsvColumn]) -> dict[str, int]:
     return counts
 
 
-def _report_nan(
-    path: str | Path, columns: list[CsvColumn], rows: list[tuple[str, list[str]]]
-) -> None:
-    """Warn of cells that say NaN: they count as not measured, but may come from a failed script."""
-    cells = [(where, x) for where, row in rows for x, cell in zip(columns, row) if _is_nan(cell)]
-    if cells:
-        where, column = cells[0]
+def _values(
+    columns: list[CsvColumn], rows: list[tuple[str, list[str]]], counts: dict[str, int]
+) -> dict[str, np.ndarray]:
+    """The cells in SI units, checked, by kind; a warning reports those that say NaN."""
+    values = {kind: np.full((len(rows), n), np.nan) for kind, n in counts.items()}
+    not_numbers = []
+    for k, (line, row) in enumerate(rows):
+        for column, cell in zip(columns, row):
+            if column.kind == "shot":
+                continue
+            where = f"{line}, column `{column.header}`"
+            values[column.kind][k, column.body - 1] = _number(where, column, cell)
+            if _is_nan(cell):
+                not_numbers.append(where)
+        for column in columns:
+            if column.kind in _ERRORS:
+                measured = values[_ERRORS[column.kind]][k, column.body - 1]
+                error = values[column.kind][k, column.body - 1]
+                _check_error(line, column, not np.isnan(measured), error)
+    if not_numbers:
         warnings.warn(
-            f"{path}: {len(cells)} cells are NaN and count as not measured, as empty ones do; the "
-            f"first is in {where.removeprefix(f'{path}, ')}, column `{column.header}`.",
+            f"{not_numbers[0]}: the cell is NaN and counts as not measured, as an empty one does; "
+            f"{len(not_numbers)} cells of the file are.",
             stacklevel=1,  # one place for all callers: Python reports it once
         )
+    return values
 
 
 def _is_nan(cell: str) -> bool:

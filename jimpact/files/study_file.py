@@ -81,8 +81,8 @@ MOTION_TABLES = {
     "data": TableKeys(("file",), ("file",)),
 }
 # Units of the bodies' arguments, which a study writes behind their names. Words and directions have
-# none, nor lists that are points [m] or mix units, as the classes say: `corners` of a Polygon,
-# `planes`, `walls`, `at`.
+# no unit here, nor have lists of points [m] or of mixed units (`corners` of a Polygon, `planes`,
+# `walls`, `at`), which the classes document.
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
@@ -177,10 +177,10 @@ def located(path: Path, table: str) -> Path:
             f"Folder '{path}' holds no study: it has no {STUDY} (`jimpact new` writes one)."
         )
     tables = sorted(bundled.glob("*.toml"))
-    known = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
+    choices = [x.name for x in tables if table in x.read_text(encoding="utf-8")]
     raise FileNotFoundError(
-        f"Study '{path}' does not exist; bundled studies are {', '.join(known)}."
-        f"{suggestion(path, known)}"
+        f"Study '{path}' does not exist; bundled studies are {', '.join(choices)}."
+        f"{suggestion(path, choices)}"
     )
 
 
@@ -191,6 +191,7 @@ def check_study(path: str | Path, law: str | None = None) -> tuple[CheckedStudy,
     """The study of one impact and the number of its shots, all checked; see `read_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> tuple[CheckedStudy, int]:
+        """Check the tables and the shots."""
         study = check_impact_tables(tables, file, law)
         shots = read_shots(study.data_file).values["pre"] if "data" in tables else ()
         return study, len(shots)
@@ -202,6 +203,7 @@ def check_motion_study(path: str | Path, law: str | None = None) -> CheckedStudy
     """The study of a motion, all checked; see `read_motion_study`."""
 
     def check(tables: dict[str, Any], file: Path) -> CheckedStudy:
+        """Check the tables and the positions."""
         study = check_motion_tables(tables, file, law)
         if "data" in tables:
             read_positions(study.data_file)
@@ -223,7 +225,8 @@ def check_impact_tables(
     Args:
         tables: as read from the file.
         path: of the file.
-        other_law: name of a law in the place of the study's; of it only what both laws know stays.
+        other_law: name of a law in the place of the study's; values that it does not take are left
+            out.
         modules: whether the module that a study names has been imported; else a law that may be
             registered there is not checked.
     """
@@ -398,6 +401,8 @@ def distribution(name: str, value: Any) -> str:
 def check_table(where: str, table: Mapping[str, Any], keys: TableKeys) -> None:
     """Raise a ValueError for unknown or missing keys, and for values that are not allowed."""
     check_keys(where, table, keys.allowed, keys.required)
+    if not isinstance(table.get("file", ""), str):
+        raise ValueError(f"`file` in {where} must be a path, but is {table['file']!r}.")
     for key in keys.flags:
         if not isinstance(table.get(key, False), bool):
             raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")

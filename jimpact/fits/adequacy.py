@@ -85,14 +85,14 @@ def stretch(problem: FitProblem, data: Weighted, rank: int) -> float:
     more: what a law or its parameters get wrong is in these.
     """
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
-    found = [(squares, freedom)]
+    tests = [(squares, freedom)]
     if problem.experiments is not None and not problem.experiments.lost_freedom:
         for k, basis in enumerate(_conserved(problem)):
             if basis.shape[1]:
                 squares -= float(np.sum((basis.T @ data.residual[data.shot == k]) ** 2))
                 freedom -= basis.shape[1]
-        found.append((max(squares, 0.0), freedom))
-    rejected = [s / f for s, f in found if f > 0 and chdtrc(f, s) < LEVEL]
+        tests.append((max(squares, 0.0), freedom))
+    rejected = [s / f for s, f in tests if f > 0 and chdtrc(f, s) < LEVEL]
     return float(np.sqrt(max(rejected, default=1.0)))
 
 
@@ -121,8 +121,8 @@ def _noise(problem: FitProblem, data: Weighted) -> tuple[float, int]:
     groups: dict[Any, list[int]] = {}
     scenes = experiments.scenes
     for k, pre in enumerate(np.asarray(experiments.pre)):
-        own = k if scenes is not None else 0  # shots in scenes of their own are no repetitions
-        groups.setdefault((own, pre.tobytes()), []).append(k)
+        # shots in scenes of their own are not repetitions
+        groups.setdefault((0 if scenes is None else k, pre.tobytes()), []).append(k)
     conserved, bodies = _conserved(problem), problem.measured.shape[1]
     squares, count = 0.0, 0
     for shots in groups.values():
@@ -142,15 +142,15 @@ def _noise(problem: FitProblem, data: Weighted) -> tuple[float, int]:
 def _conserved(problem: FitProblem) -> list[np.ndarray]:
     """Of every shot the directions (n, c) in which residuals are momentum: orthonormal columns."""
     assert problem.experiments is not None
-    found, mixing = [], problem.residuals.mixing
+    bases, mixing = [], problem.residuals.mixing
     balances = problem.experiments.balances(problem.scene)
     for k, ((rows, _, _), w) in enumerate(zip(balances, problem.weight)):
         whole = (w > 0).all() and len(rows)
         back = (rows / w).T if whole else np.zeros((len(w), 0))
         if whole and mixing is not None:
             back = np.linalg.solve(np.asarray(mixing[k], float).T, back)
-        found.append(np.linalg.qr(back)[0])
-    return found
+        bases.append(np.linalg.qr(back)[0])
+    return bases
 
 
 def _reading_variance(problem: FitProblem) -> float:
@@ -206,25 +206,25 @@ def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool)
     assert problem.experiments is not None
     known, labels = _range(data.jacobian), problem.experiments.shots
     total = float(data.residual @ data.residual)
-    found, count, reading = [], len(np.unique(data.shot)), _reading_variance(problem)
+    suspects, count, reading = [], len(np.unique(data.shot)), _reading_variance(problem)
     for k in np.unique(data.shot):
         rows = data.shot == k
         r, q, n = data.residual[rows], known[rows], int(rows.sum())
         rest = freedom - n
         if rest < _LEAST:
             return []
-        own = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
-        noise = max(total - own, 0.0) / rest + reading
+        squares = float(r @ np.linalg.lstsq(np.eye(n) - q @ q.T, r, rcond=1e-9)[0])
+        noise = max(total - squares, 0.0) / rest + reading
         if problem.sigma is not None:
             noise = max(noise, 1.0)
-        if own > 0 and (noise == 0 or fdtrc(n, rest, own / n / noise) < LEVEL / count):
-            found.append((own, labels[k]))
-    if not found:
+        if squares > 0 and (noise == 0 or fdtrc(n, rest, squares / n / noise) < LEVEL / count):
+            suspects.append((squares, labels[k]))
+    if not suspects:
         return []
     advice = "" if robust else ", or fit with loss='huber'"
-    worst = ", ".join(label for _, label in sorted(found, reverse=True)[:_LISTED])
-    more = f" and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+    worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:_LISTED])
+    more = f" and {len(suspects) - _LISTED} more" if len(suspects) > _LISTED else ""
     return [
-        f"Suspicious: shot{'s' * (len(found) > 1)} {worst}{more}, which the others do not expect "
-        f"(of {count}); look there for errors{advice}."
+        f"Suspicious: shot{'s' * (len(suspects) > 1)} {worst}{more}, which the others do not "
+        f"expect (of {count}); look there for errors{advice}."
     ]

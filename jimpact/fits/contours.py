@@ -68,8 +68,8 @@ def contour(
     >>> import jimpact as ji
     >>> pre, post = [[1.0, 0.0, -1.0], [2.0, 0.0, 0.0]], [[-0.8, 0.1, 0.7], [0.1, 1.8, 0.1]]
     >>> data = ji.Experiments(pre, post, sigma=0.1)
-    >>> found = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data)
-    >>> region = ji.contour(found, "restitution[1]", "restitution[2]", points=5)
+    >>> result = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data)
+    >>> region = ji.contour(result, "restitution[1]", "restitution[2]", points=5)
     >>> region.deviance.shape, round(region.limit, 2)
     ((5, 5), 5.99)
     """

@@ -22,7 +22,7 @@ def data_defects(
 ) -> list[str]:
     """What the data break beyond their error, a line each: momentum, energy, approach; copies.
 
-    Momentum is told as `1 + excess / sum |m v-|`: after over before where all bodies move one way.
+    Momentum is given as `1 + excess / sum |m v-|`: after over before where all bodies move one way.
     Without `sigma` the shots show their noise: a defect is one that they have in common (a t test),
     of a single shot any above a tenth of a percent.
 
@@ -78,11 +78,11 @@ def data_defects(
             f"No contact approaches in {len(labels)} of {len(experiments.shots)} shots ({which}): "
             "are pre and post swapped, or is a sign wrong?"
         )
-    every = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
-    copies = len(every) > 1 and experiments.sigma is None and (every == every[:1]).all()
+    rows = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
+    copies = len(rows) > 1 and experiments.sigma is None and (rows == rows[:1]).all()
     if copies and experiments.scenes is None:
         lines.append(
-            f"All {len(every)} shots read the same to the last digit: they say no more than one of "
+            f"All {len(rows)} shots read the same to the last digit: they say no more than one of "
             "them, and nothing of the noise; the errors mean nothing without `sigma`."
         )
     return lines
@@ -98,32 +98,33 @@ class _Defect(NamedTuple):
     ratio: float
 
 
-def _beyond_noise(found: list[tuple[int, _Defect]], gains: bool = False) -> dict[int, float]:
+def _beyond_noise(defects: list[tuple[int, _Defect]], gains: bool = False) -> dict[int, float]:
     """Ratios of the shots whose balance fails by more than their noise; gains: upwards only."""
-    if any(d.sigma is not None for _, d in found):
-        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * DEFECT_LEVEL / len(found))))
+    if any(d.sigma is not None for _, d in defects):
+        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * DEFECT_LEVEL / len(defects))))
         return {
             k: d.ratio
-            for k, d in found
+            for k, d in defects
             if d.sigma is not None
             and (d.excess if gains else abs(d.excess)) > sigmas * np.linalg.norm(d.slope * d.sigma)
         }
-    told = {
+    flagged = {
         k: d.ratio
-        for k, d in found
+        for k, d in defects
         if (d.excess if gains else abs(d.excess)) > DEFECT_TOLERANCE * d.scale
     }
-    if len(found) < 2 or not told:
-        return told
-    noise = np.array([d.excess / np.linalg.norm(d.slope) for _, d in found if d.slope.any()])
+    if len(defects) < 2 or not flagged:
+        return flagged
+    noise = np.array([d.excess / np.linalg.norm(d.slope) for _, d in defects if d.slope.any()])
     if len(noise) < 2:
-        return told
+        return flagged
     mean, error = noise.mean(), noise.std(ddof=1) / np.sqrt(len(noise))
     chance = stdtr(len(noise) - 1, -mean / error if error else -np.inf * np.sign(mean))
-    return told if (chance if gains else 2 * min(chance, 1 - chance)) < DEFECT_LEVEL else {}
+    return flagged if (chance if gains else 2 * min(chance, 1 - chance)) < DEFECT_LEVEL else {}
 
 
 def _listed(experiments: Experiments, ratios: dict[int, float]) -> str:
+    """Shots with their ratios, or the range of the ratios of many."""
     if len(ratios) <= _LISTED:
         return ", ".join(f"shot {experiments.shots[k]}: {r:.4f}" for k, r in ratios.items())
     values = list(ratios.values())

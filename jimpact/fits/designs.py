@@ -34,8 +34,8 @@ class Design:
     def __str__(self) -> str:
         lines = []
         for shot, errors in zip(self.shots, self.standard_error):
-            told = ", ".join(f"{name} +- {x:.2g}" for name, x in zip(self.names, errors))
-            lines.append(f"shot {shot}: {told}")
+            text = ", ".join(f"{name} +- {x:.2g}" for name, x in zip(self.names, errors))
+            lines.append(f"shot {shot}: {text}")
         return "\n".join(lines)
 
 
@@ -70,8 +70,8 @@ def design(
     >>> import jimpact as ji
     >>> balls = ji.chain([1.0, 1.0, 1.0])
     >>> data = ji.Experiments([[1.0, 0.0, 0.0]], [[-0.2, 0.6, 0.6]], sigma=0.01)
-    >>> found = ji.fit(ji.Newton([0.8, 0.8]), balls, data, starts=1)  # contact 2 is not seen
-    >>> print(ji.design(found, ji.Experiments([[2.0, 0, 0], [0, 0, -1.0]], [[0.0] * 3] * 2)))
+    >>> result = ji.fit(ji.Newton([0.8, 0.8]), balls, data, starts=1)  # contact 2 is not seen
+    >>> print(ji.design(result, ji.Experiments([[2.0, 0, 0], [0, 0, -1.0]], [[0.0] * 3] * 2)))
     shot 2: restitution[1] +- 0.012, restitution[2] +- 0.012
     """
     check_kind("fit", fit, Fit)

@@ -126,22 +126,23 @@ class Experiments(eqx.Module):
 
     def scene_of(self, scene: Scene | None, shot: int) -> Scene:
         """The scene of one shot (counted from 0): its own, or else the given common one."""
-        own = scene if self.scenes is None else self.scenes[shot]
-        if own is None:
+        if self.scenes is not None:
+            scene = self.scenes[shot]
+        if scene is None:
             raise ValueError(
                 "Argument `scene` must be a Scene where the experiments carry none, but is None."
             )
-        if own.size != self.pre.shape[1]:
+        if scene.size != self.pre.shape[1]:
             raise ValueError(
                 "Argument `experiments` must have one velocity per body of the scene: it has "
-                f"{self.pre.shape[1]} a shot, but the scene has {own.size}."
+                f"{self.pre.shape[1]} a shot, but the scene has {scene.size}."
             )
-        return own
+        return scene
 
     def largest_scene(self, scene: Scene | None) -> Scene:
         """The first of the scenes (or the given common scene) with the most contacts."""
         scenes = [self.scene_of(scene, k) for k in range(len(self.shots))]
-        return max(scenes, key=lambda own: own.contacts)
+        return max(scenes, key=lambda each: each.contacts)
 
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
         """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
@@ -218,14 +219,14 @@ class Experiments(eqx.Module):
         ('2',)
         """
         rows = np.arange(len(self.shots))[which]
-        own: dict[str, Any] = {"shots": [self.shots[k] for k in rows]}
-        own["lost_freedom"] = [self.lost[k] for k in rows]
+        fields: dict[str, Any] = {"shots": [self.shots[k] for k in rows]}
+        fields["lost_freedom"] = [self.lost[k] for k in rows]
         for name in ("pre", "post", "sigma", "sigma_pre", "resolution"):
-            given = getattr(self, name)
-            own[name] = None if given is None else np.asarray(given)[rows]
+            values = getattr(self, name)
+            fields[name] = None if values is None else np.asarray(values)[rows]
         if self.scenes is not None:
-            own["scenes"] = [self.scenes[k] for k in rows]
-        return self._with(**own)
+            fields["scenes"] = [self.scenes[k] for k in rows]
+        return self._with(**fields)
 
     @property
     def contacts(self) -> np.ndarray:
@@ -312,6 +313,7 @@ def closed_normals(scene: Scene) -> np.ndarray:
 
 
 def _as_rows(name: str, value: Any) -> jax.Array:
+    """Velocities as (K, n)."""
     array = as_float_array(name, value)
     check_concrete(name, array)
     array = array[None, :] if array.ndim == 1 else array
@@ -324,6 +326,7 @@ def _as_rows(name: str, value: Any) -> jax.Array:
 
 
 def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None = None) -> jax.Array:
+    """Standard errors as (K, n), NaN where nothing was measured; `least` 0.0: 0 is allowed."""
     sigma = as_float_array(name, value)
     check_concrete(name, sigma)
     if sigma.shape == measured.shape[1:] and len(measured) == 1:
@@ -335,12 +338,13 @@ def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None =
         )
     sigma = jnp.broadcast_to(sigma, measured.shape)
     # the error of a value that was not measured does not matter
-    seen = np.where(measured, np.asarray(sigma), 1.0)
-    check_values(name, seen, low=0.0, open_low=least is None)
+    of_measured = np.where(measured, np.asarray(sigma), 1.0)
+    check_values(name, of_measured, low=0.0, open_low=least is None)
     return jnp.where(measured, sigma, jnp.nan)
 
 
 def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, ...]:
+    """The scenes, one a shot, checked."""
     scenes = tuple(scenes)
     if len(scenes) != shape[0]:
         raise ValueError(
@@ -399,27 +403,27 @@ def read_experiments(
 
 
 def _scenes_of(
-    path: str | Path, values: dict[str, np.ndarray], given: Scene | Body | None, near: float
+    path: str | Path, values: dict[str, np.ndarray], place: Scene | Body | None, near: float
 ) -> list[Scene] | None:
     """The scenes of the shots of a file, None if they have none of their own."""
     columns = [kind for kind in ("q", "mass", "gap") if kind in values]
     if not columns:
         return None
     if "q" in values:
-        if columns != ["q"] or not isinstance(given, Body):
+        if columns != ["q"] or not isinstance(place, Body):
             raise ValueError(
                 f"{path}: columns `q` must belong to a body, but are given "
-                f"{'with masses or gaps' if columns != ['q'] else f'for {type(given).__name__}'}."
+                f"{'with masses or gaps' if columns != ['q'] else f'for {type(place).__name__}'}."
             )
-        return given.scenes(values["q"], near)
-    if not isinstance(given, Scene) or ("mass" in values and given.walls is None):
+        return place.scenes(values["q"], near)
+    if not isinstance(place, Scene) or ("mass" in values and place.walls is None):
         raise ValueError(
             f"{path}: columns `{columns[0]}` must belong to a chain that is given as `scene`, but "
-            f"that is {type(given).__name__}."
+            f"that is {type(place).__name__}."
         )
     count = len(values["pre"])
-    gaps = values.get("gap", [given.gaps] * count)
+    gaps = values.get("gap", [place.gaps] * count)
     if "mass" not in values:
-        return [with_gaps(given, as_float_array("gaps", gap)) for gap in gaps]
-    wall: Any = next(name for name, sides in WALLS.items() if sides == given.walls)
+        return [with_gaps(place, as_float_array("gaps", gap)) for gap in gaps]
+    wall: Any = next(name for name, sides in WALLS.items() if sides == place.walls)
     return [chain(mass, wall, gap) for mass, gap in zip(values["mass"], gaps)]

@@ -132,8 +132,8 @@ def fit(
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
-    >>> found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> round(float(found.law.restitution), 4)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> round(float(result.law.restitution), 4)
     0.4
     """
     check_method(method)
@@ -200,8 +200,8 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
         f"{', ...' * (len(labels) > LISTED)}), whose impacts fail, or whose derivatives cannot be "
         "used."
     )
-    kept = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
-    return replace(problem.weighed(kept), left_out=(*problem.left_out, line))
+    used = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
+    return replace(problem.weighed(used), left_out=(*problem.left_out, line))
 
 
 def as_fit(

@@ -37,8 +37,8 @@ class Profile:
 
         >>> import numpy as np
         >>> from jimpact.fits.intervals import Profile
-        >>> given = ("e", np.zeros(1), np.zeros(1), 4.0, 0.95)
-        >>> Profile(*given, ((0.25, 0.5), (0.75, 1.0)), (0.0, 1.0)).words
+        >>> first = ("e", np.zeros(1), np.zeros(1), 4.0, 0.95)
+        >>> Profile(*first, ((0.25, 0.5), (0.75, 1.0)), (0.0, 1.0)).words
         '0.25 to 0.5 or at least 0.75'
         """
         return in_words(self.intervals, self.domain)
@@ -54,13 +54,13 @@ def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], 
     >>> joined([(3.0, 4.0), (0.0, 1.0), (0.5, 2.0)])
     ((0.0, 2.0), (3.0, 4.0))
     """
-    found: list[tuple[float, float]] = []
+    union: list[tuple[float, float]] = []
     for low, high in sorted(pieces):
-        if found and low <= found[-1][1]:
-            found[-1] = (found[-1][0], max(high, found[-1][1]))
+        if union and low <= union[-1][1]:
+            union[-1] = (union[-1][0], max(high, union[-1][1]))
         else:
-            found.append((float(low), float(high)))
-    return tuple(found)
+            union.append((float(low), float(high)))
+    return tuple(union)
 
 
 def in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
@@ -69,6 +69,7 @@ def in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float])
 
 
 def _piece(low: float, high: float, domain: tuple[float, float]) -> str:
+    """One piece of an interval in words."""
     open_low, open_high = low <= domain[0], high >= domain[1]
     if open_low and open_high:
         return "anything"

@@ -92,7 +92,7 @@ class SolverState(eqx.Module):
     y: jax.Array
     residual: jax.Array
     jacobian: jax.Array
-    kept: Any
+    aux: Any
     cost: jax.Array
     gain: jax.Array  # what a Gauss-Newton step from the best point still promises
     trial: jax.Array
@@ -142,13 +142,14 @@ def advance(
     last = jnp.minimum(state.steps + passes, max_steps)
 
     def one(state: SolverState) -> SolverState:
-        residual, jacobian, kept = evaluate(state.trial)
+        """One pass."""
+        residual, jacobian, aux = evaluate(state.trial)
         cost = 0.5 * jnp.sum(residual**2)
         better = cost < state.cost
-        here = (state.trial, residual, jacobian, kept, cost)
-        best = (state.y, state.residual, state.jacobian, state.kept, state.cost)
+        here = (state.trial, residual, jacobian, aux, cost)
+        best = (state.y, state.residual, state.jacobian, state.aux, state.cost)
         best = jax.tree.map(lambda a, b: jnp.where(better, a, b), here, best)
-        y, r, jac, kept, least = best
+        y, r, jac, aux, least = best
         floor = jnp.asarray(_LEAST[str(y.dtype)], y.dtype)
         if method == "levenberg-marquardt":
             memory = jnp.maximum(state.memory * jnp.where(better, _LESS, _MORE), floor)
@@ -174,7 +175,7 @@ def advance(
         trial = region.retract(trial)
         dtype = str(y.dtype)
         done = stuck | (gain <= STOP_GAIN[dtype] * least + STOP_EXACT[dtype])
-        return SolverState(y, r, jac, kept, least, gain, trial, memory, state.steps + 1, done)
+        return SolverState(y, r, jac, aux, least, gain, trial, memory, state.steps + 1, done)
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
 
@@ -184,10 +185,12 @@ def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
 
     @jax.custom_jvp
     def cost(y: jax.Array) -> jax.Array:
+        """Half the sum of squares."""
         return 0.5 * jnp.sum(evaluate(y)[0] ** 2)
 
     @cost.defjvp
     def _rule(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Array]:
+        """The derivative by the Jacobian."""
         residual, jacobian, _ = evaluate(primals[0])
         return 0.5 * jnp.sum(residual**2), (jacobian.T @ residual) @ tangents[0]
 
@@ -195,6 +198,7 @@ def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:
 
 
 def _transformation(method: Method, max_steps: int) -> "optax.GradientTransformationExtraArgs":
+    """The optax transformation of a method."""
     import optax
 
     if method == "adam":

@@ -61,8 +61,8 @@ def fit_many(
 
     >>> import jimpact as ji
     >>> sets = [ji.Experiments([1.0, 0.0], [0.5 - 0.5 * e, 0.5 + 0.5 * e]) for e in (0.4, 0.8)]
-    >>> found = ji.fit_many(ji.Newton(0.9), ji.chain([1.0, 1.0]), sets)
-    >>> [round(float(each.law.restitution), 6) for each in found]
+    >>> fits = ji.fit_many(ji.Newton(0.9), ji.chain([1.0, 1.0]), sets)
+    >>> [round(float(each.law.restitution), 6) for each in fits]
     [0.4, 0.8]
     """
     as_whole("starts", starts, 1)
@@ -72,7 +72,7 @@ def fit_many(
     for k, residuals in enumerate(filled):
         shape = (jax.tree.structure(residuals), [np.shape(x) for x in jax.tree.leaves(residuals)])
         groups.setdefault(str(shape), []).append(k)
-    found: dict[int, Fit[AnyLaw]] = {}
+    fits: dict[int, Fit[AnyLaw]] = {}
     with progress_bar(progress) as show:
         for group in groups.values():
             rng = np.random.default_rng(seed)
@@ -81,20 +81,20 @@ def fit_many(
                 lambda *x: np.repeat(np.stack([np.asarray(each) for each in x]), starts, axis=0),
                 *(filled[k] for k in group),
             )
-            own = [problems[k] for k in group]
+            group_problems = [problems[k] for k in group]
             states = run(stacked, points, _METHOD, max_steps, show, rivals=False)
-            searches = _searches(own, states)
+            searches = _searches(group_problems, states)
             if stacked.mixing is not None:
                 best = np.array([search.y for search in searches])
-                own, states = settled(own, best, _METHOD, max_steps, show)
-                searches = _searches(own, states)
-            for k, problem, search in zip(group, own, searches):
+                group_problems, states = settled(group_problems, best, _METHOD, max_steps, show)
+                searches = _searches(group_problems, states)
+            for k, problem, search in zip(group, group_problems, searches):
                 if unusable(problem, search).any():  # what is left is another problem
                     options: dict[str, Any] = {"starts": starts, "seed": seed, "profiles": False}
-                    found[k] = fit(problems[k], max_steps=max_steps, progress=False, **options)
+                    fits[k] = fit(problems[k], max_steps=max_steps, progress=False, **options)
                 else:
-                    found[k] = as_fit(problem, search, _METHOD)
-    return [found[k] for k in range(len(problems))]
+                    fits[k] = as_fit(problem, search, _METHOD)
+    return [fits[k] for k in range(len(problems))]
 
 
 def _searches(problems: list[FitProblem], states: SolverState) -> list[Solution]:
@@ -145,9 +145,9 @@ def bootstrap(
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.11, 0.88], [0.2, 1.81]], sigma=0.02)
-    >>> found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> spread = ji.bootstrap(found).value.std()
-    >>> bool(abs(spread / found.standard_error[0] - 1) < 0.1)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> spread = ji.bootstrap(result).value.std()
+    >>> bool(abs(spread / result.standard_error[0] - 1) < 0.1)
     True
     """
     as_whole("samples", samples, 1)
@@ -182,8 +182,8 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.1, 0.9], [0.6, 1.4]])
-    >>> found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> ji.leave_one_out(found).value.round(6).tolist()
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> ji.leave_one_out(result).value.round(6).tolist()
     [[0.4], [0.8]]
     """
     check_squares("fit", fit)
@@ -195,10 +195,10 @@ def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:
     weight[np.arange(shots), np.arange(shots)] = 0.0
     many = eqx.tree_at(lambda r: r.weight, repeated(residuals, shots), weight)
     each = np.eye(shots)[:, :, None] * np.ones(fit.predicted.shape)
-    problems = [fit.problem.weighed(1 - own) for own in each]
-    found = _refits(fit, problems, many, progress)
-    one_each = found.predicted[np.arange(shots), np.arange(shots)]
-    return replace(found, predicted=one_each)
+    problems = [fit.problem.weighed(1 - shot) for shot in each]
+    refits = _refits(fit, problems, many, progress)
+    one_each = refits.predicted[np.arange(shots), np.arange(shots)]
+    return replace(refits, predicted=one_each)
 
 
 def _refits(
@@ -209,6 +209,6 @@ def _refits(
     with progress_bar(progress) as show:
         _, states = settled(problems, points, _METHOD, DEFAULT_STEPS[_METHOD], show, many)
     value = fit.problem.values_at(np.asarray(states.y, float))
-    seen = np.asarray(states.kept[0], float)
-    seen = seen[:, : len(fit.predicted)] if fit.predicted.ndim else seen
-    return Refits(fit.names, value, seen, at_minimum(states))
+    predicted = np.asarray(states.aux[0], float)
+    predicted = predicted[:, : len(fit.predicted)] if fit.predicted.ndim else predicted
+    return Refits(fit.names, value, predicted, at_minimum(states))

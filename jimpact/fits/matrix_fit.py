@@ -108,6 +108,7 @@ class AdmissibleMatrices(eqx.Module):
         return jax.lax.stop_gradient(Approaches(x, vectors * faces[None, :, :, None], values))
 
     def _dissipation(self, y: jax.Array) -> jax.Array:
+        """`Q = G^-1 - E^T G^-1 E` (S, m, m)."""
         e = self.matrices(y)
         return self.inverse - jnp.swapaxes(e, 1, 2) @ self.inverse @ e
 
@@ -123,20 +124,21 @@ class AdmissibleMatrices(eqx.Module):
 
     def share(self, y: jax.Array) -> jax.Array:
         """How much of the way from the center to y is admissible, at most 1."""
-        here, there = self.elementwise(self.center), self.elementwise(y)
-        crossed = there < 0
-        share = jnp.where(crossed, here / jnp.where(crossed, here - there, 1.0), 1.0).min()
+        slack, target = self.elementwise(self.center), self.elementwise(y)
+        crossed = target < 0
+        share = jnp.where(crossed, slack / jnp.where(crossed, slack - target, 1.0), 1.0).min()
 
         def closer(
             state: tuple[jax.Array, jax.Array, jax.Array],
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """The share after one more look at the worst approaches."""
             share, _, passes = state
             x = self.worst(self.center + share * (y - self.center)).x
             nearer = jnp.minimum(share, self._energy_share(y, x).min())
             return nearer, nearer < share, passes + 1
 
-        start = (share, jnp.asarray(True), jnp.asarray(0))
-        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), closer, start)[0]
+        first = (share, jnp.asarray(True), jnp.asarray(0))
+        return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), closer, first)[0]
 
     def _energy_share(self, y: jax.Array, x: jax.Array) -> jax.Array:
         """Where on the ray the energy kept at the approaches x reaches 1; above the true end."""
@@ -154,6 +156,7 @@ class AdmissibleMatrices(eqx.Module):
         x = self.worst(y).x
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """Slacks, also as the value beside their derivatives."""
             value = jnp.concatenate([self.elementwise(y), self.lost_energy(y, x).reshape(-1)])
             return value, value
 
@@ -168,6 +171,7 @@ class AdmissibleMatrices(eqx.Module):
         at = self.worst(y)
 
         def moved(y: jax.Array) -> tuple[jax.Array, jax.Array]:
+            """`E x`, and `Q x` in the eigenvectors."""
             after = jnp.einsum("sij,sfj->sfi", self.matrices(y), at.x)
             turning = jnp.einsum("sij,sfj->sfi", self._dissipation(y), at.x)
             return after, jnp.einsum("sfij,sfi->sfj", at.vectors, turning)
@@ -201,6 +205,7 @@ class AdmissibleMatrices(eqx.Module):
         first = len(self.moving)
 
         def solve(_: int, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            """The step with the curvature of the last multipliers."""
             bent = self.curvature(y, state[1][first:])
             return _quadratic(hessian + bent, gradient, slack, rows)
 
@@ -251,7 +256,7 @@ def matrix_region(
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
     start = jnp.asarray(_start(law.matrix, origin, mix), dtype)
-    every = jnp.ones((1 + len(inverse)) * m * m + (0 if ends is None else ends.size), bool)
+    all_move = jnp.ones((1 + len(inverse)) * m * m + (0 if ends is None else ends.size), bool)
     region = AdmissibleMatrices(
         origin=jnp.asarray(origin, dtype),
         map=jnp.asarray(mix, dtype),
@@ -259,12 +264,12 @@ def matrix_region(
         closed=jnp.asarray(closed, dtype),
         bounds=None if ends is None else jnp.asarray(ends, dtype),
         center=start,
-        moving=every,
+        moving=all_move,
     )
     slack, rows = _host_conditions(region, start)
     _check_start(region, slack)
     moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)
-    region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(every)]))
+    region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(all_move)]))
     return eqx.tree_at(lambda r: r.center, region, _center(region, slack, rows, moving))
 
 
@@ -305,15 +310,15 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
         # t <= slack + rows (E - e): least slack t at E, below the tangents found so far
         new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ e])[moving]
         planes = np.vstack([planes, new])
-        found = linprog(
+        farthest = linprog(
             np.append(np.zeros(m * m), -1.0),
             A_ub=planes[:, :-1],
             b_ub=planes[:, -1],
             bounds=[*[(0.0, None)] * (m * m), (None, 1.0)],
         )
-        if not found.success or found.x[-1] <= 0:
+        if not farthest.success or farthest.x[-1] <= 0:
             break
-        e = found.x[:-1]
+        e = farthest.x[:-1]
     raise ValueError(
         "Argument `scene` must have an admissible restitution matrix to start from, but none was "
         "found: give one, or RestitutionMatrix(matrix, admissible=False)."
@@ -328,8 +333,8 @@ def _inverses(scenes: list[Scene]) -> tuple[np.ndarray, np.ndarray]:
             f"Argument `law` must have at most {LARGEST} contacts to keep its matrix admissible, "
             f"but has {m}. RestitutionMatrix(matrix, admissible=False) is fitted without that."
         )
-    found = np.unique([_inverse(scene) for scene in scenes], axis=0)
-    return found[:, :m], found[:, m]
+    distinct = np.unique([_inverse(scene) for scene in scenes], axis=0)
+    return distinct[:, :m], distinct[:, m]
 
 
 def encloses(law: Law, contacts: int) -> bool:
@@ -359,10 +364,12 @@ def _start(entries: Any, origin: Any, mix: Any) -> np.ndarray:
 
 @quick_jit
 def _all_conditions(region: AdmissibleMatrices, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compiled `AdmissibleMatrices.conditions`."""
     return region.conditions(y)
 
 
 def _host_conditions(region: AdmissibleMatrices, y: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Slacks and their derivatives on the host."""
     slack, rows = _all_conditions(region, jnp.asarray(y, region.center.dtype))
     return np.asarray(slack, float), np.asarray(rows, float)
 
@@ -375,6 +382,7 @@ def _kinds(region: AdmissibleMatrices) -> tuple[slice, slice, slice]:
 
 
 def _rounding(region: AdmissibleMatrices) -> float:
+    """By how much rounding may break a condition."""
     return _ROUNDING[str(region.center.dtype)] * float(np.abs(np.asarray(region.inverse)).max())
 
 
@@ -397,13 +405,13 @@ def _center(
 
     start = np.asarray(region.center, float)
     used = np.any(rows[moving] != 0, axis=0)
-    found = linprog(
+    solution = linprog(
         np.append(np.zeros(len(start)), -1.0),  # the least slack after the step is to be large
         A_ub=np.hstack([-rows, np.ones((len(rows), 1))])[moving],
         b_ub=slack[moving],
         bounds=[*((-int(free), int(free)) for free in used), (None, 1.0)],
     )
-    move = found.x[:-1] if found.success else np.zeros(len(start))
+    move = solution.x[:-1] if solution.success else np.zeros(len(start))
     for halving in range(_HALVINGS):
         center = start + 0.5**halving * move
         if _host_conditions(region, center)[0][moving].min() > _rounding(region):

@@ -157,8 +157,8 @@ def settled(
     each = len(points) // len(problems)
     best = np.arange(0, len(points), each)
     if many is None:
-        every = [filled_up(problem.residuals) for problem in problems for _ in range(each)]
-        many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *every)
+        copies = [filled_up(problem.residuals) for problem in problems for _ in range(each)]
+        many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *copies)
     for _ in range(SETTLING):
         if many.mixing is not None:
             problems = [p.passing_errors_at(points[b]) for p, b in zip(problems, best)]
@@ -176,6 +176,7 @@ def settled(
 
 
 def _weights(residuals: Residuals) -> tuple[Any, ...]:
+    """The parts of residuals that errors of v- change."""
     return residuals.weight, residuals.size, residuals.mixing
 
 
@@ -183,6 +184,7 @@ def repeated(residuals: Residuals, count: int) -> Residuals:
     """So many times the same problem, without copies."""
 
     def each(leaf: Any) -> Any:
+        """The array without copies."""
         return np.broadcast_to(leaf, (count, *np.shape(leaf))) if eqx.is_array(leaf) else leaf
 
     return jax.tree.map(each, residuals)
@@ -219,6 +221,7 @@ def run(
     before, since = states.cost.copy(), states.steps.copy()
 
     def show_count() -> None:
+        """Show how many are done."""
         count, total = earlier + len(points) - len(active), earlier + len(points)
         steps = int(states.steps.max())
         text = f"fit: {count} of {total} {what} done, step {steps} of at most {max_steps}"
@@ -264,17 +267,19 @@ def run_held(
     return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False, what=what)
 
 
-def _batches(every: list[int], lanes: int) -> list[list[int]]:
+def _batches(items: list[int], lanes: int) -> list[list[int]]:
     """Lists of so many; the last repeats its last one."""
-    firsts = range(0, len(every), lanes)
-    return [[every[min(i + j, len(every) - 1)] for j in range(lanes)] for i in firsts]
+    firsts = range(0, len(items), lanes)
+    return [[items[min(i + j, len(items) - 1)] for j in range(lanes)] for i in firsts]
 
 
 def _rows(tree: Any, rows: list[int]) -> Any:
+    """These rows of all arrays."""
     return jax.tree.map(lambda leaf: leaf[rows] if eqx.is_array(leaf) else leaf, tree)
 
 
 def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """The array with new rows, in place."""
     leaf[rows] = new
     return leaf
 
@@ -295,9 +300,10 @@ def ends(
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
     # starts that did not converge have no minimum to tell, unless they are the best there is
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
-    predicted, status = states.kept
+    predicted, status = states.aux
 
     def slopes(i: int) -> np.ndarray:
+        """The Jacobian at an end, without what filled up."""
         return np.asarray(states.jacobian[i][: problem.measured.size, :count], float)
 
     rows = len(problem.measured) if problem.measured.ndim else None  # without what filled up
@@ -330,6 +336,7 @@ def at_minimum(states: SolverState) -> np.ndarray:
 
 
 def _all_entries(residuals: Residuals, y: np.ndarray) -> np.ndarray:
+    """All entries (Q,) of the fields at y."""
     scaled = np.asarray(residuals.offset, float) + np.asarray(residuals.mix, float) @ y
     return from_scaled(scaled, np.asarray(residuals.scale, float), np.asarray(residuals.log))
 
@@ -406,13 +413,13 @@ def _valleys(
         return np.zeros((0, states.y.shape[1]))
     passes = 1 if count == 1 else SCAN_PASSES
     scan = run_held(residuals, held, passes, show)
-    found = []
+    valleys = []
     for k in range(0, len(held), SCANNED):
         rows = slice(k, k + SCANNED)
         part = jax.tree.map(lambda x, rows=rows: x[rows], scan)
-        found += _turns(held[k][0], count, part, np.asarray(states.y[best], float))
-    found.sort(key=lambda valley: valley[0])
-    return np.array([y for _, y in found[:FOLLOWED]]).reshape(-1, states.y.shape[1])
+        valleys += _turns(held[k][0], count, part, np.asarray(states.y[best], float))
+    valleys.sort(key=lambda valley: valley[0])
+    return np.array([y for _, y in valleys[:FOLLOWED]]).reshape(-1, states.y.shape[1])
 
 
 def _turns(
@@ -443,14 +450,14 @@ def _turns(
 def start_points(problem: FitProblem, starts: int, rng: np.random.Generator) -> np.ndarray:
     """Starts y (S, Q): the law's own values, then random ones inside the bounds."""
     count, log, r = len(problem.names), problem.log, problem.residuals
-    own = problem.point(problem.start)
+    own_values = problem.point(problem.start)
     low, high = (np.array(end, float)[:count] for end in (r.low, r.high))
     reach = np.where(log, np.log(START_FACTOR), START_SCALES)
-    low = np.where(log | np.isinf(low), np.maximum(low, own[:count] - reach), low)
-    high = np.where(log | np.isinf(high), np.minimum(high, own[:count] + reach), high)
+    low = np.where(log | np.isinf(low), np.maximum(low, own_values[:count] - reach), low)
+    high = np.where(log | np.isinf(high), np.minimum(high, own_values[:count] + reach), high)
     elastic = [problem.parameters.field_of(i) == "restitution" for i in range(count)]
     low = np.where(elastic & (high > START_RESTITUTION), np.maximum(low, START_RESTITUTION), low)
-    points = np.zeros((starts, len(own)))
+    points = np.zeros((starts, len(own_values)))
     points[:, :count] = low + (high - low) * rng.random((starts, count))
-    points[0] = own
+    points[0] = own_values
     return points

@@ -50,7 +50,7 @@ class Observations(eqx.Module):
 
     scenes: Scene  # stacked, one a shot
     pre: jax.Array  # (K, n)
-    there: jax.Array  # (K, n) bodies that take part
+    present: jax.Array  # (K, n) bodies that take part
     up: jax.Array  # () sign of a velocity away from the wall
     rows: tuple[Observation, ...] = eqx.field(static=True)
 
@@ -62,17 +62,17 @@ class Observations(eqx.Module):
     @property
     def labels(self) -> tuple[str, ...]:
         """Of the values: what, of which contact or body, and how many bodies took part."""
-        there = np.asarray(self.there).sum(axis=1)
+        present = np.asarray(self.present).sum(axis=1)
         return tuple(
             " ".join(
                 [row.quantity.replace("_", " "), *([str(row.place + 1)] if row.place >= 0 else [])]
             )
-            + f", {there[row.shot]} bodies"
+            + f", {present[row.shot]} bodies"
             for row in self.rows
         )
 
     def __call__(self, law: Law) -> Prediction:
-        """What would be seen of this law."""
+        """The values that this law predicts."""
         if any(row.quantity in _OF_FORCES for row in self.rows):
             samples = SAMPLES if any(row.sampled for row in self.rows) else 2
 
@@ -86,8 +86,8 @@ class Observations(eqx.Module):
                 out = impact(law, scene, v)
                 return out.velocity, out.status, None
 
-        velocity, status, seen = jax.vmap(run)(self.scenes, self.pre)
-        raw = jnp.stack([self._value(row, velocity, seen) for row in self.rows])
+        velocity, status, histories = jax.vmap(run)(self.scenes, self.pre)
+        raw = jnp.stack([self._value(row, velocity, histories) for row in self.rows])
         first = np.array([row.first for row in self.rows])
         values = jnp.where(first < 0, raw, raw / raw[np.maximum(first, 0)])
         fails = means_nothing(status)
@@ -95,22 +95,23 @@ class Observations(eqx.Module):
         bad = fails[shot] | ~jnp.isfinite(values)
         return Prediction(values, bad, status[jnp.argmax(fails)][None])
 
-    def _value(self, row: Observation, velocity: jax.Array, seen: History | None) -> jax.Array:
+    def _value(self, row: Observation, velocity: jax.Array, histories: History | None) -> jax.Array:
+        """One value."""
         k, j = row.shot, row.place
         scene = jax.tree.map(lambda x: x[k], self.scenes)
         if row.quantity == "energy_ratio":
-            v, before = (jnp.where(self.there[k], x[k], 0.0) for x in (velocity, self.pre))
+            v, before = (jnp.where(self.present[k], x[k], 0.0) for x in (velocity, self.pre))
             mass = scene.mass if scene.mass.ndim == 2 else jnp.diag(scene.mass)
             return (v @ mass @ v) / (before @ mass @ before)
         if row.quantity == "bounce_height":
             v = self.up * velocity[k, j]
             return v * jnp.abs(v) / (2 * STANDARD_GRAVITY)
-        assert seen is not None
+        assert histories is not None
         if row.quantity == "peak_force":
-            return seen.maximum_force[k, j]
+            return histories.maximum_force[k, j]
         if row.quantity == "duration" and j < 0:
-            return seen.duration[k]
-        time, force = seen.time[k], seen.force[k, :, j]
+            return histories.duration[k]
+        time, force = histories.time[k], histories.force[k, :, j]
         return _loaded(time, force) if row.quantity == "duration" else _when_largest(time, force)
 
 
@@ -168,11 +169,11 @@ def observations(scene: Scene, tables: Sequence[Mapping[str, Any]]) -> Measured:
         raise ValueError("`sigma` must be given in all [[observe]] or in none.")
     if not sigmas and len({row.quantity for row in rows}) > 1:
         raise ValueError("`sigma` must be given where different quantities are measured.")
-    scenes, pre, there = zip(*shots)
+    scenes, pre, present = zip(*shots)
     up = 1.0 if scene.walls == (True, False) else -1.0
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *scenes)
     dtype = stacked.mass.dtype
-    arrays = (jnp.asarray(np.array(pre), dtype), jnp.asarray(np.array(there)))
+    arrays = (jnp.asarray(np.array(pre), dtype), jnp.asarray(np.array(present)))
     observe = Observations(stacked, *arrays, jnp.asarray(up, dtype), tuple(rows))
     return Measured(np.concatenate(values), np.concatenate(sigmas) if sigmas else None, observe)
 
@@ -195,24 +196,24 @@ def _shots(
         speed = (-1.0 if left else 1.0) * np.sqrt(2 * STANDARD_GRAVITY * height)
         velocities = np.repeat(speed[:, None], n, axis=1)
     else:
-        given = as_float_array("velocity_m_per_s", table["velocity_m_per_s"])
-        if given.shape != (n,):
+        velocity = as_float_array("velocity_m_per_s", table["velocity_m_per_s"])
+        if velocity.shape != (n,):
             raise ValueError(
                 f"{where}: `velocity_m_per_s` must have {n} entries, one a body, "
-                f"but has shape {tuple(given.shape)}."
+                f"but has shape {tuple(velocity.shape)}."
             )
-        velocities = np.repeat(np.asarray(given)[None], count, axis=0)
-    found = []
+        velocities = np.repeat(np.asarray(velocity)[None], count, axis=0)
+    shots = []
     for v, number in zip(velocities, bodies):
         body = np.arange(n)
-        there = body < number if left else body >= n - number
+        present = body < number if left else body >= n - number
         gaps = np.zeros(m) if scene.gaps is None else np.array(scene.gaps, float)
         if number < n:
             gaps[number if left else n - number - 1] = _AWAY
         off = _FASTER * np.abs(v).max() * (1.0 if left else -1.0)
-        own = with_gaps(scene, jnp.asarray(gaps, scene.mass.dtype))
-        found.append((own, np.where(there, v, off), there))
-    return found
+        own_scene = with_gaps(scene, jnp.asarray(gaps, scene.mass.dtype))
+        shots.append((own_scene, np.where(present, v, off), present))
+    return shots
 
 
 def _place(where: str, scene: Scene, table: Mapping[str, Any]) -> int:
@@ -230,18 +231,19 @@ def _place(where: str, scene: Scene, table: Mapping[str, Any]) -> int:
     return table[key] - 1
 
 
-def _numbers(where: str, key: str, given: Any) -> np.ndarray:
-    found = np.atleast_1d(np.asarray(as_float_array(f"{key} in {where}", given), float))
-    check_values(f"{key} in {where}", found, nan_allowed=True)
-    return found.copy()
+def _numbers(where: str, key: str, value: Any) -> np.ndarray:
+    """Numbers of a table, NaN where nothing was measured."""
+    numbers = np.atleast_1d(np.asarray(as_float_array(f"{key} in {where}", value), float))
+    check_values(f"{key} in {where}", numbers, nan_allowed=True)
+    return numbers.copy()
 
 
-def _each(where: str, key: str, given: Any, count: int) -> np.ndarray:
+def _each(where: str, key: str, value: Any, count: int) -> np.ndarray:
     """One number a value; a single one serves all."""
-    found = _numbers(where, key, given)
-    if len(found) not in (1, count):
+    numbers = _numbers(where, key, value)
+    if len(numbers) not in (1, count):
         raise ValueError(
             f"{where}: `{key}` must be a number or have {count} entries as `value`, "
-            f"but has {len(found)}."
+            f"but has {len(numbers)}."
         )
-    return np.resize(found, count)
+    return np.resize(numbers, count)

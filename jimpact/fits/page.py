@@ -75,6 +75,7 @@ def page(fit: FitResult) -> str:
 
 
 def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table."""
     lines = ["<table>"]
     if any(heads):
         lines.append(f"<tr>{''.join(f'<th>{escape(x)}</th>' for x in heads)}</tr>")
@@ -83,6 +84,7 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _listed(title: str, lines: Sequence[str]) -> str:
+    """A list below its heading; nothing where it is empty."""
     if not lines:
         return ""
     items = "\n".join(f"<li>{escape(' '.join(line.split()))}</li>" for line in lines)
@@ -90,6 +92,7 @@ def _listed(title: str, lines: Sequence[str]) -> str:
 
 
 def _pictures(fit: FitResult) -> list[str]:
+    """The pictures, each with its title."""
     from jimpact import plot
 
     drawn = []
@@ -107,6 +110,7 @@ def _pictures(fit: FitResult) -> list[str]:
 
 
 def _inline(title: str, figure: "Figure", vectors: bool) -> str:
+    """A picture within the page."""
     whole = BytesIO()
     if vectors:
         figure.savefig(whole, format="svg", metadata={"Date": None})
@@ -120,6 +124,7 @@ def _inline(title: str, figure: "Figure", vectors: bool) -> str:
 
 
 def _made_by(fit: FitResult) -> list[list[str]]:
+    """Law, solver and versions, to compute the fit again."""
     rows = [
         ["law", eqx.tree_pformat(fit.law, short_arrays=False)],
         ["solver", f"{fit.method}, loss {fit.loss}, {fit.start_count} starts, seed {fit.seed}"],

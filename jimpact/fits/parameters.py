@@ -49,8 +49,8 @@ class Parameters:
 
 def value_of(law: Law, field: str) -> Any:
     """A parameter of a law, or of its parts (the force of a compliant one); None if it has none."""
-    found = parameters_of(law).get(field)
-    return None if found is None else found.value
+    parameter = parameters_of(law).get(field)
+    return None if parameter is None else parameter.value
 
 
 def entries(law: Law, fields: tuple[str, ...]) -> np.ndarray:
@@ -140,6 +140,7 @@ def default_free(law: Law, absolute: bool = False) -> tuple[str, ...]:
 
 
 def _unknown_field(law: Law, field: str, known: list[str]) -> str:
+    """What is wrong with a field that is not free."""
     name = type(law).__name__
     if isinstance(value_of(law, field), (float, tuple)):
         return (
@@ -182,9 +183,9 @@ def bounds_of(
     parameters: Parameters, law: Law, bounds: Mapping[str, Any] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds (P,): the user's, or else the field's domain."""
-    given = dict(bounds or {})
+    chosen = dict(bounds or {})
     known = {parameters.field_of(i) for i in range(len(parameters.names))}
-    for field in given:
+    for field in chosen:
         if field not in known:
             raise ValueError(
                 f"Argument `bounds` must name free parameters, {', '.join(sorted(known))}, "
@@ -194,8 +195,8 @@ def bounds_of(
     ends = np.empty((2, len(values)))
     for field in parameters.fields:
         inside = np.array([owner == field for owner in parameters.entry_fields])
-        if field in given:
-            ends[:, inside] = _bound_pair(field, given[field], law)
+        if field in chosen:
+            ends[:, inside] = _bound_pair(field, chosen[field], law)
         elif parameters_of(law)[field].domain.log:
             ends[:, inside] = values[inside] / LOG_RANGE, values[inside] * LOG_RANGE
         else:

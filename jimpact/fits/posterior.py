@@ -65,9 +65,9 @@ def posterior(
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
-    >>> found = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    >>> result = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
     >>> prior = {"restitution": ji.Normal(0.5, 0.1)}
-    >>> draws = ji.posterior(found, prior)  # doctest: +SKIP
+    >>> draws = ji.posterior(result, prior)  # doctest: +SKIP
     >>> e = draws.posterior["restitution"]  # doctest: +SKIP
     >>> print(f"{float(e.mean()):.2f} +- {float(e.std()):.3f}")  # doctest: +SKIP
     0.40 +- 0.013
@@ -85,6 +85,7 @@ def posterior(
     inner = None if isinstance(region, BoxRegion) else _Inner(problem, region)
 
     def model() -> None:
+        """The model that numpyro samples."""
         if inner is None:
             x = jnp.stack([numpyro.sample(name, prior) for name, prior in each.items()])
         else:
@@ -92,8 +93,8 @@ def posterior(
                 numpyro.distributions.constraints.real_vector, (), (len(each),)
             )
             x, change = inner.values(numpyro.sample(_FREE, flat))
-            own = [prior.log_prob(x[i]) for i, prior in enumerate(each.values())]
-            numpyro.factor("prior", change + sum(own))
+            log_priors = [prior.log_prob(x[i]) for i, prior in enumerate(each.values())]
+            numpyro.factor("prior", change + sum(log_priors))
             for i, name in enumerate(each):
                 numpyro.deterministic(name, x[i])
         numpyro.factor("data", problem.log_density(x))
@@ -116,11 +117,11 @@ def posterior(
         progress_bar=sys.stderr.isatty() if progress is None else progress is not False,
     )
     sampler.run(jax.random.PRNGKey(seed))
-    found = arviz.from_numpyro(sampler, log_likelihood=False)
+    draws = arviz.from_numpyro(sampler, log_likelihood=False)
     if inner is not None:
-        del found.posterior[_FREE]
-    _warn(found, arviz)
-    return found
+        del draws.posterior[_FREE]
+    _warn(draws, arviz)
+    return draws
 
 
 class _Inner:
@@ -158,31 +159,33 @@ class _Inner:
 
 
 def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
+    """The start moved away from the ends of the domains."""
     low, high = domains.T
     width = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0))
     return np.clip(start, low + _INSIDE * width, high - _INSIDE * width)
 
 
-def _priors(problem: FitProblem, given: dict[str, Any], kinds: Any) -> dict[str, Any]:
+def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> dict[str, Any]:
     """A distribution of numpyro a parameter."""
-    parameters, found = problem.parameters, {}
+    parameters, priors = problem.parameters, {}
     for i, name in enumerate(problem.names):
         field = parameters.field_of(i)
-        chosen = given.get(name, given.get(field))
+        chosen = chosen_priors.get(name, chosen_priors.get(field))
         log = bool(parameters.log[parameters.first[i]])
         low, high = (float(end) for end in problem.domains[i])
-        found[name] = _prior(name, chosen, low, high, log, kinds)
+        priors[name] = _prior(name, chosen, low, high, log, kinds)
     known = {*problem.names, *(parameters.field_of(i) for i in range(len(problem.names)))}
-    for name in given:
+    for name in chosen_priors:
         if name not in known:
             raise ValueError(
                 f"Argument `priors` must name parameters, {', '.join(sorted(known))}, "
                 f"but has {name!r}."
             )
-    return found
+    return priors
 
 
 def _prior(name: str, chosen: Any, low: float, high: float, log: bool, kinds: Any) -> Any:
+    """The numpyro distribution of one parameter."""
     if chosen is None:
         if np.isfinite([low, high]).all():
             return kinds.LogUniform(low, high) if log else kinds.Uniform(low, high)
@@ -228,17 +231,17 @@ def _check_support(name: str, prior: Any, low: float, high: float) -> None:
         )
 
 
-def _warn(found: Any, arviz: Any) -> None:
+def _warn(draws: Any, arviz: Any) -> None:
     """Say where the draws are not to be trusted."""
-    diverging = int(np.asarray(found.sample_stats["diverging"]).sum())
+    diverging = int(np.asarray(draws.sample_stats["diverging"]).sum())
     if diverging:
         warnings.warn(
             f"{diverging} transitions diverged: the posterior has an edge or a kink that the "
             "sampler did not resolve; its draws near there are too few.",
             stacklevel=3,
         )
-    if found.posterior.sizes["chain"] > 1:
-        spread = arviz.rhat(found).to_array()
+    if draws.posterior.sizes["chain"] > 1:
+        spread = arviz.rhat(draws).to_array()
         if float(spread.max()) > MIXED:
             warnings.warn(
                 f"The chains disagree (r-hat up to {float(spread.max()):.3g}): draw more, or there "

@@ -108,7 +108,7 @@ class Residuals(eqx.Module):
     observe: Observable
     measured: jax.Array  # 0 where not measured
     weight: jax.Array  # 0 where not measured; makes |r|^2 a mean square relative to `unit`
-    size: jax.Array  # () size r is (seen - measured) / sigma, with sigma = 1 where unknown
+    size: jax.Array  # () size r is (prediction - measured) / sigma, with sigma = 1 where unknown
     unit: jax.Array  # () the largest measured value
     fields: tuple[str, ...] = eqx.field(static=True)
     mixing: jax.Array | None = None  # (K, n, n): makes correlated errors of a shot independent
@@ -122,12 +122,12 @@ class Residuals(eqx.Module):
 
     def residual(self, y: jax.Array) -> tuple[jax.Array, Prediction]:
         """Weighted residual (R,), and what the law makes visible."""
-        seen = self.observe(self.law_at(y))
-        bad = jnp.broadcast_to(seen.bad, self.measured.shape)
-        harmless = jnp.where(bad, self.measured, seen.value)
+        prediction = self.observe(self.law_at(y))
+        bad = jnp.broadcast_to(prediction.bad, self.measured.shape)
+        harmless = jnp.where(bad, self.measured, prediction.value)
         error = jnp.where(bad, PENALTY * self.unit, harmless - self.measured)
         error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be no numbers
-        return self.mixed(error * self.weight).reshape(-1), seen
+        return self.mixed(error * self.weight).reshape(-1), prediction
 
     def mixed(self, weighted: Any) -> Any:
         """Weighted errors, shaped like what was measured, as independent ones."""
@@ -136,14 +136,15 @@ class Residuals(eqx.Module):
         return (self.mixing @ weighted[..., None])[..., 0]
 
     def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
-        """Weighted residual (R,), its Jacobian (R, Q), and (values seen, status)."""
+        """Weighted residual (R,), its Jacobian (R, Q), and (predicted values, status)."""
 
         def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
-            residual, seen = self.residual(y)
-            return residual, (residual, seen.value, seen.status)
+            """The residual, and all that is not differentiated."""
+            residual, prediction = self.residual(y)
+            return residual, (residual, prediction.value, prediction.status)
 
-        jacobian, (residual, *kept) = jax.jacfwd(outcome, has_aux=True)(y)
-        return residual, jacobian, tuple(kept)
+        jacobian, (residual, *aux) = jax.jacfwd(outcome, has_aux=True)(y)
+        return residual, jacobian, tuple(aux)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,9 +209,9 @@ class FitProblem:
         check_kind("experiments", experiments, Experiments)
         check_concrete("law", law)
         check_concrete("scene", scene)
-        own = experiments.each(scene, lambda s: s)
+        scenes = experiments.each(scene, lambda s: s)
         same = experiments.scenes is None
-        alike, extra = stackable(own[:1] if same else own)
+        alike, extra = stackable(scenes[:1] if same else scenes)
         dtype = _dtype(law, alike, experiments.pre)
         pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
         unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
@@ -241,9 +242,9 @@ class FitProblem:
         slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
         here = ~np.isnan(self.measured)
         before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
-        own = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
+        variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2
         both = np.where(here[:, :, None] & here[:, None, :], before @ before.swapaxes(1, 2), 0.0)
-        covariance = both + own[:, :, None] * np.eye(n)
+        covariance = both + variance[:, :, None] * np.eye(n)
         sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
         factor = np.linalg.cholesky(covariance / (sigma[:, :, None] * sigma[:, None, :]))
         # factors that a weight already has (shots left out) stay
@@ -302,12 +303,12 @@ class FitProblem:
         if sigma is not None:
             sigma = np.where(np.isnan(post), 1.0, np.asarray(as_float_array("sigma", sigma)))
             check_values("sigma", sigma, low=0.0, open_low=True)
-        seen = Observed(observe) if not isinstance(observe, eqx.Module) else observe
+        observable = Observed(observe) if not isinstance(observe, eqx.Module) else observe
         unit = np.nanmax(np.abs(post)) or 1.0
-        dtype = _dtype(law, seen, post)
+        dtype = _dtype(law, observable, post)
         errors = np.ones(()) if sigma is None else sigma
-        problem = _build(law, seen, post, sigma, errors, free, bounds, dtype, unit, 1.0, [])
-        shape = eqx.filter_eval_shape(seen, law).value.shape
+        problem = _build(law, observable, post, sigma, errors, free, bounds, dtype, unit, 1.0, [])
+        shape = eqx.filter_eval_shape(observable, law).value.shape
         if shape != post.shape:
             raise ValueError(
                 f"Argument `observe` must give values of shape {post.shape} like `measured`, "
@@ -367,11 +368,11 @@ class FitProblem:
         squares = jnp.sum(self.residual(x) ** 2)
         if self.sigma is None:
             return -0.5 * self.values * jnp.log(squares)
-        seen = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
+        sigma = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
         other = np.zeros_like(self.measured)
         if self.residuals.mixing is not None:
             other = np.log(np.diagonal(self.residuals.mixing, axis1=1, axis2=2))
-        constant = np.log(seen * math.sqrt(2 * math.pi)) - other[~np.isnan(self.measured)]
+        constant = np.log(sigma * math.sqrt(2 * math.pi)) - other[~np.isnan(self.measured)]
         return -0.5 * squares - float(np.sum(constant))
 
     @property
@@ -413,15 +414,15 @@ class FitProblem:
         Args:
             factor: shaped like `measured`; 0 leaves a value out.
         """
-        r, kept = self.residuals, factor > 0
+        r, used = self.residuals, factor > 0
         mixing: Any = r.mixing
         weight = self.weight * factor
         if mixing is not None:  # which comes before the factors
-            weight = self.weight * kept
-            mixing = np.asarray(np.where(kept, factor, 1.0)[..., None] * mixing, r.weight.dtype)
+            weight = self.weight * used
+            mixing = np.asarray(np.where(used, factor, 1.0)[..., None] * mixing, r.weight.dtype)
         size = float(r.unit) * np.linalg.norm(weight)
         arrays = (np.asarray(weight / size, r.weight.dtype), np.asarray(size, r.size.dtype), mixing)
-        measured = np.where(kept, self.measured, np.nan)
+        measured = np.where(used, self.measured, np.nan)
         lost = int(np.isnan(measured).sum() - np.isnan(self.measured).sum())
         if self.experiments is not None:  # whole shots are left out, with what a correction took
             gone = np.isnan(measured).all(axis=1) & ~np.isnan(self.measured).all(axis=1)
@@ -477,6 +478,7 @@ class FitProblem:
 
 
 def _dtype(*trees: Any) -> np.dtype:
+    """The type of all floating numbers in these trees."""
     leaves = [x for x in jax.tree.leaves(trees) if eqx.is_inexact_array(x)]
     return np.result_type(*(x.dtype for x in leaves))
 
@@ -576,7 +578,10 @@ def filled_up(residuals: Residuals) -> Residuals:
 
 @quick_jit
 def _slopes_before(law: Law, shots: Shots) -> jax.Array:
+    """Compiled `dv+/dv-` of every shot."""
+
     def after(v: jax.Array, scene: Scene) -> jax.Array:
+        """v+ of v-."""
         return impact(law, scene, v).velocity
 
     return jax.vmap(jax.jacfwd(after))(shots.pre, shots.scenes)
@@ -593,10 +598,11 @@ def begin_all(problems: Residuals, starts: Any, method: Method, max_steps: int) 
     """States of a batch of problems and their starts y (S, Q)."""
 
     def one(problem: Residuals, y: jax.Array) -> SolverState:
+        """The state of one problem."""
         size, shape = problem.measured.size, problem.measured.shape
         statuses = shape[0] if isinstance(problem.observe, Shots) else 1
-        kept = (jnp.zeros(shape, y.dtype), jnp.zeros(statuses, jnp.int32))
-        first = (jnp.zeros(size, y.dtype), jnp.zeros((size, y.shape[0]), y.dtype), kept)
+        aux = (jnp.zeros(shape, y.dtype), jnp.zeros(statuses, jnp.int32))
+        first = (jnp.zeros(size, y.dtype), jnp.zeros((size, y.shape[0]), y.dtype), aux)
         return begin(problem.region.retract(y), first, method, max_steps)
 
     return eqx.filter_vmap(one)(problems, starts)
@@ -609,6 +615,7 @@ def advance_all(
     """Up to `passes` passes more of every problem."""
 
     def one(problem: Residuals, state: SolverState) -> SolverState:
+        """One problem."""
         return advance(problem.evaluate, problem.region, method, max_steps, state, passes)
 
     return eqx.filter_vmap(one)(problems, states)

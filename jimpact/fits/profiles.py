@@ -42,7 +42,7 @@ def profile(
 
     Held values cover the whole domain and the neighbourhood of the minima; from each minimum they
     are reached one after the other in both directions, all parameters side by side; far above the
-    limit they are told only roughly. Where a scan finds a further valley, it is followed to its
+    limit they are computed only roughly. Where a scan finds a further valley, it is followed to its
     minimum. Without sigma and with no degree of freedom left, the interval is that of the values
     which reproduce the data exactly.
 
@@ -61,8 +61,8 @@ def profile(
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.01, 0.98], [0.0, 2.01]], sigma=0.02)
-    >>> found = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
-    >>> print(*ji.profile(found))
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> print(*ji.profile(result))
     restitution: at least 0.97321 (95 %)
     """
     check_level(level)
@@ -190,8 +190,8 @@ class _Scans(ScaledFit):
             ends.append((float(squares[k]), with_entry(np.asarray(states.y[k]), i, y[i])))
             if not squares[k] >= self.solved[i].get(float(y[i]), (np.inf, y))[0]:
                 self.solved[i][float(y[i])] = ends[-1]
-        every = (end for solved in self.solved.values() for end in solved.values())
-        best = min(every, key=_squares)
+        all_ends = (end for solved in self.solved.values() for end in solved.values())
+        best = min(all_ends, key=_squares)
         if best[0] < self.least * (1 - SAME) - self.problem.exact_squares:
             self.least, self.lower = best
         return ends

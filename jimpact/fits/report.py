@@ -249,10 +249,10 @@ def _shots(fit: FitResult) -> list[str]:
     head = f"{'shot':>8s} {'body':>5s} {'before':>12s} {'measured':>12s} {'fitted':>12s}"
     lines = [head + common_unit]
     shots, bodies = data.pre.shape
-    shown = max(1, _VELOCITIES_SHOWN // bodies)
-    for label, body, before, value, fitted, _, unit, status in shot_rows(fit, shown):
+    rows_shown = max(1, _VELOCITIES_SHOWN // bodies)
+    for label, body, before, value, fitted, _, unit, status in shot_rows(fit, rows_shown):
         row = f"{label:>8s} {body:>5s} {before:>12s} {value:>12s} {fitted:>12s}"
         lines.append(f"{row}{' ' + unit if mixed else ''}{'   ' + status if status else ''}")
-    if shots > shown:
-        lines.append(f"     ... and {shots - shown} more shots")
+    if shots > rows_shown:
+        lines.append(f"     ... and {shots - rows_shown} more shots")
     return lines

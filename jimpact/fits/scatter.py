@@ -9,7 +9,7 @@ from jimpact._checks import check_choice
 from jimpact.files.records import with_error
 from jimpact.fits.result import FitResult
 
-LEAST_SHOTS = 4  # of which the scatter of one number can be told at all
+LEAST_SHOTS = 4  # of which the scatter of one number can be estimated
 SHOWN_FROM = 8  # shots from which a report tells it unasked
 SURE = 0.01  # chance at which scatter counts as shown
 _SMALLEST = 1e-4  # scatter looked for, in standard errors of one shot
@@ -63,11 +63,11 @@ class Scatter:
 
         Equation: t test of the slope, each shot weighing `1 / (error^2 + value^2)`.
         """
-        seen = np.isfinite(self.each) & np.isfinite(self.each_error)
-        x, y = over[seen], self.each[seen]
+        informative = np.isfinite(self.each) & np.isfinite(self.each_error)
+        x, y = over[informative], self.each[informative]
         if len(x) < LEAST_SHOTS or np.ptp(x) == 0:
             return 1.0
-        root = 1 / np.hypot(self.each_error[seen], self.value)
+        root = 1 / np.hypot(self.each_error[informative], self.value)
         design = root[:, None] * np.stack([np.ones_like(x), x], axis=1)
         slope, left = np.linalg.lstsq(design, root * y, rcond=None)[:2]
         if left.size == 0 or left[0] == 0:
@@ -98,8 +98,8 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
     >>> import jimpact as ji
     >>> e = 0.7 + 0.05 * np.random.default_rng(0).normal(size=40)
     >>> data = ji.Experiments(np.tile([1.0, 0.0], (40, 1)), np.stack([1 - e, 1 + e], 1) / 2, 0.002)
-    >>> found = ji.scatter(ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data))
-    >>> bool(0.035 < found.value < 0.065), found.chance < 1e-6
+    >>> result = ji.scatter(ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data))
+    >>> bool(0.035 < result.value < 0.065), result.chance < 1e-6
     (True, True)
     """
     from scipy.optimize import minimize_scalar  # late: slow to import
@@ -115,17 +115,17 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
     model = _Model(residual, jacobian, shot, shots, which, fit.problem.values, known)
     typical = 1 / np.sqrt(np.mean(model.seen))  # error of one shot
     ends = np.log([_SMALLEST * typical, _LARGEST * typical])
-    found = minimize_scalar(
+    best = minimize_scalar(
         lambda log: model.deviance(float(np.exp(log))), bounds=tuple(ends), method="bounded"
     )
-    least, none = float(found.fun), model.deviance(0.0)
+    least, none = float(best.fun), model.deviance(0.0)
     gain = max(none - least, 0.0)
-    ratio = float(np.exp(found.x)) if gain > 0 else 0.0  # over the noise
+    ratio = float(np.exp(best.x)) if gain > 0 else 0.0  # over the noise
     change, covariance, squares, freedom = model.solve(ratio)
     noise = 1.0 if known else float(np.sqrt(squares / freedom)) if freedom > 0 else np.nan
-    own = model.projected / np.where(model.seen > 0, model.seen, np.nan)
+    change_of_each = model.projected / np.where(model.seen > 0, model.seen, np.nan)
     with np.errstate(divide="ignore"):
-        own_error = noise / np.sqrt(model.seen)
+        each_error = noise / np.sqrt(model.seen)
     return Scatter(
         name=fit.names[which],
         value=ratio * noise,
@@ -135,8 +135,8 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
         standard_error=noise * np.sqrt(np.diag(covariance)),
         squares=squares,
         degrees_of_freedom=freedom,
-        each=fit.value[which] + own,
-        each_error=own_error,
+        each=fit.value[which] + change_of_each,
+        each_error=each_error,
     )
 
 
@@ -148,13 +148,14 @@ def shown_scatter(fit: FitResult) -> Scatter | None:
     if fit.shot_count < SHOWN_FROM:
         return None
     try:
-        found = scatter(fit)
+        result = scatter(fit)
     except ValueError:
         return None
-    return found if found.chance <= SURE else None
+    return result if result.chance <= SURE else None
 
 
 def _which(fit: FitResult, name: str | None) -> int:
+    """The place of the parameter that may scatter."""
     if fit.experiments is None:
         raise ValueError("Argument `fit` must be of shots.")
     if name is None:
@@ -187,12 +188,12 @@ class _Model:
         values: int,
         known: bool,
     ):
-        own = jacobian[:, which]
+        column = jacobian[:, which]
         member = shot[None, :] == shots[:, None]
         self.residual, self.jacobian = residual, jacobian
-        self.seen = member @ own**2  # |j_k|^2
-        self.projected = member @ (own * residual)  # j_k . r_k
-        self.crossed = member @ (own[:, None] * jacobian)  # j_k . J_k
+        self.seen = member @ column**2  # |j_k|^2
+        self.projected = member @ (column * residual)  # j_k . r_k
+        self.crossed = member @ (column[:, None] * jacobian)  # j_k . J_k
         self.values, self.known = values, known
 
     def solve(self, t: float) -> tuple[np.ndarray, np.ndarray, float, int]:

@@ -19,10 +19,9 @@ from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.result import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
-from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar
-from jimpact.registry import registered_laws
+from jimpact.registry import registered_laws, simplest_first
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
@@ -63,7 +62,7 @@ class LawFit:
 
     def to_dict(self) -> dict[str, Any]:
         """What a JSON file can hold."""
-        told = {
+        record = {
             "parameters": self.parameters,
             "rms": self.fit.rms,
             "left_out_error": self.left_out_error,
@@ -71,12 +70,12 @@ class LawFit:
             "adequate": self.adequate,
             "verdict": self.verdict,
         }
-        return as_data(told) | {"fit": self.fit.to_dict()}
+        return as_data(record) | {"fit": self.fit.to_dict()}
 
 
 @dataclass(frozen=True, eq=False)
 class LawFits:
-    """What `fit_laws` found: `entries` by name, the simplest adequate law first; `print` says all.
+    """The result of `fit_laws`: `entries` by name, the simplest adequate law first.
 
     `left_out` says by name why a law was not tried; `speed` whether the first law's e depends on
     the speed, where that was asked for.
@@ -115,8 +114,8 @@ class LawFits:
 
     def to_dict(self) -> dict[str, Any]:
         """What a JSON file can hold."""
-        told = {"best": self.best.name, "verdict": self.verdict, "left_out": self.left_out}
-        return told | as_data({"laws": self.entries, "speed": self.speed})
+        record = {"best": self.best.name, "verdict": self.verdict, "left_out": self.left_out}
+        return record | as_data({"laws": self.entries, "speed": self.speed})
 
     def __str__(self) -> str:
         heads = ["law", "free", "rms", "left out", "AICc", "verdict", "values"]
@@ -169,10 +168,10 @@ class NestedTest(NamedTuple):
 def nested_test(simple: Fit, full: Fit) -> NestedTest:
     """Whether the data need the parameters that one fit has beyond another one.
 
-    Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further parameters seen, f
-    degrees of freedom of the full fit; with sigma, unless the full fit contradicts it, `S - S_full`
-    is chi^2 with q degrees of freedom. Where the simple law is at the end of a domain of the full
-    one (a yield speed of 0), the chance told is up to twice too large.
+    Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further parameters that
+    the data determine, f degrees of freedom of the full fit; with sigma, unless the full fit
+    contradicts it, `S - S_full` is chi^2 with q degrees of freedom. Where the simple law is at the
+    end of a domain of the full one (a yield speed of 0), the chance given is up to twice too large.
 
     Args:
         simple, full: fits by least squares of the same data; the law of `simple` is a special case.
@@ -237,7 +236,7 @@ def fit_laws(
     shots left out no worse than the best law does: a paired t test over shots at 1 %, of more than
     64 shots linearized; of fewer than 4 an F test of the residuals at 5 %. Adequate laws come
     first, those with fewer parameters before others, and of these the one that needs to know less
-    of the contacts, in the order of `advise`. AICc is told where it means something: rank full,
+    of the contacts, in the order of `advise`. AICc is given where it means something: rank full,
     nothing at a bound, no shot left out, degrees of freedom left.
 
     Args:
@@ -264,8 +263,8 @@ def fit_laws(
     >>> before = np.stack([np.linspace(1, 2, 6), np.zeros(6)], axis=1)
     >>> after = before @ [[0.2, 0.8], [0.8, 0.2]]
     >>> after += 0.01 * np.random.default_rng(1).normal(size=after.shape)
-    >>> found = ji.fit_laws(ji.chain([1.0, 1.0]), ji.Experiments(before, after), ["newton"])
-    >>> found.best.name, found.best.adequate
+    >>> laws = ji.fit_laws(ji.chain([1.0, 1.0]), ji.Experiments(before, after), ["newton"])
+    >>> laws.best.name, laws.best.adequate
     ('newton', True)
     """
     check_kind("data", data, Experiments)
@@ -337,11 +336,11 @@ def _candidates(
             check_choice("laws", name, tuple(REGISTRY))
         built = {name: law for name, law in built.items() if name in wanted}
         left_out = {name: why for name, why in left_out.items() if name in wanted}
-    found: dict[str, Candidate] = {}
+    candidates: dict[str, Candidate] = {}
     for name, law in built.items():
         for label, candidate in _variants(law, contacts, alike, more).items():
-            found[f"{name}{label}"] = candidate
-    return found, left_out
+            candidates[f"{name}{label}"] = candidate
+    return candidates, left_out
 
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
@@ -382,14 +381,14 @@ def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> di
 
 def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
     """The laws with their verdicts, in order."""
-    errors = {name: _errors_left_out(found) for name, found in fits.items()}
-    against = {name: _against(found) for name, found in fits.items()}
+    errors = {name: _errors_left_out(each) for name, each in fits.items()}
+    against = {name: _against(each) for name, each in fits.items()}
     squares = {name: _per_shot(fits[name], errors[name]) for name in fits}
     usable = [name for name in fits if against[name][0] != "fails"] or list(fits)
     many = all(np.isfinite(squares[name]).sum() >= _LEAST for name in usable)
     least = {name: _total(squares[name]) if many else _variance(fits[name]) for name in usable}
     best = min(usable, key=lambda name: (least[name], len(fits[name].names)))
-    found = []
+    entries = []
     for name, each in fits.items():
         tier, verdict = against[name]
         if many:
@@ -400,60 +399,63 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
             worse = f"{worse} than {best} (chance {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
         error = _left_out_rms(each, errors[name])
-        found.append(LawFit(name, each, error, _aicc(each), verdict, tier))
-    return {x.name: x for x in sorted(found, key=_order)}
+        entries.append(LawFit(name, each, error, _aicc(each), verdict, tier))
+    return {x.name: x for x in sorted(entries, key=_order)}
 
 
 def _order(entry: LawFit) -> tuple[Any, ...]:
     """Adequate first, by parameters, then in the order of `advise`; the rest by error."""
     tier = _TIERS.index(entry.tier)
     base = entry.name.split(",")[0]
-    place = SIMPLEST_FIRST.index(base) if base in SIMPLEST_FIRST else len(SIMPLEST_FIRST)
+    order = simplest_first()
+    place = order.index(base) if base in order else len(order)
     error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
     return (tier, entry.parameters, place) if tier < 2 else (tier, error, place)
 
 
-def _against(found: Fit) -> tuple[str, str]:
+def _against(result: Fit) -> tuple[str, str]:
     """What is against a law by itself: (tier, in words)."""
-    codes = [code for code in found.status if STATUS[code].failure]
+    codes = [code for code in result.status if STATUS[code].failure]
     if codes:
         names = ", ".join(dict.fromkeys(STATUS[code].name for code in codes))
-        return "fails", f"fails in {len(codes)} of {len(found.status)} shots: {names}"
-    if not found.converged:
+        return "fails", f"fails in {len(codes)} of {len(result.status)} shots: {names}"
+    if not result.converged:
         return "fails", "does not converge"
-    if any(line.startswith("Lack of fit") for line in found.warnings):
+    if any(line.startswith("Lack of fit") for line in result.warnings):
         return "lack of fit", "lack of fit"
-    unseen = found.rank < len(found.names)
-    return "fits", f"fits, {found.rank} of {len(found.names)} seen" if unseen else "fits"
+    if result.rank < len(result.names):
+        return "fits", f"fits, {result.rank} of {len(result.names)} parameters determined"
+    return "fits", "fits"
 
 
-def _errors_left_out(found: Fit) -> np.ndarray:
+def _errors_left_out(result: Fit) -> np.ndarray:
     """Of every shot what the others predict wrongly, (K, n); NaN where there is none."""
-    if found.shot_count < 2:
-        return np.full(found.residual.shape, np.nan)
-    if len(found.residual) <= FEW:
-        return found.problem.measured - leave_one_out(found, progress=False).predicted
-    return _linearized(found)
+    if result.shot_count < 2:
+        return np.full(result.residual.shape, np.nan)
+    if len(result.residual) <= FEW:
+        return result.problem.measured - leave_one_out(result, progress=False).predicted
+    return _linearized(result)
 
 
-def _linearized(found: Fit) -> np.ndarray:
+def _linearized(result: Fit) -> np.ndarray:
     """The same by one Gauss-Newton step: `(I - J_k (J^T J)^-1 J_k^T)^-1 r_k`."""
-    jacobian, residual = map(found.problem.independent, (found.jacobian, found.residual))
+    jacobian, residual = map(result.problem.independent, (result.jacobian, result.residual))
     flat = jacobian.reshape(-1, jacobian.shape[-1])
     inverse = np.linalg.pinv(flat.T @ flat, rcond=1e-12, hermitian=True)
     hat = jacobian @ inverse @ np.swapaxes(jacobian, 1, 2)
     rest = np.eye(hat.shape[-1]) - hat
     error = np.stack([np.linalg.lstsq(a, b, rcond=1e-9)[0] for a, b in zip(rest, residual)])
-    return found.problem.errors_of(error)
+    return result.problem.errors_of(error)
 
 
-def _per_shot(found: Fit, error: np.ndarray) -> np.ndarray:
+def _per_shot(result: Fit, error: np.ndarray) -> np.ndarray:
     """Weighted squares (K,) of these errors; NaN where a shot has none."""
-    squares = np.sum(found.problem.independent(error) ** 2, axis=1)
+    squares = np.sum(result.problem.independent(error) ** 2, axis=1)
     return np.where(np.isnan(error).all(axis=1), np.nan, squares)
 
 
 def _total(squares: np.ndarray) -> float:
+    """The sum of these squares; 0 where there are none."""
     return float(np.nansum(squares)) if np.isfinite(squares).any() else 0.0
 
 
@@ -480,42 +482,43 @@ def _above_zero(more: np.ndarray, size: Any) -> float:
     return float(stdtr(len(more) - 1, -more.mean() / error))
 
 
-def _variance(found: Fit) -> float:
+def _variance(result: Fit) -> float:
     """Of the residuals; infinite where no degree of freedom is left to tell it."""
-    freedom = found.degrees_of_freedom
-    return found.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
+    freedom = result.degrees_of_freedom
+    return result.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
 
 
-def _by_residuals(found: Fit, best: Fit) -> float:
+def _by_residuals(result: Fit, best: Fit) -> float:
     """Chance of residuals so much larger, as if the better law had one parameter more at least."""
-    more = max(best.rank - found.rank, 1)
+    more = max(best.rank - result.rank, 1)
     variance = _variance(best)
-    gain = (found.starts[0].sum_of_squares - best.starts[0].sum_of_squares) / more
+    gain = (result.starts[0].sum_of_squares - best.starts[0].sum_of_squares) / more
     if not np.isfinite(variance) or gain <= 0:
         return 1.0
     least = best.problem.exact_squares
     return float(fdtrc(more, best.degrees_of_freedom, gain / max(variance, least)))
 
 
-def _left_out_rms(found: Fit, error: np.ndarray) -> float:
-    data = found.problem.experiments
+def _left_out_rms(result: Fit, error: np.ndarray) -> float:
+    """Root mean square error of shots left out [m/s]."""
+    data = result.problem.experiments
     assert data is not None
     if np.isnan(error).all():
         return np.nan
-    return float(np.sqrt(np.nanmean((error / data.natural_errors(found.problem.scene)) ** 2)))
+    return float(np.sqrt(np.nanmean((error / data.natural_errors(result.problem.scene)) ** 2)))
 
 
-def _aicc(found: Fit) -> float:
+def _aicc(result: Fit) -> float:
     """Akaike's criterion; with unknown noise corrected for few data; NaN where it means nothing."""
-    n, count = found.problem.values, len(found.names)
-    squares = found.starts[0].sum_of_squares
-    whole = found.rank == count and not found.at_bound.any() and not found.problem.left_out
-    if not whole or not found.converged:
+    n, count = result.problem.values, len(result.names)
+    squares = result.starts[0].sum_of_squares
+    whole = result.rank == count and not result.at_bound.any() and not result.problem.left_out
+    if not whole or not result.converged:
         return np.nan
-    if found.problem.sigma is not None:
+    if result.problem.sigma is not None:
         return squares + 2 * count
     k = count + 1  # and the noise
-    if n - k - 1 < 1 or squares <= found.problem.exact_squares:
+    if n - k - 1 < 1 or squares <= result.problem.exact_squares:
         return np.nan
     return float(n * np.log(squares / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
 

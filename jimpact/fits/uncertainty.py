@@ -62,8 +62,8 @@ def uncertainty(
     freedom = values - rank
     if noise is None:
         noise = float(np.sqrt(sum_of_squares / freedom)) if freedom > 0 else np.nan
-    seen = directions[:rank] / singular[:rank, None]
-    covariance = noise**2 * (seen.T @ seen) * np.outer(scale, scale)
+    determined = directions[:rank] / singular[:rank, None]
+    covariance = noise**2 * (determined.T @ determined) * np.outer(scale, scale)
     null = directions[rank:]
     lost = np.any(np.abs(null) > TAKES_PART, axis=0)
     covariance[lost, :] = covariance[:, lost] = np.nan

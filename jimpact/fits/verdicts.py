@@ -69,6 +69,7 @@ def fit_warnings(
 
 
 def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
+    """Which shots the fitted law fails in."""
     lines = []
     for code in np.unique(status):
         if STATUS[code].failure:
@@ -112,6 +113,7 @@ def _matrix(problem: FitProblem, solution: Solution, contacts: int) -> list[str]
 
 
 def _equally_good(problem: FitProblem, solution: Solution, errors: Uncertainty) -> int:
+    """How many minima fit as well as the best."""
     noise = errors.noise / problem.size if np.isfinite(errors.noise) else 0.0
     more = max(EQUALLY_GOOD * noise**2, EXACT[problem.precision])
     return sum(end.squares <= solution.minima[0].squares + more for end in solution.minima)

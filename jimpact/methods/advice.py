@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,18 +15,18 @@ from jimpact._checks import as_whole, check_per_contact, check_shape, check_valu
 from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
-from jimpact.law import Law, check_law, free_parameters_of
-from jimpact.laws import SIMPLEST_FIRST
+from jimpact.law import Law, check_law, free_parameters_of, options_of
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
 from jimpact.laws.kinematic import Moreau, Newton
 from jimpact.laws.lzb import LZB, default_rtol
 from jimpact.laws.poisson import Poisson
-from jimpact.methods.advice_report import Advice, Block, Candidate, Unknown
+from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unknown
 from jimpact.methods.timing import in_turns
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
+from jimpact.registry import ADVISED, REGISTRY, simplest_first
 from jimpact.scene import (
     Scene,
     as_velocity,
@@ -39,11 +38,11 @@ from jimpact.scene import (
 )
 from jimpact.status import STATUS
 
-# Smallest tolerance over the reference's own rtol. Ten times more would refuse 1e-6; ten times
+# Smallest tolerance over the reference's rtol. Ten times more would refuse 1e-6; ten times
 # less would let the reference's error enter.
 FINEST_TOLERANCE = 100
-# A law's own error, and the distance between LZB and Compliant, count as small below the tolerance
-# over this. Ten times more costs time; ten times less moves the verdict.
+# The error of a loosened rtol, and the distance between LZB and Compliant, count as small below the
+# tolerance over this. Ten times more costs time; ten times less moves the verdict.
 SMALL_PART = 10
 # Largest rtol that is advised: beyond, the steps of the integrator are no longer fewer.
 COARSEST_RTOL = 1e-3
@@ -84,12 +83,12 @@ class Situation(NamedTuple):
     touching: Scene
     velocity: np.ndarray
     gap_velocity: np.ndarray
-    blocks: tuple[Block, ...]
+    blocks: tuple[ContactBlock, ...]
     gapped: np.ndarray
     far: np.ndarray
 
     @property
-    def coupled(self) -> tuple[Block, ...]:
+    def coupled(self) -> tuple[ContactBlock, ...]:
         """Blocks of two contacts and more in which one approaches."""
         return tuple(b for b in self.blocks if b.approaches and len(b.contacts) > 1)
 
@@ -100,7 +99,7 @@ class Situation(NamedTuple):
         return np.sqrt(np.sum((change @ mass) * change, axis=-1)) / before
 
 
-class Samples(NamedTuple):
+class StiffnessSamples(NamedTuple):
     """Stiffnesses (r, m) to try; row 0 is the nominal one, `random` are the last rows.
 
     `alone[i]` are the rows in which only unknown i leaves its nominal value, `nudged[i]` the two
@@ -236,7 +235,7 @@ def advise(
 def _advice(
     situation: Situation,
     laws: dict[str, Trial],
-    tried: Samples,
+    tried: StiffnessSamples,
     tolerance: float,
     timing: bool,
     progress: float | None,
@@ -257,7 +256,7 @@ def _advice(
             candidates[key] = replace(candidates[key], cost=cost)
     suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
     chosen = suffice[0] if suffice else name
-    if laws[chosen].has_stiffness:
+    if "rtol" in options_of(type(laws[chosen].law)):
         candidates[chosen] = _loosened(candidates[chosen], situation, reference, tolerance)
     gap_ratio = None
     if situation.gapped.any():
@@ -353,7 +352,7 @@ def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.
 
 def _blocks(
     scene: Scene, gamma: np.ndarray, contacts: np.ndarray, friction: bool
-) -> tuple[Block, ...]:
+) -> tuple[ContactBlock, ...]:
     """These contacts in blocks that feel each other."""
     cosine = _largest_cosines(scene, friction)[np.ix_(contacts, contacts)]
     angle = np.degrees(np.asarray(kinetic_angles(scene)))
@@ -366,7 +365,7 @@ def _blocks(
         angles = [float(angle[contacts[i], contacts[j]]) for i, j in pairs]
         ends = (min(angles), max(angles)) if angles else None
         joined = contacts[members]
-        blocks.append(Block(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends))
+        blocks.append(ContactBlock(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends))
     return tuple(blocks)
 
 
@@ -401,12 +400,12 @@ def _unknown_stiffnesses(
 
 def _samples(
     stiffness: np.ndarray, unknown: tuple[Unknown, ...], samples: int, seed: int
-) -> Samples:
+) -> StiffnessSamples:
     """Nominal, one at a time, corners of the ranges, and a log-uniform sample of them."""
     count, random = len(unknown), np.random.default_rng(seed)
     if count == 0:
         none = np.zeros((0, 2), int)
-        return Samples(stiffness[None, :], (), none, none, slice(1))
+        return StiffnessSamples(stiffness[None, :], (), none, none, slice(1))
     low = np.log([u.low / u.nominal for u in unknown])
     high = np.log([u.high / u.nominal for u in unknown])
     one = np.eye(count)[:, None, :]
@@ -424,7 +423,7 @@ def _samples(
         tried[:, u.contact] *= np.exp(change[:, i])
     first = 1 + np.arange(len(alone)).reshape(count, -1)
     second = 1 + len(alone) + np.arange(len(nudged)).reshape(count, 2)
-    return Samples(tried, unknown, first, second, slice(len(change) - samples, None))
+    return StiffnessSamples(tried, unknown, first, second, slice(len(change) - samples, None))
 
 
 def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
@@ -433,7 +432,7 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
     mu, touching = law.friction, situation.touching
     gapped = bool(situation.gapped.any())
-    laws: Mapping[str, Law] = {
+    laws: dict[str, Law] = {
         "newton": Newton(e, mu),
         "moreau": Moreau(e, mu),
         "poisson": Poisson(e, mu),
@@ -441,10 +440,16 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
         "lzb": LZB(e, k, law.exponent, friction=mu),
         "compliant": Compliant(Bistiffness(k, law.exponent, e), friction=mu),
     }
-    scenes = dict.fromkeys(laws, touching)
-    if gapped:
-        scenes |= dict.fromkeys(("binary", "compliant"), situation.scene)
-    return {name: Trial(laws[name], scenes[name]) for name in SIMPLEST_FIRST}
+    known = dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True))
+    for name in simplest_first():
+        row = REGISTRY[name]
+        if name not in laws:  # a user's own law
+            laws[name] = row.build(**{key: known[key] for key in row.arguments if key in known})
+    ordered = {name: laws[name] for name in simplest_first()}
+    return {
+        name: Trial(law, situation.scene if gapped and law.uses_gaps else touching)
+        for name, law in ordered.items()
+    }
 
 
 # -------------------------------------------------------------------------- running the laws
@@ -455,6 +460,7 @@ def _batch(law: Law, scene: Scene, velocity: jax.Array, stiffness: jax.Array | N
     """The law at velocities (r, n), and at rows of stiffness (r, m) if it has one."""
 
     def one(v: jax.Array, k: jax.Array | None) -> Outcomes:
+        """One impact."""
         out = impact(law if k is None else with_entries(law, ("stiffness",), k), scene, v)
         return Outcomes(out.velocity, out.impulse, out.tangential_impulse, out.status)
 
@@ -516,6 +522,7 @@ def _usable_rows(reference: Outcomes, name: str) -> Outcomes:
         )
 
     def usable(rows: Any) -> Any:
+        """Rows (r, ...) with NaN where the reference failed."""
         return None if rows is None else np.where(failed[:, None], np.nan, rows)
 
     return reference._replace(
@@ -545,7 +552,7 @@ def _candidate(
 def _loosened(
     candidate: Candidate, situation: Situation, reference: Outcomes, tolerance: float
 ) -> Candidate:
-    """The law with an rtol for this tolerance, tightened until its own error is small beside it."""
+    """The law with an rtol for this tolerance, tightened until its error is a small part of it."""
     rtol = min(10.0 ** math.floor(math.log10(tolerance / SMALL_PART)), COARSEST_RTOL)
     finest = default_rtol("time", situation.velocity.dtype)
     while True:
@@ -565,7 +572,7 @@ def _with_simplest_laws(
     outcomes: dict[str, Outcomes],
     reference: Outcomes,
     tolerance: float,
-) -> tuple[Block, ...]:
+) -> tuple[ContactBlock, ...]:
     """The blocks, each with the simplest law whose impulses there move v+ within tolerance."""
     scene, exact = situation.scene, _all_impulses(reference)
     moved = jax.vmap(partial(_velocity_change, scene))
@@ -574,12 +581,14 @@ def _with_simplest_laws(
     sides = (exact.shape[1] - scene.contacts) // scene.contacts
     contact = np.concatenate([contact, np.repeat(contact, sides)])
 
-    def error(name: str, block: Block) -> float:
+    def error(name: str, block: ContactBlock) -> float:
+        """Largest distance that the impulses of a law in this block cause."""
         entries = np.isin(contact, block.contacts)
         wrong = _all_impulses(outcomes[name])[:1, entries] - exact[:, entries]
         return float(np.nanmax(situation.distance(wrong @ change[entries])))
 
-    def simplest(block: Block) -> str | None:
+    def simplest(block: ContactBlock) -> str | None:
+        """The first law within tolerance."""
         for name, candidate in candidates.items():
             if candidate.status != "order_dependent" and error(name, block) <= tolerance:
                 return name
@@ -601,7 +610,7 @@ def _velocity_change(scene: Scene, impulses: jax.Array) -> jax.Array:
 
 
 def _effects(
-    situation: Situation, tried: Samples, reference: Outcomes, tolerance: float
+    situation: Situation, tried: StiffnessSamples, reference: Outcomes, tolerance: float
 ) -> tuple[Unknown, ...]:
     """The unknown stiffnesses with what each does by itself."""
     v, unknown = reference.velocity, []

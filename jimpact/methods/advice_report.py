@@ -25,7 +25,7 @@ _KEYWORDS = ("friction", "order", "rtol")  # the same, by name, where they are n
 NAMES = {name: row.law.__name__ for name, row in REGISTRY.items()} | {"binary": "binary"}
 
 
-class Block(NamedTuple):
+class ContactBlock(NamedTuple):
     """Contacts that feel each other, 0-based; the kinetic angles [deg] between coupled ones."""
 
     contacts: tuple[int, ...]
@@ -118,7 +118,7 @@ class Advice:
     velocity: np.ndarray
     gap_velocity: np.ndarray
     candidates: dict[str, Candidate]
-    blocks: tuple[Block, ...]
+    blocks: tuple[ContactBlock, ...]
     stiffness: np.ndarray
     unknown: tuple[Unknown, ...]
     rows: int
@@ -137,7 +137,7 @@ class Advice:
         return self.candidates[self.name].scene
 
     @property
-    def at_work(self) -> list[Block]:
+    def at_work(self) -> list[ContactBlock]:
         """Blocks in which a contact approaches."""
         return [block for block in self.blocks if block.approaches]
 
@@ -162,6 +162,7 @@ class Advice:
         return words | fields_as_data(self, "name", "candidates", *parts) | parts
 
     def __str__(self) -> str:
+        """Half a page."""
         verdict = "within" if self.within else "NOT within"
         lines = [
             f"Advice: {as_code(self.law)}, {verdict} {share(self.tolerance)}",

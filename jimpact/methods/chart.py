@@ -28,10 +28,10 @@ QUANTITIES = ("velocity", "impulse", "energy", "duration", "gradient")
 ALGEBRAIC = ("newton", "moreau", "poisson", "binary")
 
 SPREAD = 10.0  # stiffnesses of a batch lie within this factor, half of it to either side
-SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be luckily right
-HOST_BATCH = 4  # impacts that a method without vmap does for its time in a batch: a plain loop
+SAMPLE = 16  # impacts of the batch on which errors are measured: one alone may be right by chance
+HOST_BATCH = 4  # impacts that a method without vmap does, in a loop, for its time in a batch
 HOST = "host code: finite differences only"
-FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the other one it is compared with
+FINEST, SECOND = 1e-14, 1e-12  # rtol of the reference, and of the second solution
 
 
 class Timing(NamedTuple):
@@ -61,7 +61,7 @@ class Point:
     gradient: Timing | None = None
 
     def cells(self) -> list[str]:
-        """What a table tells of it."""
+        """The cells of its row."""
         times = [_us(t and t.median) for t in (self.single, self.batched, self.gradient)]
         times[1] += f" ({_us(self.batched.low)}-{_us(self.batched.high)})"
         setting = "law" if self.setting is None else f"{self.setting:g}"
@@ -70,12 +70,13 @@ class Point:
 
 
 def _us(seconds: float | None) -> str:
+    """A time in microseconds."""
     return "" if seconds is None else f"{1e6 * seconds:.3g}"
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Where the errors are measured from: how it came about, how uncertain it is (relative)."""
+    """What errors are measured from: how it was computed, how uncertain it is (relative)."""
 
     how: str
     uncertainty: dict[str, float]
@@ -117,6 +118,7 @@ class WorkPrecision:
         return fields_as_data(self)
 
     def __str__(self) -> str:
+        """A table of all points, and how they were measured."""
         heads = ["method", "setting", "v+", "impulse", "energy", "time", "gradient", "evals"]
         heads += ["alone [us]", "batch", "with J", "compile [s]", "status"]
         rows = []
@@ -126,8 +128,8 @@ class WorkPrecision:
             for point in points:
                 rows.append([first[0], *point.cells(), first[1], point.status])
                 first = ["", ""]
-        known = [i for i, column in enumerate(zip(*rows)) if any(column)]
-        heads, rows = [heads[i] for i in known], [[row[i] for i in known] for row in rows]
+        filled = [i for i, column in enumerate(zip(*rows)) if any(column)]
+        heads, rows = [heads[i] for i in filled], [[row[i] for i in filled] for row in rows]
         uncertain = ", ".join(
             f"{k} {v:.0e}" for k, v in self.reference.uncertainty.items() if not np.isnan(v)
         )
@@ -170,9 +172,9 @@ def work_precision(
     Args:
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s], at least one contact approaching.
-        law: the `LZB` law; its own `method` and `rtol` play no part, its `max_steps` does.
+        law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does.
         methods: names in `jimpact.methods.contenders.METHODS`; None: all that support the impact.
-        settings: settings by method where its own ladder is not wanted.
+        settings: settings by method, in place of its default ones.
         laws: algebraic laws by name, points with their *model* error against LZB on this impact;
             None: Newton, Moreau, Poisson and Binary with the law's restitution.
         reference: method that errors are measured from, at rtol 1e-14; None: the
@@ -188,14 +190,14 @@ def work_precision(
         `WorkPrecision`; `print` gives a table, `ji.plot.work_precision` the chart.
 
     Raises:
-        ValueError: a method unknown or unable (the reason is told), nothing approaches, single
-            precision, bad sizes. TypeError: a law that is not LZB.
+        ValueError: a method that is unknown or does not support the law, nothing approaches,
+            single precision, bad sizes. TypeError: a law that is not LZB.
 
     >>> import jimpact as ji
     >>> pair, law, ladder = ji.chain([1.0, 2.0]), ji.LZB(0.5), {"verlet": [0.1, 0.01]}
     >>> options = {"laws": {}, "batch": 4, "gradients": False}
-    >>> found = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
-    >>> [f"{point.error['velocity']:.0e}" for point in found.points["verlet"]]
+    >>> chart = ji.work_precision(pair, [1.0, 0.0], law, ["verlet"], ladder, **options)
+    >>> [f"{point.error['velocity']:.0e}" for point in chart.points["verlet"]]
     ['2e-04', '4e-06']
     """
     repeats = as_whole("repeats", repeats, 1)
@@ -204,36 +206,36 @@ def work_precision(
     ladders = _ladders(chosen, settings or {})
     exact, second = _reference(reference, case), METHODS["dop853"]
     if laws is None:
-        known = registered_laws({"restitution": law.restitution})[0]
-        laws = {name: known[name] for name in ALGEBRAIC}
+        built = registered_laws({"restitution": law.restitution})[0]
+        laws = {name: built[name] for name in ALGEBRAIC}
     needed = {m.name: m for m in (*chosen, exact, second)}
-    programs = {name: _of_method(m, case, gradients, durations) for name, m in needed.items()}
-    programs |= {name: _of_law(other, case) for name, other in laws.items()}
+    programs = {n: _method_programs(m, case, gradients, durations) for n, m in needed.items()}
+    programs |= {name: _law_programs(other, case) for name, other in laws.items()}
     rows: list[tuple[str, float | None]] = [(n, x) for n, row in ladders.items() for x in row]
     rows += [(name, None) for name in laws]
     truth, other_truth = programs[exact.name].at(FINEST), programs[second.name].at(SECOND)
-    found = []
+    solutions = []
     with counting_bar(len(rows), "errors", progress) as advance:
         for name, value in rows:
-            found.append(programs[name].at(value))
+            solutions.append(programs[name].at(value))
             advance(1)
     times = _times([(programs[name], value) for name, value in rows], repeats, progress)
     labels = {m.name: m.label for m in chosen} | {name: f"law: {name}" for name in laws}
     points: dict[str, list[Point]] = {name: [] for name, _ in rows}
-    for (name, value), each, timed in zip(rows, found, times):
-        answer, error = each[0], _errors(case, each, truth)
-        status = STATUS[int(np.max(answer.out.status))].name
-        work = float(np.mean(answer.evaluations))
-        points[name].append(Point(labels[name], value, error, work, status, *timed))
+    for (name, value), solution, timings in zip(rows, solutions, times):
+        status = STATUS[int(np.max(solution.out.status))].name
+        work = float(np.mean(solution.evaluations))
+        error = _errors(case, solution, truth)
+        points[name].append(Point(labels[name], value, error, work, status, *timings))
     return WorkPrecision(
         velocity=np.asarray(case.velocity),
         points={name: tuple(row) for name, row in points.items()},
         reference=Reference(
             how=f"{exact.name} at rtol {FINEST:g} against {second.name} at {SECOND:g}",
             uncertainty=_errors(case, other_truth, truth),
-            velocity=np.asarray(truth[0].out.velocity[0]),
-            impulse=np.asarray(truth[0].out.impulse[0]),
-            duration=float(np.ravel(truth[0].duration)[0]),
+            velocity=np.asarray(truth.out.velocity[0]),
+            impulse=np.asarray(truth.out.impulse[0]),
+            duration=float(np.ravel(truth.duration)[0]),
         ),
         compile_time={name: programs[name].compile_time for name in points},
         left_out=left_out,
@@ -245,11 +247,11 @@ def work_precision(
     )
 
 
-# --------------------------------------------------------------- what is asked, and by whom
+# ------------------------------------------------------------------ the impact, and methods
 
 
 class Case(NamedTuple):
-    """The impact, and stiffnesses (batch, m) around its own; row 0 is its own."""
+    """The impact, and stiffnesses (batch, m) around the law's, which are row 0."""
 
     law: LZB
     scene: Scene
@@ -286,14 +288,15 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
 
 
 def _chosen(names: Sequence[str] | None, case: Case) -> tuple[list[Method], dict[str, str]]:
-    """Methods asked for; without names all that can, and why the others cannot."""
+    """Methods by name; without names all that support the law, and why others do not."""
     if names is not None:
-        return [_able("methods", name, case) for name in names], {}
+        return [_supported("methods", name, case) for name in names], {}
     left_out = {n: why for n, m in METHODS.items() if (why := m.supports(case.law)) is not None}
     return [m for n, m in METHODS.items() if n not in left_out], left_out
 
 
-def _able(argument: str, name: str, case: Case) -> Method:
+def _supported(argument: str, name: str, case: Case) -> Method:
+    """The method of this name, if it supports the law."""
     check_choice(argument, name, METHODS)
     reason = METHODS[name].supports(case.law)
     if reason is not None:
@@ -315,7 +318,7 @@ def _ladders(
 
 def _reference(name: str | None, case: Case) -> Method:
     """The method that errors are measured from."""
-    method = _able("reference", name or "dop853", case)
+    method = _supported("reference", name or "dop853", case)
     if method.setting != "rtol":
         raise ValueError(f"Argument `reference` must take an rtol, but is {name!r}.")
     return method
@@ -324,57 +327,62 @@ def _reference(name: str | None, case: Case) -> Method:
 # ------------------------------------------------------------------------------- programs
 
 
-class Answer(NamedTuple):
-    """An outcome or a batch of them, duration [s] and field evaluations; JAX or numpy."""
+class Solution(NamedTuple):
+    """An outcome or a batch of them, duration [s], field evaluations, Jacobian; JAX or numpy."""
 
     out: Impact
     duration: Any
     evaluations: Any
-
-
-Moment = tuple[Answer, np.ndarray | None]  # answers of a sample, and their gradients
+    jacobian: Any = None
 
 
 @dataclass(frozen=True)
 class Programs:
-    """What can be run at a setting; `batched` gives whole batches, `account` the sample.
+    """The programs of a method, functions of its setting, or of a law.
 
-    `compile_time` fills up as programs are called first.
+    `single` solves one impact, `batched` so many as `batch`, `sampled` those on which errors are
+    measured; `compile_time` [s] by program, filled in by the first calls.
     """
 
     single: Callable[[Any], Any]
     batched: Callable[[Any], Any]
     batch: int
-    account: Callable[[Any], Answer]
+    sampled: Callable[[Any], Solution]
     gradient: Callable[[Any], Any] | None
     compile_time: dict[str, float]
 
-    def at(self, setting: float | None) -> Moment:
-        """Answer and gradient of the sample, as numpy; evaluations NaN where not counted."""
-        answer = jax.tree.map(np.asarray, self.account(setting))
-        work = np.where(answer.evaluations == UNCOUNTED, np.nan, answer.evaluations)
-        slopes = None if self.gradient is None else np.asarray(self.gradient(setting))
-        return answer._replace(evaluations=work), slopes
+    def at(self, setting: float | None) -> Solution:
+        """Solution and Jacobian of the sample, as numpy; evaluations NaN where not counted."""
+        solution = jax.tree.map(np.asarray, self.sampled(setting))
+        work = np.where(solution.evaluations == UNCOUNTED, np.nan, solution.evaluations)
+        jacobian = None if self.gradient is None else np.asarray(self.gradient(setting))
+        return solution._replace(evaluations=work, jacobian=jacobian)
 
 
-def _of_method(method: Method, case: Case, gradients: bool, durations: bool) -> Programs:
+def _method_programs(method: Method, case: Case, gradients: bool, durations: bool) -> Programs:
+    """Programs of a method at the stiffnesses of the case."""
     if not method.jax:
-        return _on_host(method, case)
+        return _host_programs(method, case)
 
-    def whole(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Answer:
+    def solve(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Solution:
+        """The impact with stiffness k (m,)."""
         law = with_entries(law, ("stiffness",), k)
-        found = method.solve(law, scene, v, setting)
-        return Answer(outcome(law, scene, v, found), found.duration, found.evaluations)
+        result = method.solve(law, scene, v, setting)
+        return Solution(outcome(law, scene, v, result), result.duration, result.evaluations)
 
-    def fast(*given: Any) -> Answer:
-        answer = whole(*given)
-        apart = method.duration_apart or not durations
-        return answer._replace(duration=jnp.nan) if apart else answer
+    def timed(*arguments: Any) -> Solution:
+        """The same, without a duration that would cost a run of its own."""
+        solution = solve(*arguments)
+        without = method.duration_apart or not durations
+        return solution._replace(duration=jnp.nan) if without else solution
 
-    def slopes(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
-        def velocity(stretch: jax.Array, e: jax.Array) -> jax.Array:
-            moved = with_entries(law, ("restitution",), e)
-            return fast(k * jnp.exp(stretch), moved, scene, v, setting).out.velocity
+    def jacobian(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
+        """(d v+ / d ln k, d v+ / d e) (n, 2 m)."""
+
+        def velocity(log_factor: jax.Array, e: jax.Array) -> jax.Array:
+            """v+ (n,)."""
+            changed = with_entries(law, ("restitution",), e)
+            return timed(k * jnp.exp(log_factor), changed, scene, v, setting).out.velocity
 
         both = jax.jacfwd(velocity, argnums=(0, 1))(jnp.zeros_like(k), law.restitution)
         return jnp.concatenate(both, axis=-1)
@@ -383,42 +391,45 @@ def _of_method(method: Method, case: Case, gradients: bool, durations: bool) -> 
     constant = (case.law, case.scene, case.velocity)
 
     def program(name: str, function: Callable[..., Any], rows: int | None) -> Callable[[Any], Any]:
+        """The function of a setting, over the first stiffnesses; None: over the law's alone."""
         k = case.stiffness[0] if rows is None else case.stiffness[:rows]
         each = function if rows is None else jax.vmap(function, in_axes=(0, *[None] * 4))
         return _compiled(seconds, name, each, k, *constant)
 
-    batched = program("batched", fast, len(case.stiffness))
-    account = batched
+    batched = program("batched", timed, len(case.stiffness))
+    complete = batched
     if durations and method.duration_apart:
-        account = program("errors", whole, case.sample)
+        complete = program("errors", solve, case.sample)
     return Programs(
-        single=program("single", fast, None),
+        single=program("single", timed, None),
         batched=batched,
         batch=len(case.stiffness),
-        account=lambda setting: jax.tree.map(lambda a: a[: case.sample], account(setting)),
-        gradient=program("gradient", slopes, case.sample) if gradients else None,
+        sampled=lambda setting: jax.tree.map(lambda a: a[: case.sample], complete(setting)),
+        gradient=program("gradient", jacobian, case.sample) if gradients else None,
         compile_time=seconds,
     )
 
 
 def _compiled(
-    seconds: dict[str, float], name: str, function: Callable[..., Any], *given: Any
+    seconds: dict[str, float], name: str, function: Callable[..., Any], *arguments: Any
 ) -> Callable[[Any], Any]:
-    """The function of a setting; its first call enters in `seconds` how long compiling took."""
+    """The function of a setting; its first call enters the time of compiling in `seconds`."""
 
     @functools.cache
-    def ready() -> Callable[..., Any]:
+    def compiled() -> Callable[..., Any]:
+        """The compiled function."""
         begin = time.perf_counter()
-        program = jax.jit(function).lower(*given, jnp.ones((), float)).compile()
+        program = jax.jit(function).lower(*arguments, jnp.ones((), float)).compile()
         seconds[name] = time.perf_counter() - begin
         return program
 
-    return lambda setting: ready()(
-        *given, jnp.asarray(np.nan if setting is None else setting, float)
+    return lambda setting: compiled()(
+        *arguments, jnp.asarray(np.nan if setting is None else setting, float)
     )
 
 
-def _on_host(method: Method, case: Case) -> Programs:
+def _host_programs(method: Method, case: Case) -> Programs:
+    """The same of a method that runs on the host: loops."""
     rows = min(HOST_BATCH, len(case.stiffness))
     laws = [
         with_entries(case.law, ("stiffness",), k)
@@ -426,33 +437,36 @@ def _on_host(method: Method, case: Case) -> Programs:
     ]
 
     def one(law: LZB, setting: Any) -> Any:
+        """One impact."""
         return method.solve(law, case.scene, case.velocity, setting)
 
-    def account(setting: Any) -> Answer:
-        answers = []
+    def sampled(setting: Any) -> Solution:
+        """The impacts on which errors are measured."""
+        solutions = []
         for law in laws[: case.sample]:
-            found = one(law, setting)
-            out = outcome(law, case.scene, case.velocity, found)
-            answers.append(Answer(out, found.duration, found.evaluations))
-        return jax.tree.map(lambda *a: jnp.stack(a), *answers)
+            result = one(law, setting)
+            out = outcome(law, case.scene, case.velocity, result)
+            solutions.append(Solution(out, result.duration, result.evaluations))
+        return jax.tree.map(lambda *a: jnp.stack(a), *solutions)
 
     return Programs(
         single=lambda setting: one(laws[0], setting),
         batched=lambda setting: [one(law, setting) for law in laws[:rows]],
         batch=rows,
-        account=account,
+        sampled=sampled,
         gradient=None,
         compile_time={},
     )
 
 
-def _of_law(law: Law, case: Case) -> Programs:
-    """Programs of another law; it has no setting, and is accounted for at the impact itself."""
+def _law_programs(law: Law, case: Case) -> Programs:
+    """Programs of another law: it has no setting, and its sample is the impact itself."""
     law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
     seconds: dict[str, float] = {}
 
-    def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Answer:
-        return Answer(impact(law, scene, v), jnp.nan, UNCOUNTED)
+    def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Solution:
+        """One impact."""
+        return Solution(impact(law, scene, v), jnp.nan, UNCOUNTED)
 
     many = jax.vmap(run, in_axes=(0, None, None, None))
     velocities = jnp.tile(case.velocity[None, :], (batch, 1))
@@ -461,7 +475,7 @@ def _of_law(law: Law, case: Case) -> Programs:
         single=one,
         batched=_compiled(seconds, "batched", many, velocities, law, case.scene),
         batch=batch,
-        account=lambda _: jax.tree.map(lambda a: a[None], one(None)),
+        sampled=lambda _: jax.tree.map(lambda a: a[None], one(None)),
         gradient=None,
         compile_time=seconds,
     )
@@ -470,44 +484,46 @@ def _of_law(law: Law, case: Case) -> Programs:
 # ------------------------------------------------------------------------- errors and times
 
 
-def _errors(case: Case, moment: Moment, truth: Moment) -> dict[str, float]:
-    """Relative errors, the largest over as many impacts as `moment` has."""
-    (answer, slopes), (true_answer, true_slopes) = moment, truth
-    found, exact = answer.out, true_answer.out
+def _errors(case: Case, solution: Solution, truth: Solution) -> dict[str, float]:
+    """Relative errors, the largest over the impacts that were solved."""
+    out, exact = solution.out, truth.out
     fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(exact.velocity).max()
     before = float(kinetic_energy(case.scene, case.velocity)) or np.abs(exact.energy_change).max()
 
     def largest(a: Any, b: Any, scale: Any = None) -> float:
+        """Largest difference over the scale, that of the truth by default."""
         scale = np.abs(b).max() if scale is None else scale
-        return float(np.abs(a - b[: len(found.velocity)]).max() / scale)
+        return float(np.abs(a - b[: len(out.velocity)]).max() / scale)
 
-    known = slopes is not None and true_slopes is not None
-    return {
-        "velocity": largest(found.velocity, exact.velocity, fastest),
-        "impulse": largest(found.impulse, exact.impulse),
-        "energy": largest(found.energy_change, exact.energy_change, before),
-        "duration": largest(answer.duration, true_answer.duration),
-        "gradient": largest(slopes, true_slopes, fastest) if known else float("nan"),
+    errors = {
+        "velocity": largest(out.velocity, exact.velocity, fastest),
+        "impulse": largest(out.impulse, exact.impulse),
+        "energy": largest(out.energy_change, exact.energy_change, before),
+        "duration": largest(solution.duration, truth.duration),
+        "gradient": float("nan"),
     }
+    if solution.jacobian is not None and truth.jacobian is not None:
+        errors["gradient"] = largest(solution.jacobian, truth.jacobian, fastest)
+    return errors
 
 
 def _times(
     rows: list[tuple[Programs, float | None]], repeats: int, progress: float | None
 ) -> list[list[Timing]]:
-    """Single and batched time of every row, and with its gradient if it has one; all in turns."""
+    """Single and batched time of each row, and with its gradient if it has one; all in turns."""
     tasks = []
-    for row, (timed, value) in enumerate(rows):
+    for row, (programs, value) in enumerate(rows):
         for run, impacts in (
-            (timed.single, 1),
-            (timed.batched, timed.batch),
-            (timed.gradient, min(SAMPLE, timed.batch)),
+            (programs.single, 1),
+            (programs.batched, programs.batch),
+            (programs.gradient, min(SAMPLE, programs.batch)),
         ):
             if run is not None:
                 tasks.append((row, impacts, functools.partial(run, value)))
     with counting_bar(len(tasks) * repeats, "timings", progress) as advance:
-        taken = in_turns([run for *_, run in tasks], repeats, lambda: advance(1))
+        times_of_tasks = in_turns([run for *_, run in tasks], repeats, lambda: advance(1))
     times: list[list[Timing]] = [[] for _ in rows]
-    for (row, impacts, _), seconds in zip(tasks, taken):
+    for (row, impacts, _), seconds in zip(tasks, times_of_tasks):
         quartiles = np.quantile(seconds / impacts, (0.5, 0.25, 0.75))
         times[row].append(Timing(*quartiles.tolist()))
     return times

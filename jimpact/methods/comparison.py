@@ -96,7 +96,9 @@ class Entry:
     def verdict(self) -> str:
         """'ok', or what is violated, and a status that is not ok."""
         broken = [f"{name} violated" for name in self.audit.broken]
-        return ", ".join(broken + [self.status] * (self.status != "ok")) or "ok"
+        if self.status != "ok":
+            broken.append(self.status)
+        return ", ".join(broken) or "ok"
 
     def to_dict(self) -> dict[str, Any]:
         """The row, as a JSON file can hold it."""
@@ -107,14 +109,14 @@ class Entry:
 
 @dataclass(frozen=True)
 class Comparison:
-    """What `compare` found; `print` gives a table.
+    """The result of `compare`; `print` gives a table.
 
     Attributes:
         scene: as asked for.
         velocity: v- (n,) [m/s].
         entries: outcome, audit, energy ratio, dispersion and time by law.
         left_out: why a law is missing.
-        measured: v+ (n,) [m/s] beside which the laws are put, or None.
+        measured: v+ (n,) [m/s] to compare with, or None.
     """
 
     scene: Scene
@@ -145,6 +147,7 @@ class Comparison:
         return as_data(self.entries)
 
     def __str__(self) -> str:
+        """A row for each law, and the measured velocities."""
         bodies = [f"v{i + 1}+" for i in range(self.scene.size)]
         heads = ["law", *bodies, "T+/T-", "dispersion", "us", "audit"]
         rows = [
@@ -160,10 +163,12 @@ class Comparison:
             lines.append(f"closest to the measured velocities: {named} (rms {rms:.3g} m/s)")
         lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         quiet = nothing_approaches(self.scene, self.velocity)
-        return "\n".join(lines + ([] if quiet is None else [f"no impact: {quiet}"]))
+        if quiet is not None:
+            lines.append(f"no impact: {quiet}")
+        return "\n".join(lines)
 
     def _cells(self, after: Any) -> list[str]:
-        """Velocities [m/s], energy ratio and dispersion, as far as they are known."""
+        """Velocities [m/s], energy ratio and dispersion; nothing for NaN."""
         ratio = energy_ratio(self.scene, self.velocity, after)
         spread = dispersion_index(self.scene, after)
         v = [number(x, ".5f") for x in np.asarray(after)]
@@ -180,8 +185,8 @@ def compare(
         velocity: v- (n,) [m/s].
         laws: by name; default: every law of the registry, with these
         values: parameters by name, `restitution=0.9, stiffness=..., exponent=..., matrix=...`
-            (laws that need others are left out, see `left_out`); restitution is 1 where nothing
-            is said.
+            (laws that need others are left out, see `left_out`); restitution is 1 unless
+            it is among them.
 
     Returns:
         `Comparison`: an entry for each law, `print` gives a table, `ji.plot.comparison` a picture.

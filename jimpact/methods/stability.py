@@ -8,8 +8,8 @@
 #   mass_ratio        mu: mass of the middle ball; all others have 1
 #   balls             N, a touching chain without walls; v- = (1, 0, .., 0)
 
-A batch is one compiled function a method and number of balls, over lanes of points; lanes of
-one chunk wait for the slowest, so the number of steps is bounded.
+One function is compiled for each method and number of balls; it runs on batches of points, which
+wait for their slowest point, so the number of steps is bounded.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -64,17 +64,19 @@ CLASSES = (
     "unchecked",
 )
 (RIGHT, FLAGGED, WRONG, GAINS_ENERGY, STALLS, ENDLESS, NOT_FINITE, UNCHECKED) = range(8)
-HONEST = 10.0  # error over tolerance up to which a result counts as right
-FIXED_STEP_RIGHT = 1e-3  # the same of methods with a step: error in v+ over the largest |v-|
-FINER = 0.1  # setting at which a wrong result is tried again: it stalls if the error does
-FALLS = 0.5  # not fall below this part
-LANES = 32
+HONEST = 10.0  # a result is right up to this error over its rtol
+FIXED_STEP_RIGHT = 1e-3  # methods with a step: right up to this error of v+ over the largest |v-|
+FINER = 0.1  # a wrong result is tried again at this part of its setting,
+FALLS = 0.5  # and stalls unless its error falls below this part
+BATCH = 32  # points computed together
 
 REFERENCE_RTOL = 1e-12
 CHECK_RTOL = 1e-11  # of the run by scipy
-CONFIRMED = 1e-7  # difference from it up to which the reference counts as confirmed
-CHECKED = 12  # points
-QUICK_UP_TO, QUICK_BALLS = 1e3, 10  # frequencies over the slowest contact's, size of a chain
+CONFIRMED = 1e-7  # the reference is confirmed up to this difference of v+ from scipy's
+CHECKED = 12  # points solved by scipy, at most
+# scipy solves a point soon up to this ratio of frequencies, to the slowest contact's, and number
+# of balls.
+QUICK_RATIO, QUICK_BALLS = 1e3, 10
 
 CAUSES = (  # limits, formulas and remedies: docs/stability.md
     "refused beforehand",
@@ -87,14 +89,15 @@ CAUSES = (  # limits, formulas and remedies: docs/stability.md
     "steps straddle changes of phase",
 )
 (_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
-STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # step sqrt(lambda_max)
-RECLOSING = 0.1  # e below which three balls re-close (nearly) without end
-_LONG, _CLUSTERED = 10, 0.9  # chains this long stay clustered up to about this e
-_FAR = 100.0  # times between the frequencies of contacts
+STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # largest step times sqrt(lambda_max)
+RECLOSING = 0.1  # below this e three balls re-close (nearly) without end
+_LONG, _CLUSTERED = 10, 0.9  # from this number of balls on, chains below this e stay in clusters
+_FAR = 100.0  # time scales are far apart from this ratio of the contacts' frequencies on
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 SLICES = ("one", "pairs")
 BALLS = (2, 3, 5, 10, 30, 100)
-_FEW_BALLS, _FEW = (2, 3, 10), 8  # every number of balls is compiled apart: few where it is coarse
+# Each number of balls is compiled by itself: below this resolution only a few.
+_FEW_BALLS, _FEW = (2, 3, 10), 8
 
 
 class Slice(NamedTuple):
@@ -117,7 +120,7 @@ class Confirmation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StabilityMap:
-    """What `stability_map` found; `print` gives shares and causes.
+    """The result of `stability_map`; `print` gives numbers of points and causes.
 
     Attributes:
         methods: the names.
@@ -146,11 +149,12 @@ class StabilityMap:
 
     def causes(self, method: str) -> dict[str, int]:
         """Points of a method that are not right, by cause."""
-        found = np.concatenate([s.cause.ravel() for s in self._all_slices(method)])
-        counts = np.bincount(found[found >= 0], minlength=len(CAUSES)).tolist()
+        causes = np.concatenate([s.cause.ravel() for s in self._all_slices(method)])
+        counts = np.bincount(causes[causes >= 0], minlength=len(CAUSES)).tolist()
         return {cause: count for cause, count in zip(CAUSES, counts) if count}
 
     def _all_slices(self, method: str) -> tuple[Slice, ...]:
+        """Slices of a method, its samples last."""
         return (*self.slices[method], self.sampled[method])
 
     def to_dict(self) -> dict[str, Any]:
@@ -164,19 +168,20 @@ class StabilityMap:
             }
             for name in self.methods
         }
-        known = {"classes": CLASSES, "causes": CAUSES, "methods": by_method}
-        return fields_as_data(self, "slices", "sampled") | as_data(known)
+        words = {"classes": CLASSES, "causes": CAUSES, "methods": by_method}
+        return fields_as_data(self, "slices", "sampled") | as_data(words)
 
     def __str__(self) -> str:
+        """Points of each class and causes, by method."""
         base = ", ".join(f"{name.replace('_', ' ')} {x:g}" for name, x in self.base.items())
-        found = self.confirmation
+        checked = self.confirmation
         counts = [[m, *(str(x or "") for x in self.counts(m).values())] for m in self.methods]
         causes = [[m, str(x), cause] for m in self.methods for cause, x in self.causes(m).items()]
         lines = [
             f"base: {base}; at most {self.max_steps:,} steps",
-            f"reference: {found.points} points at rtol {REFERENCE_RTOL:g}; of {found.tried} "
-            f"solved by scipy, too, {found.confirmed} agree to {CONFIRMED:g} (largest "
-            f"difference {found.difference:.1g})",
+            f"reference: {checked.points} points at rtol {REFERENCE_RTOL:g}; of {checked.tried} "
+            f"solved by scipy, too, {checked.confirmed} agree to {CONFIRMED:g} (largest "
+            f"difference of v+ from scipy's {checked.difference:.1g} of |v-|)",
             f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for fixed steps, "
             "of the largest |v-|",
             "",
@@ -203,7 +208,7 @@ def stability_map(
     seed: int = 0,
     progress: float | None = None,
 ) -> StabilityMap:
-    """Where methods integrate the LZB law rightly, and where they do not, over six axes.
+    """Where methods integrate the LZB law correctly, and where they do not, over six axes.
 
     A point is a chain of N touching balls of which the first strikes the others: kappa is the
     stiffness ratio of its halves, mu the mass ratio of its middle ball (`chain_of`); and a
@@ -234,17 +239,17 @@ def stability_map(
     Source: docs/stability.md.
 
     >>> import jimpact as ji
-    >>> found = ji.stability_map(["verlet"], {"setting": [0.0, 0.8]}, {"balls": 2, "exponent": 1})
-    >>> found.counts("verlet")["right"]
+    >>> result = ji.stability_map(["verlet"], {"setting": [0.0, 0.8]}, {"balls": 2, "exponent": 1})
+    >>> result.counts("verlet")["right"]
     1
     """
     check_choice("slices", slices, SLICES)
     samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    chosen, lines = _methods(methods), _axes(axes, as_whole("resolution", resolution, 2))
+    chosen, lines = _methods(methods), _axis_values(axes, as_whole("resolution", resolution, 2))
     start = {name: axis.base for name, axis in _AXES.items()}
-    start |= {name: float(x) for name, x in _known("base", base or {}).items()}
+    start |= {name: float(x) for name, x in _checked("base", base or {}).items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
     if slices == "pairs":
         axis_sets += list(combinations(lines, 2))
@@ -255,29 +260,30 @@ def stability_map(
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
         exact, confirmation = references(points, runners, advance)
-        found = {m.name: classes_of(m, points, exact, runners, advance) for m in chosen}
-    cut = np.cumsum([part[..., 0].size for part in parts])
-    own, last = {}, {}
-    for name, results in found.items():
-        columns = [np.split(column, cut) for column in results]
-        own[name] = tuple(
-            Slice(names, *(column[i].reshape(part.shape[:-1]) for column in columns))
+        results = {m.name: classes_of(m, points, exact, runners, advance) for m in chosen}
+    ends = np.cumsum([part[..., 0].size for part in parts])
+    by_slice, by_sample = {}, {}
+    for name, columns in results.items():
+        pieces = [np.split(column, ends) for column in columns]
+        by_slice[name] = tuple(
+            Slice(names, *(piece[i].reshape(part.shape[:-1]) for piece in pieces))
             for i, (names, part) in enumerate(zip(axis_sets, parts))
         )
-        last[name] = Slice(("samples",), *(column[-1] for column in columns))
+        by_sample[name] = Slice(("samples",), *(piece[-1] for piece in pieces))
     return StabilityMap(
-        methods=tuple(found),
+        methods=tuple(results),
         axes=lines,
         base=start,
-        slices=own,
+        slices=by_slice,
         samples=sampled,
-        sampled=last,
+        sampled=by_sample,
         confirmation=confirmation,
         max_steps=max_steps,
     )
 
 
 def _methods(names: Sequence[str] | None) -> list[Method]:
+    """Methods by name, those to map by default."""
     known = {"default": DEFAULT} | {name: m for name, m in METHODS.items() if m.jax}
     names = NAMES if names is None else tuple(names)
     for name in names or ("",):
@@ -285,7 +291,7 @@ def _methods(names: Sequence[str] | None) -> list[Method]:
     return [known[name] for name in names]
 
 
-def _known(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+def _checked(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
     """Values by axis, checked."""
     for name, value in values.items():
         check_choice(argument, name, AXES)
@@ -306,16 +312,16 @@ def default_axes(r: int) -> dict[str, np.ndarray]:
     }
 
 
-def _axes(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str, np.ndarray]:
-    """The axes to map: those given, or the default ones."""
+def _axis_values(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str, np.ndarray]:
+    """The values of the axes to map."""
     if axes is None:
         return default_axes(r)
-    axes = _known("axes", axes or {"": ()})
-    found = {name: np.unique(np.asarray(x, float)) for name, x in axes.items()}
-    balls = found.get("balls", np.zeros(0))
+    axes = _checked("axes", axes or {"": ()})
+    lines = {name: np.unique(np.asarray(x, float)) for name, x in axes.items()}
+    balls = lines.get("balls", np.zeros(0))
     if (balls != np.round(balls)).any():
         raise ValueError(f"Argument `axes['balls']` must hold whole numbers, but has {balls}.")
-    return {name: found[name] for name in AXES if name in found}
+    return {name: lines[name] for name in AXES if name in lines}
 
 
 def _slice_points(
@@ -333,18 +339,18 @@ def _sample_points(
     """Latin-hypercube points (samples, 6), between the values of `axes`; others from `base`."""
     from scipy.stats import qmc  # late: slow to import
 
-    found = np.tile([base[name] for name in AXES], (samples, 1))
+    points = np.tile([base[name] for name in AXES], (samples, 1))
     unit = qmc.LatinHypercube(len(axes), rng=np.random.default_rng(seed)).random(samples)
     for column, (name, values) in zip(unit.T, axes.items()):
         place = column * (len(values) - 1)
         if name == "balls":
-            found[:, AXES.index(name)] = values[np.round(place).astype(int)]
+            points[:, AXES.index(name)] = values[np.round(place).astype(int)]
             continue
         powers = bool((values > 0).all()) and name != "exponent"
         scaled = np.log(values) if powers else values
         between = np.interp(place, np.arange(len(values)), scaled)
-        found[:, AXES.index(name)] = np.exp(between) if powers else between
-    return found
+        points[:, AXES.index(name)] = np.exp(between) if powers else between
+    return points
 
 
 # --------------------------------------------------------------------------- running methods
@@ -380,40 +386,44 @@ def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
 DEFAULT = METHODS["dop853"]._replace(name="default")
 
 
-class Found(NamedTuple):
+class PointOutcomes(NamedTuple):
     """Velocities after (L, n), status of the method and of the impact, energy gained over T-."""
 
-    velocity: np.ndarray
-    code: np.ndarray
-    status: np.ndarray
-    gain: np.ndarray
+    velocity: Any
+    code: Any
+    status: Any
+    gain: Any
 
 
-Runner = Callable[[np.ndarray, Any], Found]  # of points (L, 6) and settings () or (L,)
+Runner = Callable[[np.ndarray, Any], PointOutcomes]  # of points (L, 6) and settings () or (L,)
 Runners = Callable[[Method, int], Runner]
 
 
 def runner(max_steps: int, method: Method, balls: int) -> Runner:
-    """One method on chains of so many balls."""
+    """A function of points (L, 6) and settings: one method on chains of N balls."""
 
-    def one(point: jax.Array, setting: jax.Array) -> tuple[jax.Array, ...]:
+    def one(point: jax.Array, setting: jax.Array) -> PointOutcomes:
+        """The outcome at one point."""
         _, kappa, eta, e, mu, _ = point
         mass, stiffness = chain_of(kappa, mu, balls)
         scene, v = chain(mass), jnp.zeros_like(mass).at[0].set(1.0)
         law = LZB(e, stiffness, eta, max_steps=max_steps)
-        found = method.solve(law, scene, v, setting)
-        out = outcome(law, scene, v, found)
-        return out.velocity, found.code, out.status, audit(scene, v, out).energy_gain
+        result = method.solve(law, scene, v, setting)
+        out = outcome(law, scene, v, result)
+        return PointOutcomes(
+            out.velocity, result.code, out.status, audit(scene, v, out).energy_gain
+        )
 
     batch = jax.jit(jax.vmap(one))
 
-    def run(points: np.ndarray, settings: Any) -> Found:
-        settings, rows = np.broadcast_to(settings, len(points)), []
-        for begin in range(0, len(points), LANES):
-            lanes = np.arange(begin, begin + LANES).clip(max=len(points) - 1)  # the last repeats
-            out = batch(jnp.asarray(points[lanes]), jnp.asarray(settings[lanes]))
-            rows.append([np.asarray(x)[: len(points) - begin] for x in out])
-        return Found(*(np.concatenate(column) for column in zip(*rows)))
+    def run(points: np.ndarray, settings: Any) -> PointOutcomes:
+        """The outcomes at all points, a batch at a time."""
+        settings, parts = np.broadcast_to(settings, len(points)), []
+        for begin in range(0, len(points), BATCH):
+            rows = np.arange(begin, begin + BATCH).clip(max=len(points) - 1)  # the last repeats
+            out = batch(jnp.asarray(points[rows]), jnp.asarray(settings[rows]))
+            parts.append([np.asarray(x)[: len(points) - begin] for x in out])
+        return PointOutcomes(*(np.concatenate(column) for column in zip(*parts)))
 
     return run
 
@@ -431,14 +441,14 @@ def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
 def references(
     points: np.ndarray, runners: Runners, advance: Callable[[int], None]
 ) -> tuple[np.ndarray, Confirmation]:
-    """v+ of every point (P, most balls), NaN where no run ends; how many scipy confirms."""
+    """v+ of each point (P, largest N), NaN where no run ends; how many scipy confirms."""
     exact = np.full((len(points), int(points[:, AXES.index("balls")].max())), np.nan)
     for at, balls in _groups(points):
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
-        found = runners(DEFAULT, balls)(rows, REFERENCE_RTOL)
-        ended = (found.code == CODE["ok"]) | (found.code == CODE["plastic_limit"])
-        exact[at, :balls] = np.where(ended[:, None], found.velocity, np.nan)[np.ravel(back)]
+        out = runners(DEFAULT, balls)(rows, REFERENCE_RTOL)
+        ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
+        exact[at, :balls] = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
         advance(len(at))
     return exact, _confirm(points, exact)
 
@@ -449,26 +459,29 @@ def _confirm(points: np.ndarray, exact: np.ndarray) -> Confirmation:
     candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
-    every = max(1, -(-len(candidates) // CHECKED))
-    apart = np.array([_by_scipy(points[i], exact[i]) for i in candidates[::every]])
-    largest = float(apart.max(initial=0.0)) if len(apart) else float("nan")
-    return Confirmation(len(points), len(apart), int((apart <= CONFIRMED).sum()), largest)
+    stride = max(1, -(-len(candidates) // CHECKED))
+    differences = np.array([_from_scipy(points[i], exact[i]) for i in candidates[::stride]])
+    largest = float(differences.max(initial=0.0)) if len(differences) else float("nan")
+    agree = int((differences <= CONFIRMED).sum())
+    return Confirmation(len(points), len(differences), agree, largest)
 
 
 def _is_quick(point: np.ndarray) -> bool:
-    highest, apart = frequencies(point)
-    parts = point[AXES.index("restitution")] >= RECLOSING  # else scipy may end it too early
+    """Whether scipy solves the point soon, and does not end it too early (small e)."""
+    highest, ratio = frequencies(point)
+    separates = point[AXES.index("restitution")] >= RECLOSING
     few = point[AXES.index("balls")] <= QUICK_BALLS
-    return bool(parts and few and highest * apart < QUICK_UP_TO)
+    return bool(separates and few and highest * ratio < QUICK_RATIO)
 
 
-def _by_scipy(point: np.ndarray, exact: np.ndarray) -> float:
+def _from_scipy(point: np.ndarray, exact: np.ndarray) -> float:
+    """Largest difference of v+ from what scipy gives."""
     _, kappa, eta, e, mu, balls = map(float, point)
     mass, stiffness = chain_of(kappa, mu, int(balls))
     scene, v = chain(mass), np.eye(int(balls))[0]
     law = LZB(e, stiffness, eta)
-    found = METHODS["scipy_dop853"].solve(law, scene, v, CHECK_RTOL)
-    return float(np.abs(outcome(law, scene, v, found).velocity - exact[: len(v)]).max())
+    result = METHODS["scipy_dop853"].solve(law, scene, v, CHECK_RTOL)
+    return float(np.abs(outcome(law, scene, v, result).velocity - exact[: len(v)]).max())
 
 
 # ------------------------------------------------------------------------ classes and causes
@@ -492,18 +505,16 @@ def classes_of(
     for group, balls in _groups(points):
         run = runners(method, balls)
 
-        def off(found: Found, at: np.ndarray, balls: int = balls) -> np.ndarray:
-            return np.abs(found.velocity - exact[at, :balls]).max(axis=1)
-
         at = group[e[group] > 0] if method.divides else group
         if len(at):
-            found = run(points[at], setting[at])
-            errors[at] = off(found, at)
-            codes[at] = _classified(found, errors[at], allowed[at])
+            out = run(points[at], setting[at])
+            errors[at] = np.abs(out.velocity - exact[at, :balls]).max(axis=1)
+            codes[at] = _classified(out, errors[at], allowed[at])
         wrong = at[codes[at] == WRONG]
         if len(wrong):
             finer = run(points[wrong], FINER * setting[wrong])
-            falls = off(finer, wrong) < FALLS * errors[wrong]
+            error = np.abs(finer.velocity - exact[wrong, :balls]).max(axis=1)
+            falls = error < FALLS * errors[wrong]
             codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
         advance(len(group))
     causes = np.full(len(points), -1)
@@ -512,14 +523,14 @@ def classes_of(
     return codes, errors, causes
 
 
-def _classified(found: Found, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+def _classified(out: PointOutcomes, error: np.ndarray, allowed: np.ndarray) -> np.ndarray:
     """Classes (L,) before a finer setting is tried; `error` NaN where there is no reference."""
-    status = np.where(found.code == CODE["ok"], found.status, found.code)
+    status = np.where(out.code == CODE["ok"], out.status, out.code)
     cases = {
         NOT_FINITE: status == CODE["not_finite"],
         ENDLESS: status == CODE["max_steps"],
         RIGHT: error <= allowed,
-        GAINS_ENERGY: (status == CODE["energy_gain"]) | (found.gain > allowed),
+        GAINS_ENERGY: (status == CODE["energy_gain"]) | (out.gain > allowed),
         FLAGGED: status != CODE["ok"],
         WRONG: np.isfinite(error),
     }
@@ -542,19 +553,19 @@ def frequencies(point: np.ndarray) -> tuple[float, float]:
     w = 1 / mass[:-1] + 1 / mass[1:]
     # 1 / t_ref at the largest normalized speed, up to a common factor
     omega = k ** (1 / (eta + 1)) * np.sqrt(w)
-    slowest = omega.max() / omega.min()
+    ratio = omega.max() / omega.min()
     omega = omega / omega.max()
-    beside = -1 / mass[1:-1] / np.sqrt(w[:-1] * w[1:])
-    g = np.eye(len(w)) + np.diag(beside, 1) + np.diag(beside, -1)
+    neighbours = -1 / mass[1:-1] / np.sqrt(w[:-1] * w[1:])
+    g = np.eye(len(w)) + np.diag(neighbours, 1) + np.diag(neighbours, -1)
     largest = np.linalg.eigvalsh(omega[:, None] * g * omega[None, :])[-1]
-    with np.errstate(divide="ignore"):
-        return float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf, float(slowest)
+    fastest = float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf
+    return fastest, float(ratio)
 
 
 def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
     """Index of CAUSES."""
     e, balls = point[AXES.index("restitution")], point[AXES.index("balls")]
-    highest, apart = frequencies(point)
+    highest, ratio = frequencies(point)
     reach = setting * highest
     if name == "flagged" and e == 0:
         return _REFUSED
@@ -563,7 +574,7 @@ def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
     if name in ("does not end", "flagged", "unchecked"):
         if e < RECLOSING:
             return _RECLOSES
-        if apart > _FAR or point[AXES.index("mass_ratio")] < 1 / _FAR:
+        if ratio > _FAR or point[AXES.index("mass_ratio")] < 1 / _FAR:
             return _APART
         if balls >= _LONG and e < _CLUSTERED:
             return _CLUSTER

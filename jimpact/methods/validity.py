@@ -19,12 +19,12 @@ from jimpact.methods.comparison import dispersion_index
 from jimpact.scene import Scene, as_velocity
 from jimpact.status import STATUS
 
-RATIOS = (1e-3, 1e3, 121)  # of a map where none are given: from, to, how many
+RATIOS = (1e-3, 1e3, 121)  # default ratios: from, to, how many
 
 
 @dataclass(frozen=True)
 class ValidityMap:
-    """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), beside laws without them.
+    """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), next to laws without them.
 
     `scene` and v- `before` (n,) [m/s] as asked for; `velocity` (x, r, n) [m/s], `dispersion` and
     `status` (x, r) over `exponents` (x,) and `ratios` (r,); `laws` holds v+ (n,) of Moreau's law
@@ -65,7 +65,10 @@ class ValidityMap:
         return fields_as_data(self, "scene") | {"status": status}
 
     def __str__(self) -> str:
+        """Where each law is within 1 %, by exponent."""
+
         def ends(law: str, sign: str) -> list[str]:
+            """The ends of its ranges."""
             return ["nowhere" if np.isnan(x) else f"ratio {sign} {x:.3g}" for x in self.limit(law)]
 
         exponents = [f"{eta:.3g}" for eta in self.exponents]
@@ -81,7 +84,7 @@ def validity_map(
     exponents: Any = (1.0, 1.5, 2.0, 3.0),
     restitution: Any = 1.0,
 ) -> ValidityMap:
-    """Dispersion and v+ of LZB against the stiffness ratio, beside Moreau's law and binary.
+    """Dispersion and v+ of LZB against the stiffness ratio, next to Moreau's law and binary.
 
     Equation: `k_j = ratio^(j - 1)`: with two contacts ratio = k2/k1, with more the stiffness
     rises (ratio > 1) or falls from each contact to the next.
@@ -94,7 +97,7 @@ def validity_map(
         restitution: e in [0, 1], scalar or (m,).
 
     Returns:
-        `ValidityMap`; `ji.plot.validity_map` draws it, `print` tells where which law holds.
+        `ValidityMap`; `ji.plot.validity_map` draws it, `print` says where which law holds.
 
     Raises:
         ValueError: shapes or ranges, at rest, one contact, gaps, ratios that do not rise.
@@ -103,8 +106,8 @@ def validity_map(
 
     >>> import jimpact as ji
     >>> balls = ji.chain([1.0, 1.0, 1.0])
-    >>> found = ji.validity_map(balls, [1.0, 0.0, 0.0], ratios=[1e-3, 1.0, 1e3], exponents=[1.0])
-    >>> found.velocity[0, :, 1:].round(3).tolist()  # binary, dispersed, Moreau
+    >>> result = ji.validity_map(balls, [1.0, 0.0, 0.0], [1e-3, 1.0, 1e3], exponents=[1.0])
+    >>> result.velocity[0, :, 1:].round(3).tolist()  # binary, dispersed, Moreau
     [[0.0, 1.0], [0.15, 0.98], [0.666, 0.667]]
     """
     v = as_velocity(scene, velocity)
@@ -128,7 +131,7 @@ def validity_map(
     check_per_contact("restitution", e, scene.contacts)
     velocities, spread, status = _grid(scene, v, ratio, eta, e.astype(v.dtype))
     laws: dict[str, Law] = {"moreau": Moreau(e), "binary": Binary(e)}
-    found = {name: impact(law, scene, v).velocity for name, law in laws.items()}
+    after = {name: impact(law, scene, v).velocity for name, law in laws.items()}
     return ValidityMap(
         scene=scene,
         before=np.asarray(v),
@@ -137,8 +140,8 @@ def validity_map(
         velocity=np.asarray(velocities),
         dispersion=np.asarray(spread),
         status=np.asarray(status),
-        laws={name: np.asarray(x) for name, x in found.items()},
-        law_dispersion={name: float(dispersion_index(scene, x)) for name, x in found.items()},
+        laws={name: np.asarray(x) for name, x in after.items()},
+        law_dispersion={name: float(dispersion_index(scene, x)) for name, x in after.items()},
     )
 
 
@@ -146,9 +149,11 @@ def validity_map(
 def _grid(
     scene: Scene, v: jax.Array, ratios: jax.Array, exponents: jax.Array, e: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """v+ (x, r, n), dispersion and status (x, r) of LZB."""
     step = jnp.arange(scene.contacts).astype(v.dtype)
 
     def one(ratio: jax.Array, eta: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The same at one ratio and exponent."""
         out = impact(LZB(e, ratio**step, eta), scene, v)
         return out.velocity, dispersion_index(scene, out.velocity), out.status
 

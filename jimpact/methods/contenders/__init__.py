@@ -3,8 +3,8 @@
 >>> import jimpact as ji
 >>> from jimpact.methods.contenders import METHODS
 >>> law, balls = ji.LZB(1.0, exponent=1.0), ji.chain([1.0, 1.0])
->>> found = METHODS["verlet"].solve(law, balls, [1.0, 0.0], 0.01)
->>> round(float(found.impulse[0]), 3), int(found.evaluations)
+>>> result = METHODS["verlet"].solve(law, balls, [1.0, 0.0], 0.01)
+>>> round(float(result.impulse[0]), 3), int(result.evaluations)
 (1.0, 316)
 """
 

@@ -1,4 +1,4 @@
-"""What every way to integrate the LZB impact has in common: its problem, its result, its table row.
+"""What all ways to integrate the LZB impact have in common: problem, result, row of the table.
 
 All work on the dimensionless flow of `events/contact_flow.py`. In time form, with c_j = 1 in
 compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2,
@@ -26,7 +26,7 @@ from jimpact.laws.lzb import LZB
 from jimpact.scene import Scene
 from jimpact.status import CODE
 
-UNCOUNTED = -1  # evaluations that the method cannot tell by itself
+UNCOUNTED = -1  # evaluations of a method that does not count them
 
 
 class MethodResult(NamedTuple):
@@ -44,10 +44,10 @@ Solve = Callable[[LZB, Scene, Any, Any], MethodResult]
 class Method(NamedTuple):
     """A way to integrate an LZB impact.
 
-    `setting` says what the number handed to `solve` is: 'rtol', a tolerance on velocities relative
+    `setting` is the kind of number that `solve` takes: 'rtol', a tolerance on velocities relative
     to the largest |v-|; 'step', the time step in units of `time_scale`; or 'impulse step', the
-    step in the primary impulse, in units of the impact's own. `ladder`: settings from coarse to
-    fine. `divides`: by e, which must not be 0. `jax`: `solve(law, scene, velocity, setting)` can
+    step in the primary impulse, in units of the impact's momentum. `ladder`: settings from coarse
+    to fine. `divides`: by e, which must not be 0. `jax`: `solve(law, scene, velocity, setting)` can
     be jitted, vmapped and differentiated forward, over the setting too; otherwise it takes concrete
     values. `duration_apart`: the duration takes a run of its own.
     """
@@ -67,12 +67,12 @@ class Method(NamedTuple):
         return "it divides by e^2, and a restitution is 0" if refused else None
 
 
-class GivenImpact(NamedTuple):
-    """The dimensionless problem of an impact; the tolerances in `inputs` are those of rtol."""
+class ScaledImpact(NamedTuple):
+    """The dimensionless problem of an impact; `inputs` holds its tolerances."""
 
     dynamics: Dynamics
     max_steps: int
-    happens: jax.Array  # False: nothing approaches, nothing is stored; `inputs` then are a dummy
+    happens: jax.Array  # False: nothing approaches or is stored; `inputs` are then a placeholder
 
     @property
     def inputs(self) -> impact_dynamics.Problem:
@@ -97,8 +97,8 @@ class GivenImpact(NamedTuple):
         return rule_of(self.inputs, self.dynamics.static_exponent, self.dynamics.chain)
 
 
-def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> GivenImpact:
-    """The impact in units of its own, open contacts left out."""
+def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> ScaledImpact:
+    """The impact in dimensionless form, without open contacts."""
     if law.friction is not None:
         raise TypeError("Argument `law` must have no friction: these methods have none.")
     v = as_float_array("velocity", velocity)
@@ -107,19 +107,19 @@ def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> GivenImpa
     gamma, happens = contact.gap_velocity, contact.happens
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     contact = eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)
-    return GivenImpact(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), law.max_steps, happens)
+    return ScaledImpact(law.dynamics(contact, jnp.asarray(rtol, v.dtype)), law.max_steps, happens)
 
 
 def in_si(
-    given: GivenImpact, p: jax.Array, t: jax.Array, evaluations: jax.Array, code: jax.Array
+    scaled: ScaledImpact, p: jax.Array, t: jax.Array, evaluations: jax.Array, code: jax.Array
 ) -> MethodResult:
     """The result in SI units, nothing where nothing happens, `not_finite` where it is not."""
-    impulse = jnp.where(given.happens, p * given.units.velocity / given.units.root, 0.0)
+    impulse = jnp.where(scaled.happens, p * scaled.units.velocity / scaled.units.root, 0.0)
     finite = jnp.all(jnp.isfinite(impulse))
-    code = jnp.where(given.happens, code, CODE["ok"])
+    code = jnp.where(scaled.happens, code, CODE["ok"])
     return MethodResult(
         impulse=impulse,
-        duration=jnp.where(given.happens, t * given.units.time, 0.0),
+        duration=jnp.where(scaled.happens, t * scaled.units.time, 0.0),
         evaluations=jnp.asarray(evaluations, jnp.int32),
         code=jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32),
     )
@@ -139,20 +139,21 @@ def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
     return problem(law, scene, velocity).units.time
 
 
-class _Given(Law):
-    """A "law" whose impulses are known."""
+class _KnownImpulses(Law):
+    """A law whose impulses are known beforehand."""
 
     known: jax.Array
     code: jax.Array
     initial_energy: jax.Array
 
     def impulses(self, contact: Contact) -> Impulses:
+        """These impulses, whatever the contacts are."""
         return Impulses(self.known, None, self.code)
 
 
 def outcome(law: LZB, scene: Scene, velocity: Any, result: MethodResult) -> Impact:
     """Velocities, energy and full status (`impact`'s own checks included) of a method's result."""
-    return impact(_Given(result.impulse, result.code, law.initial_energy), scene, velocity)
+    return impact(_KnownImpulses(result.impulse, result.code, law.initial_energy), scene, velocity)
 
 
 def time_form(

@@ -36,31 +36,34 @@ FOREVER = 1e6  # in units of the impact's time scale: a contact alone lasts abou
 
 
 def _diffrax_solver(solver: diffrax.AbstractSolver, stages: int | None) -> Solve:
-    """`solve` by a diffrax solver of so many new stages a step (None: not known beforehand)."""
+    """`solve` by a diffrax solver; `stages`: new ones a step (None: not known beforehand)."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-        given = problem(law, scene, velocity)
-        inputs = given.inputs
+        """The impact at this rtol."""
+        scaled = problem(law, scene, velocity)
+        inputs = scaled.inputs
         rtol = jnp.asarray(setting, inputs.gamma.dtype)
 
         def rates(t: Any, y: Any, args: Any) -> tuple[jax.Array, jax.Array]:
+            """(x', p') at y = (x, p)."""
             flow, gamma, _ = args
             closing, force = time_form(flow, gamma, *y)
-            # it cannot clamp: an open contact keeps its x <= 0
+            # diffrax cannot clamp: an open contact stays at its x <= 0
             return jnp.where((y[0] <= 0) & (closing < 0), 0.0, closing), force
 
         def at_work(t: Any, y: Any, args: Any, **_: Any) -> jax.Array:
+            """Positive while a contact is loaded or approaches."""
             (flow, gamma, rtol), (x, p) = args, y
             return jnp.maximum(jnp.max(x), jnp.max(-(gamma + flow.coupling @ p))) - rtol
 
-        found = diffrax.diffeqsolve(
+        result = diffrax.diffeqsolve(
             diffrax.ODETerm(rates),
             solver,
             t0=jnp.zeros_like(rtol),
             t1=jnp.full_like(rtol, jnp.inf),
             dt0=None,
-            y0=(given.x, jnp.zeros_like(inputs.gamma)),
-            args=(given.flow, inputs.gamma, rtol),
+            y0=(scaled.x, jnp.zeros_like(inputs.gamma)),
+            args=(scaled.flow, inputs.gamma, rtol),
             stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
             event=diffrax.Event(
                 at_work,
@@ -68,16 +71,16 @@ def _diffrax_solver(solver: diffrax.AbstractSolver, stages: int | None) -> Solve
                 direction=False,
             ),
             adjoint=diffrax.ForwardMode(),
-            max_steps=given.max_steps,
+            max_steps=scaled.max_steps,
             throw=False,
         )
-        assert found.ys is not None
-        assert found.ts is not None
-        ended = found.result == diffrax.RESULTS.event_occurred
-        steps = found.stats["num_steps"]
+        assert result.ys is not None
+        assert result.ts is not None
+        ended = result.result == diffrax.RESULTS.event_occurred
+        steps = result.stats["num_steps"]
         evaluations = jnp.full_like(steps, UNCOUNTED) if stages is None else stages * steps + 1
         code = jnp.where(ended, CODE["ok"], CODE["max_steps"])
-        return in_si(given, found.ys[1][-1], found.ts[-1], evaluations, code)
+        return in_si(scaled, result.ys[1][-1], result.ts[-1], evaluations, code)
 
     return solve
 
@@ -85,6 +88,7 @@ def _diffrax_solver(solver: diffrax.AbstractSolver, stages: int | None) -> Solve
 def _diffrax_method(
     name: str, solver: Any, stages: int | None, ladder: tuple[float, ...]
 ) -> Method:
+    """The row of a diffrax solver."""
     label = f"diffrax {type(solver).__name__} with Event"
     return Method(name, label, "rtol", ladder, _diffrax_solver(solver, stages))
 
@@ -97,17 +101,18 @@ DIFFRAX = (
 
 
 class _GaveUpError(Exception):
-    """More evaluations than the law allows steps."""
+    """There were more evaluations than the law allows steps."""
 
 
 def _scipy_solver(name: str) -> Solve:
     """`solve` by one of the solvers of `scipy.integrate.solve_ivp`."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+        """The impact at this rtol."""
         from scipy.integrate import solve_ivp  # late: scipy is slow to import
 
-        given = setup(law, scene, velocity)
-        inputs, flow = given.inputs, given.flow
+        scaled = setup(law, scene, velocity)
+        inputs, flow = scaled.inputs, scaled.flow
         gamma, omega, e = (
             np.asarray(a, float) for a in (inputs.gamma, flow.omega, flow.restitution)
         )
@@ -119,9 +124,10 @@ def _scipy_solver(name: str) -> Solve:
         count, reached = 0, (0.0, np.zeros(2 * m))
 
         def rates(t: float, y: np.ndarray) -> np.ndarray:
+            """(x', p') (2 m,) at y = (x, p)."""
             nonlocal count, reached
             count, reached = count + 1, (t, y)
-            if count > min(given.max_steps, GIVE_UP * m):
+            if count > min(scaled.max_steps, GIVE_UP * m):
                 raise _GaveUpError
             x, now = y[:m], gamma + coupling @ y[m:]
             closing = -omega * np.where(now > 0, 1 / e**2, 1.0) * now
@@ -129,26 +135,28 @@ def _scipy_solver(name: str) -> Solve:
             return np.concatenate([closing, (eta + 1) / 2 * omega * np.maximum(x, 0.0) ** eta])
 
         def at_work(_: float, y: np.ndarray) -> float:
+            """Positive while a contact is loaded or approaches."""
             return max(y[:m].max(), -(gamma + coupling @ y[m:]).min()) - rtol
 
         at_work.terminal, at_work.direction = True, -1.0  # type: ignore[attr-defined]
-        start = np.concatenate([np.asarray(given.x, float), np.zeros(m)])
+        start = np.concatenate([np.asarray(scaled.x, float), np.zeros(m)])
         options = {"method": name, "rtol": rtol, "atol": rtol, "events": at_work}
         try:
-            found = solve_ivp(rates, (0.0, FOREVER), start, **options)
+            result = solve_ivp(rates, (0.0, FOREVER), start, **options)
         except _GaveUpError:
             p, t, code = reached[1][m:], reached[0], CODE["max_steps"]
         else:
-            code = CODE["ok"] if found.status == 1 else CODE["max_steps"]
-            p, t = found.y[m:, -1], found.t[-1]
+            code = CODE["ok"] if result.status == 1 else CODE["max_steps"]
+            p, t = result.y[m:, -1], result.t[-1]
         # `nfev`, and what LSODA's own differences take
         impulse, duration = (jnp.asarray(x, inputs.gamma.dtype) for x in (p, t))
-        return in_si(given, impulse, duration, jnp.asarray(count), jnp.asarray(code))
+        return in_si(scaled, impulse, duration, jnp.asarray(count), jnp.asarray(code))
 
     return solve
 
 
 def _scipy_method(name: str, solver: str, ladder: tuple[float, ...]) -> Method:
+    """The row of a solver of scipy."""
     label = f"scipy {solver} with event"
     return Method(name, label, "rtol", ladder, _scipy_solver(solver), jax=False)
 

@@ -50,14 +50,15 @@ from jimpact.status import CODE
 
 
 def _solve_aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-    given = problem(law, scene, velocity, setting)
-    leaves, tree = given.dynamics.columns()
+    """What `impact` does, with its duration."""
+    scaled = problem(law, scene, velocity, setting)
+    leaves, tree = scaled.dynamics.columns()
     function = ImpulseProgram(
-        tree, given.dynamics.static_exponent, given.dynamics.chain, given.max_steps
+        tree, scaled.dynamics.static_exponent, scaled.dynamics.chain, scaled.max_steps
     )
     p, _, _, code, passes = evaluate(function, leaves)
     _, _, t, _, _ = evaluate(dataclasses.replace(function, whole=True), leaves)
-    return in_si(given, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0])
+    return in_si(scaled, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0])
 
 
 Pair = tuple[jax.Array, jax.Array]
@@ -91,29 +92,32 @@ TimeStep = Callable[[Rule, jax.Array, jax.Array, _TimeWalk], tuple[jax.Array, ja
 
 
 def _in_time(step: TimeStep, stages: int, first: int) -> Solve:
-    """`solve` by fixed steps of so many evaluations each, and so many before the first."""
+    """`solve` by fixed steps in time of `stages` evaluations each; `first`: those at the start."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-        given = problem(law, scene, velocity)
-        flow, before, start = given.flow, given.inputs.gamma, given.x
+        """The impact with this time step."""
+        scaled = problem(law, scene, velocity)
+        flow, before, start = scaled.flow, scaled.inputs.gamma, scaled.x
         h, zero = jnp.asarray(setting, before.dtype), jnp.zeros_like(before)
 
         def at_work(walk: _TimeWalk) -> jax.Array:
+            """Whether a contact is loaded or approaches."""
             return jnp.any((walk.x > 0) | (walk.gamma < 0))
 
         def advance(walk: _TimeWalk) -> _TimeWalk:
+            """One step."""
             x, p, force = step(flow, before, h, walk)
             gamma = before + flow.coupling @ p
             return _TimeWalk(jnp.maximum(x, 0.0), p, gamma, force, walk.steps + 1)
 
         _, force = time_form(flow, before, start, zero)
         end = jax.lax.while_loop(
-            lambda walk: at_work(walk) & (walk.steps < given.max_steps),
+            lambda walk: at_work(walk) & (walk.steps < scaled.max_steps),
             advance,
             _TimeWalk(start, zero, before, force, jnp.zeros((), jnp.int32)),
         )
         code = jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
-        return in_si(given, end.p, h * end.steps.astype(h.dtype), stages * end.steps + first, code)
+        return in_si(scaled, end.p, h * end.steps.astype(h.dtype), stages * end.steps + first, code)
 
     return solve
 
@@ -121,7 +125,10 @@ def _in_time(step: TimeStep, stages: int, first: int) -> Solve:
 def _rk4(
     flow: Rule, before: jax.Array, h: jax.Array, walk: _TimeWalk
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A classical Runge-Kutta step."""
+
     def rates(change: Pair) -> Pair:
+        """(x', p') at a change of (x, p)."""
         return time_form(flow, before, walk.x + change[0], walk.p + change[1])
 
     dx, dp = _runge_kutta(rates, h, jnp.zeros_like(before))
@@ -131,6 +138,7 @@ def _rk4(
 def _verlet(
     flow: Rule, before: jax.Array, h: jax.Array, walk: _TimeWalk
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A step of velocity Verlet."""
     p = walk.p + 0.5 * h * walk.force
     closing, _ = time_form(flow, before, walk.x, p)  # compression or expansion: at mid-step
     x = jnp.maximum(walk.x + h * closing, 0.0)
@@ -142,19 +150,20 @@ def _verlet(
 
 
 def _in_impulse(step: Callable[[Rule, jax.Array, Walk], Walk], stages: int) -> Solve:
-    """`solve` by steps in the primary impulse, of so many evaluations each."""
+    """`solve` by steps in the primary impulse, of `stages` evaluations each."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
-        given = problem(law, scene, velocity, setting)
-        inputs, flow = given.inputs, given.flow
+        """The impact with this step in the primary impulse."""
+        scaled = problem(law, scene, velocity, setting)
+        inputs, flow = scaled.inputs, scaled.flow
         none, gamma = jnp.zeros_like(inputs.gamma), inputs.gamma
         end = jax.lax.while_loop(
-            lambda walk: impulse_form.at_work(walk) & (walk.steps < given.max_steps),
+            lambda walk: impulse_form.at_work(walk) & (walk.steps < scaled.max_steps),
             lambda walk: step(flow, inputs.step[0], walk),
             Walk(gamma, 0.5 * inputs.energy, none, jnp.zeros((), jnp.int32)),
         )
         code = jnp.where(impulse_form.at_work(end), CODE["max_steps"], CODE["ok"])
-        return in_si(given, end.p, jnp.full_like(end.p[0], jnp.nan), stages * end.steps, code)
+        return in_si(scaled, end.p, jnp.full_like(end.p[0], jnp.nan), stages * end.steps, code)
 
     return solve
 
@@ -175,10 +184,11 @@ def _impulse_rk4(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
     fresh = begun / jnp.max(jnp.where(primary, begun, 0.0))
 
     def rates(change: Pair) -> Pair:
+        """(dE, dp) over the primary impulse at a change of (E, p)."""
         at = force(flow, energy + change[0])
         leading = jnp.sum(jnp.where(primary, at, 0.0))
-        # as the primary contact is unloaded the rule has a pole; a force that outgrows its own
-        # is primary from the next step on
+        # The rule has a pole where the primary contact is unloaded; a larger force is the primary
+        # one from the next step on.
         slope = jnp.minimum(at / jnp.where(leading > 0, leading, 1.0), 1.0)
         slope = jnp.where(primary, 1.0, jnp.where(loaded & (leading > 0), slope, fresh))
         now = gamma + flow.coupling @ change[1]

@@ -14,17 +14,15 @@
 # %% [markdown]
 # # Monte Carlo over initial gaps
 #
-# *Course, part 2. Before: [fit a law](01_fit_newtons_cradle.ipynb). Next:
-# [speed, accuracy, stability](03_speed_accuracy_stability.ipynb).*
+# *Course, part 8. Before: [methods of integration](07_methods_of_integration.ipynb). Next:
+# [parameters and gaps](09_parameters_and_gaps.ipynb).*
 #
-# You will learn how large a gap must be to matter, to draw gaps at random and read the statistics, and
-# where a linearization is enough.
+# You will see how large a gap must be to matter, draw random gaps, read the statistics, and check
+# when a linearization is enough.
 #
-# Two small balls strike a large one from both sides. Rigid-body theory has the outcome jump with
-# the order of the two collisions. Real contacts are compliant: the jump is a smooth crossover,
-# about two indentations wide. Here is how wide that is for steel, what it does to the
-# statistics when gaps are only known to some micrometres, and where a linearization in the gaps
-# fails.
+# Two small balls strike a large one from both sides. In rigid-body theory the outcome jumps with
+# the order of the two collisions. Real contacts are compliant, and the jump is a smooth crossover,
+# about two indentations wide.
 
 # %%
 # %matplotlib inline
@@ -49,9 +47,9 @@ ji.plot.system(ji.chain([small, large, small], gaps=[1e-5, 1e-5]), v, "Gaps not 
 # %% [markdown]
 # ## The crossover
 #
-# Gap 1 minus gap 2 in units of the gap scale. Far to the left ball 1 has long finished when
-# ball 3 arrives: the binary outcome (-3/5, -4/25, 31/25) of masses (m/4, m, m/4). In the middle
-# both strike together: (-1, 0, 1).
+# The horizontal axis is gap 1 minus gap 2 in units of the gap scale. On the left ball 1 has left
+# before ball 3 arrives: this is the binary outcome (-3/5, -4/25, 31/25) of masses (m/4, m, m/4). In
+# the middle both strike together: (-1, 0, 1).
 
 # %%
 delta = float(scale.delta[0])
@@ -77,24 +75,22 @@ print("left  ", velocities[0].round(4), " binary (-0.6, -0.16, 1.24)")
 # %% [markdown]
 # ## Gaps known to some micrometres
 #
-# The gaps are random, uniform up to a few gap scales. Every sample is one impact; the chunks are
-# computed with `vmap`, their moments merged in float64. With `folder=` a run can be interrupted
-# and goes on where it stopped, with the same result bit by bit.
+# Let the gaps be random, uniform up to four gap scales. Each sample is one impact; `vmap` computes
+# a chunk of samples at once.
 
 # %%
 gaps = ji.Uniform(0.0, 4 * delta)
-found = ji.monte_carlo(law, balls, v, gaps=gaps, samples=20_000, key=0)
-print(found)
+result = ji.monte_carlo(law, balls, v, gaps=gaps, samples=20_000, key=0)
+print(result)
 
 # %%
-
-ji.plot.monte_carlo(found, "gaps uniform up to four gap scales")
+ji.plot.monte_carlo(result, "gaps uniform up to four gap scales")
 
 # %% [markdown]
 # ## Where a linearization fails
 #
-# The Jacobian of the outcome in the gaps gives the spread to first order. It is right for gaps
-# that scatter by much less than the gap scale, and says nothing across a crossover.
+# The Jacobian of the outcome with respect to the gaps gives the spread to first order. It is
+# accurate for gaps that scatter by much less than the gap scale, and wrong across a crossover.
 
 # %%
 jacobian = jax.jit(
@@ -116,4 +112,4 @@ for spread in (0.01, 0.1, 1.0):
     )
 
 # %% [markdown]
-# *Next: [which law, which method, how exact](03_speed_accuracy_stability.ipynb).*
+# *Next: [uncertain parameters and gaps together](09_parameters_and_gaps.ipynb).*

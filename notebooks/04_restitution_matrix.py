@@ -14,13 +14,13 @@
 # %% [markdown]
 # # A restitution matrix
 #
-# *Course, part 7. Before: [what the data can tell](06_what_the_data_can_tell.ipynb). Next:
-# [a tossed cube](08_a_tossed_cube.ipynb).*
+# *Course, part 4. Before: [what the data can tell](03_what_the_data_can_tell.ipynb). Next: [a
+# tossed cube](05_a_tossed_cube.ipynb).*
 #
-# Newton's law says $\gamma^+ = -e\gamma^-$ contact by contact; a **restitution matrix** $E$ lets
-# every contact answer to every other, $q_n^+ = -E q_n^-$. It can describe any shot. You will fit
-# one to a measured shot, read what the shot leaves open, see what keeps $E$ from creating energy,
-# and find out for which other shots it is worth nothing.
+# Newton's law is $\gamma^+ = -e\gamma^-$ for each contact. A **restitution matrix** $E$ couples the
+# contacts, $q_n^+ = -E q_n^-$, and can describe any shot. You will fit one to a measured shot, see
+# which entries the shot does not determine, check that $E$ cannot create energy, and find out for
+# which other shots it fails.
 
 # %%
 # %matplotlib inline
@@ -44,33 +44,33 @@ ji.plot.system(balls, [1.0, 0.0, 0.0], "Three equal balls, measured once")
 # %% [markdown]
 # ## One measured shot
 #
-# The study gives no matrix: the fit starts from an admissible one of its own and frees all entries.
-# The command `jimpact fit restitution_matrix.toml` does the same.
+# The study contains no matrix: the fit starts from an admissible one and fits all entries. The
+# command `jimpact fit restitution_matrix.toml` does the same.
 
 # %%
 study = ji.read_study("restitution_matrix.toml")
 print("start\n", study.law.matrix)
-found = study.run()
-print(found)
+first_fit = study.run()
+print(first_fit)
 
 # %% [markdown]
-# Only contact 1 approaches, so only the first column of $E$ answers: rank 2 of 4, and the report
-# says which combination the data cannot see.
+# Only contact 1 approaches, so the shot determines only the first column of $E$: rank 2 of 4. The
+# report names the combinations that the data cannot determine.
 #
-# ## What keeps $E$ honest
+# ## Which matrices are admissible
 #
-# Whatever the approach, contacts must separate afterwards and energy must not grow. The fit
-# searches among matrices that promise both; `audit_matrix` checks any other.
+# For any approach, contacts must separate afterwards, and the energy must not grow. The fit
+# searches only among matrices that guarantee both. `audit_matrix` checks any matrix.
 
 # %%
-print(ji.theory.audit_matrix(balls, found.law.matrix))
+print(ji.theory.audit_matrix(balls, first_fit.law.matrix))
 print(ji.theory.audit_matrix(balls, [[1.0, 0.5], [0.0, 1.0]]))
 
 # %% [markdown]
 # ## More kinds of shots
 #
-# From here on data are **simulated**: balls with stiffnesses and restitutions (the LZB law,
-# $e = 0.9$), struck from one side, from the other, from both; errors of 0.01 m/s.
+# All further data are **simulated**, by the law of Liu, Zhao and Brogliato (LZB) with $e = 0.9$:
+# balls struck from one side, from the other, and from both, with errors of 0.01 m/s.
 
 # %%
 truth, sigma = ji.LZB([0.9, 0.9], [1.0, 1.0]), 0.01
@@ -91,12 +91,13 @@ for name, fit in (("one side", one_side), ("two sides", two_sides), ("all kinds"
     print(f"{name}: rank {fit.rank} of 4\n{np.asarray(fit.law.matrix)}\n{fit.warnings}\n")
 
 # %% [markdown]
-# Two kinds of shots determine $E$. A third is one too many: $E$ acts linearly on the velocities of
-# approach, and balls do not. The fit says so.
+# Two kinds of shots determine $E$. A third kind contradicts them, because $E$ is linear in the
+# velocities of approach, and the balls are not. The fit reports a lack of fit.
 #
 # ## Other balls
 #
-# $E$ belongs to these masses. Take what was found from both sides to a heavier middle ball:
+# $E$ is valid for these masses only. Apply the matrix fitted to two sides to other masses of the
+# middle ball:
 
 # %%
 figure = Figure(figsize=(6, 3), layout="constrained")
@@ -111,10 +112,10 @@ axes.legend(frameon=False)
 figure
 
 # %%
-assert found.rank == 2
+assert first_fit.rank == 2
 assert two_sides.rank == 4
 assert any("lack of fit" in line.lower() for line in all_kinds.warnings)
 print(f"run time {time.perf_counter() - began:.0f} s")
 
 # %% [markdown]
-# *Next: [400 measured impacts of a cube](08_a_tossed_cube.ipynb).*
+# *Next: [400 measured impacts of a cube](05_a_tossed_cube.ipynb).*

@@ -14,14 +14,14 @@
 # %% [markdown]
 # # The rocking block
 #
-# *Course, part 4. Before: [speed, accuracy, stability](03_speed_accuracy_stability.ipynb). Next:
-# [whole motions](05_whole_motions.ipynb).*
+# *Course, part 11. Before: [a large run on Dask](10_a_large_run_on_dask.ipynb). Next: [whole
+# motions](12_whole_motions.ipynb).*
 #
-# You will learn how the shape of a block decides what follows a hit, what a kinetic angle is, and how
-# Housner's value fits into a restitution matrix.
+# You will see how the shape of a block determines its motion after an impact, what a kinetic angle
+# is, and how Housner's value becomes a restitution matrix.
 #
-# A block turns about its left corner A and hits the ground with its right corner B. What happens next
-# is a multiple impact: both corners touch. Does it go on about B (rocking), turn back about A
+# A block rotates about its left corner A and hits the ground with its right corner B. Both corners
+# touch, so this is a multiple impact. Does the block continue about B (rocking), turn back about A
 # (half-rocking), or leave the ground (free)?
 
 # %%
@@ -40,33 +40,34 @@ ji.plot.system(block, block.touching(0.1), "Rocking about A, the left corner; B 
 # %% [markdown]
 # ## Dispersion is a V over the kinetic angle
 #
-# The shape of the block, a = height / width, is in one angle:
-# $\cos\theta_{12} = -(a^2 - 2) / (a^2 + 4)$, 60 degrees for a sheet lying flat, 180 for a needle that
-# stands. The law is LZB with Hertz contacts of equal stiffness and Coulomb friction at both corners;
-# before the hit B approaches with 1, A rests, nothing slips.
+# One angle describes the shape of the block, a = height / width: $\cos\theta_{12} = -(a^2 - 2) /
+# (a^2 + 4)$. It is 60 degrees for a flat sheet and 180 degrees for a standing needle. The law is
+# that of Liu, Zhao and Brogliato (LZB) with Hertz contacts of equal stiffness and Coulomb friction
+# at both corners. Before the impact B approaches with 1, A rests, and nothing slips.
 
 # %%
 mu, e = [0.0, 0.1, 0.3, 0.8], [0.1, 0.3, 0.5, 0.7, 0.9, 1.0]
 shapes = np.linspace(0.35, 4.5, 60)
-found = ji.theory.rocking_dispersion(shapes, mu, e)
-print(found)
+result = ji.theory.rocking_dispersion(shapes, mu, e)
+print(result)
 
 # %%
 # |d| = |y_A'+ / y_B'-|
-ji.plot.rocking_dispersion(found, "Velocity of A after over velocity of B before, by LZB")
+ji.plot.rocking_dispersion(result, "Velocity of A after over velocity of B before, by LZB")
 
 # %% [markdown]
-# It is a V around its tip. Two things bend it: the kink on the right (mu = 0.3, 112 degrees) is where B
-# begins to stick; and on the left, for e up to about 0.3, A hits back late and weakly in very wide
-# blocks, so the curve turns down again.
+# The curve is a V with two deviations. At the kink on the right (mu = 0.3, 112 degrees) B begins to
+# stick. On the left, for e up to about 0.3, A rebounds late and weakly in very wide blocks, so the
+# curve turns down again.
 
 # %% [markdown]
-# ## The tip of the V is a critical angle, and friction alone decides it
+# ## Friction alone determines the critical angle at the tip
 #
-# At the tip the hit at B gives A no acceleration, so A's contact is never pressed, and neither e nor
-# stiffness nor exponent can matter. Without friction that is 90 degrees; with enough of it (B sticks)
-# 70.5 degrees, where Housner's value is zero. Left of the tip the block is wide: B's hit presses A
-# down, and A rebounds. Right of it the block is slender: B's hit lifts A at once.
+# At the tip the impact at B does not accelerate A, so the contact A is never pressed, and neither e
+# nor stiffness nor exponent matters. Without friction this is at 90 degrees; with enough friction
+# (B sticks) at 70.5 degrees, where Housner's value is zero. Left of the tip the block is wide: the
+# impact at B presses A down, and A rebounds. Right of it the block is slender: the impact at B
+# lifts A at once.
 
 # %%
 c = np.cos(np.asarray(ji.theory.critical_kinetic_angle(mu)))
@@ -81,30 +82,30 @@ for j, m in enumerate(mu):
     print(f"{m:3.1f} {angle:9.3f} deg {tips[j]:10.5f}   {least}   {size[j, :, j].min():.0e}")
 
 # %% [markdown]
-# All six restitutions have it in the same place. (`ji.theory.search_critical_angle` finds the tip from impacts
-# alone, to 1e-8 rad.)
+# The tip is at the same place for all six restitutions. (`ji.theory.search_critical_angle` finds it
+# from impacts alone, to 1e-8 rad.)
 
 # %% [markdown]
 # ## Rest, rocking, half-rocking, free
 #
-# A corner counts as staying where it leaves with at most 5 % of the approach (`STAYS`, a convention:
-# another value moves the borders). With LZB the corner that hits rebounds with about e of its speed:
-# it stays only where e is small. So rocking is slender and nearly plastic, half-rocking is a band
-# around the critical angle, and most hits set both corners free for a moment.
+# By convention a corner stays on the ground if it leaves with at most 5 % of the approach. Another
+# value moves the borders. With LZB the striking corner rebounds with about e of its speed, so it
+# stays only if e is small. Slender, nearly plastic blocks rock; half-rocking is a band around the
+# critical angle; after most impacts both corners leave the ground for a moment.
 
 # %%
 levels = np.linspace(0.02, 0.24, 12)
 field = ji.theory.rocking_dispersion(np.linspace(0.6, 2.5, 40), [0.0, 0.3, 0.8], levels)
 print(field)
-ji.plot.rocking_outcomes(field, "What the block does after the hit")
+ji.plot.rocking_outcomes(field, "Motion of the block after the impact")
 
 # %% [markdown]
 # ## Housner's value, and a restitution matrix of rocking
 #
-# Housner: if B neither slips nor rebounds, angular momentum about B is conserved, and
-# $\dot\theta^+ = e_\theta \dot\theta^-$ with $e_\theta = (2 a^2 - 1) / (2 (a^2 + 1))$. LZB with e = 0 and a
-# friction that sticks is that block. Without friction it keeps less. `ji.theory.rocking_matrix` puts e_theta into a
-# generalized restitution matrix, $q_n^+ = -E q_n^-$ and so on: the same velocities.
+# Housner assumes that B neither slips nor rebounds. Then angular momentum about B is conserved, and
+# $\dot\theta^+ = e_\theta \dot\theta^-$ with $e_\theta = (2 a^2 - 1) / (2 (a^2 + 1))$. LZB with e =
+# 0 and enough friction agrees. Without friction the block keeps less. `ji.theory.rocking_matrix`
+# puts e_theta into a generalized restitution matrix, $q_n^+ = -E q_n^-$, with the same velocities.
 
 # %%
 plastic = ji.theory.rocking_dispersion(np.linspace(1.5, 6.0, 480), [0.0, 0.1, 0.8], 0.0)
@@ -130,8 +131,8 @@ print(
 )
 
 # %% [markdown]
-# Measured ratios, as multiples of Housner's: concrete is close, rubber is not. They are conversions of
-# published numbers, not fits.
+# Measured ratios, relative to Housner's: concrete is close, rubber is not. They are converted from
+# published numbers, not fitted.
 
 # %%
 for row in ji.theory.rocking_ratios():
@@ -139,12 +140,12 @@ for row in ji.theory.rocking_ratios():
     print(f"{row.measured_over_housner:g} of Housner's value")
 
 # %% [markdown]
-# ## Rocking to rest, by LZB with friction
+# ## Rocking to rest, with LZB and friction
 #
-# Plastic hits are Housner's: each one keeps 0.85 of the angular velocity (a = 3). With e = 0.1 a hit is
-# a burst: B hops, ever less, until the accumulation ends, and then rocking goes on. The burst as a
-# whole takes what Housner's hit takes, because every hop conserves the angular momentum about B as
-# long as B does not slip (up to what gravity does meanwhile).
+# Plastic impacts agree with Housner: each keeps 0.85 of the angular velocity (a = 3). With e = 0.1
+# an impact becomes a sequence of smaller hops of B, an accumulation, and then rocking continues.
+# The whole sequence dissipates as much as one impact of Housner's, because each hop conserves the
+# angular momentum about B while B does not slip (except for gravity in the meantime).
 
 # %%
 system, theta = ji.block_system(0.2, 0.6), 0.15
@@ -168,4 +169,4 @@ print("largest angle on the other side, e = 0 and 0.1:", np.degrees(list(top.val
 ji.plot.phase_portrait(motions[0.0], 2, "LZB, e = 0, mu = 0.8: free rocking", system=system)
 
 # %% [markdown]
-# *Next: [the motion between and through impacts](05_whole_motions.ipynb).*
+# *Next: [whole motions](12_whole_motions.ipynb).*

@@ -14,13 +14,13 @@
 # %% [markdown]
 # # What the data can tell
 #
-# *Course, part 6. Before: [whole motions](05_whole_motions.ipynb). Next:
-# [a restitution matrix](07_restitution_matrix.ipynb).*
+# *Course, part 3. Before: [your own CSV file](02_your_own_csv.ipynb). Next: [a restitution
+# matrix](04_restitution_matrix.ipynb).*
 #
-# One ball strikes two others. Their velocities afterwards depend on the restitution and on the
-# ratio of the two stiffnesses: how well does a shot determine them, and what should be shot next?
-# You will read **profile likelihoods**, meet a shot with several **preimages** (stiffness ratios
-# that no measurement of it can tell apart), and let the fit **design** the next experiment.
+# One ball strikes two others. The velocities after the impact depend on the restitution and on the
+# ratio of the two stiffnesses. How well does a shot determine them, and which shot should be next?
+# You will read **profile likelihoods**, see a shot that several stiffness ratios reproduce equally
+# well, and let the fit **design** the next experiment.
 
 # %%
 # %matplotlib inline
@@ -43,8 +43,9 @@ ji.plot.system(balls, [1.0, 0.0, 0.0], "A striker, two balls at rest that touch"
 # %% [markdown]
 # ## A profile is the interval
 #
-# All shots here are **simulated**, with an error of 0.01 m/s, so that we know the truth:
-# $e = 0.95$ at both contacts, $k_2/k_1 = 3$. The fit takes one $e$ for both and the ratio.
+# All shots here are **simulated**, with an error of 0.01 m/s, so that we know the truth: $e = 0.95$
+# at both contacts, $k_2/k_1 = 3$. The fit has two parameters: one $e$ for both contacts, and the
+# ratio.
 
 # %%
 sigma = 0.01
@@ -56,7 +57,7 @@ def law(e, ratio):
 
 
 def shots(law, pre, seed=0):
-    """Simulated velocities after these."""
+    """Simulated shots with errors."""
     pre = np.atleast_2d(pre)
     exact = np.array([ji.impact(law, balls, v).velocity for v in pre])
     noise = np.random.default_rng(seed).normal(size=exact.shape)
@@ -64,12 +65,12 @@ def shots(law, pre, seed=0):
 
 
 one = shots(law(0.95, 3.0), [1.0, 0.0, 0.0])
-found = ji.fit(law(0.9, 1.0), balls, one, both)
-print(found)
+fit = ji.fit(law(0.9, 1.0), balls, one, both)
+print(fit)
 
 # %% [markdown]
-# The standard errors take the sum of squares for a parabola. A profile does not: it holds one
-# parameter, frees the other, and asks how much worse the fit becomes. What lies below the line is
+# Standard errors assume that the sum of squares is a parabola. A profile does not: it fixes one
+# parameter, fits the other, and shows how much worse the fit becomes. The values below the line are
 # the 95 % interval.
 
 
@@ -81,28 +82,28 @@ def picture(profiles, truths):
     return figure
 
 
-profiles = ji.profile(found)
+profiles = ji.profile(fit)
 picture(profiles, [0.95, 3.0])
 
 # %% [markdown]
-# ## Several preimages
+# ## Several ratios for one shot
 #
-# What a ball gets is no monotonic function of the stiffness ratio: where the second contact is much
-# stiffer, balls part and strike again, in another order. With $e = 1$ known, draw the velocities
-# over the ratio. Suppose a camera saw nothing but the ball in the middle (the band).
+# The velocities are not monotonic functions of the stiffness ratio: if the second contact is much
+# stiffer, the balls separate and strike again, in another order. Let $e = 1$ be known, and suppose
+# that the camera saw only the ball in the middle. The band shows its measured velocity.
 
 # %%
 ratios = np.geomspace(0.5, 100, 256)
 strike = np.array([1.0, 0.0, 0.0])
 v_plus = jax.vmap(lambda r: ji.impact(law(1.0, r), balls, strike).velocity)(ratios)
 truth = 20.0
-seen = shots(law(1.0, truth), strike)
-hidden = ji.Experiments(seen.pre, [[np.nan, seen.post[0, 1], np.nan]], sigma)
+full = shots(law(1.0, truth), strike)
+partial = ji.Experiments(full.pre, [[np.nan, full.post[0, 1], np.nan]], sigma)
 figure = Figure(figsize=(6, 3), layout="constrained")
 axes = figure.subplots()
 for i, colour in enumerate(("#0072B2", "#D55E00", "#009E73")):
     axes.semilogx(ratios, v_plus[:, i], color=colour, label=f"ball {i + 1}")
-axes.axhspan(*(hidden.post[0, 1] + np.array([-2, 2]) * sigma), color="#D55E00", alpha=0.2, lw=0)
+axes.axhspan(*(partial.post[0, 1] + np.array([-2, 2]) * sigma), color="#D55E00", alpha=0.2, lw=0)
 axes.set(xlabel="stiffness ratio $k_2/k_1$", ylabel="velocity after [m/s]")
 axes.legend(frameon=False)
 figure
@@ -110,40 +111,40 @@ figure
 # %%
 ratio_only = {"restitution": [0, 0], "stiffness": [0, 1]}
 limits = {"stiffness": (0.5, 100.0)}
-hidden_fit = ji.fit(law(1.0, 5.0), balls, hidden, ratio_only, bounds=limits)
-low, high = hidden_fit.confidence_interval()[0]
-(union,) = ji.profile(hidden_fit)
+partial_fit = ji.fit(law(1.0, 5.0), balls, partial, ratio_only, bounds=limits)
+low, high = partial_fit.confidence_interval()[0]
+(union,) = ji.profile(partial_fit)
 print(f"standard error: {low:.1f} to {high:.1f};  profile: {union.words};  truth {truth}")
 assert any(low <= truth <= high for low, high in union.intervals)
 picture([union], [truth])
 
 # %% [markdown]
-# Every piece is made of ratios that reproduce the shot within its error. More shots of the same kind
-# would narrow the pieces, but not remove one; a camera for the other balls would.
+# All ratios in these pieces reproduce the shot within its error. More shots of the same kind would
+# make the pieces narrower, but would not remove one. A camera for the other balls would.
 #
 # ## The next experiment
 #
-# Which shot would tell most? Try 64 of them, at most 1 m/s, in one program: the one that leaves the
-# smallest error of the ratio, then the best second one.
+# Which shot would help most? `design` tries 64 candidates of at most 1 m/s. It picks the one that
+# leaves the smallest error of the ratio, then the best second one.
 
 # %%
 rng = np.random.default_rng(1)
 candidates = rng.uniform(-1, 1, (64, 3)).round(2)
 candidates[np.argsort(-candidates, axis=1)[:, 0] == 2] *= -1  # the last must not run away
 pool = ji.Experiments(candidates, np.zeros_like(candidates), sigma)
-plan = ji.design(found, pool, count=2, target="stiffness[2]")
-print(f"now: stiffness[2] +- {found.standard_error[1]:.2g}\n{plan}")
+plan = ji.design(fit, pool, count=2, target="stiffness[2]")
+print(f"now: stiffness[2] +- {fit.standard_error[1]:.2g}\n{plan}")
 
 # %%
 more = np.concatenate([one.pre, candidates[plan.index]])
-after = ji.fit(found.law, balls, shots(law(0.95, 3.0), more, seed=1), both)
-print(f"shot 1 alone {found.standard_error}, with the two planned ones {after.standard_error}")
+after = ji.fit(fit.law, balls, shots(law(0.95, 3.0), more, seed=1), both)
+print(f"shot 1 alone {fit.standard_error}, with the two planned ones {after.standard_error}")
 print("values", after.value, "truth", [0.95, 3.0])
-assert after.standard_error[1] < 0.7 * found.standard_error[1]
+assert after.standard_error[1] < 0.7 * fit.standard_error[1]
 ji.plot.system(balls, candidates[plan.index[0]], "The shot to do next")
 
 # %%
 print(f"run time {time.perf_counter() - began:.0f} s")
 
 # %% [markdown]
-# *Next: [a law that can describe any shot, and what it is worth](07_restitution_matrix.ipynb).*
+# *Next: [a law that can describe any shot, and its limits](04_restitution_matrix.ipynb).*

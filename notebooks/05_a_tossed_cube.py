@@ -14,13 +14,13 @@
 # %% [markdown]
 # # A tossed cube
 #
-# *Course, part 8. Before: [a restitution matrix](07_restitution_matrix.ipynb).*
+# *Course, part 5. Before: [a restitution matrix](04_restitution_matrix.ipynb). Next: [the simplest
+# law](06_the_simplest_law.ipynb).*
 #
 # An acrylic cube of 10 cm was tossed on a board 456 times and filmed 148 times a second
-# (ContactNets, Pfrommer, Halm and Posa, 2020). 400 of its impacts, on one, two or four corners, with
-# friction, are clean enough to say what the velocities were before and after, each with its error.
-# You will fit impact laws to a few of them, **predict the others**, and see what the laws are
-# worth: where they are right, how far off they are, and what no parameter mends.
+# (ContactNets, Pfrommer, Halm and Posa, 2020). For 400 impacts, on one, two or four corners and
+# with friction, the velocities before and after are known with their errors. You will fit impact
+# laws to a few of these impacts, **predict the others**, and see how accurate the laws are.
 
 # %%
 # %matplotlib inline
@@ -56,12 +56,12 @@ figure
 # %% [markdown]
 # ## The data
 #
-# Every shot has a scene of its own: the pose decides which corners touch (those up to 2 mm above
-# the lowest one), where they are and how the inertia lies. Velocities are those of the centre of
-# mass (m/s) and the angular velocity (rad/s), with standard errors before and after.
+# Each shot has its own scene: the pose determines which corners touch (those up to 2 mm above the
+# lowest one) and the directions of inertia. Velocities are those of the centre of mass (m/s) and
+# the angular velocity (rad/s), with standard errors before and after.
 #
-# Some tosses are in the source twice, turned about the vertical: copies must not be
-# predicted from each other. Their vertical velocities give them away.
+# Some tosses are in the source twice, rotated about the vertical. Such copies must not be predicted
+# from each other. They have equal vertical velocities.
 
 # %%
 shots = ji.cube_impacts()
@@ -75,21 +75,22 @@ print(f"one corner {len(one.shots)}, two corners {len(two.shots)}; errors {one.s
 print(f"energy left: {np.quantile(one.energy_ratio(), [0.1, 0.5, 0.9]).round(2)}")
 
 # %% [markdown]
-# ## Fit sixteen impacts, predict the others
+# ## Fit eight impacts, predict the others
 #
-# Tosses fall into four groups. Of each group sixteen impacts on one corner are fitted, and all
-# impacts of the *other* groups are predicted. What is fitted is a restitution and a friction
-# coefficient, of LZB (energetic restitution, slip that may stop or turn during the impact) and
-# of Moreau (kinematic restitution, Coulomb's law for the impulse; for one contact that is Newton's law).
+# Divide the tosses into four groups. Fit eight impacts on one corner of each group, and predict all
+# impacts of the *other* groups. The parameters are a coefficient of restitution and one of
+# friction. The laws are LZB, the law of Liu, Zhao and Brogliato (energetic restitution, slip may
+# stop or reverse during the impact), and Moreau (kinematic restitution, Coulomb's law for the
+# impulse; for one contact this is Newton's law).
 
 # %%
 groups = {m: np.array([int(s.split(":")[0]) % 5 for s in d.shots]) for m, d in ((1, one), (2, two))}
 both = ("restitution", "friction")
-# errors before the impact matter little beside what laws leave over; without them it is faster
+# errors before the impact are small compared with those of the laws; without them the fit is faster
 plain = ji.Experiments(one.pre, one.post, one.sigma, one.scenes, one.shots, units=one.units)
-sixteen = [plain.only(np.flatnonzero(groups[1] == g)[:16]) for g in range(4)]
+few = [plain.only(np.flatnonzero(groups[1] == g)[:8]) for g in range(4)]
 fits = {
-    type(law).__name__: ji.fit_many(law, None, sixteen, both)
+    type(law).__name__: ji.fit_many(law, None, few, both)
     for law in (ji.LZB(0.5, friction=0.3), ji.Moreau(0.5, friction=0.3))
 }
 for name, found in fits.items():
@@ -97,13 +98,13 @@ for name, found in fits.items():
 
 
 # %% [markdown]
-# An error of a prediction is measured by its kinetic energy, over that of the velocity jump:
-# $\|v^+_{law} - v^+\|_M / \|v^+ - v^-\|_M$.
+# The error of a prediction is its norm in the kinetic metric, relative to that of the velocity
+# jump: $\|v^+_{law} - v^+\|_M / \|v^+ - v^-\|_M$.
 
 
 # %%
 def predicted(laws, data, group):
-    """Errors (laws, impacts) by the laws of the other groups; by that of its own: nan."""
+    """Errors (laws, impacts); nan where a law was fitted to the group of the impact."""
     scenes = jax.tree.map(lambda *x: np.stack(x), *data.scenes)
     after = [
         jax.vmap(ji.impact, in_axes=(None, 0, 0))(law, scenes, data.pre).velocity for law in laws
@@ -137,8 +138,8 @@ figure
 # %% [markdown]
 # ## Two corners
 #
-# The same laws, without any new parameter. Newton's law now asks every corner for its own
-# restitution, also the one that the other corner lifts.
+# The same laws, without new parameters. Newton's law now prescribes the restitution of each corner,
+# also of one that the other corner lifts.
 
 # %%
 laws["Newton"] = [ji.Newton(law.restitution, law.friction) for law in laws["Moreau"]]
@@ -148,10 +149,10 @@ for name, own in laws.items():
 # %% [markdown]
 # ## Is the law right?
 #
-# No: predictions are off by a few percent, and the measurements are better than that. `fit` says so,
-# and stretches the standard errors. The scatter from impact to impact is that of the cube and the
-# board (and of the 2 mm that decide which corners touch), not of the camera. Are the stretched
-# errors true? The four fits, to impacts of different tosses, should scatter as much:
+# No: predictions have errors of a few percent, and the measurements are more accurate. `fit`
+# reports this, and increases the standard errors. The scatter comes from the cube and the board
+# (and from the 2 mm that decide which corners touch), not from the camera. Are the increased errors
+# right? The four fits, to impacts of different tosses, should scatter as much:
 
 # %%
 lzb = fits["LZB"]
@@ -164,3 +165,6 @@ print("scatter of the four fits", values.std(axis=0, ddof=1), "stated", np.media
 assert np.nanmedian(errors["LZB"]) < np.nanmedian(errors["Moreau"]) < 0.07
 assert any("Lack of fit" in line for line in lzb[0].warnings)
 print(f"run time {time.perf_counter() - began:.0f} s")
+
+# %% [markdown]
+# *Next: [do you need such a law at all?](06_the_simplest_law.ipynb)*
