@@ -217,6 +217,8 @@ MUTATIONS = [
     Mutation("time of a hop halved", r"2 \* jnp\.abs\(p\) / safe", "jnp.abs(p) / safe", ("test_motion.py::test_finite_accumulation_is_passed",)),
     Mutation("plastic expansion with e for its square", r"closing / e\*\*2", "closing / e", ("test_contact_forces.py::test_a_plastic_contact_returns_its_share",)),
     Mutation("off-diagonal of a chain's Delassus matrix shifted", r"off_diagonal \* vector\[1:\], none", "off_diagonal * vector[:-1], none", ("test_scenes.py::test_chain_is_the_dense_scene",)),
+    Mutation("elimination takes the pivot's row for the others", r"return jnp\.where\(number == k, row, rows - factor \* row\)", "return jnp.where(number == 0, row, rows - factor * row)", ("test_friction_solver.py::test_dense_solves_are_those_of_numpy",), "dense.py"),
+    Mutation("redundant forces are shared equally", r"return jnp\.maximum\(share, least\) if least > 0 else share", "return jnp.ones_like(share)", ("test_friction_solver.py::test_shares_of_redundant_forces",), "dense.py"),
     Mutation("friction of many contacts in a box, not a disc", r"length = jnp\.sqrt\(jnp\.sum\(side\*\*2, axis=1, keepdims=True\)\)", "length = jnp.max(jnp.abs(side), axis=1, keepdims=True)", ("test_friction_solver.py::test_friction_of_many_contacts_has_a_round_cone",)),
     # --- further rooms
     Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py::test_compare",)),
