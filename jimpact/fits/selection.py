@@ -19,10 +19,9 @@ from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.result import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
-from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar
-from jimpact.registry import registered_laws
+from jimpact.registry import registered_laws, simplest_first
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
@@ -416,7 +415,8 @@ def _order(entry: LawFit) -> tuple[Any, ...]:
     """Adequate first, by parameters, then in the order of `advise`; the rest by error."""
     tier = _TIERS.index(entry.tier)
     base = entry.name.split(",")[0]
-    place = SIMPLEST_FIRST.index(base) if base in SIMPLEST_FIRST else len(SIMPLEST_FIRST)
+    order = simplest_first()
+    place = order.index(base) if base in order else len(order)
     error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
     return (tier, entry.parameters, place) if tier < 2 else (tier, error, place)
 
