@@ -1,4 +1,4 @@
-"""The next experiment: which shots would tell most about the parameters of a fit."""
+"""The next experiment: which shots would determine the parameters of a fit best."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +14,8 @@ from jimpact.fits.multistart import quiet, repeated, run
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
 
-# Information that is added to that of the data, in shares of their largest: where they cannot see a
-# combination of parameters yet, it is gained first.
+# Information that is added to that of the data, as a share of it: a combination of parameters that
+# the data do not determine yet comes first.
 _RIDGE = 1e-12
 
 
@@ -46,7 +46,7 @@ def design(
     count: int = 1,
     target: str | None = None,
 ) -> Design:
-    """The candidates that would tell most, one after another, if the fitted law is right.
+    """The most informative candidates, one after another, if the fitted law is right.
 
     Equation: of every shot the information `J^T J / sigma^2`; greedily, the determinant of the sum
     with what is known is made as large as possible, or the variance of the `target` least. All
