@@ -353,3 +353,16 @@ def test_every_body_can_be_drawn():
     assert len({tuple(sorted(x)) for x in itertools.pairwise(ends)}) == 12
     assert lengths.max() <= 0.2
     assert shadow[:, 1].max() < edges[:, 1].min()
+
+
+def test_bodies_without_contacts_and_gaps_of_another_shape_are_refused():
+    with pytest.raises(ValueError, match=r"m >= 1 contacts of Discs, but it returns \(0,\)"):
+        ji.Discs(1.0, [0.1]).scene([0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match=r"`gap_function` must return shape \(m,\).*\(1, 1\)"):
+        ji.scene_from_gaps(lambda q: q[None], [1.0], [0.5])
+
+
+@pytest.mark.parametrize("q", [[0.0, 1.0, 0.0], np.zeros((0, 3))])
+def test_scenes_need_rows_of_configurations(q):
+    with pytest.raises(ValueError, match=r"`q` must have shape \(K, d\)"):
+        ji.Block(1.0, 2.0).scenes(q)

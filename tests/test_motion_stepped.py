@@ -376,12 +376,34 @@ def test_tangents_that_do_not_fit_are_named():
         ({"tangent_function": lambda q: q[None]}, r"`tangent_function` that returns"),
         ({"base": lambda t: jnp.stack([t, t]), "base_directions": [[1.0], [0.0]]}, "`base` that"),
         ({"base": lambda t: t, "base_directions": [[1.0]]}, "`base_directions` must have shape"),
+        ({"force": lambda q, v: v}, r"`force` that takes JAX arrays \(q, v, t\)"),
+        ({"force": lambda q, v, t: np.asarray(v)}, "`force` .* raises TracerArrayConversionError"),
+        ({"force": lambda q, v, t: None}, "`force` .* returns None"),
+        ({"gap_function": lambda q: [q[0]]}, "`gap_function` .* raises TypeError"),
+        ({"gap_function": lambda q: 1}, "`gap_function` that returns floating numbers"),
     ],
 )
 def test_functions_of_a_system_must_return_what_they_should(given, named, options):
     system = ji.System(**({"gap_function": lambda q: q[:1], "mass": [1.0, 1.0]} | given))
-    with pytest.raises(ValueError, match=named):
+    with pytest.raises((ValueError, TypeError), match=named):
         ji.simulate(system, ji.Moreau(0.5), [1.0, 0.0], [0.0, 0.0], 1.0, **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"method": "time_stepping", "step": 1e-2}])
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"mass": lambda q: jnp.ones(1)},
+        {"force": lambda q, v, t: jnp.ones(1)},
+        {"potential": lambda q: jnp.ones(())},
+    ],
+)
+def test_functions_of_a_system_compute_in_the_precision_of_the_start(given, options):
+    one = np.ones(1, np.float32)
+    system = ji.System(**({"gap_function": lambda q: q, "mass": one} | given))
+    name = next(iter(given))
+    with pytest.raises(TypeError, match=f"precision of `q0`, float32, but its `{name}` returns"):
+        ji.simulate(system, ji.Moreau(np.float32(0.5)), one, 0 * one, 1.0, **options)
 
 
 def test_a_disc_without_walls_is_told():

@@ -105,3 +105,12 @@ def test_nothing_approaches_and_bad_input():
         turning_impact(GAPS, MASS, FLAT - 0.1, LANDING, Hertz(1e6))
     with pytest.raises(TypeError, match="`force`"):
         turning_impact(GAPS, MASS, FLAT, LANDING, 1.0)
+
+
+def test_a_tolerance_that_single_precision_cannot_reach_is_refused():
+    start = np.asarray(FLAT, np.float32), np.asarray(LANDING, np.float32)
+    with (
+        jax.numpy_dtype_promotion("standard"),
+        pytest.raises(ValueError, match=r"`rtol` must be at least .* roundings of float32"),
+    ):
+        turning_impact(Block(1.0, 1.0), None, *start, Hertz(1e8))

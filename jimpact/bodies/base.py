@@ -210,19 +210,15 @@ class Body(eqx.Module):
         check_shape("q", q, size, "one per coordinate of the body")
         check_values("q", q)
         mass, normals, tangents, f, margin = self._parts(q)
-        if not is_traced(margin) and not float(margin) >= 0:
+        if f.ndim != 1 or f.size == 0:
             raise ValueError(
-                f"Argument `q` must be in the range of the gap function ({self.range_in_words}), "
-                f"but its margin `valid(q)` has value {float(margin):g}."
+                "Argument `gap_function` must return shape (m,), a gap for each of m >= 1 contacts "
+                f"of {type(self).__name__}, but it returns {f.shape}."
             )
+        check_range("q", self, margin)
         eps = float(jnp.finfo(f.dtype).eps)
         none = jnp.maximum(closed_below, _ROUNDINGS * eps * jnp.maximum(1.0, jnp.abs(q).max()))
-        if not is_traced((f, none)) and bool(jnp.any(f < -none)):
-            worst = int(jnp.argmin(f))
-            raise ValueError(
-                f"Argument `q` must have no penetration (f >= -{float(none):g} m), "
-                f"but gap {worst} has value {float(f[worst]):g} m."
-            )
+        check_penetration("q", f, none)
         gaps = jnp.where(f > none.astype(f.dtype), f, 0.0)
         parts = (mass, normals, tangents, gaps)
         return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), parts))
@@ -242,27 +238,29 @@ class Body(eqx.Module):
         2
         """
         q = as_float_array("q", q)
+        if q.ndim != 2 or len(q) == 0:
+            raise ValueError(
+                f"Argument `q` must have shape (K, d), K >= 1 configurations, but has {q.shape}."
+            )
         d = self.coordinates or jax.eval_shape(self.mass_matrix, q[0]).shape[0]
         check_shape("q", q, (len(q), d), "a configuration a row")
         check_values("q", q)
         check_values("near", near, low=0.0)
         each = jax.tree.map(np.asarray, _many_parts(self, q))
         masses, normals, tangents, gaps, margins = each
-        if not (margins >= 0).all():
-            k = int(np.argmin(margins >= 0))
-            raise ValueError(
-                f"Argument `q` must be in the range of the gap function ({self.range_in_words}), "
-                f"but its margin `valid(q)` has value {margins[k]:g} in row {k + 1}."
-            )
+        for k, margin in enumerate(margins):
+            check_range("q", self, margin, f" in row {k + 1}")
         scenes, count = [], gaps.shape[1]
-        for k, on in enumerate(gaps <= gaps.min(axis=1, keepdims=True) + near):
-            sides = tangents
+        for k, closed in enumerate(gaps <= gaps.min(axis=1, keepdims=True) + near):
+            closed_tangents = None
             if tangents is not None:
-                sides = tangents[k][:, np.repeat(on, tangents.shape[2] // count)]
-            scenes.append(Scene(masses[k], normals[k][:, on], sides))
+                columns = np.repeat(closed, tangents.shape[2] // count)
+                closed_tangents = tangents[k][:, columns]
+            scenes.append(Scene(masses[k], normals[k][:, closed], closed_tangents))
         return scenes
 
     def _parts(self, q: jax.Array) -> "_Parts":
+        """What a scene at q needs, by a compiled program."""
         return _compiled_parts(self, q)
 
 
@@ -271,6 +269,7 @@ _Parts = tuple[jax.Array, jax.Array, jax.Array | None, jax.Array, jax.Array]
 
 
 def _parts(body: Body, q: jax.Array) -> _Parts:
+    """What a scene at q needs; normals are NaN out of the range of the gap function."""
     margin = body.valid(q)
     normals = jnp.where(margin >= 0, body.normals(q), jnp.nan)
     return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q), margin
@@ -278,6 +277,26 @@ def _parts(body: Body, q: jax.Array) -> _Parts:
 
 _compiled_parts = eqx.filter_jit(_parts)
 _many_parts = eqx.filter_jit(jax.vmap(_parts, in_axes=(None, 0)))
+
+
+def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:
+    """Raise where the margin () of the range of the gap function is negative."""
+    if not is_traced(margin) and not float(margin) >= 0:
+        raise ValueError(
+            f"Argument `{name}` must be in the range of the gap function ({body.range_in_words}), "
+            f"but its margin `valid({name})` has value {float(margin):g}{where}."
+        )
+
+
+def check_penetration(name: str, f: jax.Array, closed_below: jax.Array) -> None:
+    """Raise unless all gaps f (m,) are at least `-closed_below` [m]."""
+    if is_traced((f, closed_below)) or (f >= -closed_below).all():
+        return
+    worst = int(jnp.argmin(f))
+    raise ValueError(
+        f"Argument `{name}` must have no penetration (f >= -{float(closed_below):g} m), "
+        f"but gap {worst} has value {float(f[worst]):g} m."
+    )
 
 
 class GivenBody(Body):
@@ -317,10 +336,11 @@ class GivenBody(Body):
 
     def tangent_function(self, q: jax.Array) -> jax.Array | None:
         """Displacements (m,) [m] along the contact planes."""
-        found = None if self.sliding is None else self.sliding(q)
-        return None if found is None else jnp.atleast_1d(found)
+        displacements = None if self.sliding is None else self.sliding(q)
+        return None if displacements is None else jnp.atleast_1d(displacements)
 
     def _parts(self, q: jax.Array) -> _Parts:
+        """What a scene at q needs."""
         return _parts(self, q)  # each new lambda would be compiled anew
 
 
@@ -366,32 +386,31 @@ class LinearPotential(eqx.Module):
 
 def positive(name: str, value: Any, low_allowed: bool = False) -> jax.Array:
     """A scalar > 0, or >= 0 where `low_allowed`."""
-    number = as_float_array(name, value)
-    check_shape(name, number, (), "one number")
-    check_values(name, number, low=0.0, open_low=not low_allowed)
-    return number
+    scalar = number(name, value)
+    check_values(name, scalar, low=0.0, open_low=not low_allowed)
+    return scalar
 
 
 def number(name: str, value: Any) -> jax.Array:
     """A finite scalar."""
-    found = as_float_array(name, value)
-    check_shape(name, found, (), "one number")
-    check_values(name, found)
-    return found
+    scalar = as_float_array(name, value)
+    check_shape(name, scalar, (), "one number")
+    check_values(name, scalar)
+    return scalar
 
 
 def positives(
     name: str, value: Any, count: int | None = None, low_allowed: bool = False
 ) -> jax.Array:
     """Numbers (count,) > 0, or >= 0 where `low_allowed`; a scalar stands for all of them."""
-    found = as_float_array(name, value)
-    if count is not None and found.ndim == 0:
-        found = jnp.full(count, found)
-    if found.ndim != 1 or (count is not None and found.shape[0] != count):
+    numbers = as_float_array(name, value)
+    if count is not None and numbers.ndim == 0:
+        numbers = jnp.full(count, numbers)
+    if numbers.ndim != 1 or (count is not None and numbers.shape[0] != count):
         size = "n" if count is None else count
-        raise ValueError(f"Argument `{name}` must have shape ({size},), but has {found.shape}.")
-    check_values(name, found, low=0.0, open_low=not low_allowed)
-    return found
+        raise ValueError(f"Argument `{name}` must have shape ({size},), but has {numbers.shape}.")
+    check_values(name, numbers, low=0.0, open_low=not low_allowed)
+    return numbers
 
 
 def planar_directions(mass: jax.Array) -> jax.Array:

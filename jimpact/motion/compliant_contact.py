@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jimpact._checks import as_float_array, check_kind, check_shape, check_values
+from jimpact._checks import as_float_array, check_kind, check_shape, check_values, in_common_dtype
 from jimpact.bodies.base import Body
 from jimpact.compiling import quick_jit
 from jimpact.contact import delassus_matrix
@@ -23,6 +23,7 @@ from jimpact.motion.flow import (
     Settings,
     State,
     allowed_errors,
+    check_rtol,
     first_flight,
     longest_step,
     no_samples,
@@ -40,11 +41,13 @@ from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, wit
 from jimpact.motion.system import System
 from jimpact.scene import gap_velocity
 
-SNAP = 1e-2  # of the errors allowed: margins closer to 0 are 0
-SLOWEST = 1e-12  # [m/s] unit of speed of contacts that have not moved yet: any small one
+# Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off by a tenth
+# of the tolerance.
+SNAP = 1e-2
+SLOWEST = 1e-12  # [m/s] scale of contacts that have not moved yet; any small one would do
 
 
-class Units(NamedTuple):
+class ContactScales(NamedTuple):
     """Scales of each contact (m,), from its fastest approach so far."""
 
     speed: jax.Array  # [m/s]
@@ -53,12 +56,12 @@ class Units(NamedTuple):
     impulse: jax.Array  # [N s]
 
 
-def _units(force: Force, given: Contacts, fastest: jax.Array) -> Units:
-    """The units that belong to these speeds (m,)."""
-    speed, w = jnp.maximum(fastest, SLOWEST), jnp.diagonal(given.delassus)
+def _contact_scales(force: Force, contacts: Contacts, fastest: jax.Array) -> ContactScales:
+    """The scales that belong to these speeds (m,)."""
+    speed, w = jnp.maximum(fastest, SLOWEST), jnp.diagonal(contacts.delassus)
     depth = force.indentation_scale(0.5 * speed**2 / w)
     return jax.lax.stop_gradient(
-        Units(speed, depth, force.force(depth, jnp.zeros_like(depth)), speed / w)
+        ContactScales(speed, depth, force.force(depth, jnp.zeros_like(depth)), speed / w)
     )
 
 
@@ -73,7 +76,7 @@ class CompliantFlow(MotionFlow):
     """
 
     force: Force
-    units: Units
+    scales: ContactScales
 
     def constants(self, modes: jax.Array) -> jax.Array:
         """The phase of each contact."""
@@ -82,8 +85,8 @@ class CompliantFlow(MotionFlow):
     def field(self, const: jax.Array, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Rates of the state."""
         at = unpacked(self.like, y)
-        given = contacts_at(self.system, at.q, at.v, at.t, False)
-        x, gamma = at.contact[0], given.normal.rate
+        contacts = contacts_at(self.system, at.q, at.v, at.t, False)
+        x, gamma = at.contact[0], contacts.normal.rate
         loaded = (const == COMPRESSION) | (const == EXPANSION)
         push = self.force.force(jnp.where(x >= 0, x, 0.0), -gamma)
         push = jnp.where(loaded, jnp.maximum(push, 0.0), 0.0)
@@ -94,10 +97,10 @@ class CompliantFlow(MotionFlow):
         carried = base_velocity(self.system, at.t)
         base = jnp.zeros_like(at.t)
         if carried is not None:
-            base = (given.normal.gradient @ push) @ carried
+            base = (contacts.normal.gradient @ push) @ carried
         rates = State(
             q=self.system.body.rates(at.q, at.v),
-            v=given.free + given.moved @ push,
+            v=contacts.free + contacts.moved @ push,
             t=jnp.ones_like(at.t),
             work=user_force(self.system, at.q, at.v, at.t) @ at.v,
             base_work=base,
@@ -110,9 +113,9 @@ class CompliantFlow(MotionFlow):
         """Where a gap closes, a force ends or returns; where compression turns."""
         at = unpacked(self.like, y)
         rate, x = kinematics(self.system, at.q, at.v, at.t).rate, at.contact[0]
-        gamma, depth = rate / self.units.speed, x / self.units.depth
+        gamma, depth = rate / self.scales.speed, x / self.scales.depth
         if self.force.slackens:
-            onset = self.force.onset(x, -rate) / self.units.force
+            onset = self.force.onset(x, -rate) / self.scales.force
             by_x = jnp.where(const == COMPRESSION, onset, -onset)
             by_g = jnp.where(const == SLACK, depth, 1.0)
         else:
@@ -156,13 +159,26 @@ class CompliantFlow(MotionFlow):
         return any_of((after == COMPRESSION) & ((before == OPEN) | (before == SLACK)))
 
 
-class _Run(NamedTuple):
+class _CompliantRun(NamedTuple):
+    """A motion with contact forces up to now."""
+
     flight: Flight
     samples: jax.Array
     fastest: jax.Array  # (m,) approach so far [m/s]
     events: Events
     status: jax.Array
     apart: jax.Array  # whether all contacts are open and none closes
+
+
+class _CompliantProblem(NamedTuple):
+    """What does not change from pass to pass."""
+
+    system: System
+    force: Force
+    settings: Settings
+    times: jax.Array
+    start: State
+    max_events: int
 
 
 def compliant_motion(
@@ -180,80 +196,105 @@ def compliant_motion(
     Returns:
         The course, the last state, and whether all contacts are open and none closes in it.
     """
-    given = contacts_at(system, q0, v0, times[0], False)
-    m, dtype = given.normal.value.shape[0], q0.dtype
+    start = _begin(system, force, settings, q0, v0, times, max_events)
+    state = start.flight.state
+    problem = _CompliantProblem(system, force, settings, times, state, max_events)
+
+    def going(run: _CompliantRun) -> jax.Array:
+        on = (run.status == MOTION_CODE["ok"]) & (run.flight.sample < times.shape[0])
+        return on & ~run.apart if until_apart else on
+
+    end = jax.lax.while_loop(going, lambda run: _one_pass(problem, run), start)
+    samples = sampled_states(end.samples, state, end.flight.sample)
+    course = Course(samples, end.events, end.flight.steps, end.status)
+    return course, end.flight.state, end.apart
+
+
+def _begin(
+    system: System,
+    force: Force,
+    settings: Settings,
+    q0: jax.Array,
+    v0: jax.Array,
+    times: jax.Array,
+    max_events: int,
+) -> _CompliantRun:
+    """The run before its first pass: phases follow from gaps and their rates."""
+    contacts = contacts_at(system, q0, v0, times[0], False)
+    gap, gamma = contacts.normal.value, contacts.normal.rate
+    m, dtype = gap.shape[0], q0.dtype
     zero, none = jnp.zeros((), dtype), jnp.zeros((2, m), dtype)
-    gap = given.normal.value
     x = jnp.where(jnp.abs(gap) <= settings.closed_below, 0.0, -gap)
     state = State(q0, v0, times[0], zero, zero, none, jnp.stack([x, jnp.zeros_like(x)]))
-    gamma = given.normal.rate
     phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), COMPRESSION, OPEN)
     if not force.slackens:
         phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
-    begin = first_flight(system, state, phase[:, None].astype(jnp.int32), 2 * m, times)
+    flight = first_flight(system, state, phase[:, None].astype(jnp.int32), 2 * m, times)
     events = no_events(max_events, q0, v0, m)
-    start = _Run(
-        toward_sample(begin, times, begin.free),
+    return _CompliantRun(
+        toward_sample(flight, times, flight.free),
         no_samples(state, times),
         jax.lax.stop_gradient(jnp.maximum(-gamma, 0.0)),
         events,
         status_at_start(system, state, times[-1], jnp.inf),
         jnp.all((phase == OPEN) & (gamma >= 0)),
     )
-    blank = jnp.zeros((packed(state).shape[0], 1), dtype)
-
-    def going(run: _Run) -> jax.Array:
-        on = (run.status == MOTION_CODE["ok"]) & (run.flight.sample < times.shape[0])
-        return on & ~run.apart if until_apart else on
-
-    def one(run: _Run) -> _Run:
-        flight = run.flight
-        given = contacts_at(system, flight.state.q, flight.state.v, flight.state.t, False)
-        units = _units(force, given, run.fastest)
-        share = jnp.full(2 * m, SNAP * settings.rtol, dtype)
-        rounded, longest = roundings(settings, share, times), longest_step(system, times)
-        flow = CompliantFlow(
-            system, rounded, times[0], settings.rtol, blank, state, longest, force, units
-        )
-        ledger = allowed_errors(system, settings, flight.state, 1.0)[: -2 * m]
-        rows = jnp.concatenate([ledger, settings.rtol * units.depth, settings.rtol * units.impulse])
-        flown, _ = one_pass(flow, settings, rows, times, flight)
-        before, after = (f.aim.modes[:, 0] for f in (flight, flown))
-        closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
-        at = flown.state
-        gamma = kinematics(system, at.q, at.v, at.t).rate
-        row = {
-            "time": at.t,
-            "kind": jnp.where(jnp.any(closed), KIND_CODE["contact"], KIND_CODE["detachment"]),
-            "contacts": closed | opened,
-            "q": at.q,
-            "velocity_before": at.v,
-            "velocity_after": at.v,
-            "impulse": jnp.where(opened, at.contact[1], 0.0),
-            "tangential_impulse": jnp.zeros_like(gamma),
-        }
-        happened = jnp.any(closed | opened)
-        full = happened & (run.events.count >= max_events)
-        status = jnp.where(full, MOTION_CODE["max_events"], run.status)
-        status = jnp.where(flown.stuck, why_stuck(system, flown, q0, times), status)
-        fastest = jnp.maximum(run.fastest, jnp.maximum(-gamma, 0.0))
-        return _Run(
-            flown,
-            put(run.samples, packed(at)[:, 0], flight.sample),
-            jax.lax.stop_gradient(fastest),
-            with_row(run.events, happened, row),
-            status.astype(jnp.int32),
-            jnp.all((after == OPEN) & (gamma >= 0)),
-        )
-
-    end = jax.lax.while_loop(going, one, start)
-    samples = sampled_states(end.samples, state, end.flight.sample)
-    course = Course(samples, end.events, end.flight.steps, end.status)
-    return course, end.flight.state, end.apart
 
 
-RTOL = 1e-9
-HORIZON = 200.0  # contact times after which an impact is given up
+def _one_pass(problem: _CompliantProblem, run: _CompliantRun) -> _CompliantRun:
+    """One pass of the stepper, and what it shows."""
+    system, times, flight = problem.system, problem.times, run.flight
+    flown = _flown(problem, run)
+    before, after = (f.aim.modes[:, 0] for f in (flight, flown))
+    closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
+    at = flown.state
+    gamma = kinematics(system, at.q, at.v, at.t).rate
+    row = {
+        "time": at.t,
+        "kind": jnp.where(jnp.any(closed), KIND_CODE["contact"], KIND_CODE["detachment"]),
+        "contacts": closed | opened,
+        "q": at.q,
+        "velocity_before": at.v,
+        "velocity_after": at.v,
+        "impulse": jnp.where(opened, at.contact[1], 0.0),
+        "tangential_impulse": jnp.zeros_like(gamma),
+    }
+    happened = jnp.any(closed | opened)
+    full = happened & (run.events.count >= problem.max_events)
+    status = jnp.where(full, MOTION_CODE["max_events"], run.status)
+    status = jnp.where(flown.stuck, why_stuck(system, flown, problem.start.q, times), status)
+    fastest = jnp.maximum(run.fastest, jnp.maximum(-gamma, 0.0))
+    return _CompliantRun(
+        flown,
+        put(run.samples, packed(at)[:, 0], flight.sample),
+        jax.lax.stop_gradient(fastest),
+        with_row(run.events, happened, row),
+        status.astype(jnp.int32),
+        jnp.all((after == OPEN) & (gamma >= 0)),
+    )
+
+
+def _flown(problem: _CompliantProblem, run: _CompliantRun) -> Flight:
+    """The flight after one pass of the stepper, on the scales of the contacts so far."""
+    system, force, settings, times, start, _ = problem
+    at, m = run.flight.state, run.fastest.shape[0]
+    contacts = contacts_at(system, at.q, at.v, at.t, False)
+    scales = _contact_scales(force, contacts, run.fastest)
+    share = jnp.full(2 * m, SNAP * settings.rtol, at.q.dtype)
+    rounded, longest = roundings(settings, share, times), longest_step(system, times)
+    blank = jnp.zeros((run.samples.shape[1], 1), at.q.dtype)
+    flow = CompliantFlow(
+        system, rounded, times[0], settings.rtol, blank, start, longest, force, scales
+    )
+    ledger = allowed_errors(system, settings, at, 1.0)[: -2 * m]
+    rows = jnp.concatenate([ledger, settings.rtol * scales.depth, settings.rtol * scales.impulse])
+    return one_pass(flow, settings, rows, times, run.flight)[0]
+
+
+RTOL = 1e-9  # of `turning_impact`
+HORIZON = 200.0  # contact times after which an impact is given up; more only delays that
+MOST_EVENTS = 1000  # contacts that close or open in one impact; ten times more takes memory only
+PENETRATION = 1e-12  # [m] gaps this small are closed where an impact starts, as in `Body.scene`
 
 
 class TurningImpact(eqx.Module):
@@ -295,7 +336,8 @@ def turning_impact(
         Forward derivatives (motions by contact forces have no reverse ones).
 
     Raises:
-        ValueError: sizes, NaN, penetration, a mass that is not positive. TypeError: no `Force`.
+        ValueError: sizes, NaN, penetration, a mass that is not positive, an `rtol` that single
+            precision cannot reach. TypeError: no `Force`.
 
     >>> import jimpact as ji
     >>> block, q, v = ji.Block(1.0, 1.0), [0.0, 0.5, 0.0], [0.0, -0.5, -1.0]
@@ -307,7 +349,8 @@ def turning_impact(
     check_shape("velocity", v, position.shape, "one per coordinate")
     check_values("velocity", v)
     check_kind("force", force, Force)
-    system = System(gap_function, mass)
+    system, force, position, v = in_common_dtype(System(gap_function, mass), force, position, v)
+    check_rtol(rtol, position.dtype)
     scene = system.body.scene(position)  # and its checks
     gamma = gap_velocity(scene, v)
     speed = jnp.max(jnp.where(gamma < 0, -gamma, 0.0))
@@ -328,10 +371,11 @@ def _turning(
     rtol: float,
     max_steps: int,
 ) -> TurningImpact:
+    """The impact as one program, from time 0 to `horizon` () [s] at most."""
     zero = jnp.zeros_like(horizon)
     settings = Settings(
-        rtol, rtol * 1e-3, jnp.asarray(1e-12), zero, max_steps, False, horizon, zero
+        rtol, rtol * 1e-3, jnp.asarray(PENETRATION), zero, max_steps, False, horizon, zero
     )
     times = jnp.stack([zero, horizon])
-    _, end, apart = compliant_motion(system, force, settings, q, v, times, 1000, True)
+    _, end, apart = compliant_motion(system, force, settings, q, v, times, MOST_EVENTS, True)
     return TurningImpact(end.v, end.q, end.t, apart)

@@ -3,9 +3,10 @@
 One loop, one pass: where an event waits it is resolved, then a step is tried. Lanes of a batch
 advance independently; an event waits until as many lanes wait as fly.
 
-DERIVATIVES   The run writes down its accepted steps and what was decided at its events (`Plan`). A
-second walk through them, in which nothing is decided, is a scan: JAX differentiates it in both
-modes and any order. Its blocks of rows are checkpoints, and blocks without a step are skipped.
+DERIVATIVES   The run writes down its accepted steps and what was decided at its events
+(`MotionPlan`). A second walk through them, in which nothing is decided, is a scan: JAX
+differentiates it in both modes and any order. Its blocks of rows are checkpoints, and blocks
+without a step are skipped.
 """
 
 from typing import Any, NamedTuple
@@ -62,11 +63,11 @@ class Past(NamedTuple):
     """What a run takes over from the one before it."""
 
     most: jax.Array  # () events that are still allowed
-    numbers: jax.Array  # (k,) see `_handed_over`; 0 where the motion begins
+    numbers: jax.Array  # (k,) see `_pack_checkpoint`; 0 where the motion begins
 
 
-class Given(NamedTuple):
-    """What a motion follows from."""
+class MotionProblem(NamedTuple):
+    """What determines a motion."""
 
     system: System
     law: Law
@@ -94,7 +95,7 @@ class Event(NamedTuple):
     decision: Decision
 
 
-class Row(NamedTuple):
+class PlanRow(NamedTuple):
     """Of a plan: an event perhaps, a step after it perhaps."""
 
     event: Event
@@ -102,15 +103,15 @@ class Row(NamedTuple):
     aim: stepper.Step
 
 
-class Plan(NamedTuple):
+class MotionPlan(NamedTuple):
     """Rows of a run; those beyond `used` are not to be read."""
 
-    rows: Row  # (R, ..)
+    rows: PlanRow  # (R, ..)
     used: jax.Array
     lost: jax.Array  # whether there were too few
 
 
-class Table(NamedTuple):
+class MotionTable(NamedTuple):
     """What a motion writes down; rows beyond those reached hold anything."""
 
     samples: jax.Array  # (S + 1, rows of the state)
@@ -118,7 +119,7 @@ class Table(NamedTuple):
     marks: jax.Array  # (E + 1, 2 + m) kind, status of the law, contacts
 
 
-class _Run(NamedTuple):
+class _EventRun(NamedTuple):
     flight: Flight
     struck: jax.Array  # (m,) contacts that had an impact
     allowed: jax.Array  # errors of the ledger
@@ -126,50 +127,50 @@ class _Run(NamedTuple):
     approach: jax.Array  # of an impact without collision, 0 where another event waits
     several: jax.Array  # whether there were several solutions at an event
     last: Event  # before the next step, or a longer time ago
-    table: Table
+    table: MotionTable
     seen: jax.Array  # events
     status: jax.Array
-    plan: Plan | None
+    plan: MotionPlan | None
 
 
-class _End(NamedTuple):
-    table: Table
+class _EventEnd(NamedTuple):
+    table: MotionTable
     reached: jax.Array  # samples
     seen: jax.Array  # events
     steps: jax.Array
     status: jax.Array
-    plan: Plan | None
+    plan: MotionPlan | None
     past: jax.Array | None  # numbers for the next run
 
 
-def no_past(q: jax.Array, v: jax.Array, contacts: int, samples: int) -> jax.Array:
+def empty_checkpoint(q: jax.Array, v: jax.Array, contacts: int, samples: int) -> jax.Array:
     """Numbers of a `Past` for a motion that begins."""
     state = q.shape[0] + v.shape[0] + 2 * contacts + 3
     return jnp.asarray(np.zeros((samples + 2) * state + ROOM * (contacts + 2), q.dtype))
 
 
-def event_driven(given: Given, max_events: int) -> tuple[Course, jax.Array | None]:
+def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.Array | None]:
     """The motion from `times[0]` to `times[-1]`, sampled at `times`; it has both derivatives.
 
-    With it, where there is a `given.past`, what the next run takes over, which goes on after the
+    With it, where there is a `problem.past`, what the next run takes over, which goes on after the
     last of `max_events`.
     """
-    leaves, tree = jax.tree.flatten(given)
+    leaves, tree = jax.tree.flatten(problem)
     fixed = [None if eqx.is_array(x) else x for x in leaves]
 
-    def rebuilt(arrays: tuple[jax.Array, ...]) -> Given:
+    def rebuilt(arrays: tuple[jax.Array, ...]) -> MotionProblem:
         every = iter(arrays)
         return jax.tree.unflatten(tree, [next(every) if x is None else x for x in fixed])
 
     @jax.custom_jvp
-    def value(*arrays: jax.Array) -> _End:
+    def value(*arrays: jax.Array) -> _EventEnd:
         return _run(rebuilt(arrays), max_events, records=False)
 
     def rule(arrays: Any, tangents: Any) -> Any:
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
         end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
         assert end.plan is not None
-        plan: Plan = end.plan
+        plan: MotionPlan = end.plan
 
         def smooth(*moved: jax.Array) -> tuple[jax.Array, jax.Array]:
             some = iter(moved)
@@ -181,65 +182,65 @@ def event_driven(given: Given, max_events: int) -> tuple[Course, jax.Array | Non
         found, slopes = jax.jvp(smooth, values, rates)
         recorded = end.table.samples, end.table.events
         samples, events = selected(plan.lost, recorded, found)
-        end = end._replace(table=Table(samples, events, end.table.marks), plan=None)
+        end = end._replace(table=MotionTable(samples, events, end.table.marks), plan=None)
         none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)
-        return end, none._replace(table=Table(slopes[0], slopes[1], none.table.marks))
+        return end, none._replace(table=MotionTable(slopes[0], slopes[1], none.table.marks))
 
     value.defjvp(rule, symbolic_zeros=True)
     end = value(*(x for x, y in zip(leaves, fixed) if y is None))
-    samples = sampled_states(end.table.samples, given.start, end.reached)
-    events = _events(end.table, end.seen, given)
+    samples = sampled_states(end.table.samples, problem.start, end.reached)
+    events = _events(end.table, end.seen, problem)
     return Course(samples, events, end.steps, end.status), end.past
 
 
 # ------------------------------------------------------------------------------ the run
 
 
-def _run(given: Given, max_events: int, records: bool) -> _End:
+def _run(problem: MotionProblem, max_events: int, records: bool) -> _EventEnd:
     """From event to event; with its plan, if it `records`."""
-    start = _begin(given, max_events, records)
-    if given.past is not None:
-        start = _continued(start, given.past.numbers)
+    start = _begin(problem, max_events, records)
+    if problem.past is not None:
+        start = _unpack_checkpoint(start, problem.past.numbers)
 
-    def goes_on(run: _Run) -> jax.Array:
+    def goes_on(run: _EventRun) -> jax.Array:
         flight = run.flight
-        there = flight.sample >= given.times.shape[0]
+        there = flight.sample >= problem.times.shape[0]
         return (run.status == MOTION_CODE["ok"]) & ~flight.stuck & ~there
 
-    def one(run: _Run) -> _Run:
+    def one(run: _EventRun) -> _EventRun:
         on = goes_on(run)
         waiting, flying = on & run.waits, on & ~run.waits
         due = over_lanes(waiting.astype(jnp.int32)) >= over_lanes(flying.astype(jnp.int32))
-        run = _resolved(given, max_events, run, waiting, due)
-        return _flown(given, run, goes_on(run) & ~run.waits)
+        run = _resolved(problem, max_events, run, waiting, due)
+        return _flown(problem, run, goes_on(run) & ~run.waits)
 
     end = jax.lax.while_loop(lambda run: any_lane(goes_on(run)), one, start)
     stuck = end.flight.stuck & (end.status == MOTION_CODE["ok"])
     status = jnp.where(
-        stuck, why_stuck(given.system, end.flight, given.q0, given.times), end.status
+        stuck, why_stuck(problem.system, end.flight, problem.q0, problem.times), end.status
     ).astype(jnp.int32)
     told = end.several & (status == MOTION_CODE["ok"])
     status = jnp.where(told, MOTION_CODE["several_outcomes"], status).astype(jnp.int32)
     flight, past = end.flight, None
-    if given.past is not None:
-        past = _handed_over(end, given.past.numbers.shape[0])
-    return _End(end.table, flight.sample, end.seen, flight.steps, status, end.plan, past)
+    if problem.past is not None:
+        past = _pack_checkpoint(end, problem.past.numbers.shape[0])
+    return _EventEnd(end.table, flight.sample, end.seen, flight.steps, status, end.plan, past)
 
 
-def _remembered(run: _Run) -> Any:
+def _remembered(run: _EventRun) -> Any:
     """What a run must know of the one before it."""
     waits = run.waits, run.approach, run.several
     return run.flight, run.struck, run.allowed, waits, run.last, run.table.samples
 
 
-def _handed_over(run: _Run, size: int) -> jax.Array:
+def _pack_checkpoint(run: _EventRun, size: int) -> jax.Array:
     """1, and what is remembered, as numbers (size,)."""
     parts = [jnp.ravel(x).astype(run.allowed.dtype) for x in jax.tree.leaves(_remembered(run))]
     flat = jnp.concatenate([jnp.ones(1, run.allowed.dtype), *parts])
     return jnp.pad(flat, (0, size - flat.shape[0]))
 
 
-def _continued(start: _Run, past: jax.Array) -> _Run:
+def _unpack_checkpoint(start: _EventRun, past: jax.Array) -> _EventRun:
     """The run that goes on from `past`, or `start` if there is none."""
     leaves, tree = jax.tree.flatten(_remembered(start))
     ends = np.cumsum([1] + [x.size for x in leaves])
@@ -261,15 +262,15 @@ def _continued(start: _Run, past: jax.Array) -> _Run:
     )
 
 
-def _begin(given: Given, max_events: int, records: bool) -> _Run:
-    system, _, mu, settings, q0, v0, times, *_ = given
-    m, dtype = given.contacts, q0.dtype
-    state = given.start
+def _begin(problem: MotionProblem, max_events: int, records: bool) -> _EventRun:
+    system, _, mu, settings, q0, v0, times, *_ = problem
+    m, dtype = problem.contacts, q0.dtype
+    state = problem.start
     watched = 2 * m if settings.friction else m
     flight = first_flight(system, state, encoded(no_modes(m, dtype)), watched, times)
-    table = Table(
+    table = MotionTable(
         no_samples(state, times),
-        jnp.zeros((max_events + 1, _width(given)), dtype),
+        jnp.zeros((max_events + 1, _width(problem)), dtype),
         jnp.zeros((max_events + 1, 2 + m), jnp.int32),
     )
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
@@ -279,14 +280,14 @@ def _begin(given: Given, max_events: int, records: bool) -> _Run:
     if records:
         size = min(times.shape[0] + ROWS_PER_EVENT * max_events + ROWS_MORE, settings.max_steps)
         size = -(-size // BLOCK) * BLOCK + 1  # one more to write what is not kept
-        row = Row(last, no, flight.aim)
+        row = PlanRow(last, no, flight.aim)
         rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), row)
-        plan = Plan(rows, jnp.int32(0), no)
+        plan = MotionPlan(rows, jnp.int32(0), no)
     status = status_at_start(system, state, times[-1], settings.closed_below)
     if mu is not None:
         known = jnp.all(jnp.isfinite(mu))
         status = jnp.where(known, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
-    return _Run(
+    return _EventRun(
         flight,
         none,
         packed(state)[q0.size + v0.size :, 0],
@@ -306,19 +307,21 @@ def _short(x: jax.Array) -> Any:
     return jnp.int8 if jnp.issubdtype(x.dtype, jnp.integer) else x.dtype
 
 
-def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: jax.Array) -> _Run:
+def _resolved(
+    problem: MotionProblem, max_events: int, run: _EventRun, mine: jax.Array, due: jax.Array
+) -> _EventRun:
     """The event resolved and written down in lanes where it is `mine`, if it is `due`."""
-    system, law, mu, settings, *_ = given
+    system, law, mu, settings, *_ = problem
     flight, old = run.flight, run.flight.state
 
-    def now(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
+    def now(run: _EventRun) -> tuple[_EventRun, jax.Array, jax.Array]:
         scales, modes = run.last.decision.scales, decoded(flight.aim.modes, old.q.dtype)
         fired = flight.event & mine
         found = resolve(
             system, law, mu, settings, old, modes, fired, scales, run.struck, run.approach
         )
         happened = found.kind != KIND_CODE["none"]
-        most = max_events if given.past is None else jnp.minimum(given.past.most, max_events)
+        most = max_events if problem.past is None else jnp.minimum(problem.past.most, max_events)
         full = (run.seen >= most) & happened
         status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
         kept = mine & happened & ~full
@@ -329,7 +332,7 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
             event=jnp.zeros_like(flight.event),
         )
         new = run._replace(
-            flight=toward_sample(ready, given.times, flight.free),
+            flight=toward_sample(ready, problem.times, flight.free),
             struck=run.struck | (found.contacts & found.decision.strikes),
             allowed=allowed_errors(system, settings, state),
             waits=found.approach > 0,
@@ -345,12 +348,14 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
         # one that has no row any more is not resolved
         return selected(mine, selected(full, run._replace(status=status), new), run), numbers, marks
 
-    def later(run: _Run) -> tuple[_Run, jax.Array, jax.Array]:
+    def later(run: _EventRun) -> tuple[_EventRun, jax.Array, jax.Array]:
         events, marks = (jnp.zeros_like(x[0]) for x in run.table[1:])
         return run, events, marks
 
     table, plan = run.table, run.plan
-    light = run._replace(table=Table(table.samples[:1], *(x[:1] for x in table[1:])), plan=None)
+    light = run._replace(
+        table=MotionTable(table.samples[:1], *(x[:1] for x in table[1:])), plan=None
+    )
     new, numbers, marks = jax.lax.cond(due, now, later, light)
     index = jnp.where(new.seen > run.seen, run.seen, max_events)
     table = table._replace(events=put(table.events, numbers, index))
@@ -358,10 +363,10 @@ def _resolved(given: Given, max_events: int, run: _Run, mine: jax.Array, due: ja
     return new._replace(table=table, plan=plan)
 
 
-def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
+def _flown(problem: MotionProblem, run: _EventRun, flies: jax.Array) -> _EventRun:
     """One pass of the stepper in lanes that fly."""
-    system, _, mu, settings, *_ = given
-    times = given.times
+    system, _, mu, settings, *_ = problem
+    times = problem.times
     begin, last = run.flight, times.shape[0]
     scales = run.last.decision.scales
     modes = decoded(begin.aim.modes, begin.state.q.dtype)
@@ -375,11 +380,11 @@ def _flown(given: Given, run: _Run, flies: jax.Array) -> _Run:
     kept = accept | (run.waits & run.last.happens)
     if plan is not None:
         size = plan.rows.accepted.shape[0] - 1
-        row = Row(run.last, accept, begin.aim)
+        row = PlanRow(run.last, accept, begin.aim)
         index = plan.used
         rows = jax.tree.map(lambda all_, x: put(all_, x, index), plan.rows, row)
         used = jnp.minimum(index + kept.astype(jnp.int32), size)
-        plan = Plan(rows, used, plan.lost | (used == size))
+        plan = MotionPlan(rows, used, plan.lost | (used == size))
     return run._replace(
         flight=flight,
         waits=run.waits | (flies & jnp.any(flight.event)),
@@ -415,9 +420,9 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
 # ------------------------------------------------------------------------------ the record
 
 
-def _width(given: Given) -> int:
+def _width(problem: MotionProblem) -> int:
     """Numbers of an event."""
-    return 3 + given.q0.size + 2 * given.v0.size + 4 * given.contacts
+    return 3 + problem.q0.size + 2 * problem.v0.size + 4 * problem.contacts
 
 
 def _numbers(before: State, after: After) -> jax.Array:
@@ -427,13 +432,13 @@ def _numbers(before: State, after: After) -> jax.Array:
     return ravel_pytree((parts, after.passed))[0]
 
 
-def _events(table: Table, count: jax.Array, given: Given) -> Events:
+def _events(table: MotionTable, count: jax.Array, problem: MotionProblem) -> Events:
     """The record of events; NaN or 0 in rows that are not used."""
     there = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
     marks = jnp.where(there[:, None], table.marks[:-1], 0)
     rows = jnp.where(there[:, None], table.events[:-1], jnp.nan)
-    n, m = given.v0.size, given.contacts
-    sizes = np.cumsum([1, given.q0.size, n, n, m, m, 2 * m])
+    n, m = problem.v0.size, problem.contacts
+    sizes = np.cumsum([1, problem.q0.size, n, n, m, m, 2 * m])
     time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
     ends = marks[:, 0] == KIND_CODE["accumulation"]
     return Events(
@@ -456,12 +461,14 @@ def _events(table: Table, count: jax.Array, given: Given) -> Events:
 # ------------------------------------------------------------------------------ once more
 
 
-def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Array]:
-    """Samples and events of a run, as a smooth function of `given`."""
-    system, law, mu, settings, *_ = given
-    times = given.times
-    start = given.start
-    width = _width(given)
+def _again(
+    problem: MotionProblem, plan: MotionPlan, max_events: int
+) -> tuple[jax.Array, jax.Array]:
+    """Samples and events of a run, as a smooth function of `problem`."""
+    system, law, mu, settings, *_ = problem
+    times = problem.times
+    start = problem.start
+    width = _width(problem)
     size = plan.rows.accepted.shape[0] - 1
     rows = jax.tree.map(lambda x: x[:size], plan.rows)
     index = jnp.arange(size, dtype=jnp.int32)
@@ -477,7 +484,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
         new = selected(now.happens, after.state, state)
         return new, jnp.where(now.happens, _numbers(state, after), 0.0)
 
-    def step(state: State, row: Row, sample: jax.Array) -> State:
+    def step(state: State, row: PlanRow, sample: jax.Array) -> State:
         aim = row.aim._replace(modes=row.aim.modes.astype(jnp.int32))
         modes, scales = decoded(aim.modes, state.q.dtype), row.event.decision.scales
         flow = flow_of(system, mu, settings, modes, scales, times, state)
@@ -504,7 +511,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
         some = xs[0].event.happens | xs[0].accepted
         return jax.lax.cond(any_lane(jnp.any(some)), walk, stay, y)
 
-    xs = Row(rows.event._replace(happens=happens), accepted, rows.aim), reached
+    xs = PlanRow(rows.event._replace(happens=happens), accepted, rows.aim), reached
     blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
     states, numbers = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
 
@@ -518,7 +525,7 @@ def _again(given: Given, plan: Plan, max_events: int) -> tuple[jax.Array, jax.Ar
     samples = at(sampled, states, times.shape[0])
     first = packed(start)[:, 0][None]
     # where there were too few rows nothing is known, of what derivative whatsoever
-    inputs = [x for x in jax.tree.leaves(given) if eqx.is_inexact_array(x)]
+    inputs = [x for x in jax.tree.leaves(problem) if eqx.is_inexact_array(x)]
     finite = [jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)).astype(first.dtype) for x in inputs]
     unknown = jnp.where(plan.lost, jnp.nan, 0.0) * jnp.sum(jnp.stack(finite))
     events = at(written, numbers, max_events + 1)

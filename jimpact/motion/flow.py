@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jimpact.bodies.base import Body
 from jimpact.events import stepper
 from jimpact.events.batches import any_lane
+from jimpact.laws.lzb import FINEST_RTOL_IN_EPS
 from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
@@ -225,6 +226,15 @@ class MechanicalFlow(MotionFlow):
         p = constraint_impulse(given, self.mu, const, jnp.stack([value, rate], axis=1))
         move = given.moved @ p
         return at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
+
+
+def check_rtol(rtol: float, dtype: jnp.dtype) -> None:
+    """Raise for a relative tolerance that steps in this precision cannot reach."""
+    if rtol < FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps):
+        raise ValueError(
+            f"Argument `rtol` must be at least {FINEST_RTOL_IN_EPS} roundings of {dtype}, but has "
+            f"value {rtol:g}: enable jax_enable_x64, or give a coarser one."
+        )
 
 
 def packed(state: State) -> jax.Array:

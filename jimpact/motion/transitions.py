@@ -172,74 +172,153 @@ def resolve(
     That is done for all of them at once, and only if no other contact is reached within the time
     that is passed: the state after it is then that at the end of the sequence.
     """
-    m, t = before.active.shape[0], state.t
-    given = contacts_at(system, state.q, state.v, t, settings.friction)
-    closed = given.normal.value <= settings.closed_below
-    scales = _grown(system, scales, given, t, state)
+    strike = _impact_first(system, law, settings, state, scales, approach)
+    tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)
+    stick, found = _brought_slow_to_rest(system, mu, settings, strike, struck, tight)
+    jump = found.jump
+    choice, held, released = _next_modes(system, mu, settings, strike, found, before, fired)
+    status, code, wedges = _status(strike, jump, choice, held)
+    m = before.active.shape[0]
+    took = jnp.where(strike.happens, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
+    took = took | choice.parts
+    decision = Decision(
+        strike.happens, approach, strike.closed, found.held, stick, found.ends, strike.scales
+    )
+    after = After(_with_jump(state, jump), jump, found.passed)
+    parts = released[:m] | choice.parts
+    kind = _kind(strike.happens, strike.jams, jnp.any(found.ends), parts, fired)
+    return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
+
+
+class _Strike(NamedTuple):
+    """An event after its impact, if there is one."""
+
+    t: jax.Array  # ()
+    before: Contacts
+    contacts: Contacts  # with the velocities after it
+    closed: jax.Array  # (m,)
+    happens: jax.Array  # () whether there is an impact
+    jams: jax.Array  # () whether it is one without collision
+    approach: jax.Array  # () of that one, else 0
+    scales: Scales
+    rest: jax.Array  # () gap velocities that are rounding
+    jump: Jump
+
+
+def _impact_first(
+    system: System,
+    law: Law,
+    settings: Settings,
+    state: State,
+    scales: Scales,
+    approach: jax.Array,
+) -> _Strike:
+    """The impact, where a closed contact approaches or one without collision is due."""
+    t = state.t
+    before = contacts_at(system, state.q, state.v, t, settings.friction)
+    closed = before.normal.value <= settings.closed_below
+    scales = _grown(system, scales, before, t, state)
     rest = _rest(settings, scales)
-    jams, earlier = approach > 0, given
-    strikes = jnp.any(closed & (given.normal.rate < -rest)) | jams
+    jams = approach > 0
+    strikes = jnp.any(closed & (before.normal.rate < -rest)) | jams
     jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
-    given = contacts_at(system, state.q, jump.v, t, settings.friction)
-    gamma = given.normal.rate
+    contacts = contacts_at(system, state.q, jump.v, t, settings.friction)
+    return _Strike(t, before, contacts, closed, strikes, jams, approach, scales, rest, jump)
+
+
+def _brought_slow_to_rest(
+    system: System,
+    mu: jax.Array | None,
+    settings: Settings,
+    strike: _Strike,
+    struck: jax.Array,
+    tight: jax.Array,
+) -> "tuple[jax.Array, _Resting]":
+    """Which contacts (m,) stick, and what comes to rest: those that are `tight`, and slow ones."""
+    contacts, scales, closed = strike.contacts, strike.scales, strike.closed
+    m, gamma = tight.shape[0], contacts.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
     # a hop below the rounding of gaps is none: it would strike faster than it left
     least_hop = 2 * scales.acceleration * settings.gap_rounding
     slowly = jnp.maximum(slowly, jnp.sqrt(least_hop))
-    slowly = jnp.maximum(slowly, SUPPLIED * approach)
-    tight = closed & (jnp.abs(gamma) <= rest)
-    slack = rest_acceleration(gamma.dtype) * scales.acceleration
+    slowly = jnp.maximum(slowly, SUPPLIED * strike.approach)
     stick = jnp.zeros(m, bool)
-    if given.tangent is not None:
-        stick = jnp.abs(given.tangent.rate) <= slowly
+    if contacts.tangent is not None:
+        stick = jnp.abs(contacts.tangent.rate) <= slowly
 
     def resting(slow: jax.Array) -> _Resting:
-        pressed, still, force = pressed_together(given, slow, slack)
+        slack = _slack(strike)
+        pressed, still, force = pressed_together(contacts, slow, slack)
         held = tight | (slow & pressed)
         # a contact accumulates if it was brought to rest from more than rounding
-        ends = held & ~tight & strikes & ~jams
-        after, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
-        return _Resting(pressed, still, force, held, ends, after, passed)
+        ends = held & ~tight & strike.happens & ~strike.jams
+        jump, passed = _brought_to_rest(
+            system, contacts, mu, held, stick, ends, strike.t, strike.jump
+        )
+        return _Resting(pressed, still, force, held, ends, jump, passed)
 
     slow = closed & (jnp.abs(gamma) <= slowly)
     if m == 1:
-        found = resting(slow)
-    else:
-        nested = closed & strikes & ~jams & _share_bodies(given, closed | struck)
-        nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
-        both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
-        found, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
-        found = selected(_undisturbed(system, given, cluster, tight, t), cluster, found)
-    jump, pressed = found.jump, found.pressed
+        return stick, resting(slow)
+    nested = closed & strike.happens & ~strike.jams & _share_bodies(contacts, closed | struck)
+    nested = nested & (jnp.abs(gamma) <= jnp.sqrt(settings.accumulation) * scales.gap_velocity)
+    both = jax.lax.map(resting, jnp.stack([slow, slow | nested]))
+    alone, cluster = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+    undisturbed = _undisturbed(system, contacts, cluster, tight, strike.t)
+    return stick, selected(undisturbed, cluster, alone)
+
+
+def _slack(strike: _Strike) -> jax.Array:
+    """Gap accelerations () that are rounding."""
+    return rest_acceleration(strike.rest.dtype) * strike.scales.acceleration
+
+
+def _next_modes(
+    system: System,
+    mu: jax.Array | None,
+    settings: Settings,
+    strike: _Strike,
+    found: "_Resting",
+    before: Modes,
+    fired: jax.Array,
+) -> tuple[Choice, jax.Array, jax.Array]:
+    """The modes after the event, contacts (m,) that are at rest, and constraints released."""
+    contacts, jump, rest = strike.contacts, found.jump, strike.rest
     # redundant contacts come to rest with others
-    rate = given.normal.gradient.T @ (jump.v - carried_along(system, jump.v, t))
-    at_rest = closed & (jnp.abs(rate) <= rest)
+    relative = jump.v - carried_along(system, jump.v, strike.t)
+    rate = contacts.normal.gradient.T @ relative
+    at_rest = strike.closed & (jnp.abs(rate) <= rest)
     held = found.held | at_rest
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
-    released = fired & held_before & ~strikes
-    if mu is None:
-        active = pressed | (at_rest & found.still & ~released)
-        no = jnp.asarray(False)
-        modes = no_modes(m, gamma.dtype)._replace(active=active)
-        choice = Choice(modes, ~no, rest, no, jnp.zeros(m, bool))
-    else:
-        relative = jump.v - carried_along(system, state.v, t)
-        choice = _with_friction(given, mu, before, held, released, relative, rest, slack)
+    released = fired & held_before & ~strike.happens
+    if mu is not None:
+        choice = _with_friction(
+            contacts, mu, before, held, released, relative, rest, _slack(strike)
+        )
+        return choice, held, released
+    m = held.shape[0]
+    active = found.pressed | (at_rest & found.still & ~released)
+    no = jnp.asarray(False)
+    modes = no_modes(m, rest.dtype)._replace(active=active)
+    return Choice(modes, ~no, rest, no, jnp.zeros(m, bool)), held, released
+
+
+def _status(
+    strike: _Strike, jump: Jump, choice: Choice, held: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Status of the motion, that of the law, and the approach of an impact without collision."""
     fails = jnp.asarray(FAILS)[jump.code]
     status = jnp.where(fails, MOTION_CODE["law_failed"], MOTION_CODE["ok"])
-    code, wedges = jump.code, jnp.zeros_like(rest)
-    if given.tangent is not None and earlier.tangent is not None:
-        change = jnp.max(jnp.abs(given.tangent.rate - earlier.tangent.rate))
-        wedges = jnp.where(choice.consistent, 0.0, _approach(choice, given.tangent.rate, held))
-        none = (jams & (change <= SUPPLIED * approach)) | (~choice.consistent & (wedges == 0))
+    code, wedges = jump.code, jnp.zeros_like(strike.rest)
+    now, earlier = strike.contacts.tangent, strike.before.tangent
+    if now is not None and earlier is not None:
+        change = jnp.max(jnp.abs(now.rate - earlier.rate))
+        wedges = jnp.where(choice.consistent, 0.0, _approach(choice, now.rate, held))
+        jammed = strike.jams & (change <= SUPPLIED * strike.approach)
+        none = jammed | (~choice.consistent & (wedges == 0))
         status = jnp.where(none, MOTION_CODE["no_contact_force"], status)
         code = jnp.where(choice.several, jnp.maximum(code, CODE["several_outcomes"]), code)
-    took = jnp.where(strikes, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
-    took = took | choice.parts
-    decision = Decision(strikes, approach, closed, found.held, stick, found.ends, scales)
-    after = After(_booked(state, jump), jump, found.passed)
-    kind = _kind(strikes, jams, jnp.any(found.ends), released[:m] | choice.parts, fired)
-    return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
+    return status, code, wedges
 
 
 class _Resting(NamedTuple):
@@ -292,7 +371,7 @@ def resolved_again(
     jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
     given = contacts_at(system, state.q, jump.v, t, settings.friction)
     jump, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
-    return After(_booked(state, jump), jump, passed)
+    return After(_with_jump(state, jump), jump, passed)
 
 
 def _approach(choice: Choice, slip: jax.Array, held: jax.Array) -> jax.Array:
@@ -319,6 +398,7 @@ def _struck(
     closed: jax.Array,
     scales: Scales,
 ) -> Jump:
+    """The impact where it `strikes`, else nothing."""
     lead = approach if settings.friction else None
     noise = _rest(settings, scales)
     return jax.lax.cond(
@@ -328,7 +408,7 @@ def _struck(
     )
 
 
-def _booked(state: State, jump: Jump) -> State:
+def _with_jump(state: State, jump: Jump) -> State:
     """The state after a jump."""
     return state._replace(
         v=jump.v,
@@ -347,6 +427,7 @@ def _with_friction(
     rest: jax.Array,
     slack: jax.Array,
 ) -> Choice:
+    """Modes with friction, at velocities `relative` (n,) to the base."""
     assert given.tangent is not None
     rate = given.tangent.gradient.T @ relative
     now = given._replace(tangent=given.tangent._replace(rate=rate))
@@ -354,6 +435,7 @@ def _with_friction(
 
 
 def _grown(system: System, scales: Scales, given: Contacts, t: jax.Array, state: State) -> Scales:
+    """The largest values so far, those of this instant included."""
     m = given.normal.rate.shape[0]
     seen = state.v - carried_along(system, state.v, t)
     energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, seen))

@@ -1,0 +1,262 @@
+"""What a motion is refused for on the host, and what its arguments become."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import (
+    as_float_array,
+    check_kind,
+    check_per_contact,
+    check_shape,
+    check_values,
+    is_traced,
+)
+from jimpact.bodies.base import check_range
+from jimpact.law import Law
+from jimpact.laws.compliant import Compliant
+from jimpact.laws.forces import Force
+from jimpact.motion.dynamics import gaps, mass_at, seen_from_base
+from jimpact.motion.stepping import is_pile
+from jimpact.motion.system import System
+from jimpact.scene import check_mass
+
+MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
+# Instants at which the base must be finite before a motion starts; what is not finite in between
+# ends the motion with the status `not_finite`.
+BASE_INSTANTS = 64
+DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
+
+
+def check_motion(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+) -> jax.Array:
+    """Raise a ValueError for a bad start, end or system; the gaps at the start (m,)."""
+    if q.ndim != 1:
+        raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
+    coordinates = system.body.coordinates
+    if coordinates is None:
+        check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
+    else:
+        check_shape("q0", q, (coordinates,), "the coordinates of the body")
+    for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
+        check_values(name, value)
+    check_shape("t_start", start, (), "a time")
+    check_shape("t_end", end, (), "a time")
+    if not is_traced((start, end)) and not float(end) > float(start):
+        raise ValueError(
+            f"Argument `t_end` must be larger than `t_start` = {float(start):g}, "
+            f"but has value {float(end):g}."
+        )
+    _check_functions(system, q, v, start)
+    return _check_system(system, q, v, start, end)
+
+
+def _check_functions(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> None:
+    """Raise where a function of the system cannot be called, or returns what cannot be used."""
+    body, n = system.body, v.shape[0]
+
+    def shape_of(name: str, function: Any, arguments: str, *values: jax.Array) -> Any:
+        """The shape that it returns; None where that is None."""
+
+        def call(*traced: jax.Array) -> jax.Array | None:
+            out = function(*traced)
+            return None if out is None else jnp.asarray(out)
+
+        try:
+            out = jax.eval_shape(call, *values)
+        except Exception as error:
+            reason = next(iter(str(error).splitlines()), "")
+            raise TypeError(
+                f"Argument `system` must have a `{name}` that takes JAX arrays ({arguments}) and "
+                f"returns one, but it raises {type(error).__name__}: {reason}"
+            ) from error
+        if out is None:
+            return None
+        whole = not jnp.issubdtype(out.dtype, jnp.floating)
+        if whole and name in DIFFERENTIATED:
+            raise TypeError(
+                f"Argument `system` must have a `{name}` that returns floating numbers, but it "
+                f"returns {out.dtype}."
+            )
+        if not whole and jnp.finfo(out.dtype).bits > jnp.finfo(q.dtype).bits:
+            raise TypeError(
+                f"Argument `system` must compute in the precision of `q0`, {q.dtype}, but its "
+                f"`{name}` returns {out.dtype}: give `q0` in it, too."
+            )
+        return out.shape
+
+    def check(name: str, shape: Any, allowed: str, fits: bool) -> None:
+        if not fits:
+            raise ValueError(
+                f"Argument `system` must have a `{name}` that returns shape {allowed}, "
+                f"but it returns {shape}."
+            )
+
+    mass = shape_of("mass", body.mass_matrix, "q", q)
+    if mass not in ((n,), (n, n)):
+        raise ValueError(
+            f"Argument `system` must have a mass of shape ({n},) or ({n}, {n}) as `v0` has {n} "
+            f"velocities, but has one of shape {mass}."
+        )
+    f = shape_of("gap_function", body.gap_function, "q", q)
+    check("gap_function", f, "(m,), a gap for each of m >= 1 contacts", len(f) == 1 and f[0] > 0)
+    h = shape_of("tangent_function", body.tangent_function, "q", q)
+    if h is not None:
+        check("tangent_function", h, "(m,), one displacement a contact", len(h) == 1)
+    if system.force is not None:
+        force = shape_of("force", system.force, "q, v, t", q, v, t)
+        check("force", force, f"({n},), one per velocity", force == (n,))
+    if system.potential is not None:
+        energy = shape_of("potential", system.potential, "q", q)
+        check("potential", energy, "(), an energy", energy == ())
+    if system.base is not None:
+        assert system.base_directions is not None
+        d = system.base_directions.shape[1]
+        check_shape("base_directions", system.base_directions, (n, d), "a row for each velocity")
+        place = shape_of("base", system.base, "t", t)
+        fits = place == (d,) or (place == () and d == 1)
+        check("base", place, f"({d},), as `base_directions` has {d} columns", fits)
+
+
+def _check_system(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    start: jax.Array,
+    end: jax.Array,
+) -> jax.Array:
+    """Raise for values that cannot be used, where they are known; the gaps (m,) at the start."""
+    # functions of a system may close over traced numbers
+    mass, f = mass_at(system, q), gaps(system, q, start)
+    if is_traced((system, q, v, start, end, mass, f)):
+        return f
+    if callable(system.mass):
+        check_mass(mass)
+    if system.base is not None:
+        instants = np.linspace(float(start), float(end), BASE_INSTANTS)
+        displacement = system.base
+        base = jax.vmap(lambda t: jnp.atleast_1d(displacement(t)))(jnp.asarray(instants, q.dtype))
+        if is_traced(base):
+            return f
+        bad = ~np.isfinite(np.asarray(base)).all(axis=1)
+        if bad.any():
+            raise ValueError(
+                "Argument `system` must have a finite base motion, but base(t) has value "
+                f"{np.asarray(base)[bad][0]} at t = {instants[bad][0]:g} s."
+            )
+    check_range("q0", system.body, system.body.valid(seen_from_base(system, q, start)))
+    return f
+
+
+def without_closures(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> System:
+    """The system; where functions close over traced arrays these become its leaves."""
+
+    def converted(function: Any, *args: jax.Array) -> Any:
+        """The function as a pytree of the arrays that it closes over, if they are traced."""
+        if isinstance(function, eqx.Module) or not callable(function):
+            return function
+        args = tuple(jnp.zeros(x.shape, x.dtype) for x in args)
+        if not is_traced(function(*args)):
+            return function
+        new = eqx.filter_closure_convert(function, *args)
+        return new if is_traced(new) else function
+
+    def parts(s: System) -> list[Any]:
+        """All functions of a system."""
+        return [s.force, s.potential, s.base, *s.body.functions]
+
+    args = [(q, v, t), (q,), (t,), *[(q,)] * len(system.body.functions)]
+    new = [converted(function, *x) for function, x in zip(parts(system), args)]
+    return eqx.tree_at(parts, system, new, is_leaf=lambda x: x is None)
+
+
+def friction_of(
+    system: System, law: Law, friction: Any, q: jax.Array, in_space: bool
+) -> jax.Array | None:
+    """mu (m,), () of a pile: the argument, or that of the law; None without friction."""
+    mu = getattr(law, "friction", None) if friction is None else friction
+    tangents = jax.eval_shape(system.body.tangents, q)
+    if mu is None or (tangents is None and friction is None):
+        return None
+    if tangents is None:
+        raise ValueError("Argument `friction` needs a system with a `tangent_function`.")
+    mu = as_float_array("friction", mu)
+    check_values("friction", mu, low=0.0)
+    if is_traced(mu):
+        mu = jnp.where(mu >= 0, mu, jnp.nan)  # the motion is `not_finite` then
+    elif not np.asarray(mu).any():
+        return None  # frictionless systems pay nothing
+    m = contacts_of(system, q)
+    if tangents.shape[1] not in (m, 2 * m):
+        raise ValueError(
+            "Argument `system` must have one tangent a contact in the plane, two in space: "
+            f"{m} or {2 * m} for its {m} contacts, but has {tangents.shape[1]}."
+        )
+    if not (in_space or tangents.shape[1] == m):
+        raise ValueError(
+            "Argument `friction` must be 0 for a body with tangents in space: with "
+            "method='time_stepping' alone motions know friction in space."
+        )
+    if is_pile(system):
+        check_shape("friction", mu, (), "one for all contacts of a pile")
+        return mu.astype(q.dtype)
+    if mu.shape not in ((), (m,)):
+        raise ValueError(f"Argument `friction` must have shape () or ({m},), but has {mu.shape}.")
+    return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
+
+
+def check_stepped_law(system: System, law: Law, q: jax.Array, joint: bool) -> None:
+    """Raise unless time stepping of the system can use the law; `joint` as in `time_stepping`."""
+    if not joint:
+        if is_pile(system):
+            raise ValueError(
+                "Argument `law` must be Moreau's, with its own `friction` and without a matrix, "
+                f"for the many contacts of {type(system.body).__name__}, but is {law!r}."
+            )
+        return
+    m = contacts_of(system, q)
+    for name in ("restitution", "tangential_restitution"):
+        value = getattr(law, name)
+        if is_pile(system):
+            check_shape(name, value, (), "one for all contacts of a pile")
+        elif value is not None:
+            check_per_contact(name, value, m)
+
+
+def contacts_of(system: System, q: jax.Array) -> int:
+    """The number of contacts m."""
+    count: int = jax.eval_shape(system.body.gap_function, q).shape[0]
+    return count
+
+
+def force_of(law: Law, mu: jax.Array | None) -> Force:
+    """The contact force of a `Compliant` law, for motions without friction."""
+    check_kind("law", law, Compliant)
+    assert isinstance(law, Compliant)
+    if mu is not None:
+        raise ValueError("Argument `friction` must be 0 for method='contact_forces'.")
+    return law.force
+
+
+def substeps_of(step: Any, start: Any, end: Any, samples: int) -> jax.Array:
+    """Steps () between two samples, none longer than `step`."""
+    if step is None or is_traced(step):
+        raise ValueError("Argument `step` must be given, a number, for method='time_stepping'.")
+    check_values("step", step, low=0.0, open_low=True)
+    if is_traced((start, end)):
+        raise ValueError("Arguments `t_start`, `t_end` must not be traced in time stepping.")
+    between = (float(end) - float(start)) / (samples - 1)
+    count = max(1.0, np.ceil(between / float(step) * (1 - 1e-9)))
+    if count * (samples - 1) > MOST_STEPS:
+        raise ValueError(
+            f"Argument `step` must give at most {MOST_STEPS} steps, but has value {step:g}."
+        )
+    return jnp.asarray(int(count), jnp.int32)  # an array: one program for all steps
