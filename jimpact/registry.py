@@ -29,6 +29,7 @@ class Row(NamedTuple):
     source: str
     bibtex: str
     make: Callable[..., Law] | None = None  # from plain numbers, where the class takes others
+    simplicity: float | None = None  # place in the order of `simplest_first`
 
     @property
     def arguments(self) -> dict[str, inspect.Parameter]:
@@ -90,6 +91,21 @@ class Row(NamedTuple):
 
 REGISTRY: dict[str, Row] = {}
 
+# What `advise` knows of the contacts, by the names of parameters.
+ADVISED = ("restitution", "stiffness", "exponent", "friction")
+
+
+def simplest_first() -> tuple[str, ...]:
+    """Names of the laws that `advise` tries, in the order of what they must know of the contacts.
+
+    >>> import jimpact as ji
+    >>> from jimpact.registry import simplest_first
+    >>> "newton" in ji.REGISTRY and simplest_first()[0]
+    'newton'
+    """
+    places = {name: row.simplicity for name, row in REGISTRY.items() if row.simplicity is not None}
+    return tuple(sorted(places, key=lambda name: places[name]))
+
 
 def register(
     name: str,
@@ -102,6 +118,7 @@ def register(
     source: str = "",
     bibtex: str = "",
     make: Callable[..., Law] | None = None,
+    simplicity: float | None = None,
 ) -> Any:
     """Enter a law in `ji.REGISTRY`: then `compare`, studies and the command line know it by name.
 
@@ -113,12 +130,15 @@ def register(
             'energy', 'velocity_scaling', 'mass_scaling'.
         source, bibtex: where it comes from.
         make: builds it from plain numbers, where the class takes other things.
+        simplicity: place in the order in which `advise` tries laws, the simplest first: newton 1,
+            moreau 2, poisson 3, binary 4, lzb 5, compliant 6; None: `advise` leaves it out.
 
     Returns:
         The class, or the decorator.
 
     Raises:
-        TypeError: no Law. ValueError: a name that another law has, an unknown promise.
+        TypeError: no Law. ValueError: a name that another law has, an unknown promise, a law that
+            `advise` cannot make.
 
     >>> import jimpact as ji
     >>> @ji.register("gentle", summary="half of Newton's impulse")
@@ -132,6 +152,7 @@ def register(
     """
 
     def enter(law: Any) -> Any:
+        """The class, entered."""
         if not (isinstance(law, type) and issubclass(law, Law)):
             raise TypeError(f"Argument `law` must be a class of Law, but is {law!r}.")
         if name != name.lower() or not name:
@@ -144,14 +165,31 @@ def register(
                 f"Argument `name` must be new, but {name!r} is {other.law.__qualname__} of "
                 f"{other.law.__module__}."
             )
-        row = (law, summary, right_when, fails_when, frozenset(promises), source, bibtex, make)
-        REGISTRY[name] = Row(*row)
+        row = Row(
+            law,
+            summary,
+            right_when,
+            fails_when,
+            frozenset(promises),
+            source,
+            bibtex,
+            make,
+            simplicity,
+        )
+        unknown = [key for key in row.required if key not in ADVISED]
+        if simplicity is not None and unknown:
+            raise ValueError(
+                f"Argument `simplicity` must be None for a law that needs `{unknown[0]}`: `advise` "
+                f"knows only {', '.join(ADVISED)}."
+            )
+        REGISTRY[name] = row
         return law
 
     return enter if law is None else enter(law)
 
 
 def _place(law: type[Law]) -> tuple[str, str]:
+    """Module and name of a class."""
     return law.__module__, law.__qualname__
 
 

@@ -1,4 +1,4 @@
-"""Every public name tells its arguments with units, what it returns and raises, and an example.
+"""Docstrings of public names state arguments with units, results, errors, and an example.
 
 Examples are run by test_documents.py.
 """
@@ -21,7 +21,7 @@ PUBLIC = {
 FUNCTIONS = {name: x for name, x in PUBLIC.items() if inspect.isfunction(x)}
 CLASSES = {name: x for name, x in PUBLIC.items() if inspect.isclass(x)}
 
-# What arguments of these names are measured in, wherever they occur.
+# Units of arguments with these names, wherever they occur.
 UNITS = {
     "velocity": "[m/s",
     "before": "[m/s]",
@@ -73,51 +73,51 @@ def lacks_line(doc):
 
 
 def lacks(function):
-    """What the docstring of a function does not tell."""
+    """What the docstring of a function lacks."""
     doc, parameters = inspect.getdoc(function) or "", inspect.signature(function).parameters
-    told = section(doc, "Args")
-    found = [f"argument `{name}`" for name in parameters if name not in told]
-    found += [f"`{name}` is no argument" for name in told if name not in parameters]
-    found += [
+    described = section(doc, "Args")
+    missing = [f"argument `{name}`" for name in parameters if name not in described]
+    missing += [f"`{name}` is not an argument" for name in described if name not in parameters]
+    missing += [
         f"the unit {unit} of `{name}`"
         for name, unit in UNITS.items()
-        if name in told
+        if name in described
         and name in parameters
-        and unit not in told[name]
+        and unit not in described[name]
         and parameters[name].annotation is not bool
     ]
-    found += [] if re.search(r"^(Returns|Yields):$", doc, re.M) else ["what it returns"]
+    missing += [] if re.search(r"^(Returns|Yields):$", doc, re.M) else ["what it returns"]
     if raises(function) and not re.search(r"^Raises:$", doc, re.M):
-        found.append("what it raises")
-    found += [] if ">>>" in doc or function.__name__ in EXTRA else ["an example"]
+        missing.append("what it raises")
+    missing += [] if ">>>" in doc or function.__name__ in EXTRA else ["an example"]
     if function.__module__.startswith("jimpact.theory") and "Source" not in doc:
-        found.append("its source")
-    return found + lacks_line(doc)
+        missing.append("its source")
+    return missing + lacks_line(doc)
 
 
 def lacks_of_class(kind):
-    """What the docstring of a class does not tell: of its arguments, or of its fields."""
+    """What the docstring of a class lacks about its arguments or fields."""
     doc = inspect.getdoc(kind) or ""
-    told = section(doc, "Args", "Attributes")
-    named = told.keys() | set(re.findall(r"`(\w+)`", doc))
+    described = section(doc, "Args", "Attributes")
+    named = described.keys() | set(re.findall(r"`(\w+)`", doc))
     wanted = [name for name in inspect.signature(kind).parameters if not name.startswith("_")]
-    found = [f"`{name}`" for name in wanted if name not in named]
+    missing = [f"`{name}`" for name in wanted if name not in named]
     if "Args:" in doc and ">>>" not in doc:
-        found.append("an example")
+        missing.append("an example")
     if issubclass(kind, ji.Law) and kind is not ji.Law and "Source:" not in doc:
-        found.append("its source")
+        missing.append("its source")
     for name, method in vars(kind).items():
-        overrides = any(name in vars(base) for base in kind.__mro__[1:])  # and is described there
+        overrides = any(name in vars(base) for base in kind.__mro__[1:])  # described there
         if name.startswith("_") or overrides or not callable(getattr(kind, name)):
             continue
         method = getattr(kind, name)
-        told = inspect.getdoc(method) or ""
-        found += [
+        method_doc = inspect.getdoc(method) or ""
+        missing += [
             f"`{p}` of `{name}`"
             for p in inspect.signature(method).parameters
-            if p not in ("self", "cls") and not re.search(rf"\b{p}\b", told)
+            if p not in ("self", "cls") and not re.search(rf"\b{p}\b", method_doc)
         ]
-    return found + lacks_line(doc)
+    return missing + lacks_line(doc)
 
 
 def records():
@@ -129,12 +129,12 @@ def records():
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions_tell(name):
+def test_docstrings_of_functions_are_complete(name):
     assert not lacks(FUNCTIONS[name])
 
 
 @pytest.mark.parametrize("name", sorted({**CLASSES, **dict(records())}))
-def test_classes_tell(name):
+def test_docstrings_of_classes_are_complete(name):
     assert not lacks_of_class({**CLASSES, **dict(records())}[name])
 
 
@@ -150,7 +150,7 @@ def test_a_bare_docstring_is_noticed():
 
     assert lacks(bare) == [
         "argument `scene`",
-        "`speed` is no argument",
+        "`speed` is not an argument",
         "the unit [m/s of `velocity`",
         "what it returns",
         "what it raises",

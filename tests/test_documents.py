@@ -1,4 +1,4 @@
-"""README, docs, docstrings and notebooks run as printed; all in one process, which shares programs."""
+"""README, docs, docstrings and notebooks run as printed, in one process that shares programs."""
 
 import ast
 import doctest
@@ -28,10 +28,10 @@ README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def examples(name):
-    """Examples of a module that has some, as one doctest."""
+    """The examples of a module."""
     module = importlib.import_module(name)
-    found = doctest.DocTestFinder(exclude_empty=True).find(module, name)
-    return [test for test in found if test.examples]
+    tests = doctest.DocTestFinder(exclude_empty=True).find(module, name)
+    return [test for test in tests if test.examples]
 
 
 WITH_EXAMPLES = [name for name in MODULES if ">>>" in Path(
@@ -41,9 +41,9 @@ WITH_EXAMPLES = [name for name in MODULES if ">>>" in Path(
 
 @pytest.fixture(autouse=True)
 def as_a_user_runs_them(tmp_path, monkeypatch):
-    """x64, JAX's own promotion rules, a folder of one's own."""
+    """x64, the promotion rules of JAX, and a temporary folder."""
     monkeypatch.chdir(tmp_path)
-    laws = dict(ji.REGISTRY)  # examples register laws of their own
+    laws = dict(ji.REGISTRY)  # some examples register a law
     jax.config.update("jax_numpy_rank_promotion", "allow")
     jax.config.update("jax_numpy_dtype_promotion", "standard")
     yield
@@ -91,7 +91,7 @@ def code_of(path):
     text = path.read_text(encoding="utf-8")
     blocks = re.findall(r"```python\n(.*?)```", text, re.S)
     own = [block for block in blocks if ">>>" not in block and "tcp://" not in block]
-    return own, ">>>" in text  # (a cluster is nobody's own machine)
+    return own, ">>>" in text  # (a cluster does not exist here)
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_every_law_is_in_the_readme_as_in_the_registry():
 
 
 def test_public_names():
-    """Functions and classes with an example or a record's fields; no module in a name's place."""
+    """Docstrings with examples; no module hides a public name."""
     without = []
     for name in ji.__all__:
         value = getattr(ji, name)
@@ -277,7 +277,7 @@ def test_every_script_has_its_notebook():
 
 
 def test_notebooks_are_one_course():
-    """Each opens with what one will learn and a drawing of the system, and leads to the next."""
+    """Each begins with its aim and a drawing of the system, and links to the next."""
     scripts = [jupytext.read(path.with_suffix(".py")) for path in NOTEBOOKS]
     for k, (path, script) in enumerate(zip(NOTEBOOKS, scripts, strict=True)):
         head, drawing = script.cells[0].source, nbformat.read(path, as_version=4).cells[1]
@@ -291,4 +291,4 @@ def test_notebooks_are_one_course():
             assert NOTEBOOKS[k + 1].name in script.cells[-1].source, path.stem
         code = "\n".join(cell.source for cell in script.cells if cell.cell_type == "code")
         own = set(re.findall(r"^(?:from|import) (jimpact\.\S+)", code, re.M))
-        assert not own, "`ji` is all that one needs"
+        assert not own, "notebooks use public names only"

@@ -226,6 +226,25 @@ def test_lists_of_traced_numbers():
     assert float(dense(3.0)) == 2.0
 
 
+def test_advise_tries_it():
+    """With a place in the order of the laws it is a candidate, and chosen where it suffices."""
+
+    class Half(ji.Newton):
+        """Newton's law by another name."""
+
+    ji.register("half", Half, summary="for the tests", simplicity=0.5)
+    try:
+        advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
+        assert advice.name == "half"
+        assert [*advice.candidates][:2] == ["half", "newton"]
+        with pytest.raises(
+            ValueError, match="`simplicity` must be None for a law that needs `share`"
+        ):
+            ji.register("blended", Blended, simplicity=2)
+    finally:
+        del ji.REGISTRY["half"]
+
+
 def test_declared_parameters_of_our_laws():
     """Every registered law's parameters have a domain, and its required ones are few."""
     for name, row in ji.REGISTRY.items():

@@ -326,5 +326,5 @@ def test_a_history_must_be_one():
     batch = jax.tree.map(lambda x: np.stack([x, x]), impact_history())
     with pytest.raises(ValueError, match="`result` must be of one impact, but is a batch"):
         ji.plot.history(batch)
-    with pytest.raises(TypeError, match="`shown` must be a chain"):
+    with pytest.raises(TypeError, match="`drawn` must be a chain"):
         ji.plot.system(ji.Scene([1.0], [[1.0]]), [1.0])

@@ -14,8 +14,9 @@ import jimpact as ji
 from jimpact.cli.study import read_study
 from jimpact.fits.posterior import _priors
 from jimpact.fits.scatter import Scatter
-from jimpact.laws import SIMPLEST_FIRST
+from jimpact.fits.selection import _candidates
 from jimpact.laws.velocity_dependent import approach_speed
+from jimpact.registry import simplest_first
 
 PAIR = ji.chain([1.0, 2.0])
 SPEED = np.linspace(0.5, 4.0, 12)
@@ -80,12 +81,26 @@ def test_a_law_that_fails_is_named_and_comes_last():
     assert found.entries["newton"].verdict.startswith("fails in ")
 
 
+def test_compliant_is_compared_where_gaps_matter():
+    """At a wall LZB lets contacts close again at once, Compliant when their gap is closed."""
+    values = {"stiffness": 1.0}
+    free, wall = ji.chain([1.0, 1.0]), ji.chain([1.0, 1.0], wall=True)
+    candidates, left_out = _candidates([free], None, dict(values), ())
+    assert "compliant" not in candidates
+    assert "close again (as at a wall)" in left_out["compliant"]
+    for scenes, laws in (([wall], None), ([free], ["lzb", "compliant"])):
+        candidates, left_out = _candidates(scenes, laws, dict(values), ())
+        assert any(name.startswith("compliant") for name in candidates)
+        assert "compliant" not in left_out
+
+
 def test_simplest_first_is_the_order_of_advise():
     from jimpact.methods.advice import situation_of, trials
 
     law = ji.LZB(0.8)
     situation = situation_of(PAIR, np.array([1.0, 0.0]), law, known=False)
-    assert tuple(trials(situation, law)) == SIMPLEST_FIRST
+    order = ("newton", "moreau", "poisson", "binary", "lzb", "compliant")
+    assert tuple(trials(situation, law)) == order == simplest_first()
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ pytestmark = pytest.mark.slow
 
 
 def lacking(what):
-    """Skip, with a word; in CI fail."""
+    """Skip with a message; fail in CI."""
     if SITE:
         pytest.fail(f"{what} is missing")
     pytest.skip(f"no {what} here")
@@ -61,7 +61,7 @@ def site(tmp_path_factory):
 
 
 class Page(HTMLParser):
-    """What a page links to, loads, and can be linked at."""
+    """Links, loaded files and anchors of a page, and pictures without a text."""
 
     def __init__(self, path):
         super().__init__()
@@ -69,16 +69,16 @@ class Page(HTMLParser):
         self.feed(path.read_text(encoding="utf-8"))
 
     def handle_starttag(self, tag, attributes):
-        given = dict(attributes)
-        self.anchors |= {given[x] for x in ("id", "name") if given.get(x)}
-        if tag == "a" and given.get("href"):
-            self.links.append(given["href"])
-        elif tag == "link" and given.get("rel") in ("stylesheet", "icon", "preload"):
-            self.loads.append(given["href"])
-        elif tag in ("script", "img", "source", "iframe") and given.get("src"):
-            self.loads.append(given["src"])
-        if tag == "img" and not given.get("alt"):
-            self.without_words.append(given.get("src", "")[:80])
+        values = dict(attributes)
+        self.anchors |= {values[x] for x in ("id", "name") if values.get(x)}
+        if tag == "a" and values.get("href"):
+            self.links.append(values["href"])
+        elif tag == "link" and values.get("rel") in ("stylesheet", "icon", "preload"):
+            self.loads.append(values["href"])
+        elif tag in ("script", "img", "source", "iframe") and values.get("src"):
+            self.loads.append(values["src"])
+        if tag == "img" and not values.get("alt"):
+            self.without_words.append(values.get("src", "")[:80])
 
 
 def test_links_lead_somewhere_and_nothing_is_loaded_from_elsewhere(site):
@@ -118,6 +118,20 @@ def test_what_is_public_is_in_the_site(site):
         assert f"law_{name}.png" in page
         assert "<math" in page
         assert "Derivatives" in page
+
+
+def test_names_link_to_where_they_are_documented(site):
+    """Laws in tables, `ji.name` anywhere; the home page installs and runs something."""
+    laws = (site / "laws.html").read_text(encoding="utf-8")
+    for name, row in ji.REGISTRY.items():
+        link = rf'<td><p><a [^>]*href="generated/laws/{name}.html#[^>]*>(?:<[^>]*>)*{row.law.__name__}<'
+        assert re.search(link, laws), name
+    motions = (site / "motions.html").read_text(encoding="utf-8")
+    assert 'href="generated/api/motions.html#jimpact.simulate"' in motions
+    home = (site / "index.html").read_text(encoding="utf-8")
+    assert "pip install" in home
+    assert "jax.grad" in re.sub(r"<[^>]*>", "", home)
+    assert "<svg" in (site / "step_by_step.html").read_text(encoding="utf-8")
 
 
 def test_every_picture_of_the_docs_has_its_code():
@@ -177,7 +191,7 @@ def browser(tmp_path_factory):
     profile = tmp_path_factory.mktemp("profile")
     for option in [*OPTIONS, f"--user-data-dir={profile}", "--window-size=1280,900"]:
         options.add_argument(option)
-    # whatever a page asks of the network fails, and is an error of the page
+    # requests to the network fail, and count as errors of the page
     options.add_argument("--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     started = webdriver.Chrome(options, webdriver.ChromeService(driver))
@@ -195,7 +209,7 @@ def width(browser, pixels):
 ERRORS = "SEVERE", "WARNING"
 BROKEN = """return [...document.images].filter(i => !(i.complete && i.naturalWidth)
     && i.loading !== 'lazy').map(i => i.src.slice(0, 100))"""
-# what reaches beyond the screen, unless it scrolls within something: the theme would cut it off
+# elements beyond the edge of the screen that do not scroll: the theme would cut them off
 TOO_WIDE = """const edge = document.documentElement.clientWidth + 1;
     const scrolls = x => x.tagName != 'ARTICLE' && (/auto|scroll/.test(getComputedStyle(x).overflowX)
         || scrolls(x.parentElement));
@@ -223,6 +237,25 @@ def test_pages_open_without_errors_wide_and_narrow(address, site, browser):
             wrong += [f"{name} at {pixels}: {flat} formulas do not show"] if flat else []
         assert browser.title, name
     assert not wrong, "\n".join(wrong[:30])
+
+
+PLATE = """return [...document.querySelectorAll('article img')].map(i =>
+    (getComputedStyle(i).backgroundColor.match(/\\d+/g) || []).slice(0, 3).map(Number))"""
+
+
+def test_pictures_lie_on_a_light_plate_in_the_dark(address, browser):
+    dark = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", dark)
+    for page in ("index", "motions", "generated/gallery", "generated/notebooks/00_five_minutes"):
+        browser.get(f"{address}/{page}.html")
+        page_colour = browser.execute_script(
+            "return getComputedStyle(document.body).backgroundColor"
+        )
+        assert max(int(x) for x in re.findall(r"\d+", page_colour)[:3]) < 80, page
+        plates = browser.execute_script(PLATE)
+        assert plates, page
+        assert all(min(colour) > 200 for colour in plates), page
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
 
 
 def test_search_finds_a_law(address, browser):

@@ -19,10 +19,9 @@ from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
 from jimpact.fits.result import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
-from jimpact.laws import SIMPLEST_FIRST
 from jimpact.laws.velocity_dependent import VelocityDependent
 from jimpact.progress import progress_bar
-from jimpact.registry import registered_laws
+from jimpact.registry import registered_laws, simplest_first
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
@@ -324,8 +323,11 @@ def _candidates(
             left_out["restitution_matrix"] = f"has no start: {error}"
     built, missing = registered_laws(values)
     left_out = missing | left_out
-    if "compliant" in built and all(bool(np.all(scene.closed)) for scene in scenes):
-        left_out["compliant"] = "is lzb where no contact has a gap"
+    if laws is None and "compliant" in built and not any(map(_opens_and_closes, scenes)):
+        left_out["compliant"] = (
+            "differs from lzb only where contacts have gaps, or open and close again (as at a "
+            "wall): name it in `laws` to fit it, too"
+        )
     if "base" not in values:
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
     built = {name: law for name, law in built.items() if name not in left_out}
@@ -342,6 +344,11 @@ def _candidates(
         for label, candidate in _variants(law, contacts, alike, more).items():
             candidates[f"{name}{label}"] = candidate
     return candidates, left_out
+
+
+def _opens_and_closes(scene: Scene) -> bool:
+    """Whether gaps matter: some contact has one, or a wall lets contacts open and close again."""
+    return not np.all(scene.closed) or (scene.walls is not None and any(scene.walls))
 
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
@@ -408,7 +415,8 @@ def _order(entry: LawFit) -> tuple[Any, ...]:
     """Adequate first, by parameters, then in the order of `advise`; the rest by error."""
     tier = _TIERS.index(entry.tier)
     base = entry.name.split(",")[0]
-    place = SIMPLEST_FIRST.index(base) if base in SIMPLEST_FIRST else len(SIMPLEST_FIRST)
+    order = simplest_first()
+    place = order.index(base) if base in order else len(order)
     error = entry.left_out_error if np.isfinite(entry.left_out_error) else entry.fit.rms
     return (tier, entry.parameters, place) if tier < 2 else (tier, error, place)
 

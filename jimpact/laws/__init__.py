@@ -10,10 +10,7 @@ from jimpact.laws.poisson import Poisson
 from jimpact.laws.velocity_dependent import VelocityDependent, make_velocity_dependent
 from jimpact.registry import EVERY_PROPERTY, REGISTRY, Row, register
 
-__all__ = ["REGISTRY", "SIMPLEST_FIRST", "Row", "register"]
-
-# Laws in the order of what they must know of the contacts: of two that do, the first is enough.
-SIMPLEST_FIRST = ("newton", "moreau", "poisson", "binary", "lzb", "compliant")
+__all__ = ["REGISTRY", "Row", "register"]
 
 # entries by key: each begins @kind{key,
 _BIBTEX = {
@@ -30,6 +27,7 @@ register(
     promises=EVERY_PROPERTY,
     source="Liu, Zhao and Brogliato (2008); Brogliato (2016), (6.67)-(6.73)",
     bibtex=_BIBTEX["liu2008"],
+    simplicity=5,
 )
 register(
     "newton",
@@ -40,6 +38,7 @@ register(
     promises={"velocity_scaling", "mass_scaling"},
     source="Brogliato, Nonsmooth Mechanics (2016), (6.41) with diagonal E",
     bibtex=_BIBTEX["brogliato2016"],
+    simplicity=1,
 )
 register(
     "moreau",
@@ -50,6 +49,7 @@ register(
     promises={"impulse_sign", "velocity_scaling", "mass_scaling"},
     source="Moreau (1988); Brogliato (2016), (6.51)",
     bibtex=_BIBTEX["moreau1988"],
+    simplicity=2,
 )
 register(
     "poisson",
@@ -60,6 +60,7 @@ register(
     promises=EVERY_PROPERTY - {"energy"},
     source="Pfeiffer and Glocker (1996); Brogliato (2016), (6.76)-(6.79)",
     bibtex=_BIBTEX["pfeiffer1996"],
+    simplicity=3,
 )
 register(
     "binary",
@@ -70,6 +71,7 @@ register(
     promises=EVERY_PROPERTY,
     source="Brogliato (2016), (6.3)-(6.4), (6.13), (6.17)-(6.21); Towne and Hadlock (1977)",
     bibtex=_BIBTEX["towne1977"],
+    simplicity=4,
 )
 register(
     "restitution_matrix",
@@ -90,6 +92,7 @@ register(
     promises={"impulse_sign", "gap_velocity_sign", "energy"},
     source="Brogliato (2016), (6.14)-(6.16); forces as cited in `jimpact.laws.forces`",
     bibtex=_BIBTEX["brogliato2016"],
+    simplicity=6,
     make=make_compliant,
 )
 

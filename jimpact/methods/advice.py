@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -16,8 +15,7 @@ from jimpact._checks import as_whole, check_per_contact, check_shape, check_valu
 from jimpact.contact import components, kinetic_angles
 from jimpact.fits.parameters import with_entries
 from jimpact.impacts import impact
-from jimpact.law import Law, check_law, free_parameters_of
-from jimpact.laws import SIMPLEST_FIRST
+from jimpact.law import Law, check_law, free_parameters_of, options_of
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Bistiffness
@@ -28,6 +26,7 @@ from jimpact.methods.advice_report import Advice, Candidate, ContactBlock, Unkno
 from jimpact.methods.timing import in_turns
 from jimpact.montecarlo.gaps import gap_scale
 from jimpact.progress import counting_bar
+from jimpact.registry import ADVISED, REGISTRY, simplest_first
 from jimpact.scene import (
     Scene,
     as_velocity,
@@ -171,9 +170,9 @@ def advise(
     The reference is `LZB`, or `Compliant` where the two differ: LZB lets a contact that has opened
     close again at once, `Compliant` when its gap is closed (as with a wall), and only `Compliant`
     follows open contacts that can close while others are at work; the absolute stiffness must then
-    be given. Every law is compared with it over the stiffness ratios that are not known: one at a
-    time, at the corners of their ranges, and log-uniformly. Open contacts of bodies that turn (of
-    all scenes but chains) that cannot close during the impact take no part.
+    be given. Each law is compared with it over the unknown stiffness ratios: varied one at a
+    time, at the corners of their ranges, and at log-uniform samples. Open contacts of bodies that
+    turn (of all scenes but chains) take no part if they cannot close during the impact.
 
     Args:
         scene: n coordinates, m contacts.
@@ -199,7 +198,7 @@ def advise(
             unequal exponents, without stiffness.
         RuntimeError: the reference fails on this scene.
 
-    Source: the kind of Brogliato, Nonsmooth Mechanics (2016), section 6.3.3.
+    Source: comparisons as in Brogliato, Nonsmooth Mechanics (2016), section 6.3.3.
 
     >>> import jimpact as ji
     >>> advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)
@@ -257,7 +256,7 @@ def _advice(
             candidates[key] = replace(candidates[key], cost=cost)
     suffice = [key for key, c in candidates.items() if c.usable and c.worst <= tolerance]
     chosen = suffice[0] if suffice else name
-    if laws[chosen].has_stiffness:
+    if "rtol" in options_of(type(laws[chosen].law)):
         candidates[chosen] = _loosened(candidates[chosen], situation, reference, tolerance)
     gap_ratio = None
     if situation.gapped.any():
@@ -433,7 +432,7 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
     e, k = (jnp.broadcast_to(x, (m,)).astype(v.dtype) for x in (law.restitution, law.stiffness))
     mu, touching = law.friction, situation.touching
     gapped = bool(situation.gapped.any())
-    laws: Mapping[str, Law] = {
+    laws: dict[str, Law] = {
         "newton": Newton(e, mu),
         "moreau": Moreau(e, mu),
         "poisson": Poisson(e, mu),
@@ -441,10 +440,16 @@ def trials(situation: Situation, law: LZB) -> dict[str, Trial]:
         "lzb": LZB(e, k, law.exponent, friction=mu),
         "compliant": Compliant(Bistiffness(k, law.exponent, e), friction=mu),
     }
-    scenes = dict.fromkeys(laws, touching)
-    if gapped:
-        scenes |= dict.fromkeys(("binary", "compliant"), situation.scene)
-    return {name: Trial(laws[name], scenes[name]) for name in SIMPLEST_FIRST}
+    known = dict(zip(ADVISED, (e, k, law.exponent, mu), strict=True))
+    for name in simplest_first():
+        row = REGISTRY[name]
+        if name not in laws:  # a user's own law
+            laws[name] = row.build(**{key: known[key] for key in row.arguments if key in known})
+    ordered = {name: laws[name] for name in simplest_first()}
+    return {
+        name: Trial(law, situation.scene if gapped and law.uses_gaps else touching)
+        for name, law in ordered.items()
+    }
 
 
 # -------------------------------------------------------------------------- running the laws

@@ -38,7 +38,7 @@ _LEAST = 1e-16  # smaller errors are drawn here: rounding
 _DEFAULT = "dop853"  # what `impact` does: a thick line
 
 # right, flagged, wrong, gains energy, stalls, does not end, not finite, unchecked: Okabe and Ito's
-# colours where a result is returned, greys where there is none
+# colours for returned results, greys for none
 CLASS_COLOURS = (
     "#009E73",
     "#56B4E9",
@@ -94,7 +94,7 @@ def work_precision(result: WorkPrecision, title: str = "") -> Figure:
         line.set_label(label)
     if not gradients:
         legend_below(figure, list(handles.values()), 2, _note(result))
-    else:  # beside the three panels
+    else:  # next to the three panels
         panels[3].axis("off")
         options: dict[str, Any] = {"title": _note(result), "title_fontsize": SMALL, "loc": "center"}
         panels[3].legend(handles=list(handles.values()), frameon=False, fontsize=SMALL, **options)

@@ -24,7 +24,7 @@ from jimpact.plot.style import (
     side_by_side,
 )
 
-_LABELLED = 16  # shots up to which every one gets its label
+_LABELLED = 16  # up to so many shots each has a label
 
 
 def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: str = "") -> Figure:
@@ -51,10 +51,8 @@ def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: st
     2
     """
     check_kind("fit", fit, FitResult)
-    data, measured, predicted = (
-        fit.experiments,
-        *map(_in_rows, (fit.problem.measured, fit.predicted)),
-    )
+    data = fit.experiments
+    measured, predicted = _in_rows(fit.problem.measured), _in_rows(fit.predicted)
     shots, bodies = predicted.shape
     dodge = side_by_side(bodies)
     x = np.arange(shots)[:, None] + dodge[None, :]
@@ -100,8 +98,8 @@ def contour(result: Contour, title: str = "") -> Figure:
     >>> import jimpact as ji
     >>> x = np.linspace(0.4, 0.6, 5)
     >>> d = ((x - 0.5) / 0.03)[:, None] ** 2 + ((x - 0.5) / 0.02) ** 2
-    >>> given = ("e[1]", "e[2]"), x, x, d, 5.99, 0.95, (0.5, 0.5), (False, False)
-    >>> ji.plot.contour(ji.Contour(*given)).axes[0].get_xlabel()
+    >>> region = ji.Contour(("e[1]", "e[2]"), x, x, d, 5.99, 0.95, (0.5, 0.5), (False, False))
+    >>> ji.plot.contour(region).axes[0].get_xlabel()
     'e[1]'
     """
     check_kind("result", result, Contour)
@@ -134,6 +132,7 @@ def _in_rows(values: np.ndarray) -> np.ndarray:
 
 
 def _error_bars(fit: FitResult) -> np.ndarray | None:
+    """Sigma, else the estimated noise, a row a shot; None where neither is known."""
     shape = fit.predicted.shape
     if fit.problem.sigma is not None:
         return _in_rows(np.broadcast_to(np.asarray(fit.problem.sigma, float), shape))
@@ -158,7 +157,10 @@ def _shot_axis(axes: Axes, fit: FitResult, dodge: np.ndarray) -> None:
 def _legend(
     figure: Figure, fit: FitResult, others: Mapping[str, FitResult], has_bars: bool
 ) -> None:
-    bars = "" if not has_bars else ", ± sigma" if fit.problem.sigma is not None else ", ± noise"
+    """Markers of measured and fitted values, of other fits, and of bodies."""
+    bars = ""
+    if has_bars:
+        bars = ", ± noise" if fit.problem.sigma is None else ", ± sigma"
     plain: dict[str, Any] = {"ls": "none", "color": "black"}
     handles = [
         Line2D([], [], marker="o", mfc="none", label=f"measured{bars}", **plain),

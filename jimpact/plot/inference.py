@@ -1,4 +1,4 @@
-"""Pictures of what a fit knows: profiles, correlations, residuals."""
+"""Pictures of the uncertainty of a fit: profiles, correlations, residuals."""
 
 from textwrap import fill
 from typing import Any
@@ -13,8 +13,8 @@ from jimpact.fits.result import FitResult
 from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure, new_panels
 
 _TITLE = 45  # letters of a line of a panel's title
-_TOP = 3.0  # of a profile's axis, in limits: beyond, the curve says nothing more
-_TWO_SIDED = 1.96  # standard errors with 95 % between
+_TOP = 3.0  # of a profile's axis, over the limit: only what is below matters
+_TWO_SIDED = 1.96  # standard errors: 95 % of normal noise lies within
 
 
 def profiles(result: tuple[Profile, ...] | list[Profile]) -> Figure:
@@ -78,8 +78,8 @@ def correlation(fit: FitResult) -> Figure:
     count = len(fit.names)
     figure = new_figure(float(np.clip(1.8 + 0.5 * count, 3.0, 7.2)))
     axes = figure.subplots()
-    shown: Any = np.ma.masked_invalid(fit.correlation)
-    image = axes.imshow(shown, vmin=-1, vmax=1, cmap="RdBu_r")
+    finite: Any = np.ma.masked_invalid(fit.correlation)
+    image = axes.imshow(finite, vmin=-1, vmax=1, cmap="RdBu_r")
     axes.set_xticks(range(count), fit.names, rotation=90)
     axes.set_yticks(range(count), fit.names)
     if count <= 8:
@@ -152,7 +152,7 @@ def residuals(fit: FitResult) -> Figure:
 
 
 def _over(fit: FitResult) -> tuple[np.ndarray, str]:
-    """What residuals are put over: of shots the fastest approach (K, 1), else the fitted values."""
+    """The abscissa of residuals: the fastest approach (K, 1) of shots, else the fitted values."""
     data, scene = fit.experiments, fit.problem.scene
     if data is None:
         return np.asarray(fit.predicted), "fitted"

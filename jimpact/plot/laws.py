@@ -238,7 +238,7 @@ def history(result: History, title: str = "") -> Figure:
     each = friction.shape[1] // result.force.shape[1]
     for j, y in enumerate(friction.T):
         colour = COLOURS[j // each % len(COLOURS)]
-        panels[0].plot(time, y, "--", color=colour, label="along the contact" if j == 0 else None)
+        panels[0].plot(time, y, "--", color=colour, label="tangential" if j == 0 else None)
     panels[1].axhline(0, color=GREY, lw=0.8)
     panels[-1].set_xlabel(f"impact time [{unit}]")
     finish(*panels)
@@ -261,9 +261,11 @@ def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarr
         return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
 
     def push(x: float, rate: float) -> float:
+        """The force at an indentation and its rate."""
         return float(force.force(jnp.asarray(max(x, 0.0)), jnp.asarray(rate)))
 
     def slack(_: float, y: np.ndarray) -> float:
+        """Zero where the force vanishes as the pair separates."""
         return push(y[0], y[1]) if y[1] < 0 else 1.0
 
     slack.terminal = True  # type: ignore[attr-defined]

@@ -1,7 +1,6 @@
 """Picture: distributions of the velocities, and a map of the outcome over two gaps."""
 
 import textwrap
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -77,8 +76,9 @@ def _histogram(axes: Axes, result: MonteCarlo, body: int) -> None:
     axes.stairs(share, ends, color=colour, fill=True)
     top = float(share.max())
     mean, (low, high) = result.mean[body], result.quantile([0.05, 0.95])[:, body]
-    style: dict[str, Any] = {"color": "black", "ms": 4, "lw": 1, "capsize": 3}
-    axes.errorbar(mean, _MEAN_AT * top, xerr=[[mean - low], [high - mean]], fmt="o", **style)
+    height = _MEAN_AT * top
+    axes.plot([low, high], [height, height], "|-", color="black", ms=7, lw=1)
+    axes.plot(mean, height, "o", color="black", ms=4)  # it may lie outside that range
     axes.set_ylim(0, _TOP * top)
     label = f"body {body + 1}: {mean:.3f} ± {result.std[body]:.3f} m/s"
     axes.set_title(label, loc="left", fontsize=SMALL, color=colour)

@@ -22,9 +22,9 @@ from jimpact.progress import counting_bar
 
 _FRAMES_PER_SECOND = 25
 _POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
-_MARKED = ("accumulation", "detachment", "friction")  # events with a mark of their own
-_MANY = 60  # impacts up to which each gets its line
-_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film: a layout would be made for each frame
+_MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
+_MANY = 60  # up to so many impacts each is marked by a line
+_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
 _BASE_POINTS = 1000  # at which a base is drawn
 _LEGEND = 6  # coordinates that get an entry in the legend
 
@@ -70,9 +70,9 @@ def motion(
     columns = [_by_unit(labels), _by_unit(rates)]
     rows = max(map(len, columns)) + 1
     figure = new_figure(2.5 * rows)
-    every = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    panels = figure.subplots(rows, 2, sharex=True, squeeze=False)
     for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
-        for axes, (unit, which) in zip(every[:, j], units.items(), strict=False):
+        for axes, (unit, which) in zip(panels[:, j], units.items(), strict=False):
             for c, (i, word) in enumerate(which):
                 label = word if c < _LEGEND else None
                 axes.plot(course.time, values[:, i], color=COLOURS[c % len(COLOURS)], label=label)
@@ -80,18 +80,18 @@ def motion(
                 _moving_base(axes, system, motion)
             what = which[0][1] if len(which) == 1 else ("coordinates", "velocities")[j]
             axes.set_ylabel(f"{what} [{unit}]" if unit else what)
-        for axes in every[len(units) : -1, j]:
+        for axes in panels[len(units) : -1, j]:
             axes.remove()
-    _gaps(every[-1, 0], motion)
-    _ledger(every[-1, 1], motion, course, system)
+    _gaps(panels[-1, 0], motion)
+    _ledger(panels[-1, 1], motion, course, system)
     heading(figure, title)
     for axes in figure.axes:
-        if axes is not every[-1, 1]:
+        if axes is not panels[-1, 1]:
             _event_lines(axes, motion)
         finish(axes, grid="y")
         if len(axes.get_legend_handles_labels()[0]) > 1:
             legend_within(axes, 2)
-    for axes in every[-1]:
+    for axes in panels[-1]:
         axes.set_xlabel("time [s]")
     return figure
 
@@ -101,24 +101,24 @@ def _labels(
 ) -> tuple[list[str], list[str]]:
     """Names, with units, of coordinates and velocities."""
     n, rates = motion.q.shape[-1], motion.velocity.shape[-1]
-    own = () if system is None else system.body.names
-    told = [*own, *(f"q{i + 1}" for i in range(len(own), n))]
+    known = () if system is None else system.body.names
+    labels = [*known, *(f"q{i + 1}" for i in range(len(known), n))]
     for i, name in enumerate(names[:n]):
-        unit = split_name(told[i])[1]
-        told[i] = f"{name} [{unit}]" if unit and not split_name(name)[1] else name
+        unit = split_name(labels[i])[1]
+        labels[i] = f"{name} [{unit}]" if unit and not split_name(name)[1] else name
     if n == rates:
-        return told, [rate_of(name) for name in told]
-    given = () if system is None else system.body.velocity_names
-    return told, [*given] or [f"v{i + 1}" for i in range(rates)]
+        return labels, [rate_of(name) for name in labels]
+    velocities = () if system is None else system.body.velocity_names
+    return labels, [*velocities] or [f"v{i + 1}" for i in range(rates)]
 
 
 def _by_unit(names: list[str]) -> dict[str, list[tuple[int, str]]]:
-    """Unit -> (index, word) of what has it."""
-    result: dict[str, list[tuple[int, str]]] = {}
+    """Index and word of the names by their unit."""
+    by_unit: dict[str, list[tuple[int, str]]] = {}
     for i, name in enumerate(names):
         word, unit = split_name(name)
-        result.setdefault(unit, []).append((i, word))
-    return result
+        by_unit.setdefault(unit, []).append((i, word))
+    return by_unit
 
 
 class _Course(NamedTuple):
@@ -131,14 +131,15 @@ class _Course(NamedTuple):
 
 
 def _course(motion: Motion) -> _Course:
+    """The samples and events of a motion in the order of time."""
     events, rows = motion.events, np.asarray(motion.events.kind) > 0
-    there = [np.asarray(x)[rows] for x in (events.time, events.q)]
+    at, place = np.asarray(events.time)[rows], np.asarray(events.q)[rows]
     jumps = [np.asarray(x)[rows] for x in (events.velocity_before, events.velocity_after)]
-    time = np.concatenate([motion.time, there[0], there[0]])
-    q = np.concatenate([motion.q, there[1], there[1]])
+    time = np.concatenate([motion.time, at, at])
+    q = np.concatenate([motion.q, place, place])
     v = np.concatenate([motion.velocity, *jumps])
     state = np.repeat([0, 1, 2], [len(motion.time), rows.sum(), rows.sum()])
-    # of events at one time each has its own before and after
+    # events at one time: before and after of the first, then of the second
     number = np.concatenate([np.full(len(motion.time), -1), *(2 * [np.arange(rows.sum())])])
     order = np.lexsort((state, number, time))
     return _Course(time[order], q[order], v[order], state[order] == 2)
@@ -148,11 +149,11 @@ def _base_path(system: System, time: np.ndarray) -> np.ndarray:
     """Displacement of the base (S, d) along the directions of the body, where it has them."""
     assert system.base is not None
     path = np.asarray(jax.vmap(lambda t: jnp.atleast_1d(system.base(t)))(jnp.asarray(time)))  # type: ignore[misc]
-    every = system.body.base_directions
-    if every is None:
+    directions = system.body.base_directions
+    if directions is None:
         return path
     moved = path @ np.asarray(system.base_directions).T
-    return np.linalg.lstsq(np.asarray(every), moved.T, rcond=None)[0].T
+    return np.linalg.lstsq(np.asarray(directions), moved.T, rcond=None)[0].T
 
 
 def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
@@ -190,6 +191,7 @@ def _gaps(axes: Axes, motion: Motion) -> None:
 
 
 def _event_lines(axes: Axes, motion: Motion) -> None:
+    """A line at each impact, and at events of the marked kinds."""
     impacts = motion.event_times("impact")
     if len(impacts) <= _MANY:
         for t in impacts:
@@ -202,7 +204,7 @@ def _event_lines(axes: Axes, motion: Motion) -> None:
 def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) -> None:
     """Energy, and what has gone where since the start; of a known system with its jumps.
 
-    V counts from its least value, beside which what is lost can be seen.
+    V counts from its least value, so that losses can be seen.
     """
     time = np.asarray(motion.time)
     if system is None:
@@ -214,7 +216,7 @@ def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) 
     least = np.nanmin(drawn[2] - drawn[1], initial=np.inf)
     axes.plot(drawn[0], drawn[2] - least, color="black", label="T + V − min V")
     axes.plot(drawn[0], drawn[1], color=GREY, lw=0.8, label="T")
-    # the shares of single contacts in a multiple impact may have either sign: their sum is shown
+    # the sum: in a multiple impact the shares of single contacts may have either sign
     normal, tangential = np.asarray(motion.contact_work).sum(axis=-1).T
     axes.plot(time, -normal, color=COLOURS[0], label="contacts took")
     others = (
@@ -289,9 +291,9 @@ def phase_portrait(
 
 
 def _range(values: np.ndarray) -> float:
-    """Of what was reached."""
-    there = values[np.isfinite(values)]
-    return float(np.ptp(there)) if len(there) else 0.0
+    """Range of the finite values, 0 without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.ptp(finite)) if len(finite) else 0.0
 
 
 def animation(
@@ -348,6 +350,7 @@ def animation(
     view = np.array([axes.get_xlim(), axes.get_ylim()])
 
     def draw(k: int) -> list[Any]:
+        """Frame k."""
         for line, points in zip(lines, curves[k], strict=True):
             line.set_data(points[:, 0], points[:, 1])
         for line, (n, offset) in zip(drawn, floors, strict=True):
@@ -356,10 +359,10 @@ def animation(
         return [*lines, *drawn]
 
     path.parent.mkdir(parents=True, exist_ok=True)
-    shown = FuncAnimation(figure, draw, frames=len(q))
+    film = FuncAnimation(figure, draw, frames=len(q))
     with counting_bar(len(q), "frames", progress) as advance:
         writer = PillowWriter(fps=_FRAMES_PER_SECOND)
-        shown.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
+        film.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
     return path
 
 
@@ -398,7 +401,7 @@ def _curves(
 
 
 def _grounds(system: System, time: np.ndarray) -> np.ndarray:
-    """Where the base is on the picture (S, 2)."""
+    """Displacement of the base in the picture (S, 2)."""
     if system.base is None:
         return np.zeros((len(time), 2))
     path = _base_path(system, time)
@@ -413,11 +416,12 @@ def _plane(angle: Any, offset: Any) -> tuple[np.ndarray, float]:
 
 
 def _limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[Any]) -> None:
-    every = np.concatenate([points for frame in curves for points in frame])
-    middle = (every.min(axis=0) + every.max(axis=0)) / 2
+    """Equal limits that hold all curves and a point of each plane."""
+    points = np.concatenate([curve for frame in curves for curve in frame])
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
     feet = [middle - (n @ (middle - ground[0]) - offset) * n for n, offset in floors]
-    every = np.concatenate([every, *(foot[None] for foot in feet)])
-    low, high = every.min(axis=0), every.max(axis=0)
+    points = np.concatenate([points, *(foot[None] for foot in feet)])
+    low, high = points.min(axis=0), points.max(axis=0)
     half = 0.55 * float((high - low).max()) or 1.0
     centre = (low + high) / 2
     axes.set_xlim(centre[0] - half, centre[0] + half)

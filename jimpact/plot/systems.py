@@ -18,14 +18,14 @@ _LEAST = 0.35  # radius of a small body, likewise
 _ARROW = 2.2  # length of the fastest velocity, likewise
 
 
-def system(shown: Scene | Body | System, state: Any, title: str = "") -> Figure:
+def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     """A system as it is before an impact or a motion.
 
     A chain is a row of circles, their areas about as the masses, with arrows for the velocities;
     open contacts are drawn apart, not to scale. A body is drawn to scale, on what it stands on.
 
     Args:
-        shown: a chain (`ji.chain`), a body such as `ji.Block`, or a `System` of one.
+        drawn: a chain (`ji.chain`), a body such as `ji.Block`, or a `System` of one.
         state: of a chain v- (n,) [m/s]; of a body its configuration q.
         title: above the picture.
 
@@ -33,20 +33,20 @@ def system(shown: Scene | Body | System, state: Any, title: str = "") -> Figure:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        TypeError: a scene that is no chain. ValueError: not one velocity per body.
+        TypeError: a scene that is not a chain. ValueError: not one velocity per body.
 
     >>> import jimpact as ji
     >>> len(ji.plot.system(ji.chain([1.0, 2.0]), [1.0, 0.0]).axes[0].patches)
     2
     """
-    if isinstance(shown, Scene):
-        if shown.walls is None:
-            raise TypeError("Argument `shown` must be a chain, a body or a system; draw the body.")
+    if isinstance(drawn, Scene):
+        if drawn.walls is None:
+            raise TypeError("Argument `drawn` must be a chain, a body or a system; draw the body.")
         figure = new_figure(2.4)
         axes = figure.subplots()
-        _row(axes, shown, np.asarray(as_velocity(shown, state)))
+        _row(axes, drawn, np.asarray(as_velocity(drawn, state)))
     else:
-        body = shown.body if isinstance(shown, System) else shown
+        body = drawn.body if isinstance(drawn, System) else drawn
         figure = new_figure(3.6)
         axes = figure.subplots()
         draw_body(axes, body, np.asarray(state, float))
@@ -58,6 +58,7 @@ def system(shown: Scene | Body | System, state: Any, title: str = "") -> Figure:
 
 
 def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
+    """A chain as a row of circles with arrows."""
     mass = np.asarray(scene.mass, float)
     radius = np.maximum((mass / mass.max()) ** 0.5, _LEAST)
     left, right = scene.walls or (False, False)
@@ -76,8 +77,8 @@ def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
             tip = x + _ARROW * v / fastest / 2
             arrow = {"arrowstyle": "-|>", "color": colour, "lw": 2}
             axes.annotate("", (tip, 1.3), (2 * x - tip, 1.3), arrowprops=arrow)
-    for there, x in ((left, -0.3), (right, end + (apart[-1] if right else 0.0))):
-        if there:
+    for wall, x in ((left, -0.3), (right, end + (apart[-1] if right else 0.0))):
+        if wall:
             axes.add_patch(Rectangle((x, -1.1), 0.3, 2.2, color=GREY, alpha=0.5, lw=0))
     room = max(1.2, (12.0 - end) / 2)  # a single body is not as wide as the picture
     axes.set_xlim(-room, end + room)

@@ -30,7 +30,7 @@ _FILL = "#DCE9F3"
 _MARKERS = "osD^vP*X"
 _MOST_CONTACTS = 4  # beyond two contacts: projections onto pairs of the first so many
 _SAMPLES = 2000
-_SHORTEST = 0.5  # a side shorter than this part of the radius is not drawn: its name would not fit
+_SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no room for a name
 
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
@@ -81,7 +81,8 @@ def admissible_set(
 
 
 def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray) -> Figure:
-    frame = _Frame(result, closed)
+    """The set in the plane of kinetic coordinates."""
+    frame = _Plane(result, closed)
     figure = new_figure(7.6)
     axes = figure.subplots()
     circle = np.linspace(0, 2 * np.pi, 400)
@@ -129,20 +130,23 @@ def _mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
 
 
 def _write(axes: Axes, at: np.ndarray, text: str, **style: Any) -> None:
+    """A centred text."""
     centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
     axes.annotate(text, (at[0], at[1]), **centred | style)
 
 
 def _legend(figure: Figure, axes: Axes, columns: int) -> None:
+    """The entries of one panel, below the figure."""
     handles = axes.get_legend_handles_labels()[0]
     if handles:
         legend_below(figure, handles, columns)
 
 
-class _Frame:
+class _Plane:
     """Kinetic coordinates turned so that the outcomes with gamma+ >= 0 open upwards."""
 
     def __init__(self, result: AdmissibleSet, closed: np.ndarray):
+        """Turn the coordinates of a set with two closed contacts."""
         self._found = result
         self._metric = result.axes.T @ dense_mass(result.scene)
         self.radius = result.coordinates.radius
@@ -165,9 +169,14 @@ class _Frame:
 
 
 def _line(
-    axes: Axes, frame: _Frame, start: np.ndarray, direction: np.ndarray, text: str, style: str
+    axes: Axes,
+    frame: _Plane,
+    start: np.ndarray,
+    direction: np.ndarray,
+    text: str,
+    style: str,
 ) -> None:
-    """A side of the set as a ray up to the circle, named beside its outer part."""
+    """A side of the set as a ray up to the circle, named along its outer part."""
     b = start @ direction
     length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
     end = start + length * direction
@@ -184,35 +193,40 @@ def _line(
 def _projections(
     result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray
 ) -> Figure:
-    shown = closed[:_MOST_CONTACTS]
+    """Samples of the set in pairs of normalized gap velocities."""
+    contacts = closed[:_MOST_CONTACTS]
     samples = result.sample(0, _SAMPLES)
-    unit = np.asarray(result.scene.normals / kinetic_norm(result.scene)[None, :], float)[:, shown]
-    cloud, kept = samples @ unit, _energy_kept(result, samples)
-    pairs = list(combinations(range(len(shown)), 2)) or [(0, 0)]
+    unit = np.asarray(result.scene.normals / kinetic_norm(result.scene)[None, :], float)[
+        :, contacts
+    ]
+    cloud, energies = samples @ unit, _energy_ratio(result, samples)
+    pairs = list(combinations(range(len(contacts)), 2)) or [(0, 0)]
     figure, grid = new_panels(len(pairs), 3.1, 0.8)
     for axes, (i, j) in zip(grid, pairs):
         single = i == j
-        y = kept if single else cloud[:, j]
-        dots = axes.scatter(cloud[:, i], y, c=kept, s=5, cmap="viridis", lw=0, vmin=0, vmax=1)
+        y = energies if single else cloud[:, j]
+        dots = axes.scatter(cloud[:, i], y, c=energies, s=5, cmap="viridis", lw=0, vmin=0, vmax=1)
         for k, (name, v) in enumerate(marked.items()):
             point = v @ unit
-            height = _energy_kept(result, v) if single else point[j]
+            height = _energy_ratio(result, v) if single else point[j]
             _mark(axes, (point[i], height), name, k, bool(result.contains(v)))
-        axes.set_xlabel(_gap_label(shown[i]), fontsize=SMALL)
+        axes.set_xlabel(_gap_label(contacts[i]), fontsize=SMALL)
         energy = "energy kept $T^+ / T^-$"
-        axes.set_ylabel(energy if single else _gap_label(shown[j]), fontsize=SMALL)
+        axes.set_ylabel(energy if single else _gap_label(contacts[j]), fontsize=SMALL)
         finish(axes)
     figure.colorbar(dots, ax=grid.tolist(), label="energy kept $T^+ / T^-$")
     _legend(figure, grid[0], 4)
     return figure
 
 
-def _energy_kept(result: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
+def _energy_ratio(result: AdmissibleSet, velocity: np.ndarray) -> np.ndarray:
+    """T+ / T- (...,) of velocities (..., n)."""
     energy = 0.5 * np.sum(velocity @ dense_mass(result.scene) * velocity, axis=-1)
     return energy / result.energy if result.energy else np.ones_like(energy)
 
 
 def _gap_label(contact: int) -> str:
+    """The label of an axis."""
     return f"normalized gap velocity {contact + 1} after [√J]"
 
 
@@ -278,18 +292,18 @@ def rocking_outcomes(result: RockingDispersion, title: str = "", stays: float = 
     for j, axes in enumerate(panels):
         axes.pcolormesh(theta, e, codes[:, j].T, cmap=colours, norm=norm, shading="nearest")
     _angle_axes(result, panels, "restitution e")
-    shown = np.unique(codes)
-    legend_below(figure, [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in shown], 5)
+    handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)]
+    legend_below(figure, handles, 5)
     return figure
 
 
 def _panels(result: RockingDispersion, title: str) -> tuple[Figure, Any]:
     """A panel for each mu."""
-    figure, every = new_panels(len(result.friction), 2.8, 0.6, sharex=True, sharey=True)
-    for axes, mu in zip(every, np.asarray(result.friction)):
+    figure, panels = new_panels(len(result.friction), 2.8, 0.6, sharex=True, sharey=True)
+    for axes, mu in zip(panels, np.asarray(result.friction)):
         axes.set_title(f"mu = {mu:g}", loc="left", fontsize="medium")
     heading(figure, title)
-    return figure, every
+    return figure, panels
 
 
 def _angle_axes(result: RockingDispersion, panels: np.ndarray, label: str) -> None:
