@@ -65,7 +65,7 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
         `Audit`: a boolean () for each of the four, `consistent` for all; `print` says it in words.
 
     Raises:
-        ValueError: not one velocity per coordinate.
+        ValueError: the number of velocities is not that of coordinates.
 
     Source: Brogliato (2016), section 6.2.4.
 

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 
 import jimpact as ji
+from jimpact.cli.commands import _per_contact
 from jimpact.cli.main import keep_programs, main
 from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
 from jimpact.files import study_file
@@ -114,6 +115,16 @@ def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
     assert (tmp_path / "jimpact-fit.png").stat().st_size > 10_000
 
 
+def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path):
+    text = STUDY.replace("[1.0, 1.0]", "[1.0, 1.0, 1.0]").replace('"Newton"', '"lzb"\nrtol = 1e-5')
+    shots = SHOTS.replace("0.83", "0.83,0,0.1").replace("1.62", "1.62,0,0.2")
+    shots = shots.replace("post_2[m/s]", "post_2[m/s],pre_3[m/s],post_3[m/s]")
+    study, all_free = _per_contact(ji.read_study(written(tmp_path, text, shots)))
+    assert (study.law.rtol, all_free.law.rtol) == (1e-5, 1e-5)
+    np.testing.assert_array_equal(study.law.restitution, [0.9, 0.9])
+    np.testing.assert_array_equal(study.free["restitution"], [1, 1])
+
+
 def test_fit_of_a_study(tmp_path, capsys):
     picture = tmp_path / "deep" / "a.svg"
     page = tmp_path / "fit.html"
@@ -121,7 +132,7 @@ def test_fit_of_a_study(tmp_path, capsys):
     code, said = call(capsys, "fit", written(tmp_path), *options)
     assert code == 0
     assert "seed 1" in page.read_text(encoding="utf-8")
-    for words in ("study", "as measured", "corrected ", "restitution", "Warnings", "Picture: "):
+    for words in ("study", "as measured", "corrected ", "Rank: ", "Warnings", "Picture: "):
         assert words in said.out
     assert picture.read_text().startswith("<?xml")
     options = ["--law", "newton", "--method", "adam", "--starts", "1", "--json"]
@@ -167,6 +178,7 @@ REFUSED = [
     ('["restitution"]', "1", "`free` must be a list of names or a table of masks"),
     ("shots.csv", "none.csv", "none.csv' does not exist"),
     ("file =", "path =", "[data] must have the key `file`"),
+    ('"shots.csv"', "3", "`file` in [data] must be a path, but is 3"),
     ("[scene]", "[scene", "must be a TOML file"),
     ("[scene]\nmasses_kg = [1.0, 1.0]\n", "scene = 1\n", "`scene` must be a table, but is 1"),
     ('[data]\nfile = "shots.csv"\n', "", "[data]"),
@@ -216,6 +228,8 @@ def test_compare(tmp_path, capsys):
     assert code == 0
     assert "measured" not in said.out
     assert "-0.6000" in said.out
+    assert "Dispersion: 0" in said.out
+    assert "Rank: " not in said.out
 
 
 def test_montecarlo(tmp_path, capsys):

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import jimpact as ji
-from jimpact.solvers.friction import solve
+from jimpact.solvers import dense
+from jimpact.solvers.friction import distribute, solve
 from jimpact.solvers.many_contacts import solve_many
 from jimpact.status import CODE
 
@@ -286,3 +287,66 @@ def test_derivatives(rows):
     assert smooth.mean() > 0.8
     close((slope / size)[smooth], (first / size)[smooth], atol=1e-8)
     close((bend / size)[smooth], (second / size)[smooth], atol=1e-4)
+
+
+# ---- the small dense solves
+
+
+def definite(rng, n, count):
+    """Random symmetric positive definite matrices (n, n, count)."""
+    a = rng.normal(size=(count, n, n))
+    return np.moveaxis(a @ a.transpose(0, 2, 1) + 0.1 * np.eye(n), 0, -1)
+
+
+@pytest.mark.parametrize("n", [1, 3, 9])
+def test_dense_solves_are_those_of_numpy(n):
+    """In a batch; systems, inverses, products and least solutions of singular systems."""
+    rng = np.random.default_rng(n)
+    k, right = definite(rng, n, 5), rng.normal(size=(n, 2, 5))
+    thin = rng.normal(size=(5, n, max(n - 1, 1)))
+    singular = np.moveaxis(thin @ thin.transpose(0, 2, 1), 0, -1)
+    held = np.ones((n, 5), bool)
+    held[0, 2:] = n == 1
+    each = range(5)
+
+    @jax.jit
+    def run(k, right, singular, held):
+        one = dense.solve_definite(k[..., 0], right[..., 0])
+        pseudo = dense.pseudoinverse(singular, held)
+        return dense.solve(k, right), dense.inverse(k), dense.product(k, right), one, pseudo
+
+    x, inverse, product, one, pseudo = run(k, right, singular, held)
+    for i in each:
+        close(k[..., i] @ x[..., i], right[..., i], atol=1e-10)
+        close(inverse[..., i] @ k[..., i], np.eye(n), atol=1e-10)
+        close(product[..., i], k[..., i] @ right[..., i], atol=1e-12)
+        matrix = singular[..., i] * np.outer(held[:, i], held[:, i])
+        close(matrix @ pseudo[..., i] @ matrix, matrix, atol=1e-6)  # what velocities depend on
+        # the shares of redundant forces are the least ones to some percent: a null space of
+        # rounding is divided by its root
+        least = np.linalg.pinv(matrix, rcond=1e-9) @ matrix
+        close(pseudo[..., i] @ matrix, least, atol=0.05)
+    close(one, x[..., 0], atol=1e-10)
+
+
+def test_shares_of_redundant_forces():
+    """In proportion to the load; none below the least, none without load."""
+    limit = jnp.array([[2.0, 0.0], [0.5, 0.0]])
+    close(dense.load_shares(limit), [[1.0, 0.0], [0.25, 0.0]])
+    close(dense.load_shares(limit, 0.3), [[1.0, 0.3], [0.3, 0.3]])
+
+
+def test_programs_do_not_grow_with_the_contacts():
+    """Twelve contacts need no more operations than nine: nothing is written out row by row."""
+
+    def operations(n):
+        k, x = jnp.ones((n, n, 3)), jnp.ones((n, 3))
+        asked = jnp.ones((n, 3), bool)
+        programs = (
+            (lambda k, x: dense.solve(k, x[:, None]), k, x),
+            (lambda k, x: dense.pseudoinverse(k, x > 0), k, x),
+            (lambda k, x: distribute(k, x, x, asked), k, x),
+        )
+        return [jax.jit(f).lower(*given).as_text().count("=") for f, *given in programs]
+
+    assert operations(12) == operations(9)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 import jimpact as ji
@@ -24,6 +25,7 @@ from jimpact.cli.starting import as_csv
 from jimpact.cli.study import Study, read_study, without_none
 from jimpact.files.records import as_data, table
 from jimpact.files.study_file import is_motion
+from jimpact.law import with_parameter
 from jimpact.progress import Steps, waiting, wrapped
 from jimpact.registry import registered_laws
 
@@ -38,14 +40,15 @@ Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 # Words of the printed results (regular expressions), and the sentences that explain them there.
 GLOSSARY = {
     r"\brank\b": "Rank: how many combinations of the free parameters the data determine.",
+    r"\(bound\)": "(bound): the fit ended at a bound of the parameter's range.",
+    r"\bAICc\b": "AICc: Akaike's information criterion, misfit against number of parameters; lower "
+    "is better, differences below 2 mean little.",
     r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they conserve "
     "momentum.",
     r"\bparoxysm\b": "Accumulation: infinitely many impacts in a finite time. Friction: a contact "
     "begins to stick or to slip. Paroxysm: friction jams a sliding contact, an impact without "
     "collision.",
     r"\bdispersion\b": "Dispersion: 0 all energy in one body, 1 equal shares.",
-    r"\blargest difference\b": "Difference: of v+ between the two references, over the largest "
-    "|v-|.",
 }
 
 
@@ -235,12 +238,11 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
         return study, None
     tied = {}
     for name in fields:
-        choice = np.asarray(study.free.get(name, False))
-        one_each = np.arange(1, contacts + 1) if np.ndim(getattr(law, name)) else 1
+        value, choice = getattr(law, name), np.asarray(study.free.get(name, False))
+        one_each = np.arange(1, contacts + 1) if np.ndim(value) else 1
         labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
         tied[name] = np.broadcast_to(labels, (contacts,))
-    e, k = (np.broadcast_to(getattr(law, name), (contacts,)) for name in fields)
-    law = ji.LZB(e, k, exponent=law.exponent, initial_energy=law.initial_energy)
+        law = with_parameter(law, name, jnp.broadcast_to(value, (contacts,)))
     study = replace(study, law=law, free=tied)
     if len(np.unique(tied["restitution"])) == contacts and tied["stiffness"].all():
         return study, None
@@ -253,10 +255,10 @@ def _fits_table(fits: dict[str, "ji.Fit"]) -> list[str]:
     for name, fit in fits.items():
         data = "corrected" if name == CORRECTED else RAW
         rms = f"{fit.rms:.4f}" if fit.experiments is not None else f"{fit.rms:.4g}"
-        first = [type(fit.law).__name__, data], [rms, f"{fit.rank} of {len(fit.names)}"]
+        ends = [type(fit.law).__name__, data, rms, f"{fit.rank} of {len(fit.names)}"]
         for i, parameter in enumerate(fit.names):
-            left, right = first if i == 0 else (["", ""], ["", ""])
-            rows.append([*left, parameter, _value(fit, i), *right])
+            rows.append([*ends[:2], parameter, _value(fit, i), *ends[2:]])
+            ends = [""] * 4  # said once
     speeds = all(fit.experiments is not None for fit in fits.values())
     heads = ["law", "data", "parameter", "value", "rms [m/s]" if speeds else "rms", "rank"]
     lines = table(heads, rows, left=["data", "parameter", "value"])

@@ -46,6 +46,7 @@ def _partial(
     """`function` of its marked arguments alone, and their values."""
 
     def of_marked(*values: jax.Array) -> Arrays:
+        """`function` with the marked arguments replaced."""
         replaced = iter(values)
         return tuple(function(*(next(replaced) if m else x for x, m in zip(arguments, marked))))
 
@@ -65,6 +66,7 @@ class Tangent:
     many: bool = False
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
+        """Tangents (.., B) of all results; with `many`, directions first."""
         count = len(self.marked)
         primals, tangents = arrays[:count], arrays[count:]
         if getattr(self.function, "takes_duals", False):
@@ -77,6 +79,7 @@ class Tangent:
         of_marked, values = _partial(self.function, self.marked, primals)
 
         def push(*tangents: jax.Array) -> Arrays:
+            """Tangents in one direction."""
             return jax.jvp(of_marked, values, tangents)[1]
 
         return (jax.vmap(push) if self.many else push)(*tangents)
@@ -99,11 +102,13 @@ class Cotangent:
     many: bool = False
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
+        """Cotangents (.., B) of the marked arguments; with `many`, directions first."""
         count = len(self.marked)
         of_marked, values = _partial(reversible(self.function), self.marked, arrays[:count])
         _, back = jax.vjp(of_marked, *values)
 
         def pull(*cotangents: jax.Array) -> Arrays:
+            """Cotangents for one cotangent of the results."""
             return back(cotangents)
 
         return (jax.vmap(pull) if self.many else pull)(*arrays[count:])
@@ -127,11 +132,15 @@ def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     width = -(-size // count)
 
     def pieces(*whole: jax.Array) -> Arrays:
+        """All chunks, one after the other."""
+
         def cut(x: jax.Array) -> jax.Array:
+            """Chunks (count, .., width) of (.., B), the last one filled up with its last impact."""
             filled = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, count * width - size)], mode="edge")
             return jnp.moveaxis(filled.reshape(*x.shape[:-1], count, width), -2, 0)
 
         def join(x: jax.Array) -> jax.Array:
+            """The inverse of `cut`."""
             joined = jnp.moveaxis(x, 0, -2)
             return joined.reshape(*joined.shape[:-2], count * width)[..., :size]
 
@@ -191,6 +200,7 @@ def _wider(
             return list(outs), [0] * len(outs)
 
     def wide(x: jax.Array, axis: int | None) -> jax.Array:
+        """The array with the batch of `vmap` in its last axis."""
         if axis is None:
             x = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
         else:
@@ -223,6 +233,7 @@ def _transpose(cotangents: Any, *arrays: Any, function: Callable[..., Arrays]) -
     linear = tuple(ad.is_undefined_primal(x) for x in arrays)
 
     def zeros(x: Any) -> jax.Array:
+        """Zeros of the shape of an argument."""
         return jnp.zeros(x.aval.shape, x.aval.dtype)
 
     filled = [zeros(c) if type(c) is ad.Zero else c for c in cotangents]

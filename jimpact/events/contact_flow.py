@@ -95,6 +95,7 @@ class Viscous(NamedTuple):
         """A force knows contacts (m,), not batches."""
 
         def of_one(model: Any, x: jax.Array, rate: jax.Array) -> jax.Array:
+            """Of one impact, arrays (m,)."""
             return getattr(model, name)(x, rate)
 
         return jax.vmap(of_one, in_axes=-1, out_axes=-1)(self.model, x, -gamma * self.speed)
@@ -106,12 +107,15 @@ class Chain(NamedTuple):
     off_diagonal: jax.Array
 
     def times(self, f: jax.Array) -> jax.Array:
+        """`G f` (m, B)."""
         return tridiagonal_product(f, self.off_diagonal, f)
 
     def magnitude(self) -> "Chain":
+        """|G|, entry by entry."""
         return Chain(jnp.abs(self.off_diagonal))
 
     def pull(self) -> "Chain":
+        """min(G, 0) with the unit diagonal kept."""
         return Chain(jnp.minimum(self.off_diagonal, 0.0))
 
 
@@ -121,15 +125,19 @@ class Dense(NamedTuple):
     matrix: jax.Array
 
     def times(self, f: jax.Array) -> jax.Array:
+        """`G f` (m, B)."""
         return times(self.matrix, f)
 
     def _off_diagonal(self) -> jax.Array:
+        """G without its diagonal."""
         return self.matrix * (1 - unit(self.matrix))
 
     def magnitude(self) -> "Dense":
+        """|G|, entry by entry, with a unit diagonal."""
         return Dense(jnp.abs(self._off_diagonal()) + unit(self.matrix))
 
     def pull(self) -> "Dense":
+        """min(G, 0) with a unit diagonal."""
         return Dense(jnp.minimum(self._off_diagonal(), 0.0) + unit(self.matrix))
 
 
@@ -186,15 +194,18 @@ class ContactFlow(Flow):
 
     @property
     def exponent(self) -> Exponent:
+        """Exponents of the contacts: compiled in, or an array (m, B)."""
         static = self.exponent_static
         return static if static is not None else self.exponent_array  # type: ignore[return-value]
 
     @property
     def contacts(self) -> int:
+        """Number m of contacts."""
         return self.omega.shape[0]
 
     @property
     def snap(self) -> jax.Array:
+        """Margins (1, B) below this are 0."""
         return SNAP * self.tolerance
 
     @property
@@ -240,6 +251,7 @@ class ContactFlow(Flow):
     # ---- the protocol
 
     def constants(self, modes: jax.Array) -> Frozen:
+        """Factors of the field in the phases of the contacts."""
         phase, s = modes[: self.contacts], self.scales(modes)
         # the least one makes e = 0 regular; of several one of them, whole: min() would share its
         # derivative among them
@@ -264,6 +276,7 @@ class ContactFlow(Flow):
         return jnp.where(const.stiffness > 0, self.viscous.push(x, g), 0.0)
 
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of x, g, p and time."""
         x, g, _ = self.rows(y)
         f = self.force(const, x, g)
         dg = const.ratio * self.coupling.times(f)
@@ -288,12 +301,14 @@ class ContactFlow(Flow):
         return jnp.concatenate([by_x, by_g])
 
     def rooted(self, modes: jax.Array) -> jax.Array:
+        """Openings: x falls to 0 like the square of the time left."""
         opens = modes[: self.contacts] == EXPANSION
         return jnp.concatenate([opens, jnp.zeros_like(opens)])
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Phases and closings after events by indentation and by velocity."""
         m = self.contacts
         phase, count = modes[:m], modes[m : 2 * m]
         x, g, _ = self.rows(y)
@@ -320,6 +335,7 @@ class ContactFlow(Flow):
         return modes, jnp.concatenate([x, g, y[2 * m :]])
 
     def _slackening(self, phase: jax.Array, by_x: jax.Array, by_g: jax.Array) -> jax.Array:
+        """Phases (m, B) after events where forces may vanish before the indentation."""
         after = jnp.where(by_x & (phase == COMPRESSION), SLACK, phase)
         after = jnp.where(by_x & ((phase == SLACK) | (phase == OPEN)), COMPRESSION, after)
         return jnp.where(by_g & (phase == SLACK), OPEN, after)
@@ -332,12 +348,13 @@ class ContactFlow(Flow):
         return any_of(after[m : 2 * m] > before[m : 2 * m])
 
     def coasts(self, modes: jax.Array) -> jax.Array | None:
+        """With gaps, while no contact is loaded."""
         if not self.gapped:
             return None
         phase = modes[: self.contacts]
         return ~any_of((phase == COMPRESSION) | (phase == EXPANSION))
 
-    # ---- what is looked at
+    # ---- results
 
     def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
         """Forces, velocities and the rate of time in a state."""
@@ -399,6 +416,7 @@ class ContactFlow(Flow):
         return ~any_of(jnp.where(works, felt, left < -tolerance))
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """All contacts open; where a closed form ends the impact, its impulses are added."""
         m = self.contacts
         x, _, p = self.rows(y)
         _, gamma, rebound = self.at_work(modes, y, self.tolerance)

@@ -4,12 +4,12 @@
     slip:   lambda_j = -mu_j F_j u_j / |u_j|
     stick:  lambda such that u_j' = 0, while |lambda_j| <= mu_j F_j
 
-Who slips and who sticks is frozen in the modes (rows: phase, closings, slip: 0 sticks, else the
-sign of u); margins are, beside those of the normal flow, the speed of slip and the room inside the
-friction cone. The normal forces follow from the indentations, so that lambda exists and u' is
-unique whatever mu is: there is no Painleve paradox. Where K_tt is singular (both corners of a
-block lying flat) lambda is shared among the contacts that stick in proportion to mu F: they then
-break loose together.
+Which contacts slip and which stick is frozen in the modes (rows: phase, closings, slip: 0 sticks,
+else the sign of u). Margins of friction are the speed of slip and the room inside the friction
+cone. The normal forces follow from the indentations, so that lambda exists and u' is unique
+whatever mu is: there is no Painleve paradox. Where K_tt is singular (both corners of a block lying
+flat) lambda is shared among the contacts that stick in proportion to mu F: they then break loose
+together.
 """
 
 import dataclasses
@@ -34,8 +34,12 @@ from jimpact.events.stepper import any_of
 from jimpact.solvers.dense import load_shares, regularized_once, times
 from jimpact.solvers.friction import distribute
 
-AHEAD = 1e-6  # of the unit of time: at the first touch there are no forces yet to decide by
-LEFT = 0.1  # of the tolerance: a loaded contact with less energy ends the impact all the same
+# part of the unit of time. At the first touch forces are 0 and cannot decide which contacts
+# stick: those of a moment later do. Ten times more would decide by later forces.
+MOMENT = 1e-6
+# of the tolerance: the impact is over where no contact has more energy, loaded ones included. Ten
+# times more is the energy of one tolerance of velocity, which would be lost.
+LEFT = 0.1
 
 
 def ridge(dtype: Any) -> float:
@@ -54,7 +58,7 @@ class FrictionConstants(NamedTuple):
     stick: jax.Array  # (m, B)
     drag: jax.Array  # lambda / F of those that slide (m, B)
     pull: jax.Array  # u' = pull F, but for what is held (m, m, B)
-    along: jax.Array  # K_tt of those that stick (m, m, B)
+    tangent: jax.Array  # K_tt of those that stick (m, m, B)
     share: jax.Array  # beside its diagonal (m, B)
 
 
@@ -72,22 +76,25 @@ class FrictionForces(NamedTuple):
 class FrictionFlow(ContactFlow):
     """Contacts with planar friction."""
 
-    across: jax.Array  # K_nt (m, m, B)
-    along: jax.Array  # K_tt (m, m, B)
+    normal_tangent: jax.Array  # K_nt (m, m, B)
+    tangent: jax.Array  # K_tt (m, m, B)
     friction: jax.Array  # mu (m, B)
 
     # ---- the state: x, g, p, slip u, its impulse, time
 
     @property
     def driving(self) -> tuple[int, ...]:
+        """x, g, p and slip."""
         m = self.contacts
-        return m, m, m, self.across.shape[1]
+        return m, m, m, self.normal_tangent.shape[1]
 
     @property
     def adding(self) -> tuple[int, ...]:
-        return self.across.shape[1], 1
+        """The tangential impulse and time."""
+        return self.normal_tangent.shape[1], 1
 
     def slip(self, y: jax.Array) -> jax.Array:
+        """Slip u (m, B) of a state."""
         m = self.contacts
         return y[3 * m : 4 * m]
 
@@ -114,21 +121,23 @@ class FrictionFlow(ContactFlow):
         return jnp.where(shares, jnp.maximum(ridge(y.dtype) / self.tolerance, 1.0), 1.0)
 
     def loaded(self, modes: jax.Array) -> jax.Array:
+        """Contacts (m, B) in compression or expansion."""
         phase = modes[: self.contacts]
         return (phase == COMPRESSION) | (phase == EXPANSION)
 
     def constants(self, modes: jax.Array) -> Any:
+        """Those of the normal flow, and which contacts stick or slide."""
         m = self.contacts
         slip = modes[2 * m :]
         stick = (slip == 0) & self.loaded(modes)
         drag = -slip.astype(self.friction.dtype) * self.friction
-        k = jnp.where(stick[:, None] & stick[None], self.along, 0.0)
+        k = jnp.where(stick[:, None] & stick[None], self.tangent, 0.0)
         return FrictionConstants(
             frozen=super().constants(modes),
             stick=stick,
             drag=drag,
-            pull=jnp.swapaxes(self.across, 0, 1) + self.along * drag[None],
-            along=k,
+            pull=jnp.swapaxes(self.normal_tangent, 0, 1) + self.tangent * drag[None],
+            tangent=k,
             share=jnp.where(stick, ridge(k.dtype), 1.0),
         )
 
@@ -140,29 +149,31 @@ class FrictionFlow(ContactFlow):
         largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
         weight = load_shares(most)
         right = jnp.where(const.stick, -pull, 0.0)
-        held = regularized_once(const.along * weight[None], const.share, right)
+        held = regularized_once(const.tangent * weight[None], const.share, right)
         hold, size = weight * held, jnp.abs(held)
         # in parts of the force: those of a contact that opens vanish together
         some = const.stick & (largest + size > 0)
         room = jnp.where(some, (largest - size) / jnp.where(some, largest + size, 1.0), 1.0)
-        rate = jnp.where(const.stick, 0.0, pull + times(self.along, hold))
+        rate = jnp.where(const.stick, 0.0, pull + times(self.tangent, hold))
         return FrictionForces(f, const.drag * f + hold, rate, room)
 
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        frozen, found = const.frozen, self.forces(const, y)
-        pull = self.coupling.times(found.normal) + times(self.across, found.side)
+        """Rates of x, g, p, slip, its impulse and time."""
+        frozen, forces = const.frozen, self.forces(const, y)
+        pull = self.coupling.times(forces.normal) + times(self.normal_tangent, forces.side)
         return jnp.concatenate(
             [
                 frozen.closing * self.rows(y)[1],
                 frozen.ratio * pull,
-                frozen.unit * found.normal,
-                frozen.unit * found.rate,
-                frozen.unit * found.side,
+                frozen.unit * forces.normal,
+                frozen.unit * forces.rate,
+                frozen.unit * forces.side,
                 frozen.unit,
             ]
         )
 
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Those of the normal flow, speeds of slip, room in the friction cones."""
         m = self.contacts
         slides = (modes[2 * m :] != 0) & self.loaded(modes)
         return jnp.concatenate(
@@ -174,12 +185,14 @@ class FrictionFlow(ContactFlow):
         )
 
     def rooted(self, modes: jax.Array) -> jax.Array:
+        """As in the normal flow; margins of friction have no root."""
         rooted = super().rooted(modes)
         return jnp.concatenate([rooted, jnp.zeros_like(rooted)])
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Modes after events: slip that stops and stick that breaks included."""
         m = self.contacts
         stopped, broke = which[2 * m : 3 * m], which[3 * m :]
         side = self.forces(self.constants(modes), y).side
@@ -192,7 +205,7 @@ class FrictionFlow(ContactFlow):
     def decided(
         self, modes: jax.Array, y: jax.Array, stopped: jax.Array, closed: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Who sticks and who slides where to, once contacts have stopped to slip or have closed."""
+        """Which contacts stick, and where the others slide to, after slip has stopped or begun."""
         m = self.contacts
         u, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
         rests = jnp.abs(u) <= SNAP * self.tolerance
@@ -205,8 +218,8 @@ class FrictionFlow(ContactFlow):
         f = still.soon(modes, state)
         most = still.friction * f
         slides = jnp.where(asked | ~loaded, 0.0, -slip.astype(u.dtype) * most)
-        b = times(jnp.swapaxes(still.across, 0, 1), f) + times(still.along, slides)
-        stick, towards = distribute(still.along, b, most, asked)
+        b = times(jnp.swapaxes(still.normal_tangent, 0, 1), f) + times(still.tangent, slides)
+        stick, towards = distribute(still.tangent, b, most, asked)
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
         slip = jnp.where(asked, towards, slip)
         return jnp.concatenate([modes[: 2 * m], slip]), jnp.concatenate([y[: 3 * m], u, y[4 * m :]])
@@ -215,11 +228,12 @@ class FrictionFlow(ContactFlow):
         """Forces (m, B) a moment later, in parts of the largest."""
         const = ContactFlow.constants(self, modes)
         x, g, _ = self.rows(y)
-        f = self.force(const, jnp.maximum(x + AHEAD * const.closing * g, 0.0), g)
+        f = self.force(const, jnp.maximum(x + MOMENT * const.closing * g, 0.0), g)
         top = jnp.max(f, axis=0, keepdims=True)
         return f / jnp.where(top > 0, top, 1.0)
 
     def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
+        """Forces, velocities and slip in a state."""
         m, side = self.contacts, self.forces(self.constants(modes), y).side
         return (
             super()
@@ -229,19 +243,22 @@ class FrictionFlow(ContactFlow):
 
     def change(self, y: jax.Array) -> jax.Array:
         """What the impulses of a state change of the gap velocities, tangential ones, too."""
-        side = y[-1 - self.across.shape[1] : -1]
-        return super().change(y) + times(self.across, side)
+        side = y[-1 - self.normal_tangent.shape[1] : -1]
+        return super().change(y) + times(self.normal_tangent, side)
 
     # ---- the end: a contact with friction is never alone, and no multiple of another state
 
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
+        """Never: the states of an impact with friction are not self-similar."""
         return None
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
+        """Whether no contact is at work."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
         return ~any_of(works)
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Indentations set to 0; no closed form ends an impact with friction."""
         m = self.contacts
         x = jnp.zeros_like(y[:m])
         return modes, jnp.concatenate([x, y[m:]])

@@ -1,4 +1,4 @@
-"""The dynamics of an impact in units of its own: results do not depend on the user's unit system.
+"""The dynamics of an impact in its natural units: results do not depend on the user's units.
 
 With Q the largest normalized approach velocity (or stored energy) of the impact, contact j has
 
@@ -176,9 +176,9 @@ def flow_of(
     if problem.sides is None:
         flow = ContactFlow(**parts)
         return flow, *flow.start(problem.gamma, x)
-    (across, along, slip), friction = problem.sides
+    (normal_tangent, tangent, slip), friction = problem.sides
     kind = FrictionFlow if len(slip) == m else SlipFlow
-    frictional = kind(**parts, across=across, along=along, friction=friction)
+    frictional = kind(**parts, normal_tangent=normal_tangent, tangent=tangent, friction=friction)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
 
 
@@ -197,10 +197,11 @@ class ImpulseProgram:
     sides: int = 0  # tangential rows
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    smooth: bool = False  # what has derivatives alone: tangents go along with the steps
+    smooth: bool = False  # only the results that have derivatives; duals are taken
     repeats: bool = False  # walk the steps once more, for both modes
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
+        """The flow of a problem, its first modes and state."""
         flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
         return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
@@ -222,10 +223,11 @@ class ImpulseProgram:
         return dataclasses.replace(self, repeats=self.smooth)
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
+        """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
-        given = jax.lax.stop_gradient(problem) if self.repeats else problem
-        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), given)
+        fixed = jax.lax.stop_gradient(problem) if self.repeats else problem
+        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), fixed)
         gamma = value_of(problem.gamma)
         end = to_the_end(
             flow, gamma, modes, y, self.most, keeps=self.finely and not self.takes_duals
@@ -241,6 +243,7 @@ class ImpulseProgram:
         rows = 3 * gamma.shape[0]
 
         def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
+            """Normal impulses, tangential ones and time of the last state."""
             p = state[rows - len(gamma) : rows] + dp
             return p, state[rows + self.sides : -1][: self.sides], state[-1:]
 
@@ -353,14 +356,16 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
 
     @jax.custom_jvp
     def value(*leaves: jax.Array) -> tuple[jax.Array, ...]:
+        """The values."""
         return in_columns(function, *leaves)
 
     def rule(primals: Any, tangents: Any) -> Any:
+        """Values at the tolerance of derivatives, and their tangents."""
         # values keep the steps for the reverse mode: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
         outs = evaluate(fine, primals)
-        along = dataclasses.replace(fine, smooth=True)
-        rates = tangents_in_columns(along, primals, tangents)
+        smooth = dataclasses.replace(fine, smooth=True)
+        rates = tangents_in_columns(smooth, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 

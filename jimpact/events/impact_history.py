@@ -12,7 +12,7 @@ from jimpact.events.plastic_limit import to_the_end
 
 
 @dataclasses.dataclass(frozen=True)
-class Samples:
+class HistoryProgram:
     """From the leaves of a `Problem` in columns to rows of samples (s, .., B) in time.
 
     Results: the times (s, 1, B), twice the energy (s, m, B), the rows of `ContactStates`, the
@@ -23,6 +23,7 @@ class Samples:
     samples: int
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
+        """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
         still = jax.lax.stop_gradient(problem)
         flow, modes, y = self.outcome.flow(still, 1.0)
@@ -32,8 +33,8 @@ class Samples:
         states = stepper.path(moving, modes, y, plan)
         marks = jnp.where(plan.marks[:, -1:] > 0, plan.marks, 0)
         last = end.step.modes[None]
-        kept = jnp.where(marks[:, -1:] > 0, marks[:, : len(modes)].astype(last.dtype), last)
-        phases = jnp.concatenate([kept, last])
+        modes_before = jnp.where(marks[:, -1:] > 0, marks[:, : len(modes)].astype(last.dtype), last)
+        phases = jnp.concatenate([modes_before, last])
         clocks = jnp.concatenate([plan.clock, jnp.zeros_like(plan.clock[:1])])
         times = states[:, -1]  # (steps + 1, B)
         no_target = jnp.zeros(end.step.target.shape, bool)
@@ -44,6 +45,7 @@ class Samples:
             before = jnp.sum((times <= jax.lax.stop_gradient(t)).astype(jnp.int32), axis=0) - 1
 
             def of(rows: jax.Array) -> jax.Array:
+                """Rows of the step before the sample."""
                 return jnp.take_along_axis(rows, before[None, None], axis=0)[0]
 
             state, now = of(states), of(phases)
@@ -51,12 +53,12 @@ class Samples:
             ahead = jnp.where(rate > 0, (t - state[-1:]) / jnp.where(rate > 0, rate, 1.0), 0.0)
             step = stepper.Step(now, no_target, of(clocks))
             state = stepper.between(moving, step, state, ahead)
-            seen = moving.contact_states(now, state)
-            x = jnp.maximum(seen.indentation, 0.0)
-            return state[-1:], moving.energy(x, jnp.zeros_like(x)), seen._replace(indentation=x)
+            sample = moving.contact_states(now, state)
+            x = jnp.maximum(sample.indentation, 0.0)
+            return state[-1:], moving.energy(x, jnp.zeros_like(x)), sample._replace(indentation=x)
 
         parts = jnp.linspace(0.0, 1.0, self.samples, dtype=y.dtype)
-        time, energy, seen = jax.lax.map(at, parts)
+        time, energy, states_at = jax.lax.map(at, parts)
         force = jax.lax.map(lambda both: moving.contact_states(*both).force, (phases, states))
         code = ended.status.astype(y.dtype)
-        return time, energy, *seen, jnp.max(force, axis=0), code
+        return time, energy, *states_at, jnp.max(force, axis=0), code

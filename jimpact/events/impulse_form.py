@@ -82,6 +82,7 @@ def emptying(flow: Rule, walk: Walk, is_primary: jax.Array, increment: jax.Array
     """
 
     def of_primary(values: jax.Array) -> jax.Array:
+        """The value of the primary contact."""
         return jnp.sum(jnp.where(is_primary, values, 0.0))
 
     gamma, energy, dp = of_primary(walk.gamma), of_primary(walk.energy), of_primary(increment)
@@ -125,10 +126,11 @@ def rule_of(problem: Any, exponent: Any, chain: bool) -> Rule:
 def solve(problem: Any, exponent: Any, chain: bool, max_steps: int) -> tuple[jax.Array, jax.Array]:
     """Dimensionless impulses and status; the step in impulse is the problem's `step`."""
 
-    def run(given: Any, differentiated: bool) -> tuple[jax.Array, jax.Array]:
-        step = jax.lax.stop_gradient(given.step[0])
-        rule = rule_of(given, exponent, chain)
-        end = walk(rule, step, max_steps, given.gamma, 0.5 * given.energy)
+    def run(problem: Any, differentiated: bool) -> tuple[jax.Array, jax.Array]:
+        """Impulses and status, as `both_modes` takes them."""
+        step = jax.lax.stop_gradient(problem.step[0])
+        rule = rule_of(problem, exponent, chain)
+        end = walk(rule, step, max_steps, problem.gamma, 0.5 * problem.energy)
         return end.p, jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
 
     return both_modes(run)(problem)

@@ -6,7 +6,7 @@ light body lose about its part of the mass at each closing: thousands of closing
 law is homogeneous: a state multiplied by s takes the same course, multiplied by s. Once a state
 returns as a multiple s < 1 of itself, it will return so for ever, and the limit is known.
 
-Whether it does is looked at when the number of closings becomes 8, 16, 32, ... Two states one
+This is checked when the number of closings becomes 8, 16, 32, ... Two states one
 such number apart are compared by `gamma`, by the energy in each contact, and by the impulses that
 would bring the contacts to rest now. These see, as `gamma` alone does not, how fast heavy bodies
 on both sides of a light one still approach. A light body that does not lose its energy may push
@@ -32,10 +32,10 @@ SHAPE = 0.02
 
 
 class Rest(NamedTuple):
-    """Who comes to rest (m, B), and what was seen when it was looked at last."""
+    """Which contacts (m, B) come to rest, and the state of the impact at its last pause."""
 
     contacts: jax.Array  # whose closings have no end
-    carries: jax.Array  # of these, who carries an impulse
+    carries: jax.Array  # those of them that carry an impulse
     # (3, m, B): gamma, root of the energy stored, impulse that takes what is left of the approach
     rows: jax.Array
     closings: jax.Array
@@ -62,13 +62,13 @@ class ImpactEnd(NamedTuple):
 
     @property
     def plan(self) -> stepper.AcceptedSteps:
-        """The steps that were kept."""
+        """The recorded steps."""
         assert self.pen is not None
         return self.pen.plan
 
     @property
     def over(self) -> jax.Array:
-        """Not given up (1, B)."""
+        """Whether (1, B) the impact has ended, not given up."""
         return self.carry.plan[2:3] == OVER
 
     @property
@@ -99,23 +99,25 @@ def to_the_end(
     start = ImpactEnd(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
 
     def on(end: ImpactEnd) -> ImpactEnd:
+        """On to the next pause or to the end."""
         finished = (end.carry.plan[2:3] == OVER) & end.begun
         if end.pen is None:
             carry, pen = stepper.run(flow, end.carry, most), None
         else:
             carry, pen = stepper.record(flow, end.carry, end.pen, most)
         over, paused = (carry.plan[2:3] == OVER) & ~finished, carry.plan[2:3] == PAUSED
-        seen = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
-        quiet = over & at_rest(still, seen)
+        values = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
+        quiet = over & at_rest(still, values)
 
         def at_end(flow: ContactFlow, y: jax.Array) -> jax.Array:
+            """The state, finished where the impact is over."""
             return jnp.where(over, flow.finish(carry.step.modes, y)[1], y)
 
         carry = carry._replace(y=dual_like(carry.y, pushforward(at_end, flow, carry.y)))
-        seen = seen._replace(y=jax.lax.stop_gradient(value_of(carry.y)))
+        values = values._replace(y=jax.lax.stop_gradient(value_of(carry.y)))
         rest = jax.lax.cond(
             jnp.any(paused | quiet),
-            lambda: looked(still, gamma, seen, end.rest, quiet),
+            lambda: contacts_at_rest(still, gamma, values, end.rest, quiet),
             lambda: end.rest,
         )
         settled = jnp.where(rest.ended, OVER, GOES_ON)
@@ -136,10 +138,10 @@ def at_rest(flow: ContactFlow, end: stepper.StepperState) -> jax.Array:
     return quiet & any_of(quiet & (modes[m : 2 * m] >= ENDLESS))
 
 
-def looked(
-    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, seen: Rest, quiet: jax.Array
+def contacts_at_rest(
+    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, last: Rest, quiet: jax.Array
 ) -> Rest:
-    """Who is at rest at the end, or would come to rest from a pause.
+    """Which contacts are at rest at the end, or would come to rest after a pause.
 
     Contacts at rest carry what keeps each of them from approaching: `0 <= dp _|_ gamma+ >= 0`, on
     the gamma+ that their impulses give: errors of many closings add up.
@@ -147,7 +149,7 @@ def looked(
     m, modes, state = flow.contacts, carry.step.modes, carry.y
     paused = carry.plan[2:3] == PAUSED
     count = modes[m : 2 * m]
-    since = count - seen.closings
+    since = count - last.closings
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
     rest = quiet | often
     now = gamma + flow.change(state)
@@ -162,20 +164,20 @@ def looked(
     start = (often | (rest & (now < 0)), jnp.zeros_like(now))
     carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
 
-    # is it a part of the state seen before?
+    # is it a part of the state at the last look?
     root = jnp.sqrt(flow.energy(state[:m], jnp.zeros_like(now)))
     rows = jnp.where(often, jnp.stack([now, root, dp]), 0.0)
-    size, before = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, seen.rows))
+    size, before = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))
     ratio = size[:1] / jnp.where(before[:1] > 0, before[:1], size[:1])
-    returns = jnp.abs(rows - ratio * seen.rows) <= SHAPE * (1 - ratio) * size
+    returns = jnp.abs(rows - ratio * last.rows) <= SHAPE * (1 - ratio) * size
     after = now + flow.coupling.times(dp)
-    stays = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
-    meets = jnp.where(often, carries, stays) & jnp.all(returns, axis=0)
+    settled = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
+    meets = jnp.where(often, carries, settled) & jnp.all(returns, axis=0)
     ends = paused & ~any_of(~meets) & any_of(often & (flow.restitution < 1))
     rest = quiet | (often & ends)
     new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends)
     fresh = paused | any_of(quiet)
-    return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, seen)
+    return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, last)
 
 
 def remainder(
@@ -184,6 +186,7 @@ def remainder(
     """The impulses of the contacts that carry at the end, as a smooth function of the rest."""
 
     def some() -> jax.Array:
+        """Impulses where a contact carries."""
         return impulse_of_rest(flow, carries, gamma + flow.change(state))
 
     return jax.lax.cond(jnp.any(carries), some, lambda: jnp.zeros_like(gamma))
@@ -194,14 +197,15 @@ def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> 
     right = jnp.where(carries, -after, 0.0)
 
     def step(carry: Any, _: None) -> tuple[Any, None]:
+        """One step of conjugate gradients."""
         z, residual, direction, size = carry
         image = jnp.where(carries, flow.coupling.times(direction), 0.0)
         curvature = total(direction * image)
         length = jnp.where(curvature > 0, size / jnp.where(curvature > 0, curvature, 1.0), 0.0)
         z, residual = z + length * direction, residual - length * image
         new = total(residual * residual)
-        kept = jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0)
-        return (z, residual, residual + kept * direction, new), None
+        ratio = jnp.where(size > 0, new / jnp.where(size > 0, size, 1.0), 0.0)
+        return (z, residual, residual + ratio * direction, new), None
 
     start = (jnp.zeros_like(right), right, right, total(right * right))
     return jax.lax.scan(step, start, None, length=2 * right.shape[0])[0][0]

@@ -51,16 +51,16 @@ LEAST_STIFFNESS = 1e-10  # of the largest, where friction does not turn directio
 
 
 class Reduced(NamedTuple):
-    """The field with sticking forces eliminated: `a = pull F + along lambda` of those that slide.
+    """The field with sticking forces eliminated: `a = pull F + tangent lambda` of those that slide.
 
-    gamma' = coupling F + across lambda;  forces of sticking -(held F + carried lambda).
+    gamma' = coupling F + normal_tangent lambda;  forces of sticking -(held F + carried lambda).
     """
 
     frozen: Frozen
     coupling: jax.Array  # (m, m, B)
-    across: jax.Array  # (m, t, B)
+    normal_tangent: jax.Array  # (m, t, B)
     pull: jax.Array  # (t, m, B)
-    along: jax.Array  # (t, t, B)
+    tangent: jax.Array  # (t, t, B)
     held: jax.Array  # (t, m, B)
     carried: jax.Array  # (t, t, B)
 
@@ -120,23 +120,26 @@ def dot(a: jax.Array, b: jax.Array) -> jax.Array:
 class SlipFlow(FrictionFlow):
     """Contacts with friction in space."""
 
-    # across: K_nt (m, 2 m, B); along: K_tt (2 m, 2 m, B)
+    # normal_tangent: K_nt (m, 2 m, B); tangent: K_tt (2 m, 2 m, B)
 
     longest = STABLE
 
     # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
 
     def slip(self, y: jax.Array) -> jax.Array:
+        """The two rows of slip (m, 2, B) of each contact."""
         m = self.contacts
         return pairs(y[3 * m : 5 * m])
 
     def with_slip(self, y: jax.Array, q: jax.Array) -> jax.Array:
+        """The state with these rows of slip."""
         m = self.contacts
         return jnp.concatenate([y[: 3 * m], flat(q), y[5 * m :]])
 
     def start_with(
         self, gamma: jax.Array, x: jax.Array, u: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Modes and state before the impact."""
         m = self.contacts
         modes, y = self.start(gamma, x)
         modes = jnp.concatenate([modes, jnp.zeros_like(modes[:m])])
@@ -170,20 +173,21 @@ class SlipFlow(FrictionFlow):
     # ---- the protocol
 
     def constants(self, modes: jax.Array) -> Any:
+        """The field without the forces of sticking."""
         stick, slips, creeps = self.sliding(modes)
         free = twice(slips | creeps | ~self.loaded(modes))
-        z = pseudoinverse(self.along, twice(stick))
-        up = jnp.swapaxes(self.across, 0, 1)
-        held, carried = product(z, up), product(z, self.along)
+        z = pseudoinverse(self.tangent, twice(stick))
+        up = jnp.swapaxes(self.normal_tangent, 0, 1)
+        held, carried = product(z, up), product(z, self.tangent)
         coupling = self.coupling.matrix  # type: ignore[union-attr]
-        pull = up - product(self.along, held)
-        along = self.along - product(self.along, carried)
+        pull = up - product(self.tangent, held)
+        tangent = self.tangent - product(self.tangent, carried)
         return Reduced(
             frozen=ContactFlow.constants(self, modes),
-            coupling=coupling - product(self.across, held),
-            across=self.across - product(self.across, carried),
+            coupling=coupling - product(self.normal_tangent, held),
+            normal_tangent=self.normal_tangent - product(self.normal_tangent, carried),
             pull=jnp.where(free[:, None], pull, 0.0),
-            along=jnp.where(free[:, None] & free[None], along, 0.0),
+            tangent=jnp.where(free[:, None] & free[None], tangent, 0.0),
             held=held,
             carried=carried,
         )
@@ -199,10 +203,10 @@ class SlipFlow(FrictionFlow):
         angle, r = jnp.where(slides, q[:, 1], 0.0), self.speed(modes, q)
         over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
         drift, correction = self._creep(const, modes, y, f, c, angle, over_r)
-        along, right = polar(angle + correction)
-        side = flat(-c[:, None] * along)
-        a = pairs(times(const.pull, f) + times(const.along, side))
-        grows, turns = dot(along, a), dot(right, a)
+        direction, perpendicular = polar(angle + correction)
+        side = flat(-c[:, None] * direction)
+        a = pairs(times(const.pull, f) + times(const.tangent, side))
+        grows, turns = dot(direction, a), dot(perpendicular, a)
         rate = jnp.stack(
             [
                 jnp.where(slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)),
@@ -213,8 +217,8 @@ class SlipFlow(FrictionFlow):
         rate = jnp.where(
             self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
         )
-        own = pairs(const.along[np.arange(len(side)), np.arange(len(side))])
-        stiffness = c * (own[:, 0] + own[:, 1]) / 2
+        diagonal = pairs(const.tangent[np.arange(len(side)), np.arange(len(side))])
+        stiffness = c * (diagonal[:, 0] + diagonal[:, 1]) / 2
         haste = 1 + total(over_r * (length(a) + 2 * stiffness))
         holding = -(times(const.held, f) + times(const.carried, side))
         return SlipRates(f, side, jnp.where(twice(stick), holding, 0.0), rate, stiffness, haste)
@@ -222,7 +226,7 @@ class SlipFlow(FrictionFlow):
     def _blocks(self, const: Reduced) -> jax.Array:
         """K_tt (m, 2, m, 2, B)."""
         m = self.contacts
-        return const.along.reshape(m, 2, m, 2, *const.along.shape[2:])
+        return const.tangent.reshape(m, 2, m, 2, *const.tangent.shape[2:])
 
     def _creep(
         self,
@@ -234,7 +238,7 @@ class SlipFlow(FrictionFlow):
         angle: jax.Array,
         over_r: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        """How fast the directions (m, B) of creep drift, and where they are beside `angle`.
+        """How fast the directions (m, B) of creep drift, and their deviation from `angle`.
 
         With G = n . a of all contacts that creep, G' at fixed angles and J = -dG/d angle, the
         quasi-static solution G = 0 drifts by J^-1 G'. The directions lag behind it by
@@ -244,24 +248,25 @@ class SlipFlow(FrictionFlow):
         x, g, _ = self.rows(y)
         *_, creeps = self.sliding(modes)
         r = jnp.where(creeps, self.slip(y)[:, 0], 0.0)
-        along, right = polar(angle)
+        direction, perpendicular = polar(angle)
 
         def acceleration(f: jax.Array, side: jax.Array) -> jax.Array:
-            return pairs(times(const.pull, f) + times(const.along, flat(side)))
+            """u' (m, 2, B) of normal forces and those of sliding."""
+            return pairs(times(const.pull, f) + times(const.tangent, flat(side)))
 
-        side = -c[:, None] * along
+        side = -c[:, None] * direction
         a = acceleration(f, side)
-        grows, turns = dot(along, a), dot(right, a)
-        pull = times(const.coupling, f) + times(const.across, flat(side))
+        grows, turns = dot(direction, a), dot(perpendicular, a)
+        pull = times(const.coupling, f) + times(const.normal_tangent, flat(side))
         rates = (frozen.closing * g, frozen.ratio * pull)
         _, df = jax.jvp(lambda x, g: self.force(frozen, x, g), (x, g), rates)
         dc = jnp.where(c > 0, self.friction * df, 0.0)
-        turned = (c * over_r * turns)[:, None] * right  # of those that slip
-        changes = dot(right, acceleration(df, -dc[:, None] * along - turned))
+        turned = (c * over_r * turns)[:, None] * perpendicular  # of those that slip
+        changes = dot(perpendicular, acceleration(df, -dc[:, None] * direction - turned))
         # all in units of the largest entry: forces begin at 0
         blocks = self._blocks(const)
         j = sum(
-            right[:, i][:, None] * blocks[:, i, :, k] * right[:, k][None]
+            perpendicular[:, i][:, None] * blocks[:, i, :, k] * perpendicular[:, k][None]
             for i in range(2)
             for k in range(2)
         )
@@ -283,6 +288,7 @@ class SlipFlow(FrictionFlow):
         return jnp.where(creeps, drift, 0.0), jnp.where(creeps, correction, 0.0)
 
     def contact_states(self, modes: jax.Array, y: jax.Array) -> ContactStates:
+        """Forces, velocities and slip in a state."""
         m, (x, g, p) = self.contacts, self.rows(y)
         const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
         motion = self.motion(const, modes, y)
@@ -299,9 +305,10 @@ class SlipFlow(FrictionFlow):
         )
 
     def field(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """Rates of x, g, p, slip, its impulses and time, all in the shortened time."""
         _, g, _ = self.rows(y)
         frozen, motion = const.frozen, self.motion(const, modes, y)
-        pull = times(const.coupling, motion.force) + times(const.across, motion.sliding)
+        pull = times(const.coupling, motion.force) + times(const.normal_tangent, motion.sliding)
         dy = jnp.concatenate(
             [
                 frozen.closing * g,
@@ -333,6 +340,7 @@ class SlipFlow(FrictionFlow):
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
+        """Modes after events; slip changes its variables with the mode."""
         m = self.contacts
         stopped, ended = which[2 * m : 3 * m], which[3 * m :]
         stick, slips, creeps = self.sliding(modes)
@@ -358,7 +366,7 @@ class SlipFlow(FrictionFlow):
     def decided(
         self, modes: jax.Array, y: jax.Array, stopped: jax.Array, closed: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Who sticks and who creeps where to, once contacts have stopped to slip or have closed."""
+        """Which contacts stick, and where the others creep to, after slip has stopped or begun."""
         m = self.contacts
         q, slip, loaded = self.slip(y), modes[2 * m :], self.loaded(modes)
         stick = loaded & (slip == STICKS) & ~closed
@@ -376,9 +384,9 @@ class SlipFlow(FrictionFlow):
         slides = jnp.where(
             (asked | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
         )
-        b = times(jnp.swapaxes(still.across, 0, 1), f)
-        b = b - times(still.along, flat(most[:, None] * slides))
-        inside, towards = distribute(still.along, b, most, asked)
+        b = times(jnp.swapaxes(still.normal_tangent, 0, 1), f)
+        b = b - times(still.tangent, flat(most[:, None] * slides))
+        inside, towards = distribute(still.tangent, b, most, asked)
         towards = angle_of(pairs(towards))
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
         q = jnp.where(asked[:, None], begins, q)

@@ -44,7 +44,7 @@ FIRST = 0.05  # first step, in the time of the fastest contact: none can turn ar
 RESTART = 0.1  # first rooted step after a contact has closed, as a part of the step before it
 CUT = 0.7  # part of the way to an event that a step is shortened to where it cannot land
 DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
-SHORTEST = 1e-13  # step: a shorter one cannot be told from none
+SHORTEST = 1e-13  # step: a shorter one cannot be distinguished from none
 TIE = 1e-13  # of a step: events of one moment are taken in the order of their rows
 # Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
 # with the number of passes, or the errors of N steps would add up to N tolerances.
@@ -158,14 +158,14 @@ def _put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
 
 
 class Step(NamedTuple):
-    """What a step needs beside the state: enough to repeat it."""
+    """What a step needs in addition to the state: enough to repeat it."""
 
     modes: jax.Array  # (m, B)
     target: jax.Array  # (k, B) one-hot: the margin it lands on; none: a step in time
     clock: jax.Array  # (4, B): xi at the beginning, length, whether xi is a root, whether it lands
 
 
-class _Frame(NamedTuple):
+class _StepVariable(NamedTuple):
     """The variable xi of a step, (1, B) each."""
 
     start: Any  # xi at the beginning
@@ -174,7 +174,7 @@ class _Frame(NamedTuple):
     nowhere: Any  # a landing of length 0
 
 
-def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _Frame]:
+def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVariable]:
     """Constants of the flow, margins (k, B) at the beginning, and the variable of the step."""
     begun, h, in_root, lands = _rows(s.clock)
     const = flow.constants(s.modes)
@@ -188,11 +188,17 @@ def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _Frame]:
     # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
     nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
     length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
-    return const, jax.lax.stop_gradient(c0), _Frame(start, length, rooted, nowhere)
+    return const, jax.lax.stop_gradient(c0), _StepVariable(start, length, rooted, nowhere)
 
 
 def _slopes(
-    flow: Flow, const: Any, frame: _Frame, s: Step, y: jax.Array, stage: Any, ends: np.ndarray
+    flow: Flow,
+    const: Any,
+    frame: _StepVariable,
+    s: Step,
+    y: jax.Array,
+    stage: Any,
+    ends: np.ndarray,
 ) -> tuple[list[jax.Array], tuple[jax.Array, jax.Array]]:
     """dy/dxi in blocks of rows that end at `ends`, dt/dxi, margins and their rates, in a stage.
 
@@ -205,6 +211,7 @@ def _slopes(
     dy = flow.field(const, s.modes, now)
 
     def rates_of_margins() -> tuple[jax.Array, jax.Array]:
+        """Margins and their rates in the flow's own time."""
         return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy[: len(now)],))
 
     if flow.near:  # of costly margins: steps in time need them at their ends only
@@ -224,7 +231,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     """Change of y and of time (n + 1, B); both estimates of its error (2, n, B); margins (k, B) at
     the beginning, and where it `ends`: rates at the beginning, margins and rates at the end.
 
-    What of `flow` and y has tangents (see `tangents.py`) gives a change with tangents.
+    Where `flow` or y has tangents (see `tangents.py`) the change has some, too.
     """
     plain, state = value_of((flow, y))
     n, dtype, batch = state.shape[0], state.dtype, state.shape[1:]
@@ -237,6 +244,7 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     ends_of = np.cumsum([0, *blocks, *plain.adding])
 
     def stage(carry: Any, row: Any) -> tuple[Any, None]:
+        """One evaluation of the field."""
         slopes, added, *margins = carry
         i, a, node = row
         change = jax.tree.map(lambda k: jnp.tensordot(a, k, axes=1), slopes)
@@ -325,12 +333,12 @@ def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
 
 
 def goes_on(carry: StepperState, most: int) -> jax.Array:
-    """Impacts (1, B) that are neither over nor given up nor looked at."""
+    """Impacts (1, B) that are neither over nor given up nor paused."""
     return (carry.plan[2:3] == GOES_ON) & (carry.plan[3:4] < most)
 
 
 def unwatched(carry: StepperState, most: int) -> jax.Array:
-    """Whether () some impact goes on and none wants to be looked at."""
+    """Whether () some impact goes on and none pauses."""
     return jnp.any(goes_on(carry, most)) & ~jnp.any(carry.plan[2:3] == PAUSED)
 
 
@@ -355,10 +363,11 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, j
     accept = ok & (urgent.intention == AHEAD) & active
     landed = accept & (lands > 0)
     which = s.target & landed
-    # however short the step, the field has no value: given up, for the status to say
+    # however short the step, the field has no value: given up, and the status reports it
     broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
 
     def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Modes and state after the step, where it is accepted."""
         modes, end = flow.switch(s.modes, y + change[:n], which)
         return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
@@ -470,8 +479,8 @@ def _next_step(
     part = 1 - flow.near if flow.near else CUT
     cut = jnp.where(ok & shorten, part * urgent.distance, 0.5)
     shorter = jnp.where(in_root, jnp.sqrt(cut) * h, cut * jnp.where(lands, span, h))
-    kept = jnp.where(shorten, shorter, h)
-    h = jnp.where(ok & event, kept, jnp.where(lands, jnp.where(ok, h, shorter), factor * h))
+    repeated = jnp.where(shorten, shorter, h)
+    h = jnp.where(ok & event, repeated, jnp.where(lands, jnp.where(ok, h, shorter), factor * h))
     fresh = accept & flow.begins(s.modes, modes)
     restart = jnp.sqrt(jnp.minimum(RESTART * span, FIRST))
     in_root, xi = in_root | fresh, jnp.where(fresh, 0.0, xi)
@@ -517,7 +526,7 @@ def run(flow: Flow, carry: StepperState, most: int) -> StepperState:
 
 
 class AcceptedSteps(NamedTuple):
-    """Accepted steps in order, at most BLOCKS * BLOCK; nothing kept: zeros."""
+    """Accepted steps in order, at most BLOCKS * BLOCK; rows without a step are zeros."""
 
     marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 where a step is kept
     clock: jax.Array  # (steps, 4, B)
@@ -551,6 +560,7 @@ def record(
     size = BLOCKS * BLOCK
 
     def body(state: tuple[StepperState, Recorder]) -> tuple[StepperState, Recorder]:
+        """One pass, its step recorded where it is accepted."""
         carry, (plan, count) = state
         after, accept = advance(flow, carry, most)
         s = carry.step
@@ -622,13 +632,15 @@ def step_of(row: Row, modes: int) -> tuple[Step, jax.Array]:
 def _walk(
     flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps, states: bool
 ) -> tuple[jax.Array, jax.Array | None]:
-    """Through all steps of the plan; blocks in which nothing is kept cost nothing."""
+    """The state after all recorded steps; empty blocks cost nothing."""
     y = jnp.where(plan.lost, jnp.nan, 1.0) * y
 
     def step(y: jax.Array, row: Row) -> tuple[jax.Array, jax.Array | None]:
+        """One recorded step."""
         s, accept = step_of(row, modes.shape[0])
 
         def walk(y: jax.Array) -> jax.Array:
+            """The state after it."""
             end = flow.switch(s.modes, step_again(flow, s, y), s.target)[1]
             return jnp.where(accept, end, y)
 
@@ -636,10 +648,14 @@ def _walk(
         return y, y if states else None
 
     def block(y: jax.Array, rows: Row) -> tuple[jax.Array, jax.Array | None]:
+        """One block of recorded steps."""
+
         def walk(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            """The state after the block."""
             return jax.lax.scan(jax.checkpoint(step), y, rows)
 
         def stay(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+            """The state as it is: the block is empty."""
             return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
 
         return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, stay, y)

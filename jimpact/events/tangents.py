@@ -41,6 +41,7 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     depends: list[bool] = []  # of each result, whether it depends on a dual
 
     def of_values(*values: jax.Array) -> tuple[list[Any], Any]:
+        """Leaves of the results, and their tree, from the values of the duals."""
         replaced = dict(zip(duals, values))
         args = jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
         results, result_tree = jax.tree.flatten(function(*args))
@@ -51,6 +52,7 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     values = tuple(leaves[i].value for i in duals)
 
     def push(*tangents: jax.Array) -> list[jax.Array]:
+        """Tangents of the results that depend on a dual, in one direction."""
         rates = jax.jvp(lambda *v: of_values(*v)[0], values, tangents)[1]
         return [rate for rate, needed in zip(rates, depends) if needed]
 

@@ -401,6 +401,8 @@ def distribution(name: str, value: Any) -> str:
 def check_table(where: str, table: Mapping[str, Any], keys: TableKeys) -> None:
     """Raise a ValueError for unknown or missing keys, and for values that are not allowed."""
     check_keys(where, table, keys.allowed, keys.required)
+    if not isinstance(table.get("file", ""), str):
+        raise ValueError(f"`file` in {where} must be a path, but is {table['file']!r}.")
     for key in keys.flags:
         if not isinstance(table.get(key, False), bool):
             raise ValueError(f"`{key}` in {where} must be true or false, but is {table[key]!r}.")

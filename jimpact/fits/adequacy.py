@@ -32,7 +32,7 @@ class Weighted(NamedTuple):
 
 
 def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
-    """Shots (K,) whose impacts fail, or whose derivatives are no numbers or absurd."""
+    """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurd."""
     if not isinstance(problem.residuals.observe, Shots):
         return np.zeros(1, bool)
     shots, bodies = problem.measured.shape

@@ -46,16 +46,16 @@ def design(
     count: int = 1,
     target: str | None = None,
 ) -> Design:
-    """The candidates that would tell most, one after another, if the fitted law is right.
+    """The candidate shots that determine the parameters best, chosen one after another.
 
-    Equation: of every shot the information `J^T J / sigma^2`; greedily, the determinant of the sum
-    with what is known is made as large as possible, or the variance of the `target` least. All
-    candidates are computed by one program.
+    Equation: a shot has the information `J^T J / sigma^2`. Each choice makes the determinant of the
+    sum, earlier shots included, as large as possible, or the variance of the `target` as small as
+    possible. This assumes that the fitted law is right. One program computes all candidates.
 
     Args:
         fit: to shots, with a known noise.
-        candidates: velocities before (K, n), scenes where they differ; of `post` it only counts
-            what is measured (NaN: is not). Without sigma, the noise of the fit, or the median of
+        candidates: velocities before (K, n), and scenes if they differ; `post` only marks what will
+            be measured (NaN: will not). Without sigma, the noise of the fit, or the median of
             its sigma (stretched as the fit's errors are).
         scene: of the candidates; None: that of the fit.
         count: how many to choose; one may be chosen several times.

@@ -122,13 +122,13 @@ def fit(
     Returns:
         `Fit`; `print` gives its report, `ji.plot.fit` a picture.
 
-    Shots whose impact fails at the best parameters found, or whose derivatives are no numbers or
+    Shots whose impact fails at the best parameters found, or whose derivatives are not finite or
     absurd, are left out, and `Fit.warnings` names them. It also says whether the law fits at
     all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
 
     Raises:
         ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of
-            scene and experiments that differ in number, derivatives that are no numbers.
+            scene and experiments that differ in number, derivatives that are not finite.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])

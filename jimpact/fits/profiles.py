@@ -35,7 +35,7 @@ def profile(
     points: int = 33,
     progress: float | None = None,
 ) -> tuple[Profile, ...]:
-    """Profile likelihoods of parameters: intervals that need no parabola.
+    """Profile likelihoods of parameters: intervals without the assumption of a parabola.
 
     Equation: `D(x_i) = (min over the others of |r|^2 - least |r|^2) / s^2 <= q^2`, q the quantile
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).

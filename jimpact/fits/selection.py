@@ -323,8 +323,11 @@ def _candidates(
             left_out["restitution_matrix"] = f"has no start: {error}"
     built, missing = registered_laws(values)
     left_out = missing | left_out
-    if "compliant" in built and all(bool(np.all(scene.closed)) for scene in scenes):
-        left_out["compliant"] = "is lzb where no contact has a gap"
+    if laws is None and "compliant" in built and not any(map(_opens_and_closes, scenes)):
+        left_out["compliant"] = (
+            "differs from lzb only where contacts have gaps, or open and close again (as at a "
+            "wall): name it in `laws` to fit it, too"
+        )
     if "base" not in values:
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
     built = {name: law for name, law in built.items() if name not in left_out}
@@ -341,6 +344,11 @@ def _candidates(
         for label, candidate in _variants(law, contacts, alike, more).items():
             candidates[f"{name}{label}"] = candidate
     return candidates, left_out
+
+
+def _opens_and_closes(scene: Scene) -> bool:
+    """Whether gaps matter: some contact has one, or a wall lets contacts open and close again."""
+    return not np.all(scene.closed) or (scene.walls is not None and any(scene.walls))
 
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from jimpact.compiling import quick_jit
 from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImpulseProgram
-from jimpact.events.impact_history import Samples
+from jimpact.events.impact_history import HistoryProgram
 from jimpact.law import Law, check_law
 from jimpact.scene import Scene, as_velocity, velocity_change
 
@@ -94,7 +94,7 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int) -> History:
     program = ImpulseProgram(
         tree, dynamics.static_exponent, dynamics.chain, dynamics.max_steps, t, whole=True
     )
-    time, energy, *rest = in_columns(Samples(program, samples), *leaves)
+    time, energy, *rest = in_columns(HistoryProgram(program, samples), *leaves)
     *rows, maximum, code = (x[..., 0] for x in rest)
     states = ContactStates(*rows)
     force, root = units.momentum / units.time, jnp.repeat(units.root, t // len(gamma))

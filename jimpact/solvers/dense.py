@@ -77,6 +77,7 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
 
     def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
+        """Rows after the pivot k."""
         row = jax.lax.dynamic_index_in_dim(rows, k, 0)
         row = row * (1 / jax.lax.dynamic_index_in_dim(row, k, 1))
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
@@ -106,6 +107,7 @@ def block_inverse(matrix: jax.Array) -> jax.Array:
     m, eye = len(matrix), jnp.eye(matrix.shape[1], dtype=matrix.dtype)[..., None]
 
     def eliminate(i: jax.Array, inverse: jax.Array) -> jax.Array:
+        """The matrix after the block pivot i."""
         here = (jnp.arange(m) == i)[:, None, None, None]
         column, row = inverse[:, :, i], inverse[i]
         block = _small_inverse(column[i], perturbation)
@@ -197,7 +199,8 @@ def _regularized_tangent(primals: Any, tangents: Any) -> tuple[jax.Array, jax.Ar
 def pseudoinverse(matrix: jax.Array, held: jax.Array) -> jax.Array:
     """Of the rows and columns `held` (n, B) of a positive semidefinite (n, n, B); 0 elsewhere.
 
-    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes.
+    It starts with a ridge, which Newton and Schulz's iteration `Z <- 2 Z - Z K Z` removes from what
+    K transmits, to rounding; in the null space of K, forces are the least ones to some percent.
     """
     both = held[:, None] & held[None]
     k = jnp.where(both, matrix, 0.0)

@@ -23,7 +23,7 @@ from jimpact.solvers.dense import block_inverse, load_shares, times
 from jimpact.solvers.lcp import solve_lcp
 from jimpact.status import CODE
 
-ENUMERATED = 3  # contacts up to which all modes are looked at
+ENUMERATED = 3  # contacts up to which all modes are tried
 _DIRECTIONS = 4  # of slip that each sliding contact in space is started with, evenly spread
 _ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usual
 _POWER = 2 / 3  # what a solve may gather in rounding, as in `lcp`: m eps^(2/3)
@@ -47,11 +47,11 @@ class FrictionImpulses(NamedTuple):
     status: jax.Array
 
 
-class _Problem(NamedTuple):
+class _FrictionProblem(NamedTuple):
     """A (m, b, m, b), (a, b) (m, b), mu (m,): contact-major, b = 1 + rows, diagonal of order 1."""
 
     matrix: jax.Array
-    given: jax.Array
+    rate: jax.Array
     friction: jax.Array
     load: jax.Array | None
     complementary: bool
@@ -104,14 +104,14 @@ def solve(
             with `load`.
 
     Returns:
-        p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are looked at, and
-        consistent ones whose velocities differ were found; that which sticks most is returned. In
-        space Newton's method looks for the directions of slip from 4 starts a contact, all
-        combined: solutions that none of them reaches are missed. Above 3 contacts other modes are
-        not looked for. It is told, too, where redundant contacts slide, so that how they share p
-        changes their slip (a spinning cube flat on four corners). `impulse_not_unique`: only the
-        impulses differ. `infeasible`: no modes are consistent; `max_steps`: none were found (in
-        space, above 3 contacts).
+        p, p_t and a status. `several_outcomes`: with up to 3 contacts all modes are tried, and
+        consistent ones whose velocities differ were found; the one with most sticking contacts is
+        returned. In space Newton's method looks for the directions of slip from 4 starts a contact,
+        all combined: solutions that none of them reaches are missed. Above 3 contacts other modes
+        are not looked for. It is reported also where redundant contacts slide, so that how they
+        share p changes their slip (a spinning cube flat on four corners).
+        `impulse_not_unique`: only the impulses differ. `infeasible`: no modes are consistent;
+        `max_steps`: none were found (in space, above 3 contacts).
 
     Derivatives (up to the third, in any mode) hold the modes, which is one-sided where they are
     about to change, and take a singular matrix to keep its rank; those of impulses that are not
@@ -123,9 +123,9 @@ def solve(
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.friction import solve
     >>> matrix, mu = jnp.diag(jnp.array([1.0, 2.0])), jnp.array([0.5])
-    >>> given = (matrix, jnp.array([-1.0]), jnp.array([3.0]), mu)
-    >>> found = jax.jit(lambda *given: solve(*given, complementary=True))(*given)
-    >>> [round(float(x), 6) for x in (found.normal[0], found.tangential[0])]
+    >>> problem = (matrix, jnp.array([-1.0]), jnp.array([3.0]), mu)
+    >>> x = jax.jit(lambda *a: solve(*a, complementary=True))(*problem)
+    >>> [round(float(p), 6) for p in (x.normal[0], x.tangential[0])]
     [1.0, -0.5]
     """
     m = len(normal)
@@ -136,7 +136,7 @@ def solve(
     squares = jnp.stack([squares[:, 0], jnp.mean(squares[:, 1:], axis=1)], axis=1)
     norm = jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
     scale = 1 / jnp.repeat(norm, np.array([1, rows]), axis=1, total_repeat_length=1 + rows)
-    given = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
+    rate = jnp.concatenate([normal[:, None], slip.reshape(m, rows)], axis=1) * scale
     friction = friction * norm[:, 1] / norm[:, 0]
     of_contacts = of_contacts * scale[:, :, None, None] * scale[None, None]
     drag = jnp.zeros((m, rows), matrix.dtype)
@@ -147,20 +147,20 @@ def solve(
         of_contacts = of_contacts.at[..., 0].add(dragged)
         decoupled = jnp.pad(jnp.repeat(slides[:, None], rows, axis=1), ((0, 0), (1, 0)))
         apart = decoupled[:, :, None, None] | decoupled[None, None]
-        unit = jnp.eye(given.size, dtype=matrix.dtype).reshape(of_contacts.shape)
+        unit = jnp.eye(rate.size, dtype=matrix.dtype).reshape(of_contacts.shape)
         of_contacts = jnp.where(apart, unit, of_contacts)
-        given = jnp.where(decoupled, 0.0, given)
+        rate = jnp.where(decoupled, 0.0, rate)
         friction = jnp.where(slides, 0.0, friction)
-    largest = jax.lax.stop_gradient(jnp.abs(given).max())
+    largest = jax.lax.stop_gradient(jnp.abs(rate).max())
     size = jnp.where(largest > 0, largest, 1.0)
-    problem = _Problem(
+    problem = _FrictionProblem(
         of_contacts,
-        given / size,
+        rate / size,
         friction,
         None if load is None else load * norm[:, 0] / size,
         complementary,
     )
-    fixed = _Problem(*jax.lax.stop_gradient(problem[:4]), complementary)
+    fixed = _FrictionProblem(*jax.lax.stop_gradient(problem[:4]), complementary)
     modes, x, status = (_enumerate if m <= ENUMERATED else _search)(fixed)
     modes, inverted = _most_at_rest(fixed, modes, x)
     # what is free: contacts that slide may share p so that slip changes
@@ -179,9 +179,9 @@ def solve(
 # ------------------------------------------------------------------- the equations of modes
 
 
-def _rates(problem: _Problem, x: jax.Array) -> jax.Array:
+def _rates(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     """(r, s) (m, b, N) of impulses (m, b, N)."""
-    return problem.given[..., None] + _times(problem.matrix[..., None], x)
+    return problem.rate[..., None] + _times(problem.matrix[..., None], x)
 
 
 def _times(matrix: jax.Array, x: jax.Array) -> jax.Array:
@@ -206,18 +206,18 @@ def _in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
     return jnp.where((length > radius)[:, None], _over(side, length) * radius[:, None], side)
 
 
-def _bound(problem: _Problem, x: jax.Array) -> jax.Array:
+def _bound(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     """mu (p + load) (m, N)."""
     p = jnp.maximum(x[:, 0], 0.0)
     return problem.friction[:, None] * (p if problem.load is None else p + problem.load[:, None])
 
 
 def _size(x: jax.Array) -> jax.Array:
-    """(N,) of (m, b, N); what is given has size 1."""
+    """(N,) of (m, b, N); the rates without impulses have size 1."""
     return 1 + jnp.abs(x).max(axis=(0, 1))
 
 
-def _misfit(problem: _Problem, x: jax.Array) -> jax.Array:
+def _misfit(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     """How far x (m, b, N) is from what the law makes of it (N,), in parts of its size."""
     rate = _rates(problem, x)
     p, r, side = x[:, 0], rate[:, 0], x[:, 1:]
@@ -226,7 +226,7 @@ def _misfit(problem: _Problem, x: jax.Array) -> jax.Array:
     return jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1))) / _size(x)
 
 
-def _equations(problem: _Problem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
+def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
     """Linear equations (m, b, m, b, N), (m, b, N) of modes: r = 0 or p = 0, and
 
         Q s + (1 - Q) p_t + mu (p + load) d = 0
@@ -248,13 +248,13 @@ def _equations(problem: _Problem, modes: _Modes) -> tuple[jax.Array, jax.Array]:
     along = jnp.pad(modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0)))
     pressed = along[:, :, None, None] * own * first
     moved = jnp.sum(q[:, :, :, None, None] * (problem.matrix - unit)[:, None, ..., None], axis=2)
-    right = -jnp.sum(q * problem.given[:, None, :, None], axis=2)
+    right = -jnp.sum(q * problem.rate[:, None, :, None], axis=2)
     if problem.load is not None:
         right = right - along * problem.load[:, None, None]
     return moved + pressed + unit[..., None], right
 
 
-def _turned(problem: _Problem, modes: _Modes, x: jax.Array) -> _Modes:
+def _turned(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Modes:
     """The modes with the directions of slip that x (m, b, N) has, in space."""
     if modes.direction.shape[1] == 1:
         return modes
@@ -268,7 +268,7 @@ def _turned(problem: _Problem, modes: _Modes, x: jax.Array) -> _Modes:
     return modes._replace(direction=direction, turning=turning)
 
 
-def _solved(problem: _Problem, modes: _Modes) -> jax.Array:
+def _solved(problem: _FrictionProblem, modes: _Modes) -> jax.Array:
     """x (m, b, N) on modes, contact by contact; wrong where their equations are singular.
 
     Refinements undo what `block_inverse` perturbs.
@@ -277,6 +277,7 @@ def _solved(problem: _Problem, modes: _Modes) -> jax.Array:
     inverse = block_inverse(matrix)
 
     def refine(_: int, x: jax.Array) -> jax.Array:
+        """One refinement by the approximate inverse."""
         return x + _times(inverse, right - _times(matrix, x))
 
     return jax.lax.fori_loop(0, 3, refine, jnp.zeros_like(right))
@@ -301,9 +302,9 @@ def _table(contacts: int, rows: int, loaded: bool) -> tuple[np.ndarray, np.ndarr
     return table[0], table[1] == 1
 
 
-def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
+def _enumerate(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
     """The consistent modes (N = 1) that stick most, their x (m, b), and the status."""
-    m, rows = len(problem.friction), problem.given.shape[1] - 1
+    m, rows = len(problem.friction), problem.rate.shape[1] - 1
     dtype = problem.matrix.dtype
     kinds, taking = _table(m, rows, problem.load is not None)
     angle = 2 * np.pi * (kinds - 2) / (2 if rows == 1 else _DIRECTIONS)
@@ -311,7 +312,7 @@ def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     turn = jnp.asarray(np.where(kinds > 1, turned, 0.0)[:rows, :rows], dtype)
     begin = jnp.ones((m, 1, 1), dtype)
     if rows == 2:  # the slip without impulses, if there is some
-        begin = problem.given[:, 1:, None] + 0.0
+        begin = problem.rate[:, 1:, None] + 0.0
         begin = jnp.where(_length(begin)[:, None] > 0, begin, 1.0)
         begin = _over(begin, _length(begin))
     modes = _Modes(
@@ -327,6 +328,7 @@ def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     best = jnp.where(jnp.any(good), jnp.argmax(good), jnp.nanargmin(misfit))
 
     def differ(values: jax.Array) -> jax.Array:
+        """Whether consistent modes differ in these values from the chosen ones."""
         apart = jnp.abs(values - values[..., best][..., None]).max(axis=(0, 1))
         return jnp.any(good & (apart > root * _size(x[..., best])))
 
@@ -337,20 +339,21 @@ def _enumerate(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     return chosen, x[..., best], jnp.where(jnp.any(good), status, none)
 
 
-def _newton(problem: _Problem, modes: _Modes) -> tuple[_Modes, jax.Array]:
+def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array]:
     """x (m, b, N) of modes, in space with the directions of slip that they lead to."""
     if modes.direction.shape[1] == 1:
         return modes, _solved(problem, modes)
 
     def step(_: int, state: tuple[_Modes, jax.Array]) -> tuple[_Modes, jax.Array]:
+        """Impulses, and the directions of slip that follow from them."""
         x = _solved(problem, state[0])
         return _turned(problem, state[0], x), x
 
-    none = jnp.zeros((*problem.given.shape, modes.taking.shape[1]), problem.matrix.dtype)
+    none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
     return jax.lax.fori_loop(0, _ITERATIONS, step, (modes, none))
 
 
-def _at_rest(problem: _Problem, x: jax.Array, room: jax.Array) -> _Modes:
+def _at_rest(problem: _FrictionProblem, x: jax.Array, room: jax.Array) -> _Modes:
     """The modes (N = 1) that x (m, b) has: all sticks that does not slip by `room`."""
     rate = _rates(problem, x[..., None])
     room = (room * _size(x[..., None]))[None]
@@ -382,7 +385,8 @@ class _Inverted(NamedTuple):
     held: jax.Array
 
 
-def _inverted(problem: _Problem, modes: _Modes, x: jax.Array) -> _Inverted:
+def _inverted(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Inverted:
+    """The equations of modes, inverted; see the class."""
     n = x.size
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
     weight = 1 / jnp.sqrt(_weights(problem, x))
@@ -392,13 +396,15 @@ def _inverted(problem: _Problem, modes: _Modes, x: jax.Array) -> _Inverted:
     return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
 
 
-def _weights(problem: _Problem, x: jax.Array) -> jax.Array:
+def _weights(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     """(m, b) of the squares of impulses in what is least where they are shared."""
     share = load_shares(_bound(problem, x[..., None]), _LEAST_SHARE)
     return jnp.concatenate([jnp.ones_like(share), jnp.repeat(1 / share, x.shape[1] - 1, 1)], 1)
 
 
-def _most_at_rest(problem: _Problem, modes: _Modes, x: jax.Array) -> tuple[_Modes, _Inverted]:
+def _most_at_rest(
+    problem: _FrictionProblem, modes: _Modes, x: jax.Array
+) -> tuple[_Modes, _Inverted]:
     """Modes with the velocities of x where all sticks that can, if its shared impulses are allowed.
 
     Otherwise the modes as they are.
@@ -413,7 +419,9 @@ def _most_at_rest(problem: _Problem, modes: _Modes, x: jax.Array) -> tuple[_Mode
     return jax.tree.map(lambda leaf: jnp.where(allowed, *leaf), (both, inverted))
 
 
-def _on_modes(problem: _Problem, modes: _Modes, inverted: _Inverted, x: jax.Array) -> jax.Array:
+def _on_modes(
+    problem: _FrictionProblem, modes: _Modes, inverted: _Inverted, x: jax.Array
+) -> jax.Array:
     """x (m, b) on its modes, with derivatives up to the third, by as many chord steps.
 
     With y = x / D it solves `B y = f` and `V_0^T (D W D) y = 0`, or holds `V_0^T y`.
@@ -423,6 +431,7 @@ def _on_modes(problem: _Problem, modes: _Modes, inverted: _Inverted, x: jax.Arra
     start = x.reshape(n) / weight
 
     def step(_: int, y: jax.Array) -> jax.Array:
+        """One chord step."""
         x = (weight * y).reshape(shape)
         matrix, right = _equations(problem, _turned(problem, modes, x[..., None]))
         shared = weight**2 * _weights(problem, x).reshape(n) * y
@@ -443,19 +452,20 @@ class _Searched(NamedTuple):
     level: jax.Array
 
 
-def _search(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
+def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
     """Modes, x (m, b) and status from Lemke's method (planar) or Gauss-Seidel sweeps.
 
     Sweeps at finer and finer tolerances give modes, Newton's method finishes on them, until the
     law is satisfied.
     """
-    x, code = jnp.zeros_like(problem.given), jnp.asarray(CODE["ok"])
-    started = problem.given.shape[1] == 2 and problem.complementary
+    x, code = jnp.zeros_like(problem.rate), jnp.asarray(CODE["ok"])
+    started = problem.rate.shape[1] == 2 and problem.complementary
     if started:
         x, code = _by_lemke(problem)
     eps = float(jnp.finfo(x.dtype).eps)
 
     def refine(state: _Searched) -> _Searched:
+        """Sweeps at the next tolerance, then Newton's method on their modes."""
         level = (state.level // 2).astype(x.dtype)
         tolerance = jnp.maximum(_COARSEST * _FINER**level, 4 * eps)
         skip = started & (state.level < 0)
@@ -465,9 +475,9 @@ def _search(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
         modes, better = _newton(problem, _at_rest(problem, swept, room))
         good = _misfit(problem, better)[0] <= problem.tolerance
         # redundant contacts near their cones: x is allowed, the least impulses are not
-        kept = _misfit(problem, swept[..., None])[0] <= problem.tolerance
+        allowed = _misfit(problem, swept[..., None])[0] <= problem.tolerance
         chosen = jnp.where(good, better[..., 0], swept)
-        return _Searched(chosen, modes, good | kept, state.level + 1)
+        return _Searched(chosen, modes, good | allowed, state.level + 1)
 
     first = jnp.asarray(-1 if started else 0)
     blank = _at_rest(problem, x, jnp.zeros((), x.dtype))
@@ -481,7 +491,7 @@ def _search(problem: _Problem) -> tuple[_Modes, jax.Array, jax.Array]:
     return end.modes, end.x, jnp.where(end.done, CODE["ok"], status)
 
 
-def _by_lemke(problem: _Problem) -> tuple[jax.Array, jax.Array]:
+def _by_lemke(problem: _FrictionProblem) -> tuple[jax.Array, jax.Array]:
     """x from the complementarity problem of (p, p_t+, p_t-, lambda); lambda is |s| where sliding.
 
     Source: Anitescu and Potra, Nonlinear Dynamics 14 (1997) 231-247.
@@ -497,14 +507,16 @@ def _by_lemke(problem: _Problem) -> tuple[jax.Array, jax.Array]:
             [jnp.diag(problem.friction), -unit, -unit, none],
         ]
     )
-    r, s = problem.given.T
+    r, s = problem.rate.T
     room = jnp.zeros_like(r) if problem.load is None else problem.friction * problem.load
-    found = solve_lcp(whole, jnp.concatenate([r, s, -s, room]), symmetric=False)
-    z = found.z.reshape(4, m)
-    return jnp.stack([z[0], z[1] - z[2]], axis=1), found.code
+    solution = solve_lcp(whole, jnp.concatenate([r, s, -s, room]), symmetric=False)
+    z = solution.z.reshape(4, m)
+    return jnp.stack([z[0], z[1] - z[2]], axis=1), solution.code
 
 
-def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Array) -> jax.Array:
+def _sweeps(
+    problem: _FrictionProblem, x: jax.Array, tolerance: jax.Array, skip: jax.Array
+) -> jax.Array:
     """Projected Gauss-Seidel sweeps until x changes by less than `tolerance`, in its size."""
     m = len(problem.friction)
     own = problem.matrix[jnp.arange(m), :, jnp.arange(m)]
@@ -512,7 +524,8 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
     stiffest = jnp.where(stiffest > 0, stiffest, 1.0)
 
     def contact(i: jax.Array, x: jax.Array) -> jax.Array:
-        rate = problem.given[i] + jnp.sum(problem.matrix[i] * x[None], axis=(1, 2))
+        """The impulses of contact i so that it satisfies the law, all others given."""
+        rate = problem.rate[i] + jnp.sum(problem.matrix[i] * x[None], axis=(1, 2))
         p = x[i, 0] - rate[0] / own[i, 0, 0]
         p = jnp.maximum(p, 0.0) if problem.complementary else p
         rate = rate[1:] + own[i, 1:, 0] * (p - x[i, 0])
@@ -527,10 +540,12 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
     State = tuple[jax.Array, jax.Array, jax.Array]
 
     def going(state: State) -> jax.Array:
+        """Whether a sweep still changes something."""
         x, change, count = state
         return (change > tolerance * _size(x[..., None])[0]) & (count < _SWEEPS)
 
     def sweep(state: State) -> State:
+        """All contacts once."""
         x, _, count = state
         new = jax.lax.fori_loop(0, m, contact, x)
         return new, jnp.abs(new - x).max(), count + 1
@@ -545,7 +560,7 @@ def _sweeps(problem: _Problem, x: jax.Array, tolerance: jax.Array, skip: jax.Arr
 def distribute(
     matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Of the contacts `asked`: who sticks, and where the others slide to; the forces are known.
+    """Which of the contacts `asked` stick, and where the others slide to; normal forces are known.
 
     Equation: `u' = rate + K lambda`, lambda in the discs |lambda_j| <= limit_j,
     `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. A decision, without
@@ -558,7 +573,7 @@ def distribute(
         asked: (m, B); other contacts have no force here.
 
     Returns:
-        Who sticks (m, B), and the directions (t, B) of slip of the others. A contact in
+        Which contacts stick (m, B), and the directions (t, B) of slip of the others. A contact in
         space that others hold on the rim of its disc counts as sliding, at speed 0, against its
         force. Contacts are relaxed in turn, 200 times at most: of strongly coupled ones near the
         rim (of random pairs with nearly equal tangents 3 %) the last to settle may be wrong.
@@ -567,8 +582,8 @@ def distribute(
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.friction import distribute
     >>> k, asked = jnp.ones((2, 2, 1)), jnp.ones((2, 1), bool)  # both corners of a block
-    >>> given = (k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), asked)
-    >>> stick, slip = jax.jit(distribute)(*given)
+    >>> problem = (k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), asked)
+    >>> stick, slip = jax.jit(distribute)(*problem)
     >>> stick[:, 0].tolist(), jnp.sign(slip[:, 0]).tolist()
     ([False, False], [1.0, 1.0])
     """
@@ -605,6 +620,7 @@ def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
     State = tuple[jax.Array, jax.Array, jax.Array]
 
     def relax(j: jax.Array, force: jax.Array) -> jax.Array:
+        """The force of contact j after a projected step."""
         here = jax.lax.dynamic_slice_in_dim(force, rows * j, rows)
         change = jax.lax.dynamic_slice_in_dim(rate, rows * j, rows) + times(of_contacts[j], force)
         tried, most = here - change / stiffness[j], limit[j][None]
@@ -613,6 +629,7 @@ def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
         return jax.lax.dynamic_update_slice_in_dim(force, tried * shrink, rows * j, 0)
 
     def sweep(state: State) -> State:
+        """All contacts once."""
         before, _, count = state
         force = jax.lax.fori_loop(0, m, relax, before)
         return force, jnp.any(jnp.abs(force - before) > least), count + 1

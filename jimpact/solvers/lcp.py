@@ -53,8 +53,8 @@ def solve_lcp(
 
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.lcp import solve_lcp
-    >>> found = solve_lcp(jnp.array([[2.0, -1.0], [-1.0, 2.0]]), jnp.array([-1.0, 3.0]))
-    >>> [round(float(z), 6) for z in found.z]
+    >>> solution = solve_lcp(jnp.array([[2.0, -1.0], [-1.0, 2.0]]), jnp.array([-1.0, 3.0]))
+    >>> [round(float(z), 6) for z in solution.z]
     [0.5, 0.0]
     """
     diagonal = jax.lax.stop_gradient(jnp.diagonal(matrix))
@@ -74,6 +74,7 @@ def solve_lcp(
 
 
 def _gathered(b: jax.Array) -> float:
+    """Rounding that a whole run may gather."""
     return b.shape[0] * float(jnp.finfo(b.dtype).eps) ** _POWER
 
 
@@ -119,14 +120,16 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     limit = _PIVOTS * (m + 1)
 
     def going(state: _Tableau) -> jax.Array:
+        """Whether the artificial variable is still basic."""
         inside = jnp.any(state.basis == artificial)
         return needed & inside & ~state.ray & (state.pivots < limit)
 
     def one(state: _Tableau) -> _Tableau:
+        """One pivot, unless a ray shows that there is no solution."""
         row, ray = _leaving(state, artificial, tolerance)
         moved = _pivot(state, row)
-        kept = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
-        return kept._replace(ray=ray)
+        chosen = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
+        return chosen._replace(ray=ray)
 
     end = jax.lax.while_loop(going, one, first)
     number = jnp.arange(m)

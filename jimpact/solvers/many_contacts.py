@@ -25,7 +25,7 @@ MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
 
 
 class Many(NamedTuple):
-    """Impulses x (m, b), what they miss, iterations, the steepness found."""
+    """Impulses x (m, b), their misfit, iterations, the steepness at the end."""
 
     impulse: jax.Array
     misfit: jax.Array  # () over the largest rate, both scaled to a diagonal of 1
@@ -35,6 +35,8 @@ class Many(NamedTuple):
 
 
 class _At(NamedTuple):
+    """An iteration."""
+
     x: jax.Array
     ax: jax.Array
     y: jax.Array  # x with momentum
@@ -42,7 +44,7 @@ class _At(NamedTuple):
     weight: jax.Array
     steepness: jax.Array
     best: jax.Array  # x of the least misfit so far
-    misfit: jax.Array  # its
+    misfit: jax.Array  # of `best`
     tries: jax.Array
 
 
@@ -75,65 +77,78 @@ def solve_many(
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.many_contacts import solve_many
     >>> one = jnp.ones((1, 2))
-    >>> given = (jnp.array([[-1.0, 3.0]]), jnp.array(0.5), 0 * one, jnp.array(1.0), 1e-6, 100)
-    >>> [round(float(x), 5) for x in solve_many(lambda x: x, one, *given).impulse[0]]
+    >>> problem = (jnp.array([[-1.0, 3.0]]), jnp.array(0.5), 0 * one, jnp.array(1.0), 1e-6, 100)
+    >>> [round(float(x), 5) for x in solve_many(lambda x: x, one, *problem).impulse[0]]
     [1.0, -0.5]
     """
-    own = jnp.concatenate(
-        [diagonal[:, :1], jnp.mean(diagonal[:, 1:], axis=1, keepdims=True)], axis=1
-    )
-    own = jnp.where(own > 0, own, 1.0)[:, jnp.minimum(jnp.arange(diagonal.shape[1]), 1)]
-    scale = 1 / jnp.sqrt(own)
+    scale = _scale(diagonal)
     # discs stay discs: all tangents of a contact have one scale
     slope = friction * scale[:, 0] / scale[:, -1]
     goal = rate * scale
     size = jnp.max(jnp.abs(goal))
 
-    def projected(x: jax.Array) -> jax.Array:
-        p = jnp.maximum(x[:, :1], 0.0)
-        side, bound = x[:, 1:], slope[:, None] * p
-        length = jnp.sqrt(jnp.sum(side**2, axis=1, keepdims=True))
-        shrink = jnp.where(length <= bound, 1.0, bound / jnp.where(length > 0, length, 1.0))
-        return jnp.concatenate([p, side * shrink], axis=1)
-
     def times(x: jax.Array) -> jax.Array:
+        """A x, scaled."""
         return scale * product(scale * x)
 
     def going(at: _At) -> jax.Array:
+        """Whether the misfit is too large and iterations are left."""
         return (at.misfit > tolerance * size) & (at.tries < most)
 
-    def one(at: _At) -> _At:
-        x = projected(at.y - (at.ay + goal) / at.steepness)
-        ax = times(x)
-        step, bent = x - at.y, ax - at.ay
-        square = jnp.vdot(step, step)
-        # a step that overshoots is taken back
-        long = jnp.vdot(step, bent) > at.steepness * square * (1 + 1e-9)
-        back = long | (jnp.vdot(step, x - at.x) < 0)
-        weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
-        allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // most]
-        gain = jnp.where(back, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
-        x, ax = jnp.where(long, at.x, x), jnp.where(long, at.ax, ax)
-        misfit = jnp.where(long, jnp.inf, at.steepness * jnp.max(jnp.abs(step)))
-        better = ~(misfit >= at.misfit)  # also NaN, which so comes out
-        return _At(
-            x,
-            ax,
-            x + gain * (x - at.x),
-            ax + gain * (ax - at.ax),
-            jnp.where(back, 1.0, weight),
-            jnp.where(long, STEEPER, 1.0) * at.steepness,
-            jnp.where(better, x, at.best),
-            jnp.where(better, misfit, at.misfit),
-            at.tries + 1,
-        )
+    def iterate(at: _At) -> _At:
+        """One step against the rates, projected, and the momentum of the next one."""
+        x = _projected(at.y - (at.ay + goal) / at.steepness, slope)
+        return _with_momentum(at, x, times(x), most)
 
-    x = projected(start / scale) + 0 * size  # NaN where a rate is not finite
+    x = _projected(start / scale, slope) + 0 * size  # NaN where a rate is not finite
     ax = times(x)
     unit = jnp.ones((), x.dtype)
     steepness = jnp.maximum(RELAX * steepness, unit)
     begin = _At(x, ax, x, ax, unit, steepness, x, jnp.inf * unit, jnp.int32(0))
-    end = jax.lax.while_loop(going, one, begin)
+    end = jax.lax.while_loop(going, iterate, begin)
     missed = end.misfit / jnp.where(size > 0, size, 1.0)
     wrong = end.misfit * jnp.sqrt(jnp.max(diagonal))
     return Many(end.best * scale, missed, wrong, end.tries, end.steepness)
+
+
+def _scale(diagonal: jax.Array) -> jax.Array:
+    """Scale (m, b) of the impulses: one of each normal, one of the tangents of each contact."""
+    squares = jnp.concatenate(
+        [diagonal[:, :1], jnp.mean(diagonal[:, 1:], axis=1, keepdims=True)], axis=1
+    )
+    squares = jnp.where(squares > 0, squares, 1.0)
+    return 1 / jnp.sqrt(squares[:, jnp.minimum(jnp.arange(diagonal.shape[1]), 1)])
+
+
+def _projected(x: jax.Array, slope: jax.Array) -> jax.Array:
+    """The nearest normal impulses >= 0, and tangential ones (m, b - 1) in their discs."""
+    p = jnp.maximum(x[:, :1], 0.0)
+    side, bound = x[:, 1:], slope[:, None] * p
+    length = jnp.sqrt(jnp.sum(side**2, axis=1, keepdims=True))
+    shrink = jnp.where(length <= bound, 1.0, bound / jnp.where(length > 0, length, 1.0))
+    return jnp.concatenate([p, side * shrink], axis=1)
+
+
+def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: int) -> _At:
+    """The iteration after a projected step to x; a step that overshoots is taken back."""
+    step, bent = x - at.y, ax - at.ay
+    square = jnp.vdot(step, step)
+    long = jnp.vdot(step, bent) > at.steepness * square * (1 + 1e-9)
+    back = long | (jnp.vdot(step, x - at.x) < 0)
+    weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
+    allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // most]
+    gain = jnp.where(back, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
+    x, ax = jnp.where(long, at.x, x), jnp.where(long, at.ax, ax)
+    misfit = jnp.where(long, jnp.inf, at.steepness * jnp.max(jnp.abs(step)))
+    better = ~(misfit >= at.misfit)  # also NaN, which is then the result
+    return _At(
+        x,
+        ax,
+        x + gain * (x - at.x),
+        ax + gain * (ax - at.ax),
+        jnp.where(back, 1.0, weight),
+        jnp.where(long, STEEPER, 1.0) * at.steepness,
+        jnp.where(better, x, at.best),
+        jnp.where(better, misfit, at.misfit),
+        at.tries + 1,
+    )

@@ -25,29 +25,35 @@ def both_modes(
 
     @jax.custom_jvp
     def differentiable(inputs: Any) -> tuple[Any, Any]:
+        """The values."""
         return solve(inputs, False)
 
     def rule(primals: Any, tangents: Any) -> Any:
+        """Values and tangents by the Jacobian."""
         leaves, tree = jax.tree.flatten(primals[0])
         rates = jax.tree.leaves(tangents[0], is_leaf=lambda t: isinstance(t, SymbolicZero))
         moving = [i for i, rate in enumerate(rates) if not isinstance(rate, SymbolicZero)]
 
         def with_jacobian(at: list[jax.Array]) -> tuple[Any, Any, Any]:
+            """Outputs, their Jacobian, integers."""
+
             def outputs_of(values: list[jax.Array]) -> tuple[Any, Any]:
+                """Outputs of the perturbed inputs."""
                 moved = dict(zip(moving, values))
-                given = [moved.get(i, leaf) for i, leaf in enumerate(at)]
-                return solve(jax.tree.unflatten(tree, given), True)
+                inputs = [moved.get(i, leaf) for i, leaf in enumerate(at)]
+                return solve(jax.tree.unflatten(tree, inputs), True)
 
             values = [at[i] for i in moving]
 
             def push(directions: list[jax.Array]) -> tuple[Any, Any, Any]:
+                """Outputs and their tangent in one direction."""
                 return jax.jvp(outputs_of, (values,), (directions,), has_aux=True)
 
             return jax.vmap(push, out_axes=(None, 0, None))(_directions(values))
 
         out, jacobian, aux = with_jacobian(leaves)
-        along = jnp.concatenate([jnp.ravel(rates[i]) for i in moving])
-        rate = jax.tree.map(lambda rows: jnp.tensordot(along, rows, axes=1), jacobian)
+        tangent = jnp.concatenate([jnp.ravel(rates[i]) for i in moving])
+        rate = jax.tree.map(lambda rows: jnp.tensordot(tangent, rows, axes=1), jacobian)
         still = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), jax.dtypes.float0), aux)
         return (out, aux), (rate, still)
 
@@ -60,9 +66,11 @@ def without_derivatives(values: Any, why: Exception) -> Any:
 
     @jax.custom_jvp
     def same(numbers: list[Any]) -> list[Any]:
+        """The numbers as they are."""
         return numbers
 
     def rule(primals: Any, tangents: Any) -> Any:
+        """Raises where a number is perturbed."""
         rates = jax.tree.leaves(tangents, is_leaf=lambda t: isinstance(t, SymbolicZero))
         if any(not isinstance(rate, SymbolicZero) for rate in rates):
             raise why
@@ -71,15 +79,15 @@ def without_derivatives(values: Any, why: Exception) -> Any:
     same.defjvp(rule, symbolic_zeros=True)
     leaves, tree = jax.tree.flatten(values)
     moving = [i for i, x in enumerate(leaves) if eqx.is_inexact_array(x)]
-    kept = dict(zip(moving, same([leaves[i] for i in moving])))
-    return jax.tree.unflatten(tree, [kept.get(i, x) for i, x in enumerate(leaves)])
+    replaced = dict(zip(moving, same([leaves[i] for i in moving])))
+    return jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
 
 
 def _directions(values: list[jax.Array]) -> list[jax.Array]:
     """Unit perturbations (d, ...) of each entry in turn."""
     counts = [x.size for x in values]
-    unit, first, found = jnp.eye(sum(counts), dtype=values[0].dtype), 0, []
+    unit, first, directions = jnp.eye(sum(counts), dtype=values[0].dtype), 0, []
     for x, count in zip(values, counts):
-        found.append(unit[:, first : first + count].reshape(-1, *x.shape))
+        directions.append(unit[:, first : first + count].reshape(-1, *x.shape))
         first += count
-    return found
+    return directions

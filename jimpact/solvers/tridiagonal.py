@@ -1,4 +1,4 @@
-"""A symmetric tridiagonal matrix kept as its two diagonals (the Delassus matrix of a chain)."""
+"""A symmetric tridiagonal matrix stored as its two diagonals (the Delassus matrix of a chain)."""
 
 import equinox as eqx
 import jax
@@ -36,9 +36,10 @@ class Tridiagonal(eqx.Module):
         none = jnp.zeros_like(vector[:1])
         first = jnp.ones_like(none), none, none
 
-        def eliminate(row: Triple, given: Triple) -> tuple[Triple, Triple]:
+        def eliminate(row: Triple, entries: Triple) -> tuple[Triple, Triple]:
+            """A row of the bidiagonal system, from the row above."""
             pivot, right, before = row  # of the row above, and its off-diagonal entry
-            diagonal, known, after = given[0][None], given[1][None], given[2][None]
+            diagonal, known, after = entries[0][None], entries[1][None], entries[2][None]
             factor = before / pivot
             reduced = diagonal - factor * before, known - factor * right, after
             return reduced, reduced
@@ -46,10 +47,11 @@ class Tridiagonal(eqx.Module):
         after = jnp.concatenate([self.off_diagonal, none])
         _, (pivot, right, after) = jax.lax.scan(eliminate, first, (self.diagonal, vector, after))
 
-        def substitute(found: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        def substitute(x: jax.Array, row: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+            """An unknown, from the one below."""
             pivot, right, after = row
-            found = (right - after * found) / pivot
-            return found, found
+            x = (right - after * x) / pivot
+            return x, x
 
         rows = pivot, right, after
         return jax.lax.scan(substitute, none, rows, reverse=True)[1].reshape(vector.shape)
