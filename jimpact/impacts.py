@@ -50,7 +50,7 @@ def impact(
 
     Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
 
-    Contacts that no coordinate joins (two pairs of balls in one scene) are solved apart where the
+    Independent groups of contacts (two pairs of balls in one scene) are solved separately if the
     scene is known, not traced, and the law allows it (`Law.separable`); the outcome is the same.
     Approach within the rounding of v- (or within `noise`) counts as 0.
 
@@ -58,8 +58,8 @@ def impact(
         law: its parameters are scalars or have one entry per contact.
         scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
         velocity: v- (n,) [m/s].
-        noise: gap velocities () up to which are rounding, too [m/s]: in a motion v- holds the
-            rounding of its largest speeds. None: of v- only.
+        noise: speed () up to which an approach counts as rounding [m/s]: in a motion v- has the
+            rounding of the largest speeds before. None: the rounding of v-.
         approach: speed () by which all contacts approach faster for the law than v- says [m/s]: a
             small one starts an impact without collision. None: 0.
 

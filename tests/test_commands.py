@@ -132,7 +132,7 @@ def test_fit_of_a_study(tmp_path, capsys):
     code, said = call(capsys, "fit", written(tmp_path), *options)
     assert code == 0
     assert "seed 1" in page.read_text(encoding="utf-8")
-    for words in ("study", "as measured", "corrected ", "restitution", "Warnings", "Picture: "):
+    for words in ("study", "as measured", "corrected ", "Rank: ", "Warnings", "Picture: "):
         assert words in said.out
     assert picture.read_text().startswith("<?xml")
     options = ["--law", "newton", "--method", "adam", "--starts", "1", "--json"]
@@ -228,6 +228,8 @@ def test_compare(tmp_path, capsys):
     assert code == 0
     assert "measured" not in said.out
     assert "-0.6000" in said.out
+    assert "Dispersion: 0" in said.out
+    assert "Rank: " not in said.out
 
 
 def test_montecarlo(tmp_path, capsys):

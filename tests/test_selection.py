@@ -14,6 +14,7 @@ import jimpact as ji
 from jimpact.cli.study import read_study
 from jimpact.fits.posterior import _priors
 from jimpact.fits.scatter import Scatter
+from jimpact.fits.selection import _candidates
 from jimpact.laws.velocity_dependent import approach_speed
 from jimpact.registry import simplest_first
 
@@ -78,6 +79,19 @@ def test_a_law_that_fails_is_named_and_comes_last():
     )
     assert list(found.entries) == ["moreau", "newton"] == told[::-1]
     assert found.entries["newton"].verdict.startswith("fails in ")
+
+
+def test_compliant_is_compared_where_gaps_matter():
+    """At a wall LZB lets contacts close again at once, Compliant when their gap is closed."""
+    values = {"stiffness": 1.0}
+    free, wall = ji.chain([1.0, 1.0]), ji.chain([1.0, 1.0], wall=True)
+    candidates, left_out = _candidates([free], None, dict(values), ())
+    assert "compliant" not in candidates
+    assert "close again (as at a wall)" in left_out["compliant"]
+    for scenes, laws in (([wall], None), ([free], ["lzb", "compliant"])):
+        candidates, left_out = _candidates(scenes, laws, dict(values), ())
+        assert any(name.startswith("compliant") for name in candidates)
+        assert "compliant" not in left_out
 
 
 def test_simplest_first_is_the_order_of_advise():

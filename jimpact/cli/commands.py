@@ -40,14 +40,15 @@ Table = tuple[Sequence[str], Sequence[Sequence[Any]]]  # names of columns, rows
 # Words of the printed results (regular expressions), and the sentences that explain them there.
 GLOSSARY = {
     r"\brank\b": "Rank: how many combinations of the free parameters the data determine.",
+    r"\(bound\)": "(bound): the fit ended at a bound of the parameter's range.",
+    r"\bAICc\b": "AICc: Akaike's information criterion, misfit against number of parameters; lower "
+    "is better, differences below 2 mean little.",
     r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they conserve "
     "momentum.",
     r"\bparoxysm\b": "Accumulation: infinitely many impacts in a finite time. Friction: a contact "
     "begins to stick or to slip. Paroxysm: friction jams a sliding contact, an impact without "
     "collision.",
     r"\bdispersion\b": "Dispersion: 0 all energy in one body, 1 equal shares.",
-    r"\blargest difference\b": "Difference: of v+ between the two references, over the largest "
-    "|v-|.",
 }
 
 

@@ -1,4 +1,4 @@
-"""The next experiment: which shots would tell most about the parameters of a fit."""
+"""The next experiment: which shots would determine the parameters of a fit best."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +14,8 @@ from jimpact.fits.multistart import quiet, repeated, run
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
 
-# Information that is added to that of the data, in shares of their largest: where they cannot see a
-# combination of parameters yet, it is gained first.
+# Information that is added to that of the data, as a share of it: a combination of parameters that
+# the data do not determine yet comes first.
 _RIDGE = 1e-12
 
 
@@ -46,16 +46,16 @@ def design(
     count: int = 1,
     target: str | None = None,
 ) -> Design:
-    """The candidates that would tell most, one after another, if the fitted law is right.
+    """The candidate shots that determine the parameters best, chosen one after another.
 
-    Equation: of every shot the information `J^T J / sigma^2`; greedily, the determinant of the sum
-    with what is known is made as large as possible, or the variance of the `target` least. All
-    candidates are computed by one program.
+    Equation: a shot has the information `J^T J / sigma^2`. Each choice makes the determinant of the
+    sum, earlier shots included, as large as possible, or the variance of the `target` as small as
+    possible. This assumes that the fitted law is right. One program computes all candidates.
 
     Args:
         fit: to shots, with a known noise.
-        candidates: velocities before (K, n), scenes where they differ; of `post` it only counts
-            what is measured (NaN: is not). Without sigma, the noise of the fit, or the median of
+        candidates: velocities before (K, n), and scenes if they differ; `post` only marks what will
+            be measured (NaN: will not). Without sigma, the noise of the fit, or the median of
             its sigma (stretched as the fit's errors are).
         scene: of the candidates; None: that of the fit.
         count: how many to choose; one may be chosen several times.

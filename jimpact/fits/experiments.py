@@ -28,7 +28,7 @@ class Experiments(eqx.Module):
         sigma: standard error of each `post` value, (K, n) or a scalar, > 0 [m/s]; None: unknown,
             then `fit` estimates one common noise from the residual.
         scenes: one `Scene` a shot, with the same coordinates, but any number of contacts; a law's
-            entry j belongs to contact j of each. None: `fit` gets the scene.
+            entry j belongs to contact j of each. None: the argument `scene` of `fit`.
         shots: K labels for tables and pictures; None: 1, 2, ...
         lost_freedom: independent values that a correction has removed from each shot, K numbers or
             one for all.

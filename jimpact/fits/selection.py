@@ -25,7 +25,7 @@ from jimpact.registry import registered_laws, simplest_first
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
-RESTITUTION = 0.8  # start of what nobody gives
+RESTITUTION = 0.8  # start where none is given
 SPEED_EXPONENT = 0.1  # start of a dependence on the speed
 WORSE = 0.01  # chance at which a law counts as a worse predictor than the best
 WORSE_OF_FEW = 0.05  # the same by the residuals, of fewer shots
@@ -323,8 +323,11 @@ def _candidates(
             left_out["restitution_matrix"] = f"has no start: {error}"
     built, missing = registered_laws(values)
     left_out = missing | left_out
-    if "compliant" in built and all(bool(np.all(scene.closed)) for scene in scenes):
-        left_out["compliant"] = "is lzb where no contact has a gap"
+    if laws is None and "compliant" in built and not any(map(_opens_and_closes, scenes)):
+        left_out["compliant"] = (
+            "differs from lzb only where contacts have gaps, or open and close again (as at a "
+            "wall): name it in `laws` to fit it, too"
+        )
     if "base" not in values:
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
     built = {name: law for name, law in built.items() if name not in left_out}
@@ -341,6 +344,11 @@ def _candidates(
         for label, candidate in _variants(law, contacts, alike, more).items():
             candidates[f"{name}{label}"] = candidate
     return candidates, left_out
+
+
+def _opens_and_closes(scene: Scene) -> bool:
+    """Whether gaps matter: some contact has one, or a wall lets contacts open and close again."""
+    return not np.all(scene.closed) or (scene.walls is not None and any(scene.walls))
 
 
 def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
@@ -421,7 +429,7 @@ def _against(result: Fit) -> tuple[str, str]:
         return "fails", f"fails in {len(codes)} of {len(result.status)} shots: {names}"
     if not result.converged:
         return "fails", "does not converge"
-    if any(line.startswith("Lack of fit") for line in result.warnings):
+    if result.shows_lack_of_fit:
         return "lack of fit", "lack of fit"
     if result.rank < len(result.names):
         return "fits", f"fits, {result.rank} of {len(result.names)} parameters determined"
@@ -483,7 +491,7 @@ def _above_zero(more: np.ndarray, size: Any) -> float:
 
 
 def _variance(result: Fit) -> float:
-    """Of the residuals; infinite where no degree of freedom is left to tell it."""
+    """Of the residuals; infinite where no degree of freedom is left."""
     freedom = result.degrees_of_freedom
     return result.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
 

@@ -170,9 +170,9 @@ def advise(
     The reference is `LZB`, or `Compliant` where the two differ: LZB lets a contact that has opened
     close again at once, `Compliant` when its gap is closed (as with a wall), and only `Compliant`
     follows open contacts that can close while others are at work; the absolute stiffness must then
-    be given. Every law is compared with it over the stiffness ratios that are not known: one at a
-    time, at the corners of their ranges, and log-uniformly. Open contacts of bodies that turn (of
-    all scenes but chains) that cannot close during the impact take no part.
+    be given. Each law is compared with it over the unknown stiffness ratios: varied one at a
+    time, at the corners of their ranges, and at log-uniform samples. Open contacts of bodies that
+    turn (of all scenes but chains) take no part if they cannot close during the impact.
 
     Args:
         scene: n coordinates, m contacts.
@@ -198,7 +198,7 @@ def advise(
             unequal exponents, without stiffness.
         RuntimeError: the reference fails on this scene.
 
-    Source: the kind of Brogliato, Nonsmooth Mechanics (2016), section 6.3.3.
+    Source: comparisons as in Brogliato, Nonsmooth Mechanics (2016), section 6.3.3.
 
     >>> import jimpact as ji
     >>> advice = ji.advise(ji.chain([1.0, 1.0]), [1.0, 0.0], restitution=0.9, timing=False)

@@ -327,7 +327,7 @@ def _reference(name: str | None, case: Case) -> Method:
 # ------------------------------------------------------------------------------- programs
 
 
-class Solution(NamedTuple):
+class Solved(NamedTuple):
     """An outcome or a batch of them, duration [s], field evaluations, Jacobian; JAX or numpy."""
 
     out: Impact
@@ -347,11 +347,11 @@ class Programs:
     single: Callable[[Any], Any]
     batched: Callable[[Any], Any]
     batch: int
-    sampled: Callable[[Any], Solution]
+    sampled: Callable[[Any], Solved]
     gradient: Callable[[Any], Any] | None
     compile_time: dict[str, float]
 
-    def at(self, setting: float | None) -> Solution:
+    def at(self, setting: float | None) -> Solved:
         """Solution and Jacobian of the sample, as numpy; evaluations NaN where not counted."""
         solution = jax.tree.map(np.asarray, self.sampled(setting))
         work = np.where(solution.evaluations == UNCOUNTED, np.nan, solution.evaluations)
@@ -364,13 +364,13 @@ def _method_programs(method: Method, case: Case, gradients: bool, durations: boo
     if not method.jax:
         return _host_programs(method, case)
 
-    def solve(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Solution:
+    def solve(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Solved:
         """The impact with stiffness k (m,)."""
         law = with_entries(law, ("stiffness",), k)
         result = method.solve(law, scene, v, setting)
-        return Solution(outcome(law, scene, v, result), result.duration, result.evaluations)
+        return Solved(outcome(law, scene, v, result), result.duration, result.evaluations)
 
-    def timed(*arguments: Any) -> Solution:
+    def timed(*arguments: Any) -> Solved:
         """The same, without a duration that would cost a run of its own."""
         solution = solve(*arguments)
         without = method.duration_apart or not durations
@@ -440,13 +440,13 @@ def _host_programs(method: Method, case: Case) -> Programs:
         """One impact."""
         return method.solve(law, case.scene, case.velocity, setting)
 
-    def sampled(setting: Any) -> Solution:
+    def sampled(setting: Any) -> Solved:
         """The impacts on which errors are measured."""
         solutions = []
         for law in laws[: case.sample]:
             result = one(law, setting)
             out = outcome(law, case.scene, case.velocity, result)
-            solutions.append(Solution(out, result.duration, result.evaluations))
+            solutions.append(Solved(out, result.duration, result.evaluations))
         return jax.tree.map(lambda *a: jnp.stack(a), *solutions)
 
     return Programs(
@@ -464,9 +464,9 @@ def _law_programs(law: Law, case: Case) -> Programs:
     law, batch = in_common_dtype(law, case.velocity)[0], len(case.stiffness)
     seconds: dict[str, float] = {}
 
-    def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Solution:
+    def run(v: jax.Array, law: Law, scene: Scene, setting: jax.Array) -> Solved:
         """One impact."""
-        return Solution(impact(law, scene, v), jnp.nan, UNCOUNTED)
+        return Solved(impact(law, scene, v), jnp.nan, UNCOUNTED)
 
     many = jax.vmap(run, in_axes=(0, None, None, None))
     velocities = jnp.tile(case.velocity[None, :], (batch, 1))
@@ -484,7 +484,7 @@ def _law_programs(law: Law, case: Case) -> Programs:
 # ------------------------------------------------------------------------- errors and times
 
 
-def _errors(case: Case, solution: Solution, truth: Solution) -> dict[str, float]:
+def _errors(case: Case, solution: Solved, truth: Solved) -> dict[str, float]:
     """Relative errors, the largest over the impacts that were solved."""
     out, exact = solution.out, truth.out
     fastest = float(jnp.max(jnp.abs(case.velocity))) or np.abs(exact.velocity).max()

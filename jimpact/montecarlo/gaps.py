@@ -76,7 +76,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
 
     Equation: `delta_c = (m v^2 / k)^(1 / (eta + 1))` with the largest approach speed v of the
     scene and `m_j = 2 / W_jj`, the mass of two equal balls (in general `2 m1 m2 / (m1 + m2)`); for
-    forces that are no power law `F(delta_c) delta_c = m v^2`.
+    forces other than power laws `F(delta_c) delta_c = m v^2`.
 
     Args:
         scene: its gaps, None: all closed.
@@ -127,7 +127,7 @@ class Crossover(eqx.Module):
 def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
     """Outcome of a two-contact scene against the difference of its gaps.
 
-    Which contact closes first decides what follows; laws of instantaneous collisions jump where
+    The outcome depends on which contact closes first. Laws of instantaneous collisions jump where
     both close at once. With indentation the jump is a smooth crossover, about 2 delta_c wide.
 
     Args:
@@ -137,7 +137,7 @@ def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
         offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
 
     Returns:
-        `Crossover`: `gaps` (s, 2) [m], `velocity` (s, n) [m/s], `status` (s,), a row an offset.
+        `Crossover`: `gaps` (s, 2) [m], `velocity` (s, n) [m/s], `status` (s,), one row for each.
 
     Raises:
         ValueError: not two contacts, offsets of another shape. TypeError: another law.

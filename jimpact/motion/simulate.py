@@ -104,9 +104,10 @@ def simulate(
         atol: absolute one [m, m/s, rad, ..]; None: 1e-12, in single precision 1e-7.
         closed_below: contacts with smaller gaps [m] take part in an impact; None: 1e-9, or 80
             roundings of the largest coordinate or gap at the start, if that is more.
-        slow: accumulations are passed: a contact that leaves slower than this share of the largest
+        slow: accumulations are skipped: a contact that leaves slower than this share of the largest
             gap velocity of the motion, and would be pressed back, stays closed; contacts that share
-            bodies below the root of that share (docs/motions.md). `events` tells what is passed.
+            bodies below the root of that share (docs/motions_reference.md). `events` estimates
+            what is skipped.
         max_steps: of the integrator, in all.
         progress: bar on stderr, after each of those runs with the share of the duration that is
             done; None: on a terminal, for long motions.
@@ -115,14 +116,14 @@ def simulate(
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
         Method 'events' has derivatives in both modes (grad, jvp, hessian) of everything in it,
         event times and ledger included, in everything that is an array, and in what functions of
-        the system close over. They are those of the order of events that occurs, one-sided where
-        two events change places or a contact is only grazed; NaN for motions of more steps than
+        the system close over. They hold for the order of events that occurs: one-sided where
+        two events change places or a contact is grazed; NaN for motions of more steps than
         samples + 16 `max_events` + 1024. Method 'contact_forces' has forward ones (jvp, jacfwd).
 
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step.
         ValueError: shapes, t_end <= t_start, penetration, a base or a mass that is not a number, on
-            the host; inside jit only the status speaks (`raise_on_failed_motion`).
+            the host; inside jit the status reports them (`raise_on_failed_motion`).
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
 

@@ -18,7 +18,7 @@ Base = Callable[[jax.Array], jax.Array]  # t () -> displacement y_b (d,) [m]
 
 
 class System(eqx.Module):
-    """A body and everything that moves it but its impacts; a pytree, as far as its functions are.
+    """A body and the loads that move it between impacts; a pytree if its functions are.
 
     Equation: `M(q) q'' = F(q, q', t) - grad V(q) - (Coriolis terms) + N lambda_n + H lambda_t`
     with `N = grad f(q_r)`, `H = grad h(q_r)`, `q_r = q - B y_b(t)` the position seen from the base.
@@ -36,8 +36,8 @@ class System(eqx.Module):
         base_directions: B (n, d): how q changes when everything moves with the base; None: those
             of the body.
 
-    Functions that are `equinox.Module`s may hold arrays: `simulate` is differentiable in them. A
-    new lambda is a new function to JAX, and compiled anew.
+    Functions that are `equinox.Module`s may hold arrays, and `simulate` is differentiable in these.
+    JAX compiles again for each new lambda.
 
     Raises:
         ValueError: a mass that is not positive definite, a base without its directions.
@@ -187,6 +187,7 @@ class HarmonicBase(eqx.Module):
 
 
 def _under_gravity(body: Body, acceleration: Any, base: Base | None = None) -> System:
+    """The system of a body in gravity [m/s^2]."""
     return System(body, potential=gravity(body, acceleration), base=base)
 
 

@@ -82,7 +82,7 @@ def admissible_set(
 
 def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.ndarray) -> Figure:
     """The set in the plane of kinetic coordinates."""
-    frame = _Frame(result, closed)
+    frame = _Plane(result, closed)
     figure = new_figure(7.6)
     axes = figure.subplots()
     circle = np.linspace(0, 2 * np.pi, 400)
@@ -142,7 +142,7 @@ def _legend(figure: Figure, axes: Axes, columns: int) -> None:
         legend_below(figure, handles, columns)
 
 
-class _Frame:
+class _Plane:
     """Kinetic coordinates turned so that the outcomes with gamma+ >= 0 open upwards."""
 
     def __init__(self, result: AdmissibleSet, closed: np.ndarray):
@@ -169,9 +169,14 @@ class _Frame:
 
 
 def _line(
-    axes: Axes, frame: _Frame, start: np.ndarray, direction: np.ndarray, text: str, style: str
+    axes: Axes,
+    frame: _Plane,
+    start: np.ndarray,
+    direction: np.ndarray,
+    text: str,
+    style: str,
 ) -> None:
-    """A side of the set as a ray up to the circle, named beside its outer part."""
+    """A side of the set as a ray up to the circle, named along its outer part."""
     b = start @ direction
     length = -b + np.sqrt(max(b * b + frame.radius**2 - start @ start, 0.0))
     end = start + length * direction
