@@ -96,7 +96,7 @@ MUTATIONS = [
         FLOW,
         "stepper.py",
     ),
-    Mutation("dips switched off", r"dipped = turns & .*", "dipped = turns & False", ("test_methods.py::test_right_or_flagged", "test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]", "test_methods.py::test_right_or_flagged_with_more_steps[6-0.6]"), "stepper.py", "not release"),
+    Mutation("dips switched off", r"dipped = turns & .*", "dipped = turns & False", ("test_motion.py::test_no_event_is_missed_between_two_looks",), "stepper.py", "slow"),
     Mutation("crossings are missed", r"crossed, turns = free & \(c1 < -snap\)", "crossed, turns = free & (c1 < -1e3 * snap)", FLOW),
     Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", ("test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]",), "stepper.py", "slow"),
     Mutation("every step accepted", r"ok = error2 <= 1\n", "ok = error2 <= 1e6\n", FLOW),
@@ -160,7 +160,7 @@ MUTATIONS = [
     Mutation("inertia of a dimer about its axis halved", r"0\.8 \* body\.sphere_mass", "0.4 * body.sphere_mass", ("test_scenes.py::test_dimer_in_space",)),
     Mutation("pendulums without the square of their length", r"self\.masses \* self\.length\*\*2", "self.masses * self.length", (examples("bodies.pendulums"),)),
     Mutation("sign of the Coriolis terms", r"0\.5 \* (jax\.grad\(lambda x: v @ momentum\(x\)\)\(q\) - change)", r"-0.5 * \1", ("test_bodies.py::test_inertial_forces_keep_the_energy",)),
-    Mutation("closed contacts of a measured height counted from zero", r"gaps <= gaps\.min\(axis=1, keepdims=True\) \+ near", "gaps <= near", ("test_experiments.py",)),
+    Mutation("closed contacts of a measured height counted from zero", r"gaps <= gaps\.min\(axis=1, keepdims=True\) \+ near", "gaps <= near", ("test_experiments.py::test_the_cube",)),
     # --- contacts and scenes
     Mutation("tangents of open contacts confused in space", r"rows = jnp\.repeat\(part, each\)", "rows = jnp.tile(part, each)", ("test_seams.py::test_open_contacts_in_space_have_no_slip",)),
     Mutation("kinetic angles without pi", r"jnp\.pi - jnp\.arccos\(jnp\.clip", "jnp.arccos(jnp.clip", ("test_scenes.py::test_normalized_quantities_and_kinetic_angles",)),

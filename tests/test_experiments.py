@@ -59,7 +59,7 @@ def test_turning_keeps_its_unit(tmp_path):
 
 def test_missing_values_labels_and_foreign_line_ends(tmp_path):
     text = "\ufeffpost_2 [m/s], post_1[m/s],shot,pre_1[m/s],pre_2[m/s]\r\n\r\n,1,first,2,0\r\nNaN,1,,2,0\r\n"
-    with pytest.warns(UserWarning, match=r"1 cells are NaN .* line 4, column `post_2 \[m/s\]`"):
+    with pytest.warns(UserWarning, match=r"line 4, column `post_2 \[m/s\]`: the cell is NaN"):
         data = ji.read_experiments(written(tmp_path, text))
     np.testing.assert_array_equal(data.pre, [[2, 0], [2, 0]])
     np.testing.assert_array_equal(data.post, [[1, np.nan], [1, np.nan]])

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from jimpact.motion.system import System
 
-_ROUNDINGS = 4
+_ROUNDINGS = 4  # that a share may be off by in single precision; more would hide slow approach
 
 
 def not_rounding(share: float, dtype: jnp.dtype) -> float:
@@ -33,11 +33,12 @@ def base_velocity(system: System, t: jax.Array) -> jax.Array | None:
 
 def carried_along(system: System, v: jax.Array, t: jax.Array) -> jax.Array:
     """Velocity of the base (n,), 0 without one."""
-    found = base_velocity(system, t)
-    return jnp.zeros_like(v) if found is None else found
+    velocity = base_velocity(system, t)
+    return jnp.zeros_like(v) if velocity is None else velocity
 
 
 def _displaced(system: System, t: jax.Array) -> jax.Array:
+    """Displacement of the base `B y_b(t)` (n,)."""
     assert system.base is not None
     assert system.base_directions is not None
     return system.base_directions @ jnp.atleast_1d(system.base(t))
@@ -60,9 +61,11 @@ def kinematics(
     body, zero, one = system.body, jnp.zeros_like(t), jnp.ones_like(t)
 
     def gap(u: jax.Array, s: jax.Array) -> jax.Array:
+        """Gaps (m,) after the displacement u (n,) and the time s."""
         return gaps(system, body.moved(q, u), t + s)
 
     def slips(s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Slip (k,) and tangents (n, k) after the time s."""
         h = body.tangents(seen_from_base(system, body.moved(q, s * v), t + s))
         assert h is not None
         carried = base_velocity(system, t + s)
@@ -73,6 +76,7 @@ def kinematics(
         return Kinematics(jnp.zeros_like(rate), rate, drift, h)
 
     def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Gaps and gap velocities (m,) after the time s."""
         return jax.jvp(lambda s: gap(s * v, s), (s,), (jnp.ones_like(s),))
 
     (value, rate), (_, drift) = jax.jvp(rates, (zero,), (one,))

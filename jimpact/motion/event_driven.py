@@ -52,10 +52,10 @@ from jimpact.motion.transitions import After, Decision, resolve, resolved_again
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6
 AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
-# Rows of a plan beside one a sample: accepted steps of a motion that has derivatives. A motion of
-# more steps has none: NaN.
+# Rows of a plan, in addition to one a sample: accepted steps of a motion with derivatives. Those
+# of a motion of more steps are NaN. Ten times more takes ten times the memory of derivatives.
 ROWS_PER_EVENT, ROWS_MORE = 16, 1024
-ROOM = 32  # numbers a contact that a run may hand over, beside states
+ROOM = 32  # numbers a contact that a run may hand over, in addition to states
 BLOCK = 16  # rows between two checkpoints
 
 
@@ -120,6 +120,8 @@ class MotionTable(NamedTuple):
 
 
 class _EventRun(NamedTuple):
+    """A run up to now."""
+
     flight: Flight
     struck: jax.Array  # (m,) contacts that had an impact
     allowed: jax.Array  # errors of the ledger
@@ -128,15 +130,17 @@ class _EventRun(NamedTuple):
     several: jax.Array  # whether there were several solutions at an event
     last: Event  # before the next step, or a longer time ago
     table: MotionTable
-    seen: jax.Array  # events
+    event_count: jax.Array
     status: jax.Array
     plan: MotionPlan | None
 
 
 class _EventEnd(NamedTuple):
+    """A run at its end."""
+
     table: MotionTable
     reached: jax.Array  # samples
-    seen: jax.Array  # events
+    event_count: jax.Array
     steps: jax.Array
     status: jax.Array
     plan: MotionPlan | None
@@ -159,14 +163,16 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
     fixed = [None if eqx.is_array(x) else x for x in leaves]
 
     def rebuilt(arrays: tuple[jax.Array, ...]) -> MotionProblem:
-        every = iter(arrays)
-        return jax.tree.unflatten(tree, [next(every) if x is None else x for x in fixed])
+        """The problem with these arrays."""
+        values = iter(arrays)
+        return jax.tree.unflatten(tree, [next(values) if x is None else x for x in fixed])
 
     @jax.custom_jvp
     def value(*arrays: jax.Array) -> _EventEnd:
         return _run(rebuilt(arrays), max_events, records=False)
 
     def rule(arrays: Any, tangents: Any) -> Any:
+        """Values by the run, tangents by walking through its plan again."""
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
         end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
         assert end.plan is not None
@@ -174,14 +180,14 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
 
         def smooth(*moved: jax.Array) -> tuple[jax.Array, jax.Array]:
             some = iter(moved)
-            every = [next(some) if mark else x for x, mark in zip(arrays, marked)]
-            return _again(rebuilt(tuple(every)), plan, max_events)
+            inputs = [next(some) if mark else x for x, mark in zip(arrays, marked)]
+            return _again(rebuilt(tuple(inputs)), plan, max_events)
 
         values = tuple(x for x, mark in zip(arrays, marked) if mark)
         rates = tuple(t for t, mark in zip(tangents, marked) if mark)
-        found, slopes = jax.jvp(smooth, values, rates)
+        results, slopes = jax.jvp(smooth, values, rates)
         recorded = end.table.samples, end.table.events
-        samples, events = selected(plan.lost, recorded, found)
+        samples, events = selected(plan.lost, recorded, results)
         end = end._replace(table=MotionTable(samples, events, end.table.marks), plan=None)
         none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)
         return end, none._replace(table=MotionTable(slopes[0], slopes[1], none.table.marks))
@@ -189,7 +195,7 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
     value.defjvp(rule, symbolic_zeros=True)
     end = value(*(x for x, y in zip(leaves, fixed) if y is None))
     samples = sampled_states(end.table.samples, problem.start, end.reached)
-    events = _events(end.table, end.seen, problem)
+    events = _events(end.table, end.event_count, problem)
     return Course(samples, events, end.steps, end.status), end.past
 
 
@@ -204,8 +210,8 @@ def _run(problem: MotionProblem, max_events: int, records: bool) -> _EventEnd:
 
     def goes_on(run: _EventRun) -> jax.Array:
         flight = run.flight
-        there = flight.sample >= problem.times.shape[0]
-        return (run.status == MOTION_CODE["ok"]) & ~flight.stuck & ~there
+        reached = flight.sample >= problem.times.shape[0]
+        return (run.status == MOTION_CODE["ok"]) & ~flight.stuck & ~reached
 
     def one(run: _EventRun) -> _EventRun:
         on = goes_on(run)
@@ -219,12 +225,14 @@ def _run(problem: MotionProblem, max_events: int, records: bool) -> _EventEnd:
     status = jnp.where(
         stuck, why_stuck(problem.system, end.flight, problem.q0, problem.times), end.status
     ).astype(jnp.int32)
-    told = end.several & (status == MOTION_CODE["ok"])
-    status = jnp.where(told, MOTION_CODE["several_outcomes"], status).astype(jnp.int32)
+    reported = end.several & (status == MOTION_CODE["ok"])
+    status = jnp.where(reported, MOTION_CODE["several_outcomes"], status).astype(jnp.int32)
     flight, past = end.flight, None
     if problem.past is not None:
         past = _pack_checkpoint(end, problem.past.numbers.shape[0])
-    return _EventEnd(end.table, flight.sample, end.seen, flight.steps, status, end.plan, past)
+    return _EventEnd(
+        end.table, flight.sample, end.event_count, flight.steps, status, end.plan, past
+    )
 
 
 def _remembered(run: _EventRun) -> Any:
@@ -247,8 +255,8 @@ def _unpack_checkpoint(start: _EventRun, past: jax.Array) -> _EventRun:
     parts = jnp.split(past, ends)[1:-1]
     known = [x.reshape(like.shape).astype(like.dtype) for x, like in zip(parts, leaves)]
     on = past[0] > 0
-    found = selected(on, jax.tree.unflatten(tree, known), _remembered(start))
-    flight, struck, allowed, waits, last, samples = found
+    last_run = selected(on, jax.tree.unflatten(tree, known), _remembered(start))
+    flight, struck, allowed, waits, last, samples = last_run
     return start._replace(
         flight=flight,
         struck=struck,
@@ -263,6 +271,7 @@ def _unpack_checkpoint(start: _EventRun, past: jax.Array) -> _EventRun:
 
 
 def _begin(problem: MotionProblem, max_events: int, records: bool) -> _EventRun:
+    """The run before its first event; with an empty plan, if it `records`."""
     system, _, mu, settings, q0, v0, times, *_ = problem
     m, dtype = problem.contacts, q0.dtype
     state = problem.start
@@ -315,40 +324,42 @@ def _resolved(
     flight, old = run.flight, run.flight.state
 
     def now(run: _EventRun) -> tuple[_EventRun, jax.Array, jax.Array]:
+        """The run after the event, and the row of the event."""
         scales, modes = run.last.decision.scales, decoded(flight.aim.modes, old.q.dtype)
         fired = flight.event & mine
-        found = resolve(
+        outcome = resolve(
             system, law, mu, settings, old, modes, fired, scales, run.struck, run.approach
         )
-        happened = found.kind != KIND_CODE["none"]
+        happened = outcome.kind != KIND_CODE["none"]
         most = max_events if problem.past is None else jnp.minimum(problem.past.most, max_events)
-        full = (run.seen >= most) & happened
-        status = jnp.where(full, MOTION_CODE["max_events"], found.status).astype(jnp.int32)
+        full = (run.event_count >= most) & happened
+        status = jnp.where(full, MOTION_CODE["max_events"], outcome.status).astype(jnp.int32)
         kept = mine & happened & ~full
-        state = found.after.state
+        state = outcome.after.state
         ready = flight._replace(
             state=state,
-            aim=flight.aim._replace(modes=encoded(found.modes)),
+            aim=flight.aim._replace(modes=encoded(outcome.modes)),
             event=jnp.zeros_like(flight.event),
         )
         new = run._replace(
             flight=toward_sample(ready, problem.times, flight.free),
-            struck=run.struck | (found.contacts & found.decision.strikes),
+            struck=run.struck | (outcome.contacts & outcome.decision.strikes),
             allowed=allowed_errors(system, settings, state),
-            waits=found.approach > 0,
-            approach=found.approach,
-            several=run.several | found.several,
-            last=Event(jnp.asarray(True), kept, found.decision),
-            seen=run.seen + kept.astype(jnp.int32),
+            waits=outcome.approach > 0,
+            approach=outcome.approach,
+            several=run.several | outcome.several,
+            last=Event(jnp.asarray(True), kept, outcome.decision),
+            event_count=run.event_count + kept.astype(jnp.int32),
             status=status,
         )
-        codes = jnp.stack([found.kind, found.code])
-        marks = jnp.concatenate([codes.astype(jnp.int32), found.contacts.astype(jnp.int32)])
-        numbers = _numbers(old, found.after)
+        codes = jnp.stack([outcome.kind, outcome.code])
+        marks = jnp.concatenate([codes.astype(jnp.int32), outcome.contacts.astype(jnp.int32)])
+        numbers = _numbers(old, outcome.after)
         # one that has no row any more is not resolved
         return selected(mine, selected(full, run._replace(status=status), new), run), numbers, marks
 
     def later(run: _EventRun) -> tuple[_EventRun, jax.Array, jax.Array]:
+        """Nothing yet."""
         events, marks = (jnp.zeros_like(x[0]) for x in run.table[1:])
         return run, events, marks
 
@@ -357,7 +368,7 @@ def _resolved(
         table=MotionTable(table.samples[:1], *(x[:1] for x in table[1:])), plan=None
     )
     new, numbers, marks = jax.lax.cond(due, now, later, light)
-    index = jnp.where(new.seen > run.seen, run.seen, max_events)
+    index = jnp.where(new.event_count > run.event_count, run.event_count, max_events)
     table = table._replace(events=put(table.events, numbers, index))
     table = table._replace(marks=put(table.marks, marks, index))
     return new._replace(table=table, plan=plan)
@@ -434,9 +445,9 @@ def _numbers(before: State, after: After) -> jax.Array:
 
 def _events(table: MotionTable, count: jax.Array, problem: MotionProblem) -> Events:
     """The record of events; NaN or 0 in rows that are not used."""
-    there = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
-    marks = jnp.where(there[:, None], table.marks[:-1], 0)
-    rows = jnp.where(there[:, None], table.events[:-1], jnp.nan)
+    used = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
+    marks = jnp.where(used[:, None], table.marks[:-1], 0)
+    rows = jnp.where(used[:, None], table.events[:-1], jnp.nan)
     n, m = problem.v0.size, problem.contacts
     sizes = np.cumsum([1, problem.q0.size, n, n, m, m, 2 * m])
     time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
@@ -473,18 +484,20 @@ def _again(
     rows = jax.tree.map(lambda x: x[:size], plan.rows)
     index = jnp.arange(size, dtype=jnp.int32)
     # what an event without a step leaves is in the row after the last step
-    there = index <= plan.used
-    happens, accepted = rows.event.happens & there, rows.accepted & (index < plan.used)
+    used = index <= plan.used
+    happens, accepted = rows.event.happens & used, rows.accepted & (index < plan.used)
     sampled = accepted & rows.aim.target[:, -1, 0]
     written = rows.event.written & happens
     reached = jnp.cumsum(sampled, dtype=jnp.int32) + (~sampled).astype(jnp.int32)  # before the step
 
     def event(state: State, now: Event) -> tuple[State, jax.Array]:
+        """The state after an event, and its numbers."""
         after = resolved_again(system, law, mu, settings, state, now.decision)
         new = selected(now.happens, after.state, state)
         return new, jnp.where(now.happens, _numbers(state, after), 0.0)
 
     def step(state: State, row: PlanRow, sample: jax.Array) -> State:
+        """The state after an accepted step toward this sample."""
         aim = row.aim._replace(modes=row.aim.modes.astype(jnp.int32))
         modes, scales = decoded(aim.modes, state.q.dtype), row.event.decision.scales
         flow = flow_of(system, mu, settings, modes, scales, times, state)
@@ -492,6 +505,7 @@ def _again(
         return selected(row.accepted, step_again(flow, aim, state), state)
 
     def one(state: State, x: Any) -> tuple[State, Any]:
+        """One row of the plan."""
         row, sample = x
         nothing = jnp.zeros(width, start.q.dtype)
         state, numbers = jax.lax.cond(
@@ -501,6 +515,8 @@ def _again(
         return state, (packed(state)[:, 0], numbers)
 
     def block(y: Any, xs: Any) -> tuple[Any, Any]:
+        """A block of rows between two checkpoints."""
+
         def walk(y: Any) -> tuple[Any, Any]:
             return jax.lax.scan(jax.checkpoint(one), y, xs)
 
@@ -517,10 +533,9 @@ def _again(
 
     def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
         """The values in the first rows with a flag."""
-        seen, wanted = jnp.cumsum(flags, dtype=jnp.int32), jnp.arange(count, dtype=jnp.int32)
-        row = jnp.minimum(jnp.searchsorted(seen, wanted + 1), size - 1)
-        found = values.reshape(size, -1)[row]
-        return jnp.where((wanted < seen[-1])[:, None], found, 0.0)
+        so_far, wanted = jnp.cumsum(flags, dtype=jnp.int32), jnp.arange(count, dtype=jnp.int32)
+        row = jnp.minimum(jnp.searchsorted(so_far, wanted + 1), size - 1)
+        return jnp.where((wanted < so_far[-1])[:, None], values.reshape(size, -1)[row], 0.0)
 
     samples = at(sampled, states, times.shape[0])
     first = packed(start)[:, 0][None]

@@ -21,7 +21,7 @@ MAX_PASSES = 50
 _FAILS = tuple(row.failure for row in MOTION_STATUS)
 
 
-class Record(eqx.Module):
+class MotionObservable(eqx.Module):
     """The observable of a motion."""
 
     system: System
@@ -86,9 +86,9 @@ def fit_motion(
 
     >>> import jimpact as ji
     >>> ball = ji.ball_system()
-    >>> seen = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q
-    >>> found = ji.fit_motion(ball, ji.Newton(0.7), seen, [1.0], [0.0], 1.5)
-    >>> round(float(found.value[0]), 8)
+    >>> measured = ji.simulate(ball, ji.Newton(0.8), [1.0], [0.0], 1.5, samples=16).q
+    >>> result = ji.fit_motion(ball, ji.Newton(0.7), measured, [1.0], [0.0], 1.5)
+    >>> round(float(result.value[0]), 8)
     0.8
     """
     record = np.asarray(measured, float)
@@ -99,8 +99,10 @@ def fit_motion(
                 f"but has shape {record.shape}."
             )
         options = {"samples": record.shape[0]} | options
-    seen = Record(system, {"q0": q0, "v0": v0, "t_end": t_end} | options, observe or _positions)
-    problem = FitProblem.from_observable(law, seen, measured, sigma, free, bounds)
+    observable = MotionObservable(
+        system, {"q0": q0, "v0": v0, "t_end": t_end} | options, observe or _positions
+    )
+    problem = FitProblem.from_observable(law, observable, measured, sigma, free, bounds)
     return fit(
         problem,
         loss=loss,
@@ -113,4 +115,5 @@ def fit_motion(
 
 
 def _positions(motion: Motion) -> jax.Array:
+    """q (S, n)."""
     return motion.q

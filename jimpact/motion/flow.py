@@ -26,10 +26,10 @@ from jimpact.motion.persistent_contact import (
     Contacts,
     Modes,
     constraint_impulse,
+    contact_powers,
     contacts_at,
     forces,
     least_regularity,
-    powers,
     regularity,
     rest_acceleration,
 )
@@ -88,22 +88,22 @@ class Course(NamedTuple):
     status: jax.Array
 
 
-def watched(given: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales) -> jax.Array:
+def watched(contacts: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales) -> jax.Array:
     """What must stay positive (k,): gaps or normal forces, then friction."""
     m = modes.active.shape[0]
-    found = forces(given, mu, modes)
-    w = jnp.diagonal(given.delassus)
+    force = forces(contacts, mu, modes)
+    w = jnp.diagonal(contacts.delassus)
     slack = rest_acceleration(w.dtype) * scales.acceleration
-    normal = jnp.where(modes.active, found.normal * w[:m] + slack, given.normal.value)
-    if given.tangent is None or mu is None or found.tangential is None:
+    normal = jnp.where(modes.active, force.normal * w[:m] + slack, contacts.normal.value)
+    if contacts.tangent is None or mu is None or force.tangential is None:
         return normal
-    cone = (mu * found.normal - jnp.abs(found.tangential)) * w[m:] + slack
+    cone = (mu * force.normal - jnp.abs(force.tangential)) * w[m:] + slack
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
     lasts = jax.lax.cond(
-        slides, lambda: regularity(given, mu, modes), lambda: jnp.ones((), w.dtype)
+        slides, lambda: regularity(contacts, mu, modes), lambda: jnp.ones((), w.dtype)
     ) - least_regularity(w.dtype)
-    slip = modes.sign * given.tangent.rate
+    slip = modes.sign * contacts.tangent.rate
     slip = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
     side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)
     return jnp.concatenate([normal, side])
@@ -160,7 +160,7 @@ class MotionFlow(eqx.Module, stepper.Flow):
         return modes, y
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Never: it is seen from outside."""
+        """Never: the loop of the motion decides."""
         return jnp.zeros((1, 1), bool)
 
     def regular(self, rates: State, at: State) -> jax.Array:
@@ -193,38 +193,39 @@ class MechanicalFlow(MotionFlow):
         return decoded(modes, self.sizes.dtype)
 
     def _contacts(self, at: State) -> Contacts:
+        """Contact space at this state."""
         return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
 
     def field(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Rates of the state."""
         at = unpacked(self.like, y)
-        given = self._contacts(at)
-        found = forces(given, self.mu, const)
-        friction, base = powers(self.system, given, found, at.t)
+        contacts = self._contacts(at)
+        force = forces(contacts, self.mu, const)
+        friction, base = contact_powers(self.system, contacts, force, at.t)
         power = user_force(self.system, at.q, at.v, at.t) @ at.v
         per_contact = jnp.stack([jnp.zeros_like(friction), friction])
         still = jnp.zeros_like(at.contact)
         one = jnp.ones_like(at.t)
         moves = self.system.body.rates(at.q, at.v)
-        rates = State(moves, found.acceleration, one, power, base, per_contact, still)
-        parting = jnp.where(const.active, 0.0, given.normal.rate)
+        rates = State(moves, force.acceleration, one, power, base, per_contact, still)
+        parting = jnp.where(const.active, 0.0, contacts.normal.rate)
         return jnp.concatenate([self.regular(rates, at), parting[:, None]])
 
     def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """What must stay positive."""
         at = unpacked(self.like, y)
-        seen = watched(self._contacts(at), self.mu, const, self.scales)
-        return self.from_margins(seen, at)
+        margins = watched(self._contacts(at), self.mu, const, self.scales)
+        return self.from_margins(margins, at)
 
     def projected(self, const: Modes, at: State) -> State:
         """Gaps and velocities of persistent contacts set to 0, in the metric of M."""
-        given = self._contacts(at)
-        value, rate = given.normal.value, given.normal.rate
-        if given.tangent is not None:  # tangentially only velocities drift
+        contacts = self._contacts(at)
+        value, rate = contacts.normal.value, contacts.normal.rate
+        if contacts.tangent is not None:  # tangentially only velocities drift
             value = jnp.concatenate([value, jnp.zeros_like(value)])
-            rate = jnp.concatenate([rate, given.tangent.rate])
-        p = constraint_impulse(given, self.mu, const, jnp.stack([value, rate], axis=1))
-        move = given.moved @ p
+            rate = jnp.concatenate([rate, contacts.tangent.rate])
+        p = constraint_impulse(contacts, self.mu, const, jnp.stack([value, rate], axis=1))
+        move = contacts.moved @ p
         return at._replace(q=self.system.body.moved(at.q, move[:, 0]), v=at.v + move[:, 1])
 
 
@@ -286,8 +287,8 @@ def no_samples(start: State, targets: jax.Array) -> jax.Array:
 
 def sampled_states(samples: jax.Array, start: State, reached: jax.Array) -> State:
     """States of a table, NaN where they were not reached."""
-    there = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
-    rows = jnp.where(there[:, None], samples[:-1], jnp.nan)
+    is_reached = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
+    rows = jnp.where(is_reached[:, None], samples[:-1], jnp.nan)
     return jax.vmap(lambda row: unpacked(start, row[:, None]))(rows)
 
 
@@ -410,6 +411,7 @@ def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:
 
 
 def _rows(flow: MotionFlow, state: State) -> jax.Array:
+    """Rows (.., 1) of the state, with spare ones that are 0."""
     return jnp.pad(packed(state), ((0, flow.spare), (0, 0)))
 
 
@@ -429,13 +431,16 @@ def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Fl
     errors = [settings.atol + settings.rtol * jnp.concatenate([of_q, of_v]), allowed]
     if flow.spare:
         of_u = of_q if system.body.coordinates is None else h * jnp.abs(state.v)
-        seen = kinematics(system, state.q, state.v, state.t)
-        of_gap = jnp.abs(seen.value) + h * jnp.abs(seen.rate) + jnp.abs(seen.gradient).T @ of_u
+        normal = kinematics(system, state.q, state.v, state.t)
+        of_gap = (
+            jnp.abs(normal.value) + h * jnp.abs(normal.rate) + jnp.abs(normal.gradient).T @ of_u
+        )
         errors.append(settings.atol + settings.rtol * of_gap)
     return jnp.concatenate(errors)
 
 
 def _smallest_step(targets: jax.Array) -> jax.Array:
+    """Length () [s] below which a step does not move time any more."""
     return not_rounding(SMALLEST_STEP, targets.dtype) * (jnp.abs(targets[0]) + jnp.abs(targets[-1]))
 
 
@@ -459,8 +464,8 @@ def allowed_errors(
 def roundings(settings: Settings, margins: jax.Array, targets: jax.Array) -> jax.Array:
     """Roundings of these margins and of the time to the next sample (k,)."""
     least = float(jnp.finfo(targets.dtype).tiny) ** 0.5
-    every = jnp.append(margins, _smallest_step(targets))
-    return jax.lax.stop_gradient(jnp.maximum(every, least))
+    each = jnp.append(margins, _smallest_step(targets))
+    return jax.lax.stop_gradient(jnp.maximum(each, least))
 
 
 def flow_of(

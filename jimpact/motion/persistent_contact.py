@@ -94,17 +94,20 @@ def contacts_at(
     )
 
 
-def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
+def forces(contacts: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
     """The forces that keep the modes, and the acceleration with them."""
-    m = given.normal.value.shape[0]
-    if given.tangent is None or mu is None:
-        normal = _without_friction(given.delassus, -given.approach[:, None], modes.active)[:, 0]
-        return Forces(normal, None, given.free + given.moved @ normal)
-    w, held, drag = _dragged(given, mu, modes)
-    right = -given.approach
+    m = contacts.normal.value.shape[0]
+    if contacts.tangent is None or mu is None:
+        normal = _without_friction(contacts.delassus, -contacts.approach[:, None], modes.active)[
+            :, 0
+        ]
+        return Forces(normal, None, contacts.free + contacts.moved @ normal)
+    w, held, drag = _dragged(contacts, mu, modes)
+    right = -contacts.approach
     none = jnp.zeros(m, w.dtype)
 
     def shared(_: int, known: jax.Array) -> jax.Array:
+        """Forces (k,), shared by the normal forces of the last pass."""
         # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
         # `solvers.friction`: they break loose together
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
@@ -113,11 +116,11 @@ def forces(given: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
     both = both.at[m:].add(-drag * both[:m])
-    return Forces(both[:m], both[m:], given.free + given.moved @ both)
+    return Forces(both[:m], both[m:], contacts.free + contacts.moved @ both)
 
 
 def _dragged(
-    given: Contacts, mu: jax.Array, modes: Modes
+    contacts: Contacts, mu: jax.Array, modes: Modes
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """What forces do to accelerations (k, k), friction going with the normal force where it slides.
 
@@ -126,20 +129,20 @@ def _dragged(
     m = modes.active.shape[0]
     held = jnp.concatenate([modes.active, modes.active & modes.stick])
     drag = jnp.where(modes.active & ~modes.stick, modes.sign * mu, 0.0)
-    return given.delassus.at[:, :m].add(-given.delassus[:, m:] * drag[None]), held, drag
+    return contacts.delassus.at[:, :m].add(-contacts.delassus[:, m:] * drag[None]), held, drag
 
 
-def regularity(given: Contacts, mu: jax.Array, modes: Modes) -> jax.Array:
+def regularity(contacts: Contacts, mu: jax.Array, modes: Modes) -> jax.Array:
     """Determinant () of the matrix of the forces, over what it is if nothing slides with friction.
 
     Of one contact `1 - mu s W_nt / W_nn`, with s the sign of slip. Where it has fallen to 0 forces
     that keep the modes do not exist, or elastic contacts would not settle at them.
     """
-    w, held, _ = _dragged(given, mu, modes)
-    scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(given.delassus), 1.0))
+    w, held, _ = _dragged(contacts, mu, modes)
+    scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(contacts.delassus), 1.0))
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = (held[:, None] & held[None, :])[None]
-    k = jnp.stack([w, given.delassus]) * jnp.outer(scale, scale)[None]
+    k = jnp.stack([w, contacts.delassus]) * jnp.outer(scale, scale)[None]
     eye = jnp.eye(len(held), dtype=w.dtype)[None]
     ridge = float(jnp.finfo(w.dtype).eps) ** _FAINT_RIDGE
     with_friction, without = determinants(jnp.where(both, k, eye) + ridge * eye)
@@ -182,42 +185,42 @@ def _least(
 
 
 def constraint_impulse(
-    given: Contacts, mu: jax.Array | None, modes: Modes, rates: jax.Array
+    contacts: Contacts, mu: jax.Array | None, modes: Modes, rates: jax.Array
 ) -> jax.Array:
     """Impulses p that take `rates` to 0 where the modes hold them, the least ones.
 
     Rates and impulses are (k,) or (k, columns); of normals alone, rates may have m rows.
-    `given.moved @ p` is the change of velocity; of position, if `rates` are gaps (first order).
+    `contacts.moved @ p` is the change of velocity; of position, if `rates` are gaps (first order).
     """
-    friction = given.tangent is not None and mu is not None
+    friction = contacts.tangent is not None and mu is not None
     held = modes.active
     if friction:
         held = jnp.concatenate([modes.active, modes.active & modes.stick])
     held = held[: rates.shape[0]]
     size = held.shape[0]
-    w, columns = given.delassus[:size, :size], rates.reshape(size, -1)
+    w, columns = contacts.delassus[:size, :size], rates.reshape(size, -1)
     if friction:
         p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
     else:
         p = _without_friction(w, -columns, held)
-    rest = given.delassus.shape[0] - size
+    rest = contacts.delassus.shape[0] - size
     return jnp.pad(p.reshape(rates.shape), ((0, rest),) + ((0, 0),) * (rates.ndim - 1))
 
 
-def powers(
-    system: System, given: Contacts, found: Forces, t: jax.Array
+def contact_powers(
+    system: System, contacts: Contacts, result: Forces, t: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Power of friction at every contact (m,) and of the base () [W]."""
-    friction = jnp.zeros_like(found.normal)
-    push = given.normal.gradient @ found.normal
-    if given.tangent is not None and found.tangential is not None:
-        friction = found.tangential * given.tangent.rate
-        push = push + given.tangent.gradient @ found.tangential
+    friction = jnp.zeros_like(result.normal)
+    push = contacts.normal.gradient @ result.normal
+    if contacts.tangent is not None and result.tangential is not None:
+        friction = result.tangential * contacts.tangent.rate
+        push = push + contacts.tangent.gradient @ result.tangential
     carried = base_velocity(system, t)
     return friction, jnp.zeros_like(t) if carried is None else push @ carried
 
 
-class Choice(NamedTuple):
+class ModeChoice(NamedTuple):
     """Modes; with friction they may not be `consistent`, and there may be `several`.
 
     Of several that is taken which sticks most. But a contact does not go on sliding where elastic
@@ -232,18 +235,18 @@ class Choice(NamedTuple):
 
 
 def choose_with_friction(
-    given: Contacts,
+    contacts: Contacts,
     mu: jax.Array,
     before: Modes,
     touching: jax.Array,
     released: jax.Array,
     sliding: jax.Array,
     slack: jax.Array,
-) -> Choice:
+) -> ModeChoice:
     """Modes of the contacts that touch at rest.
 
     Args:
-        given: contact space.
+        contacts: contact space.
         mu: coefficients of friction (m,).
         before: modes up to now.
         touching: (m,) gap and gap velocity are 0.
@@ -251,8 +254,8 @@ def choose_with_friction(
         sliding: (m,) whether the tangential velocity is not 0.
         slack: gap accelerations below it are rounding.
     """
-    given, mu = jax.lax.stop_gradient((given, mu))
-    assert given.tangent is not None
+    contacts, mu = jax.lax.stop_gradient((contacts, mu))
+    assert contacts.tangent is not None
     m = touching.shape[0]
     slid = before.active & ~before.stick
     broken = released[m:] & before.stick & ~sliding
@@ -260,54 +263,59 @@ def choose_with_friction(
     # where sticking breaks at one contact of a body, those that began to slide before go on
     goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
     now = Modes(touching, ~sliding & ~goes_on, jnp.where(goes_on, before.sign, 0.0))
-    now = now._replace(sign=jnp.where(sliding, jnp.sign(given.tangent.rate), now.sign))
+    now = now._replace(sign=jnp.where(sliding, jnp.sign(contacts.tangent.rate), now.sign))
     # sliding begins against the last force of sticking
-    held = forces(given, mu, now._replace(active=touching & ~released[:m]))
+    held = forces(contacts, mu, now._replace(active=touching & ~released[:m]))
     assert held.tangential is not None
     sign = jnp.where(broken, jnp.where(held.tangential > 0, -1.0, 1.0), now.sign)
-    eye, diagonal = jnp.eye(2 * m, dtype=sign.dtype), jnp.diagonal(given.delassus)[:m]
+    eye, diagonal = jnp.eye(2 * m, dtype=sign.dtype), jnp.diagonal(contacts.delassus)[:m]
     least = 2 * least_regularity(sign.dtype)  # twice: flights end at once it
 
-    def choose(tried: _Tried) -> _Tried:
-        known, rows = tried.known, jnp.tile(tried.there, 2)
-        w = jnp.where(rows[:, None] & rows[None], given.delassus, eye)
-        free = jnp.where(rows, given.approach, 0.0)
-        found = solve(
+    def choose(tried: _ModeTrial) -> _ModeTrial:
+        """Modes by a complementarity problem, and what the next try must change."""
+        known, rows = tried.known, jnp.tile(tried.allowed, 2)
+        w = jnp.where(rows[:, None] & rows[None], contacts.delassus, eye)
+        free = jnp.where(rows, contacts.approach, 0.0)
+        solution = solve(
             w, free[:m], free[m:], mu * jnp.ones(m, sign.dtype), complementary=True, sliding=known
         )
-        rate = given.approach + given.delassus @ jnp.concatenate([found.normal, found.tangential])
-        active = tried.there & (rate[:m] <= slack)
-        active = active & (~released[:m] | (found.normal * diagonal > slack))
+        rate = contacts.approach + contacts.delassus @ jnp.concatenate(
+            [solution.normal, solution.tangential]
+        )
+        active = tried.allowed & (rate[:m] <= slack)
+        active = active & (~released[:m] | (solution.normal * diagonal > slack))
         slips = (known != 0) | (jnp.abs(rate[m:]) > slack)
         modes = Modes(active, active & ~slips, jnp.where(known != 0, known, jnp.sign(rate[m:])))
         # what was taken to slide from rest must do so
         returns = active & (known != 0) & ~sliding & (known * rate[m:] < -slack)
-        several = found.status == CODE["several_outcomes"]
-        solved = found.status <= CODE["several_outcomes"]
+        several = solution.status == CODE["several_outcomes"]
+        solved = solution.status <= CODE["several_outcomes"]
         known = jnp.where(jnp.where(solved, returns, ~sliding), 0.0, known)
         # what would go on sliding though it cannot parts, where that is a solution, too
-        pressed = jnp.where(solved, active, tried.there)
-        regular = regularity(given, mu, modes._replace(active=pressed, stick=pressed & ~slips))
+        pressed = jnp.where(solved, active, tried.allowed)
+        regular = regularity(contacts, mu, modes._replace(active=pressed, stick=pressed & ~slips))
         wedged = active & slips & (regular <= least)
         leaves = wedged & several
-        stays = jnp.all(~touching | tried.there | (rate[:m] >= -slack))
-        solved = solved & stays & ~jnp.any(wedged)
+        open_ones_part = jnp.all(~touching | tried.allowed | (rate[:m] >= -slack))
+        solved = solved & open_ones_part & ~jnp.any(wedged)
         done = solved & ~jnp.any(returns)
         several = several | tried.several
-        there = tried.there & ~leaves
-        return _Tried(modes, known, there, regular, several, solved, done, tried.passes + 1)
+        allowed = tried.allowed & ~leaves
+        return _ModeTrial(modes, known, allowed, regular, several, solved, done, tried.passes + 1)
 
     no = jnp.asarray(False)
-    start = _Tried(now, sign, touching, jnp.ones_like(slack), no, no, no, jnp.asarray(0))
+    start = _ModeTrial(now, sign, touching, jnp.ones_like(slack), no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(lambda t: ~t.done & (t.passes < _PASSES), choose, start)
-    parts, several = touching & ~end.there, end.several & end.solved
-    return Choice(end.modes, end.solved, end.regularity, several, parts)
+    parts, several = touching & ~end.allowed, end.several & end.solved
+    return ModeChoice(end.modes, end.solved, end.regularity, several, parts)
 
 
-class _Tried(NamedTuple):
+class _ModeTrial(NamedTuple):
+    """One try of `choose_with_friction`."""
+
     modes: Modes
-    known: jax.Array  # directions of slip that are not asked for
-    there: jax.Array  # (m,) contacts that may be pressed
+    known: jax.Array  # (m,) directions of slip that are fixed, 0 where they are solved for
+    allowed: jax.Array  # (m,) contacts that may be pressed
     regularity: jax.Array
     several: jax.Array
     solved: jax.Array
@@ -316,19 +324,19 @@ class _Tried(NamedTuple):
 
 
 def pressed_together(
-    given: Contacts, touching: jax.Array, slack: jax.Array
+    contacts: Contacts, touching: jax.Array, slack: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """`0 <= lambda _|_ W lambda + approach >= 0` over touching contacts, without friction.
 
     Returns:
         Which contacts (m,) are pressed, which (m,) neither press nor part, and lambda (m,).
     """
-    given = jax.lax.stop_gradient(given)
+    contacts = jax.lax.stop_gradient(contacts)
     m = touching.shape[0]
-    w, b = given.delassus[:m, :m], jnp.where(touching, given.approach[:m], 0.0)
+    w, b = contacts.delassus[:m, :m], jnp.where(touching, contacts.approach[:m], 0.0)
     both = touching[:, None] & touching[None, :]
     eye = jnp.eye(m, dtype=w.dtype)
     # redundant contacts: any of the solutions will do
-    found = solve_lcp(jnp.where(both, w, eye), b, regular=True)
-    pressed = touching & (found.z * jnp.diagonal(w) > slack)
-    return pressed, touching & ~pressed & (found.w <= slack), found.z
+    solution = solve_lcp(jnp.where(both, w, eye), b, regular=True)
+    pressed = touching & (solution.z * jnp.diagonal(w) > slack)
+    return pressed, touching & ~pressed & (solution.w <= slack), solution.z

@@ -46,7 +46,7 @@ MOTION_STATUS = (
 MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 
 EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction", "paroxysm")
-_ROUNDING = 1e-12  # of the largest work: what is smaller is not told
+_ROUNDING = 1e-12  # of the largest work: what is smaller is not printed
 
 KIND_CODE = {name: code for code, name in enumerate(EVENT_KINDS)}
 
@@ -82,6 +82,7 @@ def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None =
     dtype, n = q.dtype, v.shape[0]
 
     def blank(*shape: int) -> jax.Array:
+        """NaN (size, *shape)."""
         return jnp.full((size, *shape), jnp.nan, dtype)
 
     return Events(
@@ -166,8 +167,8 @@ class Motion(eqx.Module):
     @property
     def ledger_residual(self) -> jax.Array:
         """(S,) [J]: what the ledger leaves unexplained."""
-        given = self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
-        return self.energy - self.energy[..., :1] - given
+        work = self.force_work + self.base_work + jnp.sum(self.contact_work, axis=(-2, -1))
+        return self.energy - self.energy[..., :1] - work
 
     def event_times(self, kind: str = "impact") -> np.ndarray:
         """Times of the events of a kind, on the host, of one motion."""
@@ -184,6 +185,7 @@ class Motion(eqx.Module):
         return fields_as_data(self, "events") | as_data({"status": status, "events": events})
 
     def __str__(self) -> str:
+        """Status, events and energies in five lines; of a batch how many have which status."""
         if np.ndim(self.status):
             return _batch_report(self)
         kinds = np.asarray(self.events.kind)
@@ -204,31 +206,32 @@ class Motion(eqx.Module):
             f"  events: {', '.join(counts)}",
             f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
             f" at {reached[-1] if len(reached) else np.nan:g} s",
-            f"  {_told(works)}",
+            f"  {_work_report(works)}",
             f"  ledger closes to {np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J",
         ]
         return "\n".join(lines)
 
 
-def _told(works: dict[str, Any]) -> str:
-    """Who gave and who took energy, without what is rounding of the others."""
+def _work_report(works: dict[str, Any]) -> str:
+    """What gave and what took energy; work that is rounding of the largest is left out."""
     least = _ROUNDING * max(abs(float(work)) for work in works.values())
-    told = [
+    parts = [
         f"{who} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
         for who, work in works.items()
         if abs(float(work)) > least
     ]
-    return ", ".join(told) or "nothing did work"
+    return ", ".join(parts) or "nothing did work"
 
 
 def _batch_report(motion: Motion) -> str:
+    """How many motions of a batch have which status."""
     codes, counts = np.unique(np.asarray(motion.status), return_counts=True)
-    told = ", ".join(f"{n} {MOTION_STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
-    return f"{np.size(motion.status)} motions: {told}"
+    parts = ", ".join(f"{n} {MOTION_STATUS[c].name}" for c, n in zip(codes, counts, strict=True))
+    return f"{np.size(motion.status)} motions: {parts}"
 
 
-def _said(motion: Motion, row: Status, lanes: np.ndarray) -> str:
-    """What the law says where it fails."""
+def _law_failures(motion: Motion, row: Status, lanes: np.ndarray) -> str:
+    """Status of the law in the failed motions `lanes`, for the message."""
     if row.name != "law_failed":
         return ""
     codes = np.asarray(motion.events.status).reshape(motion.status.size, -1)[lanes]
@@ -254,5 +257,5 @@ def raise_on_failed_motion(motion: Motion) -> Motion:
     >>> ji.raise_on_failed_motion(motion) is motion
     True
     """
-    raise_for(motion.status, MOTION_STATUS, "motions", partial(_said, motion))
+    raise_for(motion.status, MOTION_STATUS, "motions", partial(_law_failures, motion))
     return motion

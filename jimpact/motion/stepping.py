@@ -56,9 +56,10 @@ from jimpact.status import CODE
 _ROUNDING, _ROUNDINGS = 1e-12, 64
 SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an impact
 # Misfit of a step's impulses over its velocities: what the solver aims at for a few contacts, for
-# a pile; in float32 at least so many roundings. Ten times more, and resting piles creep visibly.
+# a pile; in float32 at least so many roundings. Ten times more, and what rests creeps ten times
+# faster.
 FEW, PILE, ROUNDINGS = 1e-9, 1e-6, 32
-OFF = 1e-2  # misfit above which `unsolved_step` is reported: ten times more is visible in motions
+OFF = 1e-2  # misfit above which `unsolved_step` is reported; ten times more is no solution
 ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jammed piles only
 MEAN = 4  # tries for the mean velocity that forces depend on; each gains h omega, of spin omega
 # Share of the largest speed of any gap by which the rate of a gap changes where bodies pass each
@@ -173,7 +174,7 @@ class _ActiveContacts(NamedTuple):
         return jnp.sum(values, axis=-1, keepdims=True)
 
 
-class _Problem(NamedTuple):
+class _StepProblem(NamedTuple):
     """What does not change from step to step."""
 
     system: System
@@ -278,7 +279,7 @@ def time_stepping(
     fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
     status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
     h = (times[1] - times[0]) / substeps.astype(dtype)
-    problem = _Problem(system, law, mu, h, closed_below, joint)
+    problem = _StepProblem(system, law, mu, h, closed_below, joint)
     start = _Progress(
         begin,
         zero,
@@ -293,6 +294,8 @@ def time_stepping(
     )
 
     def to_sample(course: _Progress, t: jax.Array) -> tuple[_Progress, State]:
+        """The motion up to the next sample, from t."""
+
         def one(i: jax.Array, course: _Progress) -> _Progress:
             def go() -> _Progress:
                 return _one_step(problem, course, t + i.astype(dtype) * h)
@@ -342,7 +345,7 @@ def _contacts(
     return _AllContacts(gap, normals, closed, directions, moved, matrix)
 
 
-def _one_step(problem: _Problem, course: _Progress, t: jax.Array) -> _Progress:
+def _one_step(problem: _StepProblem, course: _Progress, t: jax.Array) -> _Progress:
     """The motion one step later."""
     setup = _set_up(problem, course, t)
     trial = _solve(problem, course, setup)
@@ -370,7 +373,7 @@ def _loads(
     return force, free_acceleration(system, q, v, force, mass)
 
 
-def _set_up(problem: _Problem, course: _Progress, t: jax.Array) -> _Setup:
+def _set_up(problem: _StepProblem, course: _Progress, t: jax.Array) -> _Setup:
     """The step that begins at t: its contacts, which of them strike, and what the law does."""
     system, law, mu, h, closed_below, joint = problem
     state, dtype, body = course.state, course.state.q.dtype, system.body
@@ -414,7 +417,7 @@ def _set_up(problem: _Problem, course: _Progress, t: jax.Array) -> _Setup:
     )  # fmt: skip
 
 
-def _solve(problem: _Problem, course: _Progress, setup: _Setup) -> _Trial:
+def _solve(problem: _StepProblem, course: _Progress, setup: _Setup) -> _Trial:
     """The impulses of the step, with forces at its mean velocity, that give no energy."""
     system, h, contacts, v0 = problem.system, problem.h, setup.contacts, course.state.v
     constant = system.force is None and not callable(system.mass)
@@ -452,7 +455,7 @@ def _solve(problem: _Problem, course: _Progress, setup: _Setup) -> _Trial:
 
 
 def _ledger(
-    problem: _Problem, course: _Progress, setup: _Setup, trial: _Trial
+    problem: _StepProblem, course: _Progress, setup: _Setup, trial: _Trial
 ) -> tuple[State, jax.Array]:
     """The state at the end, with its work, and the energy (2, m) that each contact gave."""
     h, state, contacts = problem.h, course.state, setup.contacts
@@ -471,7 +474,7 @@ def _ledger(
 
 
 def _status(
-    problem: _Problem, course: _Progress, setup: _Setup, trial: _Trial, state: State
+    problem: _StepProblem, course: _Progress, setup: _Setup, trial: _Trial, state: State
 ) -> tuple[jax.Array, jax.Array]:
     """The status after the step, and what is reported without being a failure."""
     system, contacts = problem.system, setup.contacts
@@ -504,20 +507,23 @@ def _status(
     return status.astype(jnp.int32), reported.astype(jnp.int32)
 
 
-def _closing_at_start(problem: _Problem, begin: State, contacts: int) -> jax.Array:
+def _closing_at_start(problem: _StepProblem, begin: State, contacts: int) -> jax.Array:
     """Rates (m,) of gaps that close before the middle of the first step, 0 elsewhere."""
     system, (q, v, t) = problem.system, begin[:3]
     if is_pile(system):
         return jnp.zeros(contacts, q.dtype)
 
     def later(s: jax.Array) -> jax.Array:
+        """Gaps (m,) after the time s."""
         return gaps(system, system.body.moved(q, s * v), t + s)
 
     gap, rate = jax.jvp(later, (0 * t,), (jnp.ones_like(t),))
     return _closing(gap, rate, 0.5 * problem.h, problem.closed_below)
 
 
-def _closing_after(problem: _Problem, course: _Progress, setup: _Setup, trial: _Trial) -> jax.Array:
+def _closing_after(
+    problem: _StepProblem, course: _Progress, setup: _Setup, trial: _Trial
+) -> jax.Array:
     """Rates (m,) of gaps that close before the middle of the next step, 0 elsewhere."""
     contacts = setup.contacts
     if isinstance(contacts, _ActiveContacts):
@@ -532,7 +538,7 @@ def _closing(gap: jax.Array, rate: jax.Array, h: jax.Array, closed_below: jax.Ar
 
 
 def _recorded_impact(
-    problem: _Problem, events: Events, setup: _Setup, trial: _Trial, energy: jax.Array
+    problem: _StepProblem, events: Events, setup: _Setup, trial: _Trial, energy: jax.Array
 ) -> Events:
     """The events with the impact of this step, if there is one; a pile records none."""
     contacts, x, after = setup.contacts, setup.law_impulse, trial.v

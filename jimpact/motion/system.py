@@ -187,6 +187,7 @@ class HarmonicBase(eqx.Module):
 
 
 def _under_gravity(body: Body, acceleration: Any, base: Base | None = None) -> System:
+    """The system of a body in gravity [m/s^2]."""
     return System(body, potential=gravity(body, acceleration), base=base)
 
 

@@ -17,8 +17,8 @@ from jimpact.motion.dynamics import (
 )
 from jimpact.motion.flow import Scales, Settings, State, selected
 from jimpact.motion.persistent_contact import (
-    Choice,
     Contacts,
+    ModeChoice,
     Modes,
     choose_with_friction,
     constraint_impulse,
@@ -174,19 +174,19 @@ def resolve(
     """
     strike = _impact_first(system, law, settings, state, scales, approach)
     tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)
-    stick, found = _brought_slow_to_rest(system, mu, settings, strike, struck, tight)
-    jump = found.jump
-    choice, held, released = _next_modes(system, mu, settings, strike, found, before, fired)
+    stick, result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight)
+    jump = result.jump
+    choice, held, released = _next_modes(system, mu, settings, strike, result, before, fired)
     status, code, wedges = _status(strike, jump, choice, held)
     m = before.active.shape[0]
     took = jnp.where(strike.happens, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
     took = took | choice.parts
     decision = Decision(
-        strike.happens, approach, strike.closed, found.held, stick, found.ends, strike.scales
+        strike.happens, approach, strike.closed, result.held, stick, result.ends, strike.scales
     )
-    after = After(_with_jump(state, jump), jump, found.passed)
+    after = After(_with_jump(state, jump), jump, result.passed)
     parts = released[:m] | choice.parts
-    kind = _kind(strike.happens, strike.jams, jnp.any(found.ends), parts, fired)
+    kind = _kind(strike.happens, strike.jams, jnp.any(result.ends), parts, fired)
     return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
 
 
@@ -247,6 +247,7 @@ def _brought_slow_to_rest(
         stick = jnp.abs(contacts.tangent.rate) <= slowly
 
     def resting(slow: jax.Array) -> _Resting:
+        """What comes to rest if `slow` contacts (m,) may."""
         slack = _slack(strike)
         pressed, still, force = pressed_together(contacts, slow, slack)
         held = tight | (slow & pressed)
@@ -278,17 +279,17 @@ def _next_modes(
     mu: jax.Array | None,
     settings: Settings,
     strike: _Strike,
-    found: "_Resting",
+    result: "_Resting",
     before: Modes,
     fired: jax.Array,
-) -> tuple[Choice, jax.Array, jax.Array]:
+) -> tuple[ModeChoice, jax.Array, jax.Array]:
     """The modes after the event, contacts (m,) that are at rest, and constraints released."""
-    contacts, jump, rest = strike.contacts, found.jump, strike.rest
+    contacts, jump, rest = strike.contacts, result.jump, strike.rest
     # redundant contacts come to rest with others
     relative = jump.v - carried_along(system, jump.v, strike.t)
     rate = contacts.normal.gradient.T @ relative
     at_rest = strike.closed & (jnp.abs(rate) <= rest)
-    held = found.held | at_rest
+    held = result.held | at_rest
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strike.happens
     if mu is not None:
@@ -297,14 +298,14 @@ def _next_modes(
         )
         return choice, held, released
     m = held.shape[0]
-    active = found.pressed | (at_rest & found.still & ~released)
+    active = result.pressed | (at_rest & result.still & ~released)
     no = jnp.asarray(False)
     modes = no_modes(m, rest.dtype)._replace(active=active)
-    return Choice(modes, ~no, rest, no, jnp.zeros(m, bool)), held, released
+    return ModeChoice(modes, ~no, rest, no, jnp.zeros(m, bool)), held, released
 
 
 def _status(
-    strike: _Strike, jump: Jump, choice: Choice, held: jax.Array
+    strike: _Strike, jump: Jump, choice: ModeChoice, held: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Status of the motion, that of the law, and the approach of an impact without collision."""
     fails = jnp.asarray(FAILS)[jump.code]
@@ -333,29 +334,29 @@ class _Resting(NamedTuple):
     passed: Passed
 
 
-def _share_bodies(given: Contacts, touched: jax.Array) -> jax.Array:
+def _share_bodies(contacts: Contacts, touched: jax.Array) -> jax.Array:
     """Which contacts (m,) feel another one that is `touched`."""
     m = touched.shape[0]
-    w = jnp.abs(given.delassus[:m, :m])
+    w = jnp.abs(contacts.delassus[:m, :m])
     size = jnp.sqrt(jnp.diagonal(w))
     others = touched[None] & ~jnp.eye(m, dtype=bool)
     return jnp.any(others & (w > LEAST_COUPLING * jnp.outer(size, size)), axis=1)
 
 
 def _undisturbed(
-    system: System, given: Contacts, found: _Resting, tight: jax.Array, t: jax.Array
+    system: System, contacts: Contacts, result: _Resting, tight: jax.Array, t: jax.Array
 ) -> jax.Array:
     """Whether () no other contact is reached within the time that is passed, by parabolas."""
     m = tight.shape[0]
-    gap, normals = jnp.maximum(given.normal.value, 0.0), given.normal.gradient
-    rate = normals.T @ (found.jump.v - carried_along(system, found.jump.v, t))
-    fall = given.approach[:m] + given.delassus[:m, :m] @ found.force
+    gap, normals = jnp.maximum(contacts.normal.value, 0.0), contacts.normal.gradient
+    rate = normals.T @ (result.jump.v - carried_along(system, result.jump.v, t))
+    fall = contacts.approach[:m] + contacts.delassus[:m, :m] @ result.force
     square = rate * rate - 2 * fall * gap
     root = jnp.sqrt(jnp.maximum(square, 0.0))
     later = (rate + root) / jnp.where(fall < 0, -fall, 1.0)
     reached = jnp.where(rate < 0, 2 * gap / jnp.where(rate < 0, root - rate, 1.0), later)
     never = (square < 0) | ((rate >= 0) & (fall >= 0))
-    return jnp.all(found.held | tight | never | (reached > found.passed.time))
+    return jnp.all(result.held | tight | never | (reached > result.passed.time))
 
 
 def resolved_again(
@@ -369,12 +370,12 @@ def resolved_again(
     """What `resolve` does to the state, as a smooth function: all is decided already."""
     t, (strikes, approach, closed, held, stick, ends, scales) = state.t, decision
     jump = _struck(system, law, settings, state, strikes, approach, closed, scales)
-    given = contacts_at(system, state.q, jump.v, t, settings.friction)
-    jump, passed = _brought_to_rest(system, given, mu, held, stick, ends, t, jump)
+    contacts = contacts_at(system, state.q, jump.v, t, settings.friction)
+    jump, passed = _brought_to_rest(system, contacts, mu, held, stick, ends, t, jump)
     return After(_with_jump(state, jump), jump, passed)
 
 
-def _approach(choice: Choice, slip: jax.Array, held: jax.Array) -> jax.Array:
+def _approach(choice: ModeChoice, slip: jax.Array, held: jax.Array) -> jax.Array:
     """Gap velocity () of the approach to an impact without collision, 0 where nothing slips."""
     left = jnp.clip(choice.regularity, 0.0, 2 * least_regularity(slip.dtype))
     share = float(jnp.finfo(slip.dtype).eps) ** APPROACH + MORE * left
@@ -418,7 +419,7 @@ def _with_jump(state: State, jump: Jump) -> State:
 
 
 def _with_friction(
-    given: Contacts,
+    contacts: Contacts,
     mu: jax.Array,
     before: Modes,
     held: jax.Array,
@@ -426,30 +427,32 @@ def _with_friction(
     relative: jax.Array,
     rest: jax.Array,
     slack: jax.Array,
-) -> Choice:
+) -> ModeChoice:
     """Modes with friction, at velocities `relative` (n,) to the base."""
-    assert given.tangent is not None
-    rate = given.tangent.gradient.T @ relative
-    now = given._replace(tangent=given.tangent._replace(rate=rate))
+    assert contacts.tangent is not None
+    rate = contacts.tangent.gradient.T @ relative
+    now = contacts._replace(tangent=contacts.tangent._replace(rate=rate))
     return choose_with_friction(now, mu, before, held, released, jnp.abs(rate) > rest, slack)
 
 
-def _grown(system: System, scales: Scales, given: Contacts, t: jax.Array, state: State) -> Scales:
+def _grown(
+    system: System, scales: Scales, contacts: Contacts, t: jax.Array, state: State
+) -> Scales:
     """The largest values so far, those of this instant included."""
-    m = given.normal.rate.shape[0]
-    seen = state.v - carried_along(system, state.v, t)
-    energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, seen))
+    m = contacts.normal.rate.shape[0]
+    relative = state.v - carried_along(system, state.v, t)
+    energy = jnp.maximum(kinetic(system, state.q, state.v), kinetic(system, state.q, relative))
     now = Scales(
-        jnp.abs(given.normal.rate).max(),
-        jnp.sqrt(2 * energy * jnp.max(jnp.diagonal(given.delassus))),
-        jnp.abs(given.approach[:m]).max(),
+        jnp.abs(contacts.normal.rate).max(),
+        jnp.sqrt(2 * energy * jnp.max(jnp.diagonal(contacts.delassus))),
+        jnp.abs(contacts.approach[:m]).max(),
     )
     return jax.tree.map(jnp.maximum, scales, now)
 
 
 def _brought_to_rest(
     system: System,
-    given: Contacts,
+    contacts: Contacts,
     mu: jax.Array | None,
     held: jax.Array,
     stick: jax.Array,
@@ -462,25 +465,28 @@ def _brought_to_rest(
     And what is passed by that at contacts whose accumulation `ends`.
     """
     m = held.shape[0]
-    modes, rates = no_modes(m, jump.v.dtype)._replace(active=held, stick=stick), given.normal.rate
-    if given.tangent is not None:
-        rates = jnp.concatenate([rates, given.tangent.rate])
+    modes, rates = (
+        no_modes(m, jump.v.dtype)._replace(active=held, stick=stick),
+        contacts.normal.rate,
+    )
+    if contacts.tangent is not None:
+        rates = jnp.concatenate([rates, contacts.tangent.rate])
     size = rates.shape[0]
-    columns = jnp.stack([rates, given.approach[:size]], axis=1)
-    p, force = constraint_impulse(given, mu, modes, columns).T
+    columns = jnp.stack([rates, contacts.approach[:size]], axis=1)
+    p, force = constraint_impulse(contacts, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
     energy = jnp.pad(0.5 * p * rates, (0, 2 * m - size)).reshape(2, m)
     # the gaps, up to `closed_below`, are closed by the flight that follows
-    fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * given.normal.value, 0.0)
+    fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * contacts.normal.value, 0.0)
     side = jnp.pad(p, (0, 2 * m - size))[m:]
     carried = carried_along(system, jump.v, t)
     passed = _passed(p[:m], force[:m], ends, -jnp.sum(energy), -jnp.sum(jump.energy))
     jump = jump._replace(
-        v=jump.v + given.moved @ p,
+        v=jump.v + contacts.moved @ p,
         impulse=jump.impulse + p[:m],
         tangential=jump.tangential + side,
         energy=(jump.energy + energy).at[0].add(-fallen),
-        base_work=jump.base_work + (given.directions @ p) @ carried,
+        base_work=jump.base_work + (contacts.directions @ p) @ carried,
     )
     return jump, passed
 
