@@ -1,4 +1,4 @@
-"""Is an outcome admissible? Kinematic, kinetic and energetic consistency, momentum balance."""
+"""Consistency of an outcome: kinematic, kinetic and energetic, and the momentum balance."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ CONSISTENCIES = ("kinematic", "kinetic", "energetic", "momentum")
 
 
 class Audit(eqx.Module):
-    """Four answers, and the numbers behind them, scaled by the impact's own size.
+    """Whether four conditions hold, and the numbers behind them, scaled by the impact's size.
 
     Attributes:
         kinematic: whether gamma+ >= 0 at closed contacts ().
@@ -41,12 +41,12 @@ class Audit(eqx.Module):
 
     @property
     def consistent(self) -> jax.Array:
-        """All four hold."""
+        """Whether all four hold."""
         return self.kinematic & self.kinetic & self.energetic & self.momentum
 
     @property
     def broken(self) -> list[str]:
-        """Names of those that do not."""
+        """Names of the conditions that do not hold."""
         return [name for name in CONSISTENCIES if not bool(getattr(self, name))]
 
 
@@ -90,7 +90,7 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
     if scene.constraints is not None:  # reactions of the constraints are not listed in `out`
         basis = jnp.linalg.qr(scene.constraints)[0]
         residual = residual - basis @ (basis.T @ residual)
-    # as `impact` judges: what is within rounding is none of the law's doing
+    # as `impact` judges: an approach within rounding is not the law's
     rounding = contact.rounding(out.impulse, out.tangential_impulse)
     within = jnp.clip(gamma_plus, -rounding, 0.0)
     least = jnp.where(scene.closed, (gamma_plus - within) / root, jnp.inf)
@@ -112,18 +112,18 @@ def audit(scene: Scene, velocity: Any, out: Impact) -> Audit:
 
 
 def nothing_approaches(scene: Scene, velocity: Any) -> str | None:
-    """A sentence where no contact approaches, so that no impact happens; else None."""
+    """A sentence for summaries if no contact approaches, so that no impact happens; else None."""
     contact = contact_of(scene, as_velocity(scene, velocity), uses_gaps=True)
     approaches = np.asarray(contact.gap_velocity < 0)
     if (approaches & np.asarray(scene.closed)).any():
         return None
     if approaches.any():
-        return "no closed contact approaches (gamma- < 0), only open ones do: few laws look at them"
+        return "no closed contact approaches (gamma- < 0), only open ones do: few laws use these"
     return "nothing approaches (gamma- < 0 at no contact): is the sign of the velocities as meant?"
 
 
 def summary(out: Impact, scene: Scene, velocity: Any) -> str:
-    """A printable account of one impact (or, for a batch, of its status codes).
+    """A printable report of one impact (or, for a batch, of its status codes).
 
     Args:
         out: what `impact` returned, one or a batch.
@@ -148,7 +148,7 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
         return "\n".join([f"{codes.size} impacts by status", *rows])
     row = STATUS[int(codes)]
     before = float(kinetic_energy(scene, velocity))
-    kept = (before + float(out.energy_change)) / before if before else float("nan")
+    remaining = (before + float(out.energy_change)) / before if before else float("nan")
     broken = audit(scene, velocity, out).broken
     words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
     nothing = nothing_approaches(scene, velocity)
@@ -157,7 +157,7 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
         f"status         {row.name}: {row.message}",
         *([f"impact         none: {nothing}"] if quiet else []),
         f"energy         {before:.6g} J before, change {float(out.energy_change):.6g} J "
-        f"({100 * kept:.4g} % kept)",
+        f"({100 * remaining:.4g} % kept)",
         f"audit          {', '.join(words)}",
         "coordinate          v-             v+   [m/s]",
     ]

@@ -1,4 +1,4 @@
-"""Contact space: what a law is given of an impact, and the groups of contacts that feel each other.
+"""Contact space: what a law gets of an impact, and the groups of coupled contacts.
 
 A scene of n coordinates and m contacts is reduced to W, gamma- and, where it has tangents, the
 tangential rows: everything that an impact law may depend on.
@@ -17,30 +17,30 @@ from jimpact.scene import Scene, gap_velocity, solve_mass, without_constraints
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
 
-# A gap velocity is taken for 0 below this many times eps |N|^T |v-|: v- comes out of sums and
-# products that are rounded a few times each. Ten times more would hide true, slow approaches
-# beside fast common motion; without it, the last bits of equal velocities are an impact.
+# A gap velocity counts as 0 below this many times eps |N|^T |v-|, because v- results from a few
+# rounded sums and products. Ten times more would hide true, slow approaches in fast common motion;
+# without it, the last bits of equal velocities would be an impact.
 ROUNDINGS = 4
 
-# Groups of unequal size are filled up to the largest of them: compiling one program more takes
-# longer than many impacts. A second one for the smaller groups must save this factor of entries
-# of W.
+# Groups of unequal size are padded to the largest of them, because compiling another program takes
+# longer than many impacts. A second program for the smaller groups must save this factor of the
+# entries of W. Ten times more: one large group would make every small one as expensive.
 WORTH_A_PROGRAM = 4
 
-# Contact indices (count, size), one array for each program; where a group is smaller, m plus one of
-# its contacts fills its row up (one of its own: stored energy there is on the group's scale). They
-# are data, not structure: scenes whose groups differ in their members only share the compiled
-# impact.
+# Contact indices (count, size), one array for each program. A smaller group is padded by m plus the
+# index of its first contact, so that the padding has the group's scale of stored energy. The
+# indices are data, not structure: scenes whose groups differ only in their members share the
+# compiled impact.
 Groups = tuple[np.ndarray, ...]
 
 
 class Contact(eqx.Module):
-    """All that a law sees of an impact, and what follows from it.
+    """All that a law may depend on in an impact, and what follows from it.
 
     Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`.
 
-    Open contacts are decoupled (their rows of W are 0 beside the diagonal, gamma- = 0, nothing is
-    stored in them), unless the law uses gaps; gap velocities within `noise` are 0. A law is asked
+    Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no stored
+    energy), unless the law uses gaps; gap velocities within `noise` are 0. `impulses` is called
     only where some contact approaches or stores energy.
 
     Args:
@@ -51,7 +51,7 @@ class Contact(eqx.Module):
         stored: energy (m,) [J] in the contacts before the impact (precompression); None: 0.
         norm: |grad f_j| (m,) in the metric of M^-1; None: sqrt(W_jj), which it is without
             bilateral constraints.
-        noise: (m,) [m/s] what the rounding of v- leaves unknown of gamma-; None: 0.
+        noise: (m,) [m/s] uncertainty of gamma- by the rounding of v-; None: 0.
         tangential_block: (W_nt (m, t), W_tt (t, t), u- (t,) [m/s]), None without tangents; t = m
             planar, 2 m in space, contact by contact.
 
@@ -165,7 +165,7 @@ class Contact(eqx.Module):
         return jnp.any(gamma < 0) | jnp.any(self.stored > 0) | ~jnp.all(jnp.isfinite(gamma))
 
     def within(self, noise: jax.Array) -> "Contact":
-        """The same with gap velocities up to `noise` () [m/s] set to 0, like those in rounding."""
+        """The contact with gap velocities up to `noise` () [m/s] set to 0, as within rounding."""
         gamma = self.gap_velocity
         small = jax.lax.stop_gradient(jnp.where(jnp.abs(gamma) <= noise, gamma, 0.0))
         return eqx.tree_at(
@@ -175,7 +175,7 @@ class Contact(eqx.Module):
         )
 
     def approaching(self, speed: jax.Array) -> "Contact":
-        """The same with all gap velocities lower by `speed` () [m/s]."""
+        """The contact with all gap velocities lower by `speed` () [m/s]."""
         return eqx.tree_at(lambda contact: contact.gap_velocity, self, self.gap_velocity - speed)
 
     def gap_velocity_after(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
@@ -200,7 +200,7 @@ class Contact(eqx.Module):
 
     @property
     def kinetic_angles(self) -> jax.Array:
-        """Angles (m, m) [rad] between contacts; pi/2: they do not feel each other."""
+        """Angles (m, m) [rad] between contacts; pi/2: they are decoupled."""
         return _angles(self.delassus)
 
     def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
@@ -383,6 +383,7 @@ def kinetic_angles(scene: Scene) -> jax.Array:
 
 
 def _angles(w: Symmetric) -> jax.Array:
+    """Kinetic angles (m, m) [rad] from a Delassus matrix."""
     cosine = as_matrix(scaled(w, 1 / jnp.sqrt(diagonal(w))))
     return jnp.pi - jnp.arccos(jnp.clip(cosine, -1.0, 1.0))
 
@@ -390,16 +391,16 @@ def _angles(w: Symmetric) -> jax.Array:
 def coupled_groups(scene: Scene) -> Groups | None:
     """Groups of contacts between which the Delassus matrix is zero whatever its values.
 
-    Which contacts belong together is seen from the zeros of M, N, tangents and constraints, never
-    from rounded values of W: they move a common coordinate, or coordinates joined by an
-    entry of a dense M or by bilateral constraints. Open contacts are in no group (traced gaps: all
-    contacts count as closed). None: there is but one group of all contacts, or the zeros are not
-    known on the host, or the scene is a chain, whose tridiagonal W costs O(m) as it is.
+    Groups follow from the zeros of M, N, tangents and constraints, never from rounded values of W:
+    contacts of a group move a common coordinate, or coordinates joined by an entry of a dense M or
+    by bilateral constraints. Open contacts are in no group (with traced gaps all contacts count as
+    closed). The result is None where all contacts form one group, where the zeros are not known on
+    the host, and for a chain, whose tridiagonal W costs only O(m).
 
     >>> import jimpact as ji
     >>> from jimpact.contact import coupled_groups
-    >>> beside = ji.Scene([1.0] * 4, [[-1, 0], [1, 0], [0, -1], [0, 1]])  # o o  o o
-    >>> [group.tolist() for group in coupled_groups(beside)]
+    >>> two_pairs = ji.Scene([1.0] * 4, [[-1, 0], [1, 0], [0, -1], [0, 1]])  # o o  o o
+    >>> [group.tolist() for group in coupled_groups(two_pairs)]
     [[[0], [1]]]
     """
     m, tangents = scene.contacts, scene.tangents
@@ -427,12 +428,12 @@ def coupled_groups(scene: Scene) -> Groups | None:
 
 
 def components(touches: np.ndarray) -> np.ndarray:
-    """For each column of a boolean matrix the first of the columns it hangs together with."""
-    none = touches.shape[1]
-    label = np.arange(none)
+    """For each column of a boolean matrix the first column of its connected component."""
+    count = touches.shape[1]
+    label = np.arange(count)
     while True:
-        of_row = np.where(touches, label[None, :], none).min(axis=1)
-        least = np.where(touches, of_row[:, None], none).min(axis=0)
+        of_row = np.where(touches, label[None, :], count).min(axis=1)
+        least = np.where(touches, of_row[:, None], count).min(axis=0)
         least = least[least]  # of the column it points to: long chains take few rounds
         if (least == label).all():
             return label

@@ -23,8 +23,8 @@ from jimpact.contact import Contact, contact_of
 from jimpact.scene import Scene
 from jimpact.status import CODE
 
-# Exponent of a contact force up to which a fit looks: a cone has 2, rough surfaces about 3. Beyond,
-# a contact is hard almost at once and no velocity tells its exponent.
+# Largest exponent of a contact force that a fit tries: a cone has 2, rough surfaces about 3. Of
+# larger ones a contact is hard almost at once, and no measured velocity determines them.
 LARGEST_EXPONENT = 5.0
 
 _KEY = "jimpact"  # of what a field declares, in its metadata
@@ -73,7 +73,7 @@ else:
 
 @dataclasses.dataclass(eq=False)
 class Domain:
-    """What `parameter` declares of a field; called by equinox to convert and check a value."""
+    """The domain that `parameter` declares of a field; equinox calls it to convert a value."""
 
     low: float = -np.inf
     high: float = np.inf
@@ -124,7 +124,7 @@ class Domain:
 
 @dataclasses.dataclass(eq=False)
 class Option:
-    """What `option` declares of a static field; called by equinox to check a value."""
+    """The values that `option` allows in a static field; equinox calls it to check a value."""
 
     choices: tuple[Any, ...] | None = None
     low: float | None = None
@@ -172,10 +172,10 @@ def parameter(
         matrix: may be a square matrix, which is not bounded.
         per_contact: a scalar or one value per contact (m,), checked against the scene.
         high_unless: name of an option that, where true, lifts `high`.
-        searched_high: a fit goes no further unless it starts beyond, or `bounds` say so: larger
-            values are allowed, but mean nothing that a measurement could tell.
-        default: value of a law that is not given one; may be None (no such effect).
-        kw_only: it is given by keyword only.
+        searched_high: upper bound of a fit unless it starts beyond, or `bounds` say otherwise:
+            larger values are allowed, but no measurement could determine them.
+        default: value where the constructor gets none; may be None (no such effect).
+        kw_only: the constructor takes it by keyword only.
 
     Returns:
         What a class body assigns to the field.
@@ -212,18 +212,19 @@ def option(
     converter: Callable[[Any], Any] | None = None,
     kw_only: bool = True,
 ) -> Any:
-    """A static field of a `Law` that says how it is solved: one of `choices`, or in an interval.
+    """A static field of a `Law` for how it is solved: one of `choices`, or in an interval.
 
     `converter` takes the place of these checks.
 
     Args:
-        default: of an instance that is not given one.
-        choices: what it may be; None: a number from `low` to `high`.
+        default: value where the constructor gets none.
+        choices: allowed values; None: a number from `low` to `high`.
         low: None: `converter` decides.
         high: the other end, included.
         open_low: without `low` itself.
-        converter: value -> what is kept, or a ValueError; takes the place of these checks.
-        kw_only: it is given by keyword only.
+        converter: function of the value to the stored one, which may raise a ValueError; it takes
+            the place of these checks.
+        kw_only: the constructor takes it by keyword only.
 
     Returns:
         What a class body assigns to the field.
@@ -242,17 +243,19 @@ def option(
 
 
 def _field(declared: Domain | Option, default: Any, kw_only: bool, static: bool) -> Any:
-    given = {} if default is dataclasses.MISSING else {"default": default}
+    """The dataclass field with this declaration in its metadata."""
+    options = {} if default is dataclasses.MISSING else {"default": default}
     return eqx.field(
-        converter=declared, static=static, kw_only=kw_only, metadata={_KEY: declared}, **given
+        converter=declared, static=static, kw_only=kw_only, metadata={_KEY: declared}, **options
     )
 
 
 class Declared(eqx.Module):
     """A module whose fields are parameters and options: laws, contact forces."""
 
-    def __init_subclass__(cls, **given: Any) -> None:
-        super().__init_subclass__(**given)
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Declarations get the names of their fields, for messages."""
+        super().__init_subclass__(**options)
         for name, value in vars(cls).items():
             if isinstance(value, dataclasses.Field) and _KEY in value.metadata:
                 value.metadata[_KEY].name = name
@@ -268,6 +271,7 @@ class Declared(eqx.Module):
         return f"{type(self).__name__}({', '.join(words)})"
 
     def __check_init__(self) -> None:
+        """Raise a ValueError for a parameter outside its domain."""
         for field in dataclasses.fields(self):
             declared = field.metadata.get(_KEY)
             if isinstance(declared, Domain):
@@ -290,7 +294,7 @@ def _in_words(value: Any) -> str:
 
 
 class Parameter(NamedTuple):
-    """A parameter of a law: its value, where it is in the law, and what it declares."""
+    """A parameter of a law: its value, its path in the law, and its domain."""
 
     value: Any
     path: str
@@ -302,33 +306,33 @@ def parameters_of(module: eqx.Module) -> dict[str, Parameter]:
 
     Float arrays that a class does not declare are parameters without bounds.
     """
-    found: dict[str, Parameter] = {}
+    parameters: dict[str, Parameter] = {}
     for field in dataclasses.fields(module):
         value, declared = getattr(module, field.name), field.metadata.get(_KEY)
         if isinstance(value, Declared):
             inner = parameters_of(value)
-            found |= {k: x._replace(path=f"{field.name}.{x.path}") for k, x in inner.items()}
+            parameters |= {k: x._replace(path=f"{field.name}.{x.path}") for k, x in inner.items()}
         elif isinstance(declared, Domain):
-            found[field.name] = Parameter(value, field.name, declared.of(module))
+            parameters[field.name] = Parameter(value, field.name, declared.of(module))
         elif eqx.is_inexact_array(value):
-            found[field.name] = Parameter(value, field.name, Domain(per_contact=False))
-    return found
+            parameters[field.name] = Parameter(value, field.name, Domain(per_contact=False))
+    return parameters
 
 
 def free_parameters_of(module: eqx.Module) -> dict[str, Parameter]:
-    """Those that are arrays, not None or static numbers: they can be fitted and drawn."""
+    """Parameters that are arrays, not None or static numbers: they can be fitted and sampled."""
     return {k: x for k, x in parameters_of(module).items() if eqx.is_inexact_array(x.value)}
 
 
 def with_parameter(module: Any, name: str, value: Any) -> Any:
-    """The law with another value of a parameter, of its own or of one of its parts."""
+    """The law with another value of one of its parameters, or of those of its parts."""
     return eqx.tree_at(operator.attrgetter(parameters_of(module)[name].path), module, value)
 
 
 def within_domains(law: eqx.Module) -> jax.Array:
     """Whether () all parameters are finite and in their domains, on the device."""
-    every = [x.domain.holds(x.value) for x in free_parameters_of(law).values()]
-    return jnp.all(jnp.asarray(every, bool))
+    holds = [x.domain.holds(x.value) for x in free_parameters_of(law).values()]
+    return jnp.all(jnp.asarray(holds, bool))
 
 
 def declarations_of(kind: type[eqx.Module]) -> dict[str, Domain | Option]:
@@ -443,7 +447,7 @@ def _forwarded(name: str) -> property:
 
 
 def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
-    """Raise where parameters do not fit the scene, or the law says so."""
+    """Raise a ValueError where parameters, or the law as a whole, do not fit the scene."""
     for name, (value, _, domain) in parameters_of(law).items():
         ndim = np.ndim(value)
         if value is None or not domain.per_contact or ndim == 0 or (domain.matrix and ndim == 2):

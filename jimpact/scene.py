@@ -1,4 +1,4 @@
-"""Scenes: all that an impact needs to know of a mechanical system at one instant.
+"""Scenes: what an impact depends on of a mechanical system at one instant.
 
 # notation, used in every file:
 #   n, m             velocity coordinates, contacts
@@ -188,10 +188,10 @@ def with_gaps(scene: Scene, gaps: jax.Array) -> Scene:
 
 
 def stackable(scenes: Sequence[Scene]) -> tuple[list[Scene], int]:
-    """The scenes with equal structure and sizes, and how many coordinates were added at the end.
+    """The scenes padded to equal structure and sizes, and the number of added coordinates.
 
-    Scenes with fewer contacts than another one get open contacts, each between coordinates of its
-    own that nothing else moves: where these move at unit speed, the contact separates.
+    Scenes with fewer contacts than the largest one get open contacts, each between coordinates of
+    its own at the end: where these move at unit speed, the contact separates.
 
     Raises:
         ValueError: tangents in some scenes only, planar and spatial ones, or other numbers of
@@ -372,7 +372,7 @@ def dense_mass(scene: Scene) -> np.ndarray:
 
 
 def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
-    """`M^-1 right`, with the reactions of bilateral constraints where the scene has some."""
+    """`M^-1 right`, with the reactions of bilateral constraints if the scene has any."""
     if scene.mass.ndim == 1:
         shape = (-1,) + (1,) * (right.ndim - 1)
         free = right / scene.mass.reshape(shape)
@@ -386,7 +386,7 @@ def solve_mass(scene: Scene, right: jax.Array) -> jax.Array:
 
 
 def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.Array:
-    """What contact impulses change: `v+ - v- = M^-1 (N p + H p_t)` (n,) [m/s].
+    """Velocity change by contact impulses: `v+ - v- = M^-1 (N p + H p_t)` (n,) [m/s].
 
     Args:
         scene: n coordinates, m contacts.
@@ -419,7 +419,7 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
 
 
 def without_constraints(scene: Scene) -> Scene:
-    """The scene as if it had no bilateral constraints."""
+    """The scene without its bilateral constraints."""
     return scene if scene.constraints is None else eqx.tree_at(_CONSTRAINTS, scene, None)
 
 
@@ -429,7 +429,7 @@ def chain_scene(masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | N
 
 
 def _unchecked(**fields: Any) -> Scene:
-    """A scene of these fields as they are; None: those that are not given."""
+    """A scene of these fields without checks; fields that are left out are None."""
     scene = object.__new__(Scene)
     for field in dataclasses.fields(Scene):
         object.__setattr__(scene, field.name, fields.get(field.name))
@@ -437,6 +437,7 @@ def _unchecked(**fields: Any) -> Scene:
 
 
 def _check_scene(scene: Scene) -> None:
+    """Raise a ValueError for shapes or values that no scene has."""
     mass, normals = scene.mass, scene.normals
     if mass.ndim not in (1, 2) or (mass.ndim == 2 and mass.shape[0] != mass.shape[1]):
         raise ValueError(
@@ -474,6 +475,7 @@ def _check_scene(scene: Scene) -> None:
 
 
 def _check_independent(constraints: jax.Array) -> None:
+    """Raise a ValueError where columns of the constraints depend on each other."""
     if is_traced(constraints):
         return
     rank, b = np.linalg.matrix_rank(np.asarray(constraints)), constraints.shape[1]

@@ -50,6 +50,16 @@ def number(value: float | None, form: str) -> str:
     return "" if value is None or np.isnan(value) else format(value, form)
 
 
+def listed(labels: Sequence[str], most: int = 6) -> str:
+    """The first labels of a list, and whether there are more.
+
+    >>> from jimpact.files.records import listed
+    >>> listed(["1", "2"]), listed("abcd", 3)
+    ('1, 2', 'a, b, c, ...')
+    """
+    return ", ".join([*labels[:most], *(["..."] if len(labels) > most else [])])
+
+
 def readable_unit(unit: str, largest: float) -> tuple[str, float]:
     """The multiple of an SI unit in which a quantity has 1 to 3 digits before the point, its size.
 

@@ -1,8 +1,8 @@
 """Does the law fit at all: lack of fit, shots that do not belong, shots that cannot be used.
 
-No law changes a momentum that the contacts cannot change, and none tells shots apart that began
-alike: what residuals there are in these directions is noise. With it, or with the stated sigma,
-what the law leaves over is compared.
+Every law leaves a momentum unchanged that the contacts cannot change, and predicts the same for
+shots that began alike: residuals in these directions are noise. The other residuals are compared
+with it, or with the stated sigma.
 """
 
 from typing import Any, NamedTuple
@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from jimpact.fits.multistart import Solution
+from jimpact.fits.multistart import SearchResult
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
 
-LEVEL = 0.01  # of each test: how often it speaks up on data that the law made
-_LEAST = 3  # degrees of freedom from which the noise is worth comparing with
-_RANGE = 1e-6  # singular values below this share are none (derivatives are good to 1e-7)
+LEVEL = 0.01  # of each test: how often it flags data that the law itself made
+_LEAST = 3  # degrees of freedom of the noise below which nothing is compared with it
+_RANGE = 1e-6  # singular values below this share count as 0 (derivatives are good to 1e-7)
 _LISTED = 6  # shots named one by one
-# No velocity changes by so many times the largest one for a natural step of a parameter (as far as
-# from 0 to 1 for a restitution): derivatives beyond are errors, which would hold every step back.
+# Largest derivative of a velocity, over the largest velocity and a natural step of a parameter (as
+# far as from 0 to 1 for a restitution): those beyond are errors and would shorten every step.
 ABSURD = 1e3
 
 
@@ -31,8 +31,8 @@ class Weighted(NamedTuple):
     shot: np.ndarray
 
 
-def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
-    """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurd."""
+def unusable(problem: FitProblem, solution: SearchResult) -> np.ndarray:
+    """Shots (K,) whose impacts fail, or whose derivatives are not finite or absurdly large."""
     if not isinstance(problem.residuals.observe, Shots):
         return np.zeros(1, bool)
     shots, bodies = problem.measured.shape
@@ -44,7 +44,7 @@ def unusable(problem: FitProblem, solution: Solution) -> np.ndarray:
     return used & (np.array(fails) | ~(slope <= allowed).all(axis=(1, 2)))
 
 
-def weighted(problem: FitProblem, solution: Solution) -> Weighted:
+def weighted(problem: FitProblem, solution: SearchResult) -> Weighted:
     """Residuals and derivatives as the tests need them."""
     here = ~np.isnan(problem.measured)
     rows = np.arange(len(here)) if here.ndim else np.zeros(1, int)
@@ -56,7 +56,7 @@ def weighted(problem: FitProblem, solution: Solution) -> Weighted:
     )
 
 
-def adequacy(problem: FitProblem, solution: Solution, rank: int, robust: bool) -> list[str]:
+def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: bool) -> list[str]:
     """Lack of fit and suspicious shots, in words; nothing of data that are reproduced exactly."""
     data = weighted(problem, solution)
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
@@ -81,8 +81,8 @@ def adequacy(problem: FitProblem, solution: Solution, rank: int, robust: bool) -
 def stretch(problem: FitProblem, data: Weighted, rank: int) -> float:
     """By how much errors are larger than stated, 1 where chi^2 does not reject them.
 
-    Equation: `sqrt(chi^2 / freedom)`, of all residuals, or of those that are no momentum if that is
-    more: what a law or its parameters get wrong is in these.
+    Equation: `sqrt(chi^2 / freedom)`, of all residuals, or of those that are not momentum if that
+    is more: the errors of a law or its parameters are in these.
     """
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
     tests = [(squares, freedom)]
@@ -196,7 +196,7 @@ def _pattern(problem: FitProblem, data: Weighted, freedom: int) -> list[str]:
 
 
 def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
-    """Orthonormal columns that span those of the matrix, but for what is small beside `size`."""
+    """Orthonormal columns that span those of the matrix, but for what is small against `size`."""
     u, singular, _ = np.linalg.svd(matrix, full_matrices=False)
     return u[:, singular > _RANGE * (singular[0] if size is None else size)]
 

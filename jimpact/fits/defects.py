@@ -5,16 +5,19 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri, stdtr
 
+from jimpact.files.records import listed
 from jimpact.fits.experiments import Experiments, closed_normals
 from jimpact.scene import Scene, dense_mass
 
-# Defects below this share of the momentum or energy before are no finding: a tenth of a percent
-# is what a good measured velocity is worth. With `sigma`, a defect is held against its own error.
+# Defects below this share of the momentum or energy before are not reported: a good measurement of
+# a velocity is accurate to a tenth of a percent. Ten times more would hide defects of a percent.
 DEFECT_TOLERANCE = 1e-3
+# With `sigma`, a defect is reported beyond this many of its standard errors, ...
 DEFECT_SIGMAS = 3.0
-DEFECT_LEVEL = 0.02  # of the test by which shots show a defect, all of them together
+# ... and so many that all shots together show one by chance at most this often.
+DEFECT_LEVEL = 0.02
 SEPARATION = 1e-9  # share of the velocities up to which an approach is rounding
-_LISTED = 6  # shots listed one by one; of more, the range is given
+_LISTED = 6  # shots listed one by one with their ratios; of more, the range is given
 
 
 def data_defects(
@@ -73,10 +76,9 @@ def data_defects(
         lines.append(f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.")
     if resting:
         labels = [experiments.shots[k] for k in resting]
-        which = ", ".join(labels[:_LISTED]) + ", ..." * (len(labels) > _LISTED)
         lines.append(
-            f"No contact approaches in {len(labels)} of {len(experiments.shots)} shots ({which}): "
-            "are pre and post swapped, or is a sign wrong?"
+            f"No contact approaches in {len(labels)} of {len(experiments.shots)} shots "
+            f"({listed(labels)}): are pre and post swapped, or is a sign wrong?"
         )
     rows = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
     copies = len(rows) > 1 and experiments.sigma is None and (rows == rows[:1]).all()

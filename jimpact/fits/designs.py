@@ -1,4 +1,4 @@
-"""The next experiment: which shots would tell most about the parameters of a fit."""
+"""The next experiment: which shots would determine the parameters of a fit best."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -14,8 +14,8 @@ from jimpact.fits.multistart import quiet, repeated, run
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
 
-# Information that is added to that of the data, in shares of their largest: where they cannot see a
-# combination of parameters yet, it is gained first.
+# Information that is added to that of the data, as a share of it: a combination of parameters that
+# the data do not determine yet comes first.
 _RIDGE = 1e-12
 
 

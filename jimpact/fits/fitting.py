@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice
+from jimpact.files.records import listed
 from jimpact.fits.adequacy import stretch, unusable, weighted
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.least_squares import Method, check_method, default_steps
-from jimpact.fits.multistart import Minimum, Solution, ends, search, settled
+from jimpact.fits.multistart import Minimum, SearchResult, ends, search, settled
 from jimpact.fits.page import write_page
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
 from jimpact.fits.problem import FitProblem
@@ -27,7 +28,6 @@ from jimpact.scene import Scene
 # A minimum gets standard errors up to a sum of squares this many noise standard deviations above
 # the best: intervals of all levels end before. With ten times more, only time is lost.
 HARDLY_WORSE = 10.0
-LISTED = 10  # shots that were left out, named one by one
 
 
 class Fit(FitResult[AnyLaw]):
@@ -122,9 +122,9 @@ def fit(
     Returns:
         `Fit`; `print` gives its report, `ji.plot.fit` a picture.
 
-    Shots whose impact fails at the best parameters found, or whose derivatives are not finite or
-    absurd, are left out, and `Fit.warnings` names them. It also says whether the law fits at
-    all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
+    Shots whose impact fails at the best parameters, or whose derivatives are not finite or
+    absurdly large, are left out, and `Fit.warnings` names them. It also says whether the law fits
+    at all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
 
     Raises:
         ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of
@@ -171,14 +171,14 @@ def fit(
     return result
 
 
-def _check_derivatives(problem: FitProblem, solution: Solution) -> None:
-    """Raise a ValueError where derivatives are NaN, which leaving out shots could not mend."""
+def _check_derivatives(problem: FitProblem, solution: SearchResult) -> None:
+    """Raise a ValueError where derivatives are not finite, whichever shots are left out."""
     lost = np.flatnonzero(~np.isfinite(solution.jacobian).all(axis=1))
     if len(lost):
         at = ", ".join(f"{name} = {x:g}" for name, x in zip(problem.names, solution.value))
-        which = ", ".join(str(i + 1) for i in lost[:LISTED]) + ", ..." * (len(lost) > LISTED)
+        which = listed([str(i + 1) for i in lost])
         raise ValueError(
-            f"Argument `law` must have derivatives that are numbers, but at {at} those of "
+            f"Argument `law` must have finite derivatives, but at {at} those of "
             f"{len(lost)} measured values ({which}) are not."
         )
 
@@ -196,16 +196,18 @@ def _without(problem: FitProblem, lost: np.ndarray) -> FitProblem:
     assert problem.experiments is not None
     labels = [problem.experiments.shots[k] for k in np.flatnonzero(lost)]
     line = (
-        f"Left out: {len(labels)} of {len(lost)} shots ({', '.join(labels[:LISTED])}"
-        f"{', ...' * (len(labels) > LISTED)}), whose impacts fail, or whose derivatives cannot be "
-        "used."
+        f"Left out: {len(labels)} of {len(lost)} shots ({listed(labels)}), whose impacts fail, or "
+        "whose derivatives cannot be used."
     )
     used = np.broadcast_to(~lost[:, None], problem.measured.shape).astype(float)
     return replace(problem.weighed(used), left_out=(*problem.left_out, line))
 
 
 def as_fit(
-    problem: FitProblem, solution: Solution, method: Method, robust: RobustSolution | None = None
+    problem: FitProblem,
+    solution: SearchResult,
+    method: Method,
+    robust: RobustSolution | None = None,
 ) -> Fit[Any]:
     """The fit at the end of a search: errors, rank and warnings."""
     if robust is not None:
@@ -260,7 +262,7 @@ def as_fit(
     )
 
 
-def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Solution:
+def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> SearchResult:
     """The minimum that the loss found, its residuals weighted as in `problem`."""
     solution, weighed = robust.solution, problem.weighed(robust.factor).residuals
     size = problem.size
@@ -271,7 +273,7 @@ def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Solu
     return solution._replace(jacobian=jacobian, minima=[minimum])
 
 
-def _jacobian(problem: FitProblem, solution: Solution) -> np.ndarray:
+def _jacobian(problem: FitProblem, solution: SearchResult) -> np.ndarray:
     """Derivatives (K, n, P) of what was measured in the parameters; NaN where nothing was."""
     shape = (*problem.measured.shape, len(problem.names))
     slope = solution.jacobian.reshape(shape) / solution.scale
@@ -279,7 +281,7 @@ def _jacobian(problem: FitProblem, solution: Solution) -> np.ndarray:
 
 
 def _uncertainty(
-    problem: FitProblem, solution: Solution, minimum: Minimum, noise: float | None = None
+    problem: FitProblem, solution: SearchResult, minimum: Minimum, noise: float | None = None
 ) -> Uncertainty:
     """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
     size = problem.size
@@ -299,7 +301,7 @@ def _uncertainty(
 
 
 def _standard_error(
-    problem: FitProblem, solution: Solution, minimum: Minimum, best: Uncertainty
+    problem: FitProblem, solution: SearchResult, minimum: Minimum, best: Uncertainty
 ) -> np.ndarray | None:
     """Standard errors (P,) at a minimum that fits hardly worse than the best; else None."""
     if minimum is solution.minima[0]:

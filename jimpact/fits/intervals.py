@@ -18,8 +18,8 @@ class Profile:
 
     `deviance` is the sum of squares with the parameter held, less its least value, over the noise
     variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
-    `domain` is none: the data do not bound the parameter there. `better`: values of a minimum below
-    that of the fit, or None.
+    `domain` means that the data do not bound the parameter there. `better`: values of a minimum
+    below that of the fit, or None.
     """
 
     name: str
@@ -64,7 +64,7 @@ def joined(pieces: Iterable[tuple[float, float]]) -> tuple[tuple[float, float], 
 
 
 def in_words(pieces: Iterable[tuple[float, float]], domain: tuple[float, float]) -> str:
-    """Pieces of an interval; an end at the domain is none."""
+    """Pieces of an interval; an end of the domain is left out."""
     return " or ".join(_piece(*ends, domain) for ends in pieces)
 
 

@@ -15,7 +15,15 @@ from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit, as_fit, fit
 from jimpact.fits.intervals import check_level
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import Solution, at_minimum, ends, repeated, run, settled, start_points
+from jimpact.fits.multistart import (
+    SearchResult,
+    at_minimum,
+    ends,
+    repeated,
+    run,
+    settled,
+    start_points,
+)
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.problem import FitProblem, Residuals, filled_up
 from jimpact.fits.result import check_squares
@@ -97,7 +105,7 @@ def fit_many(
     return [fits[k] for k in range(len(problems))]
 
 
-def _searches(problems: list[FitProblem], states: SolverState) -> list[Solution]:
+def _searches(problems: list[FitProblem], states: SolverState) -> list[SearchResult]:
     """The ends of each problem, all of which have equally many starts."""
     each = len(states.y) // len(problems)
     rows = [slice(i * each, (i + 1) * each) for i in range(len(problems))]

@@ -28,7 +28,7 @@ _SHORT = 16.0
 # where shots are too few to determine E.
 _LEAST_DAMPING = {"float64": 1e-8, "float32": 1e-4}
 _SCALINGS = 60  # of the ray: each closes in on the boundary quadratically
-_TIE = 1e-10  # eigenvalues of Q closer than this, relative to G^-1, are not told apart
+_TIE = 1e-10  # eigenvalues of Q closer than this, relative to G^-1, count as equal
 
 # Every support of m contacts gives a condition on the energy, 2^m - 1 in all.
 LARGEST = 6
@@ -156,7 +156,7 @@ class AdmissibleMatrices(eqx.Module):
         x = self.worst(y).x
 
         def slacks(y: jax.Array) -> tuple[jax.Array, jax.Array]:
-            """Slacks, also as the value beside their derivatives."""
+            """Slacks, to be differentiated, and once more as they are."""
             value = jnp.concatenate([self.elementwise(y), self.lost_energy(y, x).reshape(-1)])
             return value, value
 

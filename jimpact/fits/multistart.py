@@ -24,8 +24,8 @@ from jimpact.progress import Show, progress_bar
 
 LANES, DEAR_LANES = 8, 4  # starts that run together: of shots, and of what may take longer
 PASSES = 4  # until starts that are done make room
-# A Levenberg-Marquardt start that gains less than this share in so many passes sits on a kink of
-# the law (a change in the sequence of contacts), where steps zigzag: it is given up.
+# A Levenberg-Marquardt start that gains less than this share in this number of passes sits on a
+# kink of the law (a change in the sequence of contacts), where steps zigzag: it is given up.
 SLOW, SLOW_PASSES = 1e-3, 12
 # One whose sum of squares is this far above the best must gain this share to go on.
 BEHIND, SLOW_BEHIND = 10.0, 0.1
@@ -43,15 +43,15 @@ START_RESTITUTION = 0.3
 ROUNDS = 5
 NEAR_SPREAD = 2.0  # standard errors
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
-NEAR_RCOND = 1e-10  # directions the data cannot see are not searched
+NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 
 # Impacts map a stiffness ratio many to one: three balls of ratio 40 come apart as those of up to
-# nine other ratios do. So each such parameter is scanned, at so many values within this factor of
-# the user's own, the others following for so many passes, and its best valleys are followed.
+# nine other ratios do. So each such parameter is scanned: SCANNED values within SCAN_FACTOR of the
+# user's own, the others following for SCAN_PASSES; the FOLLOWED best valleys are followed.
 SCANNED, SCAN_FACTOR, SCAN_PASSES, FOLLOWED = 64, 300.0, 2, 16
-DEEP = 0.5  # share of the ridges on both sides above which a valley is none
+DEEP = 0.5  # a valley is deeper than this share of the ridges on both sides
 WITHIN = 8  # points of the scan's cubics between two of its values
-FLAT = 1e-6  # singular values below this share: a valley, where there is nothing to scan
+FLAT = 1e-6  # singular values below this share: the data leave a valley, and no scan is made
 
 # Relative sums of squares, and values in natural scales, closer than this are one minimum: a
 # hundred times what solvers leave, and far below what a measurement resolves.
@@ -71,7 +71,7 @@ class Minimum(NamedTuple):
     jacobian: np.ndarray  # (R, P), of the scaled parameters
 
 
-class Solution(NamedTuple):
+class SearchResult(NamedTuple):
     """The best end point (weighted as in `Residuals`), and all distinct minima, best first."""
 
     value: np.ndarray  # of the parameters (P,)
@@ -96,7 +96,7 @@ def search(
     seed: int,
     max_steps: int,
     progress: float | None,
-) -> Solution:
+) -> SearchResult:
     """Run all starts to their ends, then a few near the best as long as they improve it."""
     rng = np.random.default_rng(seed)
     points, residuals, lost = start_points(problem, starts, rng), filled_up(problem.residuals), 0
@@ -135,7 +135,7 @@ def quiet(what: str, done: float, total: float | None) -> None:
     """No progress is shown."""
 
 
-def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> Solution:
+def search_near(problem: FitProblem, y: np.ndarray, method: Method, max_steps: int) -> SearchResult:
     """The minimum next to y (Q,)."""
     residuals = repeated(filled_up(problem.residuals), 1)
     return ends(problem, run(residuals, y[None], method, max_steps, quiet))
@@ -268,7 +268,7 @@ def run_held(
 
 
 def _batches(items: list[int], lanes: int) -> list[list[int]]:
-    """Lists of so many; the last repeats its last one."""
+    """Lists of `lanes` items; the last list repeats its last item."""
     firsts = range(0, len(items), lanes)
     return [[items[min(i + j, len(items) - 1)] for j in range(lanes)] for i in firsts]
 
@@ -286,7 +286,7 @@ def _with_rows(rows: list[int], leaf: np.ndarray, new: np.ndarray) -> np.ndarray
 
 def ends(
     problem: FitProblem, states: SolverState, counts: np.ndarray | None = None, lost: int = 0
-) -> Solution:
+) -> SearchResult:
     """Pick the best end (the states are on the host); counts: of the starts that a state is for."""
     counts = np.ones(len(states.y), int) if counts is None else counts
     r, count = problem.residuals, len(problem.names)
@@ -298,7 +298,7 @@ def ends(
     groups = _groups(squares, y, converged, exact)
     best = groups[0][0]
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
-    # starts that did not converge have no minimum to tell, unless they are the best there is
+    # starts that did not converge have no minimum to report, unless they are the best there is
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
     predicted, status = states.aux
 
@@ -307,7 +307,7 @@ def ends(
         return np.asarray(states.jacobian[i][: problem.measured.size, :count], float)
 
     rows = len(problem.measured) if problem.measured.ndim else None  # without what filled up
-    return Solution(
+    return SearchResult(
         value=values[best],
         y=np.asarray(states.y)[best],
         entries=_all_entries(r, np.asarray(states.y)[best]),

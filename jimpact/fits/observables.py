@@ -22,7 +22,7 @@ _OF_A_CONTACT = ("peak_force", "arrival_time")
 FEELS = 0.01  # share of its largest force from which a contact counts as loaded
 SAMPLES = 400  # of the forces over an impact; times are interpolated between them
 _AWAY = 1.0  # [m] gap to bodies that are not there
-_FASTER = 10.0  # times the fastest body they fly off, so that nobody meets them
+_FASTER = 10.0  # times the fastest body: absent ones fly off, and no other meets them
 
 
 class Observation(NamedTuple):

@@ -126,7 +126,7 @@ class Residuals(eqx.Module):
         bad = jnp.broadcast_to(prediction.bad, self.measured.shape)
         harmless = jnp.where(bad, self.measured, prediction.value)
         error = jnp.where(bad, PENALTY * self.unit, harmless - self.measured)
-        error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be no numbers
+        error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
         return self.mixed(error * self.weight).reshape(-1), prediction
 
     def mixed(self, weighted: Any) -> Any:

@@ -1,7 +1,8 @@
-"""Intervals that are true: how well the data are fitted with one parameter held, all others free.
+"""Profile likelihoods: how well the data are fitted with one parameter held, all others free.
 
-A standard error is half the width of a parabola. Where the sum of squares is none (a bound, a flat
-valley, several minima), the profile is the interval: one-sided, or of several pieces.
+A standard error is half the width of a parabola. Where the sum of squares is not a parabola (at a
+bound, in a flat valley, with several minima), the profile gives the interval: one-sided, or of
+several pieces.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,9 +21,9 @@ from jimpact.progress import Show, progress_bar
 NEAR = np.array([-2, -1.5, -1, -0.5, 0.5, 1, 1.5, 2])  # half-widths of the interval of a parabola
 SAME = 1e-6  # relative sums of squares that are equal
 END = 1e-3  # of the root of the limit: how near to it an end is searched for
-FAR, ROUGH = 2.0, 2  # times the limit from which only so many passes are spent
+FAR, ROUGH = 2.0, 2  # times the limit beyond which only ROUGH passes are spent
 MANY = 256  # shots up to which they take half as long as a fit with eight starts
-QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # what `fit` profiles of itself: values across the domain
+QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # of the profiles that `fit` makes unasked: held values
 LONGEST = 2.0  # steps by which a scan is extrapolated
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
 

@@ -56,7 +56,7 @@ def verdict(fit: FitResult) -> str:
     if scatter is not None:
         sentence += f"; {scatter.name} scatters by {scatter.value:.2g} from shot to shot"
     nearest = f"it comes nearest with {sentence}" if determined else sentence
-    if any(line.startswith("Lack of fit") for line in fit.warnings):
+    if fit.shows_lack_of_fit:
         return f"{law} does not fit {data}; {nearest}."
     if any(line.startswith("The fitted law fails") for line in fit.warnings):
         return f"{law} fails in some of these {'shots' if fit.experiments else 'data'}; {nearest}."
@@ -168,7 +168,7 @@ def _quality(fit: FitResult) -> list[str]:
 
 
 def _sigma_sources(fit: FitResult) -> list[str]:
-    """What went into the stated errors beside sigma."""
+    """What went into the stated errors besides sigma."""
     data = fit.experiments
     if data is None:
         return []

@@ -164,13 +164,18 @@ class FitResult(Generic[AnyLaw]):
         return joined(pieces)
 
     @property
+    def shows_lack_of_fit(self) -> bool:
+        """Whether a test rejects the law."""
+        return any(line.startswith("Lack of fit") for line in self.warnings)
+
+    @property
     def can_be_profiled(self) -> bool:
         """Whether parameters can be held: least squares in a box, not of an admissible matrix."""
         return self.loss == "squares" and isinstance(self.problem.residuals.region, BoxRegion)
 
     @property
     def linearization_misleads(self) -> bool:
-        """Whether standard errors may mislead and profiles, which this fit lacks, would tell."""
+        """Whether standard errors may mislead and the fit has no profiles yet."""
         if self.profiles or not self.can_be_profiled or not self.converged:
             return False
         if self.rank < len(self.names):

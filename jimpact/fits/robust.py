@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jimpact.fits.least_squares import Method
-from jimpact.fits.multistart import Solution, search_near
+from jimpact.fits.multistart import SearchResult, search_near
 from jimpact.fits.problem import FitProblem
 
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
@@ -18,7 +18,7 @@ SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 class RobustSolution(NamedTuple):
     """The end of a search, factors its loss puts on the weights, noise times root of freedom."""
 
-    solution: Solution
+    solution: SearchResult
     factor: np.ndarray
     noise: float
 
@@ -39,7 +39,7 @@ LOSSES = {"huber": _huber, "student": _student}
 
 
 def robust_solution(
-    problem: FitProblem, solution: Solution, loss: str, method: Method, max_steps: int
+    problem: FitProblem, solution: SearchResult, loss: str, method: Method, max_steps: int
 ) -> tuple[FitProblem, RobustSolution]:
     """Least squares again and again, with weights `psi(u) / u` of the last residuals u.
 

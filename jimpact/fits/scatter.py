@@ -10,7 +10,7 @@ from jimpact.files.records import with_error
 from jimpact.fits.result import FitResult
 
 LEAST_SHOTS = 4  # of which the scatter of one number can be estimated
-SHOWN_FROM = 8  # shots from which a report tells it unasked
+SHOWN_FROM = 8  # shots from which a report gives it unasked
 SURE = 0.01  # chance at which scatter counts as shown
 _SMALLEST = 1e-4  # scatter looked for, in standard errors of one shot
 _LARGEST = 1e4
@@ -81,7 +81,7 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
 
     Equation: `r_k = J_k (x - x_fit) + j_k b_k + noise`, `b_k ~ N(0, value^2)`, j_k the column of
     the parameter in J_k; `value` maximizes the restricted likelihood, linearized at the fit, with
-    the noise of sigma, or estimated beside it. The chance is that of the likelihood ratio, whose
+    the noise of sigma, or estimated with it. The chance is that of the likelihood ratio, whose
     distribution at 0 is half that of chi^2 with one degree of freedom.
 
     Args:

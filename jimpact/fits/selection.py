@@ -25,7 +25,7 @@ from jimpact.registry import registered_laws, simplest_first
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
-RESTITUTION = 0.8  # start of what nobody gives
+RESTITUTION = 0.8  # start where none is given
 SPEED_EXPONENT = 0.1  # start of a dependence on the speed
 WORSE = 0.01  # chance at which a law counts as a worse predictor than the best
 WORSE_OF_FEW = 0.05  # the same by the residuals, of fewer shots
@@ -429,7 +429,7 @@ def _against(result: Fit) -> tuple[str, str]:
         return "fails", f"fails in {len(codes)} of {len(result.status)} shots: {names}"
     if not result.converged:
         return "fails", "does not converge"
-    if any(line.startswith("Lack of fit") for line in result.warnings):
+    if result.shows_lack_of_fit:
         return "lack of fit", "lack of fit"
     if result.rank < len(result.names):
         return "fits", f"fits, {result.rank} of {len(result.names)} parameters determined"
@@ -491,7 +491,7 @@ def _above_zero(more: np.ndarray, size: Any) -> float:
 
 
 def _variance(result: Fit) -> float:
-    """Of the residuals; infinite where no degree of freedom is left to tell it."""
+    """Of the residuals; infinite where no degree of freedom is left."""
     freedom = result.degrees_of_freedom
     return result.starts[0].sum_of_squares / freedom if freedom > 0 else np.inf
 

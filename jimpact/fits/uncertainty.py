@@ -41,15 +41,16 @@ def uncertainty(
 ) -> Uncertainty:
     """Linearized errors at a minimum.
 
-    Equation: `C = s^2 (J^T J)^-1` on the seen subspace, `s^2 = |r|^2 / (values - rank)`, or the
-    given noise (1 where the weights are known errors); rank = number of singular values of J, its
-    columns scaled by the natural size of each parameter, above `rank_tolerance` times the largest.
+    Equation: `C = s^2 (J^T J)^-1` on the determined subspace, `s^2 = |r|^2 / (values - rank)`, or
+    the known noise (1 where the weights are known errors); rank = number of singular values of J,
+    its columns scaled by the natural size of each parameter, above `rank_tolerance` times the
+    largest.
 
     Args:
         names: of the parameters (P,).
         jacobian: (R, P) of the weighted residuals, columns already scaled.
         scale: the natural size (P,) of each parameter.
-        log: (P,) whether changes are told in percent.
+        log: (P,) whether changes are given in percent.
         sum_of_squares: |r|^2.
         values: independent measured values.
         noise: s; None: from |r|^2.

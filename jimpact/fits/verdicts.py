@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from jimpact.files.records import listed
 from jimpact.fits.adequacy import adequacy
 from jimpact.fits.defects import data_defects
 from jimpact.fits.matrix_fit import boundary, encloses
-from jimpact.fits.multistart import Solution
+from jimpact.fits.multistart import SearchResult
 from jimpact.fits.problem import EXACT, FitProblem
 from jimpact.fits.uncertainty import Uncertainty
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -17,7 +18,7 @@ EQUALLY_GOOD = 1.0
 
 
 def fit_warnings(
-    problem: FitProblem, solution: Solution, errors: Uncertainty, robust: bool
+    problem: FitProblem, solution: SearchResult, errors: Uncertainty, robust: bool
 ) -> list[str]:
     """All warnings, those about the data first."""
     lines, data = list(problem.left_out), problem.experiments
@@ -38,7 +39,7 @@ def fit_warnings(
     if data is not None:
         lines += _statuses(solution.status, data.shots)
         lines += _matrix(problem, solution, contacts)
-    lines += _no_numbers(problem, solution)
+    lines += _not_finite(problem, solution)
     lines += adequacy(problem, solution, errors.rank, robust)
     if data is not None and problem.sigma is None and len(set(data.units)) > 1:
         lines.append(
@@ -73,31 +74,30 @@ def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
     lines = []
     for code in np.unique(status):
         if STATUS[code].failure:
-            at = ", ".join(shots[k] for k in np.flatnonzero(status == code)[:6])
-            count = int(np.sum(status == code))
+            labels = [shots[k] for k in np.flatnonzero(status == code)]
             lines.append(
-                f"The fitted law fails in {count} of {len(shots)} shots ({at}): "
+                f"The fitted law fails in {len(labels)} of {len(shots)} shots ({listed(labels)}): "
                 f"{STATUS[code].name}, {STATUS[code].message}."
             )
     return lines
 
 
-def _no_numbers(problem: FitProblem, solution: Solution) -> list[str]:
-    """Where what the user's own function gives is no number at the parameters solution."""
+def _not_finite(problem: FitProblem, solution: SearchResult) -> list[str]:
+    """Which values of a user's own function are not finite at the fitted parameters."""
     if problem.experiments is not None:
         return []
     lost = np.flatnonzero(np.isfinite(problem.measured) & ~np.isfinite(solution.predicted))
     if not len(lost):
         return []
-    which = ", ".join(str(i + 1) for i in lost[:6]) + ", .." * (len(lost) > 6)
+    which = listed([str(i + 1) for i in lost])
     return [
-        f"The fitted law fails in {len(lost)} of {problem.values} values ({which}): what is "
-        "observed is no number there, and counts as a large error."
+        f"The fitted law fails in {len(lost)} of {problem.values} values ({which}): they are not "
+        "finite there and count as large errors."
     ]
 
 
-def _matrix(problem: FitProblem, solution: Solution, contacts: int) -> list[str]:
-    """Where the conditions on a restitution matrix hold it back, or are not asked for."""
+def _matrix(problem: FitProblem, solution: SearchResult, contacts: int) -> list[str]:
+    """Which conditions on a restitution matrix it ends at, or that it need not fulfil them."""
     edges = boundary(problem.residuals.region, solution.entries)
     if edges:
         return [
@@ -112,7 +112,7 @@ def _matrix(problem: FitProblem, solution: Solution, contacts: int) -> list[str]
     return []
 
 
-def _equally_good(problem: FitProblem, solution: Solution, errors: Uncertainty) -> int:
+def _equally_good(problem: FitProblem, solution: SearchResult, errors: Uncertainty) -> int:
     """How many minima fit as well as the best."""
     noise = errors.noise / problem.size if np.isfinite(errors.noise) else 0.0
     more = max(EQUALLY_GOOD * noise**2, EXACT[problem.precision])

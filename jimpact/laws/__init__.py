@@ -101,7 +101,7 @@ register(
     VelocityDependent,
     summary="a law by name (`base`) whose e falls with the speed, and is 1 below the yield speed",
     right_when="shots of very different speeds, metals above their yield",
-    fails_when="all shots equally fast: e and its exponent cannot be told apart",
+    fails_when="all shots equally fast: e and its exponent cannot be distinguished",
     promises=(),  # those of its base, but scaling with the velocity
     source="Brogliato, Nonsmooth Mechanics (2016), 6.3.1; Johnson, Contact Mechanics (1985), 11.5",
     bibtex=_BIBTEX["johnson1985"],

@@ -20,7 +20,7 @@ ORDERS = ("fastest", "earliest", "left_to_right")
 
 
 def _checked_order(order: Any) -> str | tuple[int, ...]:
-    """`order` as a name or a tuple of ints; what needs no scene to be wrong is refused here."""
+    """`order` as a name or a tuple of ints; raise a ValueError for any other value."""
     if isinstance(order, str) and order in ORDERS:
         return order
     if not isinstance(order, (tuple, list)) or not order:
@@ -122,15 +122,17 @@ class Binary(Law):
 
     def impulses(self, contact: Contact) -> Impulses:
         """Sum of the impulses of all collisions; gaps matter in the order 'earliest'."""
-        p, side, end = self._solve(contact)
-        return Impulses(p, side, end.code)
+        p, tangential, end = self._solve(contact)
+        return Impulses(p, tangential, end.code)
 
     def _cycle(self, m: int) -> tuple[int, ...] | None:
+        """The contacts in turn; None: the fastest or the earliest one is next."""
         if isinstance(self.order, tuple):
             return self.order
         return tuple(range(m)) if self.order == "left_to_right" else None
 
     def _gaps(self, gaps: jax.Array | None, gamma: jax.Array) -> jax.Array | None:
+        """Gaps (m,) where they decide the order, else None."""
         if self.order != "earliest":
             return None
         return jnp.zeros_like(gamma) if gaps is None else gaps
@@ -144,7 +146,10 @@ class Binary(Law):
         ones = jnp.ones_like(contact.gap_velocity)
         return collisions.CoulombFriction(contact.tangential_block, mu * ones, e_t * ones)
 
-    def _solve(self, contact: Contact) -> tuple[jax.Array, jax.Array | None, collisions.End]:
+    def _solve(
+        self, contact: Contact
+    ) -> tuple[jax.Array, jax.Array | None, collisions.SequenceEnd]:
+        """Impulses, and how the sequence ended."""
         gamma = contact.gap_velocity
         return collisions.solve(
             contact.delassus,
@@ -179,9 +184,9 @@ class Binary(Law):
         Args:
             scene: n coordinates, m contacts.
             velocity: v- (n,) [m/s].
-            limit: the most that are told.
+            limit: the most collisions that are listed.
 
-        A host function, for looking at; it does not stop at a plastic limit.
+        Runs on the host, to look at a sequence; it does not stop at a plastic limit.
 
         >>> import jimpact as ji
         >>> balls = ji.chain([1.0, 1.0, 1.0])
@@ -204,11 +209,12 @@ class Binary(Law):
             before, at = at, _collide(inputs, options, g, at)
             j = int(jnp.argmax(at.p - before.p))
             time = float(at.time) if law.order == "earliest" else None
-            p, side = collisions.impulses_of(at.p, at.side, inputs.root)
-            steps.append((j, time, np.asarray(v + velocity_change(scene, p, side))))
+            p, tangential = collisions.impulses_of(at.p, at.tangential, inputs.root)
+            steps.append((j, time, np.asarray(v + velocity_change(scene, p, tangential))))
         return steps
 
     def _prepared(self, scene: Scene, velocity: Any) -> tuple["Binary", Scene, jax.Array]:
+        """Law, scene and velocity checked and in one dtype."""
         v = as_velocity(scene, velocity)
         check_values("velocity", v)
         law, scene, v = in_common_dtype(self, scene, v)
@@ -219,6 +225,7 @@ class Binary(Law):
 
 @eqx.filter_jit
 def _count(law: Binary, scene: Scene, velocity: jax.Array) -> jax.Array:
+    """Number of collisions."""
     return law._solve(law.contact(scene, velocity))[2].number
 
 

@@ -34,7 +34,7 @@ class Compliant(Law):
             a viscous force.
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
         max_steps: passes of the integrator before it gives up.
-        check_conditioning: a second run tells `ill_conditioned`, as in `LZB`.
+        check_conditioning: a second run flags `ill_conditioned`, as in `LZB`.
 
     Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`
     where that is checked.
@@ -62,6 +62,7 @@ class Compliant(Law):
     check_conditioning: bool = option(False, (False, True))
 
     def __check_init__(self) -> None:
+        """Raise where `force` is not a force, or has no energy to store."""
         if not isinstance(self.force, Force):
             raise TypeError(
                 "Argument `force` must be a contact force such as Hertz(k), "
@@ -77,7 +78,7 @@ class Compliant(Law):
 
     @property
     def has_history(self) -> bool:  # type: ignore[override]
-        """Not with a viscous force."""
+        """With a force that is a `Bistiffness`."""
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:

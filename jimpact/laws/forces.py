@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jimpact._checks import as_float_array
 from jimpact.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
 
-_SEARCH = (-60.0, 60.0)  # decades that the indentation scale of an unknown force is sought in
-_BISECTIONS = 50  # of them, to about 1e-13 decades
+_SEARCH = (-60.0, 60.0)  # decades [m] in which the indentation scale of a force is searched
+_BISECTIONS = 50  # halvings of these decades, to about 1e-13 of one
 # |zeta - 1| below which e of damped and overdamped springs is one series; its error is the square.
 _CRITICAL = 1e-4
 
@@ -67,12 +67,14 @@ class Force(Declared):
         """Indentation (m,) [m] at which about `energy` (m,) [J] is stored: x F(x, 0) = 2 energy."""
 
         def excess(log_x: jax.Array) -> jax.Array:
+            """x F less twice the energy."""
             x = 10.0**log_x
             return x * self.force(x, jnp.zeros_like(x)) - 2 * energy
 
         low, high = (jnp.full_like(energy, end) for end in _SEARCH)
 
         def halve(_: int, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            """The half in which the excess changes sign."""
             middle = 0.5 * (ends[0] + ends[1])
             above = excess(middle) > 0
             return jnp.where(above, ends[0], middle), jnp.where(above, middle, ends[1])

@@ -40,7 +40,6 @@ def frictional_impulses(
     assert contact.slip is not None  # see `check_law`
     ones = jnp.ones_like(contact.gap_velocity)
     slip = (1 + jnp.repeat(tangential_restitution * ones, contact.tangents)) * contact.slip
-    found = solve(
-        contact.whole_delassus, normal, slip, friction * ones, complementary=complementary
+    return Impulses(
+        *solve(contact.whole_delassus, normal, slip, friction * ones, complementary=complementary)
     )
-    return Impulses(*found)

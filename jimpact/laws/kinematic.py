@@ -1,4 +1,4 @@
-"""The kinematic laws: what gap velocities become is said; Newton, Moreau, RestitutionMatrix."""
+"""The kinematic laws, which prescribe gap velocities: Newton, Moreau, RestitutionMatrix."""
 
 import abc
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -20,7 +20,7 @@ from jimpact.status import CODE
 
 
 class Kinematic(Law):
-    """A law that says what becomes of the normal velocities: `gamma+ = -E gamma-`, E of any form.
+    """A law that prescribes the normal velocities: `gamma+ = -E gamma-`, E of any form.
 
     Equation: with `b = |grad f| (I + E) qn-`, prescribed: `W p + b = 0`; complementary:
     `0 <= W p + b  _|_  p >= 0`. With friction `W_nt p_t` is added, and
@@ -59,8 +59,8 @@ class Kinematic(Law):
             return frictional_impulses(contact, required, mu, e_t, complementary=self.complementary)
         w = contact.delassus
         if self.complementary:
-            found = solve_lcp(as_matrix(w), required, regular=is_regular(w))
-            return Impulses(found.z, None, found.code)
+            solution = solve_lcp(as_matrix(w), required, regular=is_regular(w))
+            return Impulses(solution.z, None, solution.code)
         return prescribed_impulses(contact, required)
 
 
@@ -252,8 +252,8 @@ class RestitutionMatrix(Kinematic):
                 f"Argument `matrix` must have shape ({m}, {m}) with `friction`, which decides "
                 f"about the tangential velocities itself, but has shape {self.matrix.shape}."
             )
-        held = 0 if scene.constraints is None else scene.constraints.shape[1]
-        full = scene.size - held
+        constraints = 0 if scene.constraints is None else scene.constraints.shape[1]
+        full = scene.size - constraints
         if size != full or full < m:
             other = f" or ({full}, {full})" if full > m else ""
             raise ValueError(
@@ -290,11 +290,11 @@ class RestitutionMatrix(Kinematic):
         m = contact.contacts
         quasi = jnp.concatenate([contact.normalized_gap_velocity, contact.quasi])
         change = quasi + self.matrix @ quasi  # qn- - qn+, qt- - qt+
-        side, missed = _least(contact.directions, -change[m:], jnp.abs(quasi).max())
-        required = contact.norm * change[:m] + contact.cross @ side
+        tangential, missed = _least(contact.directions, -change[m:], jnp.abs(quasi).max())
+        required = contact.norm * change[:m] + contact.cross @ tangential
         p, _, code = prescribed_impulses(contact, required)
         lost = missed | ~jnp.all(contact.closed)
-        return Impulses(p, side, jnp.where(lost, CODE["infeasible"], code))
+        return Impulses(p, tangential, jnp.where(lost, CODE["infeasible"], code))
 
 
 class QuasiContact(Contact):

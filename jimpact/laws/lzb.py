@@ -22,18 +22,20 @@ from jimpact.law import (
 from jimpact.laws.forces import Bistiffness
 from jimpact.scene import Scene
 
+# Tolerances of v+ where the law names none, relative to max |v-|. Ten times more would make every
+# outcome right to one digit less.
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
-DEFAULT_RTOL_IMPULSE = 1e-4  # first order: the step in the primary impulse itself
-FINEST_RTOL_IN_EPS = 16  # below this many roundings the error estimate is noise
+DEFAULT_RTOL_IMPULSE = 1e-4  # method 'impulse', first order: the step in the primary impulse itself
+FINEST_RTOL_IN_EPS = 16  # below this many eps the error estimate is noise
 
 
 def default_rtol(method: str, dtype: jnp.dtype) -> float:
-    """Tolerance used where the law names none."""
+    """Tolerance where the law has none of its own."""
     return DEFAULT_RTOL_IMPULSE if method == "impulse" else DEFAULT_RTOL.get(str(dtype), 1e-5)
 
 
 def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
-    """Raise where the precision cannot hold this tolerance."""
+    """Raise a ValueError where the precision cannot hold this tolerance."""
     finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
     if rtol is not None and rtol < finest:
         raise ValueError(
@@ -100,7 +102,7 @@ class LZB(Law):
         method: 'time' (default), event-aligned, order 8; 'impulse', the published scheme in the
             impulse of a primary contact, order 1.
         check_conditioning: a second run beside the first, at rtol / 100 and from data changed in
-            their last digits, tells `ill_conditioned` where gap velocities or slips differ by more
+            their last digits, flags `ill_conditioned` where gap velocities or slips differ by more
             than 10 rtol of the fastest approach (`docs/speed_accuracy.md`: what that finds, and
             float32). In a batch two to three times the time; method 'time'.
 
@@ -137,11 +139,12 @@ class LZB(Law):
     check_conditioning: bool = option(False, (False, True))
 
     def __check_init__(self) -> None:
-        for name, given in (
+        """Raise a ValueError for what method 'impulse' does not have."""
+        for name, used in (
             ("friction", self.friction is not None),
             ("check_conditioning", self.check_conditioning),
         ):
-            if self.method != "time" and given:
+            if self.method != "time" and used:
                 raise ValueError(
                     f"Argument `method` must be 'time' with {name}, but has value {self.method!r}."
                 )

@@ -86,8 +86,7 @@ class Poisson(Law):
         m, each, a = contact.contacts, contact.tangents, contact.whole_delassus
         mu = mu * jnp.ones_like(contact.gap_velocity)
         e_t = jnp.repeat(e_t * jnp.ones_like(mu), each)
-        given = contact.gap_velocity, contact.slip
-        first = solve(a, *given, mu, complementary=True)
+        first = solve(a, contact.gap_velocity, contact.slip, mu, complementary=True)
         returned = self.restitution * first.normal
         rate = jnp.concatenate([contact.gap_velocity, (1 + e_t) * contact.slip])
         rate = rate + a @ jnp.concatenate([first.normal + returned, first.tangential])

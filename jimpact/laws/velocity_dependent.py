@@ -22,7 +22,8 @@ from jimpact.law import (
 from jimpact.registry import REGISTRY
 from jimpact.solvers.tridiagonal import as_matrix, diagonal
 
-# |cos(kinetic angle)| below so many roundings is 0: contacts then do not feel each other
+# eps of |cos(kinetic angle)| below which contacts count as decoupled: the rounding of normals and
+# of M^-1. Ten times more would decouple contacts that influence each other slightly.
 DECOUPLED_IN_EPS = 64
 
 
@@ -64,11 +65,12 @@ class VelocityDependent(Law):
     reference_speed: Values = parameter(low=0.0, open_low=True, default=1.0, kw_only=True)
 
     def __check_init__(self) -> None:
+        """Raise a TypeError for a law without e, or that depends on the velocity already."""
         check_kind("law", self.law, Law)
         if isinstance(self.law, VelocityDependent):
             raise TypeError("Argument `law` must not depend on the velocity already.")
-        found = free_parameters_of(self.law).get("restitution")
-        if found is None or np.ndim(found.value) > 1:
+        restitution = free_parameters_of(self.law).get("restitution")
+        if restitution is None or np.ndim(restitution.value) > 1:
             raise TypeError(
                 "Argument `law` must have `restitution`, one number or one per contact, but is "
                 f"{type(self.law).__name__}."
@@ -84,6 +86,7 @@ class VelocityDependent(Law):
         return self._at(as_float_array("speed", speed))
 
     def _at(self, v: jax.Array) -> jax.Array:
+        """e at speeds v."""
         e = free_parameters_of(self.law)["restitution"].value
         moving = v > 0
         safe = jnp.where(moving, v, self.reference_speed)  # at rest e is that of the law
@@ -119,9 +122,9 @@ class VelocityDependent(Law):
 
 
 def approach_speed(contact: Contact) -> jax.Array:
-    """Of each contact (m,) the fastest approach [m/s] among those it is coupled with.
+    """For each contact the fastest approach (m,) [m/s] among those it is coupled with.
 
-    Differentiable in the speeds: which contact is the fastest is found first, on constants.
+    Differentiable in the speeds: the fastest contact is determined first, on constants.
 
     >>> import jimpact as ji
     >>> from jimpact.laws.velocity_dependent import approach_speed
@@ -137,6 +140,7 @@ def approach_speed(contact: Contact) -> jax.Array:
     )
 
     def passed_on(state: tuple[jax.Array, Any]) -> tuple[jax.Array, jax.Array]:
+        """Each contact takes the fastest one that its neighbours know of."""
         leader, _ = state
         around = jnp.where(joined, known[leader][None, :], -1.0)
         other = leader[jnp.argmax(around, axis=1)]
@@ -163,18 +167,18 @@ def make_velocity_dependent(
         known = ", ".join(name for name, row in REGISTRY.items() if "restitution" in row.arguments)
         raise ValueError(f"Argument `base` must be one of {known}, but has value {base!r}.")
     row = REGISTRY[base]
-    given = {
+    values = {
         "restitution": restitution,
         "stiffness": stiffness,
         "exponent": exponent,
         "friction": friction,
     }
-    own = {name: value for name, value in given.items() if value is not None}
-    for name in own:
+    parameters = {name: value for name, value in values.items() if value is not None}
+    for name in parameters:
         if name not in row.arguments:
-            raise ValueError(f"Argument `{name}` must not be given: {base} has none.")
+            raise ValueError(f"Argument `{name}` must not be given: {base} does not have it.")
     return VelocityDependent(
-        row.build(**own),
+        row.build(**parameters),
         speed_exponent=speed_exponent,
         yield_speed=yield_speed,
         reference_speed=reference_speed,

@@ -17,15 +17,18 @@ from jimpact.solvers.tangential import TangentialBlock, per_tangent
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
-# In eps, relative to the largest normalized approach velocity at the start: an approach below is
-# rounding (and no collision), criteria closer than that are equal. Errors of the velocities grow
-# with the root of the number of collisions, so this covers some ten thousand.
+# eps, relative to the largest normalized approach velocity at the start: slower approaches are
+# rounding (no collision), and criteria closer than that are equal. Errors of the velocities grow
+# with the root of the number of collisions, so this covers some ten thousand; ten times more would
+# lose the last slow collisions of long sequences.
 REST = 128.0
-# Times to closing are equal within so many eps of the time passed and to come.
+# eps of the time passed and to come, within which times to closing are equal. Ten times more would
+# report more sequences as dependent on the order.
 TIE = 16.0
-COUPLED = 16.0  # |G_ij| above so many eps: the collisions of i and j do not commute
+COUPLED = 16.0  # eps of |G_ij| above which the collisions of i and j do not commute
 # Three or more contacts: a last collision slower than this (relative, as REST) that leaves an
-# approach is one of an endless sequence; what remains of it is below REST.
+# approach is one of an endless sequence; what remains of it is below REST. Ten times more would cut
+# off sequences that end.
 DECAYED = {"float64": 1e-9, "float32": 3e-4}
 BOUNDARY = 8.0  # eps: a state on the edge of the endless cone (body between two walls) is in it
 SINGULAR = 16.0  # eps: two contacts with 1 - cos^2 below this are redundant
@@ -40,7 +43,7 @@ class CoulombFriction(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """A problem; `coupling` holds the entries of G beside its unit diagonal."""
+    """The normalized problem; `coupling` holds the entries of G off its unit diagonal."""
 
     coupling: jax.Array
     restitution: jax.Array  # () or (m,): a scalar costs one tangent, not m
@@ -51,15 +54,15 @@ class Inputs(NamedTuple):
 
 
 class Options(NamedTuple):
-    """What is static: the cyclic order (None: fastest or earliest) and the limit."""
+    """Static options: the cyclic order (None: fastest or earliest), the limit, a chain or not."""
 
     cycle: tuple[int, ...] | None
     max_collisions: int
     chain: bool
 
 
-class Carry(NamedTuple):
-    """Where the sequence stands; `place` is the next entry of a cyclic order."""
+class CollisionState(NamedTuple):
+    """State of the sequence between two collisions; `place`: next entry of a cyclic order."""
 
     qn: jax.Array
     p: jax.Array
@@ -70,11 +73,11 @@ class Carry(NamedTuple):
     gaps: jax.Array | None
     time: jax.Array
     slip: jax.Array | None  # (t,) with friction
-    side: jax.Array | None  # its impulses (t,)
+    tangential: jax.Array | None  # impulses (t,)
     code: jax.Array  # the worst status of a collision with friction
 
 
-class Choice(NamedTuple):
+class NextCollision(NamedTuple):
     """The next collision: contact, next place in the cycle, time until then, tied or not."""
 
     contact: jax.Array
@@ -83,7 +86,7 @@ class Choice(NamedTuple):
     tied: jax.Array
 
 
-class End(NamedTuple):
+class SequenceEnd(NamedTuple):
     """Integers of a finished run: status code and number of collisions (-1: endless)."""
 
     code: jax.Array
@@ -98,19 +101,21 @@ def solve(
     cycle: tuple[int, ...] | None,
     max_collisions: int,
     friction: CoulombFriction | None = None,
-) -> tuple[jax.Array, jax.Array | None, End]:
+) -> tuple[jax.Array, jax.Array | None, SequenceEnd]:
     """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
     inputs = to_inputs(delassus, gamma, restitution, gaps, friction)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
-    (p, side), end = both_modes(lambda given, _: run(given, options))(inputs)
-    return *impulses_of(p, side, jnp.sqrt(diagonal(delassus))), end
+    (p, tangential), end = both_modes(lambda problem, _: run(problem, options))(inputs)
+    return *impulses_of(p, tangential, jnp.sqrt(diagonal(delassus))), end
 
 
 def impulses_of(
-    p: jax.Array, side: jax.Array | None, root: jax.Array
+    p: jax.Array, tangential: jax.Array | None, root: jax.Array
 ) -> tuple[jax.Array, jax.Array | None]:
     """p (m,) and p_t (t,) [N s] of normalized ones."""
-    return p / root, None if side is None else side / per_tangent(root, side)
+    if tangential is None:
+        return p / root, None
+    return p / root, tangential / per_tangent(root, tangential)
 
 
 def to_inputs(
@@ -124,12 +129,12 @@ def to_inputs(
     root = jnp.sqrt(diagonal(delassus))
     g = scaled(delassus, 1 / root)
     m = gamma.shape[0]
-    beside = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
+    coupling = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     fixed = jax.lax.stop_gradient
     if friction is not None:
         friction = friction._replace(block=friction.block.scaled(root))
     return Inputs(
-        beside,
+        coupling,
         restitution,
         gamma / root,
         fixed(root),
@@ -138,7 +143,7 @@ def to_inputs(
     )
 
 
-def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | None], End]:
+def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | None], SequenceEnd]:
     """Normalized impulses and the end of the sequence."""
     g = coupling_matrix(inputs, options)
     start = begin(inputs)
@@ -149,7 +154,8 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
         endless, limit = endless_pair(inputs, first)
         endless = endless & approaches(inputs, start)
 
-    def unfinished(at: Carry) -> jax.Array:
+    def unfinished(at: CollisionState) -> jax.Array:
+        """Whether there is a collision to come, and the limit is not reached."""
         return ~endless & approaches(inputs, at) & (at.number < options.max_collisions)
 
     end = jax.lax.while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
@@ -162,7 +168,7 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
     code = jnp.where(endless, CODE["plastic_limit"], code)
     code = jnp.where(stopped, CODE["max_steps"], code)
     p = jnp.where(endless, limit, end.p) if pair else end.p
-    return (p, end.side), End(code, jnp.where(endless, -1, end.number))
+    return (p, end.tangential), SequenceEnd(code, jnp.where(endless, -1, end.number))
 
 
 def coupling_matrix(inputs: Inputs, options: Options) -> Symmetric:
@@ -185,16 +191,16 @@ def rest_of(inputs: Inputs) -> jax.Array:
     return REST * float(jnp.finfo(inputs.qn.dtype).eps) * scale_of(inputs)
 
 
-def approaches(inputs: Inputs, at: Carry) -> jax.Array:
-    """Is there a collision to come?"""
+def approaches(inputs: Inputs, at: CollisionState) -> jax.Array:
+    """Whether a contact approaches by more than rounding."""
     return jnp.any(at.qn < -rest_of(inputs))
 
 
-def begin(inputs: Inputs) -> Carry:
+def begin(inputs: Inputs) -> CollisionState:
     """Before the first collision."""
     dtype = inputs.qn.dtype
     zero = jnp.array(0, jnp.int32)
-    return Carry(
+    return CollisionState(
         qn=inputs.qn,
         p=jnp.zeros_like(inputs.qn),
         number=zero,
@@ -204,12 +210,12 @@ def begin(inputs: Inputs) -> Carry:
         gaps=inputs.gaps,
         time=jnp.array(0, dtype),
         slip=None if inputs.friction is None else inputs.friction.block.slip,
-        side=None if inputs.friction is None else jnp.zeros_like(inputs.friction.block.slip),
+        tangential=None if inputs.friction is None else jnp.zeros_like(inputs.friction.block.slip),
         code=jnp.array(CODE["ok"], jnp.int32),
     )
 
 
-def choose(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Choice:
+def choose(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> NextCollision:
     """The next contact to collide; some contact approaches."""
     rest = rest_of(inputs)
     approaching = at.qn < -rest
@@ -218,7 +224,7 @@ def choose(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Choice:
         turn = approaching[cycle]
         ahead = turn & (jnp.arange(len(options.cycle), dtype=jnp.int32) >= at.place)
         k = jnp.where(jnp.any(ahead), jnp.argmax(ahead), jnp.argmax(turn)).astype(jnp.int32)
-        return Choice(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
+        return NextCollision(cycle[k], k + 1, jnp.zeros_like(at.time), jnp.array(False))
     speed = jnp.where(approaching, -at.qn * inputs.root, 0.0)  # m/s
     rivals, wait = approaching, jnp.zeros_like(speed)
     if at.gaps is not None:
@@ -229,13 +235,13 @@ def choose(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Choice:
     j = jnp.argmax(level).astype(jnp.int32)  # the lowest index among equals
     chosen = jnp.arange(speed.shape[0], dtype=jnp.int32) == j
     floor = COUPLED * float(jnp.finfo(speed.dtype).eps)
-    beside = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
+    coupled = jnp.abs(times(g, chosen.astype(speed.dtype))) > floor
     equals = rivals if at.gaps is not None else level
-    return Choice(j, at.place, wait[j], jnp.any(equals & beside & ~chosen))
+    return NextCollision(j, at.place, wait[j], jnp.any(equals & coupled & ~chosen))
 
 
 def first_to_close(
-    inputs: Inputs, at: Carry, approaching: jax.Array, speed: jax.Array
+    inputs: Inputs, at: CollisionState, approaching: jax.Array, speed: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Contacts that close first, within rounding, and the time (m,) until each closes."""
     assert at.gaps is not None
@@ -255,27 +261,27 @@ def times(g: Symmetric, vector: jax.Array) -> jax.Array:
     return jnp.sum(g * vector[None, :], axis=1)
 
 
-def collide(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Carry:
+def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> CollisionState:
     """One collision, after the free flight that leads to it."""
     choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
     chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
-    slip, side, code = at.slip, at.side, at.code
+    slip, tangential, code = at.slip, at.tangential, at.code
     if inputs.friction is None:
         jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
         after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, jump))
     else:
         assert slip is not None
-        assert side is not None
-        jump, push, status = _with_friction(inputs, inputs.friction, at, choice.contact)
+        assert tangential is not None
+        jump, jump_t, status = _with_friction(inputs, inputs.friction, at, choice.contact)
         cross, tangent, _ = inputs.friction.block
-        after = at.qn + times(g, jump) + cross @ push
-        slip = slip + cross.T @ jump + tangent @ push
-        side, code = side + push, jnp.maximum(code, status)
+        after = at.qn + times(g, jump) + cross @ jump_t
+        slip = slip + cross.T @ jump + tangent @ jump_t
+        tangential, code = tangential + jump_t, jnp.maximum(code, status)
     gaps = at.gaps
     if gaps is not None:
         flown = gaps + jax.lax.stop_gradient(at.qn) * inputs.root * choice.wait
         gaps = jnp.where(chosen, 0.0, jnp.maximum(flown, 0.0))
-    return Carry(
+    return CollisionState(
         qn=after,
         p=at.p + jump,
         number=at.number + jnp.array(1, jnp.int32),
@@ -285,13 +291,13 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: Carry) -> Carry:
         gaps=gaps,
         time=at.time + choice.wait,
         slip=slip,
-        side=side,
+        tangential=tangential,
         code=code,
     )
 
 
 def _with_friction(
-    inputs: Inputs, friction: CoulombFriction, at: Carry, contact: jax.Array
+    inputs: Inputs, friction: CoulombFriction, at: CollisionState, contact: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Impulses (m,) and (t,) of a collision at one contact, and its status."""
     m, t = friction.block.normal_tangent.shape
@@ -302,20 +308,20 @@ def _with_friction(
     matrix = jnp.block([[jnp.ones((1, 1), cross.dtype), cross], [cross.T, tangent]])
     e = jnp.broadcast_to(inputs.restitution, (m,))[contact]
     assert at.slip is not None
-    found = solve_friction(
+    impulses = solve_friction(
         matrix,
         ((1 + e) * at.qn[contact])[None],
         (1 + friction.restitution[contact]) * at.slip[rows],
         friction.coefficient[contact][None],
         complementary=True,
     )
-    jump = jnp.zeros_like(at.qn).at[contact].set(found.normal[0])
-    push = jnp.zeros_like(at.slip).at[rows].set(found.tangential)
-    return jump, push, found.status
+    jump = jnp.zeros_like(at.qn).at[contact].set(impulses.normal[0])
+    jump_t = jnp.zeros_like(at.slip).at[rows].set(impulses.tangential)
+    return jump, jump_t, impulses.status
 
 
 def endless_pair(inputs: Inputs, first: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Do two contacts collide without end, `first` to begin, and the impulses of that limit.
+    """Whether two contacts collide without end, `first` to begin, and the impulses of that limit.
 
     Approach speeds of successive collisions at j, k, j, ... obey, c = -G_12,
 
