@@ -27,9 +27,9 @@ def run(executor, samples=1000, **options):
     )
 
 
-def digest(found):
-    arrays = found.mean, found.covariance, found.gap_covariance, found.counts, found.edges
-    return fingerprint((arrays, found.minimum, found.maximum, found.statuses, found.first))
+def digest(result):
+    arrays = result.mean, result.covariance, result.gap_covariance, result.counts, result.edges
+    return fingerprint((arrays, result.minimum, result.maximum, result.statuses, result.first))
 
 
 @pytest.fixture(scope="module")
@@ -40,9 +40,9 @@ def wanted():
 def test_names_and_protocol():
     assert isinstance(as_executor("serial"), Serial)
     assert isinstance(as_executor("devices"), Devices)
-    own = Serial()
-    assert as_executor(own) is own
-    assert isinstance(own, Executor)
+    serial = Serial()
+    assert as_executor(serial) is serial
+    assert isinstance(serial, Executor)
     with pytest.raises(ValueError, match="or an object with a method `run`, but is 3"):
         as_executor(3)
 
@@ -110,8 +110,8 @@ def test_dask_in_this_process(wanted, tmp_path):
     with distributed.Client(
         processes=False, n_workers=1, threads_per_worker=2, dashboard_address=None
     ) as client:
-        found = run(dask_executor(client), folder=tmp_path)
-        assert digest(found) == wanted
+        result = run(dask_executor(client), folder=tmp_path)
+        assert digest(result) == wanted
         # the files are written here, and any executor goes on from them
         assert digest(run("serial", folder=tmp_path)) == wanted
         assert digest(run(dask_executor(client.scheduler.address))) == wanted
@@ -134,8 +134,8 @@ def test_a_killed_dask_worker_changes_nothing(wanted, tmp_path):
 
         killer = threading.Thread(target=kill_after_the_first_chunks)
         killer.start()
-        found = run(dask_executor(client), folder=tmp_path, samples=128 * 400)
+        result = run(dask_executor(client), folder=tmp_path, samples=128 * 400)
         killer.join()
         survivors = set(client.run(os.getpid).values())
     assert victim not in survivors
-    assert digest(found) == digest(run("serial", samples=128 * 400))
+    assert digest(result) == digest(run("serial", samples=128 * 400))

@@ -74,8 +74,8 @@ def test_chart_in_words_and_picture(chart):
     assert binary.error["velocity"] == pytest.approx(error, rel=1e-9)
     assert math.isnan(binary.error["duration"])
     assert "verlet" in str(chart)
-    told = json.loads(json.dumps(chart.to_dict()))
-    assert told["points"]["binary"][0]["evaluations"] is None
+    data = json.loads(json.dumps(chart.to_dict()))
+    assert data["points"]["binary"][0]["evaluations"] is None
     figure = ji.plot.work_precision(chart, "three balls")
     assert figure.legends
     assert all(axes.lines for axes in figure.axes)
@@ -85,17 +85,17 @@ def test_chart_in_words_and_picture(chart):
 def test_gradients_and_the_other_methods():
     linear = ji.LZB([0.9, 0.9], [1.0, 1.0], 1.0)
     others = ("verlet", "impulse_rk4", "tsit5", "scipy_lsoda")  # and one of each kind
-    found = ji.work_precision(BALLS, STRIKE, linear, others, laws={}, batch=8, repeats=1)
-    assert not found.left_out
-    assert found.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
-    for name, row in found.points.items():
+    result = ji.work_precision(BALLS, STRIKE, linear, others, laws={}, batch=8, repeats=1)
+    assert not result.left_out
+    assert result.reference.uncertainty["velocity"] < 1e-11  # two independent integrators
+    for name, row in result.points.items():
         assert all(point.evaluations > 0 for point in row), name
-    assert 1e-9 < found.points["verlet"][-1].error["gradient"] < 0.1
+    assert 1e-9 < result.points["verlet"][-1].error["gradient"] < 0.1
     points = {
         name: tuple(dataclasses.replace(point, gradient=None) for point in row)
-        for name, row in found.points.items()
+        for name, row in result.points.items()
     }
-    bare = ji.plot.work_precision(dataclasses.replace(found, points=points))
+    bare = ji.plot.work_precision(dataclasses.replace(result, points=points))
     assert all("gradient" not in axes.get_xlabel() for axes in bare.axes)
 
 
@@ -117,10 +117,10 @@ def test_gradients_and_the_other_methods():
     ],
 )
 def test_chart_refuses(change, error, message):
-    given = {"scene": BALLS, "velocity": STRIKE, "law": HERTZ, "methods": ["verlet"]}
-    with pytest.raises(error) as told:
-        ji.work_precision(**(given | change))
-    assert message in str(told.value)
+    arguments = {"scene": BALLS, "velocity": STRIKE, "law": HERTZ, "methods": ["verlet"]}
+    with pytest.raises(error) as raised:
+        ji.work_precision(**(arguments | change))
+    assert message in str(raised.value)
 
 
 # ------------------------------------------------------------------------------- hard points
@@ -160,14 +160,14 @@ def hypercube(n, steps):
 def check_hypercube(n, steps):
     """Right or flagged everywhere; what the oracle could not solve is consistent."""
     at, out, consistent, error = hypercube(n, steps)
-    told = failed(out.status)
+    flagged = failed(out.status)
     known = np.isfinite(HELD["uncertainty"][at])
-    wrong = known & ~told & ~(error <= HONEST * RTOL)
+    wrong = known & ~flagged & ~(error <= HONEST * RTOL)
     assert not wrong.any(), list(zip(at[wrong], error[wrong]))
-    assert consistent[~told].all()
-    lossless = ~told & (HELD["points"][at, 2] == 1)
+    assert consistent[~flagged].all()
+    lossless = ~flagged & (HELD["points"][at, 2] == 1)
     assert np.abs(out.energy_change[lossless]).max(initial=0) < HONEST * RTOL
-    return np.mean(~told)
+    return np.mean(~flagged)
 
 
 def test_right_or_flagged():
@@ -226,8 +226,8 @@ def test_halves_of_a_chain():
         (4, [1.0, 1.0, 0.5, 1.0], [1.0, 1.0, 10.0]),
         (5, [1.0, 1.0, 0.5, 1.0, 1.0], [1.0, 1.0, 10.0, 10.0]),
     ):
-        found = chain_of(10.0, 0.5, balls)
-        assert [x.tolist() for x in found] == [mass, stiffness]
+        result = chain_of(10.0, 0.5, balls)
+        assert [x.tolist() for x in result] == [mass, stiffness]
 
 
 # 10 and 30 equal Hertz balls by the oracle of tests/benchmarks/lzb_oracle.cpp
@@ -322,17 +322,17 @@ def test_honest_tolerance_over_random_scenes(rtol):
 @pytest.mark.slow
 def test_stability_map():
     axes = {"setting": [0.0, 0.6], "exponent": [1.5, 3.0], "restitution": [0.0, 0.9]}
-    found = ji.stability_map(("rk4", "verlet"), axes, slices="pairs", samples=3, max_steps=2000)
-    assert found.methods == ("rk4", "verlet")
-    for name in found.methods:
-        setting, exponent = found.slices[name][:2]
+    result = ji.stability_map(("rk4", "verlet"), axes, slices="pairs", samples=3, max_steps=2000)
+    assert result.methods == ("rk4", "verlet")
+    for name in result.methods:
+        setting, exponent = result.slices[name][:2]
         assert setting.error[1] < 1e-3
         assert (exponent.codes == 0).all()
-        assert sum(found.counts(name).values()) == 6 + 3 * 4 + 3
-    assert found.confirmation.tried == found.confirmation.confirmed > 0
-    assert "step beyond the linear stability limit" in str(found)
-    assert json.loads(json.dumps(found.to_dict()))["methods"]["rk4"]["counts"]["right"] > 3
-    assert ji.plot.stability_map(found, "title").axes
+        assert sum(result.counts(name).values()) == 6 + 3 * 4 + 3
+    assert result.confirmation.tried == result.confirmation.confirmed > 0
+    assert "step beyond the linear stability limit" in str(result)
+    assert json.loads(json.dumps(result.to_dict()))["methods"]["rk4"]["counts"]["right"] > 3
+    assert ji.plot.stability_map(result, "title").axes
 
 
 @pytest.mark.parametrize(
@@ -368,7 +368,7 @@ def unknown():
 
 @pytest.mark.slow
 def test_unknown_ratio_decides(unknown):
-    """Nothing is within 1 % where k2/k1 is anywhere in [0.1, 10]; LZB is told, and what it lacks."""
+    """Nothing is within 1 % where k2/k1 is anywhere in [0.1, 10]; the advice is LZB, and what to measure."""
     assert (unknown.name, unknown.within, unknown.reference) == ("lzb", False, "lzb")
     assert "stiffness ratio k2/k1 in [0.1, 10] decides" in unknown.reason
     nominal = [-0.070952353651436871, 0.076403039071206993, 0.99454931458022988]
@@ -389,14 +389,14 @@ def test_unknown_ratio_decides(unknown):
     [(1e3, 0.02, "newton"), (50.0, 0.02, "lzb"), (1.0, 0.02, "lzb"), (0.01, 0.02, "binary")],
 )
 def test_known_ratio(ratio, tolerance, name):
-    found = quick(BALLS, STRIKE, tolerance, stiffness=[1.0, ratio])
-    exact = found.candidates["lzb"].velocity
-    assert (found.name, found.within, found.unknown) == (name, True, ())
-    assert np.abs(found.candidates[name].velocity - exact).max() <= tolerance
+    result = quick(BALLS, STRIKE, tolerance, stiffness=[1.0, ratio])
+    exact = result.candidates["lzb"].velocity
+    assert (result.name, result.within, result.unknown) == (name, True, ())
+    assert np.abs(result.candidates[name].velocity - exact).max() <= tolerance
     simple = ["newton", "moreau", "poisson", "binary"]
     for other in simple[: simple.index(name)] if name in simple else simple:
-        assert np.abs(found.candidates[other].velocity - exact).max() > tolerance
-    assert f"k2/k1 = {ratio:.3g}" in found.reason
+        assert np.abs(result.candidates[other].velocity - exact).max() > tolerance
+    assert f"k2/k1 = {ratio:.3g}" in result.reason
 
 
 def test_tolerance_from_both_sides():
@@ -412,11 +412,11 @@ def test_tolerance_from_both_sides():
 
 def test_special_scenes():
     """Plastic contacts, no approach, a law that breaks a property."""
-    found = quick(BALLS, STRIKE, restitution=0.0)
-    assert (found.name, found.within) == ("newton", True)
-    assert "plastic contacts" in found.reason
-    found = quick(BALLS, [-1.0, 0.0, 2.0])
-    assert found.reason.startswith("no approach: nothing happens")
+    result = quick(BALLS, STRIKE, restitution=0.0)
+    assert (result.name, result.within) == ("newton", True)
+    assert "plastic contacts" in result.reason
+    result = quick(BALLS, [-1.0, 0.0, 2.0])
+    assert result.reason.startswith("no approach: nothing happens")
     both = quick(ji.chain([0.25, 1.0, 0.25]), [1.0, 0.0, -1.0], 0.9, stiffness=[1.0, 1.0])
     assert both.candidates["binary"].status == "order_dependent"
     assert not both.candidates["binary"].usable
@@ -430,10 +430,10 @@ def test_special_scenes():
 )
 def test_gaps(gap, tolerance, name):
     scene = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, gap])
-    found = quick(scene, STRIKE, tolerance, stiffness=1.2e8)
+    result = quick(scene, STRIKE, tolerance, stiffness=1.2e8)
     exact = ji.impact(ji.Compliant(ji.Bistiffness(1.2e8, 1.5, 1.0)), scene, STRIKE).velocity
-    assert (found.name, found.within) == (name, True)
-    got = np.asarray(ji.impact(found.law, found.scene, STRIKE).velocity)
+    assert (result.name, result.within) == (name, True)
+    got = np.asarray(ji.impact(result.law, result.scene, STRIKE).velocity)
     assert np.abs(got - exact).max() <= tolerance
 
 
@@ -507,10 +507,10 @@ def test_contacts_that_close_again():
 @pytest.mark.release
 def test_several_ratios():
     """Five unknown ratios: which of them matters."""
-    found = quick(ji.chain(jnp.ones(7)), [1.0, 0, 0, 0, 0, 0, 0])
-    assert [u.name for u in found.unknown] == [f"k{j}/k1" for j in range(2, 7)]
-    strongest = max(found.unknown, key=lambda u: u.alone)
-    assert f"measure {strongest.name} first" in found.reason
+    result = quick(ji.chain(jnp.ones(7)), [1.0, 0, 0, 0, 0, 0, 0])
+    assert [u.name for u in result.unknown] == [f"k{j}/k1" for j in range(2, 7)]
+    strongest = max(result.unknown, key=lambda u: u.alone)
+    assert f"measure {strongest.name} first" in result.reason
 
 
 @pytest.mark.parametrize(
@@ -541,9 +541,9 @@ def test_advice_refuses(options, error, message):
 
 
 def test_advice_in_words_and_picture(unknown):
-    told = json.loads(json.dumps(unknown.to_dict()))
-    assert told["laws"]["lzb"]["worst"] == unknown.candidates["lzb"].worst
-    assert told["unknown"][0]["name"] == "k2/k1"
+    data = json.loads(json.dumps(unknown.to_dict()))
+    assert data["laws"]["lzb"]["worst"] == unknown.candidates["lzb"].worst
+    assert data["unknown"][0]["name"] == "k2/k1"
     text = str(unknown)
     assert max(len(line) for line in text.splitlines()) <= 100
     assert len(text.splitlines()) < 25
@@ -630,16 +630,16 @@ def test_validity_map_refuses(arguments, message):
 
 
 def test_compare_gives_every_law_its_outcome():
-    found = ji.compare(BALLS, STRIKE, restitution=0.9, stiffness=[1.0, 2.0])
-    assert {"lzb", "newton", "moreau", "poisson", "binary"} <= set(found.entries)
-    for name, entry in found.entries.items():
+    result = ji.compare(BALLS, STRIKE, restitution=0.9, stiffness=[1.0, 2.0])
+    assert {"lzb", "newton", "moreau", "poisson", "binary"} <= set(result.entries)
+    for name, entry in result.entries.items():
         assert entry.time > 0
-        kept = 2 * (0.5 + float(entry.outcome.energy_change))
-        assert entry.energy_ratio == pytest.approx(kept)
-        assert name in str(found)
-    assert float(found.entries["lzb"].law.stiffness[1]) == 2.0
-    told = json.loads(json.dumps(found.to_dict()))
-    assert told["moreau"]["consistent"] is True
+        ratio = 2 * (0.5 + float(entry.outcome.energy_change))
+        assert entry.energy_ratio == pytest.approx(ratio)
+        assert name in str(result)
+    assert float(result.entries["lzb"].law.stiffness[1]) == 2.0
+    data = json.loads(json.dumps(result.to_dict()))
+    assert data["moreau"]["consistent"] is True
     slender = ji.Scene(np.linalg.inv([[1.0, 0.25], [0.25, 1.0]]), np.eye(2))
     table = str(ji.compare(slender, [0.0, -1.0], {"mine": ji.Newton(0.5)}))
     assert "kinetic violated, negative_impulse" in table

@@ -61,46 +61,46 @@ def same(a, b):
 
 def test_statistics_are_those_of_the_raw_samples(tmp_path):
     law = RandomLaw(LAW, restitution=Uniform(0.8, 1.0))
-    found = sampled(law=law, folder=tmp_path, keep_samples=True)
+    result = sampled(law=law, folder=tmp_path, keep_samples=True)
     parts = list(read_samples(tmp_path))
     assert [len(part["status"]) for part in parts] == [256, 256, 256, 232]
     v, gaps = (np.concatenate([part[name] for part in parts]) for name in ("velocity", "gaps"))
     both = np.concatenate([v, gaps], axis=1)
     covariance = np.cov(both.T)
-    np.testing.assert_allclose(found.mean, v.mean(axis=0), rtol=1e-13, atol=1e-15)
-    np.testing.assert_allclose(found.covariance, covariance[:3, :3], rtol=1e-12)
-    np.testing.assert_allclose(found.gap_mean, gaps.mean(axis=0), rtol=1e-13)
-    np.testing.assert_allclose(found.gap_covariance, covariance[3:, 3:], rtol=1e-11)
-    np.testing.assert_allclose(found.cross_covariance, covariance[:3, 3:], rtol=1e-10)
-    np.testing.assert_array_equal(found.minimum, v.min(axis=0))
-    np.testing.assert_array_equal(found.maximum, v.max(axis=0))
-    assert found.counts.sum(axis=1).tolist() == [1000] * 3
+    np.testing.assert_allclose(result.mean, v.mean(axis=0), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(result.covariance, covariance[:3, :3], rtol=1e-12)
+    np.testing.assert_allclose(result.gap_mean, gaps.mean(axis=0), rtol=1e-13)
+    np.testing.assert_allclose(result.gap_covariance, covariance[3:, 3:], rtol=1e-11)
+    np.testing.assert_allclose(result.cross_covariance, covariance[:3, 3:], rtol=1e-10)
+    np.testing.assert_array_equal(result.minimum, v.min(axis=0))
+    np.testing.assert_array_equal(result.maximum, v.max(axis=0))
+    assert result.counts.sum(axis=1).tolist() == [1000] * 3
     for q in (0.0, 0.05, 0.31, 0.95, 1.0):
         wanted = np.quantile(v, q, axis=0, method="inverted_cdf")
-        assert np.all(np.abs(found.quantile(q) - wanted) <= found.quantile_resolution)
-    np.testing.assert_allclose(found.standard_error, v.std(axis=0, ddof=1) / np.sqrt(1000))
-    np.testing.assert_array_equal(found.first["velocity"], parts[0]["velocity"])
+        assert np.all(np.abs(result.quantile(q) - wanted) <= result.quantile_resolution)
+    np.testing.assert_allclose(result.standard_error, v.std(axis=0, ddof=1) / np.sqrt(1000))
+    np.testing.assert_array_equal(result.first["velocity"], parts[0]["velocity"])
 
 
 def test_each_sample_is_the_impact_of_its_gaps():
-    found = sampled(samples=300)
-    gaps, v = found.first["gaps"], found.first["velocity"]
+    result = sampled(samples=300)
+    gaps, v = result.first["gaps"], result.first["velocity"]
     closes_first = np.where((gaps[:, 0] < gaps[:, 1])[:, None], LEFT, RIGHT)
     np.testing.assert_allclose(v, closes_first[:256], atol=1e-14)
     share = np.mean(gaps[:, 0] < gaps[:, 1])
     assert 0.4 < share < 0.6
-    law, scene, velocity = found.replay(7)
+    law, scene, velocity = result.replay(7)
     assert np.asarray(scene.gaps).tobytes() == gaps[7].tobytes()
     np.testing.assert_allclose(impact(law, scene, velocity).velocity, v[7], atol=1e-14)
-    last = found.replay(299)[1].gaps
+    last = result.replay(299)[1].gaps
     assert not np.array_equal(np.asarray(last), gaps[299 - 256])  # another chunk, other draws
     with pytest.raises(ValueError, match=r"`index` must lie in \[0, 299\], but has value 300"):
-        found.replay(300)
+        result.replay(300)
 
 
 def test_random_parameters_velocities_and_their_analytic_moments():
     balls = chain([1.0, 1.0])
-    found = monte_carlo(
+    result = monte_carlo(
         RandomLaw(Newton(0.5), restitution=Uniform(0.6, 1.0)),
         balls,
         [1.0, 0.0],
@@ -108,30 +108,30 @@ def test_random_parameters_velocities_and_their_analytic_moments():
         chunk=1000,
     )
     # v2+ = (1 + e) / 2
-    assert abs(found.mean[1] - 0.9) < 4 * found.standard_error[1]
-    np.testing.assert_allclose(found.std[1], 0.2 / np.sqrt(12), rtol=0.03)
-    np.testing.assert_allclose(found.quantile(0.25)[1], 0.85, atol=0.01)
-    assert found.gap_mean.shape == (0,)
+    assert abs(result.mean[1] - 0.9) < 4 * result.standard_error[1]
+    np.testing.assert_allclose(result.std[1], 0.2 / np.sqrt(12), rtol=0.03)
+    np.testing.assert_allclose(result.quantile(0.25)[1], 0.85, atol=0.01)
+    assert result.gap_mean.shape == (0,)
     moving = monte_carlo(Newton(0.5), balls, Normal([2.0, 0.0], 0.1), samples=4000, chunk=1000)
     a = np.array([[0.25, 0.75], [0.75, 0.25]])  # v+ = A v-, all of them approach
     np.testing.assert_allclose(moving.mean, a @ [2.0, 0.0], atol=4 * 0.1 / np.sqrt(4000))
     np.testing.assert_allclose(moving.covariance, 0.01 * a @ a.T, rtol=0.1)
-    own = monte_carlo(
+    result = monte_carlo(
         lambda key: Newton(jax.random.uniform(key)), balls, [1.0, 0.0], samples=10, chunk=16
     )
-    e = np.array([float(own.replay(i)[0].restitution) for i in range(10)])
-    np.testing.assert_allclose(own.first["velocity"][:, 1], (1 + e) / 2, atol=1e-15)
+    e = np.array([float(result.replay(i)[0].restitution) for i in range(10)])
+    np.testing.assert_allclose(result.first["velocity"][:, 1], (1 + e) / 2, atol=1e-15)
 
 
 def test_given_samples_are_used_row_by_row():
     rng = np.random.default_rng(0)
     gaps = rng.uniform(0, 1e-5, (300, 2))
-    found = monte_carlo(LAW, BALLS, BEFORE, gaps, chunk=CHUNK)
-    assert found.samples == 300
-    np.testing.assert_array_equal(found.first["gaps"], gaps[:256])
+    result = monte_carlo(LAW, BALLS, BEFORE, gaps, chunk=CHUNK)
+    assert result.samples == 300
+    np.testing.assert_array_equal(result.first["gaps"], gaps[:256])
     wanted = np.where((gaps[:, 0] < gaps[:, 1])[:, None], LEFT, RIGHT)
-    np.testing.assert_allclose(found.mean, wanted.mean(axis=0), atol=1e-14)
-    np.testing.assert_array_equal(np.asarray(found.replay(299)[1].gaps), gaps[299])
+    np.testing.assert_allclose(result.mean, wanted.mean(axis=0), atol=1e-14)
+    np.testing.assert_array_equal(np.asarray(result.replay(299)[1].gaps), gaps[299])
     with pytest.raises(ValueError, match="`samples` must be at most 300, the rows of `gaps`"):
         monte_carlo(LAW, BALLS, BEFORE, gaps, samples=301)
 
@@ -148,15 +148,15 @@ def test_float32_samples_are_summed_in_float64():
     np.testing.assert_allclose(whole.covariance[0, 0], exact.var(ddof=1), rtol=1e-10)
     single = jax.tree.map(lambda x: x.astype(jnp.float32), (Newton(0.5), chain([1.0, 1.0])))
     ends = Uniform(*(jnp.float32(x) for x in (1.0, 2.0)))
-    found = monte_carlo(
+    result = monte_carlo(
         single[0],
         single[1],
         lambda k: jnp.stack([ends.sample(k, 1, jnp.float32, False)[0], jnp.float32(0)]),
         samples=50,
         chunk=64,
     )
-    assert found.first["velocity"].dtype == np.float32
-    assert found.mean.dtype == np.float64
+    assert result.first["velocity"].dtype == np.float32
+    assert result.mean.dtype == np.float64
 
 
 def test_histograms_hold_what_lies_outside_the_first_range():
@@ -294,23 +294,23 @@ def test_bad_draws_are_counted_listed_and_kept_apart():
     with pytest.warns(
         UserWarning, match=r"of 600 samples failed .* bad_gap\); see `bad` and `replay`"
     ):
-        found = sampled(samples=600, gaps=sometimes_bad)
-    draws = np.stack([np.asarray(found.replay(i)[1].gaps) for i in (0, 1)])
-    np.testing.assert_array_equal(draws, found.first["gaps"][:2])
-    fine = (found.first["gaps"] >= 0).all(axis=1)
+        result = sampled(samples=600, gaps=sometimes_bad)
+    draws = np.stack([np.asarray(result.replay(i)[1].gaps) for i in (0, 1)])
+    np.testing.assert_array_equal(draws, result.first["gaps"][:2])
+    fine = (result.first["gaps"] >= 0).all(axis=1)
     assert 0 < (~fine).sum() < 50
-    assert found.statuses["bad_gap"] == found.samples - found.count
-    assert len(found.bad) <= 20
-    assert [bad.index for bad in found.bad[: (~fine).sum()]] == np.flatnonzero(~fine)[:20].tolist()
-    bad = found.bad[0]
+    assert result.statuses["bad_gap"] == result.samples - result.count
+    assert len(result.bad) <= 20
+    assert [bad.index for bad in result.bad[: (~fine).sum()]] == np.flatnonzero(~fine)[:20].tolist()
+    bad = result.bad[0]
     assert bad.status == "bad_gap"
-    assert np.asarray(found.replay(bad.index)[1].gaps).tobytes() == bad.gaps.tobytes()
-    np.testing.assert_allclose(np.abs(found.mean).max(), 0.92, atol=0.05)  # NaN went nowhere
-    assert np.isfinite(found.gap_mean).all()
-    told = str(found)
-    assert f"bad_gap: {found.statuses['bad_gap']}, left out" in told
-    assert f"replay({bad.index})" in told
-    json.dumps(found.to_dict(), allow_nan=False)
+    assert np.asarray(result.replay(bad.index)[1].gaps).tobytes() == bad.gaps.tobytes()
+    np.testing.assert_allclose(np.abs(result.mean).max(), 0.92, atol=0.05)  # NaN went nowhere
+    assert np.isfinite(result.gap_mean).all()
+    report = str(result)
+    assert f"bad_gap: {result.statuses['bad_gap']}, left out" in report
+    assert f"replay({bad.index})" in report
+    json.dumps(result.to_dict(), allow_nan=False)
 
 
 def test_failed_impacts_are_kept_apart():
@@ -318,11 +318,11 @@ def test_failed_impacts_are_kept_apart():
     rows = np.array([[1.0, 0.0, 1.0], [1.0, 0.0, -1.0]] * 4)
     law = Binary(1.0, order="earliest", max_collisions=1)
     with pytest.warns(UserWarning, match="4 of 8 samples failed"):
-        found = monte_carlo(law, BALLS, rows, [0.0, 1e-6], chunk=8)
-    assert found.statuses == {"ok": 4, "max_steps": 4}
-    np.testing.assert_allclose(found.mean, impact(law, BALLS, rows[0]).velocity, atol=1e-15)
-    assert [bad.index for bad in found.bad] == [1, 3, 5, 7]
-    np.testing.assert_array_equal(found.bad[0].velocity, rows[1])
+        result = monte_carlo(law, BALLS, rows, [0.0, 1e-6], chunk=8)
+    assert result.statuses == {"ok": 4, "max_steps": 4}
+    np.testing.assert_allclose(result.mean, impact(law, BALLS, rows[0]).velocity, atol=1e-15)
+    assert [bad.index for bad in result.bad] == [1, 3, 5, 7]
+    np.testing.assert_array_equal(result.bad[0].velocity, rows[1])
     with pytest.raises(
         RuntimeError, match="None of the first 8 samples gave a usable outcome: 8 max_steps"
     ):
@@ -332,9 +332,9 @@ def test_failed_impacts_are_kept_apart():
 def test_parameters_out_of_their_domain_fail():
     law = lambda key: Newton(2 * jax.random.uniform(key))  # noqa: E731
     with pytest.warns(UserWarning, match="bad_law"):
-        found = monte_carlo(law, chain([1.0, 1.0]), [1.0, 0.0], samples=100, chunk=128)
-    assert 20 < found.statuses["bad_law"] < 80
-    assert found.maximum[1] <= 1.0
+        result = monte_carlo(law, chain([1.0, 1.0]), [1.0, 0.0], samples=100, chunk=128)
+    assert 20 < result.statuses["bad_law"] < 80
+    assert result.maximum[1] <= 1.0
 
 
 # ---------------------------------------------------------------------- resume
@@ -366,9 +366,9 @@ def test_interrupted_runs_continue_with_the_same_bits(tmp_path, whole):
     ):
         sampled(folder=tmp_path, executor=Stops(1))
     assert len(list(tmp_path.glob("chunk-*.npz"))) == 2
-    found = sampled(folder=tmp_path)
-    assert found.resumed == 512
-    assert same(found, whole)
+    result = sampled(folder=tmp_path)
+    assert result.resumed == 512
+    assert same(result, whole)
     again = sampled(folder=tmp_path, executor=Stops(0))  # nothing is left to compute
     assert again.resumed == 1000
     assert same(again, whole)
@@ -379,9 +379,9 @@ def test_interrupted_runs_continue_with_the_same_bits(tmp_path, whole):
 
 def test_a_run_may_grow(tmp_path, whole):
     sampled(samples=300, folder=tmp_path)
-    found = sampled(folder=tmp_path)
-    assert found.resumed == 256  # the partial chunk is computed again
-    assert same(found, whole)
+    result = sampled(folder=tmp_path)
+    assert result.resumed == 256  # the partial chunk is computed again
+    assert same(result, whole)
 
 
 def test_damaged_and_foreign_chunks_are_named_and_not_used(tmp_path, whole):
@@ -395,14 +395,14 @@ def test_damaged_and_foreign_chunks_are_named_and_not_used(tmp_path, whole):
         path.write_bytes(damaged)
     shutil.copy(tmp_path / "b" / chunks[3].name, chunks[3])
     with pytest.warns(UserWarning, match="is not used") as caught:
-        found = sampled(folder=tmp_path / "a")
-    told = [str(warning.message) for warning in caught]
-    assert len(told) == 3
-    assert all(path.name in message for path, message in zip(chunks[1:], told))
-    assert "computed again" in told[0]
-    assert "belongs to another run" in told[2]
-    assert found.resumed == 256
-    assert same(found, whole)
+        result = sampled(folder=tmp_path / "a")
+    messages = [str(warning.message) for warning in caught]
+    assert len(messages) == 3
+    assert all(path.name in message for path, message in zip(chunks[1:], messages))
+    assert "computed again" in messages[0]
+    assert "belongs to another run" in messages[2]
+    assert result.resumed == 256
+    assert same(result, whole)
     shutil.copy(chunks[1], chunks[2])
     with pytest.warns(UserWarning, match="it is chunk 1 of this run"):
         assert same(sampled(folder=tmp_path / "a"), whole)
@@ -460,9 +460,9 @@ def test_a_full_disk_is_told_and_costs_nothing(tmp_path, monkeypatch, whole):
         "manifest.json",
     ]
     monkeypatch.undo()
-    found = sampled(folder=tmp_path)
-    assert found.resumed == 512
-    assert same(found, whole)
+    result = sampled(folder=tmp_path)
+    assert result.resumed == 512
+    assert same(result, whole)
 
 
 def test_functions_are_known_by_source_and_closure():
@@ -498,9 +498,9 @@ monte_carlo(ji.Binary(1.0, order="earliest"), ji.chain([0.25, 1.0, 0.25]), [1.0,
     finally:
         process.kill()
         process.wait()
-    found = sampled(folder=tmp_path)
-    assert 512 <= found.resumed < 1000
-    assert same(found, whole)
+    result = sampled(folder=tmp_path)
+    assert 512 <= result.resumed < 1000
+    assert same(result, whole)
 
 
 # ----------------------------------------------------------------- sensitivity
@@ -560,18 +560,18 @@ def test_every_law_can_be_sampled(name):
         law = RandomLaw(law, restitution=Uniform(0.8, 0.9))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # some laws do not promise admissible outcomes
-        found = sampled(law=law, velocity=Normal([1.0, 0.0, -1.0], 0.1), samples=64, chunk=64)
-    assert found.count > 0
-    assert found.std.min() > 1e-3
-    law, scene, velocity = found.replay(3)
+        result = sampled(law=law, velocity=Normal([1.0, 0.0, -1.0], 0.1), samples=64, chunk=64)
+    assert result.count > 0
+    assert result.std.min() > 1e-3
+    law, scene, velocity = result.replay(3)
     alone = impact(law, scene, velocity)
-    np.testing.assert_allclose(alone.velocity, found.first["velocity"][3], atol=1e-9)
+    np.testing.assert_allclose(alone.velocity, result.first["velocity"][3], atol=1e-9)
 
 
 def test_progress_is_told_on_request(capfd):
     sampled(progress=True)
-    told = capfd.readouterr().err
-    assert "1,000 of 1,000 samples" in told
-    assert "/s" in told
+    progress = capfd.readouterr().err
+    assert "1,000 of 1,000 samples" in progress
+    assert "/s" in progress
     sampled()
     assert capfd.readouterr().err == ""

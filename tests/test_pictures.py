@@ -141,8 +141,8 @@ def advice():
         for name in names
     }
     none = np.zeros(2)
-    found = Advice("lzb", 0.01, False, "lzb", STRIKE, none, rows, (), none, (), 8, None)
-    return ji.plot.advice(found, "Three balls, stiffness unknown")
+    result = Advice("lzb", 0.01, False, "lzb", STRIKE, none, rows, (), none, (), 8, None)
+    return ji.plot.advice(result, "Three balls, stiffness unknown")
 
 
 def samples(gaps):
@@ -150,8 +150,8 @@ def samples(gaps):
     if not gaps:  # two equal balls of which one is struck with a random speed
         pair, speeds = ji.chain([1.0, 1.0]), ji.Uniform([1.0, 0.0], [2.0, 0.0])
         return ji.plot.monte_carlo(ji.monte_carlo(law, pair, speeds, **options))
-    found = ji.monte_carlo(law, BALLS, STRIKE, gaps=ji.Uniform(0.0, 1e-5), **options)
-    return ji.plot.monte_carlo(found, "gaps of micrometres")
+    result = ji.monte_carlo(law, BALLS, STRIKE, gaps=ji.Uniform(0.0, 1e-5), **options)
+    return ji.plot.monte_carlo(result, "gaps of micrometres")
 
 
 def rocking():
@@ -163,16 +163,16 @@ def rocking():
 
 
 def motion(kind):
-    system, found = rocked()
-    return getattr(ji.plot, kind)(found, title="dimer", system=system)
+    system, result = rocked()
+    return getattr(ji.plot, kind)(result, title="dimer", system=system)
 
 
 def outcomes(masses, wall):
     scene = ji.chain(masses, wall=wall)
     v = np.zeros(len(masses))
     v[0] = 1.0
-    found = ji.theory.admissible_set(scene, v)
-    return ji.plot.admissible_set(found, {"Newton's cradle": found.plastic, "at rest": 0 * v})
+    result = ji.theory.admissible_set(scene, v)
+    return ji.plot.admissible_set(result, {"Newton's cradle": result.plastic, "at rest": 0 * v})
 
 
 def region():
@@ -231,8 +231,8 @@ def texts(figure):
                 ticks |= labels
                 if axes.axison and low <= tick.get_loc() <= high:
                     drawn |= {label for label in labels if label.get_visible()}
-    every = figure.findobj(lambda x: isinstance(x, Text) and x.get_visible())
-    written = [x for x in every if x.get_text().strip() and (x not in ticks or x in drawn)]
+    all_texts = figure.findobj(lambda x: isinstance(x, Text) and x.get_visible())
+    written = [x for x in all_texts if x.get_text().strip() and (x not in ticks or x in drawn)]
     return [(x, x.get_window_extent(renderer)) for x in written]
 
 
@@ -263,12 +263,12 @@ def test_layout(name):
         assert drawn or axes.get_legend() is not None, "empty axes"
         if not axes.axison or axes.get_label() == "<colorbar>":
             continue
-        beside = axes.get_subplotspec()
+        place = axes.get_subplotspec()
         for label, axis in ((axes.get_xlabel(), "x"), (axes.get_ylabel(), "y")):
             ticks = getattr(axes, f"get_{axis}ticklabels")()
             silent = not any(tick.get_text() and tick.get_visible() for tick in ticks)
             categories = name == "correlation" or (axis == "y" and name == "stability_map")
-            assert silent or categories or labelled(label), (axis, label, beside)
+            assert silent or categories or labelled(label), (axis, label, place)
 
 
 def test_a_histogram_is_in_per_cent():

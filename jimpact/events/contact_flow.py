@@ -34,13 +34,24 @@ from jimpact.solvers.tridiagonal import tridiagonal_product
 
 OPEN, COMPRESSION, EXPANSION, SLACK = 0, 1, 2, 3
 
-SNAP = 1e-2  # of the tolerance: margins closer to 0 than that are 0
-NEGLIGIBLE = 0.1  # of the tolerance: an approach or a load below it does nothing more
-PATIENCE = 2000  # passes per contact after which an impact may end at WIDENED tolerances
+# The first two are in tolerances of velocity. Margins closer to 0 than SNAP are 0; ten times more
+# would move events by a tenth of the tolerance. An approach or a load below NEGLIGIBLE does nothing
+# more; ten times more would lose what the tolerance promises.
+SNAP = 1e-2
+NEGLIGIBLE = 0.1
+# Passes per contact after which an impact may end at WIDENED times the tolerance: some re-close so
+# often that they would not end. Ten times more passes: such impacts take ten times longer; ten
+# times wider: they end with errors of 1000 tolerances.
+PATIENCE = 2000
 WIDENED = 100.0
-DRAGGING = 100  # passes per contact, which few impacts need
-OFTEN = 8  # closings of a contact, from which on they may be endless
-LARGE = 6.0  # exponents below it that are whole or half are products
+# Passes per contact, which few impacts need, before endless closings are looked for; ten times
+# more: they are found later.
+DRAGGING = 100
+# Closings of a contact, from which on they may be endless, a power of 2: ten times more, found
+# later.
+OFTEN = 8
+# Whole and half exponents below it are products, not powers. Ten times more: longer products.
+LARGE = 6.0
 
 T = TypeVar("T")
 Exponent = float | tuple[float, ...] | jax.Array

@@ -34,16 +34,22 @@ from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
 
-# Derivatives are one or two digits worse than values at the same tolerance; at order 8 two digits
-# more cost a third more steps.
+# Tolerance of a run with derivatives, as a multiple of that of values: derivatives are one or two
+# digits worse at the same one. At order 8 these two digits cost a third more steps; ten times more
+# would lose one of them.
 GRADIENT_TIGHTENING = 0.01
-# Contacts so many times slower than the fastest see as many of its periods, whose errors add up.
+# A contact slower than the fastest by more than this factor sees many of its periods, whose errors
+# add up, so the tolerance falls with their number. Ten times more: it begins to fall too late.
 WIDE_SPREAD = 5.0
 METHODS = ("time", "impulse")
-# The tolerance of a second run that shows how well an outcome is conditioned, as a multiple of that
-# of the first one: APART coarser where the precision can hold none that is so much finer.
+# Tolerance of the second run that shows how well an outcome is conditioned, as a multiple of that
+# of the first one: FINER, or APART coarser where the precision allows none so fine. Ten times more:
+# runs that differ too little, or the error of a coarse one.
 FINER, APART = 0.01, 3.0
-ILL = 10.0  # rtol that two runs may differ by
+# Difference between the two runs, in `rtol`, from which on an outcome is ill-conditioned. Ten times
+# more: errors of 100 tolerances are not reported.
+ILL = 10.0
+DENSE_CHAIN = 4  # contacts up to which a dense product is faster than shifts by one contact
 
 
 class Problem(NamedTuple):
@@ -180,9 +186,6 @@ def flow_of(
     kind = FrictionFlow if len(slip) == m else SlipFlow
     frictional = kind(**parts, normal_tangent=normal_tangent, tangent=tangent, friction=friction)
     return frictional, *frictional.start_with(problem.gamma, x, slip)
-
-
-DENSE_CHAIN = 4  # contacts: up to so many a dense product is faster than shifts by one contact
 
 
 @dataclasses.dataclass(frozen=True)

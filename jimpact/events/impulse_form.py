@@ -17,7 +17,9 @@ from jimpact.solvers.sensitivity import both_modes
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
 from jimpact.status import CODE
 
-EMPTY = 1e-14  # energy below this part of the largest is rounding: the contact is unloaded
+# Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
+# Ten times more would unload contacts that still push.
+EMPTY = 1e-14
 
 
 class Rule(NamedTuple):

@@ -24,10 +24,15 @@ from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
 from jimpact.events.tangents import dual_like, pushforward, value_of
 from jimpact.status import CODE
 
-QUIET = 2.0  # tolerances, of a contact at rest once the rest of its bounces is neglected
-ENDLESS = 3  # a contact that re-closed so often and ends at rest was closing without end
-CHOICES = 8  # rounds of the search for the contacts that carry the remainder of a plastic limit
-# Of what the size of a state falls by its shape may change: at 1, anything that shrinks would do.
+# Velocity in tolerances, below which a contact that re-closed often is at rest once the rest of its
+# bounces is neglected. Ten times more: slow contacts of long chains count as plastic ones.
+QUIET = 2.0
+# Closings of a contact at rest, from which on they were endless; ten times more: not reported.
+ENDLESS = 3
+# Rounds of the search for the contacts that carry an impulse in the plastic limit; few change any.
+CHOICES = 8
+# Difference in shape between two states that are multiples of each other, as a part of what the
+# size falls by. Ten times more would end impacts whose states are not self-similar.
 SHAPE = 0.02
 
 

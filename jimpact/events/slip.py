@@ -36,18 +36,22 @@ from jimpact.solvers.friction import distribute
 
 STICKS, SLIPS, CREEPS = 0, 1, 2
 
-FLOOR = 1e-3  # of the tolerance: speed at which slip has stopped, and creep back ends
-REST = 1e-2  # of the tolerance: slower contacts are asked whether they stick when others stop
+# Speeds in tolerances: slip below FLOOR has stopped; contacts below REST may stick when others
+# stop. Ten times more would lose a hundredth, a tenth of the tolerance.
+FLOOR, REST = 1e-3, 1e-2
 # Creep ends where the rate c K_tt / r has fallen to tolerance^-1/2 / CREEP: its direction is wrong
-# by the square of r over that. At 1 some real impacts err by 60 tolerances; less costs no time.
+# by the square of r over that. Ten times more: some real impacts err by 60 tolerances.
 CREEP = 0.1
-RELAXES = 1.0  # rate at which the angle of creep returns to the corrected one
-# An explicit step of order 8 is stable up to 6 over the rate; values hide when it is longer,
-# derivatives do not.
+# Longest step, over the largest rate. A step of order 8 is stable up to 6; beyond, values do not
+# show it, derivatives do.
 STABLE = 4.0
-LOOSE = 1e-3  # most that errors of ln r and angle may be, however slow the slip
-SLOW_ANGLE = 1e-2  # square roots of the tolerance that the angle of creep, soon corrected, may err
-LEAST_STIFFNESS = 1e-10  # of the largest, where friction does not turn directions back at all
+# Errors that rows of slip may have: of ln r and angle, however slow the slip; of the angle of
+# creep, in square roots of the tolerance, as it is corrected soon. Ten times more: directions of
+# slow slip become visible in the velocities.
+LOOSE, SLOW_ANGLE = 1e-3, 1e-2
+# Added to the scaled matrix of creep, which is singular where friction does not turn directions
+# back. Ten times more would change regular directions by 1e-9.
+LEAST_STIFFNESS = 1e-10
 
 
 class Reduced(NamedTuple):
@@ -210,7 +214,7 @@ class SlipFlow(FrictionFlow):
         rate = jnp.stack(
             [
                 jnp.where(slips, over_r * grows, jnp.where(creeps, frozen.unit * grows, 0.0)),
-                jnp.where(slips, over_r * turns, drift + RELAXES * correction),
+                jnp.where(slips, over_r * turns, drift + correction),
             ],
             1,
         )

@@ -39,23 +39,41 @@ import numpy as np
 from jimpact.events.tableaux import DOP853
 from jimpact.events.tangents import Dual, dual_like, is_dual, pushforward, value_of
 
-GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8  # of the step-size control
-FIRST = 0.05  # first step, in the time of the fastest contact: none can turn around so soon
-RESTART = 0.1  # first rooted step after a contact has closed, as a part of the step before it
-CUT = 0.7  # part of the way to an event that a step is shortened to where it cannot land
-DOUBT = 0.01  # part of a step's change of slope that its minimum may lie lower than it seems
-SHORTEST = 1e-13  # step: a shorter one cannot be distinguished from none
-TIE = 1e-13  # of a step: events of one moment are taken in the order of their rows
+# Step-size control: a step is at most so many times, at least this part of the one before it, and
+# this part of what its error allows. More growth or less safety: more rejected steps.
+GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8
+# First step, in the time of the fastest contact, which cannot turn around so soon. Ten times more
+# could step over its first event.
+FIRST = 0.05
+# First rooted step after a contact has closed, as a part of the step before; ten times more:
+# rejected.
+RESTART = 0.1
+# Part of the way to an event that a step is shortened to where it cannot land on it. At 1 it ends
+# at the event and may step over it again.
+CUT = 0.7
+# Part of a step's change of slope by which its minimum may lie lower than its cubic. Ten times
+# more: steps are shortened for margins that do not dip.
+DOUBT = 0.01
+# Step that cannot be distinguished from none, in the flow's own time; ten times more gives up
+# earlier.
+SHORTEST = 1e-13
+# Part of a step within which events are simultaneous, and are taken in the order of their rows. Ten
+# times more is still far below the tolerance.
+TIE = 1e-13
 # Passes per contact at the full local tolerance, which ordinary impacts end within. Then it falls
 # with the number of passes, or the errors of N steps would add up to N tolerances.
 FULL = 30
-POLISH = 2  # Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3
-FINEST = 16  # roundings: an error estimate below them is noise
-COARSE = 0.3  # the error is no less than this part of the third-order estimate squared
-COARSE_ROUNDING = 64  # roundings of a state that is large itself: a wide gap
+# Newton steps to a root of the cubic of a step: from the chord they leave about 1e-3.
+POLISH = 2
+# Roundings: an error estimate below them is noise, and COARSE_ROUNDING of a state that is itself
+# large, behind a wide gap. Ten times more loosens the finest tolerances.
+FINEST, COARSE_ROUNDING = 16, 64
+# The error is no less than this part of the third-order estimate squared. Ten times more: steps
+# half as long.
+COARSE = 0.3
 
-# Accepted steps kept for the reverse mode: blocks of steps; where nothing is kept one is skipped.
-# An impact of more steps has no derivative there: NaN, whatever its status.
+# Accepted steps recorded for the reverse mode, in blocks; a block without a step is skipped. An
+# impact of more steps has no derivative there: NaN, whatever its status. Ten times more: memory.
 BLOCKS, BLOCK = 64, 16
 
 STAGES = len(DOP853.c)

@@ -376,7 +376,8 @@ def _single_contacts(advice: Advice, verb: str) -> str:
 
 def _has_friction(advice: Advice) -> bool:
     """Whether the laws have friction."""
-    return parameters_of(advice.law)["friction"].value is not None
+    friction = parameters_of(advice.law).get("friction")
+    return friction is not None and friction.value is not None
 
 
 def _reclosing(advice: Advice) -> str:

@@ -413,6 +413,8 @@ def advice(result: Advice, title: str = "") -> Figure:
     """
     check_kind("result", result, Advice)
     names, rows = list(result.candidates), list(result.candidates.values())
+    chain = result.scene.walls is not None
+    what, unit = ("body", "m/s") if chain else ("coordinate", "m/s, rad/s")
     bodies, x = len(result.velocity), np.arange(len(names))
     dodge = side_by_side(bodies)
     figure = new_figure(6.5)
@@ -422,7 +424,7 @@ def advice(result: Advice, title: str = "") -> Figure:
         v = np.array([c.velocity[i] for c in rows])
         range_ = np.array([[c.low[i], c.high[i]] for c in rows])
         top.vlines(x + dodge[i], range_[:, 0], range_[:, 1], color=colour, lw=4, alpha=0.4)
-        top.plot(x + dodge[i], v, "o", color=colour, label=f"body {i + 1}")
+        top.plot(x + dodge[i], v, "o", color=colour, label=f"{what} {i + 1}")
     worst = np.maximum([c.worst for c in rows], _FLOOR)
     colours = [COLOURS[2] if name == result.name else GREY for name in names]
     bottom.bar(x, worst, 0.5, color=colours, label="worst")
@@ -432,7 +434,7 @@ def advice(result: Advice, title: str = "") -> Figure:
     bottom.set_ylim(result.tolerance / 1000, 30)  # room above for the legend
     logarithmic(bottom, "y")
     bottom.set_ylabel("error of v+ (energy norm)")
-    top.set_ylabel("velocity after the impact [m/s]")
+    top.set_ylabel(f"velocity after the impact [{unit}]")
     named = [f"{name}{'' if c.usable else f' ({c.status})'}" for name, c in zip(names, rows)]
     bottom.set_xticks(x, [wrapped(name.replace(" ", "_")) for name in named], fontsize=SMALL)
     bottom.set_xlabel("law")

@@ -30,9 +30,10 @@ _BY_LOOP = 4
 # Columns up to which products are written out: a reduction does not fuse with what follows it. Ten
 # times more would make large programs of long chains.
 COLUMNS_WRITTEN_OUT = 8
-# With a unit diagonal a matrix of m rows counts as singular when it has an eigenvalue below this
-# multiple of its rounding errors, eps m. Ten times more: nearly parallel contacts are redundant.
-_SINGULAR = 100.0
+# With a unit diagonal a matrix of m rows counts as singular when it has an eigenvalue (singular
+# value) below this multiple of its rounding errors, eps m. Ten times more: nearly parallel contacts
+# are redundant.
+SINGULAR = 100.0
 # Parts of a matrix below this multiple of sqrt(eps) of its largest entry are none in its
 # pseudoinverse. Ten times more would drop small, regular parts.
 _NEGLIGIBLE_PART = 4.0
@@ -220,7 +221,7 @@ def null_projector(g: jax.Array) -> tuple[jax.Array, jax.Array]:
     Held constant in derivatives: a perturbation is taken to keep the rank.
     """
     eigenvalues, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(g))
-    null = eigenvalues < _SINGULAR * jnp.finfo(g.dtype).eps * g.shape[0]
+    null = eigenvalues < SINGULAR * jnp.finfo(g.dtype).eps * g.shape[0]
     basis = jnp.where(null[None, :], vectors, 0.0)
     return basis @ basis.T, jnp.any(null)
 

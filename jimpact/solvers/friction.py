@@ -19,24 +19,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.solvers.dense import block_inverse, load_shares, times
-from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.dense import SINGULAR, block_inverse, load_shares, times
+from jimpact.solvers.lcp import gathered_rounding, solve_lcp
 from jimpact.status import CODE
 
-ENUMERATED = 3  # contacts up to which all modes are tried
-_DIRECTIONS = 4  # of slip that each sliding contact in space is started with, evenly spread
+ENUMERATED = 3  # contacts up to which all modes are tried: 4^3 in the plane, 6^3 in space
+_DIRECTIONS = 4  # directions of slip, evenly spread, that each sliding contact in space starts from
 _ITERATIONS = 8  # of Newton's method for the directions of slip; 4 to 6 are usual
-_POWER = 2 / 3  # what a solve may gather in rounding, as in `lcp`: m eps^(2/3)
-_SINGULAR = 100.0  # singular values below this times eps n, of the largest, are zero
-_LEAST_SHARE = 1e-6  # of the largest mu p: a contact without load keeps a weight in the sharing
-_SWEEPS = 2000  # of the projected Gauss-Seidel iteration, at each of its tolerances
-_COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8  # tolerances of the sweeps; each is taken twice
+# Part of the largest mu p: the weight in the sharing of a contact without load. Ten times more: it
+# takes a visible share.
+_LEAST_SHARE = 1e-6
+# Projected Gauss-Seidel: sweeps at each tolerance; the coarsest tolerance, the factor to the next
+# finer one, and how many levels there are, each tolerance taken twice. Ten times more sweeps: slow
+# scenes end later.
+_SWEEPS = 2000
+_COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8
 # What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
-# contacts that reach their cone while others hold them: sweeps bring those to rest slowly.
+# contacts that reach their cone while others hold them: sweeps bring those to rest slowly. Ten
+# times more: contacts that slip are taken to stick, and the law is not satisfied.
 _ROOM, _SLOW_ROOM = 10.0, 100.0
-_RELAXATIONS = 200  # sweeps of `distribute` over the contacts, at most
-_SETTLED = 1e-13  # of the largest limit: a sweep of it that changes less is the last
-_INSIDE = 1e-9  # part of the limit below which a force is inside its disc, of a rate that is none
+# `distribute`: sweeps at most; part of the largest limit below which a sweep changes nothing; part
+# of the limit below which a force is inside its disc, or a rate is 0. Ten times more of the last
+# two: contacts on the rim of their cone stick.
+_RELAXATIONS = 200
+_SETTLED, _INSIDE = 1e-13, 1e-9
 
 
 class FrictionImpulses(NamedTuple):
@@ -59,7 +65,7 @@ class _FrictionProblem(NamedTuple):
     @property
     def tolerance(self) -> float:
         """Of what is satisfied, in parts of the size."""
-        return len(self.friction) * float(jnp.finfo(self.matrix.dtype).eps) ** _POWER
+        return gathered_rounding(len(self.friction), self.matrix.dtype)
 
 
 class _Modes(NamedTuple):
@@ -391,7 +397,7 @@ def _inverted(problem: _FrictionProblem, modes: _Modes, x: jax.Array) -> _Invert
     matrix, _ = _equations(problem, _turned(problem, modes, x[..., None]))
     weight = 1 / jnp.sqrt(_weights(problem, x))
     left, values, right = jnp.linalg.svd((matrix[..., 0] * weight[None, None]).reshape(n, n))
-    null = values <= _SINGULAR * n * float(jnp.finfo(x.dtype).eps) * values[0]
+    null = values <= SINGULAR * n * float(jnp.finfo(x.dtype).eps) * values[0]
     inverse = (right.T / jnp.where(null, 1.0, values)[None]) @ left.T
     return _Inverted(inverse, jnp.where(null[None], left, 0.0) @ right, weight, jnp.asarray(True))
 

@@ -5,7 +5,7 @@ support then gives values and derivatives of any order. At a kink (a contact abo
 impulse or to give one up) the derivatives are those of one side.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,11 +13,11 @@ import jax.numpy as jnp
 from jimpact.solvers.dense import null_projector
 from jimpact.status import CODE
 
-# The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Then
-_ROUNDING = 64.0  # entries below this times eps m are rounding: no pivot, a tie of two ratios
-_POWER = 2 / 3  # what a whole run may gather in rounding: m eps^(2/3). A larger artificial
-# variable left at the end means that there is no solution; a larger w that the contact is open
-_PIVOTS = 10  # pivots allowed per unknown, plus a few; 1 or 2 are usual
+# The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Entries below this times
+# eps m are rounding: no pivot, a tie of two ratios. Ten times more: small pivots are missed.
+_ROUNDING = 64.0
+_POWER = 2 / 3  # of eps: see `gathered_rounding`
+_PIVOTS = 10  # pivots allowed per unknown; 1 or 2 are usual
 
 
 class LCP(NamedTuple):
@@ -73,9 +73,13 @@ def solve_lcp(
     return LCP(z * scale * size, w / scale * size, code)
 
 
-def _gathered(b: jax.Array) -> float:
-    """Rounding that a whole run may gather."""
-    return b.shape[0] * float(jnp.finfo(b.dtype).eps) ** _POWER
+def gathered_rounding(unknowns: int, dtype: Any) -> float:
+    """Rounding m eps^(2/3) that a whole run may gather.
+
+    A larger artificial variable left at its end means that there is no solution; a larger w means
+    that the contact is open.
+    """
+    return unknowns * float(jnp.finfo(dtype).eps) ** _POWER
 
 
 def _solve_on(support: jax.Array, a: jax.Array, right: jax.Array) -> jax.Array:
@@ -93,12 +97,12 @@ def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, ja
     """
     m = b.shape[0]
     w = jax.lax.stop_gradient(a @ z + b)
-    tight = w <= _gathered(b)
+    tight = w <= gathered_rounding(len(b), b.dtype)
     both = tight[:, None] & tight[None, :]
     projector, singular = null_projector(jnp.where(both, a, jnp.eye(m, dtype=b.dtype)))
     rest = z - projector @ z
     # rounding of `rest` at zero must not start pivots
-    noise = jnp.abs(rest) <= _gathered(b) * jnp.abs(z).max()
+    noise = jnp.abs(rest) <= gathered_rounding(len(b), b.dtype) * jnp.abs(z).max()
     support, _ = _support(projector, jnp.where(noise, 0.0, jax.lax.stop_gradient(rest)))
     y = _solve_on(support, projector, -rest)
     return jnp.where(singular, rest + projector @ y, z), singular
@@ -135,7 +139,7 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     number = jnp.arange(m)
     support = needed & jnp.any(end.basis[:, None] == (m + number)[None, :], axis=0)
     left = jnp.max(jnp.where(end.basis == artificial, end.rows[:, -1], 0.0))
-    stuck = needed & (left > _gathered(b))
+    stuck = needed & (left > gathered_rounding(len(b), b.dtype))
     code = jnp.where(stuck, jnp.where(end.ray, CODE["infeasible"], CODE["max_steps"]), CODE["ok"])
     return support, code
 

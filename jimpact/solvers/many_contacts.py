@@ -17,8 +17,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-STEEPER = 1.5  # the largest eigenvalue is taken to be so much larger where a step shows it
-RELAX = 0.9  # and so much less at the beginning of the next problem
+# Factors of the steepness, the estimate of the largest eigenvalue: where a step shows that it is
+# too small, and at the beginning of the next problem. Further from 1: short steps, or steps taken
+# back.
+STEEPER, RELAX = 1.5, 0.9
 # Discs grow and shrink with p: full momentum may go round and round among them. So there is less
 # of it in each quarter of the iterations.
 MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
