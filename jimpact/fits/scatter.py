@@ -13,8 +13,8 @@ LEAST_SHOTS = 4  # of which the scatter of one number can be estimated
 SHOWN_FROM = 8  # shots from which a report gives it unasked
 SURE = 0.01  # chance at which scatter counts as shown
 _SMALLEST = 1e-4  # scatter looked for, in standard errors of one shot
-_LARGEST = 1e4
-_NO_CHANCE = 1e-15
+_LARGEST = 1e4  # likewise, the upper end of the search
+_NO_CHANCE = 1e-15  # smaller chances are rounding, and printed as "below"
 
 
 @dataclass(frozen=True, eq=False)
