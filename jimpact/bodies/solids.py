@@ -25,8 +25,8 @@ from jimpact.scene import check_mass
 UNIT_WITHIN = 1e-6
 _SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
 _SERIES = 1e-2  # squares of angles below it go through the series: there the formula is 0/0
-_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-_LEVEL = (0.0, 0.0, 1.0)
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
+_LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
 
 
 class Solid(Body):
