@@ -70,7 +70,7 @@ FINER = 0.1  # a wrong result is tried again at this part of its setting,
 FALLS = 0.5  # and stalls unless its error falls below this part
 BATCH = 32  # points computed together
 
-REFERENCE_RTOL = 1e-12
+REFERENCE_RTOL = 1e-12  # of the default method, the reference of all others
 CHECK_RTOL = 1e-11  # of the run by scipy
 CONFIRMED = 1e-7  # the reference is confirmed up to this difference of v+ from scipy's
 CHECKED = 12  # points solved by scipy, at most
@@ -95,7 +95,7 @@ _LONG, _CLUSTERED = 10, 0.9  # from this number of balls on, chains below this e
 _FAR = 100.0  # time scales are far apart from this ratio of the contacts' frequencies on
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 SLICES = ("one", "pairs")
-BALLS = (2, 3, 5, 10, 30, 100)
+BALLS = (2, 3, 5, 10, 30, 100)  # numbers of balls, of the axis N of the maps
 # Each number of balls is compiled by itself: below this resolution only a few.
 _FEW_BALLS, _FEW = (2, 3, 10), 8
 
