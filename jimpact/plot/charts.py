@@ -119,8 +119,7 @@ def _styles(points: Mapping[str, tuple[Point, ...]]) -> dict[str, dict[str, Any]
         }
     for number, name in enumerate(laws):
         marker = _LAW_MARKERS[number % len(_LAW_MARKERS)]
-        styles[name] = {"marker": marker, "ms": 10, "ls": "none", "color": GREY, "mfc": "none"}
-        styles[name] |= {"mew": 1.5}
+        styles[name] = {"marker": marker, "ms": 8, "ls": "none", "color": GREY, "mec": "white"}
     return styles
 
 
