@@ -171,8 +171,8 @@ def _which(fit: FitResult, name: str | None) -> int:
 def _weighted(fit: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals (R,) in units of sigma, their derivatives (R, P), shots (R,)."""
     problem, here = fit.problem, ~np.isnan(fit.problem.measured)
-    shot = np.broadcast_to(np.arange(len(here))[:, None], here.shape)[here]
-    return problem.independent(fit.residual)[here], problem.independent(fit.jacobian)[here], shot
+    residual, jacobian = problem.independent(fit.residual), problem.independent(fit.jacobian)
+    return residual[here], jacobian[here], problem.shot_of_value
 
 
 class _Model:
