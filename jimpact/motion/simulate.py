@@ -35,7 +35,7 @@ from jimpact.motion.dynamics import kinetic, potential
 from jimpact.motion.event_driven import MotionProblem, Past, empty_checkpoint, event_driven
 from jimpact.motion.flow import Course, Settings, check_rtol
 from jimpact.motion.record import MOTION_CODE, Events, Motion, joined
-from jimpact.motion.stepping import joins_step, recorded_gaps, time_stepping
+from jimpact.motion.stepping import recorded_gaps, time_stepping
 from jimpact.motion.system import System
 from jimpact.progress import progress_bar, waiting
 
@@ -162,7 +162,7 @@ def simulate(
     arguments: Any
     if method == "time_stepping":
         substeps = substeps_of(step, t_start, t_end, count)
-        joint = joins_step(law) and friction is None
+        joint = law.joins_step and friction is None
         check_stepped_law(system, law, q, joint)
         arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
         return _waited(_stepped, arguments, progress)
