@@ -184,6 +184,9 @@ def test_constants_are_complete_and_explained(pages, tmp_path):
         ("A", "1.0", "[m] above"), ("B", "2", "beside"), ("C", "3.0", ""),
     ]  # fmt: skip
     assert pages.unit_of("[m] above") == "m"
+    unexplained = [(path, name) for path, rows in pages.constants().items()
+                   for name, _, comment in rows if not comment]  # fmt: skip
+    assert not unexplained, "add a comment: unit, meaning, what ten times more would do"
     page = pages.constants_page()["constants.md"]
     for path in (ROOT / "jimpact").rglob("*.py"):
         if path.name == "tableaux.py":

@@ -942,6 +942,17 @@ def test_report_and_json(rank_2_of_3):
     assert told["shots"] == ["1"]
 
 
+def test_one_number_can_be_fitted():
+    """An observable of shape (): e^2 = .49 +- .001, so e = .7 +- .001 / (2 e)."""
+    problem = ji.FitProblem.from_observable(
+        ji.Newton(0.9), lambda law: law.restitution**2, 0.49, 0.001
+    )
+    fit = ji.fit(problem, starts=1)
+    np.testing.assert_allclose(fit.value, [0.7], atol=1e-6)
+    np.testing.assert_allclose(fit.standard_error, [0.001 / 1.4], rtol=1e-4)
+    assert "1 measured values" in str(fit)
+
+
 def test_no_degree_of_freedom_leaves_errors_unknown():
     data = ji.Experiments([1.0, 0.0], [np.nan, 0.6])
     found = ji.fit(ji.Newton(0.9), PAIR, data, starts=1)

@@ -236,7 +236,7 @@ def test_a_page_of_something_else_than_shots(tmp_path):
             lambda: ji.REGISTRY["velocity_dependent"].build(
                 base="newton", restitution=0.9, stiffness=1.0
             ),
-            "newton has none",
+            "newton does not have it",
         ),
     ],
 )

@@ -24,7 +24,7 @@ from jimpact.bodies.polygons import Cornered, Disc
 _PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
 
 
-class Contacts(NamedTuple):
+class PlanarContacts(NamedTuple):
     """Of the m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
 
     gap: jax.Array  # (m,)
@@ -95,10 +95,10 @@ class PlanarBodies(Body):
         for body in self.bodies:
             if not isinstance(body, OnGround):
                 raise TypeError(f"Argument `bodies` must hold planar bodies, but holds {body!r}.")
-        every = [_plane(plane) for plane in planes]
-        self.planes = jnp.stack(every) if every else jnp.zeros((0, 2))
+        rows = [_plane(plane) for plane in planes]
+        self.planes = jnp.stack(rows) if rows else jnp.zeros((0, 2))
         counts = [body.points.shape[0] for body in self.bodies]
-        ground = [(b, -1) for _ in every for b, count in enumerate(counts) for _ in range(count)]
+        ground = [(b, -1) for _ in rows for b, count in enumerate(counts) for _ in range(count)]
         self.pairs = _sorted_pairs(self.bodies, pairs, at)
         self.between = (*ground, *self.pairs.between)
         if not self.between:
@@ -118,18 +118,18 @@ class PlanarBodies(Body):
         """`V = g sum m_i y_i`."""
         return planar_weight(self.mass, acceleration)
 
-    def contacts(self, q: jax.Array) -> Contacts:
+    def contacts(self, q: jax.Array) -> PlanarContacts:
         """Gaps, points and normals at q (3 b,); `between` says of which bodies."""
-        places, found = self._places(q), []
+        places, parts = self._places(q), []
         if self.planes.shape[0]:
-            found.append(self._on_planes(places))
+            parts.append(self._on_planes(places))
         if self.pairs.discs:
-            found.append(_discs(places, np.array(self.pairs.discs)))
+            parts.append(_discs(places, np.array(self.pairs.discs)))
         for polygon, discs in self.pairs.rolling:
-            found.append(_disc_on_polygon(places, np.array(discs), polygon))
+            parts.append(_disc_on_polygon(places, np.array(discs), polygon))
         if self.pairs.sides:
-            found.append(_facing_sides(places, self.pairs.sides))
-        return Contacts(*(jnp.concatenate(parts) for parts in zip(*found)))
+            parts.append(_facing_sides(places, self.pairs.sides))
+        return PlanarContacts(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f(q) (m,) [m]."""
@@ -137,17 +137,17 @@ class PlanarBodies(Body):
 
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (3 b, m): how fast body 1 slides along body 2, to the right of the normal."""
-        found, middle = self.contacts(q), q.reshape(-1, 3)[:, :2]
-        along = jnp.stack([found.normal[:, 1], -found.normal[:, 0]], axis=1)
+        contacts, middle = self.contacts(q), q.reshape(-1, 3)[:, :2]
+        tangent = jnp.stack([contacts.normal[:, 1], -contacts.normal[:, 0]], axis=1)
         first, second = np.array(self.between).T
         columns = np.arange(len(first))
         out = jnp.zeros((len(self.bodies), 3, len(first)), q.dtype)
         for body, sign in ((first, 1.0), (second, -1.0)):
-            there = body >= 0
-            lever = found.point - middle[body]
-            turn = lever[:, :1] * along[:, 1:] - lever[:, 1:] * along[:, :1]
-            rows = sign * jnp.concatenate([along, turn], axis=1)[there]
-            out = out.at[body[there], :, columns[there]].add(rows)
+            moves = body >= 0  # planes do not
+            lever = contacts.point - middle[body]
+            turn = lever[:, :1] * tangent[:, 1:] - lever[:, 1:] * tangent[:, :1]
+            rows = sign * jnp.concatenate([tangent, turn], axis=1)[moves]
+            out = out.at[body[moves], :, columns[moves]].add(rows)
         return out.reshape(-1, len(first))
 
     def valid(self, q: jax.Array) -> jax.Array:
@@ -157,8 +157,8 @@ class PlanarBodies(Body):
             i, j = np.array(self.pairs.discs).T
             room.append(_length(places.middle[i] - places.middle[j])[0])
         for polygon, discs in self.pairs.rolling:
-            found = _disc_on_polygon(places, np.array(discs), polygon)
-            room.append(found.gap + places.rim[np.array(discs)])
+            contacts = _disc_on_polygon(places, np.array(discs), polygon)
+            room.append(contacts.gap + places.rim[np.array(discs)])
         room += [_overlap(places, *pair)[None] for pair in self.pairs.sides]
         return jnp.min(jnp.concatenate(room))
 
@@ -189,6 +189,7 @@ class PlanarBodies(Body):
         return np.asarray(self.planes).tolist()
 
     def _places(self, q: jax.Array) -> "_Places":
+        """Contact points and corners at q (3 b,)."""
         at = q.reshape(-1, 3)
         counts = np.array([body.points.shape[0] for body in self.bodies])
         owner = np.repeat(np.arange(len(counts)), counts)
@@ -201,13 +202,14 @@ class PlanarBodies(Body):
         }
         return _Places(owner, points, points[np.cumsum(counts) - counts], rim, polygons)
 
-    def _on_planes(self, places: "_Places") -> Contacts:
+    def _on_planes(self, places: "_Places") -> PlanarContacts:
+        """Contacts of all points with all planes."""
         a, offset = self.planes.T
         n = jnp.stack([-jnp.sin(a), jnp.cos(a)], axis=1)[:, None]
         height = jnp.sum(n * places.points[None], axis=2) - offset[:, None]
         point = places.points[None] - height[..., None] * n
         gap, normal = height - places.rim[places.owner][None], jnp.broadcast_to(n, point.shape)
-        return Contacts(gap.reshape(-1), point.reshape(-1, 2), normal.reshape(-1, 2))
+        return PlanarContacts(gap.reshape(-1), point.reshape(-1, 2), normal.reshape(-1, 2))
 
 
 Side = tuple[int, int]  # of which body, and which
@@ -228,6 +230,8 @@ class _Pairs(NamedTuple):
 
 
 class _Places(NamedTuple):
+    """Bodies where they are."""
+
     owner: np.ndarray  # (p,) body of each contact point
     points: jax.Array  # (p, 2)
     middle: jax.Array  # (b, 2) first contact point: the middle of a disc
@@ -250,6 +254,7 @@ def _length(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Scalar products (..)."""
     return jnp.sum(a * b, axis=-1)
 
 
@@ -258,41 +263,46 @@ def _outward(side: jax.Array) -> jax.Array:
     return jnp.stack([side[..., 1], -side[..., 0]], axis=-1) / jnp.sqrt(_dot(side, side))[..., None]
 
 
-def _discs(places: _Places, pairs: np.ndarray) -> Contacts:
+def _discs(places: _Places, pairs: np.ndarray) -> PlanarContacts:
+    """One contact for each pair (g, 2) of discs."""
     i, j = pairs.T
     length, n = _length(places.middle[i] - places.middle[j])
     gap = length - places.rim[i] - places.rim[j]
-    return Contacts(gap, places.middle[j] + (places.rim[j] + 0.5 * gap)[:, None] * n, n)
+    return PlanarContacts(gap, places.middle[j] + (places.rim[j] + 0.5 * gap)[:, None] * n, n)
 
 
-def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> Contacts:
+def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> PlanarContacts:
     """Distances of discs from a polygon: from a side, or, beyond its ends, from a corner."""
     begin, middle = places.polygons[polygon], places.middle[discs]
     side = jnp.roll(begin, -1, axis=0) - begin
     normals = _outward(side)
     heights = jnp.sum((middle[:, None] - begin[None]) * normals[None], axis=2)
     nearest = jnp.argmax(heights, axis=1)  # outside, its side or one of its ends is the nearest
-    a, along, n = begin[nearest], side[nearest], normals[nearest]
-    share = _dot(middle - a, along) / _dot(along, along)
+    a, tangent, n = begin[nearest], side[nearest], normals[nearest]
+    share = _dot(middle - a, tangent) / _dot(tangent, tangent)
     beyond = (share < 0) | (share > 1)
-    corner = a + jnp.where(share > 1, 1.0, 0.0)[:, None] * along
+    corner = a + jnp.where(share > 1, 1.0, 0.0)[:, None] * tangent
     length, toward = _length(middle - corner)
     n = jnp.where(beyond[:, None], toward, n)
     away = jnp.where(beyond, length, jnp.max(heights, axis=1))
-    return Contacts(away - places.rim[discs], middle - away[:, None] * n, n)
+    return PlanarContacts(away - places.rim[discs], middle - away[:, None] * n, n)
 
 
-def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> Contacts:
+def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> PlanarContacts:
     """Two contacts a pair, at the begin and at the end of the first body's side."""
 
     def ends(which: int) -> tuple[jax.Array, jax.Array]:
-        found = [_side(places, pair[which]) for pair in pairs]
-        return jnp.stack([x for x, _ in found]), jnp.stack([x for _, x in found])
+        """Begins and ends (g, 2) of the sides of the first or second bodies."""
+        sides = [_side(places, pair[which]) for pair in pairs]
+        return jnp.stack([x for x, _ in sides]), jnp.stack([x for _, x in sides])
 
     (a_begin, a_end), (b_begin, b_end) = ends(0), ends(1)
     n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)
 
-    def at_end(a: jax.Array, other_a: jax.Array, b: jax.Array, other_b: jax.Array) -> Contacts:
+    def at_end(
+        a: jax.Array, other_a: jax.Array, b: jax.Array, other_b: jax.Array
+    ) -> PlanarContacts:
+        """Contacts at the ends a (g, 2) of first sides, which face the ends b of second ones."""
         side = other_a - a
         share = _dot(side, b - a) / _dot(side, side)
         over = _dot(b - other_b, a - b) > 0  # a overhangs: b is under the side, or beyond it
@@ -305,14 +315,15 @@ def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> Cont
         gap = jnp.where(by_end, apart, jnp.where(by_side, _dot(n_a, b - a), _dot(n_b, a - b)))
         n = jnp.where(by_end[:, None], toward, jnp.where(by_side[:, None], -n_a, n_b))
         point = jnp.where(by_end[:, None], 0.5 * (end + b), jnp.where(by_side[:, None], b, a))
-        return Contacts(gap, point, n)
+        return PlanarContacts(gap, point, n)
 
     both = (at_end(a_begin, a_end, b_end, b_begin), at_end(a_end, a_begin, b_begin, b_end))
     gap, point, n = (jnp.stack(parts, axis=1) for parts in zip(*both))
-    return Contacts(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
+    return PlanarContacts(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
 
 
 def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
+    """Its begin and its end (2,)."""
     corners, begin = places.polygons[side[0]], side[1]
     return corners[begin], corners[(begin + 1) % corners.shape[0]]
 
@@ -321,15 +332,15 @@ def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
     """Margin () [m] of the gaps of two sides, see `PlanarBodies`."""
     (a_begin, a_end), (b_begin, b_end) = _side(places, first), _side(places, second)
     n = _outward(b_end - b_begin)
-    along = jnp.stack([-n[1], n[0]])  # from begin to end
+    tangent = jnp.stack([-n[1], n[0]])  # from begin to end
     corners = places.polygons[first[0]]
     others = [
         c for c in range(corners.shape[0]) if c not in (first[1], (first[1] + 1) % len(corners))
     ]
     beyond = jnp.min((corners[np.array(others)] - b_begin[None]) @ n)
-    facing = along @ (a_begin - a_end)
-    shared = jnp.minimum(along @ (a_begin - b_end), 0.0) + along @ (b_end - b_begin)
-    shared = shared - jnp.maximum(along @ (a_end - b_begin), 0.0)
+    facing = tangent @ (a_begin - a_end)
+    shared = jnp.minimum(tangent @ (a_begin - b_end), 0.0) + tangent @ (b_end - b_begin)
+    shared = shared - jnp.maximum(tangent @ (a_end - b_begin), 0.0)
     above = jnp.minimum((a_begin - b_begin) @ n, (a_end - b_begin) @ n)
     n_a = _outward(a_end - a_begin)
     apart = jnp.maximum(above, jnp.minimum((b_begin - a_begin) @ n_a, (b_end - a_begin) @ n_a))
@@ -341,14 +352,15 @@ def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
 
 def _plane(plane: Any) -> jax.Array:
     """(angle, offset) of an angle, or of both."""
-    found = as_float_array("planes", plane)
-    found = jnp.stack([found, jnp.zeros_like(found)]) if found.ndim == 0 else found
-    check_shape("planes", found, (2,), "an angle, or an angle and an offset, of each")
-    check_values("planes", found)
-    return found
+    row = as_float_array("planes", plane)
+    row = jnp.stack([row, jnp.zeros_like(row)]) if row.ndim == 0 else row
+    check_shape("planes", row, (2,), "an angle, or an angle and an offset, of each")
+    check_values("planes", row)
+    return row
 
 
 def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at: Any) -> _Pairs:
+    """Pairs by the shapes of their bodies."""
     if pairs is None:
         shapes = [b for b, body in enumerate(bodies) if isinstance(body, Cornered | Disc)]
         pairs = [(i, j) for i in shapes for j in shapes if i > j]
@@ -372,6 +384,7 @@ def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at:
 
 
 def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:
+    """The body of one half of a pair."""
     body = entry if np.ndim(entry) == 0 else entry[0]
     if not 0 <= body < len(bodies):
         raise ValueError(
@@ -386,6 +399,7 @@ def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:
 
 
 def _polygon(bodies: tuple[OnGround, ...], which: int) -> Cornered:
+    """The body of this number, which has corners."""
     body = bodies[which]
     assert isinstance(body, Cornered)
     return body
@@ -414,6 +428,7 @@ def _sides_of(
     check_values("at", q)
 
     def shape(which: int) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of a body and outward normals of its sides (k, 2)."""
         body = _polygon(bodies, which)
         corners = _placed(body.corners[np.array(body.ring)], q.reshape(-1, 3)[which][None])
         return np.asarray(corners), np.asarray(_outward(jnp.roll(corners, -1, axis=0) - corners))

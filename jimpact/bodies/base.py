@@ -12,10 +12,12 @@ from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.scene import Scene, check_mass
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
-CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0
-_ROUNDINGS = 16  # of the largest coordinate: a gap that small is zero, in float32 too
+CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too
+# Of the largest coordinate: a gap that small is zero, in float32 too. Ten times more would close
+# gaps that single precision can still tell from 0.
+_ROUNDINGS = 16
 
-_AROUND = np.linspace(0, 2 * np.pi, 49)
+_AROUND = np.linspace(0, 2 * np.pi, 49)  # [rad] corners of a drawn circle
 CIRCLE = np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=1)  # outline of a ball of radius 1
 
 Potential = Callable[[jax.Array], jax.Array]  # q (n,) -> V () [J]
@@ -129,6 +131,7 @@ class Body(eqx.Module):
             return jnp.zeros_like(v)
 
         def momentum(x: jax.Array) -> jax.Array:
+            """`M(x) v` (n,)."""
             mass = self.mass_matrix(x)
             return mass * v if mass.ndim == 1 else mass @ v
 
@@ -429,9 +432,17 @@ class OnGround(Body):
 
     Equation: contact i is a circle of radius r about the point c_i of the body,
     `f_i = y + (R(theta) c_i)_y - r`, its lowest point slides at the rate of
-    `x + (R(theta) c_i)_x + r theta`. A body of this kind gives `points` (m, 2), `mass` and, unless
-    it is 0, `rim`.
+    `x + (R(theta) c_i)_x + r theta`. A body of this kind gives `points` (m, 2), `total_mass` [kg],
+    `inertia` [kg m^2] and, unless it is 0, `rim`.
     """
+
+    total_mass: eqx.AbstractVar[jax.Array]
+    inertia: eqx.AbstractVar[jax.Array]
+
+    @property
+    def mass(self) -> jax.Array:
+        """M = diag(m, m, I)."""
+        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
 
     @property
     def points(self) -> jax.Array:
@@ -500,7 +511,7 @@ def inertia_of(inertia: Any, homogeneous: Any, centre: Any) -> Any:
     return homogeneous
 
 
-_AZIMUTH, _ELEVATION = np.deg2rad(30.0), np.deg2rad(20.0)  # from where bodies in space are seen
+_AZIMUTH, _ELEVATION = np.deg2rad(30.0), np.deg2rad(20.0)  # of the view of bodies in space
 _SCREEN = np.array(
     [
         [np.cos(_AZIMUTH), np.sin(_AZIMUTH), 0.0],

@@ -57,21 +57,16 @@ class Dimer(OnGround):
         """Distance of a sphere's centre from the middle, L/2 + R."""
         return 0.5 * self.length + self.radius
 
-    @property
-    def total_mass(self) -> jax.Array:
+    @property  # type: ignore[misc]
+    def total_mass(self) -> jax.Array:  # type: ignore[override]
         """Of both spheres and the rod."""
         return 2 * self.sphere_mass + self.rod_mass
 
-    @property
-    def inertia(self) -> jax.Array:
+    @property  # type: ignore[misc]
+    def inertia(self) -> jax.Array:  # type: ignore[override]
         """About an axis through the middle, across the rod."""
         sphere = self.sphere_mass * (0.4 * self.radius**2 + self.arm**2)
         return 2 * sphere + self.rod_mass * self.length**2 / 12
-
-    @property
-    def mass(self) -> jax.Array:
-        """M = diag(m, m, I)."""
-        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
 
     @property
     def rim(self) -> jax.Array:
@@ -139,6 +134,7 @@ class SpatialDimer(Body):
         return LinearPotential(self.planar.total_mass * up * acceleration)
 
     def _mass(self, q: jax.Array) -> jax.Array:
+        """M(q) (6, 6)."""
         body = self.planar
         about_axis = 0.8 * body.sphere_mass * body.radius**2
         sine, cosine = jnp.sin(q[4]), jnp.cos(q[4])
@@ -165,6 +161,7 @@ class SpatialDimer(Body):
         """H_t (6, 4): x and y of sphere 1, x and y of sphere 2."""
 
         def ends(q: jax.Array) -> jax.Array:
+            """x, y of both centres (4,)."""
             level = self.planar.arm * jnp.cos(q[4])
             way = level * jnp.stack([jnp.cos(q[3]), jnp.sin(q[3])])
             return jnp.concatenate([q[:2] + way, q[:2] - way])

@@ -17,11 +17,9 @@ _FULL_TURN = 1e-6  # [rad] rounding of the angles of a polygon; ten times more w
 class Cornered(OnGround):
     """A convex body with sharp corners: `corners` (k, 2) from the centre of mass, and their `ring`.
 
-    Contacts are its `points`, all corners where nothing else is said.
+    Contacts are its `points`, by default all corners.
     """
 
-    total_mass: eqx.AbstractVar[jax.Array]
-    inertia: eqx.AbstractVar[jax.Array]
     ring: eqx.AbstractVar[tuple[int, ...]]  # corners in counter-clockwise order
 
     @property
@@ -33,11 +31,6 @@ class Cornered(OnGround):
     def points(self) -> jax.Array:
         """The corners."""
         return self.corners
-
-    @property
-    def mass(self) -> jax.Array:
-        """M = diag(m, m, I)."""
-        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
 
     def inner_radius(self) -> jax.Array:
         """Distance of the centre of mass from the nearest side [m]."""
@@ -56,7 +49,7 @@ class Polygon(Cornered):
 
     Equation: `f_i = y + (R(theta) c_i)_y`, c_i corner i from the centre of mass; tangents are the
     corners' positions along the ground, `x + (R(theta) c_i)_x`. One contact a corner, in the order
-    given: a polygon may land on any side, and no gap function ends anywhere.
+    given: a polygon may land on any side, and its gap function holds everywhere.
 
     Args:
         corners: (k, 2) around the polygon, k >= 3, in a frame of its own [m]. Traced ones must
@@ -150,11 +143,6 @@ class Disc(OnGround):
         self.inertia = positive("inertia", inertia)
 
     @property
-    def mass(self) -> jax.Array:
-        """M = diag(m, m, I)."""
-        return jnp.stack([self.total_mass, self.total_mass, self.inertia])
-
-    @property
     def points(self) -> jax.Array:
         """The middle (1, 2)."""
         return self.middle[None, :]
@@ -170,6 +158,7 @@ class Disc(OnGround):
 
 
 def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Cross products (k,) of vectors (k, 2) in the plane."""
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 

@@ -25,8 +25,8 @@ from jimpact.scene import check_mass
 UNIT_WITHIN = 1e-6
 _SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
 _SERIES = 1e-2  # squares of angles below it go through the series: there the formula is 0/0
-_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
-_LEVEL = (0.0, 0.0, 1.0)
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
+_LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
 
 
 class Solid(Body):
@@ -159,9 +159,9 @@ class Solid(Body):
 
     def _drawn(self, q: np.ndarray, curve: np.ndarray) -> list[np.ndarray]:
         """A curve (k, 3) of the body in projection, and its shadow."""
-        seen = q[:3] + curve @ np.asarray(rotation(jnp.asarray(q))).T
+        placed = q[:3] + curve @ np.asarray(rotation(jnp.asarray(q))).T
         n = np.asarray(self.normal)
-        return [projected(seen), projected(seen - np.outer(seen @ n, n))]
+        return [projected(placed), projected(placed - np.outer(placed @ n, n))]
 
 
 class Box(Solid):
@@ -232,8 +232,8 @@ class Box(Solid):
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Its edges and their shadow, in projection."""
         signs = np.array([*itertools.product((-0.5, 0.5), repeat=3)])
-        every = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]  # a way along all edges
-        return self._drawn(q, (np.asarray(self.middle) + signs * np.asarray(self.sizes))[every])
+        way = [0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4]  # a way along all edges
+        return self._drawn(q, (np.asarray(self.middle) + signs * np.asarray(self.sizes))[way])
 
 
 class Sphere(Solid):
@@ -321,13 +321,15 @@ def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _vector(name: str, value: Any) -> jax.Array:
-    found = as_float_array(name, value)
-    check_shape(name, found, (3,), "a vector in space")
-    check_values(name, found)
-    return found
+    """A finite vector (3,)."""
+    vector = as_float_array(name, value)
+    check_shape(name, vector, (3,), "a vector in space")
+    check_values(name, vector)
+    return vector
 
 
 def _unit(quaternion: Any) -> jax.Array:
+    """A quaternion (4,) of length 1."""
     e = as_float_array("quaternion", quaternion)
     check_shape("quaternion", e, (4,), "scalar first")
     check_values("quaternion", e)
@@ -339,19 +341,20 @@ def _unit(quaternion: Any) -> jax.Array:
 
 
 def _inertia(value: Any) -> jax.Array:
-    found = as_float_array("inertia", value)
-    if found.shape not in ((3,), (3, 3)):
-        raise ValueError(f"Argument `inertia` must have shape (3,) or (3, 3), not {found.shape}.")
-    if is_traced(found):
-        return found
+    """Moments of inertia (3,), or their matrix (3, 3), that some body has [kg m^2]."""
+    inertia = as_float_array("inertia", value)
+    if inertia.shape not in ((3,), (3, 3)):
+        raise ValueError(f"Argument `inertia` must have shape (3,) or (3, 3), not {inertia.shape}.")
+    if is_traced(inertia):
+        return inertia
     try:
-        check_mass(found)
+        check_mass(inertia)
     except ValueError as error:
         raise ValueError(str(error).replace("`mass`", "`inertia`").replace("M ", "I ")) from None
-    least = np.sort(found if found.ndim == 1 else np.linalg.eigvalsh(found))
+    least = np.sort(inertia if inertia.ndim == 1 else np.linalg.eigvalsh(inertia))
     if least[2] > (1 + _SLACK) * (least[0] + least[1]):
         raise ValueError(
             "Argument `inertia` must have principal moments none of which is more than the sum of "
             f"the others, but has {least.tolist()}."
         )
-    return found
+    return inertia

@@ -43,7 +43,7 @@ NEGLIGIBLE = 0.1
 # often that they would not end. Ten times more passes: such impacts take ten times longer; ten
 # times wider: they end with errors of 1000 tolerances.
 PATIENCE = 2000
-WIDENED = 100.0
+WIDENED = 100.0  # tolerances, at which an impact may end after PATIENCE passes
 # Passes per contact, which few impacts need, before endless closings are looked for; ten times
 # more: they are found later.
 DRAGGING = 100

@@ -19,8 +19,8 @@ UNITS = {  # of velocities, in m/s or rad/s
     "deg/s": np.pi / 180,
 }
 LINEAR, ANGULAR = "m/s", "rad/s"  # the units after reading
-_LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}
-_ANGLES = {"rad": 1.0, "deg": np.pi / 180}
+_LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "um": 1e-6}  # [m], by unit
+_ANGLES = {"rad": 1.0, "deg": np.pi / 180}  # [rad], by unit
 _KINDS = {  # of columns, with their units
     **dict.fromkeys(("pre", "post", "sigma", "sigma_pre", "resolution"), UNITS),
     "mass": {"kg": 1.0, "g": 0.001},

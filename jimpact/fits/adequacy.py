@@ -47,12 +47,10 @@ def unusable(problem: FitProblem, solution: SearchResult) -> np.ndarray:
 def weighted(problem: FitProblem, solution: SearchResult) -> Weighted:
     """Residuals and derivatives as the tests need them."""
     here = ~np.isnan(problem.measured)
-    rows = np.arange(len(here)) if here.ndim else np.zeros(1, int)
-    shot = np.broadcast_to(rows.reshape(-1, *(1,) * (here.ndim - 1)), here.shape)
     return Weighted(
         problem.independent(problem.measured - solution.predicted)[here],
         problem.size * solution.jacobian[here.ravel()],
-        shot[here],
+        problem.shot_of_value,
     )
 
 

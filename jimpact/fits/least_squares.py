@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Evaluate = Callable[[jax.Array], tuple[jax.Array, jax.Array, Any]]
 Method: TypeAlias = "str | optax.GradientTransformation"
 
+# Steps of one start before the solver gives up: more only costs time.
 DEFAULT_STEPS = {"levenberg-marquardt": 100, "lbfgs": 100, "adam": 500, "sgd": 1000}
 
 # Done when an undamped Gauss-Newton step promises less than this share of the sum of squares:

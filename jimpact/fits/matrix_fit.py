@@ -251,25 +251,15 @@ def matrix_region(
     if not scenes or not encloses(law, scenes[0].contacts):
         return None
     assert isinstance(law, RestitutionMatrix)
-    m, dtype = scenes[0].contacts, law.matrix.dtype
-    inverse, closed = _inverses(scenes)
+    dtype = law.matrix.dtype
     used = np.any(mix != 0, axis=0)
     ends = bounds if np.isfinite(bounds[:, used]).any() else None
     start = jnp.asarray(_start(law.matrix, origin, mix), dtype)
-    all_move = jnp.ones((1 + len(inverse)) * m * m + (0 if ends is None else ends.size), bool)
-    region = AdmissibleMatrices(
-        origin=jnp.asarray(origin, dtype),
-        map=jnp.asarray(mix, dtype),
-        inverse=jnp.asarray(inverse, dtype),
-        closed=jnp.asarray(closed, dtype),
-        bounds=None if ends is None else jnp.asarray(ends, dtype),
-        center=start,
-        moving=all_move,
-    )
+    region = _region(scenes, dtype, origin, mix, ends, start)
     slack, rows = _host_conditions(region, start)
     _check_start(region, slack)
     moving = np.any(rows[:, used] != 0, axis=1) & np.isfinite(slack)
-    region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(all_move)]))
+    region = eqx.tree_at(lambda r: r.moving, region, jnp.asarray(moving[: len(region.moving)]))
     return eqx.tree_at(lambda r: r.center, region, _center(region, slack, rows, moving))
 
 
@@ -291,16 +281,7 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
 
     m = scenes[0].contacts
     dtype = scenes[0].mass.dtype
-    inverse, closed = _inverses(scenes)
-    region = AdmissibleMatrices(
-        origin=jnp.zeros(m * m, dtype),
-        map=jnp.eye(m * m, dtype=dtype),
-        inverse=jnp.asarray(inverse, dtype),
-        closed=jnp.asarray(closed, dtype),
-        bounds=None,
-        center=jnp.zeros(m * m, dtype),
-        moving=jnp.ones((1 + len(inverse)) * m * m, bool),
-    )
+    region = _region(scenes, dtype, np.zeros(m * m), np.eye(m * m), None, np.zeros(m * m))
     e, planes = 0.5 * np.eye(m).ravel(), np.zeros((0, m * m + 2))
     for _ in range(_CUTS):
         slack, rows = _host_conditions(region, e)
@@ -322,6 +303,28 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
     raise ValueError(
         "Argument `scene` must have an admissible restitution matrix to start from, but none was "
         "found: give one, or RestitutionMatrix(matrix, admissible=False)."
+    )
+
+
+def _region(
+    scenes: list[Scene],
+    dtype: Any,
+    origin: np.ndarray,
+    mix: np.ndarray,
+    bounds: np.ndarray | None,
+    center: Any,
+) -> AdmissibleMatrices:
+    """The region of these scenes, all of whose conditions count as depending on y."""
+    inverse, closed = _inverses(scenes)
+    count = inverse[0].size * (1 + len(inverse)) + (0 if bounds is None else bounds.size)
+    return AdmissibleMatrices(
+        origin=jnp.asarray(origin, dtype),
+        map=jnp.asarray(mix, dtype),
+        inverse=jnp.asarray(inverse, dtype),
+        closed=jnp.asarray(closed, dtype),
+        bounds=None if bounds is None else jnp.asarray(bounds, dtype),
+        center=jnp.asarray(center, dtype),
+        moving=jnp.ones(count, bool),
     )
 
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _VECTORS = 400  # values up to which a picture is drawn in vectors; beyond, points outweigh pixels
-_DPI = 110
+_DPI = 110  # pixels per inch of pictures with too many points for vectors
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
 .verdict { font-size: 1.2rem; border-left: .3rem solid #0072B2; padding-left: .8rem; }

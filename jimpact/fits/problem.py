@@ -376,6 +376,12 @@ class FitProblem:
         return -0.5 * squares - float(np.sum(constant))
 
     @property
+    def shot_of_value(self) -> np.ndarray:
+        """(R,) the shot (or row, from 0) of every measured value."""
+        here = ~np.isnan(self.measured)
+        return np.nonzero(here)[0] if here.ndim else np.zeros(1, int)
+
+    @property
     def weight(self) -> np.ndarray:
         """1 / sigma, shaped like `measured`; 0 where nothing was."""
         return np.asarray(self.residuals.weight, float) * self.size
@@ -387,14 +393,14 @@ class FitProblem:
             errors: (K, n, ...), shaped like `measured`, in its units.
         """
         more = (1,) * (errors.ndim - self.measured.ndim)
-        scaled = np.nan_to_num(errors) * self.weight.reshape(*self.measured.shape, *more)
+        scaled = np.nan_to_num(errors) * self.weight.reshape((*self.measured.shape, *more))
         mixing = self.residuals.mixing
         return scaled if mixing is None else np.einsum("kij,kj...->ki...", mixing, scaled)
 
     def errors_of(self, independent: np.ndarray) -> np.ndarray:
         """The errors (K, n, ...) that are these as independent ones; NaN where nothing was."""
         more = (1,) * (independent.ndim - self.measured.ndim)
-        weight = self.weight.reshape(*self.measured.shape, *more)
+        weight = self.weight.reshape((*self.measured.shape, *more))
         if self.residuals.mixing is not None:
             back = np.linalg.inv(np.asarray(self.residuals.mixing, float))
             independent = np.einsum("kij,kj...->ki...", back, independent)

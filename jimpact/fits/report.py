@@ -9,7 +9,7 @@ from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.status import STATUS
 
 _VELOCITIES_SHOWN = 24  # in the table of shots
-_MINIMA_SHOWN = 5
+_MINIMA_SHOWN = 5  # in the list of minima, the lowest first
 _PARAMETERS_NAMED = 6  # in one sentence; of more, the least certain
 
 

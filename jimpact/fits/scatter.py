@@ -13,8 +13,8 @@ LEAST_SHOTS = 4  # of which the scatter of one number can be estimated
 SHOWN_FROM = 8  # shots from which a report gives it unasked
 SURE = 0.01  # chance at which scatter counts as shown
 _SMALLEST = 1e-4  # scatter looked for, in standard errors of one shot
-_LARGEST = 1e4
-_NO_CHANCE = 1e-15
+_LARGEST = 1e4  # likewise, the upper end of the search
+_NO_CHANCE = 1e-15  # smaller chances are rounding, and printed as "below"
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +171,8 @@ def _which(fit: FitResult, name: str | None) -> int:
 def _weighted(fit: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Residuals (R,) in units of sigma, their derivatives (R, P), shots (R,)."""
     problem, here = fit.problem, ~np.isnan(fit.problem.measured)
-    shot = np.broadcast_to(np.arange(len(here))[:, None], here.shape)[here]
-    return problem.independent(fit.residual)[here], problem.independent(fit.jacobian)[here], shot
+    residual, jacobian = problem.independent(fit.residual), problem.independent(fit.jacobian)
+    return residual[here], jacobian[here], problem.shot_of_value
 
 
 class _Model:

@@ -70,7 +70,7 @@ FINER = 0.1  # a wrong result is tried again at this part of its setting,
 FALLS = 0.5  # and stalls unless its error falls below this part
 BATCH = 32  # points computed together
 
-REFERENCE_RTOL = 1e-12
+REFERENCE_RTOL = 1e-12  # of the default method, the reference of all others
 CHECK_RTOL = 1e-11  # of the run by scipy
 CONFIRMED = 1e-7  # the reference is confirmed up to this difference of v+ from scipy's
 CHECKED = 12  # points solved by scipy, at most
@@ -95,7 +95,7 @@ _LONG, _CLUSTERED = 10, 0.9  # from this number of balls on, chains below this e
 _FAR = 100.0  # time scales are far apart from this ratio of the contacts' frequencies on
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
 SLICES = ("one", "pairs")
-BALLS = (2, 3, 5, 10, 30, 100)
+BALLS = (2, 3, 5, 10, 30, 100)  # numbers of balls, of the axis N of the maps
 # Each number of balls is compiled by itself: below this resolution only a few.
 _FEW_BALLS, _FEW = (2, 3, 10), 8
 
@@ -177,11 +177,14 @@ class StabilityMap:
         checked = self.confirmation
         counts = [[m, *(str(x or "") for x in self.counts(m).values())] for m in self.methods]
         causes = [[m, str(x), cause] for m in self.methods for cause, x in self.causes(m).items()]
+        others = ""
+        if checked.confirmed < checked.tried:
+            others = f"; v+ of the others differs by up to {checked.difference:.1g} of |v-|: scipy "
+            others += "may end an impact too early (docs/stability.md)"
         lines = [
             f"base: {base}; at most {self.max_steps:,} steps",
             f"reference: {checked.points} points at rtol {REFERENCE_RTOL:g}; of {checked.tried} "
-            f"solved by scipy, too, {checked.confirmed} agree to {CONFIRMED:g} (largest "
-            f"difference of v+ from scipy's {checked.difference:.1g} of |v-|)",
+            f"solved by scipy, too, {checked.confirmed} agree to {CONFIRMED:g}{others}",
             f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for fixed steps, "
             "of the largest |v-|",
             "",

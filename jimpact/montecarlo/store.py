@@ -23,7 +23,7 @@ import numpy as np
 
 from jimpact.montecarlo.statistics import Chunk, chunk_from
 
-FORMAT = 1
+FORMAT = 1  # version of the files of a run
 MANIFEST = "manifest.json"
 
 

@@ -17,7 +17,7 @@ from jimpact.motion.system import System
 
 Observe = Callable[[Motion], jax.Array]
 
-MAX_PASSES = 50
+MAX_PASSES = 50  # steps of one start before it gives up
 _FAILS = tuple(row.failure for row in MOTION_STATUS)
 
 

@@ -20,7 +20,7 @@ from jimpact.motion.system import System
 from jimpact.plot.style import COLOURS, GREY, finish, heading, legend_within, new_figure
 from jimpact.progress import counting_bar
 
-_FRAMES_PER_SECOND = 25
+_FRAMES_PER_SECOND = 25  # of animations
 _POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
 _MANY = 60  # up to so many impacts each is marked by a line

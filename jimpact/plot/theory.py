@@ -29,7 +29,7 @@ from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_
 _FILL = "#DCE9F3"
 _MARKERS = "osD^vP*X"
 _MOST_CONTACTS = 4  # beyond two contacts: projections onto pairs of the first so many
-_SAMPLES = 2000
+_SAMPLES = 2000  # points drawn of a set of outcomes
 _SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no room for a name
 
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES

@@ -18,7 +18,8 @@ from jimpact.theory.capped_polyhedron import (
 # Contacts count as redundant when the matrix of their cosines has an eigenvalue below this
 # multiple of eps * m.
 _SINGULAR = 100.0
-# A contact approaches when |qn-| exceeds this multiple of eps times the speed sqrt(2 T).
+# A contact approaches when |qn-| exceeds this multiple of eps times the speed sqrt(2 T). Ten times
+# more would leave slow approaches out of the set.
 _APPROACH = 64.0
 _ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
 
@@ -63,10 +64,10 @@ class AdmissibleSet:
         Each is a linear function over the convex set, solved to rounding (about 1e-9 of the
         impact's size).
         """
-        found = [
+        ends = [
             [self._velocity(self.coordinates.lowest(s * c)) for s in (1, -1)] for c in self.axes
         ]
-        return np.array([[low[i], high[i]] for i, (low, high) in enumerate(found)])
+        return np.array([[low[i], high[i]] for i, (low, high) in enumerate(ends)])
 
     def contains(self, velocity: Any, tolerance: float | None = None) -> Any:
         """Whether a velocity v+ (n,), or each of (k, n), is admissible up to `tolerance` impacts.
@@ -86,8 +87,8 @@ class AdmissibleSet:
         offset = v - self.center
         mass = dense_mass(self.scene)
         u = offset @ mass @ self.axes
-        beside = offset - u @ self.axes.T  # against the momentum balance
-        off = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", beside, mass, beside), 0.0))
+        outside = offset - u @ self.axes.T  # violates the momentum balance
+        off = np.sqrt(np.maximum(np.einsum("...i,ij,...j->...", outside, mass, outside), 0.0))
         inside = np.maximum(self.coordinates.excess(u), off) <= allowed * self._size
         return bool(inside) if v.ndim == 1 else inside
 
@@ -135,16 +136,20 @@ class AdmissibleSet:
         return self._velocity(self.coordinates.boundary(points))
 
     def __str__(self) -> str:
+        """A table of several lines."""
         return _in_words(self)
 
     @property
     def _size(self) -> float:
+        """Of the impact, sqrt(2 energy) [sqrt(J)]; not 0."""
         return self.coordinates.radius or float(np.sqrt(2 * self.energy)) or 1.0
 
     def _velocity(self, u: np.ndarray) -> np.ndarray:
+        """v+ (..., n) of kinetic coordinates u."""
         return self.center + u @ self.axes.T
 
     def _check_plane(self) -> None:
+        """Raise a ValueError unless the set is two-dimensional."""
         if self.dimension != 2:
             raise ValueError(
                 "An arc and a boundary need a set of dimension 2 (two independent contacts), but "
@@ -223,40 +228,43 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
 
 
 def _unconstrained(scene: Scene, root: np.ndarray, y: np.ndarray, tolerance: float) -> np.ndarray:
-    """Projector onto what the bilateral constraints leave free, in the coordinates y."""
+    """Projector onto the directions free of bilateral constraints, in the coordinates y."""
     if scene.constraints is None:
         return np.eye(len(y))
-    held = np.linalg.qr(np.linalg.solve(root, np.asarray(scene.constraints, float)))[0]
-    if np.linalg.norm(held.T @ y) > tolerance * np.linalg.norm(y):
+    basis = np.linalg.qr(np.linalg.solve(root, np.asarray(scene.constraints, float)))[0]
+    if np.linalg.norm(basis.T @ y) > tolerance * np.linalg.norm(y):
         raise ValueError(
             "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but is "
-            f"{np.linalg.norm(held.T @ y):.3g} off in the kinetic norm."
+            f"{np.linalg.norm(basis.T @ y):.3g} off in the kinetic norm."
         )
-    return np.eye(len(y)) - held @ held.T
+    return np.eye(len(y)) - basis @ basis.T
 
 
-def _in_words(found: AdmissibleSet) -> str:
-    closed = np.asarray(found.scene.closed)
-    approaching = np.asarray(gap_velocity(found.scene, found.velocity))[closed] < 0
+def _in_words(outcomes: AdmissibleSet) -> str:
+    """The set as a table."""
+    closed = np.asarray(outcomes.scene.closed)
+    approaching = np.asarray(gap_velocity(outcomes.scene, outcomes.velocity))[closed] < 0
     head = f"closed contacts: {int(closed.sum())}, approaching: {int(approaching.sum())};"
-    smallest = _ZERO * max(1e-300, float(np.abs(found.velocity).max()))
+    smallest = _ZERO * max(1e-300, float(np.abs(outcomes.velocity).max()))
 
     def show(x: float, width: int = 0) -> str:
+        """A velocity; 0 within rounding."""
         return f"{x if abs(x) > smallest else 0.0:{width}.6g}"
 
-    if found.dimension == 0:
-        return f"{head} one admissible outcome, v+ = ({', '.join(map(show, found.center))})"
+    if outcomes.dimension == 0:
+        return f"{head} one admissible outcome, v+ = ({', '.join(map(show, outcomes.center))})"
     lines = [
-        f"{head} admissible outcomes of dimension {found.dimension}",
-        f"energy       from {found.least_energy:.6g} J (plastic) to {found.energy:.6g} J (T-)",
+        f"{head} admissible outcomes of dimension {outcomes.dimension}",
+        f"energy       from {outcomes.least_energy:.6g} J (plastic) "
+        f"to {outcomes.energy:.6g} J (T-)",
         "coordinate          v-         least       plastic      greatest   [m/s]",
     ]
     columns = np.column_stack(
-        [found.velocity, found.bounds[:, 0], found.plastic, found.bounds[:, 1]]
+        [outcomes.velocity, outcomes.bounds[:, 0], outcomes.plastic, outcomes.bounds[:, 1]]
     )
     for i, row in enumerate(columns):
         lines.append(f"{i + 1:10d}{show(row[0], 12)}" + "".join(show(x, 14) for x in row[1:]))
-    if found.dimension == 2:
-        for name, v in zip("AB", found.conserving_arc(2)):
+    if outcomes.dimension == 2:
+        for name, v in zip("AB", outcomes.conserving_arc(2)):
             lines.append(f"T+ = T- at {name} ({', '.join(map(show, v))})")
     return "\n".join(lines)

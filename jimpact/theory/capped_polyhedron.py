@@ -51,6 +51,7 @@ class CappedPolyhedron(NamedTuple):
 
         # minimizes c.w + |w|^2 / (2 s); |w| grows with s until the ball or a least c.w ends it
         def beyond(s: float) -> float:
+            """Distance outside the ball."""
             return float(np.linalg.norm(self.project(-s * c)) - self.radius)
 
         far = self.radius
@@ -138,6 +139,7 @@ class CappedPolyhedron(NamedTuple):
         return points[np.argsort(np.arctan2(relative[:, 1], relative[:, 0]))]
 
     def _on_circle(self, angle: np.ndarray) -> np.ndarray:
+        """Points (..., 2) of the circle at angles [rad]."""
         return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
@@ -204,6 +206,7 @@ def least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _on_support(matrix: np.ndarray, target: np.ndarray, support: np.ndarray) -> np.ndarray:
+    """Least squares x with the columns of the support only."""
     x = np.zeros(matrix.shape[1])
     x[support] = np.linalg.lstsq(matrix[:, support], target, rcond=None)[0]
     return x

@@ -16,7 +16,7 @@ from jimpact.theory.quasi_velocities import quasi_basis, to_quasi_velocities
 
 
 class InclusionOutcome(NamedTuple):
-    """What `restitution_inclusion` found.
+    """Solution of `restitution_inclusion`.
 
     `velocity`: quasi-velocities v+ (n,) [sqrt(J)]; `percussion` (c,) along the columns of the
     coupling; `status` (), a code of `jimpact.STATUS`.
@@ -117,8 +117,8 @@ def _in_box(
     both = bounded[:, None] & bounded[None, :]
     matrix = jnp.where(both, matrix, jnp.eye(2 * len(y), dtype=s.dtype))
     # p = p_low - p_high is unique where S is regular, whatever the two parts are
-    found = solve_lcp(matrix, room, regular=True)
-    return found.z[: len(y)] - found.z[len(y) :], found.code
+    solution = solve_lcp(matrix, room, regular=True)
+    return solution.z[: len(y)] - solution.z[len(y) :], solution.code
 
 
 class FrictionBounds(NamedTuple):
@@ -153,7 +153,10 @@ class FrictionBounds(NamedTuple):
         )
 
     def __str__(self) -> str:
+        """The four conditions, a line each."""
+
         def word(holds: bool) -> str:
+            """A sufficient condition that fails says nothing."""
             return "holds" if holds else "does not hold, which decides nothing"
 
         first, third = self.g_mu_bound < 1, self.restitution_bound < 1
@@ -171,7 +174,7 @@ class FrictionBounds(NamedTuple):
 
 
 class _Coupling(NamedTuple):
-    """What friction needs of a scene: G, n_q^T H_t, t_q^T H_t, mubar xi, all with m columns."""
+    """The matrices of friction of a scene: G, n_q^T H_t, t_q^T H_t, mubar xi, with m columns."""
 
     delassus: jax.Array
     normal: jax.Array
@@ -180,6 +183,7 @@ class _Coupling(NamedTuple):
 
     @property
     def g_mu(self) -> jax.Array:
+        """G^mu (m, m)."""
         return self.delassus - self.normal * self.friction[None, :]
 
 
@@ -311,22 +315,24 @@ def friction_energy_change(
     """
     coupling = _coupling(scene, 0.0, 0.0)
     p = as_float_array("impulse", impulse)
-    side = as_float_array("tangential_impulse", tangential_impulse)
-    for name, value in (("impulse", p), ("tangential_impulse", side)):
+    p_t = as_float_array("tangential_impulse", tangential_impulse)
+    for name, value in (("impulse", p), ("tangential_impulse", p_t)):
         check_shape(name, value, (scene.contacts,), "one per contact")
     qn, qt = to_quasi_velocities(scene, velocity)
     pbar = kinetic_norm(scene) * p
-    qn_plus = qn + coupling.delassus @ pbar + coupling.normal @ side
-    pushed = coupling.tangential @ side  # = qt+ - qt-
-    normal = pbar + jnp.linalg.solve(coupling.delassus, coupling.normal @ side)
+    qn_plus = qn + coupling.delassus @ pbar + coupling.normal @ p_t
+    pushed = coupling.tangential @ p_t  # = qt+ - qt-
+    normal = pbar + jnp.linalg.solve(coupling.delassus, coupling.normal @ p_t)
     return 0.5 * (qn_plus + qn) @ normal + 0.5 * (2 * qt + pushed) @ pushed
 
 
 def _norm(matrix: Any) -> float:
+    """Largest singular value; 0 of an empty matrix."""
     return float(np.linalg.norm(np.asarray(matrix, float), 2)) if np.size(matrix) else 0.0
 
 
 def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
+    """E (m, m) on the host, checked."""
     e = as_float_array("matrix", matrix)
     check_shape("matrix", e, (scene.contacts,) * 2, "one row and one column per contact")
     check_values("matrix", e)
@@ -334,6 +340,7 @@ def _restitution(scene: Scene, matrix: Any) -> np.ndarray:
 
 
 def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
+    """The matrices of a planar scene of closed contacts, checked."""
     m = scene.contacts
     if scene.tangents is None or scene.tangents.shape[1] != m:
         raise ValueError(
@@ -349,7 +356,7 @@ def _coupling(scene: Scene, friction: Any, slip: Any) -> _Coupling:
     _, tangent = quasi_basis(scene)
     unit = jnp.eye(m, dtype=scene.mass.dtype)
     none = jnp.zeros(m, scene.mass.dtype)
-    pushed = jax.vmap(lambda side: velocity_change(scene, none, side), 1, 1)(unit)
+    pushed = jax.vmap(lambda p_t: velocity_change(scene, none, p_t), 1, 1)(unit)
     return _Coupling(
         delassus=as_matrix(normalized_delassus(scene)),
         normal=jax.vmap(partial(normalized_gap_velocity, scene), 1, 1)(pushed),

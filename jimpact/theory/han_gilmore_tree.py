@@ -9,15 +9,16 @@ import numpy as np
 from jimpact._checks import as_whole, check_values, is_traced
 from jimpact.scene import Scene, as_velocity, dense_mass
 
-# Relative to the largest normalized approach velocity at the start: gap velocities and impulses
-# below are zero, velocities that differ by less are the same.
+# Relative to the largest normalized approach velocity at the start: smaller gap velocities and
+# impulses are zero, velocities that differ by less are the same. Ten times more would merge
+# branches that differ in the eighth digit.
 ZERO = 1e-9
 SINGULAR = 1e-14  # singular values of G_SS below this are zero: redundant contacts
 
 
 @dataclasses.dataclass(frozen=True)
 class HanGilmoreOutcome:
-    """v+ (n,) [m/s], total impulse p (m,) [N s], and what rule (iii) said at each impact."""
+    """v+ (n,) [m/s], total impulse p (m,) [N s], and the outcome of rule (iii) at each impact."""
 
     velocity: np.ndarray
     impulse: np.ndarray
@@ -26,22 +27,25 @@ class HanGilmoreOutcome:
 
 @dataclasses.dataclass(frozen=True)
 class _Node:
+    """Normalized gap velocities and impulses (m,) so far, and the rules applied."""
+
     qn: np.ndarray
     p: np.ndarray
     rules: tuple[str, ...]
 
 
-class _Seen:
-    """Gap velocities met so far, sorted into cells by a generic weighted sum."""
+class _VisitedStates:
+    """Gap velocities visited so far, sorted into cells by a generic weighted sum."""
 
     def __init__(self, first: np.ndarray):
+        """With one state."""
         self._weights = np.sqrt(np.arange(2.0, len(first) + 2))
         self._width = 2 * ZERO * float(self._weights.sum())  # equal ones are in adjacent cells
         self._cells: dict[int, list[np.ndarray]] = {}
         self.add(first)
 
     def add(self, qn: np.ndarray) -> bool:
-        """Whether `qn` is new; it is kept then."""
+        """Whether `qn` is new; then it is added."""
         cell = int(np.floor(qn @ self._weights / self._width))
         near = [old for k in (cell - 1, cell, cell + 1) for old in self._cells.get(k, [])]
         if any(np.abs(old - qn).max() <= ZERO for old in near):
@@ -93,27 +97,27 @@ def han_gilmore(scene: Scene, velocity: Any, *, max_depth: int = 100) -> list[Ha
     size = float(np.max(-qn[closed], initial=0.0))
     if size == 0.0:
         return [HanGilmoreOutcome(v, np.zeros_like(qn), ())]
-    found: list[HanGilmoreOutcome] = []
+    outcomes: list[HanGilmoreOutcome] = []
     frontier = [_Node(qn / size, np.zeros_like(qn), ())]
-    seen = _Seen(qn / size)
+    visited = _VisitedStates(qn / size)
     while frontier:
         following: list[_Node] = []
         for node in frontier:
             for child in _impacts(g, node, closed):
-                if not seen.add(child.qn):
+                if not visited.add(child.qn):
                     continue
                 if np.all(child.qn[closed] >= -ZERO):
                     p = child.p * size / root
-                    found.append(HanGilmoreOutcome(v + mobility @ p, p, child.rules))
+                    outcomes.append(HanGilmoreOutcome(v + mobility @ p, p, child.rules))
                 else:
                     following.append(child)
         if following and len(following[0].rules) >= max_depth:
             raise RuntimeError(
                 f"A branch of the tree has more than `max_depth` = {max_depth} impacts "
-                f"({len(found)} outcomes found so far)."
+                f"({len(outcomes)} outcomes found so far)."
             )
         frontier = following
-    return found
+    return outcomes
 
 
 def _on_host(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -130,6 +134,7 @@ def _on_host(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _checked(scene: Scene, velocity: Any, max_depth: int) -> np.ndarray:
+    """v- (n,) on the host, all arguments checked."""
     if is_traced((scene, velocity)):
         raise TypeError("`han_gilmore` is a host function: it cannot be traced (jit, vmap, grad).")
     v = as_velocity(scene, velocity)

@@ -47,6 +47,7 @@ def bilateral_motion(
     n = scene.size
 
     def acceleration(x: jax.Array) -> jax.Array:
+        """x'' at displacements x."""
         return velocity_change(scene, -k * gap_velocity(scene, x))
 
     pull = jax.vmap(acceleration, out_axes=1)(jnp.eye(n, dtype=v.dtype))
@@ -72,7 +73,7 @@ def newby_ratio(n: int) -> float:
         The ratio, a float.
 
     Raises:
-        ValueError: n is no whole number of at least 2.
+        ValueError: n is not a whole number of at least 2.
 
     Source: Newby, Am. J. Phys. 52 (1984) 745; Brogliato (2016), after (6.16).
 

@@ -1,4 +1,4 @@
-"""Is a restitution matrix admissible for *all* pre-impact velocities? Props. 6.2-6.5, Carnot."""
+"""Restitution matrices that are admissible for *all* pre-impact velocities: Props. 6.2-6.5."""
 
 from typing import Any, Literal, NamedTuple
 
@@ -11,9 +11,12 @@ from jimpact.contact import kinetic_norm, normalized_delassus, normalized_gap_ve
 from jimpact.scene import Scene, kinetic_energy, velocity_change
 from jimpact.solvers.tridiagonal import as_matrix
 
-LARGEST = 12  # 2^12 supports of one eigenproblem each are still a fraction of a second
+# Most rows of a matrix: its 2^12 supports of one eigenproblem each take a fraction of a second.
+# Each row more doubles that.
+LARGEST = 12
 # |margin| below this multiple of the matrix scale is "boundary": rounding of Q reaches about
-# m eps cond(G), so seven digits remain for the condition number in either precision.
+# m eps cond(G), so seven digits remain for the condition number in either precision. Ten times more
+# would call clear answers "boundary".
 COPOSITIVITY_TOLERANCE = {"float64": 1e-9, "float32": 1e-4}
 
 # G counts as singular when its smallest eigenvalue is below this multiple of eps * m * largest.
@@ -112,6 +115,7 @@ def copositivity(
 
 
 def _size(matrix: jax.Array) -> int:
+    """m, checked."""
     shape = np.shape(matrix)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
         raise ValueError(f"Argument `matrix` must have shape (m, m), but has shape {shape}.")
@@ -172,6 +176,7 @@ class MatrixAudit(NamedTuple):
         return self.kinematic.holds and self.kinetic.holds and bool(self.energetic)
 
     def __str__(self) -> str:
+        """The verdict and each proposition, a line each."""
         return _in_words(self)
 
 
@@ -317,9 +322,10 @@ def _sign(a: np.ndarray, tolerance: float, closed: np.ndarray) -> Sign:
     return Sign(worst >= -tolerance, worst, (int(contact[at[0]]), int(contact[at[1]])), velocity)
 
 
-def _in_words(found: MatrixAudit) -> str:
-    kinematic, kinetic, energetic = found.kinematic, found.kinetic, found.energetic
-    verdict = "admissible" if found.admissible else "NOT admissible"
+def _in_words(audit: MatrixAudit) -> str:
+    """The audit as text."""
+    kinematic, kinetic, energetic = audit.kinematic, audit.kinetic, audit.energetic
+    verdict = "admissible" if audit.admissible else "NOT admissible"
     lines = [f"restitution matrix: {verdict} for all pre-impact velocities qn- <= 0"]
     for title, sign, what in (
         ("kinematic  (6.2 i)  E >= 0", kinematic, "still approaches"),
@@ -338,20 +344,21 @@ def _in_words(found: MatrixAudit) -> str:
         "boundary": "boundary, energy never grows but is conserved",
     }[energetic.answer]
     if energetic.answer != "yes":
-        text += f" for qn- = {_row(found.worst_normal_velocity)}, v- = {_row(found.worst_velocity)}"
+        text += f" for qn- = {_row(audit.worst_normal_velocity)}, v- = {_row(audit.worst_velocity)}"
     lines.append(f"energetic  (6.3)    G^-1 - E^T G^-1 E copositive: {text}")
-    if found.spectral is None:
+    if audit.spectral is None:
         text = "not applicable, E is not self-adjoint (G^-1 E not symmetric)"
     else:
-        text = f"{'yes' if found.spectral else 'NO'}, rho = {found.spectral_radius:.4g}"
+        text = f"{'yes' if audit.spectral else 'NO'}, rho = {audit.spectral_radius:.4g}"
     lines.append(f"spectral   (6.4)    rho(E) <= 1: {text}")
-    holds = "yes" if found.singular_values else "does not hold, which decides nothing"
+    holds = "yes" if audit.singular_values else "does not hold, which decides nothing"
     lines.append(
-        f"sufficient (6.5)    sigma_max(E) = {found.singular_value:.4g} <= "
-        f"{found.singular_value_bound:.4g}: {holds}"
+        f"sufficient (6.5)    sigma_max(E) = {audit.singular_value:.4g} <= "
+        f"{audit.singular_value_bound:.4g}: {holds}"
     )
     return "\n".join(lines)
 
 
 def _row(vector: np.ndarray) -> str:
+    """A vector with four digits."""
     return "(" + ", ".join(f"{x:.4g}" for x in vector) + ")"

@@ -14,8 +14,9 @@ from jimpact.impacts import impact
 from jimpact.laws.lzb import LZB
 from jimpact.status import STATUS
 
-# After the impact a corner counts as staying on the ground where its gap velocity is at most this
-# part of the approach of B: real corners are not sharp, and slow ones touch down again at once.
+# After the impact a corner counts as staying on the ground up to this gap velocity, as part of the
+# approach of B: real corners are not sharp, and slow ones touch down again at once. Ten times more
+# would call most rocking blocks resting.
 STAYS = 0.05
 OUTCOMES = ("rest", "rocking", "half-rocking", "free", "unresolved")
 _FAILS = np.array([row.failure for row in STATUS])
@@ -170,13 +171,14 @@ class RockingDispersion(eqx.Module):
         return np.where(np.isnan(np.asarray(self.gap_velocity[..., 0])), 4, codes)
 
     def __str__(self) -> str:
-        theta, found = np.degrees(self.kinetic_angle), self.outcomes()
+        """Numbers of outcomes for each coefficient of friction."""
+        theta, outcomes = np.degrees(self.kinetic_angle), self.outcomes()
         lines = [
             f"rocking block, kinetic angle {theta.min():.1f} to {theta.max():.1f} degrees "
             f"({len(theta)} shapes), {len(self.restitution)} e",
         ]
         for j, mu in enumerate(np.asarray(self.friction)):
-            counts = np.bincount(found[:, j].ravel(), minlength=len(OUTCOMES))
+            counts = np.bincount(outcomes[:, j].ravel(), minlength=len(OUTCOMES))
             shares = ", ".join(f"{n} {name}" for name, n in zip(OUTCOMES, counts) if n)
             critical = float(np.degrees(critical_kinetic_angle(mu)))
             lines.append(f"mu = {mu:g}: critical angle {critical:.2f} degrees; {shares}")
@@ -243,6 +245,7 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.A
     """gamma+ (n, 2), theta'+, slip+, T+ / T-, status, of all (a, mu, e), at unit width and hit."""
 
     def one(a: jax.Array, mu: jax.Array, e: jax.Array) -> tuple[jax.Array, ...]:
+        """One block of aspect a."""
         scene = rocking_block(jnp.ones_like(a), a, jnp.ones_like(a))
         before = jnp.stack([a / 2, jnp.full_like(a, -0.5), jnp.full_like(a, -1.0)])
         fields = (mu, e)
@@ -250,16 +253,17 @@ def _impacts(a: jax.Array, mu: jax.Array, e: jax.Array, law: LZB) -> tuple[jax.A
         out = impact(now, scene, before)
         after, energy = out.velocity, (before**2 * scene.mass).sum() / 2
         slip = after[0] + a / 2 * after[2]
-        kept = 1 + out.energy_change / energy
-        return scene.normals.T @ after, -after[2], slip, kept, out.status
+        remaining = 1 + out.energy_change / energy
+        return scene.normals.T @ after, -after[2], slip, remaining, out.status
 
-    gamma, turns, slip, kept, status = jax.vmap(one)(a, mu, e)
+    gamma, turns, slip, remaining, status = jax.vmap(one)(a, mu, e)
     bad = jnp.asarray(_FAILS)[status]
-    parts = [jnp.where(bad, jnp.nan, x) for x in (turns, slip, kept)]
+    parts = [jnp.where(bad, jnp.nan, x) for x in (turns, slip, remaining)]
     return jnp.where(bad[:, None], jnp.nan, gamma), *parts, status
 
 
 def _law(stiffness: Any, exponent: Any, rtol: float | None) -> LZB:
+    """LZB; friction and restitution are set case by case."""
     return LZB(1.0, stiffness, exponent, friction=0.0, rtol=rtol)
 
 
@@ -307,9 +311,9 @@ def rocking_dispersion(
     check_values("friction", mu, low=0.0)
     check_values("restitution", e, low=0.0, high=1.0)
     each_a, each_mu, each_e = (x.reshape(-1) for x in jnp.meshgrid(a, mu, e, indexing="ij"))
-    found = _impacts(each_a, each_mu, each_e, _law(stiffness, exponent, rtol))
+    results = _impacts(each_a, each_mu, each_e, _law(stiffness, exponent, rtol))
     shape = (len(a), len(mu), len(e))
-    parts = [x.reshape(shape + x.shape[1:]) for x in found]
+    parts = [x.reshape(shape + x.shape[1:]) for x in results]
     return RockingDispersion(a, mu, e, *parts)
 
 
@@ -318,8 +322,8 @@ def search_critical_angle(
 ) -> jax.Array:
     """The kinetic angle [rad] at which |d| is least, by impacts alone: for all (B, C) of mu and e.
 
-    Grids over 0.5 <= a <= 2, each around the best of the one before; to about 1e-7 where e > 0
-    (at e = 0 there is no V to search). Arguments as in `rocking_dispersion`.
+    Grids over 0.5 <= a <= 2, each around the best point of the previous one; to about 1e-7 where
+    e > 0 (at e = 0 there is no minimum). Arguments as in `rocking_dispersion`.
 
     Args:
         friction: mu >= 0, scalar or (B,).

@@ -66,13 +66,13 @@ Aims beside measurements:
 
 
 def main():
-    given = arguments(__doc__)
+    options = arguments(__doc__)
     console = Console(stderr=True)
     load, seconds, verdicts, failed = os.getloadavg()[0], {}, [], []
     for place, name in enumerate(SCRIPTS, 1):
         console.rule(f"{place} of {len(SCRIPTS)}: {name}")
         command = [sys.executable, str(Path(__file__).with_name(f"{name}.py"))]
-        command += ["--out", str(given.out)] + (["--quick"] if given.quick else [])
+        command += ["--out", str(options.out)] + (["--quick"] if options.quick else [])
         start = time.perf_counter()
         run = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         for line in run.stdout:
@@ -82,8 +82,8 @@ def main():
         seconds[name] = time.perf_counter() - start
         if run.wait() != 0:
             failed.append(name)
-    (given.out / "README.md").write_text(readme(seconds, load, verdicts))
-    console.print(f"all: {sum(seconds.values()):.0f} s; written: {given.out / 'README.md'}")
+    (options.out / "README.md").write_text(readme(seconds, load, verdicts))
+    console.print(f"all: {sum(seconds.values()):.0f} s; written: {options.out / 'README.md'}")
     if failed:
         raise SystemExit(f"failed: {', '.join(failed)}")
 

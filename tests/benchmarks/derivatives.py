@@ -45,7 +45,7 @@ def with_arrays(parameters, rtol=None):
 def jacobian(batch, repeats):
     """Full Jacobian in k (2,), e (2,), eta () of a batch, in units of the value."""
     k, e = (jnp.asarray(x) for x in problem(batch))
-    given = (k, e, jnp.full(batch, 1.5))
+    values = (k, e, jnp.full(batch, 1.5))
 
     def full(rtol):
         return jax.jit(jax.vmap(jax.jacfwd(lambda p: with_arrays(p, rtol))))
@@ -54,13 +54,13 @@ def jacobian(batch, repeats):
     array, derivative = jax.jit(jax.vmap(with_arrays)), full(None)
     runs = {
         "value, exponent static": lambda: static(k, e),
-        "value, exponent array": lambda: array(given),
-        "Jacobian (k, e, eta)": lambda: derivative(given),
+        "value, exponent array": lambda: array(values),
+        "Jacobian (k, e, eta)": lambda: derivative(values),
     }
     with stage("Jacobian: compiling and timing"):
         times = alternating(runs, repeats)
     with stage("Jacobian: error against rtol 1e-12"):
-        exact, ours = full(TIGHT)(given), derivative(given)
+        exact, ours = full(TIGHT)(values), derivative(values)
         difference = jax.tree.map(lambda a, b: float(jnp.max(jnp.abs(a - b))), ours, exact)
         error = max(jax.tree.leaves(difference))
     rows = []
@@ -101,14 +101,14 @@ def single(points, repeats, settings):
     with stage("single impact with gradient: tuning"):
         exact = jnp.concatenate(gradient(k, e, TRUTH), axis=1)
 
-        def error_of(found):
-            return float(jnp.max(jnp.abs(jnp.concatenate(found, axis=1) - exact)))
+        def error_of(parts):
+            return float(jnp.max(jnp.abs(jnp.concatenate(parts, axis=1) - exact)))
 
         rtol, _ = loosest(lambda r: error_of(gradient(k, e, r)), settings, GRADIENT_ERROR)
         with_gradient = solver(rtol)
         pairs = list(zip(k, e))
-        found = [with_gradient(*pair)[1] for pair in pairs]
-        error = error_of([jnp.stack(part) for part in zip(*found)])
+        gradients = [with_gradient(*pair)[1] for pair in pairs]
+        error = error_of([jnp.stack(part) for part in zip(*gradients)])
     rows = []
     value = jax.jit(lambda k, e: one_impact(k, e, rtol) @ weight)
     value(*pairs[0])
@@ -186,8 +186,8 @@ def main():
     if "--compile" in sys.argv:
         print(compiled_here(sys.argv[-1]))
         return
-    given = arguments(__doc__)
-    quick = given.quick
+    options = arguments(__doc__)
+    quick = options.quick
     rows = jacobian(*((32, 2) if quick else (BATCH, REPEATS)))
     rows += single(*((2, 2) if quick else (POINTS, REPEATS)), steps(1e-4, 1e-10, 4))
     if not quick:
@@ -200,8 +200,8 @@ def main():
             print(
                 f"{row['quantity']}: {row['median']:.2f} {row['unit']} ({spread}); aim: {row['aim']}"
             )
-    write_csv(given.out / "derivatives.csv", rows)
-    chart(rows, given.out / "derivatives.png")
+    write_csv(options.out / "derivatives.csv", rows)
+    chart(rows, options.out / "derivatives.png")
 
 
 if __name__ == "__main__":

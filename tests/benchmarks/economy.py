@@ -40,7 +40,7 @@ def struck(n):
 
 
 def dense(n):
-    """A chain of n equal balls whose structure the package is not told."""
+    """A chain of n equal balls without the structure of a chain."""
     return ji.Scene(jnp.ones(n), ji.chain(jnp.ones(n)).normals)
 
 
@@ -235,8 +235,8 @@ def chart(rows, path):
 
 
 def main():
-    given = arguments(__doc__)
-    quick = given.quick
+    options = arguments(__doc__)
+    quick = options.quick
     batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if quick else (BATCH, REPEATS)
     long = 8 if quick else 100
     cases = contact_space(batch) + open_contacts() + independent_pairs(batch, long)
@@ -250,8 +250,8 @@ def main():
     rows.append(name | {"lean_passes": closed, "full_passes": whole} | saving)
     keys = "lean / full|lean_ms|full_ms|saving_q1|saving|saving_q3|saving_cpu|aim"
     show("no more model than a scene needs", rows, keys.split("|"))
-    write_csv(given.out / "economy.csv", rows)
-    chart(rows, given.out / "economy.png")
+    write_csv(options.out / "economy.csv", rows)
+    chart(rows, options.out / "economy.png")
 
 
 if __name__ == "__main__":

@@ -69,15 +69,15 @@ def measure(row):
 
 
 def main(repeats=3):
-    found = {row: [] for row in TARGETS}
+    times = {row: [] for row in TARGETS}
     for _ in range(repeats):
         for row in TARGETS:
             command = [sys.executable, __file__, "--row", row]
             out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-            found[row].append(float(out.split()[-1]))
-    unit = statistics.median(found["diffrax"])
+            times[row].append(float(out.split()[-1]))
+    unit = statistics.median(times["diffrax"])
     for row, target in TARGETS.items():
-        middle = statistics.median(found[row])
+        middle = statistics.median(times[row])
         wanted = "" if target is None else f"   wanted <= {target}"
         print(f"{row:26s} {middle:6.2f} s CPU   {middle / unit:5.2f} x diffrax{wanted}")
 

@@ -31,17 +31,17 @@ def laws():
     """name -> (v, mu) -> impact."""
     block = ji.rocking_block(width=1.0, height=1.5)
     rod = ji.Scene(block.mass, block.normals[:, :1], tangents=block.tangents[:, :1])
-    found = {}
+    runs = {}
     for name, scene in (("block", block), ("rod", rod)):
-        found[name, "none"] = lambda v, mu, s=scene: ji.impact(ji.LZB(E), s, v)
-        found[name, "LZB"] = lambda v, mu, s=scene: ji.impact(ji.LZB(E, friction=mu), s, v)
-    found["block", "Moreau"] = lambda v, mu: ji.impact(ji.Moreau(E, friction=mu), block, v)
-    return found
+        runs[name, "none"] = lambda v, mu, s=scene: ji.impact(ji.LZB(E), s, v)
+        runs[name, "LZB"] = lambda v, mu, s=scene: ji.impact(ji.LZB(E, friction=mu), s, v)
+    runs["block", "Moreau"] = lambda v, mu: ji.impact(ji.Moreau(E, friction=mu), block, v)
+    return runs
 
 
 def main():
-    given = arguments(__doc__)
-    batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if given.quick else (BATCH, REPEATS)
+    options = arguments(__doc__)
+    batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if options.quick else (BATCH, REPEATS)
     v, mu = inputs(batch)
     programs = {key: jax.jit(jax.vmap(law)) for key, law in laws().items()}
     timings = alternating({key: lambda f=f: f(v, mu) for key, f in programs.items()}, repeats)
@@ -52,7 +52,7 @@ def main():
         rows.append(row | columns(timing, batch, timings[scene, "none"]))
     keys = ("scene", "friction", "us", "us_q1", "us_q3", "ratio_q1", "ratio", "ratio_q3", "failed")
     show(f"Cost of friction, {batch} impacts, ratio to the frictionless", rows, keys)
-    write_csv(given.out / "friction.csv", rows)
+    write_csv(options.out / "friction.csv", rows)
 
 
 if __name__ == "__main__":

@@ -100,7 +100,7 @@ def ours(rtol):
 
 
 def seconds(runs):
-    """Medians of alternating repeats, after a first call each whose time is told apart."""
+    """Medians of alternating repeats, after a first call each, timed by itself."""
     first = []
     for run in runs:
         start = time.perf_counter()

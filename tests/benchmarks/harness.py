@@ -39,11 +39,11 @@ def arguments(description: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="tiny batches: only whether it runs")
     parser.add_argument("--out", type=Path, default=None, help=f"folder; default {RESULTS.name}/")
-    given = parser.parse_args()
-    if given.out is None:
-        given.out = Path("jimpact-out") if given.quick else RESULTS
-    given.out.mkdir(parents=True, exist_ok=True)
-    return given
+    options = parser.parse_args()
+    if options.out is None:
+        options.out = Path("jimpact-out") if options.quick else RESULTS
+    options.out.mkdir(parents=True, exist_ok=True)
+    return options
 
 
 @contextlib.contextmanager

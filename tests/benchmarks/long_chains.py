@@ -148,8 +148,8 @@ def chart(kept, path):
 
 
 def main():
-    given = arguments(__doc__)
-    kept = all_lengths((4, 8) if given.quick else LENGTHS)
+    options = arguments(__doc__)
+    kept = all_lengths((4, 8) if options.quick else LENGTHS)
     rows = []
     for e, part in kept.items():
         slopes = {f"{key}_exponent": exponent_of(part, key) for key in ("seconds", "passes")}
@@ -162,8 +162,8 @@ def main():
         )
     keys = "e N seconds_q1 seconds seconds_q3 passes us_per_pass loaded memory_MB status"
     show("one Hertz chain, struck at its end", rows, keys.split())
-    write_csv(given.out / "long_chains.csv", rows)
-    chart(kept, given.out / "long_chains.png")
+    write_csv(options.out / "long_chains.csv", rows)
+    chart(kept, options.out / "long_chains.png")
 
 
 if __name__ == "__main__":

@@ -21,21 +21,21 @@ AIMS = {"ball": 26.0, "block": 100.0}
 
 def ball(e):
     """Dropped from 1 m, to rest."""
-    given = (ji.ball_system(), ji.Newton(e), [1.0], [0.0], 9.0)
-    return ji.simulate(*given, samples=11, max_events=200)
+    start = (ji.ball_system(), ji.Newton(e), [1.0], [0.0], 9.0)
+    return ji.simulate(*start, samples=11, max_events=200)
 
 
 def block(e):
     """Released tilted, rocks to rest."""
     law = ji.RestitutionMatrix(ji.theory.rocking_matrix(e))
     q0 = [0.0, 0.1 * np.sin(0.15) + 0.3 * np.cos(0.15), 0.15]
-    given = (ji.block_system(0.2, 0.6, corners="base"), law, q0, [0.0] * 3, 4.0)
-    return ji.simulate(*given, friction=5.0, samples=11, max_events=200)
+    start = (ji.block_system(0.2, 0.6, corners="base"), law, q0, [0.0] * 3, 4.0)
+    return ji.simulate(*start, friction=5.0, samples=11, max_events=200)
 
 
 def main():
-    given = arguments(__doc__)
-    batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if given.quick else (BATCH, REPEATS)
+    options = arguments(__doc__)
+    batch, repeats = (QUICK_BATCH, QUICK_REPEATS) if options.quick else (BATCH, REPEATS)
     e, one, runs, events = np.linspace(0.85, 0.9, batch), jnp.asarray(0.85), {}, {}
     for name, motion in (("ball", ball), ("block", block)):
         many, single = jax.jit(jax.vmap(motion)), jax.jit(motion)
@@ -61,7 +61,7 @@ def main():
             print(
                 f"aim: {row['motion']}, batch: {row['cpu_us']:.0f} us, {AIMS[row['motion']]:.0f} aimed at"
             )
-    write_csv(given.out / "motions.csv", rows)
+    write_csv(options.out / "motions.csv", rows)
 
 
 if __name__ == "__main__":

@@ -67,9 +67,9 @@ def build(folder):
 
     def written(name, rows):
         rows = np.atleast_2d(rows)
-        told = ",".join("{" + ",".join(f"{x!r}L" for x in map(float, row)) + "}" for row in rows)
+        text = ",".join("{" + ",".join(f"{x!r}L" for x in map(float, row)) + "}" for row in rows)
         shape = f"[{len(rows)}][{stages}]" if len(rows) > 1 else f"[{stages}]"
-        return f"const long double {name}{shape} = {'{' + told + '}' if len(rows) > 1 else told};\n"
+        return f"const long double {name}{shape} = {'{' + text + '}' if len(rows) > 1 else text};\n"
 
     d = dop853_coefficients
     text = f"const int STAGES = {stages};\n" + written("A", d.A[:stages, :stages])
@@ -108,13 +108,13 @@ def main():
         program = build(Path(folder))
 
         def solve(i):
-            found = []
+            velocities = []
             for tolerance in TOLERANCES:
                 code, v = ask(program, chosen[i], tolerance)
                 if code == 2:
                     return i, 2, v, np.nan
-                found.append(v)
-            return i, code, v, np.abs(found[1] - found[0]).max()
+                velocities.append(v)
+            return i, code, v, np.abs(velocities[1] - velocities[0]).max()
 
         for done, (i, code, v, apart) in enumerate(pool.map(solve, missing), 1):
             end[i], uncertainty[i] = code, apart
@@ -125,8 +125,8 @@ def main():
                 np.savez_compressed(DATA, points=chosen, **outcome)
                 print(f"{done} of {len(missing)}", file=sys.stderr)
     print(f"given up: {(end == 2).sum()}, endless: {(end == 1).sum()}")
-    told = np.nanmedian(uncertainty), np.nanmax(uncertainty)
-    print("uncertainty: median {:.1e}, largest {:.1e}".format(*told))
+    spread = np.nanmedian(uncertainty), np.nanmax(uncertainty)
+    print("uncertainty: median {:.1e}, largest {:.1e}".format(*spread))
 
 
 if __name__ == "__main__":

@@ -205,17 +205,17 @@ def chart(rows, path):
 
 
 def main():
-    given = arguments(__doc__)
-    batch, repeats = (32, 2) if given.quick else (BATCH, REPEATS)
+    options = arguments(__doc__)
+    batch, repeats = (32, 2) if options.quick else (BATCH, REPEATS)
     bench = Bench(batch)
     rows = measured(rows_of(bench), batch, repeats)
-    rows = with_siconos(rows, bench, given.quick)
+    rows = with_siconos(rows, bench, options.quick)
     rows = [{"batch": batch, **row} for row in rows]
     keys = "method target setting error_max passes us_q1 us us_q3 cpu_us ratio ratio_cpu"
     show(f"{batch} three-ball impacts, ratios to jimpact at the same target", rows, keys.split())
     verdicts(rows)
-    write_csv(given.out / "three_balls.csv", rows)
-    chart(rows, given.out / "three_balls.png")
+    write_csv(options.out / "three_balls.csv", rows)
+    chart(rows, options.out / "three_balls.png")
 
 
 if __name__ == "__main__":

@@ -204,7 +204,7 @@ def _impulse_rk4(flow: Rule, dp: jax.Array, walk: Walk) -> Walk:
     )
 
 
-_TIME_STEPS = (0.2, 0.1, 0.03, 0.01, 0.003)
+_TIME_STEPS = (0.2, 0.1, 0.03, 0.01, 0.003)  # in units of `time_scale`, coarse to fine
 DOP853_ALIGNED = Method(
     "dop853",
     "event-aligned Dormand-Prince 8 (default)",
