@@ -383,6 +383,8 @@ class Law(Declared):
         pads_scenes: open contacts may be added, so that scenes of few contacts share a program.
         contact_force: the `Force` by which its contacts indent (`gap_scale`, `crossover`).
         has_history: whether `dynamics` may be sampled over the impact's time (`history`).
+        joins_step: whether it is Moreau's condition contact by contact, with its `restitution` and
+            `tangential_restitution`, which time stepping solves together with its step.
         only_stiffness_ratios: whether a common factor of all stiffnesses changes nothing (`fit`
             then holds the first one).
 
@@ -401,6 +403,7 @@ class Law(Declared):
     separable: ClassVar[bool] = False
     pads_scenes: ClassVar[bool] = False
     has_history: ClassVar[bool] = False
+    joins_step: ClassVar[bool] = False
     only_stiffness_ratios: ClassVar[bool] = False
 
     @abc.abstractmethod

@@ -70,7 +70,7 @@ def test_a_body_may_rest_on_its_springs():
 
 def test_what_contact_forces_need():
     ball = (ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0)
-    with pytest.raises(TypeError, match="`law` must be of type Compliant"):
+    with pytest.raises(TypeError, match="`law` must use gaps and have a `contact_force`"):
         ji.simulate(*ball, method="contact_forces")
     block, law = ji.block_system(1.0, 1.0), ji.Compliant(ji.Hertz(1e6))
     with pytest.raises(ValueError, match="`friction` must be 0"):

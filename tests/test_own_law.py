@@ -134,11 +134,20 @@ def test_a_law_around_another_one_has_its_capabilities():
     """Every member of `Law` but what it says itself: nobody lists them by hand."""
     members = {name for name in vars(ji.Law) if not name.startswith("_")}
     around = ji.VelocityDependent(ji.LZB(0.9, initial_energy=0.2), yield_speed=0.1)
-    for name in members - {"impulses", "dynamics", "contact", "check", "contact_force"}:
+    for name in members - {
+        "impulses",
+        "dynamics",
+        "contact",
+        "check",
+        "contact_force",
+        "joins_step",
+    }:
         assert getattr(around, name) == getattr(around.law, name), name
     assert around.separable
     assert around.pads_scenes
     assert around.has_history
+    assert ji.Moreau(0.5).joins_step
+    assert not ji.VelocityDependent(ji.Moreau(0.5), speed_exponent=0.2).joins_step
 
 
 def test_compare_and_the_registry(registered):

@@ -157,6 +157,11 @@ class Moreau(_WithCoefficient):
 
     restitution: Values = parameter(low=0.0, high=1.0, matrix=True)
 
+    @property
+    def joins_step(self) -> bool:  # type: ignore[override]
+        """Without a matrix."""
+        return self.restitution.ndim < 2
+
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
         """A matrix must have one row and one column per contact."""
         if self.restitution.ndim == 2:

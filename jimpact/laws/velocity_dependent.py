@@ -1,6 +1,6 @@
 """Restitution that depends on the speed of the approach: an option of every law that has an e."""
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -58,6 +58,8 @@ class VelocityDependent(Law):
     >>> [round(float(ji.impact(law, pair, [v, 0.0]).velocity[1] / v), 4) for v in (0.005, 16.0)]
     [1.0, 0.625]
     """
+
+    joins_step: ClassVar[bool] = False  # its e is not a field
 
     law: Law
     speed_exponent: OptionalValues = parameter(low=-1.0, high=1.0, default=None, kw_only=True)

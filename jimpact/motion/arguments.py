@@ -9,7 +9,6 @@ import numpy as np
 
 from jimpact._checks import (
     as_float_array,
-    check_kind,
     check_per_contact,
     check_shape,
     check_values,
@@ -17,7 +16,6 @@ from jimpact._checks import (
 )
 from jimpact.bodies.base import check_range
 from jimpact.law import Law
-from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Force
 from jimpact.motion.dynamics import gaps, mass_at, seen_from_base
 from jimpact.motion.stepping import is_pile
@@ -238,12 +236,16 @@ def contacts_of(system: System, q: jax.Array) -> int:
 
 
 def force_of(law: Law, mu: jax.Array | None) -> Force:
-    """The contact force of a `Compliant` law, for motions without friction."""
-    check_kind("law", law, Compliant)
-    assert isinstance(law, Compliant)
+    """The contact force of a law, for motions without friction."""
+    force: Force | None = law.contact_force
+    if force is None or not law.uses_gaps:
+        raise TypeError(
+            "Argument `law` must use gaps and have a `contact_force` (Compliant) for "
+            f"method='contact_forces', but is {law!r}."
+        )
     if mu is not None:
         raise ValueError("Argument `friction` must be 0 for method='contact_forces'.")
-    return law.force
+    return force
 
 
 def substeps_of(step: Any, start: Any, end: Any, samples: int) -> jax.Array:

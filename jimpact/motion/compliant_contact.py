@@ -13,7 +13,7 @@ from jimpact.compiling import quick_jit
 from jimpact.contact import delassus_matrix
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
 from jimpact.events.stepper import any_of
-from jimpact.laws.forces import Bistiffness, Force
+from jimpact.laws.forces import Force
 from jimpact.motion.dynamics import base_velocity, kinematics, user_force
 from jimpact.motion.event_driven import why_stuck
 from jimpact.motion.flow import (
@@ -91,8 +91,9 @@ class CompliantFlow(MotionFlow):
         push = self.force.force(jnp.where(x >= 0, x, 0.0), -gamma)
         push = jnp.where(loaded, jnp.maximum(push, 0.0), 0.0)
         closing = -gamma
-        if isinstance(self.force, Bistiffness):
-            e = jnp.where(self.force.restitution > 0, self.force.restitution, 1.0)
+        bistiffness = self.force.bistiffness
+        if bistiffness is not None:
+            e = jnp.where(bistiffness.restitution > 0, bistiffness.restitution, 1.0)
             closing = jnp.where(const == EXPANSION, closing / e**2, closing)
         carried = base_velocity(self.system, at.t)
         base = jnp.zeros_like(at.t)
@@ -147,8 +148,8 @@ class CompliantFlow(MotionFlow):
             after = jnp.where(turned, EXPANSION, phase)
             after = jnp.where(by_g & (phase == EXPANSION), COMPRESSION, after)
             opened = by_x & (phase == EXPANSION)
-            if isinstance(self.force, Bistiffness):  # e = 0 returns nothing
-                opened = opened | (turned & (self.force.restitution == 0))
+            if self.force.bistiffness is not None:  # e = 0 returns nothing
+                opened = opened | (turned & (self.force.bistiffness.restitution == 0))
         after = jnp.where(opened, OPEN, jnp.where(closed, COMPRESSION, after))
         x, impulse = at.contact
         contact = jnp.stack([jnp.where(opened | closed, 0.0, x), jnp.where(closed, 0.0, impulse)])

@@ -35,7 +35,7 @@ from jimpact.motion.dynamics import kinetic, potential
 from jimpact.motion.event_driven import MotionProblem, Past, empty_checkpoint, event_driven
 from jimpact.motion.flow import Course, Settings, check_rtol
 from jimpact.motion.record import MOTION_CODE, Events, Motion, joined
-from jimpact.motion.stepping import joins_step, recorded_gaps, time_stepping
+from jimpact.motion.stepping import recorded_gaps, time_stepping
 from jimpact.motion.system import System
 from jimpact.progress import progress_bar, waiting
 
@@ -137,10 +137,10 @@ def simulate(
     check_kind("system", system, System)
     check_kind("law", law, Law)
     q, v = as_float_array("q0", q0), as_float_array("v0", v0)
-    start, end = (as_float_array(k, x) for k, x in (("t_start", t_start), ("t_end", t_end)))
     system, law, q, v = in_common_dtype(system, law, q, v)
     dtype = q.dtype
-    start, end = start.astype(dtype), end.astype(dtype)
+    start = as_float_array("t_start", t_start).astype(dtype)
+    end = as_float_array("t_end", t_end).astype(dtype)
     f = check_motion(system, q, v, start, end)
     count = as_whole("samples", samples, 2)
     if max_events is not None:
@@ -155,20 +155,19 @@ def simulate(
     below, rounding = _closed_gaps(q, f, closed_below)
     if method != "contact_forces":
         check_penetration("q0", f, below)
+    share = jnp.asarray(slow, dtype)
     settings = Settings(
-        rtol, atol, below, rounding, max_steps, mu is not None, end - start,
-        jnp.asarray(slow, dtype),
+        rtol, atol, below, rounding, max_steps, mu is not None, end - start, share
     )  # fmt: skip
     arguments: Any
     if method == "time_stepping":
         substeps = substeps_of(step, t_start, t_end, count)
-        joint = joins_step(law) and friction is None
+        joint = law.joins_step and friction is None
         check_stepped_law(system, law, q, joint)
         arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
         return _waited(_stepped, arguments, progress)
     if method == "contact_forces":
-        force = force_of(law, mu)
-        arguments = system, force, settings, q, v, start, end, count, rows
+        arguments = system, force_of(law, mu), settings, q, v, start, end, count, rows
         return _waited(_forced, arguments, progress)
     arguments = system, law, mu, settings, q, v, start, end
     if _on_host(arguments):

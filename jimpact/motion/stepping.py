@@ -29,7 +29,6 @@ import jax.numpy as jnp
 from jimpact.bodies.base import ActivePairs
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
-from jimpact.laws.kinematic import Moreau
 from jimpact.motion.dynamics import (
     carried_along,
     definite,
@@ -257,7 +256,7 @@ def time_stepping(
 ) -> Course:
     """The motion with `substeps` () steps between neighbours of `times` (S,).
 
-    `joint`: the law is a condition on v' that joins the problem of the step (`joins_step`).
+    `joint`: the law is a condition on v' that joins the problem of the step (`Law.joins_step`).
     """
     system, law, mu, q0, v0, times = without_derivatives(
         (system, law, mu, q0, v0, times), NotImplementedError(WHY)
@@ -398,9 +397,9 @@ def _set_up(problem: _StepProblem, course: _Progress, t: jax.Array) -> _Setup:
     # energy from the velocities as the potential gains
     met = state.v if joint else state.v + 0.5 * h * free
     if joint:
-        assert isinstance(law, Moreau)
-        e = law.restitution
-        e_t = e_t if law.tangential_restitution is None else law.tangential_restitution
+        moreau: Any = law  # or a law that says so
+        e = moreau.restitution
+        e_t = e_t if moreau.tangential_restitution is None else moreau.tangential_restitution
     else:
         scene = scene_at(system, q, state.v, middle, contacts.closed)
         impulse, code = jax.lax.cond(
@@ -579,11 +578,6 @@ def _wanted(
         jnp.concatenate([normal, e_t[:, None] * slip], axis=1),
         jnp.concatenate([normal, slip], axis=1),
     )
-
-
-def joins_step(law: Law) -> bool:
-    """Whether the law is a condition on v' contact by contact: Moreau's, without a matrix."""
-    return isinstance(law, Moreau) and law.restitution.ndim < 2
 
 
 def _law_impulses(
