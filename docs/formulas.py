@@ -22,6 +22,7 @@ NAME = re.compile(r"([A-Za-z]+)(?:_([A-Za-z]+\d*|\d+[a-z]*|\{[^}]*\}))?('*)([+-]
 
 
 def _letters(word: str) -> str:
+    """LaTeX of a word: a Greek letter, a function, a symbol or an operator name."""
     if word in GREEK:
         return rf"\{word} "
     if word in FUNCTIONS:
@@ -36,7 +37,7 @@ def _letters(word: str) -> str:
 
 
 def _closing(text: str, start: int) -> int:
-    """Index behind the bracket that closes the one at `start`."""
+    """Index after the bracket that closes the one at `start`."""
     depth = 0
     for i in range(start, len(text)):
         depth += {"(": 1, ")": -1}.get(text[i], 0)
@@ -45,8 +46,9 @@ def _closing(text: str, start: int) -> int:
     raise ValueError(f"{text!r} has an open bracket")
 
 
-def _name(found: re.Match[str]) -> str:
-    word, index, primes, sign = found.groups()
+def _name(match: re.Match[str]) -> str:
+    """LaTeX of a name with index, primes and sign."""
+    word, index, primes, sign = match.groups()
     base = _letters(word)
     if index is not None:
         inner = index.strip("{}")
@@ -56,6 +58,7 @@ def _name(found: re.Match[str]) -> str:
 
 
 def _translate(text: str) -> str:
+    """LaTeX of a whole formula."""
     parts, i = [], 0
     while i < len(text):
         root = text.startswith("sqrt(", i)
@@ -68,12 +71,12 @@ def _translate(text: str) -> str:
         elif text[i] == "^":  # a number, or a name
             power = re.match(r"-?[\d.]+|-?[A-Za-z]+(?:_\w+)?|-", text[i + 1 :])
             if power is None:
-                raise ValueError(f"{text!r} has a power that is none")
+                raise ValueError(f"{text!r} has a power that is not a number or name")
             parts.append(f"^{{{_translate(power[0])}}}")
             i += 1 + power.end()
-        elif found := NAME.match(text, i):
-            parts.append(_name(found))
-            i = found.end()
+        elif match := NAME.match(text, i):
+            parts.append(_name(match))
+            i = match.end()
         else:
             sign, tex = next((x for x in SIGNS if text.startswith(x[0], i)), (text[i], text[i]))
             parts.append(tex)
@@ -82,7 +85,7 @@ def _translate(text: str) -> str:
 
 
 def tex(text: str) -> str | None:
-    """LaTeX of a formula as docstrings write it; None where it is no formula.
+    """LaTeX of a formula as docstrings write it; None if the text is not a formula.
 
     >>> tex("gamma+ = -e gamma-")
     '\\\\gamma ^{+} = -e \\\\gamma ^{-}'
@@ -97,15 +100,15 @@ def tex(text: str) -> str | None:
     if re.search(r"\w\.[A-Za-z]|[`\"\\%&#$]|__", text) or not re.search(r"[A-Za-z]", text):
         return None
     try:
-        found = _translate(text).strip()
-        tex2mathml(found)
+        latex = _translate(text).strip()
+        tex2mathml(latex)
     except (ValueError, MathError):
         return None
-    return found
+    return latex
 
 
 def typeset(lines: list[str]) -> None:
-    """In place: formulas of paragraphs that begin `Equation` become the site's formulas."""
+    """Typeset in place the formulas of paragraphs that begin with `Equation`."""
     i = 0
     while i < len(lines):
         end = i
@@ -119,6 +122,7 @@ def typeset(lines: list[str]) -> None:
         i = max(end, i + 1)
 
 
-def _as_role(found: re.Match[str]) -> str:
-    formula = tex(found[1])
-    return found[0] if formula is None else f":math:`{formula}`"
+def _as_role(match: re.Match[str]) -> str:
+    """A formula in backticks as a role of the site; other text unchanged."""
+    formula = tex(match[1])
+    return match[0] if formula is None else f":math:`{formula}`"

@@ -208,11 +208,13 @@ def constants_of(path: Path) -> list[tuple[str, str, str]]:
         while row in comments and lines[row - 1].lstrip().startswith("#"):
             above.insert(0, comments[row])
             row -= 1
-        beside = [comments[k] for k in range(node.lineno, end + 1) if k in comments]
-        beside = [x for x in beside if not x.startswith(("fmt:", "noqa", "type:"))]
-        if not above and not beside and row == last_line:
+        same_line = [comments[k] for k in range(node.lineno, end + 1) if k in comments]
+        same_line = [x for x in same_line if not x.startswith(("fmt:", "noqa", "type:"))]
+        if not above and not same_line and row == last_line:
             above = [shared]
-        comment = " ".join([*beside, *above]) if node.lineno == end else " ".join([*above, *beside])
+        comment = (
+            " ".join([*same_line, *above]) if node.lineno == end else " ".join([*above, *same_line])
+        )
         rows.append((", ".join(names), ast.unparse(node.value), comment))
         last_line, shared = end, " ".join(above)
     return rows

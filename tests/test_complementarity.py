@@ -32,6 +32,13 @@ def enumerate_supports(a, q):
     return None
 
 
+def test_redundant_contacts_share_in_equal_parts():
+    """Three supports of one body, of which any carries it alone: the z of least norm."""
+    solution = jax.jit(solve_lcp)(jnp.ones((3, 3)), -jnp.ones(3))
+    np.testing.assert_allclose(solution.z, [1 / 3] * 3, rtol=1e-12)
+    assert names(solution.code) == ["impulse_not_unique"]
+
+
 def problem(state):
     """W and gamma- of a state."""
     n = np.asarray(state.normals, float)

@@ -230,7 +230,7 @@ def test_a_law_with_friction_may_be_made_outside_of_jit():
     assert jax.eval_shape(run, jnp.array([0.0, 0.3, 0.1])).shape == (2, 3)
 
 
-def test_a_motion_back_in_time_is_told():
+def test_a_motion_back_in_time_is_reported():
     ball, start = (
         ji.ball_system(),
         SimpleNamespace(q=jnp.ones(1), v=jnp.ones(1), t=jnp.asarray(1.0)),
@@ -705,7 +705,7 @@ def test_time_stepping_of_many_beads_comes_to_rest(law):
 
 
 @pytest.mark.slow
-def test_time_stepping_tells_what_it_cannot_resolve():
+def test_time_stepping_reports_what_it_cannot_resolve():
     pile = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]], room=1)
     system, q = ji.System(pile, potential=ji.gravity(pile)), pile.at([[0.0, 0.1], [0.3, 0.1]])
     crowded = ji.simulate(

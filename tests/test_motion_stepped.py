@@ -124,7 +124,7 @@ class Table(ji.Body):
         {"method": "time_stepping", "step": 1e-2},
     ],
 )
-def test_leaving_the_range_of_a_gap_function_is_told(options):
+def test_leaving_the_range_of_a_gap_function_is_reported(options):
     system = ji.System(Table(), potential=Table().gravity(G))
     motion = ji.simulate(system, ji.Moreau(0.5), [0.0, 0.1], [1.0, 0.0], 2.0, samples=11, **options)
     assert status(motion) == "out_of_range"
@@ -268,7 +268,7 @@ def shrinking(q):
         (lambda q: q - 0.5, [1.0], np.nan, "law_failed"),
     ],
 )
-def test_what_goes_wrong_on_the_way_is_told(gap, mass, restitution, expected):
+def test_what_goes_wrong_on_the_way_is_reported(gap, mass, restitution, expected):
     run = jax.jit(lambda e: stepped(ji.System(gap, mass), ji.Moreau(e), [0.5003], [-1.0]))
     assert status(run(restitution)) == expected
 
@@ -283,7 +283,7 @@ def test_a_motion_says_how_its_law_fails():
         ji.raise_on_failed_motion(failed)
 
 
-def test_friction_below_0_is_told():
+def test_friction_below_0_is_reported():
     run = jax.jit(
         lambda mu: stepped(
             ji.block_system(0.2, 0.4), ji.Moreau(0.0, friction=mu), [0.0, 0.2, 0.0], [1.0, 0.0, 0.0]
@@ -292,7 +292,7 @@ def test_friction_below_0_is_told():
     assert status(run(-0.3)) == "law_failed"
 
 
-def test_a_quaternion_of_length_2_is_told():
+def test_a_quaternion_of_length_2_is_reported():
     ball = ji.Sphere(0.1)
     run = jax.jit(lambda q: stepped(ji.System(ball), ji.Moreau(0.5), q, jnp.zeros(6)))
     assert status(run(ball.at([0.0, 0.0, 0.2]).at[3].set(2.0))) == "out_of_range"
@@ -406,7 +406,7 @@ def test_functions_of_a_system_compute_in_the_precision_of_the_start(given, opti
         ji.simulate(system, ji.Moreau(np.float32(0.5)), one, 0 * one, 1.0, **options)
 
 
-def test_a_disc_without_walls_is_told():
+def test_a_disc_without_walls_is_refused():
     disc = ji.Discs(1.0, [0.1])
     with pytest.raises(ValueError, match="each of m >= 1 contacts"):
         stepped(ji.System(disc), ji.Moreau(0.5), disc.at([[0.0, 1.0]]), np.zeros(3))

@@ -1,6 +1,6 @@
 """Forces in contacts as a flow: LZB, gaps and viscous forces, with and without planar friction.
 
-With sqrt-energy units (see `dimensionless.py`) and frozen geometry the law reads
+With sqrt-energy units (see `impact_dynamics.py`) and frozen geometry the law reads
 
     x_j' = -omega_j c_j gamma_j,   p_j' = F_j = (eta_j + 1)/2 omega_j x_j^eta_j,
     gamma' = G F + K_nt lambda,    u' = K_tn F + K_tt lambda
