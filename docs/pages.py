@@ -150,16 +150,14 @@ def law_pages() -> dict[str, str]:
 
 # ---------------------------------------------------------------------------- the constants
 
-UNITS = (  # how a comment begins, and the unit that it states
+UNITS = (  # words of a comment that state a unit, and the unit; None: the words themselves
     (r"\[([^\]]+)\]", None),
     (r"^(m/s\^2)", None),
-    (r"(?:of|in|relative to) the tolerance|tolerances\b", "tolerance"),
-    (r"seconds\b|\bs\b:", "s"),
-    (r"eps\b|roundings?\b", "eps"),
-    (r"relative\b|share\b|fraction\b|of the\b|factor\b", "1"),
-    (r"(?:passes|steps|contacts|samples|shots|iterations|halvings|impacts|events|closings|rounds"
-     r"|bytes|digits|signs|lines|columns|degrees|points|bodies|terms|sweeps)\b", ""),
-)  # fmt: skip
+    (r"^(?:(?:of|in) )?(?:the )?tolerances?\b", "tolerance"),
+    (r"^seconds\b", "s"),
+    (r"^(?:of )?eps\b|this many eps|multiple of (?:m )?eps|so many roundings", "eps"),
+    (r"^(?:a )?(?:relative|share|factor)\b|\bthis (?:share|factor)\b", "1"),
+)
 
 
 def numbers_in(value: ast.expr) -> bool:
@@ -248,7 +246,8 @@ def constants_page() -> dict[str, str]:
         "# Constants", "",
         "Every number bound to a name in capitals at the top of a module, with its comment in the "
         "source. Values are SI where nothing else is stated; `eps` is the rounding unit of the "
-        "precision in use. Coefficients of published Runge-Kutta methods are left out.", "",
+        "precision in use. A constant without a unit is a count, or its meaning states the unit. "
+        "Coefficients of published Runge-Kutta methods are left out.", "",
     ]  # fmt: skip
     room = None
     for path, rows in constants().items():

@@ -24,7 +24,7 @@ from jimpact.scene import Scene
 
 # Tolerances of v+ where the law names none, relative to max |v-|. Ten times more would make every
 # outcome right to one digit less.
-DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}  # error of v+ over the largest |v-|
+DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # method 'impulse', first order: the step in the primary impulse itself
 FINEST_RTOL_IN_EPS = 16  # below this many eps the error estimate is noise
 
