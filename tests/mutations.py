@@ -133,7 +133,7 @@ MUTATIONS = [
     Mutation("bodies that pass each other are not reported", r"again \| \(\(course", "again | (False & (course", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
     # --- the command line
-    Mutation("the newest programs go first", r"in sorted\(files\):", "in sorted(files, reverse=True):", ("test_program_cache.py",), "program_cache.py"),
+    Mutation("the newest programs go first", r"in sorted\(files\):", "in sorted(files, reverse=True):", ("test_program_cache.py::test_the_least_recently_used_files_go_first",), "program_cache.py"),
     Mutation("unwritable places pass", r"with tempfile\.TemporaryFile\(dir=above\):", "if above:", ("test_commands.py::test_unwritable_places_are_refused_before_anything_is_computed",), "options.py"),
     Mutation("NaN cells go unreported", r"if not_numbers:", "if not not_numbers:", ("test_commands.py::test_nan_cells_are_reported_once",), "shots_file.py"),
     Mutation("bodies at rest collide", r"(before\)\)) >= 0", r"\1 > 0", ("test_commands.py::test_velocities_without_an_impact_are_refused",), "commands.py"),
