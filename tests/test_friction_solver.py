@@ -298,7 +298,7 @@ def definite(rng, n, count):
     return np.moveaxis(a @ a.transpose(0, 2, 1) + 0.1 * np.eye(n), 0, -1)
 
 
-@pytest.mark.parametrize("n", [1, 3, 9])
+@pytest.mark.parametrize("n", [1, 2, 3, 9])
 def test_dense_solves_are_those_of_numpy(n):
     """In a batch; systems, inverses, products and least solutions of singular systems."""
     rng = np.random.default_rng(n)

@@ -7,8 +7,8 @@ With sqrt-energy units (see `impact_dynamics.py`) and frozen geometry the law re
 
 with c_j = 1 in compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2. In
 expansion g_j = gamma_j / e_j takes the place of gamma_j, and time runs in units of the smallest e
-at work: nothing is then divided by e, so that e = 0 is an ordinary, differentiable case (the whole
-expansion takes no time; derivatives in e there are one-sided).
+of these contacts: nothing is then divided by e, so that e = 0 is an ordinary, differentiable case
+(the whole expansion takes no time; derivatives in e there are one-sided).
 
 STATE (rows)   x, g, p (m each), time; with friction slip u and its impulse (t each).
 MODES (rows)   phase (m), how often each contact has closed (m); with friction the slip: 0 sticks,
@@ -44,11 +44,11 @@ NEGLIGIBLE = 0.1
 # times wider: they end with errors of 1000 tolerances.
 PATIENCE = 2000
 WIDENED = 100.0  # tolerances, at which an impact may end after PATIENCE passes
-# Passes per contact, which few impacts need, before endless closings are looked for; ten times
-# more: they are found later.
+# Passes per contact, which few impacts need, before endless closings are checked for; ten times
+# more: they are detected later.
 DRAGGING = 100
-# Closings of a contact, from which on they may be endless, a power of 2: ten times more, found
-# later.
+# Closings of a contact, from which on they may be endless, a power of 2: ten times more:
+# detected later.
 OFTEN = 8
 # Whole and half exponents below it are products, not powers. Ten times more: longer products.
 LARGE = 6.0
@@ -126,7 +126,7 @@ class Chain(NamedTuple):
         return Chain(jnp.abs(self.off_diagonal))
 
     def pull(self) -> "Chain":
-        """min(G, 0) with the unit diagonal kept."""
+        """min(G, 0) with its unit diagonal."""
         return Chain(jnp.minimum(self.off_diagonal, 0.0))
 
 
@@ -155,7 +155,7 @@ class Dense(NamedTuple):
 class Frozen(NamedTuple):
     """What of the field does not change while the modes last."""
 
-    unit: jax.Array  # (1, B) time unit s*: the smallest e at work
+    unit: jax.Array  # (1, B) time unit s*: the smallest s_j
     ratio: jax.Array  # (m, B) s* / s_j
     closing: jax.Array  # (m, B) x' / g
     stiffness: jax.Array  # (m, B) force / x^eta
@@ -215,7 +215,7 @@ class ContactFlow(Flow):
         return self.omega.shape[0]
 
     @property
-    def snap(self) -> jax.Array:
+    def zero_margin(self) -> jax.Array:
         """Margins (1, B) below this are 0."""
         return SNAP * self.tolerance
 
@@ -383,14 +383,14 @@ class ContactFlow(Flow):
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
         """Where the most closings of a contact become 8, 16, 32, ...: see `plastic_limit.py`."""
         if self.gapped or self.viscous is not None:
-            return None  # nothing is self-similar there
+            return None  # not self-similar
         m = self.contacts
         count, old = (jnp.max(x[m : 2 * m], axis=0, keepdims=True) for x in (after, before))
         doubled = (count > old) & (count >= OFTEN) & (count & (count - 1) == 0)
         return doubled & (passes > DRAGGING * m)
 
     def patience(self, passes: jax.Array) -> jax.Array:
-        """Widens what counts as nothing left once an impact drags on."""
+        """The tolerance (1, B), WIDENED once an impact drags on."""
         return jnp.where(passes > PATIENCE * self.taking_part, WIDENED, 1.0) * self.tolerance
 
     def energy(self, x: jax.Array, g: jax.Array) -> jax.Array:
@@ -414,7 +414,7 @@ class ContactFlow(Flow):
         return works, gamma, jnp.where(works, rebound, gamma)
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Whether contacts at work feel and press no others: the rest follows from the energy."""
+        """Whether loaded contacts act on no others: the rest then follows from the energy."""
         tolerance = self.patience(passes)
         works, gamma, rebound = self.at_work(modes, y, tolerance)
         if not self.closed_form:

@@ -5,7 +5,7 @@
     stick:  lambda such that u_j' = 0, while |lambda_j| <= mu_j F_j
 
 Which contacts slip and which stick is frozen in the modes (rows: phase, closings, slip: 0 sticks,
-else the sign of u). Margins of friction are the speed of slip and the room inside the friction
+else the sign of u). Margins of friction are the speed of slip and the distance to the friction
 cone. The normal forces follow from the indentations, so that lambda exists and u' is unique
 whatever mu is: there is no Painleve paradox. Where K_tt is singular (both corners of a block lying
 flat) lambda is shared among the contacts that stick in proportion to mu F: they then break loose
@@ -43,10 +43,10 @@ LEFT = 0.1
 
 
 def ridge(dtype: Any) -> float:
-    """Weight of sum lambda^2 / (mu F), which forces of sticking minimize, beside K_tt.
+    """Weight of sum lambda^2 / (mu F), which forces of sticking minimize, added to K_tt.
 
-    It decides only where K_tt is singular. A refinement removes what it changes elsewhere, so that
-    rounding is least at the square root of that of a number.
+    It matters only where K_tt is singular. A refinement removes its effect elsewhere, so that
+    errors are least at the square root of the machine epsilon.
     """
     return math.sqrt(float(jnp.finfo(dtype).eps))
 
@@ -57,18 +57,18 @@ class FrictionConstants(NamedTuple):
     frozen: Frozen
     stick: jax.Array  # (m, B)
     drag: jax.Array  # lambda / F of those that slide (m, B)
-    pull: jax.Array  # u' = pull F, but for what is held (m, m, B)
+    pull: jax.Array  # u' = pull F without sticking forces (m, m, B)
     tangent: jax.Array  # K_tt of those that stick (m, m, B)
-    share: jax.Array  # beside its diagonal (m, B)
+    ridge: jax.Array  # added to the diagonal of K_tt (m, B)
 
 
 class FrictionForces(NamedTuple):
-    """Forces and what follows from them, (m, B) each."""
+    """Forces, rates of slip and margins of sticking, (m, B) each."""
 
     normal: jax.Array  # F
     side: jax.Array  # lambda
     rate: jax.Array  # u'
-    room: jax.Array  # in the cones of those that stick: 1 nothing is held, 0 on the cone
+    room: jax.Array  # inside the cone of those that stick: 1: no tangential force, 0: on the cone
 
 
 @as_pytree
@@ -112,9 +112,9 @@ class FrictionFlow(ContactFlow):
     # ---- the protocol
 
     def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
-        """How contacts share what they hold is as good as the rounding beside the weight allows.
+        """How contacts share tangential forces is accurate to rounding / weight (`ridge`).
 
-        It changes no velocity, and all else of lambda is linear in F while the modes last.
+        The sharing changes no velocity, and all else of lambda is linear in F while the modes last.
         """
         m = self.contacts
         shares = (np.arange(len(y)) // m == 4)[:, None]
@@ -138,7 +138,7 @@ class FrictionFlow(ContactFlow):
             drag=drag,
             pull=jnp.swapaxes(self.normal_tangent, 0, 1) + self.tangent * drag[None],
             tangent=k,
-            share=jnp.where(stick, ridge(k.dtype), 1.0),
+            ridge=jnp.where(stick, ridge(k.dtype), 1.0),
         )
 
     def forces(self, const: FrictionConstants, y: jax.Array) -> FrictionForces:
@@ -149,7 +149,7 @@ class FrictionFlow(ContactFlow):
         largest = jax.lax.stop_gradient(jnp.max(most, axis=0, keepdims=True))
         weight = load_shares(most)
         right = jnp.where(const.stick, -pull, 0.0)
-        held = regularized_once(const.tangent * weight[None], const.share, right)
+        held = regularized_once(const.tangent * weight[None], const.ridge, right)
         hold, size = weight * held, jnp.abs(held)
         # in parts of the force: those of a contact that opens vanish together
         some = const.stick & (largest + size > 0)
@@ -173,7 +173,7 @@ class FrictionFlow(ContactFlow):
         )
 
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """Those of the normal flow, speeds of slip, room in the friction cones."""
+        """Those of the normal flow, speeds of slip, distances to the friction cones."""
         m = self.contacts
         slides = (modes[2 * m :] != 0) & self.loaded(modes)
         return jnp.concatenate(
@@ -211,17 +211,17 @@ class FrictionFlow(ContactFlow):
         rests = jnp.abs(u) <= SNAP * self.tolerance
         slip = jnp.where(closed & ~rests, jnp.sign(u).astype(slip.dtype), slip)
         resting = loaded & rests & ((slip != 0) | closed)
-        ask = any_of(stopped | (closed & resting))
-        asked = ask & loaded & (stopped | resting | (slip == 0))
-        u = jnp.where(asked, 0.0, u)
+        check = any_of(stopped | (closed & resting))
+        to_check = check & loaded & (stopped | resting | (slip == 0))
+        u = jnp.where(to_check, 0.0, u)
         still, state = jax.lax.stop_gradient((self, y))
         f = still.soon(modes, state)
         most = still.friction * f
-        slides = jnp.where(asked | ~loaded, 0.0, -slip.astype(u.dtype) * most)
+        slides = jnp.where(to_check | ~loaded, 0.0, -slip.astype(u.dtype) * most)
         b = times(jnp.swapaxes(still.normal_tangent, 0, 1), f) + times(still.tangent, slides)
-        stick, towards = distribute(still.tangent, b, most, asked)
+        stick, towards = distribute(still.tangent, b, most, to_check)
         towards = jnp.where(stick, 0, jnp.sign(towards).astype(slip.dtype))
-        slip = jnp.where(asked, towards, slip)
+        slip = jnp.where(to_check, towards, slip)
         return jnp.concatenate([modes[: 2 * m], slip]), jnp.concatenate([y[: 3 * m], u, y[4 * m :]])
 
     def soon(self, modes: jax.Array, y: jax.Array) -> jax.Array:
@@ -253,7 +253,7 @@ class FrictionFlow(ContactFlow):
         return None
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Whether no contact is at work."""
+        """Whether no contact is loaded or approaches."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
         return ~any_of(works)
 

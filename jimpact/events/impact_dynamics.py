@@ -113,7 +113,7 @@ def dimensionless(
     x_ref = ((eta + 1) * q**2 / (2 * stiffness)) ** (1 / (eta + 1))
     t_ref = x_ref / (q * root)
     time = jax.lax.stop_gradient(jnp.min(t_ref))
-    # tolerance is asked of velocities: where W_jj is large, impulses must be finer
+    # the tolerance applies to velocities: where W_jj is large, impulses must be finer
     fastest = jnp.max(jnp.maximum(-gamma, jnp.sqrt(2 * stored) * root))
     weight = jnp.maximum(1.0, q * root / fastest)
     omega = time / t_ref
@@ -254,7 +254,7 @@ class ImpulseProgram:
         if self.smooth:
             return p, *rest
         p = stepper.with_plan(p, end.plan) if self.finely else p
-        return p, *rest, end.status, end.carry.plan[3:4].astype(jnp.int32)
+        return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
 
 
 class Dynamics(NamedTuple):

@@ -1,10 +1,10 @@
 """Contacts that close again and again, and the plastic limit that this comes to.
 
 Each closing takes part of the velocities away, so that endless closings end with `gamma+ = 0` of
-those contacts. What is left of a contact below the tolerance is such an end. But contacts beside a
-light body lose about its part of the mass at each closing: thousands of closings, all alike. The
-law is homogeneous: a state multiplied by s takes the same course, multiplied by s. Once a state
-returns as a multiple s < 1 of itself, it will return so for ever, and the limit is known.
+those contacts. Most contacts soon end below the tolerance. But contacts of a light body lose only
+about its part of the mass at each closing: thousands of closings, all alike. The law is
+homogeneous: a state multiplied by s takes the same course, multiplied by s. Once a state returns as
+a multiple s < 1 of itself, it will return so for ever, and the limit is known.
 
 This is checked when the number of closings becomes 8, 16, 32, ... Two states one
 such number apart are compared by `gamma`, by the energy in each contact, and by the impulses that
@@ -57,7 +57,7 @@ class ImpactEnd(NamedTuple):
 
     @property
     def carries(self) -> jax.Array:
-        """Contacts at rest that carry an impulse (m, B); asks for both, see `with_plan`."""
+        """Contacts at rest that carry an impulse (m, B); uses both, see `with_plan`."""
         return self.rest.carries & self.rest.contacts
 
     @property
@@ -74,7 +74,7 @@ class ImpactEnd(NamedTuple):
     @property
     def over(self) -> jax.Array:
         """Whether (1, B) the impact has ended, not given up."""
-        return self.carry.plan[2:3] == OVER
+        return self.carry.progress[2:3] == OVER
 
     @property
     def finishes(self) -> jax.Array:
@@ -105,12 +105,12 @@ def to_the_end(
 
     def on(end: ImpactEnd) -> ImpactEnd:
         """On to the next pause or to the end."""
-        finished = (end.carry.plan[2:3] == OVER) & end.begun
+        finished = (end.carry.progress[2:3] == OVER) & end.begun
         if end.pen is None:
             carry, pen = stepper.run(flow, end.carry, most), None
         else:
             carry, pen = stepper.record(flow, end.carry, end.pen, most)
-        over, paused = (carry.plan[2:3] == OVER) & ~finished, carry.plan[2:3] == PAUSED
+        over, paused = (carry.progress[2:3] == OVER) & ~finished, carry.progress[2:3] == PAUSED
         values = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
         quiet = over & at_rest(still, values)
 
@@ -126,8 +126,8 @@ def to_the_end(
             lambda: end.rest,
         )
         settled = jnp.where(rest.ended, OVER, GOES_ON)
-        plan = carry.plan.at[2:3].set(jnp.where(paused, settled, carry.plan[2:3]))
-        return ImpactEnd(carry._replace(plan=plan), pen, rest, jnp.asarray(True))
+        progress = carry.progress.at[2:3].set(jnp.where(paused, settled, carry.progress[2:3]))
+        return ImpactEnd(carry._replace(progress=progress), pen, rest, jnp.asarray(True))
 
     return jax.lax.while_loop(
         lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start
@@ -139,7 +139,7 @@ def at_rest(flow: ContactFlow, end: stepper.StepperState) -> jax.Array:
     m, modes = flow.contacts, end.step.modes
     gamma = flow.scales(modes) * flow.rows(end.y)[1]
     # no wider than what ended the impact: a ball of a long chain may be slower
-    quiet = jnp.abs(gamma) <= QUIET * flow.patience(end.plan[3:4])
+    quiet = jnp.abs(gamma) <= QUIET * flow.patience(end.progress[3:4])
     return quiet & any_of(quiet & (modes[m : 2 * m] >= ENDLESS))
 
 
@@ -152,7 +152,7 @@ def contacts_at_rest(
     the gamma+ that their impulses give: errors of many closings add up.
     """
     m, modes, state = flow.contacts, carry.step.modes, carry.y
-    paused = carry.plan[2:3] == PAUSED
+    paused = carry.progress[2:3] == PAUSED
     count = modes[m : 2 * m]
     since = count - last.closings
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
@@ -169,7 +169,7 @@ def contacts_at_rest(
     start = (often | (rest & (now < 0)), jnp.zeros_like(now))
     carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
 
-    # is it a part of the state at the last look?
+    # is it a multiple of the state at the last check?
     root = jnp.sqrt(flow.energy(state[:m], jnp.zeros_like(now)))
     rows = jnp.where(often, jnp.stack([now, root, dp]), 0.0)
     size, before = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))

@@ -13,7 +13,7 @@ one of three modes, and its two rows of slip mean
              slip comes to a stop at the FLOOR after a few steps, as ln r falls at a steady rate
     CREEPS   r and angle, 0 included: r is so small that the direction follows from the forces, to
              first order in r. It obeys n . a = r angle': the angle is a state that drifts as the
-             solution drifts, and one step of Newton's method beside it gives the direction.
+             solution drifts, and one Newton step corrects the direction.
 
 and of a contact without load the Cartesian slip velocity. Slip sets in by creeping, from r = 0
 where stick ends; where the stiffness c K_tt / r has fallen enough, it SLIPS. Where several contacts
@@ -103,7 +103,7 @@ def length(pair: jax.Array) -> jax.Array:
 
 
 def polar(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Unit vectors (m, 2, B) along and at right angles."""
+    """Unit vectors (m, 2, B) in this direction and at right angles to it."""
     cosine, sine = jnp.cos(angle), jnp.sin(angle)
     return jnp.stack([cosine, sine], 1), jnp.stack([-sine, cosine], 1)
 
@@ -380,19 +380,19 @@ class SlipFlow(FrictionFlow):
         moving = jnp.where(slips[:, None], q, 1.0)
         q = jnp.where(slips[:, None], jnp.stack([jnp.log(length(moving)), angle_of(moving)], 1), q)
         slip = jnp.where(slips, SLIPS, slip)
-        ask = any_of(stopped | (closed & resting))
-        asked = ask & loaded & (stopped | resting | stick)
+        check = any_of(stopped | (closed & resting))
+        to_check = check & loaded & (stopped | resting | stick)
         still, state = jax.lax.stop_gradient((self, y))
         f = still.soon(modes, state)
         most = still.friction * f
         slides = jnp.where(
-            (asked | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
+            (to_check | ~loaded)[:, None], 0.0, polar(jax.lax.stop_gradient(q[:, 1]))[0]
         )
         b = times(jnp.swapaxes(still.normal_tangent, 0, 1), f)
         b = b - times(still.tangent, flat(most[:, None] * slides))
-        inside, towards = distribute(still.tangent, b, most, asked)
+        inside, towards = distribute(still.tangent, b, most, to_check)
         towards = angle_of(pairs(towards))
         begins = jnp.stack([jnp.zeros_like(towards), jnp.where(inside, 0.0, towards)], 1)
-        q = jnp.where(asked[:, None], begins, q)
-        slip = jnp.where(asked, jnp.where(inside, STICKS, CREEPS), slip).astype(modes.dtype)
+        q = jnp.where(to_check[:, None], begins, q)
+        slip = jnp.where(to_check, jnp.where(inside, STICKS, CREEPS), slip).astype(modes.dtype)
         return jnp.concatenate([modes[: 2 * m], slip]), self.with_slip(y, q)

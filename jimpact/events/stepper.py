@@ -1,31 +1,33 @@
 """One event-aligned stepper for every flow with modes: no step straddles a change of mode.
 
-LAYOUT   Rows first, batch last: state y (n, B), margins (k, B), modes (m, B) whole numbers; what is
-one number an impact is (1, B). One impact is a batch of one.
+LAYOUT   Rows first, batch last: state y (n, B), margins (k, B), modes (m, B) whole numbers;
+per-impact scalars have shape (1, B). One impact is a batch of one.
 
 PROTOCOL   A flow is a pytree of parameters (arrays (.., B)): see `Flow`. It defines `field`,
-`margins`, `switch`, `over` and a tolerance, and overrides those of the defaults that it needs.
+`margins`, `switch`, `over` and a tolerance, and overrides the defaults that do not fit.
 
 ONE FORMULA FOR A STEP   Steps advance in xi with dt/dxi = N(xi) / R,
 
     N = 2 xi where xi is a root, else 1;   R = dc_k/dt on landings, else 1.
 
-A landing on margin k runs from xi = c_k (or its root) to exactly 0 (Henon): no root is searched
-for, and its length is differentiated. An event where a step begins is a landing of length 0; an
+A landing on margin k runs from xi = c_k (or its root) to exactly 0 (M. Henon, On the numerical
+computation of Poincare maps, Physica D 5, 1982): no root is searched for, and the length of the
+step has derivatives. An event where a step begins is a landing of length 0; an
 explicit Runge-Kutta step of length 0 has the right derivatives up to its order, so there are no
 jump rules, also where events coincide.
 
 WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a distance in units of
 the step just tried; the most urgent one decides (`advance`).
 
-DERIVATIVES   Forward ones go along with the steps: the state carries tangents (`tangents.py`) while
-values alone decide. For the reverse mode the run records its accepted steps, and `repeat` walks
-through them once more as a scan in which nothing is decided. JAX differentiates both: any order.
+DERIVATIVES   In forward mode the state carries tangents (`tangents.py`); step sizes and events
+depend on values, not on tangents. For the reverse mode the run records its accepted steps, and
+`repeat` walks through them once more as a scan with all decisions fixed. JAX differentiates both:
+any order.
 
 COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
 reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
-b gives margins and their rates at the end of a step), and what is one number an impact is rows of
-two arrays.
+b gives margins and their rates at the end of a step), and per-impact scalars are rows of two
+arrays, `Step.clock` and `StepperState.progress`.
 """
 
 import abc
@@ -39,8 +41,8 @@ import numpy as np
 from jimpact.events.tableaux import DOP853
 from jimpact.events.tangents import Dual, dual_like, is_dual, pushforward, value_of
 
-# Step-size control: a step is at most so many times, at least this part of the one before it, and
-# this part of what its error allows. More growth or less safety: more rejected steps.
+# Step-size control: a step is at most GROWTH times and at least SHRINK times the one before it, and
+# SAFETY times what its error allows. More growth or less safety: more rejected steps.
 GROWTH, SHRINK, SAFETY = 6.0, 0.2, 0.8
 # First step, in the time of the fastest contact, which cannot turn around so soon. Ten times more
 # could step over its first event.
@@ -51,6 +53,9 @@ RESTART = 0.1
 # Part of the way to an event that a step is shortened to where it cannot land on it. At 1 it ends
 # at the event and may step over it again.
 CUT = 0.7
+# A flow with `near` lands where the event is at most this many times `near` ahead, in steps. Such a
+# landing evaluates costly margins in each stage; ten times more makes it longer.
+REACH = 5
 # Part of a step's change of slope by which its minimum may lie lower than its cubic. Ten times
 # more: steps are shortened for margins that do not dip.
 DOUBT = 0.01
@@ -103,16 +108,16 @@ class Flow(abc.ABC):
 
     @property
     @abc.abstractmethod
-    def snap(self) -> jax.Array:
-        """Margins closer to 0 than this (1, B) are 0."""
+    def zero_margin(self) -> jax.Array:
+        """Margins closer to 0 than this (1, B) count as 0."""
 
     @abc.abstractmethod
     def field(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """dy (n, B) in the flow's own time."""
+        """Rates dy (n, B) in the flow's own time."""
 
     @abc.abstractmethod
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
-        """(k, B): each is >= 0 while its mode lasts."""
+        """Margins (k, B): each is >= 0 while its mode lasts."""
 
     @abc.abstractmethod
     def switch(
@@ -125,11 +130,11 @@ class Flow(abc.ABC):
         """Whether (1, B) nothing is left to integrate."""
 
     def constants(self, modes: jax.Array) -> Any:
-        """What of the field does not change while the modes last."""
+        """The parts of the field that do not change while the modes last."""
         return None
 
     def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
-        """Tolerances (n, B) that the error of each row may be."""
+        """Allowed error (n, B) of each row, in tolerances."""
         return 1.0
 
     def rooted(self, modes: jax.Array) -> jax.Array:
@@ -137,7 +142,7 @@ class Flow(abc.ABC):
         return jnp.zeros((1, 1), bool)
 
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
-        """Whether (1, B) forces set in like powers of time, so that steps begin in its root."""
+        """Whether (1, B) forces start as a power of time: steps then advance in its root."""
         return jnp.zeros((1, 1), bool)
 
     def coasts(self, modes: jax.Array) -> jax.Array | None:
@@ -145,11 +150,11 @@ class Flow(abc.ABC):
         return None
 
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
-        """Whether (1, B) the caller is to look at the state after this event; None: never."""
+        """Whether (1, B) the caller has to inspect the state after this event; None: never."""
         return None
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Modes and state at the end, where it is over."""
+        """Modes and state at the end of the impact, where `over` is True."""
         return modes, y
 
 
@@ -176,7 +181,7 @@ def _put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
 
 
 class Step(NamedTuple):
-    """What a step needs in addition to the state: enough to repeat it."""
+    """A step without its state: enough to repeat it."""
 
     modes: jax.Array  # (m, B)
     target: jax.Array  # (k, B) one-hot: the margin it lands on; none: a step in time
@@ -189,7 +194,7 @@ class _StepVariable(NamedTuple):
     start: Any  # xi at the beginning
     length: Any  # of the step in xi
     rooted: Any  # whether xi is a root
-    nowhere: Any  # a landing of length 0
+    zero_length: Any  # whether it is a landing on a margin that is 0
 
 
 def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVariable]:
@@ -197,16 +202,16 @@ def _frame(flow: Flow, s: Step, y: jax.Array) -> tuple[Any, jax.Array, _StepVari
     begun, h, in_root, lands = _rows(s.clock)
     const = flow.constants(s.modes)
     c0 = flow.margins(const, s.modes, y)
-    # from a margin that is 0 already a landing has length 0, and no root
-    root = flow.rooted(s.modes) & (c0 > flow.snap)
+    # a landing from a margin that is already 0 has length 0, and no root
+    root = flow.rooted(s.modes) & (c0 > flow.zero_margin)
     xi0 = jnp.where(root, jnp.sqrt(jnp.where(root, c0, 1.0)), c0)
     xi0 = total(jnp.where(s.target, xi0, 0.0))
     rooted = total(jnp.where(s.target, root.astype(y.dtype), 0.0)) + in_root
     start = jnp.where(lands > 0, xi0, begun)
-    # a margin that is as good as 0 takes no time, however slow it is; its derivatives are kept
-    nowhere = (lands > 0) & (jnp.abs(xi0) <= flow.snap)
-    length = jnp.where(nowhere, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
-    return const, jax.lax.stop_gradient(c0), _StepVariable(start, length, rooted, nowhere)
+    # a margin that counts as 0 takes no time, however slow it is; its derivatives remain
+    zero_length = (lands > 0) & (jnp.abs(xi0) <= flow.zero_margin)
+    length = jnp.where(zero_length, jax.lax.stop_gradient(xi0) - xi0, jnp.where(lands > 0, -xi0, h))
+    return const, jax.lax.stop_gradient(c0), _StepVariable(start, length, rooted, zero_length)
 
 
 def _slopes(
@@ -239,7 +244,7 @@ def _slopes(
     else:
         value, dc = rates_of_margins()
     rate = total(jnp.where(s.target, dc, 0.0)) + (1 - lands)
-    rate = jnp.where(frame.nowhere & (rate == 0), jnp.inf, rate)
+    rate = jnp.where(frame.zero_length & (rate == 0), jnp.inf, rate)
     dt = (1 + frame.rooted * (2 * xi - 1)) / rate
     rows = [dy[first:last] * dt for first, last in pairwise(ends)]
     return [*rows, dt], jax.lax.stop_gradient((value, dc))
@@ -318,27 +323,31 @@ def _with_row(table: Any, new: list[Any], i: jax.Array) -> Any:
     return Dual(value, tangents)
 
 
-# What an impact does: it goes on, is over, or waits for the caller to look at it
+# State of an impact: it goes on, is over, or waits until the caller has inspected it.
 GOES_ON, OVER, PAUSED = 0.0, 1.0, 2.0
 
 # What the next step does about a margin, the most urgent first, and what its distance means. The
-# numbers leave room for distances from 0 to 1 between them: their sum is the order of urgency.
+# numbers leave a gap for distances from 0 to 1 between them: their sum is the order of urgency.
 SHORTEN = -2.0  # it dips, or cannot be landed on from here: at this part of the step
 LAND = 0.0  # it vanishes at this part of the step: repeat the step as a landing on it
-AHEAD = 1.0  # it is expected to vanish so many steps ahead: land on it if the next step reaches it
+AHEAD = 1.0  # expected to vanish this many steps ahead: land on it if the next step reaches it
 
 
 class StepperState(NamedTuple):
-    """What one pass hands to the next."""
+    """The state after a pass, and the step to try in the next one."""
 
     y: Any  # (n, B), which may be `Dual`
     step: Step  # the one to try
-    # (4, B): time it is expected to take, landing aimed at twice, GOES_ON | OVER | PAUSED, passes
-    plan: jax.Array
+    # (4, B): time it is expected to take; whether a landing already had to aim at another event;
+    # GOES_ON | OVER | PAUSED; number of passes
+    progress: jax.Array
 
 
 def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
-    """The first step: short, in the root of time, for forces set in like a power of it."""
+    """The state before the first pass.
+
+    The first step is short and advances in the root of time, as forces start as a power of it.
+    """
     start = dual_like((flow, start), start)
     flow, y = value_of((flow, start))
     one = jnp.ones_like(y[:1])
@@ -352,54 +361,54 @@ def begin(flow: Any, modes: jax.Array, start: Any) -> StepperState:
 
 def goes_on(carry: StepperState, most: int) -> jax.Array:
     """Impacts (1, B) that are neither over nor given up nor paused."""
-    return (carry.plan[2:3] == GOES_ON) & (carry.plan[3:4] < most)
+    return (carry.progress[2:3] == GOES_ON) & (carry.progress[3:4] < most)
 
 
 def unwatched(carry: StepperState, most: int) -> jax.Array:
     """Whether () some impact goes on and none pauses."""
-    return jnp.any(goes_on(carry, most)) & ~jnp.any(carry.plan[2:3] == PAUSED)
+    return jnp.any(goes_on(carry, most)) & ~jnp.any(carry.progress[2:3] == PAUSED)
 
 
 def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, jax.Array]:
-    """One pass, and whether (1, B) the step tried is accepted.
+    """Try one step; accept it, or shorten it, or repeat it so that it ends at an event.
 
-    A step with an event in its middle is not accepted: it is repeated as a landing on the event, or
-    shortened where it cannot land.
+    Returns the state for the next pass, and whether (1, B) the step was accepted.
     """
     duals, start, s = flow, state.y, state.step
     flow, y = value_of((flow, start))
     n = y.shape[0]
-    expected, again, done, passes = _rows(state.plan)
+    expected, aimed_twice, mark, passes = _rows(state.progress)
     _, h, _, lands = _rows(s.clock)
     change, errors, c0, (d0, c1, d1) = _stages(duals, s, start, ends=True)
     error2 = _squared_error(flow, s, y, errors, passes)
     ok = error2 <= 1
-    taken = value_of(change)[n:]
-    span = jnp.where(ok & (taken > 0), taken, expected)
-    urgent = _most_urgent(*_intentions(flow, s, again, c0, d0 * span, c1, d1 * span))
+    elapsed = value_of(change)[n:]  # the last row is time
+    duration = jnp.where(ok & (elapsed > 0), elapsed, expected)
+    slopes = d0 * duration, d1 * duration
+    urgent = _most_urgent(*_intentions(flow, s, aimed_twice, (c0, c1), slopes))
     active = goes_on(state, most)
     accept = ok & (urgent.intention == AHEAD) & active
     landed = accept & (lands > 0)
-    which = s.target & landed
-    # however short the step, the field has no value: given up, and the status reports it
+    events = s.target & landed  # one-hot
+    # the field has no value, however short the step: given up, and the status reports it
     broken = active & ~(lands > 0) & ~(error2 < jnp.inf) & (h < SHORTEST)
 
     def after(flow: Flow, y: jax.Array, change: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Modes and state after the step, where it is accepted."""
-        modes, end = flow.switch(s.modes, y + change[:n], which)
+        modes, end = flow.switch(s.modes, y + change[:n], events)
         return modes, jnp.where(accept, end, jnp.where(broken, jnp.nan, y))
 
     modes, end = pushforward(after, duals, start, change)
     end = dual_like(start, end)
-    step, due = _next_step(flow, s, modes, urgent, accept, error2, span)
+    step, next_duration = _next_step(flow, s, modes, urgent, accept, error2, duration)
     passes = passes + active.astype(y.dtype)
     pauses = flow.pauses(s.modes, modes, passes)
-    done = done if pauses is None else jnp.where(landed & pauses, PAUSED, done)
+    mark = mark if pauses is None else jnp.where(landed & pauses, PAUSED, mark)
     over = flow.over(modes, value_of(end), passes) | broken
     aimed_twice = (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < AHEAD)
-    done = jnp.where(over, OVER, done)
-    plan = jnp.concatenate([due, aimed_twice.astype(y.dtype), done, passes])
-    return StepperState(end, *jax.lax.stop_gradient((step, plan))), accept
+    mark = jnp.where(over, OVER, mark)
+    progress = jnp.concatenate([next_duration, aimed_twice.astype(y.dtype), mark, passes])
+    return StepperState(end, *jax.lax.stop_gradient((step, progress))), accept
 
 
 def _squared_error(
@@ -411,7 +420,7 @@ def _squared_error(
     local = jnp.maximum(flow.tolerance * (full / jnp.maximum(passes, full)), FINEST * eps)
     scale = local * flow.allowance(s.modes, y) + COARSE_ROUNDING * eps * jnp.abs(y)
     fifth, third = (x[None] for x in jnp.max(jnp.abs(errors) / scale[None], axis=1))
-    # `tiny`: a landing of length 0 has no errors
+    # 0.01 is Hairer's; `tiny`: a landing of length 0 has no errors
     error2 = fifth**4 / (fifth**2 + 0.01 * third**2 + tiny)
     # small by chance where the fifth order is: a landing from a maximum, a step of half a period
     return jnp.maximum(error2, (COARSE * third**2 * local) ** 2)
@@ -420,42 +429,59 @@ def _squared_error(
 def _intentions(
     flow: Flow,
     s: Step,
-    again: jax.Array,
-    c0: jax.Array,
-    d0: jax.Array,
-    c1: jax.Array,
-    d1: jax.Array,
+    aimed_twice: jax.Array,
+    values: tuple[jax.Array, jax.Array],
+    slopes: tuple[jax.Array, jax.Array],
 ) -> tuple[jax.Array, jax.Array]:
-    """Intention and distance of each margin (k, B), from its values c and slopes d.
+    """Intention and distance of each margin (k, B), from values and slopes at both ends of a step.
 
-    At the beginning (0) and the end (1) of a step; slopes are in units of the step.
+    In units of the step, with v = 1 - u, a margin within the step is Hermite's cubic
+
+        c(u) = (c0 (1 + 2 u) + d0 u) v^2 + (c1 (1 + 2 v) - d1 v) u^2,
+
+    and at the distance w behind its end the parabola c1 + d1 w + (d1 - d0) w^2 / 2.
     """
-    snap, lands = flow.snap, s.clock[3:4] > 0
+    (c0, c1), (d0, d1) = values, slopes
+    zero, lands = flow.zero_margin, s.clock[3:4] > 0
     free = ~s.target
-    crossed, turns = free & (c1 < -snap), free & (d0 < 0) & (d1 > 0) & (c0 > snap)
-    top = jnp.where(crossed, jnp.maximum(c0, 0.0), jnp.where(turns, -d0, c1))
-    bottom = jnp.where(crossed, c0 - c1, jnp.where(turns, d1 - d0, -d1))
-    u = top / jnp.where(bottom > 0, bottom, jnp.inf)
-    # what rises from 0 and falls back: as in a parabola
-    u = jnp.where(crossed & (c0 <= snap) & (d0 > 0), d0 / jnp.where(crossed, d0 - c1, 1.0), u)
-    if flow.near:
-        # steps in time go before: exact in a parabola, where dt/dxi has a singularity at the top
-        u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
+    crossed, turns = free & (c1 < -zero), free & (d0 < 0) & (d1 > 0) & (c0 > zero)
+    u = _place_within(flow, crossed, values, slopes)
     v = 1 - u
-    low = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
-    dipped = turns & (low < DOUBT * (d1 - d0) - snap)
-    at_once = (c0 <= snap) & (d0 <= 0)
-    direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > snap))
-    direct = direct & (again == 0)
-    # ahead by a parabola: a margin that only creeps towards 0 is not about to reach it
-    left = d1 * d1 - 2 * (d1 - d0) * c1
-    ahead = free & ~turns & (d1 < 0) & (c1 > snap) & (left > 0) & ~lands
-    soon = 2 * c1 / (jnp.sqrt(jnp.where(ahead, left, 1.0)) - jnp.where(ahead, d1, 0.0))
-    soon = jnp.where(ahead, soon, jnp.inf)
+    minimum = (c0 * (1 + 2 * u) + d0 * u) * v * v + (c1 * (1 + 2 * v) - d1 * v) * u * u
+    dipped = turns & (minimum < DOUBT * (d1 - d0) - zero)
+    at_once = (c0 <= zero) & (d0 <= 0)
+    direct = at_once if flow.near else at_once | ((d0 < 0) & (c0 > zero))
+    direct = direct & (aimed_twice == 0)
+    # the parabola has no root where a margin only creeps towards 0
+    discriminant = d1 * d1 - 2 * (d1 - d0) * c1
+    ahead = free & ~turns & (d1 < 0) & (c1 > zero) & (discriminant > 0) & ~lands
+    w = 2 * c1 / (jnp.sqrt(jnp.where(ahead, discriminant, 1.0)) - jnp.where(ahead, d1, 0.0))
+    w = jnp.where(ahead, w, jnp.inf)
     intention = jnp.where(dipped, SHORTEN, AHEAD)
     intention = jnp.where(crossed, jnp.where(direct, LAND, SHORTEN), intention)
-    inside = jnp.where(crossed & direct & at_once, 0.0, u)
-    return intention, jnp.where(crossed | dipped, inside, soon)
+    u = jnp.where(crossed & direct & at_once, 0.0, u)
+    return intention, jnp.where(crossed | dipped, u, w)
+
+
+def _place_within(
+    flow: Flow,
+    crossed: jax.Array,
+    values: tuple[jax.Array, jax.Array],
+    slopes: tuple[jax.Array, jax.Array],
+) -> jax.Array:
+    """Where u (k, B) in a step margins vanish if they have `crossed` 0, otherwise turn."""
+    (c0, c1), (d0, d1) = values, slopes
+    # the root of the chord c0 + (c1 - c0) u, or of the slope d0 + (d1 - d0) u
+    part = jnp.where(crossed, jnp.maximum(c0, 0.0), -d0)
+    whole = jnp.where(crossed, c0 - c1, d1 - d0)
+    u = part / jnp.where(whole > 0, whole, jnp.inf)
+    # a margin that rises from 0 and falls back: the root of the parabola d0 u + (c1 - d0) u^2
+    rises = crossed & (c0 <= flow.zero_margin) & (d0 > 0)
+    u = jnp.where(rises, d0 / jnp.where(crossed, d0 - c1, 1.0), u)
+    if flow.near:
+        # a step in time precedes the landing: dt/dxi is singular at the top of a parabola
+        u = jnp.where(crossed, _root_of_cubic(u, c0, d0, c1, d1), u)
+    return u
 
 
 class _Urgent(NamedTuple):
@@ -481,41 +507,70 @@ def _next_step(
     urgent: _Urgent,
     accept: jax.Array,
     error2: jax.Array,
-    span: jax.Array,
+    duration: jax.Array,
 ) -> tuple[Step, jax.Array]:
     """The step to try after `s`, and the time it is expected to take (1, B).
 
-    `span` is the time that `s` takes, `error2` its error in tolerances, squared.
+    `duration` is the time that `s` takes, `error2` its error in tolerances, squared.
     """
-    begun, h, in_root, lands = _rows(s.clock)
-    ok, event, shorten = error2 <= 1, urgent.intention < AHEAD, urgent.intention == SHORTEN
-    factor = SAFETY / jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20))))
-    factor = jnp.where(error2 < jnp.inf, jnp.clip(factor, SHRINK, GROWTH), SHRINK)
-    lands = lands > 0
+    start, length, in_root, lands = _rows(s.clock)
+    ok, event, lands = error2 <= 1, urgent.intention < AHEAD, lands > 0
     in_root = (in_root > 0) & ~lands
-    xi = jnp.where(in_root, begun + jnp.where(accept, h, 0.0), 0.0)
-    part = 1 - flow.near if flow.near else CUT
-    cut = jnp.where(ok & shorten, part * urgent.distance, 0.5)
-    shorter = jnp.where(in_root, jnp.sqrt(cut) * h, cut * jnp.where(lands, span, h))
-    repeated = jnp.where(shorten, shorter, h)
-    h = jnp.where(ok & event, repeated, jnp.where(lands, jnp.where(ok, h, shorter), factor * h))
-    fresh = accept & flow.begins(s.modes, modes)
-    restart = jnp.sqrt(jnp.minimum(RESTART * span, FIRST))
-    in_root, xi = in_root | fresh, jnp.where(fresh, 0.0, xi)
-    h = jnp.where(fresh & (restart > 0), restart, h)
-    h = jnp.where(in_root, h, jnp.minimum(h, flow.longest))
-    new_span = jnp.where(in_root, (xi + h) ** 2 - xi**2, h)
-    coasts = flow.coasts(s.modes)
-    reached = urgent.distance * span < new_span
-    reached = reached if coasts is None else reached | (coasts & (urgent.distance < jnp.inf))
-    if flow.near:
-        reached = reached & (urgent.distance < 5 * flow.near)
-    aim = ok & jnp.where(event, ~shorten, ~lands & reached)
-    h = jnp.where(aim & in_root, new_span, h)
+    start = jnp.where(in_root, start + jnp.where(accept, length, 0.0), 0.0)
+    shorter = _shorter_length(flow, s, in_root, urgent, ok, duration)
+    at_event = jnp.where(urgent.intention == SHORTEN, shorter, length)
+    after_landing = jnp.where(ok, length, shorter)
+    proposed = jnp.where(lands, after_landing, _length_from_error(length, error2))
+    proposed = jnp.where(ok & event, at_event, proposed)
+    closed = accept & flow.begins(s.modes, modes)
+    in_root, start = in_root | closed, jnp.where(closed, 0.0, start)
+    proposed = _restart_in_root(closed, duration, proposed)
+    proposed = jnp.where(in_root, proposed, jnp.minimum(proposed, flow.longest))
+    # xi is the root of time: from `start` on a step takes this long
+    expected = jnp.where(in_root, (start + proposed) ** 2 - start**2, proposed)
+    reached = _reaches_event(flow, s.modes, urgent.distance, duration, expected)
+    aim = ok & jnp.where(event, urgent.intention == LAND, ~lands & reached)
+    proposed = jnp.where(aim & in_root, expected, proposed)
     in_root = in_root & ~aim
-    clock = jnp.concatenate([xi, h, in_root.astype(h.dtype), aim.astype(h.dtype)])
-    due = jnp.where(aim, urgent.distance * span, new_span)
-    return Step(modes, aim & urgent.target, clock), due
+    flags = [x.astype(length.dtype) for x in (in_root, aim)]
+    step = Step(modes, aim & urgent.target, jnp.concatenate([start, proposed, *flags]))
+    return step, jnp.where(aim, urgent.distance * duration, expected)
+
+
+def _length_from_error(length: jax.Array, error2: jax.Array) -> jax.Array:
+    """The length (1, B) at which the error would be SAFETY^8 tolerances, as error ~ length^8."""
+    # four roots: error^(1/8) = error2^(1/16); 1e-20 keeps it from 0, far beyond GROWTH
+    eighth_root = jnp.sqrt(jnp.sqrt(jnp.sqrt(jnp.sqrt(error2 + 1e-20))))
+    factor = jnp.clip(SAFETY / eighth_root, SHRINK, GROWTH)
+    return jnp.where(error2 < jnp.inf, factor, SHRINK) * length
+
+
+def _shorter_length(
+    flow: Flow, s: Step, in_root: jax.Array, urgent: _Urgent, ok: jax.Array, duration: jax.Array
+) -> jax.Array:
+    """The length (1, B) that ends before an event, or half of the time of a failed landing."""
+    part = 1 - flow.near if flow.near else CUT
+    cut = jnp.where(ok & (urgent.intention == SHORTEN), part * urgent.distance, 0.5)
+    length, lands = s.clock[1:2], s.clock[3:4] > 0
+    # a landing is not in time: the shorter step is
+    return jnp.where(in_root, jnp.sqrt(cut) * length, cut * jnp.where(lands, duration, length))
+
+
+def _restart_in_root(closed: jax.Array, duration: jax.Array, length: jax.Array) -> jax.Array:
+    """The length (1, B), but of the first step after a contact has `closed` in the root of time."""
+    restart = jnp.sqrt(jnp.minimum(RESTART * duration, FIRST))
+    return jnp.where(closed & (restart > 0), restart, length)
+
+
+def _reaches_event(
+    flow: Flow, modes: jax.Array, distance: jax.Array, duration: jax.Array, expected: jax.Array
+) -> jax.Array:
+    """Whether (1, B) the next step, of this expected time, shall land on the event ahead."""
+    reached = distance * duration < expected
+    coasts = flow.coasts(modes)
+    if coasts is not None:
+        reached = reached | (coasts & (distance < jnp.inf))
+    return reached & (distance < REACH * flow.near) if flow.near else reached
 
 
 def _root_of_cubic(
@@ -546,21 +601,21 @@ def run(flow: Flow, carry: StepperState, most: int) -> StepperState:
 class AcceptedSteps(NamedTuple):
     """Accepted steps in order, at most BLOCKS * BLOCK; rows without a step are zeros."""
 
-    marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 where a step is kept
+    marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 for an accepted step
     clock: jax.Array  # (steps, 4, B)
-    # (1, B): there were too few rows. Such an impact has no derivative: NaN, no wrong number
+    # (1, B): there were too few rows. Such an impact has no derivative: NaN, not a wrong number
     lost: jax.Array
 
 
 class Recorder(NamedTuple):
-    """A plan while it is written, and rows used."""
+    """A plan that is being written, and the number of rows used."""
 
     plan: AcceptedSteps
     used: jax.Array
 
 
 def recorder(carry: StepperState) -> Recorder:
-    """A plan without a step."""
+    """An empty plan."""
     modes, target, clock = carry.step
     size, rows = BLOCKS * BLOCK, len(modes) + len(target) + 1
     plan = AcceptedSteps(
@@ -574,7 +629,7 @@ def recorder(carry: StepperState) -> Recorder:
 def record(
     flow: Flow, carry: StepperState, pen: Recorder, most: int
 ) -> tuple[StepperState, Recorder]:
-    """As `run`, and the plan of its steps."""
+    """As `run`; it also records the plan of its steps."""
     size = BLOCKS * BLOCK
 
     def body(state: tuple[StepperState, Recorder]) -> tuple[StepperState, Recorder]:
@@ -599,10 +654,10 @@ def record(
 
 
 def with_plan(x: jax.Array, plan: AcceptedSteps) -> jax.Array:
-    """x, of a program that has to keep the plan although nothing else is asked of it.
+    """x, of a program that has to record the plan even if only x is used.
 
-    Values and their derivatives record the same steps. The compiler makes one loop of two that are
-    the same; it would strip one of them of the plan first.
+    Values and their derivatives record the same steps. The compiler merges two loops that are the
+    same; it would first remove the plan from one of them.
     """
     marks, clock = plan.marks[0, -1:], plan.clock[0, 2:3]  # each is 0 or 1
     return jnp.where((marks < 0) | (clock < 0), jnp.nan, x)
@@ -620,7 +675,7 @@ def path(flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps) -> jax
 
 
 def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
-    """The state so long (1, B) after y, in the flow's own time, within the step from there."""
+    """The state within the step from y at `ahead` (1, B) after it, in the flow's own time."""
     begun, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
     in_root = in_root * (1 - lands)
     begun = begun * in_root
@@ -672,11 +727,11 @@ def _walk(
             """The state after the block."""
             return jax.lax.scan(jax.checkpoint(step), y, rows)
 
-        def stay(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
+        def skip(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
             """The state as it is: the block is empty."""
             return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
 
-        return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, stay, y)
+        return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, skip, y)
 
     rows = tuple(x.reshape(BLOCKS, BLOCK, *x.shape[1:]) for x in (plan.marks, plan.clock))
     return jax.lax.scan(jax.checkpoint(block), y, rows)

@@ -141,7 +141,7 @@ class MotionFlow(eqx.Module, stepper.Flow):
         return self.sizes
 
     @property
-    def snap(self) -> jax.Array:
+    def zero_margin(self) -> jax.Array:
         """Margins are in units of their rounding."""
         return jnp.ones((1, 1), self.sizes.dtype)
 
@@ -372,7 +372,7 @@ def one_pass(
         state=state,
         free=free,
         aim=jax.lax.stop_gradient(after.step),
-        plan=jax.lax.stop_gradient(after.plan),
+        plan=jax.lax.stop_gradient(after.progress),
         event=jnp.where(flies, landed[:-1], flight.event),
         sample=flight.sample + sampled.astype(flight.sample.dtype),
         steps=steps,
