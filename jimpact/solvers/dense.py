@@ -91,9 +91,9 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 def _solve_two(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """`solve` for two rows, by the same operations."""
-    scale, factor = 1 / matrix[0, 0], matrix[1, 0]
-    above, x = matrix[0, 1] * scale, right[0] * scale
-    last = (right[1] - factor * x) * (1 / (matrix[1, 1] - factor * above))
+    scale, factor = 1 / matrix[0, :1], matrix[1, :1]
+    above, x = matrix[0, 1:] * scale, right[0] * scale
+    last = (right[1] - factor * x) * (1 / (matrix[1, 1:] - factor * above))
     return jnp.stack([x - above * last, last])
 
 
