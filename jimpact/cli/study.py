@@ -100,7 +100,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
       profiles.
     - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
-      with scenes of their own near_m, contacts (only shots with so many). Without data a study
+      with scenes of their own near_m, contacts (only shots with that many). Without data a study
       can be compared, not fitted.
     - `[[observe]]`, in the place of `[data]`: quantity (peak_force [N], arrival_time [s] of a
       contact; duration [s] of a contact or of all; energy_ratio; bounce_height [m] of a body),
