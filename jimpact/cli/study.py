@@ -203,7 +203,7 @@ def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3
     frame being the last one before the impact. The cube is the `Box` of `tossed_cube.toml`.
 
     Args:
-        contacts: only impacts on so many corners, one number or several; None: all.
+        contacts: only impacts on this number of corners (or several numbers); None: all.
         near: corners up to so far above the lowest one touch, too (board and cube are flat to
             1.4 mm) [m].
 

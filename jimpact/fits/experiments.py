@@ -246,7 +246,7 @@ class Experiments(eqx.Module):
         return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """Error in each velocity (n,) that counts as 1 m/s: 1, in rad/s by kinetic energy.
+        """Error in each velocity (n,) of a scene that counts as 1 m/s: 1, in rad/s by energy.
 
         Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
         """

@@ -1,7 +1,7 @@
 """Fits of a restitution matrix: the region in which it is consistent for every approach.
 
 The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is convex (each x >= 0
-asks `|E x| <= |x|` in the norm of G^-1), so points outside are drawn back along the ray to a
+asks `|E x| <= |x|` in the norm of G^-1), so points outside are drawn back on the ray to a
 point inside, and steps are cut by the conditions linearized at the current matrix. Only the
 energy bends; its second derivatives make the steps converge quadratically.
 """

@@ -333,7 +333,7 @@ def _key(key: Any) -> tuple[np.ndarray, str]:
 def _in_brackets(velocity: Any) -> str:
     """Velocities as (1, 0, -1), the first few of many."""
     entries = [f"{x:g}" for x in np.asarray(velocity)]
-    more = [f"... {len(entries)} in all"] if len(entries) > _WRITTEN else []
+    more = [f"... {len(entries)} entries"] if len(entries) > _WRITTEN else []
     return f"({', '.join(entries[:_WRITTEN] + more)})"
 
 
