@@ -50,7 +50,7 @@ class Binary(Law):
             'left_to_right': contacts 0 .. m-1 in turn, again and again;
             a tuple of all contact indices (0-based, repeats allowed): in turn, likewise. Contacts
             that do not approach are skipped.
-        max_collisions: the law gives up after so many.
+        max_collisions: largest number of collisions before the law gives up.
         friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
         tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `u+ = -e_t u-`.
 
