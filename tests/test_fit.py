@@ -211,9 +211,9 @@ def test_copies_of_a_shot_are_told():
     pre = np.tile([[1.0, 0.0]], (6, 1))
     post = np.tile([[-0.2, 0.6]], (6, 1))
     copies = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
-    assert "All 6 shots read the same" in told(copies)
+    assert "All 6 shots are equal" in told(copies)
     post[1] += [0.01, -0.005]
-    assert "read the same" not in told(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post)))
+    assert "shots are equal" not in told(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post)))
 
 
 class Steep(ji.Newton):
