@@ -63,9 +63,9 @@ class Binary(Law):
     exactly iff z >= 1 and the state is in the invariant cone, gamma+ = 0 then; for more where
     approach speeds decay below rounding without ending; `max_steps` at `max_collisions`.
 
-    Derivatives, forward and reverse, in restitution, W and gamma-, at the order found. v+ is
-    continuous where the number of collisions changes, with one-sided derivatives; it jumps where
-    the order of coupled contacts changes. Derivatives in gaps are zero.
+    Derivatives, forward and reverse, in restitution, W and gamma-, at the order of collisions that
+    occurs. v+ is continuous where the number of collisions changes, with one-sided derivatives; it
+    jumps where the order of coupled contacts changes. Derivatives in gaps are zero.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.3), (6.4), (6.13) corrected, (6.17)-(6.21);
     Towne and Hadlock, Am. J. Phys. 45 (1977) 255 (number of collisions).

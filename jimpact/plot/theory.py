@@ -93,7 +93,7 @@ def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.n
     axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
     for k in (0, 1):
         _line(
-            axes, frame, np.zeros(2), frame.walls[k], f"contact {closed[k] + 1} stays closed", "-"
+            axes, frame, np.zeros(2), frame.walls[k], f"contact {closed[k] + 1} remains closed", "-"
         )
         away = frame.push[1 - k]
         _line(axes, frame, frame.before, away, f"no impulse at contact {closed[k] + 1}", ":")
