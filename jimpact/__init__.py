@@ -3,7 +3,8 @@
 The mental model: a `Scene` (mass matrix, contact normals) turns velocities into contact space,
 `W = N^T M^-1 N` and gap velocities `gamma = N^T v` (negative on approach); a *law* maps
 `(W, gamma-)` and its own parameters to impulses `p >= 0`; `impact` gives
-`v+ = v- + M^-1 N p`, the energy change (<= 0 dissipates) and a status code.
+`v+ = v- + M^-1 (N p + H p_t)`, with tangential impulses p_t and tangents H under friction, the
+energy change (<= 0 dissipates) and a status code.
 Laws and scenes are pytrees: `jax.jit`, `jax.vmap` and `jax.grad` work over all of them.
 
 >>> import jimpact as ji

@@ -151,11 +151,11 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     remaining = (before + float(out.energy_change)) / before if before else float("nan")
     broken = audit(scene, velocity, out).broken
     words = [f"{name} {'VIOLATED' if name in broken else 'ok'}" for name in CONSISTENCIES]
-    nothing = nothing_approaches(scene, velocity)
-    quiet = nothing is not None and not np.asarray(out.impulse).any()
+    reason = nothing_approaches(scene, velocity)
+    quiet = reason is not None and not np.asarray(out.impulse).any()
     lines = [
         f"status         {row.name}: {row.message}",
-        *([f"impact         none: {nothing}"] if quiet else []),
+        *([f"impact         none: {reason}"] if quiet else []),
         f"energy         {before:.6g} J before, change {float(out.energy_change):.6g} J "
         f"({100 * remaining:.4g} % kept)",
         f"audit          {', '.join(words)}",

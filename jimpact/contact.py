@@ -1,4 +1,4 @@
-"""Contact space: what a law gets of an impact, and the groups of coupled contacts.
+"""Contact space: the arguments of an impact law, and the groups of coupled contacts.
 
 A scene of n coordinates and m contacts is reduced to W, gamma- and, where it has tangents, the
 tangential rows: everything that an impact law may depend on.
@@ -35,13 +35,16 @@ Groups = tuple[np.ndarray, ...]
 
 
 class Contact(eqx.Module):
-    """All that a law may depend on in an impact, and what follows from it.
+    """All that a law may depend on in an impact, with derived quantities.
 
-    Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`.
+    Equation: `gamma+ = gamma- + W p + W_nt p_t`, `u+ = u- + W_tn p + W_tt p_t`, with normals N,
+    tangents H, W = N^T M^-1 N, W_nt = N^T M^-1 H = W_tn^T, W_tt = H^T M^-1 H, slip velocities
+    u = H^T v, normal impulses p and tangential impulses p_t.
 
     Open contacts are decoupled (their rows of W are 0 off the diagonal, gamma- = 0, no stored
-    energy), unless the law uses gaps; gap velocities within `noise` are 0. `impulses` is called
-    only where some contact approaches or stores energy.
+    energy), unless the law uses gaps; gap velocities within `noise` are 0. `impact` always calls
+    `impulses`. If no contact approaches or stores energy, it passes gamma- = -1 and discards the
+    result, so that gradients stay finite.
 
     Args:
         delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain).
@@ -49,11 +52,11 @@ class Contact(eqx.Module):
         closed: (m,) contacts without a gap; None: all.
         gaps: (m,) [m]; None: 0.
         stored: energy (m,) [J] in the contacts before the impact (precompression); None: 0.
-        norm: |grad f_j| (m,) in the metric of M^-1; None: sqrt(W_jj), which it is without
-            bilateral constraints.
+        norm: (m,) sqrt(grad f_j^T M^-1 grad f_j), f_j the gap function, ignoring bilateral
+            constraints; None: sqrt(W_jj), equal if there are none.
         noise: (m,) [m/s] uncertainty of gamma- by the rounding of v-; None: 0.
         tangential_block: (W_nt (m, t), W_tt (t, t), u- (t,) [m/s]), None without tangents; t = m
-            planar, 2 m in space, contact by contact.
+            in the plane, 2 m in space, contact by contact.
 
     Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
 
@@ -153,14 +156,14 @@ class Contact(eqx.Module):
 
     @property
     def size(self) -> jax.Array:
-        """Square root of twice the energy of what approaches and what is stored () [sqrt(J)]."""
+        """Energy scale () [sqrt(J)]: root of twice the energy of approach plus the stored one."""
         root = jnp.sqrt(diagonal(self.delassus))
         approach = jnp.sum((jnp.minimum(self.gap_velocity, 0.0) / root) ** 2)
         return jnp.sqrt(approach + 2 * jnp.sum(self.stored))
 
     @property
     def happens(self) -> jax.Array:
-        """Whether a contact approaches or stores energy (or is not finite)."""
+        """Whether () there is an impact: a contact approaches, stores energy or is not finite."""
         gamma = self.gap_velocity
         return jnp.any(gamma < 0) | jnp.any(self.stored > 0) | ~jnp.all(jnp.isfinite(gamma))
 
@@ -269,7 +272,7 @@ def _taking_part(contact: Contact, part: jax.Array) -> Contact:
 def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, jax.Array]:
     """gamma- (m,), 0 where it is within the rounding of v-, and that rounding (m,).
 
-    The derivative of gamma- stays that of N^T v- where its value is set to 0.
+    The derivative of gamma- remains that of N^T v- where its value is set to 0.
     """
     gamma, speed = gap_velocity(scene, velocity), jax.lax.stop_gradient(jnp.abs(velocity))
     if scene.walls is None:
@@ -444,7 +447,9 @@ def _by_size(groups: list[np.ndarray], m: int) -> Groups:
     """The groups in one array, or the smaller ones and the larger ones in two."""
     groups = sorted(groups, key=len)  # stable
     size = np.array([len(group) for group in groups])
-    few = np.arange(len(groups))  # entries of W if the first so many groups have their own array
+    few = np.arange(
+        len(groups)
+    )  # entry i: number of entries of W if the first i groups have their own array
     entries = few * size[few - 1] ** 2 + (len(groups) - few) * size[-1] ** 2
     cut = int(np.argmin(entries)) if entries[0] > WORTH_A_PROGRAM * entries.min() else 0
 

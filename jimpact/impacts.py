@@ -21,9 +21,9 @@ from jimpact.status import CODE, STATUS, raise_for, sign_tolerance
 # times more would hide a contact that pulls slightly.
 ROUNDING_PUSHES = 8
 
-# Number of contacts of the program that single impacts of fewer contacts share. Compiling takes a
-# second for each number of contacts; padding by open contacts costs a tenth of the impact. Ten
-# times more would make every first impact slow.
+# Number of contacts of the compiled program that single impacts of fewer contacts share. Compiling
+# takes a second for each number of contacts; padding by open contacts costs a tenth of the impact.
+# Ten times more would make every first impact slow.
 SHARED = 8
 
 
@@ -48,20 +48,22 @@ def impact(
 ) -> Impact:
     """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
 
-    Equation: `v+ = v- + M^-1 N p`, `T+ - T- = (gamma+ + gamma-)^T p / 2`.
+    Equation: `v+ = v- + M^-1 (N p + H p_t)`,
+    `T+ - T- = ((gamma+ + gamma-)^T p + (u+ + u-)^T p_t) / 2`; N (n, m) holds the contact normals,
+    H (n, t) the tangents, u = H^T v are the slip velocities.
 
     Independent groups of contacts (two pairs of balls in one scene) are solved separately if the
     scene is known, not traced, and the law allows it (`Law.separable`); the outcome is the same.
     Approach within the rounding of v- (or within `noise`) counts as 0.
 
     Args:
-        law: its parameters are scalars or have one entry per contact.
+        law: its parameters are scalars or (m,); a restitution matrix is (m, m).
         scene: n coordinates, m contacts; contacts with gap > 0 take no part in instantaneous laws.
-        velocity: v- (n,) [m/s].
-        noise: speed () up to which an approach counts as rounding [m/s]: in a motion v- has the
-            rounding of the largest speeds before. None: the rounding of v-.
-        approach: speed () by which all contacts approach faster for the law than v- says [m/s]: a
-            small one starts an impact without collision. None: 0.
+        velocity: v- (n,) [m/s], [rad/s] for rotations.
+        noise: speed () [m/s] up to which an approach counts as rounding: in a motion v- has the
+            rounding of the largest earlier speeds. None: the rounding of v-.
+        approach: speed () [m/s] subtracted from every gap velocity before the law is applied; a
+            small value starts an impact without collision. None: 0.
 
     Returns:
         `Impact` with `velocity` (n,), `impulse` (m,), `tangential_impulse`, `energy_change` (),
@@ -162,7 +164,7 @@ def _impact(
     p, tangential = outcome.normal, outcome.tangential
     jump = velocity_change(scene, p, tangential)
     v_plus = v + jump
-    # `(gamma+ + gamma-)^T p / 2`, summed over bodies: beside a light one terms of W p cancel
+    # the work of the impulses, summed over bodies: next to a much lighter body terms of W p cancel
     change = 0.5 * momentum(scene, jump) @ (v + v_plus)
     total = jnp.sum(stored)
     tolerance = sign_tolerance(v.dtype) * outcome.size**2 + outcome.noise
@@ -184,9 +186,9 @@ class _Resolved(NamedTuple):
 
 
 def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
-    """The law's impulses; none where nothing happens, nor at open contacts."""
+    """The law's impulses; 0 without an impact (`happens` false), and at open contacts."""
     gamma = contact.gap_velocity
-    # where nothing happens the law gets a harmless approach, so its gradients stay finite
+    # without an impact the law gets gamma- = -1 and its result is discarded: gradients stay finite
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     impulses = Impulses(*law.impulses(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless)))
     part = happens & (contact.closed | law.uses_gaps)
@@ -204,10 +206,10 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
 def _in_groups(
     law: Law, scene: Scene, v: jax.Array, groups: Groups, offsets: _Offsets
 ) -> tuple[_Resolved, jax.Array, jax.Array]:
-    """All groups solved side by side; whether anything happens, and the stored energy (m,).
+    """All groups solved side by side; whether there is an impact, and the stored energy (m,).
 
-    Signs are judged on the scale of their group. A group in which nothing happens gets p = 0,
-    unless the law also pulls at separating contacts.
+    Signs are judged on the scale of their group. A group without an impact gets p = 0, unless the
+    law also pulls at separating contacts.
     """
     m = scene.contacts
     stored = jnp.where(scene.closed, jnp.broadcast_to(law.stored, (m,)).astype(v.dtype), 0.0)
@@ -245,7 +247,7 @@ def _signs(contact: Contact, p: jax.Array, tangential: jax.Array) -> jax.Array:
     """negative_impulse or inadmissible_velocity; 0 if neither."""
     tolerance = sign_tolerance(p.dtype) * contact.size
     root = jnp.sqrt(diagonal(contact.delassus))
-    # an impulse that only undoes what the rounding of v- may hold has no sign
+    # the sign of an impulse that only undoes the rounding of v- is not judged
     floor = tolerance + jnp.sqrt(jnp.sum((ROUNDING_PUSHES * contact.noise / root) ** 2))
     pull = jnp.any(p * root < -floor)
     after = contact.gap_velocity_after(p, tangential) + contact.rounding(p, tangential)

@@ -23,8 +23,8 @@ from jimpact.contact import Contact, contact_of
 from jimpact.scene import Scene
 from jimpact.status import CODE
 
-# Largest exponent of a contact force that a fit tries: a cone has 2, rough surfaces about 3. Of
-# larger ones a contact is hard almost at once, and no measured velocity determines them.
+# Largest exponent of a contact force that a fit tries: a cone has 2, rough surfaces about 3. With a
+# larger one a contact is rigid almost at once, and no measured velocity determines it.
 LARGEST_EXPONENT = 5.0
 
 _KEY = "jimpact"  # of what a field declares, in its metadata
@@ -166,15 +166,15 @@ def parameter(
     Args:
         low: smallest value.
         high: largest value.
-        open_low: without `low` itself.
-        log: only its logarithm has a natural scale (a stiffness): fitted there.
+        open_low: exclude `low`.
+        log: fit the logarithm (for a stiffness, whose order of magnitude is unknown).
         static_numbers: a Python number or tuple is compiled in, an array is a parameter.
-        matrix: may be a square matrix, which is not bounded.
+        matrix: also accept a square matrix, not checked against the bounds.
         per_contact: a scalar or one value per contact (m,), checked against the scene.
         high_unless: name of an option that, where true, lifts `high`.
-        searched_high: upper bound of a fit unless it starts beyond, or `bounds` say otherwise:
+        searched_high: upper bound in fits that start below it, unless `bounds` say otherwise:
             larger values are allowed, but no measurement could determine them.
-        default: value where the constructor gets none; may be None (no such effect).
+        default: value if the constructor gets none; may be None (no such effect).
         kw_only: the constructor takes it by keyword only.
 
     Returns:
@@ -185,13 +185,9 @@ def parameter(
             shape.
 
     >>> import jimpact as ji
-    >>> class Lossy(ji.Newton):
+    >>> class Lossy(ji.LZB):
     ...     loss: float = ji.parameter(low=0, high=1, default=0.1)
-    ...
-    ...     def __init__(self, loss):
-    ...         self.loss = loss
-    ...         super().__init__(restitution=0.5)
-    >>> Lossy(1.5)
+    >>> Lossy(0.9, loss=1.5)
     Traceback (most recent call last):
         ...
     ValueError: Argument `loss` must lie in [0, 1], but has value 1.5.
@@ -219,9 +215,9 @@ def option(
     Args:
         default: value where the constructor gets none.
         choices: allowed values; None: a number from `low` to `high`.
-        low: None: `converter` decides.
-        high: the other end, included.
-        open_low: without `low` itself.
+        low: smallest value; None: no limits.
+        high: largest value.
+        open_low: exclude `low`.
         converter: function of the value to the stored one, which may raise a ValueError; it takes
             the place of these checks.
         kw_only: the constructor takes it by keyword only.
@@ -369,24 +365,26 @@ class Law(Declared):
     A law is a pytree: grad of a law is a law, vmap over a law is a batch. Fields are declared with
     `ji.parameter`; two of them mean the same in every law: `friction`, Coulomb's mu (the scene
     must have tangents unless it is None), and `initial_energy`, stored in the contacts before the
-    impact [J]. `impact` calls `impulses` only where something happens; it leaves out open contacts,
-    takes rounding for 0, and adds to the status what it checks itself (not finite, negative
-    impulse, inadmissible velocity, energy gain).
+    impact [J]. `impact` always calls `impulses`. If no contact approaches or stores energy, it
+    passes gamma- = -1 and discards the result, so that gradients stay finite. It decouples open
+    contacts and gives them no impulse (unless `uses_gaps`), sets gap velocities within rounding to
+    0, and adds its own checks to the status (not finite, negative impulse, inadmissible velocity,
+    energy gain).
 
     A law declares what else it can do; by default it only returns impulses.
 
     Class attributes:
         uses_gaps: open contacts take part, at their gaps.
-        pulls: separating contacts take part, too, if anything happens anywhere.
-        separable: contacts that W does not couple may be solved apart: the law itself couples
+        pulls: separating contacts take part, too, if any contact approaches or stores energy.
+        separable: contacts that W does not couple may be solved separately: the law itself couples
             none, and its parameters are scalars or (m,).
-        pads_scenes: open contacts may be added, so that scenes of few contacts share a program.
-        contact_force: the `Force` by which its contacts indent (`gap_scale`, `crossover`).
+        pads_scenes: open contacts may be added, so that small scenes share one compiled program.
+        contact_force: the `Force` of its contacts (`gap_scale`, `crossover`).
         has_history: whether `dynamics` may be sampled over the impact's time (`history`).
-        joins_step: whether it is Moreau's condition contact by contact, with its `restitution` and
-            `tangential_restitution`, which time stepping solves together with its step.
+        joins_step: True if the law is Moreau's, with `restitution` and `tangential_restitution` of
+            each contact; time stepping then solves it together with the equations of motion.
         only_stiffness_ratios: whether a common factor of all stiffnesses changes nothing (`fit`
-            then holds the first one).
+            then fixes the first one).
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
@@ -423,7 +421,7 @@ class Law(Declared):
 
     @property
     def contact_force(self) -> Any:
-        """The `Force` by which its contacts indent; None: they do not."""
+        """The `Force` of its contacts; None: they are rigid."""
         return None
 
     @property
@@ -465,7 +463,7 @@ def check_law(law: Law, scene: Scene, dtype: jnp.dtype) -> None:
 
 
 def is_separable(law: Law) -> bool:
-    """Whether contacts that W does not couple may be solved apart."""
+    """Whether contacts that W does not couple may be solved separately."""
     known = all(
         x.domain.per_contact and np.ndim(x.value) < 2 and not isinstance(x.value, tuple)
         for x in parameters_of(law).values()

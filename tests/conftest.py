@@ -38,7 +38,7 @@ WORTH_SHARING = "0.2"  # seconds
 # neither the count nor BUDGET depends on how fast the machine is or which process runs which test.
 COUNTS_FROM = 200  # operations of StableHLO
 # Programs of the default suite, over all processes.
-BUDGET = 10_000
+BUDGET = 450
 COMPILED = "/jax/core/compile/backend_compile_duration"
 
 BY_LAW = ("test_contract", "test_systems")  # a law's tests share its programs

@@ -130,7 +130,7 @@ MUTATIONS = [
     Mutation("the seed of a chunk", r"jax\.random\.fold_in\(key, np\.uint32\(task\.number\)\)", "key", ("test_montecarlo.py::test_random_parameters_velocities_and_their_analytic_moments", "test_montecarlo.py::test_each_sample_is_the_impact_of_its_gaps")),
     Mutation("variance by n", r"self\.products / \(self\.count - 1\)", "self.products / self.count", ("test_montecarlo.py::test_chunks_of_unequal_size_are_merged",)),
     Mutation("restitution not in the base's frame", r"relative = state\.v - carried\n    out = impact", "relative = state.v\n    out = impact", ("test_motion.py::test_the_base_works_at_its_own_speed",)),
-    Mutation("bodies that pass each other are not reported", r"again \| \(\(course", "again | (False & (course", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
+    Mutation("bodies that pass each other are not reported", r"struck_again \| \(\(progress", "struck_again | (False & (progress", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
     # --- the command line
     Mutation("the newest programs go first", r"in sorted\(files\):", "in sorted(files, reverse=True):", ("test_program_cache.py::test_the_least_recently_used_files_go_first",), "program_cache.py"),

@@ -145,7 +145,7 @@ def test_momentum_of_the_measured_balls():
     assert corrected.lost_freedom == 1
     assert [corrected.only(which).lost_freedom for which in ([0], [0, 0])] == [1, 2]
     assert data_defects(data, CHAIN) == [
-        "The data break momentum (1 = conserved): shot 1: 1.0422; no law can reproduce that part "
+        "The data violate conservation of momentum (1 = conserved): shot 1: 1.0422; no law can reproduce that part "
         "(rms 0.0141 m/s).",
         "The data gain energy (1 = conserved): shot 1: 1.0103.",
     ]

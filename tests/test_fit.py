@@ -133,7 +133,9 @@ def test_honest_noise_breaks_no_momentum():
     pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
     post = simulated(ji.Newton(0.98), PAIR, pre, noise=0.02)
     assert ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)).warnings == ()
-    assert "break momentum" in told(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, 1.1 * post)))
+    assert "violate conservation of momentum" in told(
+        ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, 1.1 * post))
+    )
 
 
 def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
@@ -209,9 +211,9 @@ def test_copies_of_a_shot_are_told():
     pre = np.tile([[1.0, 0.0]], (6, 1))
     post = np.tile([[-0.2, 0.6]], (6, 1))
     copies = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
-    assert "All 6 shots read the same" in told(copies)
+    assert "All 6 shots are equal" in told(copies)
     post[1] += [0.01, -0.005]
-    assert "read the same" not in told(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post)))
+    assert "shots are equal" not in told(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post)))
 
 
 class Steep(ji.Newton):
@@ -324,7 +326,7 @@ def test_carts_that_stick_end_at_the_bound():
         assert float(found.law.restitution) == 0.0
         assert found.at_bound[0]
         assert "restitution ends at its bound 0" in " ".join(found.warnings)
-        assert "The data break momentum" in found.warnings[0]
+        assert "The data violate conservation of momentum" in found.warnings[0]
         assert found.confidence_interval()[0, 0] == 0.0
 
 
@@ -366,7 +368,7 @@ def test_a_stiffness_that_nobody_freed_is_held():
     np.testing.assert_allclose(found.value, [0.9911], atol=1e-4)
     assert found.law.stiffness == ji.LZB(0.95).stiffness
     (note,) = found.identifiability
-    assert note.startswith("stiffness is held at its start")
+    assert note.startswith("stiffness is fixed at its start")
     assert note in str(found)
     more = ji.design(found, data)
     assert more.names == ("restitution",)
@@ -390,7 +392,7 @@ def test_one_shot_of_three_balls_determines_two_of_three(rank_2_of_3):
     assert np.isinf(found.standard_error).all()
     assert found.law.stiffness[0] == 1.0
     held, unseen = found.identifiability
-    assert "stiffness[1] is held" in held
+    assert "stiffness[1] is fixed" in held
     assert all(name in unseen for name in found.names)
     assert "The data determine 2 of 3 parameters" in " ".join(found.warnings)
     np.testing.assert_allclose(found.rms, 0.0422 / 3, rtol=1e-6)  # the momentum defect alone
@@ -453,7 +455,7 @@ def test_known_parameters_are_recovered_from_varied_shots():
     np.testing.assert_allclose(found.value, [0.9, 0.7, 2.0], rtol=1e-6)
     assert type(found.law) is ji.LZB
     assert found.identifiability == (
-        "stiffness[1] is held at its start: with equal exponents only stiffness ratios matter.",
+        "stiffness[1] is fixed at its start: with equal exponents only stiffness ratios matter.",
     )
 
 
@@ -897,7 +899,7 @@ PER_CONTACT = ji.LZB([0.9, 0.9], [1.0, 1.0])
         (ji.Newton(0.9), PAIR, TWO, {"free": ()}, r"leaves none free"),
         (ji.Newton(0.9), PAIR, TWO, {"free": {"restitution": False}}, r"leaves none free"),
         (PER_CONTACT, BALLS, THREE, {"free": {"restitution": [True]}}, r"mask of shape \(2,\) for `restitution`"),
-        (ji.LZB(0.9), BALLS, THREE, {"free": {"restitution": [True, True]}}, r"one value for all contacts \(tied\)"),
+        (ji.LZB(0.9), BALLS, THREE, {"free": {"restitution": [True, True]}}, r"one value for all contacts"),
         (ji.Newton(0.9), PAIR, TWO, {"free": {"restitution": 0.5}}, r"True, False, a boolean mask or numbers of groups"),
         (ji.LZB(0.9), BALLS, THREE, {"free": "stiffness"}, r"must not hold a scalar `stiffness`.*a common factor"),
         (ji.LZB(0.9), BALLS, THREE, {"free": ("restitution", "stiffness")}, r"must not hold a scalar `stiffness`"),

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import OPTIMIZED
 
 import jimpact as ji
 from jimpact.solvers import dense
@@ -22,11 +23,18 @@ CONTACTS = {1: PLANAR, 2: SPATIAL}
 close = np.testing.assert_allclose
 
 
-def question(rows, complementary):
-    return jax.jit(jax.vmap(lambda *given: solve(*given, complementary=complementary)))
+def question(complementary):
+    """The solver on many problems at once.
+
+    With little optimization and without its newer fusions XLA 0.10 compiles the planar program
+    wrongly: slips came out that vanish as soon as they are printed. With all optimizations both
+    kinds of fusion agree.
+    """
+    batch = jax.vmap(lambda *problem: solve(*problem, complementary=complementary))
+    return jax.jit(batch, compiler_options=OPTIMIZED)
 
 
-ASK = {key: question(*key) for key in itertools.product((1, 2), (True, False))}
+ASK = {key: question(key[1]) for key in itertools.product((1, 2), (True, False))}
 
 
 def test_friction_of_many_contacts_has_a_round_cone():

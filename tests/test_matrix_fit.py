@@ -241,5 +241,5 @@ def test_scenes_without_an_admissible_set():
 def test_held_entries_that_leave_no_room():
     """Elastic first column: any entry more in the second would gain energy somewhere."""
     elastic = np.eye(2)
-    with pytest.raises(ValueError, match="must leave room"):
+    with pytest.raises(ValueError, match="must leave an admissible choice"):
         fitted(shots(E_TRUE), start=elastic, free=np.array([[False, True], [False, False]]))

@@ -30,7 +30,7 @@ AFTER = np.array([-0.1, 0.2, 0.9])
 HERTZ = ji.Compliant(ji.Hertz(1e9))
 DIMENSIONLESS = (  # quantities that have no unit
     "ratio", "restitution", "exponent", "setting", "error", "evaluations", "dispersion",
-    "energy kept", "share", "method", "balls N", "deviance", "stiffness",
+    "share", "method", "balls N", "deviance", "stiffness",
 )  # fmt: skip
 COUNTED = ("law", "force", "body", "shot")  # names stand along the axis
 

@@ -102,7 +102,7 @@ def test_a_fit_in_one_sentence():
     assert both.verdict == (
         "restitution[1] = 0.600 ± 0.010; stiffness[1] cannot be determined from this shot."
     )
-    held = replace(both.problem, notes=("stiffness[1] is held at its start.",))
+    held = replace(both.problem, notes=("stiffness[1] is fixed at its start.",))
     ratio = canned(1, problem=held, names=("restitution[1]", "stiffness[2]"))
     assert "the stiffness ratio stiffness[2] / stiffness[1] cannot be determined" in ratio.verdict
     assert canned(4, converged=False).verdict.startswith("No answer")

@@ -49,7 +49,7 @@ class PlanarBodies(Body):
     The gap functions hold (`valid`, [m]) while the centre of a disc is outside the other body, and
     while two sides overlap or the line of one of them keeps them apart, turned by less than 90
     degrees against each other, with no other corner of the first body beyond the second side: a
-    body that falls beside another or rolls on it to its next side leaves this range. Bodies that
+    body that falls next to another or rolls on it to its next side leaves this range. Bodies that
     are no pair do not feel each other.
 
     Args:
@@ -152,25 +152,25 @@ class PlanarBodies(Body):
 
     def valid(self, q: jax.Array) -> jax.Array:
         """The least of the margins () [m], see the class."""
-        places, room = self._places(q), [super().valid(q)[None]]
+        places, margins = self._places(q), [super().valid(q)[None]]
         if self.pairs.discs:
             i, j = np.array(self.pairs.discs).T
-            room.append(_length(places.middle[i] - places.middle[j])[0])
+            margins.append(_length(places.middle[i] - places.middle[j])[0])
         for polygon, discs in self.pairs.rolling:
             contacts = _disc_on_polygon(places, np.array(discs), polygon)
-            room.append(contacts.gap + places.rim[np.array(discs)])
-        room += [_overlap(places, *pair)[None] for pair in self.pairs.sides]
-        return jnp.min(jnp.concatenate(room))
+            margins.append(contacts.gap + places.rim[np.array(discs)])
+        margins += [_overlap(places, *pair)[None] for pair in self.pairs.sides]
+        return jnp.min(jnp.concatenate(margins))
 
     def touching(
         self, angle: Any = 0.0, along: Any = 0.0, body: int = 0, plane: int = 0
     ) -> jax.Array:
         """(x, y, theta) of one body on one plane, turned by `angle` from it, `along` it [m]."""
-        turn, way = number("angle", angle), number("along", along)
+        turn, distance = number("angle", angle), number("along", along)
         a, offset = self.planes[plane]
         x, y, _ = self.bodies[body].touching(turn)
         c, s = jnp.cos(a), jnp.sin(a)
-        right, up = x + way, y + offset
+        right, up = x + distance, y + offset
         return jnp.stack([c * right - s * up, s * right + c * up, turn + a])
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:

@@ -14,7 +14,7 @@ from jimpact.scene import Scene, check_mass
 STANDARD_GRAVITY = 9.80665  # m/s^2
 CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too
 # Of the largest coordinate: a gap that small is zero, in float32 too. Ten times more would close
-# gaps that single precision can still tell from 0.
+# gaps that single precision can distinguish from 0.
 _ROUNDINGS = 16
 
 _AROUND = np.linspace(0, 2 * np.pi, 49)  # [rad] corners of a drawn circle
@@ -38,7 +38,7 @@ def split_name(name: str) -> tuple[str, str]:
 
 
 def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
-    """Names of so many bodies: "x [m]" as "x1 [m]", "x2 [m]", ...; of one alone as they are."""
+    """Names of `count` bodies: "x [m]" as "x1 [m]", "x2 [m]", ...; of one alone as they are."""
     if count == 1:
         return tuple(names)
     parts = [split_name(name) for name in names]
@@ -306,7 +306,7 @@ class GivenBody(Body):
     """A body given by functions, see `System` and `scene_from_gaps`."""
 
     gaps: Callable[[jax.Array], jax.Array]
-    mass_given: Any
+    mass_argument: Any
     sliding: Callable[[jax.Array], jax.Array | None] | None
 
     def __init__(self, gap_function: Any, mass: Any, tangent_function: Any = None):
@@ -318,20 +318,20 @@ class GivenBody(Body):
                 raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
         self.gaps, self.sliding = gap_function, tangent_function
         if callable(mass):
-            self.mass_given = mass
+            self.mass_argument = mass
         else:
-            self.mass_given = as_float_array("mass", mass)
-            check_mass(self.mass_given)
+            self.mass_argument = as_float_array("mass", mass)
+            check_mass(self.mass_argument)
 
     @property
     def functions(self) -> tuple[Any, ...]:
         """The gaps, the displacements and the mass."""
-        return self.gaps, self.sliding, self.mass_given
+        return self.gaps, self.sliding, self.mass_argument
 
     @property
     def mass(self) -> Any:
-        """M or q -> M(q), as given."""
-        return self.mass_given
+        """M or q -> M(q), the argument `mass`."""
+        return self.mass_argument
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f(q) (m,) [m]."""
@@ -503,7 +503,7 @@ def wheel(radius: Any, q: np.ndarray, middle: Any = (0.0, 0.0)) -> np.ndarray:
 
 
 def inertia_of(inertia: Any, homogeneous: Any, centre: Any) -> Any:
-    """The inertia given, or that of a homogeneous body, whose centre of mass is known."""
+    """The argument `inertia`, or that of a homogeneous body, whose centre of mass is known."""
     if inertia is not None:
         return inertia
     if centre is not None:

@@ -38,7 +38,7 @@ class Discs(Body):
         masses: > 0, scalar or (k,) [kg].
         radii: > 0 (k,) [m].
         walls: rows (n_x, n_y, d): the half plane `n . x >= d` is free; n is made a unit vector.
-        room: contacts that may be closed at once in time stepping; None: 4 a disc.
+        room: largest number of closed contacts at once in time stepping; None: 4 per disc.
 
     >>> import jimpact as ji
     >>> discs = ji.Discs(1.0, [0.1, 0.1], walls=[[0.0, 1.0, 0.0]])

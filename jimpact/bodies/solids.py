@@ -165,7 +165,7 @@ class Solid(Body):
 
 
 class Box(Solid):
-    """A box in space over a plane, see `Solid`; one contact a corner, eight in all.
+    """A box in space over a plane, see `Solid`; one contact per corner, eight contacts.
 
     Equation: c_i = middle + (+/- a/2, +/- b/2, +/- c/2), contacts in the order (-,-,-), (-,-,+),
     (-,+,-), ... (+,+,+) of the body's axes; with `rounding` r, spheres that touch the sides.

@@ -1,1 +1,1 @@
-"""The command line: commands, options, studies built of files, programs kept between calls."""
+"""The command line: commands, options, studies built of files, stored programs."""

@@ -212,7 +212,7 @@ def _fit_and_yardsticks(study: Study, chosen: dict[str, Any], steps: Steps) -> d
     run(RAW, study)
     if study.measured is not None:  # the other laws know no forces and no times
         return fits
-    if any("break momentum" in line for line in fits[RAW].warnings):
+    if any("conservation of momentum" in line for line in fits[RAW].warnings):
         assert study.experiments is not None  # it was fitted
         data = study.experiments.momentum_corrected(study.scene)
         run(CORRECTED, replace(study, experiments=data))
@@ -227,7 +227,7 @@ def _fit_and_yardsticks(study: Study, chosen: dict[str, Any], steps: Steps) -> d
 
 
 def _per_contact(study: Study) -> tuple[Study, Study | None]:
-    """The study of an LZB law with one value per contact, tied where it had one for all.
+    """The study of an LZB law with an entry for each contact; those of one value share it.
 
     And the study with every e and stiffness ratio free; None where the law is another one, or
     where they are free already.
@@ -236,15 +236,15 @@ def _per_contact(study: Study) -> tuple[Study, Study | None]:
     fields = ("restitution", "stiffness")
     if not isinstance(law, ji.LZB) or contacts < 2 or not set(study.free) <= set(fields):
         return study, None
-    tied = {}
+    groups = {}
     for name in fields:
         value, choice = getattr(law, name), np.asarray(study.free.get(name, False))
         one_each = np.arange(1, contacts + 1) if np.ndim(value) else 1
         labels = np.where(choice, one_each, 0) if choice.dtype == bool else choice
-        tied[name] = np.broadcast_to(labels, (contacts,))
+        groups[name] = np.broadcast_to(labels, (contacts,))
         law = with_parameter(law, name, jnp.broadcast_to(value, (contacts,)))
-    study = replace(study, law=law, free=tied)
-    if len(np.unique(tied["restitution"])) == contacts and tied["stiffness"].all():
+    study = replace(study, law=law, free=groups)
+    if len(np.unique(groups["restitution"])) == contacts and groups["stiffness"].all():
         return study, None
     return study, replace(study, free=dict.fromkeys(fields, True))
 

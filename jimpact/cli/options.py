@@ -44,7 +44,7 @@ class Command:
     """Print JSON instead of text."""
     csv: Flag = False
     """Print the table as CSV instead of text."""
-    # Compile anew. Else compiled programs are kept in the user's cache folder (up to 1 GB), or in
+    # Compile anew. Else compiled programs are stored in the user's cache folder (up to 1 GB), or in
     # the folder that the environment variable JIMPACT_CACHE names (empty: nowhere).
     no_cache: Flag = False
 
@@ -61,7 +61,7 @@ class Command:
     def remains(self) -> str:
         """What remains of an interrupted command."""
         cached = os.environ.get("JAX_COMPILATION_CACHE_DIR") and not self.no_cache
-        return "Compiled programs are kept, nothing else." if cached else "Nothing is kept."
+        return "Only compiled programs are stored." if cached else "No result is stored."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,9 +217,9 @@ class MonteCarloCommand(DrawingCommand):
             check_writable("--folder", self.folder)
 
     def remains(self) -> str:
-        """Finished chunks, where a folder was given."""
+        """Finished chunks, if there is a folder."""
         if self.folder is None:
-            return "Nothing is kept, because no --folder was given."
+            return "No result is stored, because --folder is not set."
         return f"Finished chunks are in '{self.folder}': the same command continues from there."
 
 
@@ -358,7 +358,7 @@ class NewCommand:
         return "new"
 
     def check(self) -> None:
-        """Nothing is refused beforehand."""
+        """No option is refused beforehand."""
 
     def remains(self) -> str:
         """Files are written whole or not at all."""

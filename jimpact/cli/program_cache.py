@@ -71,7 +71,7 @@ class ProgramCache:
     """Programs in a folder; those that are missing there are compiled and written.
 
     Args:
-        folder: used for nothing else; made if need be.
+        folder: reserved for programs; created if missing.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -129,7 +129,7 @@ def stored_programs(folder: str | Path | None) -> Iterator[None]:
 
 
 def limit_size(folder: str | Path, largest: int = LARGEST_FOLDER) -> None:
-    """Delete the least recently used files of a folder until the rest has at most so many bytes.
+    """Delete the least recently used files of a folder down to a total size [bytes].
 
     Where the disk does not record reading, the oldest go.
     """

@@ -100,7 +100,7 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
       profiles.
     - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
-      with scenes of their own near_m, contacts (only shots with so many). Without data a study
+      with scenes of their own near_m, contacts (only shots with that many). Without data a study
       can be compared, not fitted.
     - `[[observe]]`, in the place of `[data]`: quantity (peak_force [N], arrival_time [s] of a
       contact; duration [s] of a contact or of all; energy_ratio; bounce_height [m] of a body),
@@ -203,7 +203,7 @@ def cube_impacts(contacts: int | Sequence[int] | None = None, near: float = 2e-3
     frame being the last one before the impact. The cube is the `Box` of `tossed_cube.toml`.
 
     Args:
-        contacts: only impacts on so many corners, one number or several; None: all.
+        contacts: only impacts on this number of corners (or several numbers); None: all.
         near: corners up to so far above the lowest one touch, too (board and cube are flat to
             1.4 mm) [m].
 

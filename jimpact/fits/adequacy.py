@@ -1,4 +1,4 @@
-"""Does the law fit at all: lack of fit, shots that do not belong, shots that cannot be used.
+"""Does the law fit at all: lack of fit, suspicious shots, shots that cannot be used.
 
 Every law leaves a momentum unchanged that the contacts cannot change, and predicts the same for
 shots that began alike: residuals in these directions are noise. The other residuals are compared
@@ -15,7 +15,7 @@ from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
 
 LEVEL = 0.01  # of each test: how often it flags data that the law itself made
-_LEAST = 3  # degrees of freedom of the noise below which nothing is compared with it
+_LEAST = 3  # degrees of freedom of the noise too few to test against
 _RANGE = 1e-6  # singular values below this share count as 0 (derivatives are good to 1e-7)
 _LISTED = 6  # shots named one by one
 # Largest derivative of a velocity, over the largest velocity and a natural step of a parameter (as
@@ -55,7 +55,7 @@ def weighted(problem: FitProblem, solution: SearchResult) -> Weighted:
 
 
 def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: bool) -> list[str]:
-    """Lack of fit and suspicious shots, in words; nothing of data that are reproduced exactly."""
+    """Lack of fit and suspicious shots, in words; none if the data are reproduced exactly."""
     data = weighted(problem, solution)
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
     if freedom < 1 or squares <= problem.exact_squares:

@@ -1,4 +1,4 @@
-"""Confidence regions of two parameters at once: how well the data are fitted with both held."""
+"""Confidence regions of two parameters at once: how well the data are fitted with both fixed."""
 
 from dataclasses import dataclass
 
@@ -62,8 +62,8 @@ def contour(
         `Contour` with `deviance` (points, points).
 
     Raises:
-        ValueError: level, points or names; a robust loss; a matrix that is kept admissible; a
-            region so thin that no held value lies inside.
+        ValueError: level, points or names; a robust loss; a matrix that must be admissible; a
+            region so thin that no fixed value lies inside.
 
     >>> import jimpact as ji
     >>> pre, post = [[1.0, 0.0, -1.0], [2.0, 0.0, 0.0]], [[-0.8, 0.1, 0.7], [0.1, 1.8, 0.1]]
@@ -119,7 +119,7 @@ def _flood(
     limit: float,
     show: Show,
 ) -> np.ndarray:
-    """Deviances on the grid of held values, from the minima outwards; inf where not computed.
+    """Deviances on the grid of fixed values, from the minima outwards; inf where not computed.
 
     Each cell below the limit starts its neighbours from its own minimum.
     """
@@ -131,12 +131,12 @@ def _flood(
         row, column = (int(np.argmin(np.abs(v - point[i]))) for v, i in zip(values, pair))
         ahead[row, column] = point
     while ahead:
-        held = []
+        fixed = []
         for cell, near in ahead.items():
             point = near.copy()
             point[list(pair)] = [v[k] for v, k in zip(values, cell)]
-            held.append((pair, point))
-        totals, states = scaled.minimize(held, show)
+            fixed.append((pair, point))
+        totals, states = scaled.minimize(fixed, show)
         for k, cell in enumerate(ahead):
             squares[cell], ends[cell] = totals[k], np.asarray(states.y[k], float)
         scaled.least = min(scaled.least, float(totals.min()))

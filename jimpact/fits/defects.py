@@ -14,10 +14,10 @@ from jimpact.scene import Scene, dense_mass
 DEFECT_TOLERANCE = 1e-3
 # With `sigma`, a defect is reported beyond this many of its standard errors, ...
 DEFECT_SIGMAS = 3.0
-# ... and so many that all shots together show one by chance at most this often.
+# ... or beyond more, so that all shots together show one by chance at most this often.
 DEFECT_LEVEL = 0.02
 SEPARATION = 1e-9  # share of the velocities up to which an approach is rounding
-_LISTED = 6  # shots listed one by one with their ratios; of more, the range is given
+_LISTED = 6  # shots listed one by one with their ratios; of more, the range is reported
 
 
 def data_defects(
@@ -25,9 +25,9 @@ def data_defects(
 ) -> list[str]:
     """What the data break beyond their error, a line each: momentum, energy, approach; copies.
 
-    Momentum is given as `1 + excess / sum |m v-|`: after over before where all bodies move one way.
-    Without `sigma` the shots show their noise: a defect is one that they have in common (a t test),
-    of a single shot any above a tenth of a percent.
+    Momentum is reported as `1 + excess / sum |m v-|`: after over before where all bodies move one
+    way. Without `sigma` the shots show their noise: a defect is one that they have in common (a t
+    test), of a single shot any above a tenth of a percent.
 
     Args:
         experiments: the shots; those with missing values are not judged.
@@ -64,12 +64,17 @@ def data_defects(
         gain = t_plus - t_minus - stored_energy
         slope = np.append(mass @ post, -mass @ pre)[both]
         energies.append((k, _Defect(gain, t_minus, slope, sigma, energy_ratios[k])))
-    momentum = {k: r for found in momenta.values() for k, r in _beyond_noise(found).items()}
+    momentum = {
+        k: ratio
+        for momentum_ratios in momenta.values()
+        for k, ratio in _beyond_noise(momentum_ratios).items()
+    }
     energy = _beyond_noise(energies, gains=True)
     lines = []
     if momentum:
         lines.append(
-            f"The data break momentum (1 = conserved): {_listed(experiments, momentum)}; "
+            "The data violate conservation of momentum (1 = conserved): "
+            f"{_listed(experiments, momentum)}; "
             f"no law can reproduce that part{_floor(experiments, scene)}."
         )
     if energy:
@@ -84,8 +89,8 @@ def data_defects(
     copies = len(rows) > 1 and experiments.sigma is None and (rows == rows[:1]).all()
     if copies and experiments.scenes is None:
         lines.append(
-            f"All {len(rows)} shots read the same to the last digit: they say no more than one of "
-            "them, and nothing of the noise; the errors mean nothing without `sigma`."
+            f"All {len(rows)} shots are equal to the last digit: they carry no more information "
+            "than one of them, and none on the noise; without `sigma` the errors are meaningless."
         )
     return lines
 

@@ -86,8 +86,8 @@ def design(
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
     noise = fit.noise
     if fit.experiments.sigma is not None:  # which weigh candidates of other units as `fit` does
-        worth = fit.experiments.natural_errors(fit.problem.scene)
-        noise *= float(np.nanmedian(np.asarray(fit.problem.sigma) / worth))
+        natural_error = fit.experiments.natural_errors(fit.problem.scene)
+        noise *= float(np.nanmedian(np.asarray(fit.problem.sigma) / natural_error))
     each = _information(problem, fit, 1.0 if candidates.sigma is not None else noise)
     known = known + _RIDGE * np.trace(known + each.sum(axis=0)) * np.eye(len(known))
     first = fit.problem.parameters.first
@@ -113,7 +113,7 @@ def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:
     """`J^T J / noise^2` (K, P, P) of every shot at the parameters of the fit, in scaled form."""
     residuals, r = filled_up(problem.residuals), fit.problem.residuals
     y = fit.problem.point(fit.value)
-    ends: Any = BoxRegion(*np.broadcast_to(y.astype(r.offset.dtype), (2, len(y))))  # held there
+    ends: Any = BoxRegion(*np.broadcast_to(y.astype(r.offset.dtype), (2, len(y))))  # fixed there
     parts = (r.mix, r.offset, r.scale, ends.low, ends.high, ends)
     here = eqx.tree_at(
         lambda r: (r.mix, r.offset, r.scale, r.low, r.high, r.region), residuals, parts

@@ -27,8 +27,8 @@ class Experiments(eqx.Module):
         post: v+ of the same shape [m/s]; NaN marks a value that was not measured.
         sigma: standard error of each `post` value, (K, n) or a scalar, > 0 [m/s]; None: unknown,
             then `fit` estimates one common noise from the residual.
-        scenes: one `Scene` a shot, with the same coordinates, but any number of contacts; a law's
-            entry j belongs to contact j of each. None: the argument `scene` of `fit`.
+        scenes: one `Scene` for each shot, with the same coordinates, but any number of contacts; a
+            law's entry j belongs to contact j of each. None: the argument `scene` of `fit`.
         shots: K labels for tables and pictures; None: 1, 2, ...
         lost_freedom: independent values that a correction has removed from each shot, K numbers or
             one for all.
@@ -40,7 +40,7 @@ class Experiments(eqx.Module):
             to q have the standard error q / sqrt(12), which is added to sigma (in squares).
 
     Raises:
-        ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, nothing
+        ValueError: no shots, different shapes, NaN in `pre`, infinite values, sigma <= 0, no value
             measured, scenes that do not belong to these velocities.
 
     >>> import jimpact as ji
@@ -246,7 +246,7 @@ class Experiments(eqx.Module):
         return np.array([max(-gamma.min(initial=0.0), 0.0) for gamma in rates])
 
     def natural_errors(self, scene: Scene | None = None) -> np.ndarray:
-        """What one m/s of error is worth in each velocity (n,) of a scene: 1, in rad/s by energy.
+        """Error in each velocity (n,) of a scene that counts as 1 m/s: 1, in rad/s by energy.
 
         Equation: `sqrt(mean M_ii of the velocities in m/s / mean M_ii of those in rad/s)`.
         """
@@ -326,7 +326,7 @@ def _as_rows(name: str, value: Any) -> jax.Array:
 
 
 def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None = None) -> jax.Array:
-    """Standard errors as (K, n), NaN where nothing was measured; `least` 0.0: 0 is allowed."""
+    """Standard errors as (K, n), NaN where no value was measured; `least` 0.0: 0 is allowed."""
     sigma = as_float_array(name, value)
     check_concrete(name, sigma)
     if sigma.shape == measured.shape[1:] and len(measured) == 1:
@@ -344,7 +344,7 @@ def _as_sigma(name: str, value: Any, measured: np.ndarray, least: float | None =
 
 
 def _as_scenes(scenes: Sequence[Scene], shape: tuple[int, ...]) -> tuple[Scene, ...]:
-    """The scenes, one a shot, checked."""
+    """The scenes, one for each shot, checked."""
     scenes = tuple(scenes)
     if len(scenes) != shape[0]:
         raise ValueError(

@@ -91,17 +91,17 @@ def fit(
     Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured values.
 
     Args:
-        law: start values. A scalar field is one value for all contacts (tied), an (m,) field is
-            free contact by contact. The stiffnesses of `LZB` with equal exponents: only their
-            ratios matter, so that of contact 1 is held; a scalar stiffness is held by default, and
-            naming it in `free` is an error.
+        law: the law to fit; its parameters are the start values. All contacts share one value of
+            a scalar field; an (m,) field is free contact by contact. The stiffnesses of `LZB` with
+            equal exponents: only their ratios matter, so that of contact 1 is fixed; a scalar
+            stiffness is fixed by default, and naming it in `free` is an error.
             The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
             approach velocity, at every evaluation and with every method; the start must be so.
             Or a `FitProblem`, which holds the next three arguments and `bounds`.
-        scene: the scene of all shots; not used where the experiments carry one a shot.
+        scene: the scene of all shots; ignored if each shot has its own scene.
         experiments: measured shots.
         free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of
-            groups}: contacts with equal numbers are tied, 0 is held.
+            groups}: contacts with equal numbers share one value, 0 is fixed.
         bounds: {field: (low, high)}; default [0, 1] for restitution, > 0 for stiffness, ...
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
@@ -109,13 +109,13 @@ def fit(
             value), 'student' (the density of Student's t, 4 degrees of freedom). Where sigma is
             not known, it is taken from the median of the residuals.
         starts: number of starts, the first from the law's values, the others random; if
-            more than one, further ones around the best follow as long as they improve it, and,
-            of up to 64 shots, scans for other minima of what is fitted in its logarithm.
+            more than one, further ones around the best follow as long as they improve it, and for
+            up to 64 shots also a scan for other minima in log-fitted parameters.
         seed: of the random starts.
         max_steps: iterations per start.
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
-            trusted (at a bound, in a valley, with several minima, or where the data hardly see a
-            parameter), of up to 256 shots, with a single start of up to 64; else the report says
+            trusted (at a bound, in a valley, with several minima, or for weakly determined
+            parameters), of up to 256 shots, with a single start of up to 64; else the report says
             how to get them.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 
@@ -123,11 +123,12 @@ def fit(
         `Fit`; `print` gives its report, `ji.plot.fit` a picture.
 
     Shots whose impact fails at the best parameters, or whose derivatives are not finite or
-    absurdly large, are left out, and `Fit.warnings` names them. It also says whether the law fits
-    at all ("Lack of fit"), which shots are suspicious, and what is wrong with the data.
+    absurdly large, are left out, and `Fit.warnings` names them. `Fit.warnings` also says whether
+    the law fits at all ("Lack of fit"), which shots are suspicious, and what is wrong with the
+    data.
 
     Raises:
-        ValueError: unknown field, nothing free, masks or bounds that do not fit, bodies of
+        ValueError: unknown field, no free parameter, masks or bounds that do not fit, bodies of
             scene and experiments that differ in number, derivatives that are not finite.
 
     >>> import jimpact as ji
@@ -186,8 +187,8 @@ def _check_derivatives(problem: FitProblem, solution: SearchResult) -> None:
 def _rms(problem: FitProblem, residual: np.ndarray) -> float:
     """The root mean square of residuals, those in rad/s by kinetic energy [m/s]."""
     data = problem.experiments
-    worth = 1.0 if data is None else data.natural_errors(problem.scene)
-    known = (residual / worth)[np.isfinite(residual)]
+    natural_error = 1.0 if data is None else data.natural_errors(problem.scene)
+    known = (residual / natural_error)[np.isfinite(residual)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
 
 
@@ -274,7 +275,7 @@ def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Sear
 
 
 def _jacobian(problem: FitProblem, solution: SearchResult) -> np.ndarray:
-    """Derivatives (K, n, P) of what was measured in the parameters; NaN where nothing was."""
+    """Derivatives (K, n, P) of what was measured in the parameters; NaN where none was measured."""
     shape = (*problem.measured.shape, len(problem.names))
     slope = solution.jacobian.reshape(shape) / solution.scale
     return problem.errors_of(problem.size * slope)

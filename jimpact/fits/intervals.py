@@ -16,7 +16,7 @@ def check_level(level: float) -> None:
 class Profile:
     """`deviance` (G,) over the `value`s (G,) of parameter `name`, and where it is below `limit`.
 
-    `deviance` is the sum of squares with the parameter held, less its least value, over the noise
+    `deviance` is the sum of squares with the parameter fixed, less its least value, over the noise
     variance. `intervals` are the pieces of the confidence interval at `level`, in order; an end at
     `domain` means that the data do not bound the parameter there. `better`: values of a minimum
     below that of the fit, or None.

@@ -1,7 +1,7 @@
 """Fits of a restitution matrix: the region in which it is consistent for every approach.
 
 The set `{E : E >= 0, G^-1 (I + E) >= 0, G^-1 - E^T G^-1 E copositive}` is convex (each x >= 0
-asks `|E x| <= |x|` in the norm of G^-1), so points outside are drawn back along the ray to a
+asks `|E x| <= |x|` in the norm of G^-1), so points outside are drawn back on the ray to a
 point inside, and steps are cut by the conditions linearized at the current matrix. Only the
 energy bends; its second derivatives make the steps converge quadratically.
 """
@@ -30,7 +30,7 @@ _LEAST_DAMPING = {"float64": 1e-8, "float32": 1e-4}
 _SCALINGS = 60  # of the ray: each closes in on the boundary quadratically
 _TIE = 1e-10  # eigenvalues of Q closer than this, relative to G^-1, count as equal
 
-# Every support of m contacts gives a condition on the energy, 2^m - 1 in all.
+# Every support of m contacts gives a condition on the energy, 2^m - 1 conditions.
 LARGEST = 6
 # Conditions may be broken by rounding, in units of the entries of G^-1.
 _ROUNDING = {"float64": 1e-9, "float32": 1e-4}
@@ -141,7 +141,7 @@ class AdmissibleMatrices(eqx.Module):
         return jax.lax.while_loop(lambda s: s[1] & (s[2] < _SCALINGS), closer, first)[0]
 
     def _energy_share(self, y: jax.Array, x: jax.Array) -> jax.Array:
-        """Where on the ray the energy kept at the approaches x reaches 1; above the true end."""
+        """Where on the ray the energy ratio of approaches x reaches 1; above the true end."""
         start = jnp.einsum("sij,sfj->sfi", self.matrices(self.center), x)
         rate = jnp.einsum("sij,sfj->sfi", self.matrices(y), x) - start
         a, b = _square(self.inverse, rate), jnp.einsum("sfi,sij,sfj->sf", start, self.inverse, rate)
@@ -245,8 +245,8 @@ def matrix_region(
         bounds: (2, Q) of y.
 
     Raises:
-        ValueError: redundant contacts, too many contacts, a start that is not admissible, held
-            entries that leave no room.
+        ValueError: redundant contacts, too many contacts, a start that is not admissible, fixed
+            entries that leave no admissible choice.
     """
     if not scenes or not encloses(law, scenes[0].contacts):
         return None
@@ -288,7 +288,7 @@ def admissible_start(scenes: list[Scene]) -> np.ndarray:
         moving = np.any(rows != 0, axis=1)
         if slack[moving].min() >= -_rounding(region):
             return e.reshape(m, m)
-        # t <= slack + rows (E - e): least slack t at E, below the tangents found so far
+        # t <= slack + rows (E - e): least slack t at E, below all tangents so far
         new = np.column_stack([-rows, np.ones(len(rows)), slack - rows @ e])[moving]
         planes = np.vstack([planes, new])
         farthest = linprog(
@@ -420,13 +420,13 @@ def _center(
         if _host_conditions(region, center)[0][moving].min() > _rounding(region):
             return jnp.asarray(center, region.center.dtype)
     raise ValueError(
-        "Argument `free` must leave room for an admissible matrix: with the held entries every "
+        "Argument `free` must leave an admissible choice: with the fixed entries every "
         "free entry is at the edge already."
     )
 
 
 def boundary(region: Any, entries: np.ndarray) -> tuple[str, ...]:
-    """The conditions that a fitted E is at the edge of (other than by held entries), in words."""
+    """The conditions that a fitted E is at the edge of (other than by fixed entries), in words."""
     if not isinstance(region, AdmissibleMatrices):
         return ()
     slack, rows = _host_conditions(region, _start(entries, region.origin, region.map))

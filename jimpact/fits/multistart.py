@@ -23,7 +23,7 @@ from jimpact.fits.problem import (
 from jimpact.progress import Show, progress_bar
 
 LANES, DEAR_LANES = 8, 4  # starts that run together: of shots, and of what may take longer
-PASSES = 4  # until starts that are done make room
+PASSES = 4  # until starts that are done are replaced
 # A Levenberg-Marquardt start that gains less than this share in this number of passes sits on a
 # kink of the law (a change in the sequence of contacts), where steps zigzag: it is given up.
 SLOW, SLOW_PASSES = 1e-3, 12
@@ -151,7 +151,7 @@ def settled(
 ) -> tuple[list[FitProblem], SolverState]:
     """Minima next to points (S, Q), equally many of each problem, its best one first.
 
-    Errors of v- are passed on as the law of the best does that is found, until both agree. `many`:
+    Errors of v- are propagated by the law of the best minimum, until both agree. `many`:
     other residuals (S, ...) than the problems', whose weights alone are taken.
     """
     each = len(points) // len(problems)
@@ -245,25 +245,25 @@ def run(
     return states
 
 
-def run_held(
+def run_fixed(
     residuals: Residuals,
-    held: Sequence[tuple[Sequence[int] | int, np.ndarray]],
+    fixed: Sequence[tuple[Sequence[int] | int, np.ndarray]],
     max_steps: int,
     show: Show,
 ) -> SolverState:
-    """Minima from y (Q,) of each, while its entries of these numbers are held."""
-    points = np.array([y for _, y in held])
+    """Minima from y (Q,) of each, while its entries of these numbers are fixed."""
+    points = np.array([y for _, y in fixed])
     low, high = (
-        np.tile(np.asarray(end, float), (len(held), 1)) for end in (residuals.low, residuals.high)
+        np.tile(np.asarray(end, float), (len(fixed), 1)) for end in (residuals.low, residuals.high)
     )
-    for k, (which, y) in enumerate(held):
+    for k, (which, y) in enumerate(fixed):
         at = np.array(which, int)
         low[k, at] = high[k, at] = y[at]
     dtype = residuals.offset.dtype
     box: Any = BoxRegion(low.astype(dtype), high.astype(dtype))  # type: ignore[arg-type]
-    many = repeated(residuals, len(held))
+    many = repeated(residuals, len(fixed))
     many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (box.low, box.high, box))
-    what = "held values"
+    what = "fixed values"
     return run(many, points, "levenberg-marquardt", max_steps, show, rivals=False, what=what)
 
 
@@ -387,7 +387,7 @@ def _valleys(
 ) -> np.ndarray:
     """Points (., Q) in the valleys of scans through the best end.
 
-    A parameter that is fitted in its logarithm, or that two bounds do not hold, is held at many
+    A parameter that is fitted in its logarithm, or that lacks one of two bounds, is fixed at many
     values while the others follow. Between two values the residuals are taken for cubic, with the
     slopes that the Jacobian gives: two turns between two of them are seen.
     """
@@ -403,21 +403,21 @@ def _valleys(
     low, high = (np.asarray(end, float)[:count] for end in (residuals.low, residuals.high))
     log, center = problem.log, problem.point(problem.start)[:count]
     reach = np.where(log, np.log(SCAN_FACTOR), START_SCALES)
-    held = []
+    fixed = []
     for i in np.flatnonzero(log | ~np.isfinite(low) | ~np.isfinite(high)):
         ends = np.clip(center[i] + reach[i] * np.array([-1, 1]), low[i], high[i])
         for value in np.linspace(ends[0], ends[1], SCANNED):
-            held.append((int(i), np.array(states.y[best], float)))
-            held[-1][1][i] = value
-    if not held:
+            fixed.append((int(i), np.array(states.y[best], float)))
+            fixed[-1][1][i] = value
+    if not fixed:
         return np.zeros((0, states.y.shape[1]))
     passes = 1 if count == 1 else SCAN_PASSES
-    scan = run_held(residuals, held, passes, show)
+    scan = run_fixed(residuals, fixed, passes, show)
     valleys = []
-    for k in range(0, len(held), SCANNED):
+    for k in range(0, len(fixed), SCANNED):
         rows = slice(k, k + SCANNED)
         part = jax.tree.map(lambda x, rows=rows: x[rows], scan)
-        valleys += _turns(held[k][0], count, part, np.asarray(states.y[best], float))
+        valleys += _turns(fixed[k][0], count, part, np.asarray(states.y[best], float))
     valleys.sort(key=lambda valley: valley[0])
     return np.array([y for _, y in valleys[:FOLLOWED]]).reshape(-1, states.y.shape[1])
 

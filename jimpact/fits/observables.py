@@ -10,7 +10,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_choice, check_values
 from jimpact.bodies.base import STANDARD_GRAVITY
-from jimpact.fits.problem import Prediction, means_nothing
+from jimpact.fits.problem import Prediction, meaningless
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.laws.histories import History, history
@@ -48,7 +48,7 @@ class Observations(eqx.Module):
     times ask for an `LZB` or `Compliant` law with stiffnesses in SI units.
     """
 
-    scenes: Scene  # stacked, one a shot
+    scenes: Scene  # stacked, one for each shot
     pre: jax.Array  # (K, n)
     present: jax.Array  # (K, n) bodies that take part
     up: jax.Array  # () sign of a velocity away from the wall
@@ -90,7 +90,7 @@ class Observations(eqx.Module):
         raw = jnp.stack([self._value(row, velocity, histories) for row in self.rows])
         first = np.array([row.first for row in self.rows])
         values = jnp.where(first < 0, raw, raw / raw[np.maximum(first, 0)])
-        fails = means_nothing(status)
+        fails = meaningless(status)
         shot = np.array([row.shot for row in self.rows])
         bad = fails[shot] | ~jnp.isfinite(values)
         return Prediction(values, bad, status[jnp.argmax(fails)][None])
@@ -163,7 +163,7 @@ def observations(scene: Scene, tables: Sequence[Mapping[str, Any]]) -> Measured:
         rows += [Observation(quantity, place, len(shots) + k, first) for k in range(count)]
         shots += _shots(where, scene, table, count)
         values.append(value)
-        if first >= 0 and len(value) > 1:  # one to which others are relative says nothing itself
+        if first >= 0 and len(value) > 1:  # the reference of the others is no measurement
             values[-1][0] = np.nan
     if sigmas and len(sigmas) < len(tables):
         raise ValueError("`sigma` must be given in all [[observe]] or in none.")
@@ -181,7 +181,7 @@ def observations(scene: Scene, tables: Sequence[Mapping[str, Any]]) -> Measured:
 def _shots(
     where: str, scene: Scene, table: Mapping[str, Any], count: int
 ) -> list[tuple[Scene, np.ndarray, np.ndarray]]:
-    """Of each value its scene, the velocities before, and who takes part."""
+    """Scene, velocities before and the bodies that take part, for each value."""
     n, m = scene.size, scene.contacts
     left = scene.walls == (True, False)
     one_wall = scene.walls is not None and sum(scene.walls) == 1
@@ -199,7 +199,7 @@ def _shots(
         velocity = as_float_array("velocity_m_per_s", table["velocity_m_per_s"])
         if velocity.shape != (n,):
             raise ValueError(
-                f"{where}: `velocity_m_per_s` must have {n} entries, one a body, "
+                f"{where}: `velocity_m_per_s` must have {n} entries, one for each body, "
                 f"but has shape {tuple(velocity.shape)}."
             )
         velocities = np.repeat(np.asarray(velocity)[None], count, axis=0)
@@ -232,14 +232,14 @@ def _place(where: str, scene: Scene, table: Mapping[str, Any]) -> int:
 
 
 def _numbers(where: str, key: str, value: Any) -> np.ndarray:
-    """Numbers of a table, NaN where nothing was measured."""
+    """Numbers of a table, NaN where a value was not measured."""
     numbers = np.atleast_1d(np.asarray(as_float_array(f"{key} in {where}", value), float))
     check_values(f"{key} in {where}", numbers, nan_allowed=True)
     return numbers.copy()
 
 
 def _each(where: str, key: str, value: Any, count: int) -> np.ndarray:
-    """One number a value; a single one serves all."""
+    """One number for each value; a single number is repeated."""
     numbers = _numbers(where, key, value)
     if len(numbers) not in (1, count):
         raise ValueError(

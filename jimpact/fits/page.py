@@ -84,7 +84,7 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def _listed(title: str, lines: Sequence[str]) -> str:
-    """A list below its heading; nothing where it is empty."""
+    """A list below its heading; an empty text if there are no lines."""
     if not lines:
         return ""
     items = "\n".join(f"<li>{escape(' '.join(line.split()))}</li>" for line in lines)

@@ -11,7 +11,7 @@ from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
 DEFAULT_FREE = ("restitution", "stiffness")  # or a matrix, or what else a law has
-OF_SPEED = ("speed_exponent", "yield_speed")  # where a law has them, they were asked for
+OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
 
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
 # beyond, the softer contact has no further influence that a measurement could see.
@@ -20,13 +20,13 @@ LOG_RANGE = 1e4
 
 @dataclasses.dataclass(frozen=True)
 class Parameters:
-    """P free parameters. Each moves one or several (tied) of the Q entries of the named fields.
+    """P free parameters. Each moves one or several of the Q entries of the named fields.
 
     Entries are numbered through the flattened fields, in the order of `fields`; entries in no
-    group are held. (All entries are kept so that a compiled fit does not depend on the groups.)
+    group are fixed. (All entries are listed so that a compiled fit does not depend on the groups.)
     """
 
-    labels: dict[str, np.ndarray]  # of each field: 0 is held, entries with equal numbers are tied
+    labels: dict[str, np.ndarray]  # of each field: 0 is fixed, equal numbers share a value
     names: tuple[str, ...]
     groups: tuple[tuple[int, ...], ...]
     entry_fields: tuple[str, ...]  # of each entry
@@ -70,16 +70,16 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
 
 
 def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parameters, list[str]]:
-    """The parameters that `free` names, and notes on what was held instead.
+    """The parameters that `free` names, and notes on what was fixed instead.
 
     `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
     """
     known = free_parameters_of(law)
-    labels, held = {}, ""
+    labels, fixed = {}, ""
     if free is DEFAULT_FREE:
         free = default_free(law, absolute)
         if "stiffness" in known and "stiffness" not in free:
-            held = "stiffness"
+            fixed = "stiffness"
     choices = dict(free) if isinstance(free, Mapping) else dict.fromkeys(_as_names(free), True)
     for field, choice in choices.items():
         if field not in known:
@@ -87,19 +87,21 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
         labels[field] = _as_labels(field, choice, np.shape(value_of(law, field)))
     ratios = not absolute and _only_ratios(law, labels)
     if ratios and "stiffness" in labels and labels["stiffness"].all():
-        tied = labels["stiffness"] == labels["stiffness"].flat[0]
-        if tied.all():
+        shared = labels["stiffness"] == labels["stiffness"].flat[0]
+        if shared.all():
             raise ValueError(
                 "Argument `free` must not hold a scalar `stiffness` (or one for all contacts): "
                 "with equal exponents a common factor of all stiffnesses changes nothing, so the "
                 "data cannot determine it. Give the law one stiffness per contact to fit their "
                 "ratios, or free only `restitution`."
             )
-        labels["stiffness"][tied] = 0
-        held = "stiffness[1]"
+        labels["stiffness"][shared] = 0
+        fixed = "stiffness[1]"
     notes = []
-    if held:
-        notes = [f"{held} is held at its start: with equal exponents only stiffness ratios matter."]
+    if fixed:
+        notes = [
+            f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
+        ]
     names, groups, start = [], [], 0
     for field, label in labels.items():
         for value in dict.fromkeys(label[label > 0].tolist()):
@@ -115,7 +117,7 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
 
 
 def _name(field: str, members: np.ndarray, size: int) -> str:
-    """restitution (all tied), restitution[2] (contact 2), restitution[1=3] (tied), matrix[1,2]."""
+    """restitution (one value for all), restitution[2], restitution[1=3] (shared), matrix[1,2]."""
     if len(members) == size and (size > 1 or members.shape[1] == 0):
         return field
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
@@ -154,17 +156,17 @@ def _unknown_field(law: Law, field: str, known: list[str]) -> str:
 
 
 def _as_labels(field: str, choice: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Integers shaped like the field: 0 is held, entries with equal numbers are tied."""
+    """Integers shaped like the field: 0 is fixed, entries with equal numbers share one value."""
     mask = np.asarray(choice)
     if mask.dtype.kind not in "biu" or (mask < 0).any():
         raise ValueError(
             f"Argument `free` must map `{field}` to True, False, a boolean mask or numbers of "
-            f"groups (0 is held), but has value {choice!r}."
+            f"groups (0 is fixed), but has value {choice!r}."
         )
     if mask.shape not in ((), shape):
-        tied = "one value for all contacts (tied)" if shape == () else f"of shape {shape}"
+        kind = "one value for all contacts" if shape == () else f"of shape {shape}"
         raise ValueError(
-            f"Argument `free` must have a mask of shape {shape} for `{field}`, which is {tied} "
+            f"Argument `free` must have a mask of shape {shape} for `{field}`, which is {kind} "
             f"in this law, but has a mask of shape {mask.shape}."
         )
     if mask.dtype == bool:  # each free entry is a group of its own

@@ -39,7 +39,7 @@ def posterior(
 
     Equation: `p(x | data) ~ exp(problem.log_density(x)) prior(x)`; where sigma is not known it is
     integrated over `d sigma / sigma`. Chains start at the fit. Derivatives are by forward mode.
-    Matrices that are kept admissible are `E = E_0 + L(d) tanh(|z| / L(d)) d` of the sampled z, d
+    Matrices that must be admissible are `E = E_0 + L(d) tanh(|z| / L(d)) d` of the sampled z, d
     its direction, L(d) how far the admissible ones reach from an inner E_0.
 
     Args:

@@ -33,7 +33,7 @@ from jimpact.law import Law
 from jimpact.scene import Scene, dense_mass, stackable
 from jimpact.status import CODE
 
-# Outcomes whose velocities mean nothing. A trial that meets one gets a residual far above any
+# Outcomes whose velocities are meaningless. A trial with one of them gets a residual far above any
 # honest one, so that a solver turns back; inadmissible or energetic outcomes are only reported.
 UNUSABLE = ("infeasible", "max_steps", "not_finite")
 PENALTY = 1e3  # times the largest measured value
@@ -48,7 +48,7 @@ FEWEST, FEW = 4, 64
 
 
 class Prediction(NamedTuple):
-    """What a law makes visible: values, where they mean nothing, and status codes (S,)."""
+    """What a law predicts: values, where they are meaningless, and status codes (S,)."""
 
     value: jax.Array
     bad: jax.Array
@@ -58,19 +58,19 @@ class Prediction(NamedTuple):
 class Shots(eqx.Module):
     """The observable of impacts: v+ (K, n)."""
 
-    scenes: Scene  # stacked, one a shot
+    scenes: Scene  # stacked, one for each shot
     pre: jax.Array  # (K, n), further columns where scenes were made alike
     bodies: int = eqx.field(static=True)
 
     def __call__(self, law: Law) -> Prediction:
         """Velocities after every shot, and the status of its impact."""
         out = jax.vmap(impact, in_axes=(None, 0, 0))(law, self.scenes, self.pre)
-        bad = means_nothing(out.status)
+        bad = meaningless(out.status)
         return Prediction(out.velocity[:, : self.bodies], bad[:, None], out.status)
 
 
-def means_nothing(status: jax.Array) -> jax.Array:
-    """Whether velocities with these codes (K,) mean nothing."""
+def meaningless(status: jax.Array) -> jax.Array:
+    """Whether velocities with these codes (K,) are meaningless."""
     codes = jnp.asarray([CODE[name] for name in UNUSABLE], status.dtype)
     return jnp.any(status[:, None] == codes[None, :], axis=1)
 
@@ -81,7 +81,7 @@ class Observed(eqx.Module):
     function: Callable[[Law], Any] = eqx.field(static=True)
 
     def __call__(self, law: Law) -> Prediction:
-        """What the function gives; NaN means nothing."""
+        """The value of the function; NaN counts as meaningless."""
         value = jnp.asarray(self.function(law))
         return Prediction(value, ~jnp.isfinite(value), jnp.zeros(1, jnp.int32))
 
@@ -162,9 +162,9 @@ class FitProblem:
     `C = diag(sigma^2) + J S J^T`, and its residual is multiplied by the inverse of the Cholesky
     factor of C (J of the start; `fit` takes J of the law it finds).
 
-    Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where nothing
-    was), `sigma`, `experiments` and `scene` or None, how many independent `values`
-    were measured; in words, `notes` on what was held instead of fitted, and shots `left_out`; and
+    Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where no
+    value was), `sigma`, `experiments` and `scene` or None, how many independent `values`
+    were measured; in words, `notes` on what was fixed instead of fitted, and shots `left_out`; and
     for the solvers `residuals` and `parameters`.
 
     >>> import jimpact as ji
@@ -178,7 +178,7 @@ class FitProblem:
 
     residuals: Residuals
     parameters: Parameters
-    notes: tuple[str, ...]  # what was held instead of fitted
+    notes: tuple[str, ...]  # what was fixed instead of fitted
     domains: np.ndarray
     measured: np.ndarray  # NaN where not
     sigma: np.ndarray | None
@@ -277,13 +277,13 @@ class FitProblem:
             law: start values.
             observe: law -> array, differentiable in forward mode; NaN where the law fails. A
                 residual is an observable of which zeros were measured.
-            measured: what was measured of it, of the same shape; NaN where nothing was.
+            measured: what was measured of it, of the same shape; NaN where no value was measured.
             sigma: standard errors, scalar or of the same shape; None: one common, unknown.
             free: as in `fit`.
             bounds: as in `fit`.
 
         Raises:
-            ValueError: nothing measured, sigma <= 0, an observable of another shape, and as `fit`.
+            ValueError: no measured value, sigma <= 0, an observable of another shape, and as `fit`.
 
         >>> import jax.numpy as jnp
         >>> import jimpact as ji
@@ -383,7 +383,7 @@ class FitProblem:
 
     @property
     def weight(self) -> np.ndarray:
-        """1 / sigma, shaped like `measured`; 0 where nothing was."""
+        """1 / sigma, shaped like `measured`; 0 where no value was measured."""
         return np.asarray(self.residuals.weight, float) * self.size
 
     def independent(self, errors: np.ndarray) -> np.ndarray:
@@ -398,7 +398,7 @@ class FitProblem:
         return scaled if mixing is None else np.einsum("kij,kj...->ki...", mixing, scaled)
 
     def errors_of(self, independent: np.ndarray) -> np.ndarray:
-        """The errors (K, n, ...) that are these as independent ones; NaN where nothing was."""
+        """The errors (K, n, ...) that are these as independent ones; NaN where not measured."""
         more = (1,) * (independent.ndim - self.measured.ndim)
         weight = self.weight.reshape((*self.measured.shape, *more))
         if self.residuals.mixing is not None:

@@ -1,4 +1,4 @@
-"""Profile likelihoods: how well the data are fitted with one parameter held, all others free.
+"""Profile likelihoods: how well the data are fitted with one parameter fixed, all others free.
 
 A standard error is half the width of a parabola. Where the sum of squares is not a parabola (at a
 bound, in a flat valley, with several minima), the profile gives the interval: one-sided, or of
@@ -23,7 +23,7 @@ SAME = 1e-6  # relative sums of squares that are equal
 END = 1e-3  # of the root of the limit: how near to it an end is searched for
 FAR, ROUGH = 2.0, 2  # times the limit beyond which only ROUGH passes are spent
 MANY = 256  # shots up to which they take half as long as a fit with eight starts
-QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # of the profiles that `fit` makes unasked: held values
+QUICK_POINTS, QUICK_LEVEL = 17, 0.95  # of the profiles that `fit` computes by default: fixed values
 LONGEST = 2.0  # steps by which a scan is extrapolated
 ROUNDS = 8  # of the search for an end: it is then right to a millionth of a grid cell, mostly
 
@@ -41,7 +41,7 @@ def profile(
     Equation: `D(x_i) = (min over the others of |r|^2 - least |r|^2) / s^2 <= q^2`, q the quantile
     of the normal law where sigma is known (s = 1), else of Student's t (s = `fit.noise`).
 
-    Held values cover the whole domain and the neighbourhood of the minima; from each minimum they
+    Fixed values cover the whole domain and the neighbourhood of the minima; from each minimum they
     are reached one after the other in both directions, all parameters side by side; far above the
     limit they are computed only roughly. Where a scan finds a further valley, it is followed to its
     minimum. Without sigma and with no degree of freedom left, the interval is that of the values
@@ -51,14 +51,14 @@ def profile(
         fit: by least squares.
         names: of parameters; None: all.
         level: of the confidence intervals, in (0, 1).
-        points: held values across the domain, besides those near the minimum, at least 3.
+        points: fixed values across the domain, besides those near the minimum, at least 3.
         progress: bar on stderr; None: on a terminal, once it takes longer than two seconds.
 
     Returns:
         A `Profile` for each name; `print` says its interval.
 
     Raises:
-        ValueError: level, points or names; a robust loss; a matrix that is kept admissible.
+        ValueError: level, points or names; a robust loss; a matrix that must be admissible.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.01, 0.98], [0.0, 2.01]], sigma=0.02)
@@ -96,7 +96,7 @@ class _Scans(ScaledFit):
         super().__init__(fit)
         self.which, self.level, self.show = which, level, show
         self.limit = fit.quantile(level) ** 2  # deviance at the ends of an interval
-        # of each parameter: held value -> (sum of squares, y)
+        # of each parameter: fixed value -> (sum of squares, y)
         self.solved: dict[int, dict[float, tuple[float, np.ndarray]]] = {
             i: {float(self.best[i]): (self.least, self.best)} for i in which
         }
@@ -139,7 +139,7 @@ class _Scans(ScaledFit):
                 parts.append(self.near(i, y, float(error[i])))
                 fronts += [_Front(i, step, y) for step in (-1, 1)]
             values[i] = np.unique(np.concatenate(parts))
-        alone = len(self.fit.names) == 1  # nothing is left to be solved for
+        alone = len(self.fit.names) == 1  # no other parameter to solve for
         if not (whole and alone):
             self.advance(fronts, values, far * self.limit)
         if whole:
@@ -179,15 +179,15 @@ class _Scans(ScaledFit):
 
     def _solve(
         self,
-        held: Sequence[tuple[int, np.ndarray]],
+        fixed: Sequence[tuple[int, np.ndarray]],
         steps: int = DEFAULT_STEPS["levenberg-marquardt"],
     ) -> list[tuple[float, np.ndarray]]:
-        """Minimize with the i-th entry of each y held, and remember what improves on the known."""
-        if not held:
+        """Minimize with the i-th entry of each y fixed, and store what improves on the known."""
+        if not fixed:
             return []
-        squares, states = self.minimize(held, self.show, steps)
+        squares, states = self.minimize(fixed, self.show, steps)
         ends = []
-        for k, (i, y) in enumerate(held):
+        for k, (i, y) in enumerate(fixed):
             ends.append((float(squares[k]), with_entry(np.asarray(states.y[k]), i, y[i])))
             if not squares[k] >= self.solved[i].get(float(y[i]), (np.inf, y))[0]:
                 self.solved[i][float(y[i])] = ends[-1]
@@ -198,11 +198,11 @@ class _Scans(ScaledFit):
         return ends
 
     def _nearest(self, i: int, y: float) -> np.ndarray:
-        """The minimum with the held value that is nearest to y."""
+        """The minimum with the fixed value that is nearest to y."""
         return self.solved[i][min(self.solved[i], key=lambda known: abs(known - y))][1]
 
     def deviance(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Held values and their deviances."""
+        """Fixed values and their deviances."""
         values = np.array(sorted(self.solved[i]))
         squares = np.array([self.solved[i][y][0] for y in values])
         return values, np.maximum(self.deviance_of(squares), 0.0)
@@ -281,7 +281,7 @@ class _Scans(ScaledFit):
         )
 
     def _end(self, i: int, y: np.ndarray, deviance: np.ndarray, k: int, step: int) -> float:
-        """Where the deviance passes the limit beyond the k-th held value; the domain's end else."""
+        """Where the deviance passes the limit beyond the k-th fixed value, or the domain's end."""
         beyond = k + step
         if not 0 <= beyond < len(y):
             return float(self.problem.domains[i][(step + 1) // 2])

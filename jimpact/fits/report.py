@@ -77,10 +77,10 @@ def _data_name(fit: FitResult) -> str:
 
 
 def _full_name(fit: FitResult, i: int) -> str:
-    """The name of a parameter; a stiffness is one over that of a contact which is held."""
+    """The name of a parameter; a stiffness is a ratio if that of contact 1 is fixed."""
     name = fit.names[i]
-    held = any(note.startswith("stiffness[1] is held") for note in fit.problem.notes)
-    return f"the stiffness ratio {name} / stiffness[1]" if "stiffness" in name and held else name
+    fixed = any(note.startswith("stiffness[1] is fixed") for note in fit.problem.notes)
+    return f"the stiffness ratio {name} / stiffness[1]" if "stiffness" in name and fixed else name
 
 
 def _with_error(fit: FitResult, i: int) -> str:
@@ -183,7 +183,7 @@ def _sigma_sources(fit: FitResult) -> list[str]:
 
 
 def _section(title: str, lines: tuple[str, ...]) -> list[str]:
-    """A list below its title; nothing where it is empty."""
+    """A list below its title; no lines if it is empty."""
     return [title, *(f"  - {line}" for line in lines)] if lines else []
 
 
@@ -198,8 +198,7 @@ def _scatter(fit: FitResult) -> list[str]:
     chance = scatter.trend(np.log(np.where(speed > 0, speed, 1.0)))
     if chance < SURE:
         lines.append(
-            f"  - It depends on the speed (chance without that {chance:.1g}): see "
-            "`ji.VelocityDependent`."
+            f"  - It depends on the speed (p-value {chance:.1g}): see `ji.VelocityDependent`."
         )
     return lines
 

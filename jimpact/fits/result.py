@@ -48,11 +48,11 @@ class FitResult(Generic[AnyLaw]):
         bounds: lowest and highest values (P,), (P,).
         at_bound: (P,) boolean.
         predicted: shaped like what was measured, (K, n) [m/s].
-        residual: measured less predicted (K, n) [m/s]; NaN where nothing was measured.
+        residual: measured less predicted (K, n) [m/s]; NaN where no value was measured.
         rms: of the residual.
         noise: estimated standard error of one value; NaN where no degree of freedom is left, 1
-            where `sigma` was given, or, where chi^2 says that it is too small, by how much:
-            the standard errors are stretched by that.
+            if `sigma` is known, or, if chi^2 shows that sigma is too small, the factor that
+            the standard errors are multiplied by.
         degrees_of_freedom: independent measured values less `rank`.
         rank: of the Jacobian; below P: see `identifiability`.
         singular_values: (P,) of the scaled Jacobian.
@@ -64,11 +64,11 @@ class FitResult(Generic[AnyLaw]):
         lost_starts: how many did not converge.
         warnings: what is wrong with data or fit, in words.
         problem: what was solved.
-        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where nothing
-            was measured.
+        jacobian: derivatives of what was measured in the parameters (K, n, P), NaN where no
+            value was measured.
         loss: see `fit`.
         seed: of the random starts.
-        profiles: where `fit` was asked for them.
+        profiles: if `fit` computed them.
     """
 
     law: AnyLaw
@@ -123,7 +123,7 @@ class FitResult(Generic[AnyLaw]):
         piece for every minimum that fits well enough.
 
         Equation: `value -+ q standard_error`, q the quantile of Student's t with the degrees of
-        freedom that are left, or of the normal law where `sigma` was given; of what is fitted in
+        freedom that are left, or of the normal law if `sigma` is known; of what is fitted in
         its logarithm `value exp(-+ q standard_error / value)`; at a minimum whose sum of squares
         is higher by d, q^2 - d / noise^2 in place of q^2.
         """
@@ -170,7 +170,7 @@ class FitResult(Generic[AnyLaw]):
 
     @property
     def can_be_profiled(self) -> bool:
-        """Whether parameters can be held: least squares in a box, not of an admissible matrix."""
+        """Whether parameters can be fixed: least squares in a box, not of an admissible matrix."""
         return self.loss == "squares" and isinstance(self.problem.residuals.region, BoxRegion)
 
     @property
@@ -181,7 +181,7 @@ class FitResult(Generic[AnyLaw]):
         if self.rank < len(self.names):
             return True
         if not np.isfinite(self.noise):
-            return False  # nothing says how far a value may be off
+            return False  # the errors are unknown
         q = self.quantile(0.95)
         for i in range(len(self.names)):
             pieces = self.linearized_interval(i, q)

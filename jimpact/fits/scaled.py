@@ -1,4 +1,4 @@
-"""A fit in the scaled parameters of its solver, where some of them are held and others follow."""
+"""A fit in the scaled parameters of its solver, some fixed and the others fitted."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,14 +7,14 @@ import numpy as np
 
 from jimpact._checks import check_kind
 from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
-from jimpact.fits.multistart import START_SCALES, run_held
+from jimpact.fits.multistart import START_SCALES, run_fixed
 from jimpact.fits.problem import filled_up, from_scaled, to_scaled
 from jimpact.fits.result import FitResult
 from jimpact.progress import Show
 
 
 class ScaledFit:
-    """A fit in scaled parameters y (Q,), and the minima with some of them held."""
+    """A fit in scaled parameters y (Q,), and the minima with some of them fixed."""
 
     def __init__(self, fit: FitResult):
         self.fit, self.problem = fit, fit.problem
@@ -22,7 +22,7 @@ class ScaledFit:
         r, self.scale, self.log = self.residuals, fit.problem.scale, fit.problem.log
         self.low, self.high = np.asarray(r.low, float), np.asarray(r.high, float)
         self.size = self.problem.size
-        # of the weighted residuals; where nothing determines it, what is exact up to rounding
+        # of the weighted residuals; if it is undetermined, that of an exact fit up to rounding
         known = np.isfinite(fit.noise) and fit.noise > 0
         self.variance = float(fit.noise**2) if known else self.problem.exact_squares
         self.least = fit.starts[0].sum_of_squares
@@ -54,21 +54,21 @@ class ScaledFit:
 
     def minimize(
         self,
-        held: Sequence[tuple[Sequence[int] | int, np.ndarray]],
+        fixed: Sequence[tuple[Sequence[int] | int, np.ndarray]],
         show: Show,
         steps: int = DEFAULT_STEPS["levenberg-marquardt"],
     ) -> tuple[np.ndarray, SolverState]:
-        """Sums of squares at the minima from each y (Q,) with its entries of these numbers held."""
-        states = run_held(self.residuals, held, steps, show)
+        """Sums of squares at the minima from each y (Q,) with these of its entries fixed."""
+        states = run_fixed(self.residuals, fixed, steps, show)
         return 2 * np.asarray(states.cost, float) * self.size**2, states
 
 
 def check_profiled(fit: FitResult) -> None:
-    """Raise an error unless this is a fit, of parameters that can be held."""
+    """Raise an error unless this is a fit, of parameters that can be fixed."""
     check_kind("fit", fit, FitResult)
     if not fit.can_be_profiled:
         raise ValueError(
-            "Argument `fit` must be by least squares, and not of a matrix that is kept admissible."
+            "Argument `fit` must be by least squares, and not of a matrix that must be admissible."
         )
 
 

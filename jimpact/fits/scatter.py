@@ -10,19 +10,19 @@ from jimpact.files.records import with_error
 from jimpact.fits.result import FitResult
 
 LEAST_SHOTS = 4  # of which the scatter of one number can be estimated
-SHOWN_FROM = 8  # shots from which a report gives it unasked
-SURE = 0.01  # chance at which scatter counts as shown
+SHOWN_FROM = 8  # number of shots from which a report includes it
+SURE = 0.01  # p-value below which scatter counts as detected
 _SMALLEST = 1e-4  # scatter looked for, in standard errors of one shot
 _LARGEST = 1e4  # likewise, the upper end of the search
-_NO_CHANCE = 1e-15  # smaller chances are rounding, and printed as "below"
+_NO_CHANCE = 1e-15  # smaller p-values are rounding, and printed as "below"
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
     """Scatter `value` of the parameter `name` between shots, and the fit with it.
 
-    `chance` that shots without scatter show so much; `mean` (P,) and `standard_error` (P,) of all
-    parameters `names`, `squares` and `degrees_of_freedom` of what is left; `each` (K,) the value
+    `chance` is the p-value of no scatter; `mean` (P,) and `standard_error` (P,) of all parameters
+    `names`, `squares` and `degrees_of_freedom` of what is left; `each` (K,) the value
     of every single shot and its error `each_error` (inf where a shot does not see it).
     """
 
@@ -42,13 +42,13 @@ class Scatter:
         mean, error = self.mean[i], self.standard_error[i]
         if self.chance > SURE:
             return (
-                f"{self.name} shows no scatter from shot to shot (chance {self.chance:.2g}): "
+                f"{self.name} shows no scatter from shot to shot (p-value {self.chance:.2g}): "
                 f"{with_error(mean, error)}."
             )
         chance = f"{self.chance:.1g}" if self.chance > _NO_CHANCE else f"below {_NO_CHANCE:g}"
         return (
-            f"{self.name} scatters by {self.value:.2g} from shot to shot (chance without scatter "
-            f"{chance}): its mean is {with_error(mean, error)}, in the next shot it is "
+            f"{self.name} scatters by {self.value:.2g} from shot to shot (p-value of no "
+            f"scatter {chance}): its mean is {with_error(mean, error)}, in the next shot it is "
             f"{with_error(mean, float(np.hypot(self.value, error)))}."
         )
 
@@ -59,7 +59,7 @@ class Scatter:
         return freedom > 0 and float(chdtrc(freedom, self.squares)) >= SURE
 
     def trend(self, over: np.ndarray) -> float:
-        """Chance that single shots show such a trend over these values (K,) without any.
+        """P-value of a trend of the shots over these values (K,).
 
         Equation: t test of the slope, each shot weighing `1 / (error^2 + value^2)`.
         """
@@ -81,7 +81,7 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
 
     Equation: `r_k = J_k (x - x_fit) + j_k b_k + noise`, `b_k ~ N(0, value^2)`, j_k the column of
     the parameter in J_k; `value` maximizes the restricted likelihood, linearized at the fit, with
-    the noise of sigma, or estimated with it. The chance is that of the likelihood ratio, whose
+    the noise of sigma, or estimated with it. The p-value is that of the likelihood ratio, whose
     distribution at 0 is half that of chi^2 with one degree of freedom.
 
     Args:

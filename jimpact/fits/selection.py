@@ -25,9 +25,9 @@ from jimpact.registry import registered_laws, simplest_first
 from jimpact.scene import Scene
 from jimpact.status import STATUS
 
-RESTITUTION = 0.8  # start where none is given
+RESTITUTION = 0.8  # start value by default
 SPEED_EXPONENT = 0.1  # start of a dependence on the speed
-WORSE = 0.01  # chance at which a law counts as a worse predictor than the best
+WORSE = 0.01  # p-value below which a law counts as a worse predictor than the best
 WORSE_OF_FEW = 0.05  # the same by the residuals, of fewer shots
 SAME = 1e-5  # share by which squares of the same law differ, as solvers leave them
 _LEAST = 4  # shots from which predictions of two laws are compared
@@ -39,7 +39,7 @@ class LawFit:
     """A law at its best: its `fit`, how it predicts shots left out, and what is against it.
 
     `left_out_error` is the root mean square error of shots predicted from the others [m/s], NaN of
-    fewer than two shots; `aicc` is NaN where it means nothing (see `fit_laws`); `verdict` is
+    fewer than two shots; `aicc` is NaN where it is meaningless (see `fit_laws`); `verdict` is
     'fits', or why not.
     """
 
@@ -52,7 +52,7 @@ class LawFit:
 
     @property
     def adequate(self) -> bool:
-        """Whether nothing is against it."""
+        """Whether no objection was found."""
         return self.tier == "fits"
 
     @property
@@ -78,7 +78,7 @@ class LawFits:
     """The result of `fit_laws`: `entries` by name, the simplest adequate law first.
 
     `left_out` says by name why a law was not tried; `speed` whether the first law's e depends on
-    the speed, where that was asked for.
+    the speed, if requested.
     """
 
     entries: dict[str, LawFit]
@@ -137,7 +137,7 @@ class NestedTest(NamedTuple):
     """Whether further parameters are needed: F, or chi^2 where sigma is known and fits.
 
     `statistic` of `more` parameters, and of the `degrees_of_freedom` left (None: chi^2); the
-    `chance` that data of the simpler law show as much; `names` of the further parameters.
+    p-value `chance`; `names` of the further parameters.
     """
 
     statistic: float
@@ -157,7 +157,7 @@ class NestedTest(NamedTuple):
         rest = "" if self.degrees_of_freedom is None else f" and {self.degrees_of_freedom}"
         return (
             f"{', '.join(self.names)} {word}: {kind} = {self.statistic:.3g} with {self.more}{rest} "
-            f"degrees of freedom, chance {self.chance:.2g}."
+            f"degrees of freedom, p-value {self.chance:.2g}."
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -171,7 +171,7 @@ def nested_test(simple: Fit, full: Fit) -> NestedTest:
     Equation: `F = (S - S_full) / q / (S_full / f)`, S sums of squares, q further parameters that
     the data determine, f degrees of freedom of the full fit; with sigma, unless the full fit
     contradicts it, `S - S_full` is chi^2 with q degrees of freedom. Where the simple law is at the
-    end of a domain of the full one (a yield speed of 0), the chance given is up to twice too large.
+    end of a domain of the full one (a yield speed of 0), the p-value is up to twice too large.
 
     Args:
         simple, full: fits by least squares of the same data; the law of `simple` is a special case.
@@ -236,11 +236,11 @@ def fit_laws(
     shots left out no worse than the best law does: a paired t test over shots at 1 %, of more than
     64 shots linearized; of fewer than 4 an F test of the residuals at 5 %. Adequate laws come
     first, those with fewer parameters before others, and of these the one that needs to know less
-    of the contacts, in the order of `advise`. AICc is given where it means something: rank full,
-    nothing at a bound, no shot left out, degrees of freedom left.
+    of the contacts, in the order of `advise`. AICc is reported if it is meaningful: rank full,
+    no parameter at a bound, no shot left out, degrees of freedom left.
 
     Args:
-        scene: of all shots; not used where the data carry one a shot.
+        scene: of all shots; ignored if each shot has its own scene.
         data: measured shots.
         laws: names of the registry, or laws by a name of your own (each with its default free
             parameters); None: all of the registry that these values make.
@@ -249,7 +249,7 @@ def fit_laws(
         starts, seed, progress: as of `fit`, of every law.
         done: called with name and fit after every law.
         values: parameters by name, `friction=0.2, stiffness=..., exponent=...`: starts of what is
-            fitted, held otherwise; restitution starts at 0.8. Without a stiffness, laws that need
+            fitted, fixed otherwise; restitution starts at 0.8. Without a stiffness, laws that need
             it in SI units are left out.
 
     Returns:
@@ -358,7 +358,7 @@ def _default(law: Law, more: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _variants(law: Law, contacts: int, alike: bool, more: tuple[str, ...]) -> dict[str, Candidate]:
-    """One e for all contacts or one each, stiffness ratios held or free; one program serves all."""
+    """One e for all contacts or one each, stiffness ratios fixed or free; one program for all."""
     known = free_parameters_of(law)
     if "restitution" not in known or np.ndim(known["restitution"].value) > 1:
         return {"": (law, _default(law, more))}
@@ -404,7 +404,7 @@ def _judged(fits: dict[str, Fit]) -> dict[str, LawFit]:
         else:
             chance, level, worse = _by_residuals(each, fits[best]), WORSE_OF_FEW, "fits worse"
         if tier != "fails" and chance < level:
-            worse = f"{worse} than {best} (chance {chance:.1g})"
+            worse = f"{worse} than {best} (p-value {chance:.1g})"
             tier, verdict = "worse", f"{verdict}, {worse}" if tier != "fits" else worse
         error = _left_out_rms(each, errors[name])
         entries.append(LawFit(name, each, error, _aicc(each), verdict, tier))
@@ -517,7 +517,7 @@ def _left_out_rms(result: Fit, error: np.ndarray) -> float:
 
 
 def _aicc(result: Fit) -> float:
-    """Akaike's criterion; with unknown noise corrected for few data; NaN where it means nothing."""
+    """Akaike's criterion; with unknown noise corrected for few data; NaN if meaningless."""
     n, count = result.problem.values, len(result.names)
     squares = result.starts[0].sum_of_squares
     whole = result.rank == count and not result.at_bound.any() and not result.problem.left_out

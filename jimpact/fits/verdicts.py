@@ -70,7 +70,7 @@ def fit_warnings(
 
 
 def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:
-    """Which shots the fitted law fails in."""
+    """The shots in which the fitted law fails."""
     lines = []
     for code in np.unique(status):
         if STATUS[code].failure:

@@ -50,7 +50,7 @@ class Binary(Law):
             'left_to_right': contacts 0 .. m-1 in turn, again and again;
             a tuple of all contact indices (0-based, repeats allowed): in turn, likewise. Contacts
             that do not approach are skipped.
-        max_collisions: the law gives up after so many.
+        max_collisions: largest number of collisions before the law gives up.
         friction: Coulomb's mu >= 0, scalar or (m,), for scenes with tangents; None: no friction.
         tangential_restitution: e_t in [-1, 1], scalar or (m,): sticking is `u+ = -e_t u-`.
 
@@ -63,9 +63,9 @@ class Binary(Law):
     exactly iff z >= 1 and the state is in the invariant cone, gamma+ = 0 then; for more where
     approach speeds decay below rounding without ending; `max_steps` at `max_collisions`.
 
-    Derivatives, forward and reverse, in restitution, W and gamma-, at the order found. v+ is
-    continuous where the number of collisions changes, with one-sided derivatives; it jumps where
-    the order of coupled contacts changes. Derivatives in gaps are zero.
+    Derivatives, forward and reverse, in restitution, W and gamma-, at the order of collisions that
+    occurs. v+ is continuous where the number of collisions changes, with one-sided derivatives; it
+    jumps where the order of coupled contacts changes. Derivatives in gaps are zero.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.3), (6.4), (6.13) corrected, (6.17)-(6.21);
     Towne and Hadlock, Am. J. Phys. 45 (1977) 255 (number of collisions).

@@ -1,4 +1,4 @@
-"""Compliant penalization: contacts with real gaps and a force-indentation law."""
+"""Compliant contacts: real gaps and a force that depends on indentation and its rate."""
 
 from collections.abc import Callable
 from functools import partial
@@ -22,26 +22,27 @@ class Compliant(Law):
     """Unilateral compliant contacts, each with its own gap: opens, waits, closes again.
 
     Equation: `M v' = N F`, `x_j' = -gamma_j`, `F_j = max(f(x_j, x_j'), 0)` while `x_j > 0`, from
-    `x_j = -gap_j` until nothing approaches any more. Free flight between contacts is exact, so
-    that gaps of any size cost nothing. Geometry (M and N) is frozen.
+    `x_j = -gap_j` until no contact is loaded or approaches. Free flight between contacts is exact,
+    so that gaps of any size cost nothing. Geometry (M and N) is frozen.
 
     Args:
         force: a contact force: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
             `Bistiffness(k, eta, e)`, `KelvinVoigt(k, c)`, `HuntCrossley(k, d, eta)`,
-            `KuwabaraKono(k, A)`, `UserForce(function, parameters)`.
+            `KuwabaraKono(k, A)`, `UserForce(function, parameters)`; stiffness k [N / m^eta],
+            exponent eta, restitution e, damping c [N s/m], d [s/m], dissipative time A [s].
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
         initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed contacts; not with
             a viscous force.
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
-        max_steps: passes of the integrator before it gives up.
-        check_conditioning: a second run flags `ill_conditioned`, as in `LZB`.
+        max_steps: maximum attempted steps.
+        check_conditioning: solve a second time to detect `ill_conditioned`, as in `LZB`.
 
     Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`
-    where that is checked.
+    if checked.
 
     Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-; one-sided
-    where a gap is 0 and at grazing events. Where two orders of collision meet the outcome changes
-    within gaps of about `gap_scale`, and the derivative there is as large as that says.
+    where a gap is 0 and at grazing events. Where two orders of collision meet, the outcome changes
+    within gaps of about `gap_scale`; there derivatives are of order |change of v+| / `gap_scale`.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.14)-(6.16).
 
@@ -78,15 +79,15 @@ class Compliant(Law):
 
     @property
     def has_history(self) -> bool:  # type: ignore[override]
-        """With a force that is a `Bistiffness`."""
+        """True if the force is a `Bistiffness`."""
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """A tolerance that the precision can hold."""
+        """Raise a ValueError for a tolerance finer than the precision can hold."""
         check_rtol(self.rtol, dtype)
 
     def dynamics(self, contact: Contact) -> Dynamics:
-        """The dynamics of the contact's whole encounter in units of their own."""
+        """The dimensionless dynamics of the whole encounter."""
         gamma, force, viscous = contact.gap_velocity, self.force, None
         bistiffness = force.bistiffness
         if bistiffness is not None:
@@ -129,7 +130,7 @@ def make_compliant(
     rheology: str = "bistiffness",
     damping: Any = None,
 ) -> Compliant:
-    """`Compliant` from plain parameters, as a study file gives them."""
+    """`Compliant` from plain parameters, as in a study file."""
     viscous: dict[str, Callable[..., Force]] = {
         "kelvin-voigt": KelvinVoigt,
         "hunt-crossley": partial(HuntCrossley, exponent=exponent),

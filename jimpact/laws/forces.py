@@ -88,7 +88,7 @@ class Bistiffness(Force):
 
     Equation: loading `F = k x^eta`; unloading from (x_c, F_c) along
     `F = F_c ((x - x_r) / (x_c - x_r))^eta` with the residual indentation `x_r = (1 - e^2) x_c`,
-    where the surface then stays. The pair's restitution coefficient is e, whatever the speed.
+    where the surface remains after unloading. The pair's restitution coefficient is e at any speed.
 
     Args:
         stiffness: k > 0 [N / m^eta].

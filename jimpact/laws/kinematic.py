@@ -139,7 +139,7 @@ class Moreau(_WithCoefficient):
     Status: `inadmissible_velocity` where a contact that separated before the impact is driven
     together (the law then asks for gamma+ >= -e gamma- < 0 only); `energy_gain`, with unequal e;
     `infeasible` (a body squeezed between walls with unequal e); `impulse_not_unique` for redundant
-    contacts (of all p that of least |pbar| is given, where friction allows it). With friction there
+    contacts (the p of least |pbar| is returned, where friction allows it). With friction there
     is a solution unless contacts jam (impulses that move nothing).
 
     Derivatives are one-sided where a contact is about to take part (p_j = 0 = gamma+ + e gamma-).
@@ -197,7 +197,7 @@ class RestitutionMatrix(Kinematic):
     contradict each other, or no tangential impulses give the change of qt; `impulse_not_unique`
     for redundant contacts. With friction `infeasible`, too, where normal and tangential directions
     couple so that neither sticking nor sliding is consistent, `several_outcomes` where more than
-    one is (found for up to 3 contacts; of them that which sticks most is given), and
+    one is (detected for up to 3 contacts; the one with most sticking contacts is returned), and
     `impulse_not_unique` where p_t is not determined (a block lying flat).
 
     Raises:

@@ -22,7 +22,7 @@ from jimpact.law import (
 from jimpact.laws.forces import Bistiffness
 from jimpact.scene import Scene
 
-# Tolerances of v+ where the law names none, relative to max |v-|. Ten times more would make every
+# Tolerances of v+ if the law has no `rtol`, relative to max |v-|. Ten times more would make every
 # outcome right to one digit less.
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # method 'impulse', first order: the step in the primary impulse itself
@@ -30,7 +30,7 @@ FINEST_RTOL_IN_EPS = 16  # below this many eps the error estimate is noise
 
 
 def default_rtol(method: str, dtype: jnp.dtype) -> float:
-    """Tolerance where the law has none of its own."""
+    """Tolerance if the law has no `rtol`."""
     return DEFAULT_RTOL_IMPULSE if method == "impulse" else DEFAULT_RTOL.get(str(dtype), 1e-5)
 
 
@@ -83,9 +83,9 @@ class LZB(Law):
 
     Equation, with force `F_j = k_j x_j^eta_j` at the indentation x_j:
     `gamma' = W F`, `p' = F`, `x_j' = -gamma_j` in compression, `-gamma_j / e_j^2` in expansion.
-    It is the distributing rule `dp_j / dp_i = Gamma_ji` (6.70) written in time, where it is
-    regular. It ends when all contacts are unloaded and none approaches. A contact may open,
-    re-close and be compressed repeatedly; geometry is frozen.
+    It is the distributing rule `dp_j / dp_i = Gamma_ji` (6.70), written in time because the ratio
+    form is singular at first contact. It ends when all contacts are unloaded and none approaches.
+    A contact may open, re-close and be compressed repeatedly; geometry is frozen.
 
     Args:
         restitution: energetic coefficient e_j in [0, 1], scalar or (m,); at 0 the limit e -> 0+.
@@ -95,19 +95,18 @@ class LZB(Law):
             2); an array is a parameter to differentiate and fit.
         initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression.
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents (planar or spatial);
-            None: none. While contacts slip `lambda = -mu F u / |u|`, while they stick their slip
-            velocity is exactly 0 and `|lambda| <= mu F` (see `docs/friction.md`).
+            None: none. While a contact slips, the tangential force is `lambda = -mu F u / |u|`;
+            while it sticks, u is exactly 0 and `|lambda| <= mu F` (`docs/friction.md`).
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
-        max_steps: passes of the integrator (or steps, method 'impulse') before it gives up.
+        max_steps: maximum attempted steps.
         method: 'time' (default), event-aligned, order 8; 'impulse', the published scheme in the
             impulse of a primary contact, order 1.
-        check_conditioning: a second run beside the first, at rtol / 100 and from data changed in
-            their last digits, flags `ill_conditioned` where gap velocities or slips differ by more
-            than 10 rtol of the fastest approach (`docs/speed_accuracy.md`: what that finds, and
-            float32). In a batch two to three times the time; method 'time'.
+        check_conditioning: solve a second time with rtol / 100 and with perturbed last digits, and
+            set `ill_conditioned` if gap velocities or slips differ by more than 10 rtol of the
+            fastest approach (method 'time' only; cost and float32: `docs/speed_accuracy.md`).
 
-    Status: `plastic_limit` where contacts re-close without end; `max_steps`, also where large
-    friction wedges contacts that then vibrate for long; `ill_conditioned` where that is checked.
+    Status: `plastic_limit` where contacts re-close without end; `max_steps`, also because large
+    friction can jam contacts, which then vibrate for a long time; `ill_conditioned` if checked.
 
     Derivatives, forward and reverse, in all parameters, W and gamma-; one-sided at e = 0 and
     e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three equal
@@ -155,26 +154,26 @@ class LZB(Law):
 
     @property
     def pads_scenes(self) -> bool:  # type: ignore[override]
-        """Without friction, by the stepper."""
+        """True for method 'time' without friction."""
         return self.method == "time" and self.friction is None
 
     @property
     def has_history(self) -> bool:  # type: ignore[override]
-        """By the stepper."""
+        """True for method 'time'."""
         return self.method == "time"
 
     @property
     def only_stiffness_ratios(self) -> bool:  # type: ignore[override]
-        """With equal exponents."""
+        """True if all exponents are equal."""
         return len(np.unique(np.asarray(self.exponent, float))) == 1
 
     @property
     def contact_force(self) -> Bistiffness:
-        """That of its contacts; in SI units where the stiffness is."""
+        """The Bistiffness force of each contact; in SI units only if the stiffness is."""
         return Bistiffness(self.stiffness, self.exponent, self.restitution)
 
     def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
-        """The dynamics of a contact in units of their own; `rtol` in place of the law's."""
+        """The dimensionless dynamics of the contacts; `rtol` replaces that of the law."""
         problem, units = dimensionless(
             contact.delassus,
             contact.gap_velocity,

@@ -30,7 +30,7 @@ def hertz_stiffness(
         radius2: R2 [m]; None: an equal sphere; `inf`: a plane.
 
     Returns:
-        k [N / m^1.5], of the common shape. Good for x small beside R and no plastic flow.
+        k [N / m^1.5], of the common shape. Valid for x much smaller than R and no plastic flow.
 
     Raises:
         ValueError: modulus or radius not positive, Poisson ratio out of range.

@@ -42,7 +42,7 @@ class VelocityDependent(Law):
         law: with `restitution` e_j, scalar or (m,): its value at `reference_speed`.
         speed_exponent: k in [-1, 1], scalar or (m,); None: no power law.
         yield_speed: v_y >= 0, scalar or (m,) [m/s]; None: no yield.
-        reference_speed: v_ref > 0 [m/s], where e_j holds; to fit it beside e_j and k is impossible.
+        reference_speed: v_ref > 0 [m/s], where e_j holds; cannot be fitted together with e_j and k.
 
     Status: that of the law. Derivatives: forward and reverse; one-sided where e reaches 1 and where
     two contacts approach equally fast. In `yield_speed` at 0 the slope is 0: start a fit above.

@@ -47,9 +47,9 @@ SMALL_PART = 10
 # Largest rtol that is advised: beyond, the steps of the integrator are no longer fewer.
 COARSEST_RTOL = 1e-3
 
-# Range of the ratio of two stiffnesses where nothing is known: contacts of bodies of one kind.
+# Range of an unknown ratio of two stiffnesses: contacts of bodies of one kind.
 UNKNOWN_RANGE = (0.1, 10.0)
-# Contacts whose directions have a cosine below so many roundings do not feel each other: the
+# Contacts whose directions have a cosine below this many roundings are decoupled: the
 # rounding of normals and of M^-1. Ten times more could hide a weak coupling of 1e-13.
 DECOUPLED_IN_EPS = 64
 # Stiffnesses with every ratio at an end of its range, all of them up to this number, else as many
@@ -59,24 +59,24 @@ ALONE = (0.0, 1 / 3, 2 / 3, 1.0)  # places in a ratio's range (of its logarithm)
 NUDGE = 0.02  # change of ln k for the sensitivity; its square is far below what is printed
 
 # Open contacts of a body that turns (all but chains) take part where they can close while others
-# are at work: within this time [s], longer than hard bodies touch ...
+# are loaded: within this time [s], longer than hard bodies touch ...
 LONGEST_CONTACT = 1e-2
-# ... or, where the stiffness is known, within so many times delta_c / v, about a third of the
-# duration of one collision. Ten times more: contacts far away ask for a stiffness.
+# ... or, where the stiffness is known, within this many times delta_c / v, about a third of the
+# duration of one collision. Ten times more: contacts far away require a stiffness.
 CONTACT_TIMES = 10
 
 CHUNK = 64  # rows computed together
-FEW_CONTACTS = 8  # up to so many contacts a chunk is always full, so that it compiles once
+FEW_CONTACTS = 8  # up to this number of contacts a chunk is always full, so that it compiles once
 LANES = 2048  # impacts of a batch, over m^2, of the laws that take no time
 ROUNDS = 7  # of the timing
 
 
 class Situation(NamedTuple):
-    """Scene and v- with what decides about the laws.
+    """Scene and v- with derived quantities that decide between the laws.
 
-    `scene` is as asked for, but contacts too far to take part (`far`, (m,)) have an infinite gap;
+    `scene` is as passed, but contacts too far to take part (`far`, (m,)) have an infinite gap;
     `touching` has all contacts closed that take part; `gapped` (m,) marks the open contacts that
-    can close while others are at work.
+    can close while others are loaded.
     """
 
     scene: Scene
@@ -134,7 +134,7 @@ class Trial(NamedTuple):
         return "stiffness" in free_parameters_of(self.law)
 
     def lanes(self, rows: int) -> int:
-        """Impacts computed together for so many rows of stiffness: enough to hide a call's cost."""
+        """Impacts computed together for these rows of stiffness: enough to hide a call's cost."""
         return rows if self.has_stiffness else max(1, LANES // self.scene.contacts**2)
 
     def run(self, velocity: np.ndarray, stiffness: np.ndarray) -> Outcomes:
@@ -162,29 +162,30 @@ def advise(
     timing: bool = True,
     progress: float | None = None,
 ) -> Advice:
-    """The simplest law whose v+ is within a tolerance of contacts with bistiffness springs.
+    """Find the simplest law whose v+ agrees with the bistiffness reference within `tolerance`.
 
     Equation: the error of a law is `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the difference between
     its v+ and the reference's: a ratio of energy norms, which does not mix m/s and rad/s.
 
-    The reference is `LZB`, or `Compliant` where the two differ: LZB lets a contact that has opened
-    close again at once, `Compliant` when its gap is closed (as with a wall), and only `Compliant`
-    follows open contacts that can close while others are at work; the absolute stiffness must then
-    be given. Each law is compared with it over the unknown stiffness ratios: varied one at a
-    time, at the corners of their ranges, and at log-uniform samples. Open contacts of bodies that
-    turn (of all scenes but chains) take no part if they cannot close during the impact.
+    The reference is `LZB`, or `Compliant` where the two differ: in LZB an opened contact re-closes
+    as soon as its bodies approach, in `Compliant` only after the gap that opened has closed (as
+    with a wall). Only `Compliant` follows open contacts that can close while others are loaded;
+    this requires the absolute stiffness. Each law is compared with it over the
+    unknown stiffness ratios: varied one at a time, at the corners of their ranges, and at
+    log-uniform samples. Open contacts of bodies that turn (of all scenes but chains) take no part
+    if they cannot close during the impact.
 
     Args:
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s].
-        tolerance: of the error; at least 100 times the reference's own 1e-8.
+        tolerance: of the error; at least 100 times the reference's rtol (1e-8 in float64).
         restitution: e in [0, 1], scalar or (m,).
         stiffness: k > 0, scalar or (m,) [N / m^eta]; None: only their ratio's range is known.
         exponent: eta >= 1, as in `LZB`.
         friction: Coulomb's mu >= 0, scalar or (m,), of every law (e_t = 0); None: no friction.
-        stiffness_range: low and high factor on every stiffness ratio (k_j over that of the first
-            contact of its block; on every k_j where not only ratios count); default: (0.1, 10)
-            where no stiffness is given, else (1, 1).
+        stiffness_range: low and high factor on each unknown ratio k_j / k_first within a group of
+            coupled contacts, or on each k_j if absolute stiffness matters; default: (0.1, 10)
+            if `stiffness` is None, else (1, 1).
         samples: number of log-uniform samples.
         seed: of the samples.
         timing: measure the cost of every law (some seconds of compilation).
@@ -301,7 +302,7 @@ def _missing_stiffness(situation: Situation) -> str:
         named = ", ".join(str(j + 1) for j in np.flatnonzero(situation.gapped))
         return (
             "Argument `stiffness` must be given [N/m^eta] where open contacts can close while "
-            f"others are at work (contact {named}): gaps count in units of the indentation. "
+            f"others are loaded (contact {named}): gaps count in units of the indentation. "
             "Set their gaps to inf if they take no part."
         )
     return "Argument `stiffness` must be given where exponents differ: ratios do not suffice then."
@@ -311,7 +312,7 @@ def _missing_stiffness(situation: Situation) -> str:
 
 
 def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> Situation:
-    """Blocks and gaps of a scene at v- (n,); `known`: the stiffness of `law` was given."""
+    """Blocks and gaps of a scene at v- (n,); `known`: whether the stiffness of `law` is known."""
     gamma = np.asarray(gap_velocity(scene, velocity))
     opened = ~np.asarray(scene.closed)
     far = opened & ~_can_close(scene, velocity, law, known)
@@ -333,7 +334,7 @@ def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> S
 
 
 def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.ndarray:
-    """Which contacts (m,) can close while others are at work; in a chain all, geometry is fixed.
+    """Which contacts (m,) can close while others are loaded; in a chain all, geometry is fixed.
 
     No gap velocity exceeds `sqrt(W_jj 2 T)` as long as no energy is gained.
     """

@@ -94,17 +94,17 @@ class Advice:
 
     Attributes:
         name: of the simplest law; `reason` says why, in words.
-        tolerance: as asked for.
+        tolerance: as passed.
         within: whether that law is within it.
         reference: name of the law that all are compared with, 'lzb' or 'compliant'.
         velocity: v- (n,) [m/s].
         gap_velocity: gamma- (m,) [m/s].
         candidates: the evidence by law, the simplest first.
-        blocks: contacts that feel each other.
+        blocks: groups of coupled contacts.
         stiffness: nominal ones (m,).
         unknown: the stiffnesses that are not known and what they do.
         rows: how many stiffnesses were tried.
-        gap_ratio: gaps that can close while other contacts are at work, in units of delta_c
+        gap_ratio: gaps that can close while other contacts are loaded, in units of delta_c
             (`ji.gap_scale`), or None.
         far: open contacts (from 0) that cannot close during the impact and take no part.
         reclosing: largest difference between LZB and Compliant on contacts without gaps: LZB lets
@@ -358,7 +358,7 @@ def _main_reason(advice: Advice) -> str:
 
 
 def _single_contacts(advice: Advice, verb: str) -> str:
-    """The reason where no two contacts at work feel each other."""
+    """The reason if no two loaded contacts are coupled."""
     if len(advice.gap_velocity) == 1:
         words = "single contact"
     elif len(advice.at_work) == 1:

@@ -48,7 +48,7 @@ class Point:
 
     `error[quantity]` is relative, the largest over the sample (of a law: its model error); NaN
     where there is none. `evaluations`: mean number of field evaluations an impact, NaN where there
-    are none or nothing counts them. `gradient` is None where there is none. `status`: the gravest.
+    are none or they are not counted. `gradient` is None where there is none. `status`: the gravest.
     """
 
     label: str
@@ -340,8 +340,8 @@ class Solved(NamedTuple):
 class Programs:
     """The programs of a method, functions of its setting, or of a law.
 
-    `single` solves one impact, `batched` so many as `batch`, `sampled` those on which errors are
-    measured; `compile_time` [s] by program, filled in by the first calls.
+    `single` solves one impact, `batched` a number `batch` of them, `sampled` those on which errors
+    are measured; `compile_time` [s] by program, filled in by the first calls.
     """
 
     single: Callable[[Any], Any]

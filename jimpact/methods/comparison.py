@@ -25,7 +25,7 @@ AS_CLOSE = 1.01  # distances from the measured velocities up to this ratio count
 
 
 def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:
-    """Kinetic-energy ratio `T+ / T-`; 1 conserves, NaN where nothing moves before.
+    """Kinetic-energy ratio `T+ / T-`; 1 conserves, NaN if all bodies rest before.
 
     Args:
         scene: n coordinates, m contacts.
@@ -112,7 +112,7 @@ class Comparison:
     """The result of `compare`; `print` gives a table.
 
     Attributes:
-        scene: as asked for.
+        scene: as passed.
         velocity: v- (n,) [m/s].
         entries: outcome, audit, energy ratio, dispersion and time by law.
         left_out: why a law is missing.
@@ -168,7 +168,7 @@ class Comparison:
         return "\n".join(lines)
 
     def _cells(self, after: Any) -> list[str]:
-        """Velocities [m/s], energy ratio and dispersion; nothing for NaN."""
+        """Velocities [m/s], energy ratio and dispersion; an empty text for NaN."""
         ratio = energy_ratio(self.scene, self.velocity, after)
         spread = dispersion_index(self.scene, after)
         v = [number(x, ".5f") for x in np.asarray(after)]

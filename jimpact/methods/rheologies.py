@@ -37,8 +37,8 @@ def compare_rheologies(
         ValueError: nothing approaches, restitution or stiffness out of range.
 
     >>> import jimpact as ji
-    >>> found = ji.compare_rheologies(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0], 0.9)
-    >>> for name, entry in found.entries.items():
+    >>> result = ji.compare_rheologies(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0], 0.9)
+    >>> for name, entry in result.entries.items():
     ...     print(f"{name:20}", *(f"{float(v):7.3f}" for v in entry.outcome.velocity))
     Hertz, bistiffness    -0.009   0.104   0.904
     linear, bistiffness   -0.065   0.167   0.898

@@ -26,7 +26,7 @@ RATIOS = (1e-3, 1e3, 121)  # default ratios: from, to, how many
 class ValidityMap:
     """Outcomes of LZB over exponents (x,) and stiffness ratios (r,), next to laws without them.
 
-    `scene` and v- `before` (n,) [m/s] as asked for; `velocity` (x, r, n) [m/s], `dispersion` and
+    `scene` and v- `before` (n,) [m/s] as passed; `velocity` (x, r, n) [m/s], `dispersion` and
     `status` (x, r) over `exponents` (x,) and `ratios` (r,); `laws` holds v+ (n,) of Moreau's law
     and of binary collisions, `law_dispersion` their indices.
     """

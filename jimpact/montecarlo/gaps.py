@@ -137,7 +137,7 @@ def crossover(scene: Scene, law: Law, velocity: Any, offset: Any) -> Crossover:
         offset: (s,), or one, `(gap_1 - gap_2) / delta_c`, with the larger delta_c of the two.
 
     Returns:
-        `Crossover`: `gaps` (s, 2) [m], `velocity` (s, n) [m/s], `status` (s,), one row for each.
+        `Crossover`: `velocity` (s, n) [m/s] and `status` (s,), one row for each `offset` (s,).
 
     Raises:
         ValueError: not two contacts, offsets of another shape. TypeError: another law.
@@ -204,7 +204,7 @@ class GapSensitivity:
             return linear / self.sampled.std
 
     def __str__(self) -> str:
-        """The linearized outcome, beside the sampled spread if there is one."""
+        """The linearized outcome and, if sampled, the spread."""
         m = len(self.gaps)
         at = ", ".join(f"{gap:g}" for gap in self.gaps)
         lines = [f"Linearized at gaps ({at}) m, status {self.status}; d v+ / d gap [1/s]:"]

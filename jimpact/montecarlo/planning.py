@@ -30,7 +30,7 @@ from jimpact.scene import Scene, with_gaps
 CHUNK = 4096  # samples: fast on a CPU for cheap and costly laws alike; a GPU wants more
 _WRITTEN = 6  # velocities that the report lists
 DELTA_C = "delta_c: how deep a contact is indented at the largest approach speed of the scene"
-SAMPLES = 100_000  # of a run that states no number; ten times more: quantiles three times finer
+SAMPLES = 100_000  # default number of samples; ten times more: quantiles three times finer
 BINS = 1000  # of a histogram; ten times more: quantiles finer than 100 000 samples determine them
 
 
@@ -333,7 +333,7 @@ def _key(key: Any) -> tuple[np.ndarray, str]:
 def _in_brackets(velocity: Any) -> str:
     """Velocities as (1, 0, -1), the first few of many."""
     entries = [f"{x:g}" for x in np.asarray(velocity)]
-    more = [f"... {len(entries)} in all"] if len(entries) > _WRITTEN else []
+    more = [f"... {len(entries)} entries"] if len(entries) > _WRITTEN else []
     return f"({', '.join(entries[:_WRITTEN] + more)})"
 
 

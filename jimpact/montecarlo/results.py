@@ -59,7 +59,7 @@ class MonteCarlo:
         rate: samples computed a second [1/s].
         resumed: samples that were read from the folder.
         description: law, scene and distributions, in words.
-        run: what was asked for; `replay` needs it.
+        run: the requested run; `replay` needs it.
     """
 
     samples: int
@@ -104,7 +104,7 @@ class MonteCarlo:
         return binned_quantiles(q, ends, self.counts, self.minimum, self.maximum)
 
     def replay(self, index: int) -> tuple[Law, Scene, jax.Array]:
-        """Law, scene and velocity of sample `index`: `ji.impact(*found.replay(index))`."""
+        """Law, scene and velocity of sample `index`: `ji.impact(*result.replay(index))`."""
         if not 0 <= index < self.samples:
             raise ValueError(
                 f"Argument `index` must lie in [0, {self.samples - 1}], but has value {index}."

@@ -47,24 +47,25 @@ def monte_carlo(
         law: a law, `RandomLaw`, or a function `key -> Law`.
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s], or random (n entries): `Uniform`, `Normal`, a function
-            `key -> (n,)`, given samples (S, n).
+            `key -> (n,)`, an array of samples (S, n).
         gaps: likewise (m entries) [m], none negative: `Normal` is truncated at 0; None: the
             scene's.
-        samples: how many; default: the number of given samples, or 100 000.
+        samples: number of samples; default: that of the passed samples, or 100 000.
         key: a JAX random key, or an integer seed.
-        chunk: samples computed together; part of what determines the draws.
-        executor: 'serial', 'devices' (all of this process), 'dask', or `DaskExecutor(client)`.
+        chunk: samples computed together; changing it changes the random samples.
+        executor: 'serial', 'devices' (all JAX devices), 'dask', or `DaskExecutor(client)`.
         folder: where every finished chunk is stored; the same call again continues from it, and
             may ask for more samples.
         keep_samples: store the raw samples in the folder, too (`read_samples`).
-        bins: of the histograms, between the ends of the first chunk's range plus a tenth.
+        bins: of the histograms, over the range of the first chunk, widened by 10 % of its width at
+            each end.
         progress: a progress bar on stderr; None: on a terminal, for long runs.
 
     Returns:
         `MonteCarlo`. Samples whose status is a failure are counted, listed and left out.
 
     Raises:
-        ValueError: bad arguments, gaps that can be negative, a folder of another run.
+        ValueError: bad arguments, gaps that can be negative, a folder that holds a different run.
         RuntimeError: no sample of the first chunk could be used.
         OSError: the folder cannot be written; what was written before is intact.
         KeyboardInterrupt: with a message that says how to continue.

@@ -4,7 +4,7 @@ One loop, one pass: where an event waits it is resolved, then a step is tried. L
 advance independently; an event waits until as many lanes wait as fly.
 
 DERIVATIVES   The run writes down its accepted steps and what was decided at its events
-(`MotionPlan`). A second walk through them, in which nothing is decided, is a scan: JAX
+(`MotionPlan`). A second walk through them, with all decisions fixed, is a scan: JAX
 differentiates it in both modes and any order. Its blocks of rows are checkpoints, and blocks
 without a step are skipped.
 """
@@ -88,7 +88,7 @@ class MotionProblem(NamedTuple):
 
 
 class Event(NamedTuple):
-    """What is kept of an event."""
+    """Record of an event."""
 
     happens: jax.Array  # () whether there is one
     written: jax.Array  # () whether it has a row in the record
@@ -288,7 +288,7 @@ def _begin(problem: MotionProblem, max_events: int, records: bool) -> _EventRun:
     plan = None
     if records:
         size = min(times.shape[0] + ROWS_PER_EVENT * max_events + ROWS_MORE, settings.max_steps)
-        size = -(-size // BLOCK) * BLOCK + 1  # one more to write what is not kept
+        size = -(-size // BLOCK) * BLOCK + 1  # one more for discarded entries
         row = PlanRow(last, no, flight.aim)
         rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), row)
         plan = MotionPlan(rows, jnp.int32(0), no)
@@ -334,7 +334,7 @@ def _resolved(
         most = max_events if problem.past is None else jnp.minimum(problem.past.most, max_events)
         full = (run.event_count >= most) & happened
         status = jnp.where(full, MOTION_CODE["max_events"], outcome.status).astype(jnp.int32)
-        kept = mine & happened & ~full
+        written = mine & happened & ~full
         state = outcome.after.state
         ready = flight._replace(
             state=state,
@@ -348,8 +348,8 @@ def _resolved(
             waits=outcome.approach > 0,
             approach=outcome.approach,
             several=run.several | outcome.several,
-            last=Event(jnp.asarray(True), kept, outcome.decision),
-            event_count=run.event_count + kept.astype(jnp.int32),
+            last=Event(jnp.asarray(True), written, outcome.decision),
+            event_count=run.event_count + written.astype(jnp.int32),
             status=status,
         )
         codes = jnp.stack([outcome.kind, outcome.code])
@@ -388,18 +388,18 @@ def _flown(problem: MotionProblem, run: _EventRun, flies: jax.Array) -> _EventRu
     )
     # an event that another one follows at once has a row of its own
     plan, still = run.plan, jnp.asarray(False)
-    kept = accept | (run.waits & run.last.happens)
+    recorded = accept | (run.waits & run.last.happens)
     if plan is not None:
         size = plan.rows.accepted.shape[0] - 1
         row = PlanRow(run.last, accept, begin.aim)
         index = plan.used
         rows = jax.tree.map(lambda all_, x: put(all_, x, index), plan.rows, row)
-        used = jnp.minimum(index + kept.astype(jnp.int32), size)
+        used = jnp.minimum(index + recorded.astype(jnp.int32), size)
         plan = MotionPlan(rows, used, plan.lost | (used == size))
     return run._replace(
         flight=flight,
         waits=run.waits | (flies & jnp.any(flight.event)),
-        last=run.last._replace(happens=jnp.where(kept, still, run.last.happens)),
+        last=run.last._replace(happens=jnp.where(recorded, still, run.last.happens)),
         table=run.table._replace(samples=samples),
         plan=plan,
     )
@@ -539,7 +539,7 @@ def _again(
 
     samples = at(sampled, states, times.shape[0])
     first = packed(start)[:, 0][None]
-    # where there were too few rows nothing is known, of what derivative whatsoever
+    # all derivatives are NaN if rows ran out
     inputs = [x for x in jax.tree.leaves(problem) if eqx.is_inexact_array(x)]
     finite = [jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)).astype(first.dtype) for x in inputs]
     unknown = jnp.where(plan.lost, jnp.nan, 0.0) * jnp.sum(jnp.stack(finite))

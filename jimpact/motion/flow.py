@@ -37,7 +37,8 @@ from jimpact.motion.record import MOTION_CODE, Events
 from jimpact.motion.system import System
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
-# Error allowed in the ledger, of what the errors allowed in q and v are worth: ten times more, and
+# Error allowed in the ledger, as a share of the work of the errors allowed in q and v: ten times
+# more, and
 # the steps of a body that rests on a moving base are those of the base's motion only.
 LEDGER = 0.01
 FORGET = 0.5  # of the last free step, that shorter ones leave of it each
@@ -124,7 +125,7 @@ class MotionFlow(eqx.Module, stepper.Flow):
     like: State  # of its shapes
     longest: jax.Array  # step ()
 
-    spare = 0  # rows beside those of the state, which only say how long steps may be
+    spare = 0  # rows in addition to those of the state, which only limit the length of steps
 
     @property
     def taking_part(self) -> int:  # type: ignore[override]
@@ -280,7 +281,7 @@ def put(rows: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
 
 
 def no_samples(start: State, targets: jax.Array) -> jax.Array:
-    """A table of the states at the samples, and a last row for what is not kept."""
+    """A table of the states at the samples, and a last row for discarded entries."""
     row = packed(start)[:, 0]
     return jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype).at[0].set(row)
 
@@ -302,7 +303,7 @@ def longest_step(system: System, targets: jax.Array) -> jax.Array:
 def first_flight(
     system: System, state: State, rows: jax.Array, events: int, targets: jax.Array
 ) -> Flight:
-    """A flight at the beginning: `rows` of modes, so many `events`; one sample is reached."""
+    """A flight at the beginning: `rows` of modes, number of `events`; one sample is reached."""
     step = jnp.minimum(
         jax.lax.stop_gradient(targets[1] - targets[0]), longest_step(system, targets)
     )
@@ -314,7 +315,7 @@ def first_flight(
 
 
 def next_sample(targets: jax.Array, reached: jax.Array) -> jax.Array:
-    """The time of the sample after so many."""
+    """The time of the next sample, after `reached` () samples."""
     return targets[jnp.minimum(reached, targets.shape[0] - 1)]
 
 
@@ -345,8 +346,8 @@ def one_pass(
 ) -> tuple[Flight, jax.Array]:
     """One pass of the stepper, and whether its step is accepted.
 
-    `allowed` are the errors of all rows of the state but q and v. Of a lane that does not fly all
-    stays as it is but the step to try, which `toward_sample` then sets anew.
+    `allowed` are the errors of all rows of the state but q and v. In a lane without flight
+    only the step to try changes, which `toward_sample` then sets anew.
     """
     state = flight.state
     flow = dataclasses.replace(
@@ -457,7 +458,7 @@ def allowed_errors(
         of_q = jnp.broadcast_to(jnp.max(of_q), at.v.shape)
     ledger = share * (of_q @ pushed[:, 0] + of_v @ pushed[:, 1])
     rows = packed(at).shape[0] - at.q.shape[0] - at.v.shape[0]
-    # at least a number: nothing moves and nothing is pulled
+    # positive even without motion or forces
     return jnp.full(rows, jnp.maximum(ledger, settings.atol)).at[0].set(jnp.inf)  # time: none
 
 

@@ -29,18 +29,18 @@ from jimpact.status import CODE
 # Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
 # stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
-# Without friction masses may differ by as much as rounding lets them; who carries what of redundant
-# contacts may err by rounding over this.
+# Without friction masses may differ by as much as rounding lets them; how redundant contacts share
+# the load may err by rounding over this.
 _THIN_RIDGE = 1e-9
 _INDEPENDENT = 3  # frictionless contacts that are taken not to be redundant: legs of a table
 _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts without load regular
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
 _REST_ACCELERATION = 1e-11
-_PASSES = 3  # choices: contacts that would not slide as they are taken to are asked again
+_PASSES = 3  # choices: contacts whose slip contradicts their choice are re-evaluated
 # A power of rounding: of the matrix of the forces the rest would be rounding. What happens until it
 # has fallen from there to 0 is as small.
-_LEAST_REGULARITY, _FAINT_RIDGE = 1 / 2, 3 / 4  # the second beside redundant contacts
+_LEAST_REGULARITY, _FAINT_RIDGE = 1 / 2, 3 / 4  # the second with redundant contacts
 
 
 class Modes(NamedTuple):

@@ -78,7 +78,7 @@ class Events(eqx.Module):
 
 
 def no_events(size: int, q: jax.Array, v: jax.Array, m: int, sides: int | None = None) -> Events:
-    """An empty table of events of m contacts; so many tangential impulses, m where not said."""
+    """An empty table of events of m contacts; `sides`: tangential impulses, None: m."""
     dtype, n = q.dtype, v.shape[0]
 
     def blank(*shape: int) -> jax.Array:
@@ -114,7 +114,7 @@ def joined(parts: list[Events], most: int) -> Events:
 
 
 def with_row(events: Events, happened: jax.Array, values: dict[str, jax.Array]) -> Events:
-    """One row more if it `happened` and there is room; beyond the last row nothing is written."""
+    """One row more if it `happened` and one is left; beyond the last row nothing is written."""
     size = events.time.shape[0]
     row = jnp.where(happened, events.count, size)
     new = {
@@ -216,8 +216,8 @@ def _work_report(works: dict[str, Any]) -> str:
     """What gave and what took energy; work that is rounding of the largest is left out."""
     least = _ROUNDING * max(abs(float(work)) for work in works.values())
     parts = [
-        f"{who} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
-        for who, work in works.items()
+        f"{source} {'took' if work < 0 else 'gave'} {abs(float(work)):.4g} J"
+        for source, work in works.items()
         if abs(float(work)) > least
     ]
     return ", ".join(parts) or "nothing did work"

@@ -44,10 +44,10 @@ from jimpact.progress import progress_bar, waiting
 CLOSED_BELOW = 1e-9
 ROUNDING_GAP = 1e-5  # of the gap that counts as closed: smaller gaps are rounding, hops as well
 # Roundings that a gap may be off by, of the largest coordinate or gap at the start; what counts as
-# closed is so many times more. In metres and double precision neither of them matters.
+# closed is MORE_CLOSED times more. In metres and double precision neither of them matters.
 GAP_ROUNDINGS, MORE_CLOSED = 8, 10
 TOLERANCES = {"float64": (1e-10, 1e-12), "float32": (1e-5, 1e-7)}  # rtol, atol of the flights
-# Of the largest gap velocity: a contact that leaves slower and is pressed back stays. Ten times
+# Share of the largest gap velocity: a slower contact that is pressed back remains closed. Ten times
 # more passes an accumulation a few impacts earlier, and loses a hundred times the energy there.
 SLOW = 1e-6
 MAX_STEPS = 100_000  # of the flights by default; ten times more only delays the status `max_steps`
@@ -79,14 +79,15 @@ def simulate(
     """The whole motion of a system: flights, impacts by `law`, persistent contact.
 
     Equation: between impacts that of `System`, with `0 <= lambda_n _|_ f'' >= 0` at contacts that
-    are closed and at rest; at an impact `v+` of `ji.impact` in the frame of the base. Where
-    friction leaves no such lambda, an impact without collision stops the slip, if the law has one.
+    are closed and at rest; f are the gaps, lambda_n the normal contact forces. At an impact `v+` of
+    `ji.impact` in the frame of the base. If friction admits no solution (Painleve paradox), a
+    tangential impact stops the slip, provided that the law supports it.
 
     Args:
         system: gaps, mass, forces, base.
         law: any impact law.
-        q0: (n,) at the start, without penetration.
-        v0: (n,); of bodies in space `(x', omega)`.
+        q0: (n,) [m, rad] at the start, without penetration.
+        v0: (n,) [m/s, rad/s] at the start; of bodies in space `(x', omega)`.
         t_end: [s] > t_start.
         t_start: [s].
         samples: number of equally spaced instants in the record, both ends included.
@@ -97,33 +98,33 @@ def simulate(
         friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
             `tangent_function`, in time stepping with any tangents; None: that of the law, if it
             has a field `friction`.
-        max_events: one more ends the motion with the status `max_events` (in time stepping it is
-            not written). None: 500; with method 'events' outside jit, vmap and derivatives 100 000,
-            found by the program for 500 in as many runs as needed.
+        max_events: largest number of recorded events; the next one ends the motion with status
+            `max_events` (time stepping goes on without recording). None: 500; for a direct call
+            with method 'events' (outside jit, vmap, derivatives) 100 000, computed in runs of 500.
         rtol: relative tolerance of the flights; None: 1e-10, in single precision 1e-5.
         atol: absolute one [m, m/s, rad, ..]; None: 1e-12, in single precision 1e-7.
         closed_below: contacts with smaller gaps [m] take part in an impact; None: 1e-9, or 80
             roundings of the largest coordinate or gap at the start, if that is more.
-        slow: accumulations are skipped: a contact that leaves slower than this share of the largest
-            gap velocity of the motion, and would be pressed back, stays closed; contacts that share
-            bodies below the root of that share (docs/motions_reference.md). `events` estimates
-            what is skipped.
-        max_steps: of the integrator, in all.
-        progress: bar on stderr, after each of those runs with the share of the duration that is
-            done; None: on a terminal, for long motions.
+        slow: repeated impacts with decreasing speed (accumulations) are cut short: a contact that
+            leaves slower than this share of the largest gap velocity so far, and would be pressed
+            back, remains closed. For contacts that share a body the limit is `sqrt(slow)`
+            (docs/motions_reference.md). `events` estimates the skipped time.
+        max_steps: total integrator steps.
+        progress: bar on stderr with the share of the duration that is done, after each run; None:
+            on a terminal, for long motions.
 
     Returns:
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
         Method 'events' has derivatives in both modes (grad, jvp, hessian) of everything in it,
-        event times and ledger included, in everything that is an array, and in what functions of
-        the system close over. They hold for the order of events that occurs: one-sided where
+        event times and accumulated works included, in all arrays, also those captured by the
+        system's functions. They hold for the order of events that occurs: one-sided where
         two events change places or a contact is grazed; NaN for motions of more steps than
         samples + 16 `max_events` + 1024. Method 'contact_forces' has forward ones (jvp, jacfwd).
 
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step.
-        ValueError: shapes, t_end <= t_start, penetration, a base or a mass that is not a number, on
-            the host; inside jit the status reports them (`raise_on_failed_motion`).
+        ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
+            host; inside jit the status reports them (`raise_on_failed_motion`).
 
     Source: Brogliato, Nonsmooth Mechanics (2016), Remark 6.9 for the time stepping.
 

@@ -49,18 +49,18 @@ from jimpact.solvers.many_contacts import Many, solve_many
 from jimpact.solvers.sensitivity import without_derivatives
 from jimpact.status import CODE
 
-# Gap velocities below this share of the largest speed of the motion, or below so many roundings of
-# it, are what solving for contacts at rest leaves. Ten times less, and resting beads strike in
-# every step; ten times more, and slow impacts come a step later.
+# Gap velocities below _ROUNDING times the largest speed of the motion, or _ROUNDINGS times its
+# rounding, are what solving for contacts at rest leaves. Ten times less, and resting beads strike
+# in every step; ten times more, and slow impacts come a step later.
 _ROUNDING, _ROUNDINGS = 1e-12, 64
 SLOW = 2.0  # steps of the free acceleration: slower approach is rest, not an impact
-# Misfit of a step's impulses over its velocities: what the solver aims at for a few contacts, for
-# a pile; in float32 at least so many roundings. Ten times more, and what rests creeps ten times
-# faster.
+# Misfit of a step's impulses over its velocities at which the solver ends: for a few contacts, for
+# a pile; at least ROUNDINGS times eps, which matters in float32. Ten times more, and what rests
+# creeps ten times faster.
 FEW, PILE, ROUNDINGS = 1e-9, 1e-6, 32
 OFF = 1e-2  # misfit above which `unsolved_step` is reported; ten times more is no solution
 ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jammed piles only
-MEAN = 4  # tries for the mean velocity that forces depend on; each gains h omega, of spin omega
+MEAN = 4  # iterations of the mean velocity in the forces; the error falls by h omega (spin) each
 # Share of the largest speed of any gap by which the rate of a gap changes where bodies pass each
 # other in a step: head-on it is 2 for the fastest. Ten times less would report corners that roll
 # over the ground, ten times more would hide what is slower than half of the fastest.
@@ -109,12 +109,12 @@ class _AllContacts(NamedTuple):
         m, b = self.matrix.shape[:2]
         return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
 
-    def warm_start(self, memory: jax.Array) -> jax.Array:
+    def warm_start(self, last_impulses: jax.Array) -> jax.Array:
         """Impulses (m, b) of the last step."""
-        return jnp.where(self.closed[:, None], memory, 0.0)
+        return jnp.where(self.closed[:, None], last_impulses, 0.0)
 
-    def stored(self, memory: jax.Array, x: jax.Array) -> jax.Array:
-        """The memory of impulses x (m, b) for the next step."""
+    def update_memory(self, last_impulses: jax.Array, x: jax.Array) -> jax.Array:
+        """Impulses x (m, b) in the form in which the next step reads them."""
         return x
 
     def recorded(self, values: jax.Array) -> jax.Array:
@@ -160,13 +160,13 @@ class _ActiveContacts(NamedTuple):
         """Of the Delassus matrix (m, b)."""
         return jnp.sum(self.pairs.directions**2 * self.inverse[self.pairs.bodies][:, None], (2, 3))
 
-    def warm_start(self, memory: jax.Array) -> jax.Array:
+    def warm_start(self, last_impulses: jax.Array) -> jax.Array:
         """Impulses (m, b) of the last step."""
-        return memory.at[self.pairs.number].get(mode="fill", fill_value=0.0)
+        return last_impulses.at[self.pairs.number].get(mode="fill", fill_value=0.0)
 
-    def stored(self, memory: jax.Array, x: jax.Array) -> jax.Array:
-        """The memory (pairs, b) of impulses x (m, b) for the next step."""
-        return jnp.zeros_like(memory).at[self.pairs.number].set(x, mode="drop")
+    def update_memory(self, last_impulses: jax.Array, x: jax.Array) -> jax.Array:
+        """Impulses x (m, b) as (pairs, b), the form in which the next step reads them."""
+        return jnp.zeros_like(last_impulses).at[self.pairs.number].set(x, mode="drop")
 
     def recorded(self, values: jax.Array) -> jax.Array:
         """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
@@ -174,7 +174,7 @@ class _ActiveContacts(NamedTuple):
 
 
 class _StepProblem(NamedTuple):
-    """What does not change from step to step."""
+    """Quantities that are the same in all steps."""
 
     system: System
     law: Law
@@ -189,46 +189,46 @@ class _Progress(NamedTuple):
 
     state: State
     speed: jax.Array  # () largest gap velocity that velocities could give so far
-    memory: jax.Array  # impulses of the last step
-    missed: jax.Array  # gap velocity () by which they miss
-    steepness: jax.Array
-    since: jax.Array  # (m,) steps since each was struck
-    closing: jax.Array  # (m,) rates of gaps that close before the next look at them; others 0
+    last_impulses: jax.Array  # of the last step
+    residual_velocity: jax.Array  # gap velocity () that these leave unsolved
+    inverse_step_size: jax.Array  # of the solver, see `solve_many`
+    steps_since_impact: jax.Array  # (m,) of each contact
+    closing: jax.Array  # (m,) rates of gaps that close before they are next evaluated; others 0
     events: Events
     status: jax.Array
     reported: jax.Array  # a status that is not a failure
 
 
 class _Setup(NamedTuple):
-    """One step before it is solved: contacts in its middle and what the law does there."""
+    """One step before it is solved: contacts in its middle, and the law's impulses there."""
 
     middle: jax.Array  # () time in the middle of the step
     end: jax.Array  # () time at its end
     q: jax.Array  # in the middle
     mass: jax.Array
-    carried: jax.Array  # (n,) velocity of the base
+    base_velocity: jax.Array  # (n,)
     contacts: _AllContacts | _ActiveContacts
     speed: jax.Array  # as in `_Progress`
     noise: jax.Array  # () gap velocities below it are rounding
     tolerance: float  # of the solver
     strikes: jax.Array  # (m,) whether there is an impact
-    met: jax.Array  # (n,) velocity that the law is shown
+    law_velocity: jax.Array  # (n,) velocity to which the law is applied
     law_impulse: jax.Array  # (m, b) of a law that does not join the problem
     law_status: jax.Array
     rates: jax.Array  # (m, b) of gaps and slips, after those impulses, before forces
-    wanted: jax.Array  # w (m, b) with friction against the slip at the end
-    against_mean: jax.Array  # w (m, b) with friction against the mean slip
+    offset: jax.Array  # w (m, b) with friction against the slip at the end
+    offset_for_mean: jax.Array  # w (m, b) with friction against the mean slip
 
 
 class _Trial(NamedTuple):
-    """One try of a step."""
+    """One iteration of the solution of a step."""
 
     v: jax.Array  # at its end
     mean: jax.Array  # velocity
     force: jax.Array
     solution: Many
-    gains: jax.Array  # () whether the impulses give energy
-    tries: jax.Array  # () so far, this one included
+    adds_energy: jax.Array  # () whether the impulses add energy
+    tries: jax.Array  # () iterations so far, this one included
 
 
 def is_pile(system: System) -> bool:
@@ -280,30 +280,30 @@ def time_stepping(
     h = (times[1] - times[0]) / substeps.astype(dtype)
     problem = _StepProblem(system, law, mu, h, closed_below, joint)
     start = _Progress(
-        begin,
-        zero,
-        jnp.zeros((contacts if pair_count is None else pair_count, b), dtype),
-        zero,
-        jnp.ones((), dtype),
-        jnp.full(contacts, substeps * len(times)),
-        _closing_at_start(problem, begin, contacts),
-        events,
-        status,
-        jnp.int32(MOTION_CODE["ok"]),
+        state=begin,
+        speed=zero,
+        last_impulses=jnp.zeros((contacts if pair_count is None else pair_count, b), dtype),
+        residual_velocity=zero,
+        inverse_step_size=jnp.ones((), dtype),
+        steps_since_impact=jnp.full(contacts, substeps * len(times)),
+        closing=_closing_at_start(problem, begin, contacts),
+        events=events,
+        status=status,
+        reported=jnp.int32(MOTION_CODE["ok"]),
     )
 
-    def to_sample(course: _Progress, t: jax.Array) -> tuple[_Progress, State]:
+    def to_sample(progress: _Progress, t: jax.Array) -> tuple[_Progress, State]:
         """The motion up to the next sample, from t."""
 
-        def one(i: jax.Array, course: _Progress) -> _Progress:
+        def one(i: jax.Array, progress: _Progress) -> _Progress:
             def go() -> _Progress:
-                return _one_step(problem, course, t + i.astype(dtype) * h)
+                return _one_step(problem, progress, t + i.astype(dtype) * h)
 
-            return jax.lax.cond(course.status == MOTION_CODE["ok"], go, lambda: course)
+            return jax.lax.cond(progress.status == MOTION_CODE["ok"], go, lambda: progress)
 
-        course = jax.lax.fori_loop(0, substeps, one, course)
-        fine = course.status == MOTION_CODE["ok"]
-        return course, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), course.state)
+        progress = jax.lax.fori_loop(0, substeps, one, progress)
+        fine = progress.status == MOTION_CODE["ok"]
+        return progress, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
 
     end, later = jax.lax.scan(to_sample, start, times[:-1])
     samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, later)
@@ -344,23 +344,24 @@ def _contacts(
     return _AllContacts(gap, normals, closed, directions, moved, matrix)
 
 
-def _one_step(problem: _StepProblem, course: _Progress, t: jax.Array) -> _Progress:
-    """The motion one step later."""
-    setup = _set_up(problem, course, t)
-    trial = _solve(problem, course, setup)
-    state, energy = _ledger(problem, course, setup, trial)
-    status, reported = _status(problem, course, setup, trial, state)
+def _one_step(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Progress:
+    """Advance the motion by one step of length h."""
+    setup = _set_up(problem, progress, t)
+    trial = _solve(problem, progress, setup)
+    state, energy = _end_state(problem, progress, setup, trial)
+    status, reported = _status(problem, progress, setup, trial, state)
+    solution, contacts = trial.solution, setup.contacts
     return _Progress(
-        state,
-        setup.speed,
-        setup.contacts.stored(course.memory, trial.solution.impulse),
-        trial.solution.missed,
-        trial.solution.steepness,
-        jnp.where(setup.strikes, 1, course.since + 1),
-        _closing_after(problem, course, setup, trial),
-        _recorded_impact(problem, course.events, setup, trial, energy),
-        status,
-        reported,
+        state=state,
+        speed=setup.speed,
+        last_impulses=contacts.update_memory(progress.last_impulses, solution.impulse),
+        residual_velocity=solution.residual_velocity,
+        inverse_step_size=solution.inverse_step_size,
+        steps_since_impact=jnp.where(setup.strikes, 1, progress.steps_since_impact + 1),
+        closing=_closing_after(problem, progress, setup, trial),
+        events=_recorded_impact(problem, progress.events, setup, trial, energy),
+        status=status,
+        reported=reported,
     )
 
 
@@ -372,68 +373,91 @@ def _loads(
     return force, free_acceleration(system, q, v, force, mass)
 
 
-def _set_up(problem: _StepProblem, course: _Progress, t: jax.Array) -> _Setup:
-    """The step that begins at t: its contacts, which of them strike, and what the law does."""
+def _set_up(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Setup:
+    """The step that begins at t: its contacts, which of them strike, and the law's impulses."""
     system, law, mu, h, closed_below, joint = problem
-    state, dtype, body = course.state, course.state.q.dtype, system.body
+    state, dtype, body = progress.state, progress.state.q.dtype, system.body
     middle, end = t + 0.5 * h, t + h
     q = body.moved(state.q, 0.5 * h * state.v)
-    carried = carried_along(system, state.v, middle)
+    base_velocity = carried_along(system, state.v, middle)
     mass = mass_at(system, q)
     free = _loads(system, q, state.v, middle, mass)[1]
-    falls = body.moved(q, 0.5 * h * (state.v + h * free))
-    contacts = _contacts(system, q, middle, falls, end, closed_below, mu is not None)
-    before = contacts.rates(state.v - carried)
+    q_predicted = body.moved(q, 0.5 * h * (state.v + h * free))
+    contacts = _contacts(system, q, middle, q_predicted, end, closed_below, mu is not None)
+    before = contacts.rates(state.v - base_velocity)
     eps = float(jnp.finfo(dtype).eps)
-    speed = jnp.maximum(course.speed, contacts.fastest(state.v))
+    speed = jnp.maximum(progress.speed, contacts.fastest(state.v))
     tolerance = max(PILE if is_pile(system) else FEW, ROUNDINGS * eps)
-    noise = max(_ROUNDING, _ROUNDINGS * eps) * speed + course.missed
+    noise = max(_ROUNDING, _ROUNDINGS * eps) * speed + progress.residual_velocity
     noise += tolerance * contacts.fastest(h * free)
     slow = noise + SLOW * h * jnp.abs(contacts.rates(free)[:, 0])
     strikes = contacts.closed & (before[:, 0] < -slow)
-    impulse, code = jnp.zeros_like(before), jnp.int32(CODE["ok"])
-    e, e_t = jnp.zeros((), dtype), jnp.zeros((), dtype)
     # half of the forces before an impact, half after it: over the whole step they take as much
     # energy from the velocities as the potential gains
-    met = state.v if joint else state.v + 0.5 * h * free
-    if joint:
-        moreau: Any = law  # or a law that says so
-        e = moreau.restitution
-        e_t = e_t if moreau.tangential_restitution is None else moreau.tangential_restitution
-    else:
+    law_velocity = state.v if joint else state.v + 0.5 * h * free
+    impulse, law_status = jnp.zeros_like(before), jnp.int32(CODE["ok"])
+    if not joint:
         scene = scene_at(system, q, state.v, middle, contacts.closed)
-        impulse, code = jax.lax.cond(
+        relative = law_velocity - base_velocity
+        impulse, law_status = jax.lax.cond(
             jnp.any(strikes),
-            lambda: _law_impulses(law, scene, met - carried, noise, before.shape),
-            lambda: (impulse, code),
+            lambda: _law_impulses(law, scene, relative, noise, before.shape),
+            lambda: (impulse, law_status),
         )
     rates = before + contacts.product(impulse)
-    late = jnp.where(strikes, 0.5 * h * contacts.rates(free)[:, 0], 0.0)
-    wanted, against_mean = _wanted(e, jnp.where(strikes, e_t, 0.0), rates, late)
+    added = jnp.where(strikes, 0.5 * h * contacts.rates(free)[:, 0], 0.0)
+    e, e_t = _coefficients(problem, strikes, dtype)
+    offset, offset_for_mean = _offsets(e, e_t, rates, added)
     return _Setup(
-        middle, end, q, mass, carried, contacts, speed, noise, tolerance,
-        strikes, met, impulse, code, rates, wanted, against_mean,
-    )  # fmt: skip
+        middle=middle,
+        end=end,
+        q=q,
+        mass=mass,
+        base_velocity=base_velocity,
+        contacts=contacts,
+        speed=speed,
+        noise=noise,
+        tolerance=tolerance,
+        strikes=strikes,
+        law_velocity=law_velocity,
+        law_impulse=impulse,
+        law_status=law_status,
+        rates=rates,
+        offset=offset,
+        offset_for_mean=offset_for_mean,
+    )
 
 
-def _solve(problem: _StepProblem, course: _Progress, setup: _Setup) -> _Trial:
-    """The impulses of the step, with forces at its mean velocity, that give no energy."""
-    system, h, contacts, v0 = problem.system, problem.h, setup.contacts, course.state.v
+def _coefficients(
+    problem: _StepProblem, strikes: jax.Array, dtype: jnp.dtype
+) -> tuple[jax.Array, jax.Array]:
+    """e, and e_t (m,) where contacts strike, of a law with `joins_step`; 0 for another law."""
+    e, e_t = jnp.zeros((), dtype), jnp.zeros((), dtype)
+    if problem.joint:
+        law: Any = problem.law
+        e = law.restitution
+        e_t = e_t if law.tangential_restitution is None else law.tangential_restitution
+    return e, jnp.where(strikes, e_t, 0.0)
+
+
+def _solve(problem: _StepProblem, progress: _Progress, setup: _Setup) -> _Trial:
+    """The impulses of the step, with forces at its mean velocity, that add no energy."""
+    system, h, contacts, v0 = problem.system, problem.h, setup.contacts, progress.state.v
     constant = system.force is None and not callable(system.mass)
     least = 1 if constant and system.body.coordinates is None else MEAN
 
-    def tried(last: _Trial) -> _Trial:
+    def iteration(last: _Trial) -> _Trial:
         """The step with the forces at its mean velocity, as far as that is known."""
         force, free = _loads(system, setup.q, last.mean, setup.middle, setup.mass)
         pulled = setup.rates + h * contacts.rates(free)
-        goal = pulled + jnp.where(last.tries < least, setup.wanted, setup.against_mean)
+        right_side = pulled + jnp.where(last.tries < least, setup.offset, setup.offset_for_mean)
         solution = solve_many(
             contacts.product,
             contacts.diagonal,
-            jnp.where(contacts.closed[:, None], goal, 0.0),
+            jnp.where(contacts.closed[:, None], right_side, 0.0),
             jnp.zeros((), v0.dtype) if problem.mu is None else problem.mu,
             last.solution.impulse,
-            last.solution.steepness,
+            last.solution.inverse_step_size,
             setup.tolerance,
             ITERATIONS,
         )
@@ -441,44 +465,50 @@ def _solve(problem: _StepProblem, course: _Progress, setup: _Setup) -> _Trial:
         v = v0 + h * free + contacts.velocity_change(setup.law_impulse + x)
         after = pulled + contacts.product(x)
         energy = 0.5 * jnp.vdot(x, setup.rates + after)
-        gains = energy > (setup.noise + solution.missed) * jnp.sum(jnp.abs(x))
-        return _Trial(v, 0.5 * (v0 + v), force, solution, gains, last.tries + 1)
+        adds_energy = energy > (setup.noise + solution.residual_velocity) * jnp.sum(jnp.abs(x))
+        return _Trial(v, 0.5 * (v0 + v), force, solution, adds_energy, last.tries + 1)
 
     def goes_on(trial: _Trial) -> jax.Array:
-        return (trial.tries < least) | (trial.gains & (trial.tries < 2 * least))
+        return (trial.tries < least) | (trial.adds_energy & (trial.tries < 2 * least))
 
     zero = 0 * setup.speed
-    begin = Many(contacts.warm_start(course.memory), zero, zero, jnp.int32(0), course.steepness)
+    begin = Many(
+        impulse=contacts.warm_start(progress.last_impulses),
+        misfit=zero,
+        residual_velocity=zero,
+        iterations=jnp.int32(0),
+        inverse_step_size=progress.inverse_step_size,
+    )
     start = _Trial(v0, v0, jnp.zeros_like(v0), begin, jnp.asarray(False), jnp.int32(0))
-    return jax.lax.while_loop(goes_on, tried, start)
+    return jax.lax.while_loop(goes_on, iteration, start)
 
 
-def _ledger(
-    problem: _StepProblem, course: _Progress, setup: _Setup, trial: _Trial
+def _end_state(
+    problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial
 ) -> tuple[State, jax.Array]:
     """The state at the end, with its work, and the energy (2, m) that each contact gave."""
-    h, state, contacts = problem.h, course.state, setup.contacts
+    h, state, contacts = problem.h, progress.state, setup.contacts
     x = setup.law_impulse + trial.solution.impulse
-    work = x * contacts.rates(trial.mean - setup.carried)
+    work = x * contacts.rates(trial.mean - setup.base_velocity)
     energy = jnp.stack([work[:, 0], jnp.sum(work[:, 1:], axis=1)])
     new = state._replace(
         q=problem.system.body.moved(setup.q, 0.5 * h * trial.v),
         v=trial.v,
         t=setup.end,
         work=state.work + h * trial.force @ trial.mean,
-        base_work=state.base_work + contacts.generalized_impulse(x) @ setup.carried,
+        base_work=state.base_work + contacts.generalized_impulse(x) @ setup.base_velocity,
         contact_work=state.contact_work + contacts.recorded(energy),
     )
     return new, energy
 
 
 def _status(
-    problem: _StepProblem, course: _Progress, setup: _Setup, trial: _Trial, state: State
+    problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial, state: State
 ) -> tuple[jax.Array, jax.Array]:
     """The status after the step, and what is reported without being a failure."""
     system, contacts = problem.system, setup.contacts
     fails = jnp.asarray(FAILS)[setup.law_status]
-    status = jnp.where(fails, MOTION_CODE["law_failed"], course.status)
+    status = jnp.where(fails, MOTION_CODE["law_failed"], progress.status)
     status = jnp.where(out_of_range(system, state), MOTION_CODE["out_of_range"], status)
     if isinstance(contacts, _ActiveContacts):
         status = jnp.where(contacts.pairs.overflows, MOTION_CODE["room"], status)
@@ -487,22 +517,22 @@ def _status(
     finite &= jnp.all(jnp.isfinite(state.contact_work))
     status = jnp.where(finite, status, MOTION_CODE["not_finite"])
     if callable(system.mass):
-        sound = definite(setup.mass) | ~jnp.all(jnp.isfinite(setup.mass))
-        status = jnp.where(sound, status, MOTION_CODE["singular_mass"])
+        positive_definite = definite(setup.mass) | ~jnp.all(jnp.isfinite(setup.mass))
+        status = jnp.where(positive_definite, status, MOTION_CODE["singular_mass"])
     if isinstance(contacts, _ActiveContacts):
         speeds = jnp.sum(trial.v.reshape(-1, 3)[:, :2] ** 2, axis=1)
         coarse = problem.h * jnp.sqrt(jnp.max(speeds)) > contacts.pairs.reach
     else:
-        again = setup.strikes & (course.since < APART)
-        # a gap that was to close grows: bodies passed each other between two looks at it
-        relative = course.state.v - setup.carried
+        struck_again = setup.strikes & (progress.steps_since_impact < APART)
+        # a gap that was to close grows: bodies passed each other between two evaluations of it
+        relative = progress.state.v - setup.base_velocity
         rate = contacts.normals.T @ relative
         fastest = jnp.max(jnp.abs(contacts.normals).T @ jnp.abs(relative))
-        turned = rate - course.closing > TURN * fastest
-        coarse = jnp.any(again | ((course.closing < 0) & (rate > 0) & turned))
+        turned = rate - progress.closing > TURN * fastest
+        coarse = jnp.any(struck_again | ((progress.closing < 0) & (rate > 0) & turned))
     coarse = jnp.where(coarse, MOTION_CODE["coarse_step"], 0)
-    missed = jnp.where(trial.solution.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
-    reported = jnp.maximum(course.reported, jnp.maximum(coarse, missed))
+    unsolved = jnp.where(trial.solution.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
+    reported = jnp.maximum(progress.reported, jnp.maximum(coarse, unsolved))
     return status.astype(jnp.int32), reported.astype(jnp.int32)
 
 
@@ -521,13 +551,13 @@ def _closing_at_start(problem: _StepProblem, begin: State, contacts: int) -> jax
 
 
 def _closing_after(
-    problem: _StepProblem, course: _Progress, setup: _Setup, trial: _Trial
+    problem: _StepProblem, progress: _Progress, setup: _Setup, trial: _Trial
 ) -> jax.Array:
     """Rates (m,) of gaps that close before the middle of the next step, 0 elsewhere."""
     contacts = setup.contacts
     if isinstance(contacts, _ActiveContacts):
-        return course.closing
-    rate = contacts.normals.T @ (trial.v - setup.carried)
+        return progress.closing
+    rate = contacts.normals.T @ (trial.v - setup.base_velocity)
     return _closing(contacts.gap, rate, problem.h, problem.closed_below)
 
 
@@ -546,13 +576,13 @@ def _recorded_impact(
     if problem.joint:
         x = x + trial.solution.impulse
     else:
-        after = setup.met + contacts.velocity_change(x)
+        after = setup.law_velocity + contacts.velocity_change(x)
     row = {
         "time": setup.middle,
         "kind": jnp.int32(KIND_CODE["impact"]),
         "contacts": setup.strikes,
         "q": setup.q,
-        "velocity_before": setup.met,
+        "velocity_before": setup.law_velocity,
         "velocity_after": after,
         "impulse": x[:, 0],
         "energy": energy,
@@ -563,16 +593,21 @@ def _recorded_impact(
     return with_row(events, jnp.any(setup.strikes), row)
 
 
-def _wanted(
-    e: jax.Array, e_t: jax.Array, rates: jax.Array, late: jax.Array
+def _offsets(
+    e: jax.Array, e_t: jax.Array, rates: jax.Array, added: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """w (m, b) of `0 <= p _|_ gamma' + w >= 0` and of friction; also with that for the mean slip.
+    """w (m, b) of `0 <= p _|_ gamma' + w >= 0`, for friction at the end and at the mean slip.
 
-    `rates` (m, b) without the forces of the step, which give struck contacts `late` until they
-    strike. Where `w >= rates`, as always in normal direction, impulses give no energy.
+    Args:
+        e: coefficient () or (m,) of normal restitution.
+        e_t: that of tangential restitution (m,), 0 where no contact strikes.
+        rates: gap velocities and slips (m, b) without the forces of the step.
+        added: gap velocity (m,) that the forces add before the impact, 0 where there is none.
+
+    Where `w >= rates`, as always in normal direction, impulses add no energy.
     """
     gamma = rates[:, 0]
-    normal = jnp.where(gamma < 0, e * (gamma + late) - late, gamma)[:, None]
+    normal = jnp.where(gamma < 0, e * (gamma + added) - added, gamma)[:, None]
     slip = rates[:, 1:]
     return (
         jnp.concatenate([normal, e_t[:, None] * slip], axis=1),

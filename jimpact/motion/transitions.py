@@ -40,10 +40,10 @@ REST_SPEED = 1e-9
 LEAST_COUPLING = 1e-9  # |W_ij| / sqrt(W_ii W_jj) of two contacts: less is rounding
 ROUNDINGS = 64  # of the time: velocities that arise within them are 0
 # An impact without collision is that of contacts that approach at this power of rounding, of the
-# slip: it errs by about as much. To this so many times what is left of `regularity` is added, or
+# slip: it errs by about as much. MORE times what is left of `regularity` is added to this, or
 # contacts would part before they are wedged.
 APPROACH, MORE = 1 / 2, 10.0
-# Slips that change by less than so many approaches change by what any impact does.
+# Slips that change by less than SUPPLIED approaches change by what any impact does.
 SUPPLIED = 100.0
 
 
@@ -158,7 +158,7 @@ def resolve(
 ) -> Outcome:
     """Impact if a closed contact approaches; contacts come to rest; new modes.
 
-    A closed contact stays closed if it leaves by no more than rounding, or slower than
+    A closed contact remains closed if it leaves by no more than rounding, or slower than
     `settings.accumulation` and would be pressed back: the rest of its infinite sequence of
     impacts is then passed at once (its gap velocity is set to 0, energy is lost).
 
@@ -168,7 +168,7 @@ def resolve(
 
     Clusters: where contacts share bodies, accumulations are nested: their numbers of impacts
     multiply. A contact that shares a body with another one that is closed or was `struck` before
-    stays closed below the square root of that share of velocity, which is that share of height.
+    remains closed below the square root of that share of velocity, which is that share of height.
     That is done for all of them at once, and only if no other contact is reached within the time
     that is passed: the state after it is then that at the end of the sequence.
     """
@@ -498,7 +498,7 @@ def _passed(
 
     Under the force F that will keep a contact closed a hop takes 2 p / F, and energy E lifts it by
     E / F at most. If each impact keeps r^2 of the energy, and k contacts strike in turn, hops
-    take `2 k p / F (1 + r + ..)` in all: exact for a single contact.
+    take `2 k p / F (1 + r + ..)` together: exact for a single contact.
     """
     ends = ends & (force > 0)
     safe, some = jnp.where(ends, force, 1.0), jnp.any(ends) & (left > 0)

@@ -1,8 +1,8 @@
 """Pictures: one function for each kind of result; each returns a matplotlib figure.
 
 >>> import jimpact as ji
->>> found = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
->>> len(ji.plot.comparison(found).axes)
+>>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+>>> len(ji.plot.comparison(result).axes)
 2
 """
 

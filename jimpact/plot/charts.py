@@ -430,7 +430,7 @@ def advice(result: Advice, title: str = "") -> Figure:
     bottom.plot(x, np.maximum([c.median for c in rows], _FLOOR), "k_", ms=18, label="median")
     bottom.axhline(result.tolerance, color=COLOURS[1], lw=1, label="tolerance")
     bottom.set_yscale("log")
-    bottom.set_ylim(result.tolerance / 1000, 30)  # room above for the legend
+    bottom.set_ylim(result.tolerance / 1000, 30)  # space above for the legend
     logarithmic(bottom, "y")
     bottom.set_ylabel("error of v+ (energy norm)")
     top.set_ylabel(f"velocity after the impact [{unit}]")

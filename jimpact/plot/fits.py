@@ -24,7 +24,7 @@ from jimpact.plot.style import (
     side_by_side,
 )
 
-_LABELLED = 16  # up to so many shots each has a label
+_LABELLED = 16  # up to this number of shots each has a label
 
 
 def fit(fit: FitResult, others: Mapping[str, FitResult] | None = None, title: str = "") -> Figure:

@@ -37,7 +37,7 @@ _UPRIGHT = 8  # names that stand side by side, at most
 
 
 def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
-    """Velocities after the impact by law, above the energy kept and how evenly it is spread.
+    """Velocities after the impact by law, energy ratios T+/T- and dispersion indices.
 
     Measured velocities are horizontal lines, and the laws closest to them are highlighted; a law
     whose outcome fails the audit is crossed.
@@ -97,11 +97,11 @@ def _velocities(axes: Axes, result: Comparison) -> None:
 
 
 def _energies(axes: Axes, result: Comparison) -> None:
-    """Energy kept and dispersion index by law, as bars."""
+    """Energy ratio T+/T- and dispersion index by law, as bars."""
     entries, at = result.entries.values(), np.arange(len(result.entries))
     ratio = [entry.energy_ratio for entry in entries]
     spread = [entry.dispersion_index for entry in entries]
-    axes.bar(at - 0.18, ratio, 0.32, color=GREY, label="energy kept T+/T-")
+    axes.bar(at - 0.18, ratio, 0.32, color=GREY, label="energy ratio T+/T-")
     axes.bar(at + 0.18, spread, 0.32, color=COLOURS[4], label="dispersion index")
     axes.set_ylabel("share of 1")
 

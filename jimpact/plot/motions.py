@@ -23,7 +23,7 @@ from jimpact.progress import counting_bar
 _FRAMES_PER_SECOND = 25  # of animations
 _POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
-_MANY = 60  # up to so many impacts each is marked by a line
+_MANY = 60  # up to this number of impacts each is marked by a line
 _PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
 _BASE_POINTS = 1000  # at which a base is drawn
 _LEGEND = 6  # coordinates that get an entry in the legend

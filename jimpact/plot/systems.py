@@ -80,8 +80,8 @@ def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:
     for wall, x in ((left, -0.3), (right, end + (apart[-1] if right else 0.0))):
         if wall:
             axes.add_patch(Rectangle((x, -1.1), 0.3, 2.2, color=GREY, alpha=0.5, lw=0))
-    room = max(1.2, (12.0 - end) / 2)  # a single body is not as wide as the picture
-    axes.set_xlim(-room, end + room)
+    margin = max(1.2, (12.0 - end) / 2)  # a single body is not as wide as the picture
+    axes.set_xlim(-margin, end + margin)
     axes.set_ylim(-1.7, 2.1)
     axes.set_aspect("equal")
     axes.axis("off")

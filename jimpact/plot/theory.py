@@ -28,9 +28,11 @@ from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_
 
 _FILL = "#DCE9F3"
 _MARKERS = "osD^vP*X"
-_MOST_CONTACTS = 4  # beyond two contacts: projections onto pairs of the first so many
+_MOST_CONTACTS = (
+    4  # beyond two contacts: projections onto pairs of the first ones up to this number
+)
 _SAMPLES = 2000  # points drawn of a set of outcomes
-_SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no room for a name
+_SHORTEST = 0.5  # sides shorter than this part of the radius are not drawn: no space for a name
 
 _OUTCOME_COLOURS = ("#999999", "#009E73", "#E69F00", "#56B4E9", "#EEEEEE")  # as OUTCOMES
 
@@ -43,7 +45,7 @@ def admissible_set(
     Two contacts: the plane of kinetic coordinates, where energy is the squared distance from the
     point of common velocity; the arc A-B conserves it (Brogliato 2016, Fig. 6.3). Otherwise
     samples of the set, in the normalized gap velocities of pairs of contacts, coloured by the
-    energy kept; for one contact, against the energy kept.
+    energy ratio T+/T-; for one contact, against it.
 
     Args:
         result: what `admissible_set` returned.
@@ -91,7 +93,7 @@ def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.n
     axes.fill(*frame(result.boundary(400)).T, color=_FILL, lw=0)
     for k in (0, 1):
         _line(
-            axes, frame, np.zeros(2), frame.walls[k], f"contact {closed[k] + 1} stays closed", "-"
+            axes, frame, np.zeros(2), frame.walls[k], f"contact {closed[k] + 1} remains closed", "-"
         )
         away = frame.push[1 - k]
         _line(axes, frame, frame.before, away, f"no impulse at contact {closed[k] + 1}", ":")
@@ -211,10 +213,10 @@ def _projections(
             height = _energy_ratio(result, v) if single else point[j]
             _mark(axes, (point[i], height), name, k, bool(result.contains(v)))
         axes.set_xlabel(_gap_label(contacts[i]), fontsize=SMALL)
-        energy = "energy kept $T^+ / T^-$"
+        energy = "energy ratio $T^+ / T^-$"
         axes.set_ylabel(energy if single else _gap_label(contacts[j]), fontsize=SMALL)
         finish(axes)
-    figure.colorbar(dots, ax=grid.tolist(), label="energy kept $T^+ / T^-$")
+    figure.colorbar(dots, ax=grid.tolist(), label="energy ratio $T^+ / T^-$")
     _legend(figure, grid[0], 4)
     return figure
 
@@ -263,15 +265,17 @@ def rocking_dispersion(result: RockingDispersion, title: str = "") -> Figure:
     return figure
 
 
-def rocking_outcomes(result: RockingDispersion, title: str = "", stays: float = STAYS) -> Figure:
+def rocking_outcomes(
+    result: RockingDispersion, title: str = "", separation_threshold: float = STAYS
+) -> Figure:
     """Rest, rocking, half-rocking, free over the kinetic angle and e: a panel for each mu.
 
-    The dotted line is `critical_kinetic_angle`; `stays` as in `RockingDispersion.outcomes`.
+    The dotted line is `critical_kinetic_angle`.
 
     Args:
         result: what `ji.theory.rocking_dispersion` returned.
         title: above the picture.
-        stays: largest speed, over |gamma_B-|, of a corner that stays.
+        separation_threshold: largest speed, over |gamma_B-|, of a corner that remains closed.
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
@@ -285,7 +289,7 @@ def rocking_outcomes(result: RockingDispersion, title: str = "", stays: float = 
     1
     """
     figure, panels = _panels(result, title)
-    codes = result.outcomes(stays)
+    codes = result.outcomes(separation_threshold)
     colours = ListedColormap(_OUTCOME_COLOURS)
     norm = BoundaryNorm(np.arange(len(OUTCOMES) + 1) - 0.5, len(OUTCOMES))
     theta, e = np.degrees(result.kinetic_angle), np.asarray(result.restitution)

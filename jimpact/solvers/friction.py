@@ -34,10 +34,10 @@ _LEAST_SHARE = 1e-6
 # scenes end later.
 _SWEEPS = 2000
 _COARSEST, _FINER, _LEVELS = 1e-4, 1e-3, 8
-# What counts as no impulse and as no slip, in parts of that tolerance. The slow room is for
+# What counts as no impulse and as no slip, in parts of that tolerance. The second value is for
 # contacts that reach their cone while others hold them: sweeps bring those to rest slowly. Ten
 # times more: contacts that slip are taken to stick, and the law is not satisfied.
-_ROOM, _SLOW_ROOM = 10.0, 100.0
+_NEAR_ZERO, _SLOW_NEAR_ZERO = 10.0, 100.0
 # `distribute`: sweeps at most; part of the largest limit below which a sweep changes nothing; part
 # of the limit below which a force is inside its disc, or a rate is 0. Ten times more of the last
 # two: contacts on the rim of their cone stick.
@@ -102,11 +102,11 @@ def solve(
         slip: (t,) `(1 + e_t) u-`.
         friction: mu (m,).
         complementary: contacts may part; otherwise they may pull (without friction).
-        load: (m,) >= 0, normal impulses beside p that friction knows of: it is bounded by
+        load: (m,) >= 0, normal impulses in addition to p, which friction includes: it is bounded by
             `mu (p + load)`, and acts on contacts with p = 0 too. None: 0. One below rounding counts
             as one that begins: where p = 0 = r, derivatives are those of a contact that opens.
         sliding: (t,) unit vectors of slip where it is known (forces of contacts that slide
-            already: s, an acceleration, does not decide), 0 where it is asked for. Not together
+            already: s, an acceleration, does not decide), 0 where it is unknown. Not together
             with `load`.
 
     Returns:
@@ -251,12 +251,14 @@ def _equations(problem: _FrictionProblem, modes: _Modes) -> tuple[jax.Array, jax
     unit = jnp.eye(m * (1 + rows), dtype=dtype).reshape(problem.matrix.shape)
     own = jnp.eye(m, dtype=dtype)[:, None, :, None, None]
     first = jnp.eye(1 + rows, dtype=dtype)[0][None, None, None, :, None]
-    along = jnp.pad(modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0)))
-    pressed = along[:, :, None, None] * own * first
+    friction_direction = jnp.pad(
+        modes.direction * problem.friction[:, None, None], ((0, 0), (1, 0), (0, 0))
+    )
+    pressed = friction_direction[:, :, None, None] * own * first
     moved = jnp.sum(q[:, :, :, None, None] * (problem.matrix - unit)[:, None, ..., None], axis=2)
     right = -jnp.sum(q * problem.rate[:, None, :, None], axis=2)
     if problem.load is not None:
-        right = right - along * problem.load[:, None, None]
+        right = right - friction_direction * problem.load[:, None, None]
     return moved + pressed + unit[..., None], right
 
 
@@ -359,19 +361,19 @@ def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array
     return jax.lax.fori_loop(0, _ITERATIONS, step, (modes, none))
 
 
-def _at_rest(problem: _FrictionProblem, x: jax.Array, room: jax.Array) -> _Modes:
-    """The modes (N = 1) that x (m, b) has: all sticks that does not slip by `room`."""
+def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Modes:
+    """The modes (N = 1) that x (m, b) has: contacts stick that slip by less than `margin`."""
     rate = _rates(problem, x[..., None])
-    room = (room * _size(x[..., None]))[None]
-    taking = rate[:, 0] <= room if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
+    margin = (margin * _size(x[..., None]))[None]
+    taking = rate[:, 0] <= margin if problem.complementary else jnp.ones(rate[:, 0].shape, bool)
     if problem.load is not None:
         begins = (problem.load > 0) & (problem.load < float(jnp.finfo(x.dtype).eps))
-        taking = taking & ~(begins[:, None] & (x[:, :1] <= room))
-    pushes = taking & (x[:, :1] >= -room)
+        taking = taking & ~(begins[:, None] & (x[:, :1] <= margin))
+    pushes = taking & (x[:, :1] >= -margin)
     if problem.load is not None:
         pushes = pushes | (problem.load[:, None] > 0)
     speed = _length(rate[:, 1:])
-    sticks = pushes & (speed <= room)
+    sticks = pushes & (speed <= margin)
     slides = pushes & ~sticks
     direction = jnp.where(slides[:, None], _over(rate[:, 1:], speed), 0.0)
     modes = _Modes(taking, sticks, direction, jnp.zeros(speed.shape, x.dtype))
@@ -382,7 +384,7 @@ class _Inverted(NamedTuple):
     """Of the equations E of modes, with the weights D of the sharing and no derivatives.
 
     B = E D = U S V^T: `inverse` (n, n) of B + U_0 V_0^T, `pairs` U_0 V_0^T of its null vectors,
-    and D (m, b). `held`: what is free stays as it is, as the least is not allowed.
+    and D (m, b). `held`: free contacts remain free, as the least is not allowed.
     """
 
     inverse: jax.Array
@@ -476,9 +478,9 @@ def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
         tolerance = jnp.maximum(_COARSEST * _FINER**level, 4 * eps)
         skip = started & (state.level < 0)
         swept = _sweeps(problem, state.x, tolerance, skip)
-        room = tolerance * jnp.where(state.level % 2 == 0, _ROOM, _SLOW_ROOM)
-        room = jnp.where(skip, problem.tolerance, room)
-        modes, better = _newton(problem, _at_rest(problem, swept, room))
+        margin = tolerance * jnp.where(state.level % 2 == 0, _NEAR_ZERO, _SLOW_NEAR_ZERO)
+        margin = jnp.where(skip, problem.tolerance, margin)
+        modes, better = _newton(problem, _at_rest(problem, swept, margin))
         good = _misfit(problem, better)[0] <= problem.tolerance
         # redundant contacts near their cones: x is allowed, the least impulses are not
         allowed = _misfit(problem, swept[..., None])[0] <= problem.tolerance
@@ -514,8 +516,8 @@ def _by_lemke(problem: _FrictionProblem) -> tuple[jax.Array, jax.Array]:
         ]
     )
     r, s = problem.rate.T
-    room = jnp.zeros_like(r) if problem.load is None else problem.friction * problem.load
-    solution = solve_lcp(whole, jnp.concatenate([r, s, -s, room]), symmetric=False)
+    bound = jnp.zeros_like(r) if problem.load is None else problem.friction * problem.load
+    solution = solve_lcp(whole, jnp.concatenate([r, s, -s, bound]), symmetric=False)
     z = solution.z.reshape(4, m)
     return jnp.stack([z[0], z[1] - z[2]], axis=1), solution.code
 
@@ -564,9 +566,9 @@ def _sweeps(
 
 
 def distribute(
-    matrix: jax.Array, rate: jax.Array, limit: jax.Array, asked: jax.Array
+    matrix: jax.Array, rate: jax.Array, limit: jax.Array, candidates: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Which of the contacts `asked` stick, and where the others slide to; normal forces are known.
+    """Which `candidates` stick, and where the others slide to; normal forces are known.
 
     Equation: `u' = rate + K lambda`, lambda in the discs |lambda_j| <= limit_j,
     `lambda_j in -limit_j Sgn(u_j')`. This is a convex problem: u' is unique. A decision, without
@@ -576,7 +578,7 @@ def distribute(
         matrix: K (t, t, B), positive semidefinite, t = m (planar) or 2 m, contact-major.
         rate: (t, B) u' without the forces of these contacts.
         limit: mu F (m, B).
-        asked: (m, B); other contacts have no force here.
+        candidates: (m, B); other contacts have no force here.
 
     Returns:
         Which contacts stick (m, B), and the directions (t, B) of slip of the others. A contact in
@@ -587,16 +589,16 @@ def distribute(
     >>> import jax
     >>> import jax.numpy as jnp
     >>> from jimpact.solvers.friction import distribute
-    >>> k, asked = jnp.ones((2, 2, 1)), jnp.ones((2, 1), bool)  # both corners of a block
-    >>> problem = (k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), asked)
+    >>> k, candidates = jnp.ones((2, 2, 1)), jnp.ones((2, 1), bool)  # both corners of a block
+    >>> problem = (k, jnp.full((2, 1), 1.5), jnp.array([[0.4], [0.6]]), candidates)
     >>> stick, slip = jax.jit(distribute)(*problem)
     >>> stick[:, 0].tolist(), jnp.sign(slip[:, 0]).tolist()
     ([False, False], [1.0, 1.0])
     """
     matrix, rate, limit = jax.lax.stop_gradient((matrix, rate, limit))
     rows = len(matrix) // len(limit)
-    limit = jnp.where(asked, limit, 0.0)
-    each = jnp.repeat(asked, rows, axis=0)
+    limit = jnp.where(candidates, limit, 0.0)
+    each = jnp.repeat(candidates, rows, axis=0)
     matrix = jnp.where(each[:, None] & each[None], matrix, 0.0)
     rate = jnp.where(each, rate, 0.0)
     force = _relaxed(matrix, rate, limit)
@@ -606,7 +608,7 @@ def distribute(
         scale = jnp.max(jnp.abs(rate), axis=0, keepdims=True)
         stick = stick | (jnp.abs(slip) <= _INSIDE * scale)
     pushed = jnp.repeat(_lengths(force, rows) > 0, rows, axis=0)
-    return asked & stick, jnp.where(pushed, -force, slip)
+    return candidates & stick, jnp.where(pushed, -force, slip)
 
 
 def _lengths(force: jax.Array, rows: int) -> jax.Array:

@@ -17,9 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-# Factors of the steepness, the estimate of the largest eigenvalue: where a step shows that it is
-# too small, and at the beginning of the next problem. Further from 1: short steps, or steps taken
-# back.
+# Factors of the inverse step size, the estimate of the largest eigenvalue: where a step shows that
+# it is too small, and at the beginning of the next problem. Further from 1: short steps, or steps
+# taken back.
 STEEPER, RELAX = 1.5, 0.9
 # Discs grow and shrink with p: full momentum may go round and round among them. So there is less
 # of it in each quarter of the iterations.
@@ -27,13 +27,13 @@ MOMENTUM = np.array([1.0, 0.9, 0.7, 0.5])
 
 
 class Many(NamedTuple):
-    """Impulses x (m, b), their misfit, iterations, the steepness at the end."""
+    """Impulses x (m, b), their misfit, iterations, the inverse step size at the end."""
 
     impulse: jax.Array
     misfit: jax.Array  # () over the largest rate, both scaled to a diagonal of 1
-    missed: jax.Array  # () [m/s] at most
+    residual_velocity: jax.Array  # () [m/s] at most
     iterations: jax.Array
-    steepness: jax.Array
+    inverse_step_size: jax.Array
 
 
 class _At(NamedTuple):
@@ -44,7 +44,7 @@ class _At(NamedTuple):
     y: jax.Array  # x with momentum
     ay: jax.Array
     weight: jax.Array
-    steepness: jax.Array
+    inverse_step_size: jax.Array
     best: jax.Array  # x of the least misfit so far
     misfit: jax.Array  # of `best`
     tries: jax.Array
@@ -56,7 +56,7 @@ def solve_many(
     rate: jax.Array,
     friction: jax.Array,
     start: jax.Array,
-    steepness: jax.Array,
+    inverse_step_size: jax.Array,
     tolerance: float,
     most: int,
 ) -> Many:
@@ -68,7 +68,7 @@ def solve_many(
         rate: (a, b) (m, b) [m/s].
         friction: mu () or (m,).
         start: x (m, b) to begin with.
-        steepness: largest eigenvalue of A, scaled to a diagonal of 1, as far as it is known.
+        inverse_step_size: estimate of the largest eigenvalue of A, scaled to a diagonal of 1.
         tolerance: misfit at which it ends, of the largest of `rate`.
         most: iterations.
 
@@ -99,18 +99,18 @@ def solve_many(
 
     def iterate(at: _At) -> _At:
         """One step against the rates, projected, and the momentum of the next one."""
-        x = _projected(at.y - (at.ay + goal) / at.steepness, slope)
+        x = _projected(at.y - (at.ay + goal) / at.inverse_step_size, slope)
         return _with_momentum(at, x, times(x), most)
 
     x = _projected(start / scale, slope) + 0 * size  # NaN where a rate is not finite
     ax = times(x)
     unit = jnp.ones((), x.dtype)
-    steepness = jnp.maximum(RELAX * steepness, unit)
-    begin = _At(x, ax, x, ax, unit, steepness, x, jnp.inf * unit, jnp.int32(0))
+    inverse_step_size = jnp.maximum(RELAX * inverse_step_size, unit)
+    begin = _At(x, ax, x, ax, unit, inverse_step_size, x, jnp.inf * unit, jnp.int32(0))
     end = jax.lax.while_loop(going, iterate, begin)
-    missed = end.misfit / jnp.where(size > 0, size, 1.0)
-    wrong = end.misfit * jnp.sqrt(jnp.max(diagonal))
-    return Many(end.best * scale, missed, wrong, end.tries, end.steepness)
+    relative = end.misfit / jnp.where(size > 0, size, 1.0)
+    residual = end.misfit * jnp.sqrt(jnp.max(diagonal))
+    return Many(end.best * scale, relative, residual, end.tries, end.inverse_step_size)
 
 
 def _scale(diagonal: jax.Array) -> jax.Array:
@@ -135,13 +135,13 @@ def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: int) -> _At:
     """The iteration after a projected step to x; a step that overshoots is taken back."""
     step, bent = x - at.y, ax - at.ay
     square = jnp.vdot(step, step)
-    long = jnp.vdot(step, bent) > at.steepness * square * (1 + 1e-9)
+    long = jnp.vdot(step, bent) > at.inverse_step_size * square * (1 + 1e-9)
     back = long | (jnp.vdot(step, x - at.x) < 0)
     weight = (1 + jnp.sqrt(1 + 4 * at.weight**2)) / 2
     allowed = jnp.asarray(MOMENTUM, x.dtype)[len(MOMENTUM) * at.tries // most]
     gain = jnp.where(back, 0.0, jnp.minimum((at.weight - 1) / weight, allowed))
     x, ax = jnp.where(long, at.x, x), jnp.where(long, at.ax, ax)
-    misfit = jnp.where(long, jnp.inf, at.steepness * jnp.max(jnp.abs(step)))
+    misfit = jnp.where(long, jnp.inf, at.inverse_step_size * jnp.max(jnp.abs(step)))
     better = ~(misfit >= at.misfit)  # also NaN, which is then the result
     return _At(
         x,
@@ -149,7 +149,7 @@ def _with_momentum(at: _At, x: jax.Array, ax: jax.Array, most: int) -> _At:
         x + gain * (x - at.x),
         ax + gain * (ax - at.ax),
         jnp.where(back, 1.0, weight),
-        jnp.where(long, STEEPER, 1.0) * at.steepness,
+        jnp.where(long, STEEPER, 1.0) * at.inverse_step_size,
         jnp.where(better, x, at.best),
         jnp.where(better, misfit, at.misfit),
         at.tries + 1,

@@ -26,12 +26,12 @@ _ZERO = 1e-12  # printed as 0 below this multiple of the largest velocity
 
 @dataclass(frozen=True)
 class AdmissibleSet:
-    """The outcomes v+ of `admissible_set`; `print(found)` describes them.
+    """The outcomes v+ of `admissible_set`; `print(result)` describes them.
 
     Every outcome is v = `center` + `axes` u, u (d,) in a convex set `coordinates`, and has the
     energy `T(center) + |u|^2 / 2`: u are kinetic coordinates [sqrt(J)]. `dimension` d is 0 where
     only one outcome is possible. `plastic` v+ (n,) has the `least_energy` [J]; `energy` is T-.
-    `scene` and `velocity` v- (n,) [m/s] are those asked for, `tolerance` that of `contains`.
+    `scene` and `velocity` v- (n,) [m/s] are the arguments, `tolerance` that of `contains`.
     """
 
     scene: Scene
@@ -49,7 +49,7 @@ class AdmissibleSet:
 
     @cached_property
     def plastic(self) -> np.ndarray:
-        """v+ (n,) [m/s] of least energy: every contact that carries an impulse stays closed."""
+        """v+ (n,) [m/s] of least energy: every contact that carries an impulse remains closed."""
         return self._velocity(self.coordinates.project(np.zeros(self.dimension)))
 
     @property
@@ -173,18 +173,18 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
         contacts `conserving_arc`, `boundary`. Without an approaching contact it is v- alone.
 
     Raises:
-        ValueError: shape, NaN, a velocity against the bilateral constraints; so many redundant
-            contacts that the cone of impulses cannot be enumerated.
+        ValueError: shape, NaN, a velocity against the bilateral constraints; too many redundant
+            contacts, so that the cone of impulses cannot be enumerated.
 
     Host function, not differentiable.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.2, (6.5)-(6.8) and Fig. 6.3.
 
     >>> import jimpact as ji
-    >>> found = admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
-    >>> (found.conserving_arc(2).round(4) + 0.0).tolist()
+    >>> result = admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])
+    >>> (result.conserving_arc(2).round(4) + 0.0).tolist()
     [[0.0, 0.0, 1.0], [-0.3333, 0.6667, 0.6667]]
-    >>> found.contains([0.1, 0.3, 0.6]), found.contains([0.5, 0.25, 0.25])
+    >>> result.contains([0.1, 0.3, 0.6]), result.contains([0.5, 0.25, 0.25])
     (True, False)
     """
     v = as_velocity(scene, velocity)

@@ -103,7 +103,7 @@ class CappedPolyhedron(NamedTuple):
     def arc(self) -> tuple[float, float] | None:
         """First and last angle of the part of the circle |w| = r inside; d = 2 only.
 
-        The set is expected to have one such part; of several, the longest is given.
+        The set is expected to have one such part; of several, the longest is returned.
         """
         angle = np.arctan2(self.rows[:, 1], self.rows[:, 0])
         cut = np.abs(self.offset) <= self.radius
@@ -113,12 +113,12 @@ class CappedPolyhedron(NamedTuple):
             inside = self.excess(self._on_circle(np.zeros(1)))[0] <= _ROUNDING * self.radius
             return (0.0, 2 * np.pi) if inside else None
         width = np.diff(np.append(ends, ends[0] + 2 * np.pi))
-        kept = self.excess(self._on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
-        if kept.all():
+        feasible = self.excess(self._on_circle(ends + 0.5 * width)) <= _ROUNDING * self.radius
+        if feasible.all():
             return 0.0, 2 * np.pi
         pieces = []
-        for first in np.flatnonzero(kept & ~np.roll(kept, 1)):
-            run = np.roll(kept, -first)
+        for first in np.flatnonzero(feasible & ~np.roll(feasible, 1)):
+            run = np.roll(feasible, -first)
             length = np.roll(width, -first)[: np.argmin(run)].sum()
             pieces.append((float(ends[first]), float(ends[first] + length)))
         return max(pieces, key=lambda piece: piece[1] - piece[0], default=None)
@@ -171,9 +171,10 @@ def capped_polyhedron(
         rows, offset = rows[~flat], offset[~flat] - rows[~flat] @ center
     within = rows @ axes
     length = np.linalg.norm(within, axis=1)
-    kept = length > _INDEPENDENT
+    independent = length > _INDEPENDENT
     inner = float(np.sqrt(max(radius**2 - float(center @ center), 0.0)))
-    within, offset = within[kept] / length[kept, None], offset[kept] / length[kept]
+    within = within[independent] / length[independent, None]
+    offset = offset[independent] / length[independent]
     return CappedPolyhedron(within, offset, inner), center, axes
 
 

@@ -111,13 +111,13 @@ def _in_box(
 ) -> tuple[jax.Array, jax.Array]:
     """Multipliers that bring `y + S p` into the box; S symmetric positive semidefinite."""
     bounded = jnp.isfinite(jnp.concatenate([low, high]))
-    room = jnp.concatenate([y - low, high - y])
-    room = jnp.where(bounded, room, 1.0)  # a bound at infinity never binds
+    slack = jnp.concatenate([y - low, high - y])
+    slack = jnp.where(bounded, slack, 1.0)  # a bound at infinity never binds
     matrix = jnp.block([[s, -s], [-s, s]])
     both = bounded[:, None] & bounded[None, :]
     matrix = jnp.where(both, matrix, jnp.eye(2 * len(y), dtype=s.dtype))
     # p = p_low - p_high is unique where S is regular, whatever the two parts are
-    solution = solve_lcp(matrix, room, regular=True)
+    solution = solve_lcp(matrix, slack, regular=True)
     return solution.z[: len(y)] - solution.z[len(y) :], solution.code
 
 

@@ -84,8 +84,8 @@ def han_gilmore(scene: Scene, velocity: Any, *, max_depth: int = 100) -> list[Ha
     (2016), (6.9)-(6.12).
 
     >>> import jimpact as ji
-    >>> for found in ji.han_gilmore(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]):
-    ...     print(found.velocity.round(6) + 0.0, len(found.rules))
+    >>> for outcome in ji.han_gilmore(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0]):
+    ...     print(outcome.velocity.round(6) + 0.0, len(outcome.rules))
     [-0.333333  0.666667  0.666667] 1
     [0. 0. 1.] 2
     """

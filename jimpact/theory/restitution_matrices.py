@@ -145,7 +145,7 @@ class Sign(NamedTuple):
 
 
 class MatrixAudit(NamedTuple):
-    """What `audit_matrix` found; `print(audit)` says it in words.
+    """Result of `audit_matrix`; `print(audit)` describes it.
 
     `kinematic`, `kinetic`: Prop. 6.2 (i), (ii). `energetic`: Prop. 6.3; `bool` of it is True on
     the boundary too. Of all approaches of one length |qn-|, `worst_normal_velocity` qn- (m,), with
@@ -223,8 +223,8 @@ def audit_matrix(scene: Scene, matrix: Any, tolerance: float | None = None) -> M
     Source: Brogliato, Nonsmooth Mechanics (2016), Props. 6.2-6.5 (rho instead of lambda_max).
 
     >>> import jimpact as ji
-    >>> found = audit_matrix(ji.chain([1.0, 1.0, 1.0]), [[0.0, 1.2], [0.2, 0.0]])
-    >>> found.admissible, found.energetic.answer, found.worst_velocity.round(2).tolist()
+    >>> result = audit_matrix(ji.chain([1.0, 1.0, 1.0]), [[0.0, 1.2], [0.2, 0.0]])
+    >>> result.admissible, result.energetic.answer, result.worst_velocity.round(2).tolist()
     (False, 'no', [0.47, 0.47, -0.94])
     """
     g, norm, e, closed = _closed_problem(scene, matrix)

@@ -130,7 +130,7 @@ class RockingDispersion(eqx.Module):
         friction: mu (B,).
         restitution: energetic e (C,).
         gap_velocity: gamma+ / |gamma_B-| (A, B, C, 2), of B and A.
-        angular_ratio: theta'+ / theta'- (A, B, C); beside `housner_restitution(aspect)`.
+        angular_ratio: theta'+ / theta'- (A, B, C); compare with `housner_restitution(aspect)`.
         slip_velocity: of both corners after, / |gamma_B-| (A, B, C).
         energy_ratio: T+ / T- (A, B, C).
         status: codes (A, B, C); values of failures are NaN.
@@ -160,13 +160,15 @@ class RockingDispersion(eqx.Module):
         """theta'+ / theta'- over Housner's value (A, B, C)."""
         return self.angular_ratio / housner_restitution(self.aspect)[:, None, None]
 
-    def outcomes(self, stays: float = STAYS) -> np.ndarray:
-        """Rows of `OUTCOMES` (A, B, C): which corners leave, faster than `stays` |gamma_B-|.
+    def outcomes(self, separation_threshold: float = STAYS) -> np.ndarray:
+        """Rows of `OUTCOMES` (A, B, C): which corners leave.
+
+        A corner leaves if it is faster than `separation_threshold` |gamma_B-|.
 
         rest: none; rocking: A only, the block goes on about B; half-rocking: B only, it turns
         back about A; free: both; unresolved: the law failed.
         """
-        leaves = np.asarray(self.gap_velocity) > stays
+        leaves = np.asarray(self.gap_velocity) > separation_threshold
         codes = leaves[..., 1] + 2 * leaves[..., 0]
         return np.where(np.isnan(np.asarray(self.gap_velocity[..., 0])), 4, codes)
 

@@ -109,7 +109,7 @@ SPOILED = (
     Row(
         "the last ball read 5 % too fast",
         N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 12, spoiled=lambda v: v * [1.0, 1.0, 1.05],
-        expected="The data break momentum",
+        expected="The data violate conservation of momentum",
     ),
     Row(
         "all velocities 10 % too large, e = .99",
@@ -122,7 +122,7 @@ SPOILED = (
 ALARMS = (
     "Lack of fit",
     "Suspicious",
-    "The data break momentum",
+    "The data violate conservation of momentum",
     "The data gain energy",
     "No contact approaches",
     "The fit has not converged",
