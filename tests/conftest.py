@@ -91,7 +91,10 @@ def pytest_configure(config):
     if hasattr(config, "workerinput"):
         return
     config.pluginmanager.register(Workers())
-    # The processes of xdist read this when they start; it nearly halves the time of compiling.
+    # The processes of xdist read this when they start; it nearly halves the time of compiling. With
+    # little optimization XLA 0.10 then compiles some batched loops wrongly, in certain sizes of the
+    # batch (with all optimizations, as users have it, it does not): programs in which a test found
+    # that have `compiler_options=OPTIMIZED`.
     flags = [f"--{name}={str(value).lower()}" for name, value in known_options().items()]
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
