@@ -53,7 +53,7 @@ def random_scenes(rng):
 
 
 def broken(make):
-    """Counts of violations by property, over all scenes, and how many no status told."""
+    """Counts of violations by property, over all scenes, and how many no status reported."""
 
     @jax.jit
     @jax.vmap
@@ -96,17 +96,17 @@ UNFINISHED = ("plastic_limit", "infeasible", "max_steps", "not_finite")
 
 
 def table():
-    """The table's lines, and how many violations no status told."""
+    """The table's lines, and how many violations no status reported."""
     head = " | ".join(COLUMNS)
     lines, silent = [f"| law | {head} |", "|" + "---|" * (len(COLUMNS) + 1)], 0
     for name, make in LAWS.items():
-        counts, untold = broken(make)
+        counts, unreported = broken(make)
         lines.append(f"| {name} | " + " | ".join(str(n) for n in counts) + " |")
-        silent += untold
+        silent += unreported
     return lines, silent
 
 
 if __name__ == "__main__":
     lines, silent = table()
     print("\n".join(lines))
-    print(f"not told by a status: {silent}")
+    print(f"not reported by a status: {silent}")

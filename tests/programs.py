@@ -254,16 +254,16 @@ def failed(status):
 
 
 def check_held(name, states, allowed=None):
-    """Held outcomes, impulses and statuses of many states, all of them told that fail."""
+    """Held outcomes, impulses and statuses of many states, all of them reported that fail."""
     out, _ = values(name)(states)
     wrong = []
     for i, state in enumerate(states):
         n, m = state.size
         speed = np.abs(np.asarray(state.velocity, float)).max() or 1.0
         size = (allowed or 10 * LAWS[name].accuracy) * speed
-        told = ji.STATUS[out.status[i]].name
-        if state.status is not None and told != state.status:
-            wrong.append((state.name or i, told, state.status))
+        reported = ji.STATUS[out.status[i]].name
+        if state.status is not None and reported != state.status:
+            wrong.append((state.name or i, reported, state.status))
         heavy = np.abs(np.asarray(state.mass, float)).max()
         for got, held, scale in (
             (out.velocity[i, :n], state.after, 1.0),

@@ -49,8 +49,8 @@ def test_number_of_collisions_is_that_of_the_chebyshev_solution():
     assert len(np.unique(expected[use])) > 6
     out, count = three_balls(masses, e, np.tile(START, (LANES, 1)))
     np.testing.assert_array_equal(count[use], expected[use])
-    told = np.where(expected[use] < 0, "plastic_limit", "ok")
-    np.testing.assert_array_equal(names(out.status[use]), told)
+    reported = np.where(expected[use] < 0, "plastic_limit", "ok")
+    np.testing.assert_array_equal(names(out.status[use]), reported)
 
 
 def plain(normals, mass, gaps, v, e, order, limit=10_000):

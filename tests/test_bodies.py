@@ -47,8 +47,8 @@ def test_two_corners_have_a_range():
     def lands(q):
         return ji.impact(ji.Newton(0.5), block.scene(q), jnp.array([0.0, -1.0, 0.0])).status
 
-    told = [ji.STATUS[int(lands(q))].name for q in (block.touching(), fallen)]
-    assert told == ["ok", "not_finite"]
+    reported = [ji.STATUS[int(lands(q))].name for q in (block.touching(), fallen)]
+    assert reported == ["ok", "not_finite"]
 
 
 def test_polygons_find_their_centre_of_mass():
@@ -167,7 +167,7 @@ def test_gaps_are_distances(heap):
             seen += 1
             assert gaps[3:].min() == pytest.approx(away, abs=1e-14)
         if valid[i] >= 0 and away is None:
-            assert gaps[3:].min() < 1e-12  # never told open
+            assert gaps[3:].min() < 1e-12  # never reported open
     assert seen > 100
 
 
@@ -303,8 +303,8 @@ def test_a_quaternion_must_have_length_one():
 
     code, v = lands(q)
     np.testing.assert_allclose(v, [0.85, 0, 0.5, 0, 0.15 * 0.1 / 0.004, 0], atol=1e-14)
-    told = [ji.STATUS[int(x)].name for x in (code, lands(q.at[3].set(1.01))[0])]
-    assert told == ["ok", "not_finite"]
+    reported = [ji.STATUS[int(x)].name for x in (code, lands(q.at[3].set(1.01))[0])]
+    assert reported == ["ok", "not_finite"]
 
 
 def test_inertial_forces_keep_the_energy():

@@ -101,15 +101,15 @@ def test_singular_and_degenerate_problems():
     """Feasible exactly where a linear programme is; then complementary to rounding."""
     states = integer_states(320)
     out, _ = programs.values("moreau")(states)
-    told = np.array(names(out.status))
+    reported = np.array(names(out.status))
     seen = {"infeasible": 0, "impulse_not_unique": 0, "ok": 0}
     for i, state in enumerate(states):
         w, gamma = problem(state)
         q = (1 + state.e) * gamma
         feasible = linprog(np.zeros(3), A_ub=-w, b_ub=q, method="highs").status == 0
-        assert feasible == (told[i] != "infeasible"), (w, q, told[i])
-        if told[i] in seen:
-            seen[told[i]] += 1
+        assert feasible == (reported[i] != "infeasible"), (w, q, reported[i])
+        if reported[i] in seen:
+            seen[reported[i]] += 1
         if feasible:
             p = out.impulse[i]
             rate = w @ p + q
@@ -117,7 +117,7 @@ def test_singular_and_degenerate_problems():
             assert rate.min() > -1e-11
             assert np.abs(p * rate).max() < 1e-11
             unique = np.linalg.matrix_rank(w[np.ix_(p > 1e-9, p > 1e-9)]) == (p > 1e-9).sum()
-            assert unique or told[i] != "ok"
+            assert unique or reported[i] != "ok"
     assert min(seen.values()) > 10, seen
 
 

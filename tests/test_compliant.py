@@ -269,7 +269,7 @@ def test_same_pair_restitution_other_chain():
 
 @pytest.mark.slow
 def test_user_forces():
-    """One's own force is the built-in one; without a value it is told; it cannot pull."""
+    """One's own force is the built-in one; without a value it is reported; it cannot pull."""
     gaps = jnp.array([0.0, 0.2])
     user = ji.UserForce(lambda x, rate, p: p["k"] * x + p["c"] * rate, {"k": 1.0, "c": 0.3})
     outcomes = [

@@ -1,4 +1,4 @@
-"""One contract for every registered law: what it promises holds, and what can fail is told.
+"""One contract for every registered law: what it promises holds, and what can fail is reported.
 
 All states of a law are lanes of one compiled batch (`programs.values`), its derivatives of one
 more. A user's own law is held to the same functions (`test_wrong_laws_are_caught`).
@@ -72,7 +72,7 @@ LIGHT = [
 
 
 def check_promises(run, entry, accuracy, states):
-    """Signs, energy, momentum, scaling: kept, or else (where not promised) told by the status."""
+    """Signs, energy, momentum, scaling: kept, or else (where not promised) reported by the status."""
     fast = [dataclasses.replace(s, velocity=1e3 * np.asarray(s.velocity)) for s in states]
     light = [dataclasses.replace(s, mass=1e-4 * np.asarray(s.mass)) for s in states]
     (out, found), (out_fast, _), (out_light, _) = run(states), run(fast), run(light)
@@ -83,7 +83,7 @@ def check_promises(run, entry, accuracy, states):
         "gap_velocity_sign": found.kinematic,
         "energy": found.energetic,
     }
-    over = ~np.isin(programs.names(out.status), ["max_steps"])  # told, and few: see below
+    over = ~np.isin(programs.names(out.status), ["max_steps"])  # reported, and few: see below
     for promise, holds in signs.items():
         if promise in entry.promises:
             assert holds[over].all(), (promise, np.flatnonzero(over & ~holds))

@@ -119,8 +119,8 @@ def test_number_of_collisions_of_unequal_coefficients():
         e = rng.uniform(0.02, 1, 2).round(3)
         exact = [[Fraction(x) for x in row] for row in (m, (1, 0, 0), e)]
         _, count = collide(*exact, (0, 1), end=True)
-        told, cos = number_of_collisions(m, *e, 40)
-        assert told == count
+        reported, cos = number_of_collisions(m, *e, 40)
+        assert reported == count
         counts.add(count)
         few |= {count} if cos <= -1 else set()
     assert counts >= {2, 3, 4, 5, 40}

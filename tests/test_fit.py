@@ -92,20 +92,20 @@ def test_corrected_momentum_costs_degrees_of_freedom():
 # --------------------------------------------------------------------- does the law fit
 
 
-def told(found):
+def reported(found):
     return " ".join(found.warnings)
 
 
-def test_data_that_another_law_made_are_told():
+def test_data_that_another_law_made_are_reported():
     """One e for two contacts; without sigma the noise is what momentum shows."""
     pre = np.random.default_rng(0).uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))
     for scene, reason in ((BALLS, "noise that momentum"), (WALLED, "follow the velocities")):
         post = simulated(ji.Newton([0.9, 0.4]), scene, pre[:, : scene.size], noise=0.01)
         data = ji.Experiments(pre[:, : scene.size], post)
-        assert reason in told(ji.fit(ji.Newton(0.8), scene, data))
+        assert reason in reported(ji.fit(ji.Newton(0.8), scene, data))
         right = ji.fit(ji.Newton([0.8, 0.8]), scene, data)
-        assert "Lack of fit" not in told(right)
-        assert "Suspicious" not in told(right)
+        assert "Lack of fit" not in reported(right)
+        assert "Suspicious" not in reported(right)
 
 
 def test_lack_of_fit_is_reported_from_its_level_on():
@@ -122,8 +122,8 @@ def test_lack_of_fit_is_reported_from_its_level_on():
     left = np.sum(fit(1.0).residual ** 2) - np.sum(momentum**2)
     ratio = left / 23 / (np.sum(momentum**2) / 12)
     edge = np.sqrt(stats.f.isf(0.01, 23, 12) / ratio)
-    assert "noise that momentum" not in told(fit(0.98 * edge))
-    assert "noise that momentum" in told(fit(1.02 * edge))
+    assert "noise that momentum" not in reported(fit(0.98 * edge))
+    assert "noise that momentum" in reported(fit(1.02 * edge))
 
 
 WALLED = ji.chain([1.0, 2.0], wall=True)
@@ -133,7 +133,7 @@ def test_honest_noise_breaks_no_momentum():
     pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
     post = simulated(ji.Newton(0.98), PAIR, pre, noise=0.02)
     assert ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)).warnings == ()
-    assert "violate conservation of momentum" in told(
+    assert "violate conservation of momentum" in reported(
         ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, 1.1 * post))
     )
 
@@ -144,13 +144,13 @@ def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
     post[17] += [0.8, -0.4]  # momentum is conserved
     data = ji.Experiments(pre, post)
     moved = ji.fit(ji.Newton(0.5), PAIR, data)
-    assert "Suspicious: shot 18," in told(moved)
+    assert "Suspicious: shot 18," in reported(moved)
     assert abs(moved.value[0] - 0.9) > 0.02
     for loss in ("huber", "student"):
         found = ji.fit(ji.Newton(0.5), PAIR, data, loss=loss)
         assert abs(found.value[0] - 0.9) < 0.005
         assert abs(found.value[0] - 0.9) < 4 * found.standard_error[0] < 0.02
-        assert "Suspicious: shot 18," in told(found)
+        assert "Suspicious: shot 18," in reported(found)
 
 
 def test_honest_shots_are_seldom_suspicious():
@@ -160,7 +160,7 @@ def test_honest_shots_are_seldom_suspicious():
         post = simulated_at_once(0.9, pre) + 0.005 * np.random.default_rng(seed).normal(
             size=(24, 2)
         )
-        named += "Suspicious" in told(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)))
+        named += "Suspicious" in reported(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)))
     assert named <= 3
 
 
@@ -200,20 +200,22 @@ def test_the_scale_of_robust_losses_is_that_of_normal_errors():
     np.testing.assert_allclose(fitted.value, [e], rtol=1e-5)
 
 
-def test_swapped_velocities_are_told():
+def test_swapped_velocities_are_reported():
     post = simulated(ji.Newton(0.9), PAIR, SHOTS)
-    assert "No contact approaches in 4 of 4 shots" in told(
+    assert "No contact approaches in 4 of 4 shots" in reported(
         ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(post, SHOTS), starts=1)
     )
 
 
-def test_copies_of_a_shot_are_told():
+def test_copies_of_a_shot_are_reported():
     pre = np.tile([[1.0, 0.0]], (6, 1))
     post = np.tile([[-0.2, 0.6]], (6, 1))
     copies = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
-    assert "All 6 shots are equal" in told(copies)
+    assert "All 6 shots are equal" in reported(copies)
     post[1] += [0.01, -0.005]
-    assert "shots are equal" not in told(ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post)))
+    assert "shots are equal" not in reported(
+        ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
+    )
 
 
 class Steep(ji.Newton):
@@ -232,7 +234,7 @@ def fitted_without_the_third_shot(law):
     slow = [0, 1, 3]
     found = ji.fit(law, PAIR, ji.Experiments(SHOTS, post))
     expected = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS[slow], post[slow]))
-    assert "Left out: 1 of 4 shots (3)" in told(found)
+    assert "Left out: 1 of 4 shots (3)" in reported(found)
     np.testing.assert_allclose(found.value, expected.value, rtol=1e-6)
     return found
 
@@ -274,7 +276,7 @@ def test_turning_weighs_by_kinetic_energy():
     found = ji.fit(ji.Newton(0.8), scene, data)
     same = ji.fit(ji.Newton(0.8), scene, ji.Experiments(pre, post, sigma=[[1.0, 10.0]] * 3))
     np.testing.assert_allclose(found.value, same.value, rtol=1e-8)
-    assert "same kinetic energy" in told(found)
+    assert "same kinetic energy" in reported(found)
     assert " rad/s" in str(found)
 
 
@@ -311,7 +313,7 @@ def test_gradient_descent_agrees_with_levenberg_marquardt(method):
 PRE_3 = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, -2.0], [1.0, 0.5, 0.0]])
 
 
-def test_too_few_steps_are_told():
+def test_too_few_steps_are_reported():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.01))
     found = ji.fit(ji.Newton(0.9), PAIR, data, method="adam", starts=1, max_steps=3)
     assert not found.converged
@@ -412,11 +414,11 @@ def test_the_unseen_combination_is_really_unseen(rank_2_of_3):
     change = ji.impact(moved, BALLS, [1.0, 0, 0]).velocity - rank_2_of_3.predicted[0]
     alone = ji.LZB(law.restitution, moved.stiffness)
     seen = ji.impact(alone, BALLS, [1.0, 0, 0]).velocity - rank_2_of_3.predicted[0]
-    # two digits of the steps are told, second order remains
+    # two digits of the steps are reported, second order remains
     assert np.abs(change).max() < 0.05 * np.abs(seen).max()
 
 
-def test_the_interval_of_a_valley_is_told(rank_2_of_3):
+def test_the_interval_of_a_valley_is_reported(rank_2_of_3):
     """Whatever e1 is in its interval, others reproduce the shot as well; no lower end of k2."""
     found = rank_2_of_3
     assert "at least" in str(found)
@@ -436,12 +438,12 @@ def test_all_stiffness_ratios_that_fit_are_found():
     found = ji.fit(ji.LZB([0.9, 0.9], [1.0, 1.0]), BALLS, data, free)
     ratios = sorted(start.value[1] for start in found.starts)
     np.testing.assert_allclose(ratios, [11.531, 31.732, 40.0], rtol=1e-3)
-    for told in (found, replace(found, profiles=())):  # by profiles, by parabolas
-        pieces = told.intervals()[1]
+    for reported in (found, replace(found, profiles=())):  # by profiles, by parabolas
+        pieces = reported.intervals()[1]
         assert len(pieces) in (2, 3)
         assert any(low <= 40.0 <= high for low, high in pieces)
         assert not any(low <= 20.0 <= high for low, high in pieces)
-        assert told.confidence_interval()[1, 0] < 12
+        assert reported.confidence_interval()[1, 0] < 12
     assert " or " in str(found)
     assert "3 different minima fit equally well" in " ".join(found.warnings)
 
@@ -497,9 +499,9 @@ def test_a_contact_that_is_never_loaded_is_named():
     data = ji.Experiments(pre, simulated(ji.LZB([0.9, 0.5], [1.0, 1.0]), BALLS, pre))
     found = ji.fit(ji.LZB([0.8, 0.8], [1.0, 1.0]), BALLS, data)
     assert found.rank == 1
-    told = " ".join(found.identifiability)
-    assert "cannot see restitution[2]: no measured velocity depends on it" in told
-    assert "cannot see stiffness[2]: no measured velocity depends on it" in told
+    reported = " ".join(found.identifiability)
+    assert "cannot see restitution[2]: no measured velocity depends on it" in reported
+    assert "cannot see stiffness[2]: no measured velocity depends on it" in reported
     np.testing.assert_allclose(found.value[0], 0.9, rtol=1e-6)
     assert np.isfinite(found.standard_error[0])
     np.testing.assert_array_equal(found.standard_error[1:], np.inf)
@@ -564,7 +566,7 @@ def test_a_users_own_observable():
 
 
 @pytest.mark.parametrize("lost", [1, 2])
-def test_an_observable_that_is_no_number_is_told(lost):
+def test_an_observable_that_is_no_number_is_reported(lost):
     factor = jnp.array([np.nan, 1.0 if lost == 1 else np.nan])
     observe = lambda law: law.restitution * factor  # noqa: E731
     found = ji.fit(ji.FitProblem.from_observable(ji.Newton(0.9), observe, [0.5, 0.4], 0.01))
@@ -594,7 +596,7 @@ def test_another_number_of_shots_is_served_by_the_same_program(caplog):
         few = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre[:3], post[:3]))
         assert "advance_all" not in caplog.text
         ji.fit(ji.Newton([0.9]), PAIR, ji.Experiments(pre, post), starts=1)
-        assert "advance_all" in caplog.text  # this is how it would be told
+        assert "advance_all" in caplog.text  # this is how it would be reported
     e, error, rest = newton_in_closed_form(post[:3], np.ones((3, 2)), pre[:3])
     np.testing.assert_allclose(few.value, [e], rtol=1e-9)
     np.testing.assert_allclose(few.standard_error, [np.sqrt(rest / 5) * error], rtol=1e-9)
@@ -661,8 +663,8 @@ def test_profile_ends_at_a_bound_on_one_side():
     assert scan.intervals[0][1] == 1.0
     assert scan.words.startswith("at least 0.9")
     assert "at least 0.9" in str(found)  # a fit at a bound profiles of itself
-    (told,) = ji.fit(ji.Newton(0.9), PAIR, found.experiments, profiles=False).intervals(0.9)
-    np.testing.assert_allclose(told, scan.intervals, rtol=1e-6)
+    (reported,) = ji.fit(ji.Newton(0.9), PAIR, found.experiments, profiles=False).intervals(0.9)
+    np.testing.assert_allclose(reported, scan.intervals, rtol=1e-6)
 
 
 def test_profile_of_two_minima_is_a_union():
@@ -842,7 +844,7 @@ def test_trials_that_fail_do_not_poison_the_fit():
     assert np.isfinite([start.sum_of_squares for start in found.starts]).all()
 
 
-def test_a_fitted_law_that_fails_is_told():
+def test_a_fitted_law_that_fails_is_reported():
     pre = [[1.0, 0.0, -1.0]]
     truth = Coupled(jnp.array([[1.2, 0.0], [0.0, 1.2]]))  # gains energy
     data = ji.Experiments(pre, simulated(truth, BALLS, pre))
@@ -850,7 +852,7 @@ def test_a_fitted_law_that_fails_is_told():
     assert "fails in 1 of 1 shots (1): energy_gain" in " ".join(found.warnings)
 
 
-def test_minima_that_fit_equally_well_are_told():
+def test_minima_that_fit_equally_well_are_reported():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.49), PAIR, SHOTS, noise=0.001))
     found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root")
     np.testing.assert_allclose(sorted(s.value[0] for s in found.starts), [-0.7, 0.7], atol=2e-3)
@@ -937,11 +939,11 @@ def test_report_and_json(rank_2_of_3):
     text = str(rank_2_of_3)
     assert "determined     2 of 3 parameters (rank of the derivatives)" in text
     assert "undetermined" in text
-    told = json.loads(json.dumps(rank_2_of_3.to_dict(), allow_nan=False))
-    assert [p["seen"] for p in told["parameters"]] == [False] * 3
-    assert told["parameters"][0]["standard_error"] is None
-    assert told["rank"] == 2
-    assert told["shots"] == ["1"]
+    reported = json.loads(json.dumps(rank_2_of_3.to_dict(), allow_nan=False))
+    assert [p["seen"] for p in reported["parameters"]] == [False] * 3
+    assert reported["parameters"][0]["standard_error"] is None
+    assert reported["rank"] == 2
+    assert reported["shots"] == ["1"]
 
 
 def test_one_number_can_be_fitted():

@@ -292,16 +292,16 @@ def misfit(scene, v, out, e, e_t, mu, complementary):
     ],
 )
 def test_outcomes_satisfy_the_kinematic_law(name, rows):
-    """Cone, opposition to slip, complementarity; where nothing does, it is told."""
+    """Cone, opposition to slip, complementarity; where nothing does, it is reported."""
     e_t = 0.1
     scenes, e, mu, _ = random_scenes(
         64, rows, n=4 if rows == 1 else 6, coupling=1.0 if rows == 1 else 0.3, seed=3
     )
     e = np.tile(e[:, :1], 2)
     out, _ = run(name, *scenes, e, mu, np.full(64, e_t))
-    told = np.isin(names(out.status), ["infeasible", "max_steps", "not_finite"])
-    assert told.mean() < (0.3 if name == "newton" else 0.02)
-    for i in np.flatnonzero(~told):
+    reported = np.isin(names(out.status), ["infeasible", "max_steps", "not_finite"])
+    assert reported.mean() < (0.3 if name == "newton" else 0.02)
+    for i in np.flatnonzero(~reported):
         lane = jax.tree.map(lambda x, i=i: x[i], out)
         scene, v = [x[i] for x in scenes[:3]], scenes[3][i]
         assert misfit(scene, v, lane, e[i], e_t, mu[i], name == "moreau") < 1e-11
@@ -339,7 +339,7 @@ def solutions(w, given, mu):
     return len(found)
 
 
-def test_none_and_several_outcomes_are_told():
+def test_none_and_several_outcomes_are_reported():
     """Normal and tangential directions so coupled that nothing, or several things, may happen."""
     none = (
         [[-1.0, 3.0], [1.0, 1.0], [-1.0, 2.0]],

@@ -440,7 +440,7 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
         sampled(folder=tmp_path)
 
 
-def test_a_full_disk_is_told_and_costs_nothing(tmp_path, monkeypatch, whole):
+def test_a_full_disk_is_reported_and_costs_nothing(tmp_path, monkeypatch, whole):
     calls = []
 
     def full(descriptor):
@@ -568,7 +568,7 @@ def test_every_law_can_be_sampled(name):
     np.testing.assert_allclose(alone.velocity, result.first["velocity"][3], atol=1e-9)
 
 
-def test_progress_is_told_on_request(capfd):
+def test_progress_is_reported_on_request(capfd):
     sampled(progress=True)
     progress = capfd.readouterr().err
     assert "1,000 of 1,000 samples" in progress

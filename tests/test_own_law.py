@@ -55,7 +55,7 @@ class Elastic(ji.Law):
 
 
 class Push(ji.Law):
-    """It pushes at every contact, whatever it is told of them."""
+    """It pushes at every contact, open or closed."""
 
     def impulses(self, contact):
         return ji.Impulses(jnp.ones_like(contact.gap_velocity))

@@ -65,7 +65,7 @@ def motions():
     return jax.tree.map(np.asarray, found)
 
 
-def told(name):
+def reported(name):
     """Status, kinds of events."""
     motion = motions()[name]
     kinds = [EVENT_KINDS[k] for k in motion.events.kind[: int(motion.events.count)]]
@@ -88,7 +88,7 @@ def without_collision(e, theta, slip):
 def test_impact_without_collision(name):
     e, _, theta, _, slip = STARTS[name]
     events = motions()[name].events
-    status, kinds = told(name)
+    status, kinds = reported(name)
     assert status == "ok"
     assert kinds[0] == "paroxysm"
     leaves, p = without_collision(e, theta, slip)
@@ -141,8 +141,8 @@ def test_its_outcome_is_the_limit_of_a_stiff_contact():
     assert errors[1] < 0.2 * errors[0]
 
 
-def test_several_solutions_are_told():
-    status, kinds = told("indeterminate")
+def test_several_solutions_are_reported():
+    status, kinds = reported("indeterminate")
     motion = motions()["indeterminate"]
     assert status == "several_outcomes"
     assert not MOTION_STATUS[int(motion.status)].failure
@@ -155,11 +155,11 @@ def test_several_solutions_are_told():
 
 
 def test_sliding_the_other_way_is_regular():
-    assert told("regular") == ("ok", [])
+    assert reported("regular") == ("ok", [])
 
 
 def test_a_law_without_friction_has_no_such_impact():
-    assert told("not supplied") == ("no_contact_force", ["paroxysm"])
+    assert reported("not supplied") == ("no_contact_force", ["paroxysm"])
 
 
 def test_a_sliding_rod_jams():
@@ -175,7 +175,7 @@ def test_a_sliding_rod_jams():
         return [room, room * rate, turn, MU * press + room * c * rate**2 + s * turn]
 
     y = solve_ivp(field, (0, 20), [0, theta, rate, slip], "DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
-    status, kinds = told("jamming")
+    status, kinds = reported("jamming")
     assert status == "ok"
     assert kinds[:2] == ["friction", "paroxysm"]
     events = motions()["jamming"].events

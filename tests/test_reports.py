@@ -112,8 +112,8 @@ def test_a_fit_in_one_sentence():
         "restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.97, 1.0),), (0.0, 1.0)
     )
     flat = replace(open_end, name="stiffness[1]", intervals=((0.0, 1.0),))
-    told = canned(4, profiles=(open_end, flat), standard_error=np.array([0.01, 1.0]))
-    assert told.verdict == (
+    reported = canned(4, profiles=(open_end, flat), standard_error=np.array([0.01, 1.0]))
+    assert reported.verdict == (
         "restitution[1] = 0.600 ± 0.010, at least 0.97 (95 %); stiffness[1] cannot be determined from these 4 shots."
     )
 
@@ -149,11 +149,11 @@ def test_tables_of_a_fit(monkeypatch):
 
 
 def test_json_of_a_fit():
-    told = json.loads(json.dumps(canned(4).to_dict(), allow_nan=False))
-    assert told["rank"] == 1
-    assert told["degrees_of_freedom"] == 6
-    assert [row["seen"] for row in told["parameters"]] == [True, False]
-    assert told["parameters"][1]["standard_error"] is None
+    reported = json.loads(json.dumps(canned(4).to_dict(), allow_nan=False))
+    assert reported["rank"] == 1
+    assert reported["degrees_of_freedom"] == 6
+    assert [row["seen"] for row in reported["parameters"]] == [True, False]
+    assert reported["parameters"][1]["standard_error"] is None
 
 
 def test_confidence_intervals_are_cut_at_the_bounds():

@@ -211,9 +211,9 @@ def test_rocking(aspect):
     assert float(out.impulse[0]) > 0
     assert int(out.status) == 0
     # and with less the block would have to be pulled there
-    for share, told in ((1.001, "ok"), (0.999, "negative_impulse")):
+    for share, reported in ((1.001, "ok"), (0.999, "negative_impulse")):
         out = ji.impact(RestitutionMatrix(rocking_matrix(share * e)), scene, v)
-        assert int(out.status) == CODE[told]
+        assert int(out.status) == CODE[reported]
 
 
 def test_rocking_ratios_are_a_conversion():

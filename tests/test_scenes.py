@@ -307,11 +307,11 @@ def test_summary_speaks(three):
 
 
 def test_statuses_go_from_mild_to_grave():
-    told = [row.name for row in ji.STATUS]
-    assert told[0] == "ok"
-    assert len(set(told)) == len(told)
+    reported = [row.name for row in ji.STATUS]
+    assert reported[0] == "ok"
+    assert len(set(reported)) == len(reported)
     failures = [row.failure for row in ji.STATUS]
     assert failures == sorted(failures)
     wanted = "max_steps out_of_range not_finite infeasible inadmissible_velocity negative_impulse energy_gain"
     wanted += " impulse_not_unique order_dependent plastic_limit several_outcomes ill_conditioned"
-    assert set(wanted.split()) <= set(told)
+    assert set(wanted.split()) <= set(reported)

@@ -89,8 +89,8 @@ def test_poisson_on_redundant_contacts():
 def test_summary_says_that_nothing_approaches():
     pair = ji.chain([1.0, 1.0])
     law, v = ji.Newton(0.5), np.array([-1.0, 0.0])
-    told = ji.summary(ji.impact(law, pair, v), pair, v)
-    assert "nothing approaches" in told
+    reported = ji.summary(ji.impact(law, pair, v), pair, v)
+    assert "nothing approaches" in reported
     assert "none:" not in ji.summary(ji.impact(law, pair, -v), pair, -v)
     gapped = ji.chain([1.0, 1.0], gaps=[0.1])
     assert "only open ones do" in ji.summary(ji.impact(law, gapped, -v), gapped, -v)
@@ -271,21 +271,21 @@ TOUCHY = (  # masses, e, k
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
-def test_ill_conditioned_is_told_and_nothing_else_is(dtype):
+def test_ill_conditioned_is_reported_and_nothing_else_is(dtype):
     @jax.jit
     @jax.vmap
-    def told(masses, e, k, v):
+    def reported(masses, e, k, v):
         return ji.impact(ji.LZB(e, k, check_conditioning=True), ji.chain(masses), v).status
 
     plain = [np.ones(4), np.full(3, 0.9), np.ones(3)]
     v = np.array([1.0, 0.0, 0.0, 0.0])
     args = [jnp.asarray(pair, dtype) for pair in zip((*TOUCHY, v), (*plain, v))]
-    status = told(*args)
+    status = reported(*args)
     assert list(status) == [CODE["ill_conditioned"], CODE["ok"]]
 
 
 @pytest.mark.slow
-def test_light_balls_with_gaps_and_knife_edges_are_right_or_told():
+def test_light_balls_with_gaps_and_knife_edges_are_right_or_reported():
     """Masses and stiffnesses over three decades behind gaps; gaps of 1e-8 that open and close."""
     rng, half = np.random.default_rng(0), 48
     masses = np.concatenate(
@@ -311,9 +311,9 @@ def test_light_balls_with_gaps_and_knife_edges_are_right_or_told():
     known = (got.status <= CODE["ill_conditioned"]) & (exact.status == 0)
     assert known.mean() > 0.9
     error = np.abs(got.velocity - exact.velocity).max(1) / np.abs(v).max(1)
-    told = got.status == CODE["ill_conditioned"]
-    assert error[known & ~told].max() < 10e-8
-    assert told.mean() < 0.05
+    reported = got.status == CODE["ill_conditioned"]
+    assert error[known & ~reported].max() < 10e-8
+    assert reported.mean() < 0.05
 
 
 @pytest.mark.slow

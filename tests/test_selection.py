@@ -50,9 +50,9 @@ def test_laws_that_agree_are_listed_by_what_they_must_know(every):
     assert not every.speed.needed
     assert every.verdict.startswith("The simplest law that fits is newton: restitution = 0.8")
     assert "predict" not in str(every)
-    told = json.loads(json.dumps(every.to_dict(), allow_nan=False))
-    assert told["best"] == "newton"
-    assert len(told["laws"]["moreau"]["fit"]["shots"]) == 12
+    reported = json.loads(json.dumps(every.to_dict(), allow_nan=False))
+    assert reported["best"] == "newton"
+    assert len(reported["laws"]["moreau"]["fit"]["shots"]) == 12
     heads, rows = every.rows()
     assert len(heads) == len(rows[0])
     assert [row[0] for row in rows] == ["newton", "moreau"]
@@ -70,15 +70,15 @@ def test_a_law_that_fails_is_named_and_comes_last():
     """Newton pulls at a contact that separates."""
     balls = ji.chain([1.0, 1.0, 1.0])
     data = ji.Experiments([[1.0, 0.0, 1.0], [2.0, 0.0, 1.5]], [[0.1, 0.9, 1.0], [0.2, 1.8, 1.9]])
-    told = []
+    reported = []
     found = ji.fit_laws(
         balls,
         data,
         {"newton": ji.Newton(0.5), "moreau": ji.Moreau(0.5)},
         starts=1,
-        done=lambda name, fit: told.append(name),
+        done=lambda name, fit: reported.append(name),
     )
-    assert list(found.entries) == ["moreau", "newton"] == told[::-1]
+    assert list(found.entries) == ["moreau", "newton"] == reported[::-1]
     assert found.entries["newton"].verdict.startswith("fails in ")
 
 
@@ -284,11 +284,11 @@ def test_scatter_between_shots():
     rng = np.random.default_rng(3)
     e = 0.7 + 0.05 * rng.normal(size=12)
     found = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(e, 0.002), sigma=0.002))
-    told = ji.scatter(found)
-    assert told.explains
-    assert told.value == pytest.approx(e.std(ddof=1), rel=0.05)
-    assert told.standard_error[0] == pytest.approx(told.value / np.sqrt(12), rel=0.05)
-    np.testing.assert_allclose(told.each, e, atol=0.02)
+    reported = ji.scatter(found)
+    assert reported.explains
+    assert reported.value == pytest.approx(e.std(ddof=1), rel=0.05)
+    assert reported.standard_error[0] == pytest.approx(reported.value / np.sqrt(12), rel=0.05)
+    np.testing.assert_allclose(reported.each, e, atol=0.02)
     assert "if restitution scatters by 0.0" in found.verdict
     assert "Scatter from shot to shot" in str(found)
     assert found.noise > 5  # the errors of the plain fit are stretched
@@ -321,10 +321,10 @@ def test_a_trend_over_the_shots_has_two_sides():
 def test_no_scatter_is_said():
     data = ji.Experiments(PRE, after(np.full(12, 0.7), 0.01))
     found = ji.fit(ji.Newton(0.5), PAIR, data)
-    told = ji.scatter(found)
-    assert told.chance > 0.01
-    assert "shows no scatter" in str(told)
-    assert told.mean[0] == pytest.approx(found.value[0], abs=0.5 * found.standard_error[0])
+    reported = ji.scatter(found)
+    assert reported.chance > 0.01
+    assert "shows no scatter" in str(reported)
+    assert reported.mean[0] == pytest.approx(found.value[0], abs=0.5 * found.standard_error[0])
     with pytest.raises(ValueError, match="`name` must be one of restitution"):
         ji.scatter(found, "friction")
 
@@ -332,7 +332,7 @@ def test_no_scatter_is_said():
 @pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.01, None])
 def test_errors_of_the_mean_are_true(sigma):
-    """Over many sets of shots whose e scatters: the spread of what is found is what is told."""
+    """Over many sets of shots whose e scatters: the spread of what is found is what is reported."""
     rng, sets = np.random.default_rng(5), 150
     many = []
     for k in range(sets):

@@ -26,10 +26,10 @@ def test_outcomes(name):
         error = np.abs(out.velocity[i, : len(expected)] - expected)[known].max()
         if not error <= max(2e-12, LAWS[name].accuracy):
             wrong.append((key, error))
-        told = programs.names(out.status[i])[0]
-        if system.status and told != system.status:
-            wrong.append((key, told))
-        assert told in ("ok", "plastic_limit")
+        reported = programs.names(out.status[i])[0]
+        if system.status and reported != system.status:
+            wrong.append((key, reported))
+        assert reported in ("ok", "plastic_limit")
     assert not wrong, wrong
 
 

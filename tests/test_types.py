@@ -82,14 +82,14 @@ def test_mypy_sees_names_signatures_and_fields():
 @pytest.mark.skipif(find_spec("basedpyright") is None, reason="basedpyright is not installed")
 def test_pyright_sees_names_signatures_and_fields(tmp_path):
     """By basedpyright, which is pyright with a node of its own: nothing is downloaded."""
-    told = {
+    reported = {
         "include": [str(SCRIPT)],
         "typeCheckingMode": "standard",
         "enableTypeIgnoreComments": True,
         "reportUnnecessaryTypeIgnoreComment": "error",
         "extraPaths": [str(ROOT)],
     }
-    (tmp_path / "pyrightconfig.json").write_text(json.dumps(told))
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(reported))
     command = [sys.executable, "-m", "basedpyright", "--project", str(tmp_path)]
     command += ["--pythonpath", sys.executable]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -121,8 +121,8 @@ def test_compare_leaves_out_what_it_cannot_build(folder, monkeypatch):
 
 def test_command_line(folder, capsys, tmp_path):
     assert main(["laws", "--module", str(folder / "my_laws.py"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["sluggish"]["parameters"] == ["restitution", "loss", "hardness"]
+    reported = json.loads(capsys.readouterr().out)
+    assert reported["sluggish"]["parameters"] == ["restitution", "loss", "hardness"]
     out = str(tmp_path / "fit.png")
     assert main(["fit", str(folder / "study.toml"), "--json", "--out", out]) == 0
     fits = json.loads(capsys.readouterr().out)["fits"]

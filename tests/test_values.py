@@ -199,7 +199,7 @@ def test_lzb_between_the_limits():
 )
 @pytest.mark.slow
 def test_slow_plastic_limits(masses, k, exponent, u0):
-    """Mixed exponents let the last approach fade slowly: still the common velocity, told."""
+    """Mixed exponents let the last approach fade slowly: still the common velocity, reported."""
     out = ji.impact(ji.LZB(0.0, k, exponent, u0), ji.chain(masses), [1.0, 0.0, 0.0])
     assert programs.names(out.status) == ["plastic_limit"]
     np.testing.assert_allclose(out.velocity, masses[0] / sum(masses), atol=2e-7)
@@ -304,7 +304,7 @@ KINEMATIC = {
         State([[1]], [[1, -1]], [1], e=0.0, after=[0], status="impulse_not_unique"),
         State([[1]], [[1, -1]], [1], e=0.5, after=[-0.5], status="inadmissible_velocity"),
         State([[1]], [[1, -1]], [1], e=[0.2, 0.5], status="infeasible"),
-        # unequal e can gain energy: told
+        # unequal e can gain energy: reported
         chain([4.8, 0.6, 4.25], [0.7, 2.4, -2.1], e=[0.05, 0.9], status="inadmissible_velocity"),
         chain([1, 1e-6, 1], [1, 50, -1], e=[0, 1], status="energy_gain"),
     ],

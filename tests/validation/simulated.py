@@ -174,7 +174,7 @@ def covered(row, fits):
         many = jax.tree.map(lambda *x: np.stack([np.asarray(each) for each in x]), *filled)
         box = BoxRegion(low, high)
         many = eqx.tree_at(lambda r: (r.low, r.high, r.region), many, (low, high, box))
-        states = run(many, y, "levenberg-marquardt", 100, lambda *told: None, rivals=False)
+        states = run(many, y, "levenberg-marquardt", 100, lambda *reported: None, rivals=False)
         squares = 2 * np.asarray(states.cost) * np.array([s.size for s in scaled]) ** 2
         deviance = np.array([s.deviance_of(x) for x, s in zip(squares, scaled)])
         inside.append(deviance <= [f.quantile(0.95) ** 2 for f in fits])

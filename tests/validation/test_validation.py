@@ -30,9 +30,9 @@ def test_numbers_by_others(case):
     wrong = [row for row in rows if not row.error <= row.allowed]
     assert not wrong, wrong
     # the committed page: the same words, digits and sources; errors to within a power of ten
-    told = re.search(rf"## {re.escape(case.title)}\n.*?(?=\n## |\Z)", TEXT, re.S)
-    assert told, f"docs/validation.md lacks {case.title!r}: run python tests/validation/page.py"
-    written = told.group().strip().splitlines()
+    reported = re.search(rf"## {re.escape(case.title)}\n.*?(?=\n## |\Z)", TEXT, re.S)
+    assert reported, f"docs/validation.md lacks {case.title!r}: run python tests/validation/page.py"
+    written = reported.group().strip().splitlines()
     given = "\n".join(page.lines(case, rows)).strip().splitlines()
     assert len(written) == len(given)
     for a, b in zip(written, given):
