@@ -217,6 +217,8 @@ def test_a_bad_motion_ends_alone(balls):
     with pytest.raises(RuntimeError, match=r"max_events.*\(1 at 3\)"):
         ji.raise_on_failed_motion(balls[0])
     assert str(balls[0]) == "6 motions: 3 ok, 1 max_events, 1 penetration, 1 not_finite"
+    impacts = kinds(lane(balls[0], 0)).count("impact")
+    assert f"  events: {impacts} impact, 1 accumulation\n" in str(lane(balls[0], 0))
     np.testing.assert_allclose(lane(balls[0], 4).events.time[0], np.sqrt(1 / G), atol=1e-12)
     assert np.isnan(np.asarray(lane(balls[0], 3).q)[-1]).all()
 

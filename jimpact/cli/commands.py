@@ -45,9 +45,9 @@ GLOSSARY = {
     "is better, differences below 2 mean little.",
     r"\bcorrected\b": "Corrected: the data, changed as little as possible so that they conserve "
     "momentum.",
-    r"\bparoxysm\b": "Accumulation: infinitely many impacts in a finite time. Friction: a contact "
-    "begins to stick or to slip. Paroxysm: friction jams a sliding contact, an impact without "
-    "collision.",
+    r"\baccumulation\b": "Accumulation: infinitely many impacts in a finite time.",
+    r"\d friction\b": "Friction: a contact begins to stick or to slip.",
+    r"\bparoxysm\b": "Paroxysm: friction jams a sliding contact, an impact without collision.",
     r"\bdispersion\b": "Dispersion: 0 all energy in one body, 1 equal shares.",
 }
 

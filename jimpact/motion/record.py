@@ -189,7 +189,8 @@ class Motion(eqx.Module):
         if np.ndim(self.status):
             return _batch_report(self)
         kinds = np.asarray(self.events.kind)
-        counts = [f"{int((kinds == i).sum())} {name}" for i, name in enumerate(EVENT_KINDS) if i]
+        numbers = np.bincount(kinds, minlength=len(EVENT_KINDS))
+        counts = [f"{n} {name}" for n, name in zip(numbers, EVENT_KINDS) if n and name != "none"]
         row = MOTION_STATUS[int(self.status)]
         reached = np.asarray(self.time)[np.isfinite(np.asarray(self.energy))]
         last = int(np.isfinite(np.asarray(self.energy)).sum()) - 1
@@ -203,7 +204,7 @@ class Motion(eqx.Module):
         lines = [
             f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: {row.name}"
             + (f" ({row.message})" if row.failure else ""),
-            f"  events: {', '.join(counts)}",
+            f"  events: {', '.join(counts) or 'none'}",
             f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
             f" at {reached[-1] if len(reached) else np.nan:g} s",
             f"  {_work_report(works)}",
