@@ -19,8 +19,6 @@ import numpy as np
 import programs as programs_of_laws
 import pytest
 
-from jimpact.compiling import known_options
-
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -91,12 +89,6 @@ def pytest_configure(config):
     if hasattr(config, "workerinput"):
         return
     config.pluginmanager.register(Workers())
-    # The processes of xdist read this when they start; it nearly halves the time of compiling. With
-    # little optimization XLA 0.10 then compiles some batched loops wrongly, in certain sizes of the
-    # batch (with all optimizations, as users have it, it does not): programs in which a test found
-    # that have `compiler_options=OPTIMIZED`.
-    flags = [f"--{name}={str(value).lower()}" for name, value in known_options().items()]
-    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = tempfile.TemporaryDirectory(prefix="jimpact-tests-")
         config.add_cleanup(folder.cleanup)

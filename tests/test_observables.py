@@ -46,7 +46,7 @@ def test_energies_and_bounces(tmp_path):
         ('quantity = "peak_force"\nvalue = 1\ndrop_height_m = 1', r"a peak_force needs `contact`, from 1 to 3"),
         ('quantity = "peak_force"\ncontact = 4\nvalue = 1\ndrop_height_m = 1', r"`contact` must lie in \[1, 3\]"),
         ('quantity = "duration"\nvalue = 1', r"must have one of velocity_m_per_s, drop_height_m, but has none"),
-        ('quantity = "duration"\nvalue = 1\nvelocity_m_per_s = [1.0]', r"must have 3 entries, one a body"),
+        ('quantity = "duration"\nvalue = 1\nvelocity_m_per_s = [1.0]', r"must have 3 entries, one for each body"),
         ('quantity = "duration"\nvalue = [1, 2]\nbodies = [1, 2, 3]\ndrop_height_m = 1', r"must be a number or have 2 entries"),
         ('quantity = "duration"\nvalue = 1\nbodies = 4\ndrop_height_m = 1', r"`bodies` must lie in \[1, 3\]"),
         ('quantity = "duration"\nvalue = 1\nsigma = 0\ndrop_height_m = 1', r"must lie in \(0, inf\)"),
