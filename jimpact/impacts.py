@@ -48,8 +48,8 @@ def impact(
 ) -> Impact:
     """Velocities after the impact of `law` on `scene`; pure: jit, vmap and grad over all three.
 
-    Equation: `v+ = v- + M^-1 (N p + H p_t)`,
-    `T+ - T- = ((gamma+ + gamma-)^T p + (u+ + u-)^T p_t) / 2`; N (n, m) holds the contact normals,
+    Equation: `v+ = v- + M^-1 (N p + H p_t)`, `T+ - T- = (a + b) / 2`,
+    `a = (gamma+ + gamma-)^T p`, `b = (u+ + u-)^T p_t`; N (n, m) holds the contact normals,
     H (n, t) the tangents, u = H^T v are the slip velocities.
 
     Independent groups of contacts (two pairs of balls in one scene) are solved separately if the
