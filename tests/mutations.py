@@ -221,6 +221,7 @@ MUTATIONS = [
     Mutation("redundant forces are shared equally", r"return jnp\.maximum\(share, least\) if least > 0 else share", "return jnp.ones_like(share)", ("test_friction_solver.py::test_shares_of_redundant_forces",), "dense.py"),
     Mutation("friction of many contacts in a box, not a disc", r"length = jnp\.sqrt\(jnp\.sum\(side\*\*2, axis=1, keepdims=True\)\)", "length = jnp.max(jnp.abs(side), axis=1, keepdims=True)", ("test_friction_solver.py::test_friction_of_many_contacts_has_a_round_cone",)),
     # --- further rooms
+    Mutation("the exit code of the module is lost", r"sys\.exit\(program\(\)\)", "program()", ("test_commands.py::test_the_module_ends_with_the_exit_code_of_the_command",)),
     Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py::test_compare",)),
     Mutation("vertical and horizontal bases exchanged", r"\(0 \* y, y\) if self\.direction == \"vertical\"", '(0 * y, y) if self.direction == "horizontal"', (examples("motion.system"),)),
     Mutation("limits of validity from the wrong end", r"if law == \"moreau\" else slice", 'if law == "binary" else slice', ("test_methods.py::test_limits_are_of_the_unbroken_run_from_their_end",)),

@@ -343,6 +343,13 @@ def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
         assert "Traceback" not in message
 
 
+def test_the_module_ends_with_the_exit_code_of_the_command():
+    command = [sys.executable, "-m", "jimpact.cli", "fti"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "Did you mean fit?" in done.stderr
+
+
 def test_where_programs_are_kept(tmp_path, monkeypatch):
     folder, enabled = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
     for name in (folder, enabled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JIMPACT_CACHE"):

@@ -1,6 +1,8 @@
 """`python -m jimpact.cli` is the command `jimpact`."""
 
+import sys
+
 from jimpact.cli.main import program
 
 if __name__ == "__main__":
-    program()
+    sys.exit(program())
