@@ -424,6 +424,10 @@ class Law(Declared):
         """The `Force` of its contacts; None: they are rigid."""
         return None
 
+    def accuracy(self, dtype: jnp.dtype) -> float:
+        """Relative error that the law allows itself: `impact` judges signs and energy beyond it."""
+        return 0.0
+
     @property
     def stored(self) -> jax.Array:
         """Energy stored in the contacts before the impact, () or (m,) [J]."""

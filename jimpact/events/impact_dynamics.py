@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.contact import Contact
-from jimpact.events import impulse_form, stepper
+from jimpact.events import implicit_steps, impulse_form, stepper
 from jimpact.events.batches import in_columns, tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
@@ -26,10 +26,12 @@ from jimpact.events.contact_flow import (
     per_row,
 )
 from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import pushforward, value_of
 from jimpact.solvers.dense import unit
+from jimpact.solvers.sensitivity import without_derivatives
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -38,10 +40,15 @@ from jimpact.status import CODE
 # digits worse at the same one. At order 8 these two digits cost a third more steps; ten times more
 # would lose one of them.
 GRADIENT_TIGHTENING = 0.01
+NO_SECOND = (
+    "Argument `method` must be 'time' for second derivatives, but has value 'implicit': steps that "
+    "do not end at events have first derivatives only."
+)
+IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost more
 # A contact slower than the fastest by more than this factor sees many of its periods, whose errors
 # add up, so the tolerance falls with their number. Ten times more: it begins to fall too late.
 WIDE_SPREAD = 5.0
-METHODS = ("time", "impulse")
+METHODS = ("time", "implicit", "impulse")
 # Tolerance of the second run that shows how well an outcome is conditioned, as a multiple of that
 # of the first one: FINER, or APART coarser where the precision allows none so fine. Ten times more:
 # runs that differ too little, or the error of a coarse one.
@@ -147,21 +154,32 @@ def sides_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Sides
     return Sides(block, friction * jnp.ones_like(units.root))
 
 
+def normal_coupling(problem: Problem, chain: bool) -> jax.Array:
+    """G (m, m, B) from the entries that a problem holds."""
+    m, (_, *batch) = problem.omega.shape[0], problem.omega.shape
+    i, j = (jnp.arange(m - 1), jnp.arange(1, m)) if chain else jnp.triu_indices(m, 1)
+    upper = jnp.zeros((m, m, *batch), problem.omega.dtype).at[i, j].set(problem.off_diagonal)
+    return unit(upper) + upper + jnp.swapaxes(upper, 0, 1)
+
+
+def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
+    """Indentations x (m, B) before the impact: of what is stored, otherwise minus the gap."""
+    eta: Any = exponent if problem.exponent is None else problem.exponent
+    loaded = problem.energy > 0
+    energy = jnp.where(loaded, problem.energy, 1.0)
+    # not loaded: minus the gap, at 0 too, where its derivative is the one-sided one
+    apart = 0.0 if problem.gap is None else -problem.gap
+    return jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
+
+
 def flow_of(
     problem: Problem, exponent: Exponent | None, chain: bool, tighten: float = 1.0
 ) -> tuple[ContactFlow, jax.Array, jax.Array]:
     """The flow of a problem in columns (.., B), and its first modes and state."""
-    m, dtype = problem.omega.shape[0], problem.omega.dtype
-    batch = problem.omega.shape[1:]
+    m, viscous = problem.omega.shape[0], problem.viscous
     coupling: Chain | Dense = Chain(problem.off_diagonal)
     if not chain or m <= DENSE_CHAIN:
-        i, j = jnp.triu_indices(m, 1)
-        if chain:
-            i, j = jnp.arange(m - 1), jnp.arange(1, m)
-        upper = jnp.zeros((m, m, *batch), dtype).at[i, j].set(problem.off_diagonal)
-        coupling = Dense(unit(upper) + upper + jnp.swapaxes(upper, 0, 1))
-    eta: Any = exponent if problem.exponent is None else problem.exponent
-    viscous = problem.viscous
+        coupling = Dense(normal_coupling(problem, chain))
     parts: dict[str, Any] = dict(
         coupling=coupling,
         omega=problem.omega,
@@ -174,11 +192,7 @@ def flow_of(
         gapped=problem.gap is not None,
         closed_form=viscous is None,
     )
-    loaded = problem.energy > 0
-    energy = jnp.where(loaded, problem.energy, 1.0)
-    # not loaded: minus the gap, at 0 too, where its derivative is the one-sided one
-    apart = 0.0 if problem.gap is None else -problem.gap
-    x = jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
+    x = first_indentation(problem, exponent)
     if problem.sides is None:
         flow = ContactFlow(**parts)
         return flow, *flow.start(problem.gamma, x)
@@ -225,6 +239,10 @@ class ImpulseProgram:
         """The same in a form that both modes go through."""
         return dataclasses.replace(self, repeats=self.smooth)
 
+    def once(self, leaves: Any) -> Any:
+        """The leaves that first derivatives are taken at: they have derivatives of their own."""
+        return leaves
+
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
@@ -255,6 +273,65 @@ class ImpulseProgram:
             return p, *rest
         p = stepper.with_plan(p, end.plan) if self.finely else p
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImplicitProgram(ImpulseProgram):
+    """As `ImpulseProgram`, by steps without events; both modes go through it as it is."""
+
+    @property
+    def takes_duals(self) -> bool:
+        """No: derivatives walk the steps of the plan."""
+        return False
+
+    def reversible(self) -> "ImplicitProgram":
+        """Itself."""
+        return self
+
+    def once(self, leaves: Any) -> Any:
+        """The leaves, whose derivatives raise: events within steps spoil those of second order."""
+        return without_derivatives(leaves, NotImplementedError(NO_SECOND))
+
+    def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.State]:
+        """The contacts of a problem, and their state before the impact."""
+        coupling = normal_coupling(problem, self.chain)
+        friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
+        if problem.sides is not None:
+            (across, tangent, slip), friction = problem.sides
+            back = jnp.swapaxes(across, 0, 1)
+            rows = [jnp.concatenate(x, axis=1) for x in ((coupling, across), (back, tangent))]
+            coupling = jnp.concatenate(rows)
+            velocity = jnp.concatenate([velocity, slip])
+        flow = ImplicitSteps(
+            coupling=coupling,
+            omega=problem.omega,
+            restitution=problem.restitution,
+            exponent_array=problem.exponent,
+            friction=friction,
+            tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
+            kept=jnp.full_like(problem.tolerance, 1.0 if self.finely else 0.0),
+            viscous=problem.viscous,
+            exponent_static=None if problem.exponent is not None else self.exponent,
+            gapped=problem.gap is not None,
+        )
+        return flow, flow.start(first_indentation(problem, self.exponent), velocity)
+
+    def __call__(self, *leaves: Any) -> tuple[Any, ...]:
+        """The results from the leaves of a problem; see `ImpulseProgram`."""
+        problem = jax.tree.unflatten(self.tree, leaves)
+        flow, start = self.steps(jax.lax.stop_gradient(problem))
+        run = implicit_steps.to_the_end(flow, start, self.most, keeps=self.finely)
+        state, m = run.state, flow.contacts
+        if self.smooth:
+            assert run.plan is not None
+            state = implicit_steps.repeat(*self.steps(problem), run.plan)
+        p, side, time = state.impulse[:m], state.impulse[m:], state.time
+        if self.smooth:
+            return p, side, time
+        if run.plan is not None:  # values keep the plan: one loop where both are one program
+            p = jnp.where(run.plan.lengths[0] < 0, jnp.nan, p)
+        code = jnp.where(flow.busy(state), CODE["max_steps"], CODE["ok"]).astype(jnp.int32)
+        return p, side, time, code, run.passes
 
 
 class Dynamics(NamedTuple):
@@ -298,7 +375,8 @@ def solve(
     if condition_check is not None:
         second = dynamics._replace(problem=perturbed(dynamics.problem)).columns()[0]
         leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
-    program = ImpulseProgram(tree, exponent, dynamics.chain, max_steps, dynamics.tangents)
+    kind = ImplicitProgram if method == "implicit" else ImpulseProgram
+    program = kind(tree, exponent, dynamics.chain, max_steps, dynamics.tangents)
     p, side, _, code, _ = evaluate(program, leaves)
     p, code = p * units.momentum[:, None], code[0]
     tangential = None
@@ -368,7 +446,7 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
         fine = dataclasses.replace(function, finely=True)
         outs = evaluate(fine, primals)
         smooth = dataclasses.replace(fine, smooth=True)
-        rates = tangents_in_columns(smooth, primals, tangents)
+        rates = tangents_in_columns(smooth, function.once(primals), tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 
