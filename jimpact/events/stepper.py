@@ -660,7 +660,8 @@ def _in_slots(flow: Any, carry: StepperState, most: int) -> StepperState:
         return jnp.any(goes_on(s.carry, most)) | (s.following < count)
 
     first = jnp.arange(SLOTS, dtype=jnp.int32)
-    slots = _Slots(first, jnp.asarray(SLOTS, jnp.int32), *picked((flow, carry), first), carry)
+    own, here = picked((flow, carry), first)
+    slots = _Slots(first, jnp.asarray(SLOTS, jnp.int32), own, here, carry)
     return stored(jax.lax.while_loop(open_work, one_pass, slots))
 
 
