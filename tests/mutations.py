@@ -95,6 +95,8 @@ MUTATIONS = [
         FLOW,
         "stepper.py",
     ),
+    Mutation("impacts of a queue end in the first slots", r"x\.at\[\.\.\., s\.impact\]", "x.at[..., jnp.arange(SLOTS)]", ("test_friction.py::test_a_large_batch_is_a_queue",), "stepper.py"),
+    Mutation("a new impact in a slot keeps the flow of the last", r"return _Slots\(impact, following, new_flow,", "return _Slots(impact, following, s.flow,", ("test_friction.py::test_a_large_batch_is_a_queue",), "stepper.py"),
     Mutation("dips switched off", r"dipped = turns & .*", "dipped = turns & False", ("test_motion.py::test_no_event_is_missed_between_two_looks",), "stepper.py", "slow"),
     Mutation("crossings are missed", r"crossed, turns = free & \(c1 < -zero\)", "crossed, turns = free & (c1 < -1e3 * zero)", FLOW),
     Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", ("test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]",), "stepper.py", "slow"),
