@@ -224,8 +224,7 @@ def _impact(
     # the work of the impulses, summed over bodies: next to a much lighter body terms of W p cancel
     change = 0.5 * momentum(scene, jump) @ (v + v_plus)
     total = jnp.sum(stored)
-    tolerance = tolerance_of(law, v.dtype) * outcome.size**2 + outcome.noise
-    code = jnp.where(change > total + tolerance, CODE["energy_gain"], CODE["ok"])
+    code = jnp.where(change > total + outcome.noise, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     code = jnp.where(finite, code, CODE["not_finite"])
@@ -237,13 +236,12 @@ def _impact(
 
 
 class _Resolved(NamedTuple):
-    """Impulses of contacts, the status of the law and of their signs, and two scales."""
+    """Impulses of contacts, the status of the law and of their signs."""
 
     normal: jax.Array
     tangential: jax.Array
     status: jax.Array
-    size: jax.Array  # () of the impact, square root of an energy
-    noise: jax.Array  # () energy that the rounding of v- leaves unknown
+    noise: jax.Array  # () energy that the rounding of v- and the law's accuracy leave unknown
 
 
 def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
@@ -258,11 +256,12 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
     if impulses.tangential is not None:
         rows = jnp.repeat(part, contact.tangents)
         tangential = jnp.where(rows, impulses.tangential, 0.0)
-    signs = _signs(contact, p, tangential, tolerance_of(law, p.dtype))
+    tolerance = max(sign_tolerance(p.dtype), ACCURACIES * law.accuracy(contact))
+    signs = _signs(contact, p, tangential, tolerance * contact.size)
     code = jnp.maximum(impulses.status, signs)
     code = jnp.where(happens, code, CODE["ok"])
-    noise = jnp.sum(contact.noise * jnp.abs(p))
-    return _Resolved(p, tangential, code, contact.size, noise)
+    noise = jnp.sum(contact.noise * jnp.abs(p)) + tolerance * contact.size**2
+    return _Resolved(p, tangential, code, noise)
 
 
 def _in_groups(
@@ -281,7 +280,7 @@ def _in_groups(
     p = jnp.zeros(m, v.dtype)
     each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
     tangential = jnp.zeros((m, each), v.dtype)
-    code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
+    code, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype)
     for padded, contacts, acts in zip(groups, batches, active):
         index = jnp.asarray(padded % m)
         acts = happens & (acts | law.pulls)
@@ -300,21 +299,15 @@ def _in_groups(
         rows = part.tangential.reshape(len(at), each)
         tangential = tangential.at[at].set(rows, mode="drop")
         code = jnp.maximum(code, jnp.max(part.status))
-        square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
-    outcome = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise)
+        noise = noise + jnp.sum(part.noise)
+    outcome = _Resolved(p, tangential.reshape(-1), code, noise)
     return outcome, happens, stored
 
 
-def tolerance_of(law: Law, dtype: jnp.dtype) -> float:
-    """Part of the impact's size beyond which a sign is violated."""
-    return max(sign_tolerance(dtype), ACCURACIES * law.accuracy(dtype))
-
-
 def _signs(
-    contact: Contact, p: jax.Array, tangential: jax.Array, tolerance: jax.Array | float
+    contact: Contact, p: jax.Array, tangential: jax.Array, tolerance: jax.Array
 ) -> jax.Array:
-    """negative_impulse or inadmissible_velocity; 0 if neither."""
-    tolerance = tolerance * contact.size
+    """negative_impulse or inadmissible_velocity beyond `tolerance`; 0 if neither."""
     root = jnp.sqrt(diagonal(contact.delassus))
     # the sign of an impulse that only undoes the rounding of v- is not judged
     floor = tolerance + jnp.sqrt(jnp.sum((ROUNDING_PUSHES * contact.noise / root) ** 2))

@@ -48,7 +48,10 @@ IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost mor
 # A contact slower than the fastest by more than this factor sees many of its periods, whose errors
 # add up, so the tolerance falls with their number. Ten times more: it begins to fall too late.
 WIDE_SPREAD = 5.0
-METHODS = ("time", "implicit", "impulse")
+METHODS = ("auto", "time", "implicit", "impulse")
+# Contacts with friction in space up to which 'auto' is 'time'. More of them change between stick
+# and slip thousands of times, one after the other. Ten times more: some impacts do not end.
+EXACT_CONTACTS = 4
 # Tolerance of the second run that shows how well an outcome is conditioned, as a multiple of that
 # of the first one: FINER, or APART coarser where the precision allows none so fine. Ten times more:
 # runs that differ too little, or the error of a coarse one.
@@ -285,6 +288,11 @@ class ImplicitProgram(ImpulseProgram):
     """As `ImpulseProgram`, by steps without events; both modes go through it as it is."""
 
     @property
+    def queues(self) -> bool:
+        """No: it is called with chunks of a batch."""
+        return False
+
+    @property
     def takes_duals(self) -> bool:
         """No: derivatives walk the steps of the plan."""
         return False
@@ -335,8 +343,20 @@ class ImplicitProgram(ImpulseProgram):
             return p, side, time
         if run.plan is not None:  # values keep the plan: one loop where both are one program
             p = jnp.where(run.plan.lengths[0] < 0, jnp.nan, p)
-        code = jnp.where(flow.busy(state), CODE["max_steps"], CODE["ok"]).astype(jnp.int32)
-        return p, side, time, code, run.passes
+        return p, side, time, self.code(flow, run), run.passes
+
+    def code(self, flow: ImplicitSteps, run: implicit_steps.Run) -> jax.Array:
+        """Status (1, B) of a run."""
+        code = jnp.where(flow.busy(run.state), CODE["max_steps"], CODE["ok"])
+        return code.astype(jnp.int32)
+
+
+def method_for(method: str, contact: Contact) -> str:
+    """What 'auto' stands for at these contacts; another method is itself."""
+    if method != "auto":
+        return method
+    many = contact.tangents == 2 and contact.contacts > EXACT_CONTACTS
+    return "implicit" if many else "time"
 
 
 class Dynamics(NamedTuple):
@@ -347,6 +367,7 @@ class Dynamics(NamedTuple):
     exponent: Exponent
     chain: bool
     max_steps: int
+    method: str = "time"
 
     @property
     def static_exponent(self) -> float | tuple[float, ...] | None:
@@ -363,26 +384,32 @@ class Dynamics(NamedTuple):
         leaves, tree = jax.tree.flatten(self.problem)
         return tuple(x[..., None] for x in leaves), tree
 
+    def program(self, whole: bool = False) -> ImpulseProgram:
+        """From `columns` to impulses; `whole`: no closed form ends it."""
+        kind = ImplicitProgram if self.method == "implicit" else ImpulseProgram
+        tree = self.columns()[1]
+        parts = tree, self.static_exponent, self.chain, self.max_steps, self.tangents
+        return kind(*parts, whole=whole)
+
 
 def solve(
-    dynamics: Dynamics, method: str = "time", condition_check: Contact | None = None
+    dynamics: Dynamics, condition_check: Contact | None = None
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
     """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
     `condition_check`: the contacts, if a second run is to show whether the outcome is
     `ill_conditioned`. Differentiable in both modes; method 'time' in all orders.
     """
-    units, exponent, max_steps = dynamics.units, dynamics.static_exponent, dynamics.max_steps
-    if method == "impulse":
-        p, code = impulse_form.solve(dynamics.problem, exponent, dynamics.chain, max_steps)
+    units, problem = dynamics.units, dynamics.problem
+    if dynamics.method == "impulse":
+        exponent, most = dynamics.static_exponent, dynamics.max_steps
+        p, code = impulse_form.solve(problem, exponent, dynamics.chain, most)
         return p * units.momentum, None, code
-    leaves, tree = dynamics.columns()
+    leaves, _ = dynamics.columns()
     if condition_check is not None:
-        second = dynamics._replace(problem=perturbed(dynamics.problem)).columns()[0]
+        second = dynamics._replace(problem=perturbed(problem)).columns()[0]
         leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
-    kind = ImplicitProgram if method == "implicit" else ImpulseProgram
-    program = kind(tree, exponent, dynamics.chain, max_steps, dynamics.tangents)
-    p, side, _, code, _ = evaluate(program, leaves)
+    p, side, _, code, _ = evaluate(dynamics.program(), leaves)
     p, code = p * units.momentum[:, None], code[0]
     tangential = None
     if dynamics.tangents > 0:

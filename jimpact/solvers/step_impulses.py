@@ -13,7 +13,7 @@ step before. Which contacts stick, which slip and where to, and who carries what
 redundant, comes out of the minimum: no modes, nothing to be compiled for each contact.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -63,17 +63,17 @@ def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.A
     """Impulses (n, B) that leave velocities right to `tolerance` (1, B), from a guess."""
 
     class Sweep(NamedTuple):
-        """Impulses, the point that the next sweep starts from, momentum, error, count."""
+        """Impulses, the point that the next sweep starts from, momentum, error, sweeps done."""
 
         impulses: jax.Array
         ahead: jax.Array
         momentum: jax.Array
         error: jax.Array
-        count: jax.Array
+        done: jax.Array
 
     def going(s: Sweep) -> jax.Array:
         """Whether a lane of the batch is not yet right."""
-        return (s.count < SWEEPS) & jnp.any(s.error > tolerance)
+        return (s.done < SWEEPS) & jnp.any(s.error > tolerance)
 
     def sweep(s: Sweep) -> Sweep:
         """One step of descent, and Nesterov's extrapolation unless it points uphill."""
@@ -83,7 +83,7 @@ def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.A
         momentum = jnp.where(uphill, 1.0, (1 + jnp.sqrt(1 + 4 * s.momentum**2)) / 2)
         weight = jnp.where(uphill, 0.0, (s.momentum - 1) / momentum)
         ahead = new + weight * (new - s.impulses)
-        return Sweep(new, ahead, momentum, change / problem.descent, s.count + 1)
+        return Sweep(new, ahead, momentum, change / problem.descent, s.done + 1)
 
     one = jnp.ones_like(tolerance)
     first = Sweep(start, start, one, one * jnp.inf, jnp.asarray(0))
@@ -94,15 +94,15 @@ def solve_smooth(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -
     """As `solve`, as a smooth function of the problem: derivatives solve the tangent equations."""
     still = jax.lax.stop_gradient((problem, start, tolerance))
 
-    def iterate(_residual: object, _start: jax.Array) -> jax.Array:
+    def iterate(_residual: Any, _start: jax.Array) -> jax.Array:
         """The impulses."""
         return solve(*still)
 
-    def tangent_solve(linear: object, right: jax.Array) -> jax.Array:
+    def tangent_solve(linear: Any, right: jax.Array) -> jax.Array:
         """The impulses (n, B) whose image under the residual's derivative is `right`."""
         n = len(right)
         units = jnp.broadcast_to(jnp.eye(n, dtype=right.dtype)[:, :, None], (n, *right.shape))
-        matrix = jnp.swapaxes(jax.vmap(linear)(units), 0, 1)  # type: ignore[arg-type]
+        matrix = jnp.swapaxes(jax.vmap(linear)(units), 0, 1)
         ridge = jnp.full_like(right, RIDGE)
         return regularized_once(matrix, ridge, right)
 
