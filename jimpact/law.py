@@ -427,7 +427,7 @@ class Law(Declared):
         return None
 
     def accuracy(self, contact: Contact) -> float:
-        """Relative error that the law allows itself: `impact` judges signs and energy beyond it."""
+        """Relative error of v+ at this `contact`: `impact` judges signs and energy beyond it."""
         return 0.0
 
     @property

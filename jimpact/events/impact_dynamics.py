@@ -32,6 +32,7 @@ from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import pushforward, value_of
 from jimpact.solvers.dense import unit
 from jimpact.solvers.sensitivity import without_derivatives
+from jimpact.solvers.step_impulses import descent_lengths
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -321,6 +322,7 @@ class ImplicitProgram(ImpulseProgram):
             restitution=problem.restitution,
             exponent_array=problem.exponent,
             friction=friction,
+            descent=jax.lax.stop_gradient(descent_lengths(coupling, problem.omega.shape[0])),
             tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
             kept=jnp.full_like(problem.tolerance, 1.0 if self.finely else 0.0),
             viscous=problem.viscous,

@@ -71,7 +71,8 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     if not law.has_history:
         raise TypeError(
             "Argument `law` must have a history (`has_history`: LZB, not by method 'impulse', a "
-            f"Compliant with a Bistiffness force, a law of your own with `dynamics`), but is {law!r}."
+            "Compliant with a Bistiffness force, a law of your own with `dynamics`), "
+            f"but is {law!r}."
         )
     as_whole("samples", samples, 2)
     v = as_velocity(scene, velocity)

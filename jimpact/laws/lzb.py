@@ -170,10 +170,10 @@ class LZB(Law):
         check_rtol(self.rtol, dtype)
 
     def accuracy(self, contact: Contact) -> float:
-        """That of method 'implicit'; errors of the others are below what `impact` judges."""
-        return self.tolerance(contact) if method_for(self.method, contact) == "implicit" else 0.0
+        """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
+        return self._tolerance(contact) if method_for(self.method, contact) == "implicit" else 0.0
 
-    def tolerance(self, contact: Contact) -> float:
+    def _tolerance(self, contact: Contact) -> float:
         """`rtol`, or the default of the method at these contacts."""
         method = method_for(self.method, contact)
         return self.rtol or default_rtol(method, contact.gap_velocity.dtype)
@@ -207,7 +207,7 @@ class LZB(Law):
             self.stiffness,
             self.exponent,
             contact.stored,
-            self.tolerance(contact) if rtol is None else rtol,
+            self._tolerance(contact) if rtol is None else rtol,
             closed=contact.closed,
         )
         if self.friction is not None:

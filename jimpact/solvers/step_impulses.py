@@ -31,19 +31,19 @@ RIDGE = 1e-10
 
 
 class StepProblem(NamedTuple):
-    """What the impulses (n, B) of a step have to satisfy, n = m + t; rows (m, B) but for two."""
+    """What the impulses (n, B) of a step have to satisfy, n = m + t."""
 
     coupling: jax.Array  # K (n, n, B)
     velocity: jax.Array  # b (n, B), the velocities without the impulses
-    load: jax.Array  # F, the largest normal impulses
-    unloading: jax.Array  # a >= 0
-    friction: jax.Array  # mu
-    descent: jax.Array  # (1, B), at most 1 / the largest eigenvalue of K
+    load: jax.Array  # F (m, B), the largest normal impulses
+    unloading: jax.Array  # a >= 0 (m, B)
+    friction: jax.Array  # mu (m, B)
+    descent: jax.Array  # (n, B), lengths of the steps of descent, see `descent_lengths`
 
     def projected(self, impulses: jax.Array, velocities: jax.Array) -> jax.Array:
         """The admissible impulses (n, B) next to a step of gradient descent."""
-        m, step = len(self.load), self.descent
-        tried = impulses - step * velocities
+        m, step = len(self.load), self.descent[: len(self.load)]
+        tried = impulses - self.descent * velocities
         cut = (self.unloading * tried[:m] + step * self.load) / (self.unloading + step)
         normal = jnp.where(self.unloading > 0, jnp.clip(cut, 0.0, self.load), self.load)
         side = tried[m:].reshape(m, -1, tried.shape[-1])
@@ -57,6 +57,27 @@ class StepProblem(NamedTuple):
     def residual(self, impulses: jax.Array) -> jax.Array:
         """Impulses (n, B) less their projection: 0 at the solution."""
         return impulses - self.projected(impulses, self.velocities(impulses))
+
+
+def descent_lengths(coupling: jax.Array, contacts: int) -> jax.Array:
+    """Lengths d (n, B) with which descent converges: diag(1/d) - K is positive semidefinite.
+
+    Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the largest
+    eigenvalue is then at most the Frobenius norm, and the largest sum of a row.
+    """
+    n = len(coupling)
+    size = coupling[jnp.arange(n), jnp.arange(n)]
+    side = size[contacts:].reshape(contacts, -1, size.shape[-1])
+    rows = side.shape[1]
+    if rows:
+        largest = jnp.repeat(jnp.max(side, axis=1), rows, axis=0)
+        size = jnp.concatenate([size[:contacts], largest])
+    size = jnp.where(size > 0, size, 1.0)
+    root = jnp.sqrt(size)
+    scaled = jnp.abs(coupling) / (root[:, None] * root[None])
+    row_sum = jnp.max(jnp.sum(scaled, axis=1), axis=0, keepdims=True)
+    norm = jnp.sqrt(jnp.sum(scaled**2, axis=(0, 1)))[None]
+    return 1 / (size * jnp.minimum(row_sum, norm))
 
 
 def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.Array:
@@ -78,12 +99,13 @@ def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.A
     def sweep(s: Sweep) -> Sweep:
         """One step of descent, and Nesterov's extrapolation unless it points uphill."""
         new = problem.projected(s.ahead, problem.velocities(s.ahead))
-        change = jnp.max(jnp.abs(new - s.ahead), axis=0, keepdims=True)
-        uphill = jnp.sum((s.ahead - new) * (new - s.impulses), axis=0, keepdims=True) > 0
+        moved = (s.ahead - new) / problem.descent
+        change = jnp.max(jnp.abs(moved), axis=0, keepdims=True)
+        uphill = jnp.sum(moved * (new - s.impulses), axis=0, keepdims=True) > 0
         momentum = jnp.where(uphill, 1.0, (1 + jnp.sqrt(1 + 4 * s.momentum**2)) / 2)
         weight = jnp.where(uphill, 0.0, (s.momentum - 1) / momentum)
         ahead = new + weight * (new - s.impulses)
-        return Sweep(new, ahead, momentum, change / problem.descent, s.done + 1)
+        return Sweep(new, ahead, momentum, change, s.done + 1)
 
     one = jnp.ones_like(tolerance)
     first = Sweep(start, start, one, one * jnp.inf, jnp.asarray(0))
