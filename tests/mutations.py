@@ -87,6 +87,7 @@ MUTATIONS = [
     Mutation("no recompression", r"after = jnp\.where\(by_g & \(phase == EXPANSION\), COMPRESSION, after\)", "pass", FLOW, "contact_flow.py"),
     Mutation("no re-closing", r"closed = \(by_x \| by_g\) & \(phase == OPEN\)", "closed = by_x & (phase == OPEN)", FLOW),
     Mutation("gaps forgotten", r"apart = 0\.0 if problem\.gap is None else -problem\.gap", "apart = 0.0 if problem.gap is None else -0.5 * problem.gap", (*FLOW, "test_compliant.py::test_gapped_chains_against_scipy")),
+    Mutation("slopes in the exponent go unwatched", r"watches=tighten < 1 and problem\.exponent is not None", "watches=False", ("test_values.py::test_slopes_in_the_exponent_of_linear_springs",)),
     # --- the stepper
     Mutation(  # the last event first, and none watched on the way; either alone repairs itself
         "events in the wrong order",
