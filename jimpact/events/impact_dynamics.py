@@ -217,6 +217,11 @@ class ImpulseProgram:
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
 
     @property
+    def queues(self) -> bool:
+        """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
+        return self.sides > 0 and (self.takes_duals or not self.finely)
+
+    @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
         return self.smooth and not self.repeats
