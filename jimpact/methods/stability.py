@@ -252,7 +252,7 @@ def stability_map(
         slices: 'one' axis at a time, or 'pairs' of axes as well.
         samples: number of Latin-hypercube points over all axes besides.
         scene: one scene in place of chains, planar or in space; None: chains.
-        velocity: its v- (n,), of which only the ratios matter.
+        velocity: its v- (n,) [m/s], of which only the ratios matter.
         max_steps: of every run; batches wait for their slowest point.
         seed: of the samples.
         progress: a bar on stderr; None: on a terminal, for long runs.
