@@ -198,7 +198,7 @@ def flow_of(
     )
     x = first_indentation(problem, exponent)
     if problem.sides is None:
-        flow = ContactFlow(**parts)
+        flow = ContactFlow(**parts, watches=tighten < 1 and problem.exponent is not None)
         return flow, *flow.start(problem.gamma, x)
     (normal_tangent, tangent, slip), friction = problem.sides
     kind = FrictionFlow if len(slip) == m else SlipFlow
