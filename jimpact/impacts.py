@@ -249,11 +249,12 @@ def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
 
 
 class _Resolved(NamedTuple):
-    """Impulses of contacts, the status of the law and of their signs."""
+    """Impulses of contacts, the status of the law and of their signs, and two scales."""
 
     normal: jax.Array
     tangential: jax.Array
     status: jax.Array
+    size: jax.Array  # () of the impact, square root of an energy
     noise: jax.Array  # () energy that the rounding of v- and the law's accuracy leave unknown
 
 
@@ -274,7 +275,7 @@ def _resolved(law: Law, contact: Contact, happens: jax.Array) -> _Resolved:
     code = jnp.maximum(impulses.status, signs)
     code = jnp.where(happens, code, CODE["ok"])
     noise = jnp.sum(contact.noise * jnp.abs(p)) + tolerance * contact.size**2
-    return _Resolved(p, tangential, code, noise)
+    return _Resolved(p, tangential, code, contact.size, noise)
 
 
 def _in_groups(
@@ -293,7 +294,7 @@ def _in_groups(
     p = jnp.zeros(m, v.dtype)
     each = 0 if scene.tangents is None else scene.tangents.shape[1] // m
     tangential = jnp.zeros((m, each), v.dtype)
-    code, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype)
+    code, square, noise = jnp.asarray(CODE["ok"]), jnp.zeros((), v.dtype), jnp.zeros((), v.dtype)
     for padded, contacts, acts in zip(groups, batches, active):
         index = jnp.asarray(padded % m)
         acts = happens & (acts | law.pulls)
@@ -312,8 +313,8 @@ def _in_groups(
         rows = part.tangential.reshape(len(at), each)
         tangential = tangential.at[at].set(rows, mode="drop")
         code = jnp.maximum(code, jnp.max(part.status))
-        noise = noise + jnp.sum(part.noise)
-    outcome = _Resolved(p, tangential.reshape(-1), code, noise)
+        square, noise = square + jnp.sum(part.size**2), noise + jnp.sum(part.noise)
+    outcome = _Resolved(p, tangential.reshape(-1), code, jnp.sqrt(square), noise)
     return outcome, happens, stored
 
 

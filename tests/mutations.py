@@ -153,7 +153,7 @@ MUTATIONS = [
     Mutation("hops below the rounding of gaps are resolved", r"jnp\.maximum\(slowly, jnp\.sqrt\(least_hop\)\)", "slowly", ("test_motion.py::test_hops_below_the_rounding_of_gaps_are_passed",)),
     Mutation("the median deviation taken for sigma", r"MEDIAN = 1\.4826", "MEDIAN = 1.0", ("test_fit.py::test_the_scale_of_robust_losses_is_that_of_normal_errors",)),
     Mutation("5/4 becomes 3/2 in the indentation of Hertz", r"1\.25 \* mass \* speed\*\*2", "1.5 * mass * speed**2", ("test_compliant.py::test_linear_forces_reach_the_indentation_of_hertz",)),
-    Mutation("size of grouped impacts a million times too large", r"noise = noise \+ jnp\.sum\(part\.noise\)", "noise = noise + 1e12 * jnp.sum(part.noise)", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
+    Mutation("size of grouped impacts a million times too large", r"noise \+ jnp\.sum\(part\.noise\)", "noise + 1e12 * jnp.sum(part.noise)", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
     Mutation("a hundred times the rounding of velocities", r"\nROUNDINGS = 4\n", "\nROUNDINGS = 400\n", ("test_seams.py::test_ten_times_the_rounding_is_an_impact",)),
     Mutation("degrees of freedom of the F test swapped", r"fdtrc\(more, rest, ratio\)", "fdtrc(rest, more, ratio)", ("test_selection.py::test_the_need_of_a_dependence_on_speed_is_tested",)),
     Mutation("crossover in units of the smaller indentation", r"delta = jnp\.max\(scale\.delta\)", "delta = jnp.min(scale.delta)", ("test_compliant.py::test_offsets_of_gaps_are_in_units_of_the_larger_indentation",)),

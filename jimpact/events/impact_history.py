@@ -49,8 +49,7 @@ class HistoryProgram:
         def at(part: jax.Array) -> tuple[jax.Array, jax.Array, ContactStates]:
             """A sample is one more step, in time, from the state before it."""
             t = part * times[-1:]
-            reached = times <= jax.lax.stop_gradient(t)[None]
-            before = jnp.sum(reached.astype(jnp.int32), axis=0) - 1
+            before = jnp.sum((times <= jax.lax.stop_gradient(t)).astype(jnp.int32), axis=0) - 1
 
             def of(rows: jax.Array) -> jax.Array:
                 """Rows of the step before the sample."""
