@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from friction_reference import routh, small_steps
+from friction_reference import regularized, routh, small_steps
 from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
@@ -198,6 +198,17 @@ def test_rods_are_rouths():
     kinds = np.abs(expected[:, 1]) < mu * expected[:, 0] - 1e-6
     assert kinds.any()
     assert not kinds.all()
+
+
+@pytest.mark.parametrize("rod", [RODS[16], RODS[54]], ids=["slips", "jams"])
+def test_regularized_friction_is_rouths(rod):
+    """The independent integration itself, against the closed form."""
+    mass, normals, tangents, v, e, mu = rod
+    scene = ji.Scene(mass, normals, tangents=tangents)
+    p, side = routh(scene, v, mu, e)
+    after, uncertainty = regularized(scene, v, 1.0, 1.5, e, mu, eps=1e-5)
+    close(after, v + (normals[:, 0] * p + tangents[:, 0] * side) / mass, atol=1e-8)
+    assert uncertainty < 1e-4
 
 
 def test_particle_of_example_6_2():
