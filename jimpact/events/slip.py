@@ -127,9 +127,7 @@ def polar(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     return direction, perpendicular_to(direction)
 
 
-def turned(
-    vectors: tuple[jax.Array, jax.Array], angle: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def turned(vectors: tuple[jax.Array, jax.Array], angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Two vectors as those of `polar`, turned by small angles, to second order: without a cosine."""
     direction, perpendicular = vectors
     half = (angle / 2)[:, None]
