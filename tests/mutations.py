@@ -87,6 +87,7 @@ MUTATIONS = [
     Mutation("no recompression", r"after = jnp\.where\(by_g & \(phase == EXPANSION\), COMPRESSION, after\)", "pass", FLOW, "contact_flow.py"),
     Mutation("no re-closing", r"closed = \(by_x \| by_g\) & \(phase == OPEN\)", "closed = by_x & (phase == OPEN)", FLOW),
     Mutation("gaps forgotten", r"apart = 0\.0 if problem\.gap is None else -problem\.gap", "apart = 0.0 if problem.gap is None else -0.5 * problem.gap", (*FLOW, "test_compliant.py::test_gapped_chains_against_scipy")),
+    Mutation("slopes in the exponent go unwatched", r"watches=tighten < 1 and problem\.exponent is not None", "watches=False", ("test_values.py::test_slopes_in_the_exponent_of_linear_springs",)),
     # --- the stepper
     Mutation(  # the last event first, and none watched on the way; either alone repairs itself
         "events in the wrong order",
@@ -120,6 +121,7 @@ MUTATIONS = [
     Mutation("pulling is not reported", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", (examples("impacts"),)),
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
     Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
+    Mutation("energies that no number holds pass", r"beyond = happens & ~_has_scale\(outcome\.size, v\)", "beyond = happens & False", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",), "impacts.py"),
     Mutation("gaps that are not known count as open", r"unknown = \[jnp\.any\(jnp\.isnan\(x\)\) for x in numbers\]", "unknown = []", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "impacts.py"),
     Mutation("an asymmetric mass passes inside jit", r"else _is_symmetric\(scene\.mass\)\]", "else jnp.asarray(True)]", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "scene.py"),
     Mutation("a normal of zero passes inside jit", r"allowed\.append\(jnp\.all\(_has_body\(scene\.normals\)\)\)", "pass", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "scene.py"),
