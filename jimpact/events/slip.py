@@ -128,7 +128,7 @@ def polar(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def turned(vectors: tuple[jax.Array, jax.Array], angle: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Two vectors as those of `polar`, turned by small angles, to second order: without a cosine."""
+    """Vectors as those of `polar`, turned by small angles, to second order: without a cosine."""
     direction, perpendicular = vectors
     half = (angle / 2)[:, None]
     cosine, sine = (1 - half**2) / (1 + half**2), 2 * half / (1 + half**2)
