@@ -121,6 +121,8 @@ MUTATIONS = [
     Mutation("pulling is not reported", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", (examples("impacts"),)),
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
     Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
+    Mutation("dependent tangents are not reported", r"\(least < _DEPENDENT\) & \(n >= unit\.shape\[1\]\)", "least < 0", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",), "scene.py"),
+    Mutation("oblique tangents are not reported", r"oblique \|= known & ", "oblique |= known & False & ", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",), "scene.py"),
     Mutation("energies that no number holds pass", r"beyond = happens & ~_has_scale\(outcome\.size, v\)", "beyond = happens & False", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",), "impacts.py"),
     Mutation("gaps that are not known count as open", r"unknown = \[jnp\.any\(jnp\.isnan\(x\)\) for x in numbers\]", "unknown = []", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "impacts.py"),
     Mutation("an asymmetric mass passes inside jit", r"else _is_symmetric\(scene\.mass\)\]", "else jnp.asarray(True)]", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "scene.py"),
