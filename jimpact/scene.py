@@ -528,7 +528,8 @@ def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
     positions if they are uncoupled in M, as many as the directions of each body that the contact
     moves, and if the normal has length 1 in each body. Rotations do not fit this but by chance.
     """
-    masses, count, moves = np.diag(mass), directions.shape[2], directions.any(axis=2)
+    masses, count = np.diag(mass), directions.shape[2]
+    moves: np.ndarray = np.any(directions, axis=2)
     uncoupled = np.count_nonzero(mass, axis=1) == 1
     oblique = np.zeros(len(directions), bool)
     for value in np.unique(masses[uncoupled]):
