@@ -33,10 +33,11 @@ columns_p.multiple_results = True
 def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """`function(*arrays)`, where all arrays in and out have the batch in their last axis.
 
-    Where it is differentiated all its results are floating-point numbers.
+    Results that are whole numbers have no derivatives; `function.smoothed()` leaves them out.
     `function` is hashable and compares equal where it does the same (a function of a module, or a
     frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
+    It is called with the whole batch if its attribute `queues` is True, else with chunks of it.
     """
     return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
 
@@ -205,13 +206,20 @@ def _count_of_values(outs: Any) -> int:
     return next(n for n in range(len(outs)) if n + sum(smooth[:n]) == len(outs))
 
 
+def _queues(function: Any) -> bool:
+    """Whether the function works through a batch of any size by itself."""
+    if isinstance(function, Tangent | WithTangents):
+        return _queues(smoothed(function.function))
+    return getattr(function, "queues", False)
+
+
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
-    count = -(
-        -size
-        // (CHUNK if not isinstance(function, Tangent | WithTangents) else CHUNK_WITH_TANGENTS)
-    )
+    if _queues(function):
+        return tuple(function(*arrays))
+    tangents = isinstance(function, Tangent | WithTangents)
+    count = -(-size // (CHUNK_WITH_TANGENTS if tangents else CHUNK))
     if count == 1:
         return tuple(function(*arrays))
     width = -(-size // count)

@@ -217,6 +217,12 @@ class ImpulseProgram:
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
 
     @property
+    def queues(self) -> bool:
+        """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
+        smooth = self.smooth and self.takes_duals  # called with tangents
+        return self.sides > 0 and (smooth or not self.finely)
+
+    @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
         return self.finely and not self.repeats
