@@ -244,7 +244,8 @@ class ImpulseProgram:
         gamma = value_of(problem.gamma)
         duals = any(map(is_dual, leaves))
         end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
-        state, dp = end.carry.y, end.impulse
+        state: Any = end.carry.y
+        dp: Any = end.impulse
         if self.repeats:
             flow, _, y = self.flow(problem, tighten)
             state = stepper.repeat(flow, modes, y, end.plan)
