@@ -87,7 +87,8 @@ def impact(
             `not_finite` (NaN in the velocity, a gap, `noise` or `approach`), or `out_of_range` (a
             parameter outside its domain, a normal that is 0, a mass that is asymmetric or not
             positive, a negative gap, `noise` or `approach`, a velocity that breaks a bilateral
-            constraint).
+            constraint). An energy of the impact, `sum gamma-^2 / W_jj`, that the floating type
+            takes for 0 or infinite is `out_of_range` on the host, too: choose other units.
 
     >>> import jimpact as ji
     >>> out = ji.impact(ji.LZB(0.9, stiffness=1.0, exponent=1.5), ji.chain([1, 1, 1]), [1, 0, 0])
@@ -224,11 +225,23 @@ def _impact(
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
     code = jnp.where(finite, code, CODE["not_finite"])
+    beyond = happens & ~_has_scale(outcome.size, v)
+    code = jnp.where(beyond, CODE["out_of_range"], code)
     if any(traced):
         refused = traced.code(law, scene, v, offsets)
         code = jnp.where(refused > CODE["ok"], refused, code)
     code = code.astype(jnp.int32)
     return Impact(v_plus, p, tangential, change, total, code)
+
+
+def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
+    """Whether () the energy size^2 of an impact is neither 0 nor infinite to the precision.
+
+    True as well where the velocity (n,) is not finite, and the energy can have no value.
+    """
+    tiny = float(jnp.finfo(size.dtype).tiny)
+    inside = (size**2 >= tiny) & (size**2 < jnp.inf)
+    return inside | ~jnp.all(jnp.isfinite(v))
 
 
 class _Resolved(NamedTuple):

@@ -491,8 +491,7 @@ def _is_symmetric(mass: Any) -> Any:
 def is_allowed(scene: Scene) -> jax.Array:
     """Whether () the values of a traced scene are those that `Scene` allows on the host.
 
-    Values that are not finite, and a dense M that is not positive definite, give an outcome that is
-    not finite.
+    NaN is not looked for; a dense M that is not positive definite gives energies without a value.
     """
     allowed = [jnp.all(scene.mass > 0) if scene.mass.ndim == 1 else _is_symmetric(scene.mass)]
     if scene.walls is None:

@@ -87,6 +87,7 @@ MUTATIONS = [
     Mutation("no recompression", r"after = jnp\.where\(by_g & \(phase == EXPANSION\), COMPRESSION, after\)", "pass", FLOW, "contact_flow.py"),
     Mutation("no re-closing", r"closed = \(by_x \| by_g\) & \(phase == OPEN\)", "closed = by_x & (phase == OPEN)", FLOW),
     Mutation("gaps forgotten", r"apart = 0\.0 if problem\.gap is None else -problem\.gap", "apart = 0.0 if problem.gap is None else -0.5 * problem.gap", (*FLOW, "test_compliant.py::test_gapped_chains_against_scipy")),
+    Mutation("slopes in the exponent go unwatched", r"watches=tighten < 1 and problem\.exponent is not None", "watches=False", ("test_values.py::test_slopes_in_the_exponent_of_linear_springs",)),
     # --- the stepper
     Mutation(  # the last event first, and none watched on the way; either alone repairs itself
         "events in the wrong order",
@@ -121,6 +122,7 @@ MUTATIONS = [
     Mutation("pulling is not reported", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", (examples("impacts"),)),
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
     Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
+    Mutation("energies that no number holds pass", r"beyond = happens & ~_has_scale\(outcome\.size, v\)", "beyond = happens & False", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",), "impacts.py"),
     Mutation("gaps that are not known count as open", r"unknown = \[jnp\.any\(jnp\.isnan\(x\)\) for x in numbers\]", "unknown = []", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "impacts.py"),
     Mutation("an asymmetric mass passes inside jit", r"else _is_symmetric\(scene\.mass\)\]", "else jnp.asarray(True)]", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "scene.py"),
     Mutation("a normal of zero passes inside jit", r"allowed\.append\(jnp\.all\(_has_body\(scene\.normals\)\)\)", "pass", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "scene.py"),
@@ -245,7 +247,9 @@ MUTATIONS = [
     Mutation("one-sided confidence intervals", r"0\.5 \+ 0\.5 \* level\n", "level\n", ("test_fit.py::test_errors_from_the_residual_are_those_of_linear_regression",)),
     Mutation("bootstrap without the noise", r"fit\.noise \* np\.moveaxis", "np.moveaxis", ("test_fit.py::test_bootstrap_scatters_as_much_as_the_standard_error",)),
     Mutation("given samples of the next chunk", r"values\[number \* size : \(number \+ 1\) \* size\]", "values[(number + 1) * size : (number + 2) * size]", ("test_montecarlo.py::test_given_samples_are_used_row_by_row",)),
-    Mutation("friction that pushes along the sliding", r"modes\.sign \* mu, 0\.0", "-modes.sign * mu, 0.0", ("test_motion.py::test_sliding_block_comes_to_stick",)),
+    Mutation("friction that pushes along the sliding", r"along \* mu\[:, None\], 0\.0", "-along * mu[:, None], 0.0", ("test_motion.py::test_sliding_block_comes_to_stick",)),
+    Mutation("slip in space turned to the wrong side", r"jnp\.where\(straight, 0\.0, u\[:, 1\]\)", "jnp.where(straight, 0.0, -u[:, 1])", ("test_motion_in_space.py::test_a_sphere_slides_until_it_rolls",)),
+    Mutation("slip in space that begins held along itself", r"jnp\.stack\(\[stick, across\], axis=1\)", "jnp.stack([across, stick], axis=1)", ("test_motion_in_space.py::test_a_sphere_that_is_pulled_begins_to_slide",)),
     Mutation("elastic energy of a history doubled", r"0\.5 \* units\.velocity\*\*2 \* energy", "units.velocity**2 * energy", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
     # --- pictures
     Mutation("histogram in shares, not per cent", r"100 \* bars / max", "bars / max", ("test_pictures.py::test_a_histogram_is_in_per_cent",)),

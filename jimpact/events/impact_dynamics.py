@@ -180,7 +180,7 @@ def flow_of(
     apart = 0.0 if problem.gap is None else -problem.gap
     x = jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
     if problem.sides is None:
-        flow = ContactFlow(**parts)
+        flow = ContactFlow(**parts, watches=tighten < 1 and problem.exponent is not None)
         return flow, *flow.start(problem.gamma, x)
     (normal_tangent, tangent, slip), friction = problem.sides
     kind = FrictionFlow if len(slip) == m else SlipFlow

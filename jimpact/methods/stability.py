@@ -97,7 +97,7 @@ CAUSES = (  # limits, formulas and remedies: docs/stability.md
     "many contacts at once",
     "first order at E = 0",
     "steps straddle changes of phase",
-    "contacts creep instead of sticking",
+    "regularized friction, or steps that straddle changes of phase",
     "contacts vibrate between stick and slip",
 )
 (_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)

@@ -2,6 +2,7 @@
 
     python tests/benchmarks/space.py [--scenes ...] [--methods ...] [--tasks ...]
     python tests/benchmarks/space.py --impacts 10000 [--kinds ...] [--methods ...]
+    python tests/benchmarks/space.py --agreement [--methods ...]
 
 Every entry of the first table is a process of its own, without a compilation cache, that may use
 LIMIT seconds of the processor: tracing and compiling, without imports and JAX's own start. Ratios
@@ -10,6 +11,9 @@ the median of calls that follow, processor time. e = .3, mu = .3, Hertz contacts
 
 `--impacts N` solves N random boxes and the measured cube's impacts at mu = .16, .3 and .6, each
 alone (for its time) and in batches of BATCH: statuses, failures, the slowest, and Moreau's batch.
+
+`--agreement`: v+ and its slopes in mu, e and ln k_1 beside an independent integration and its
+differences, which `tests/data/friction_space.npz` holds (see space_reference.py): median and worst.
 """
 
 import json
@@ -42,11 +46,14 @@ WANTED = {"value": 4.0, "jacobian": 8.0, "second": 20.0}  # first calls, in unit
 ROBUST = 1.5  # first value of the implicit method
 SCENES = (*spatial_scenes.NAMED, "plane, 2 contacts")
 CUBES = {"cube corner": 1, "cube edge": 2, "cube flat": 4}
+HELD = Path(__file__).parent.parent / "data" / "friction_space.npz"
+INPUTS = ("mass", "normals", "tangents", "velocity", "restitution", "friction", "stiffness")
+SHARP = 1e-3  # slopes are compared where lower differences agree to this: no kink in between
 KINDS = (*spatial_scenes.KINDS, *CUBES)
 
 
 def laws(method):
-    """(e, mu) -> law; None where the package has no such method."""
+    """(e, mu, and for LZB other arguments) -> law; None where the package has no such method."""
     import jimpact as ji
     from jimpact.events.impact_dynamics import METHODS as known
 
@@ -55,8 +62,8 @@ def laws(method):
     if method == "implicit":
         if "implicit" not in known:
             return None
-        return lambda e, mu: ji.LZB(e, friction=mu, method="implicit")
-    return lambda e, mu: ji.LZB(e, friction=mu, method="time")
+        return lambda e, mu, **x: ji.LZB(e, friction=mu, method="implicit", **x)
+    return lambda e, mu, **x: ji.LZB(e, friction=mu, method="time", **x)
 
 
 # ------------------------------------------------------------------------------- the table
@@ -300,8 +307,66 @@ def many_impacts(options):
     write_csv(options.out / "space_impacts.csv", rows)
 
 
+# ---------------------------------------------------------------------------- agreement
+
+
+def agree(method, contacts):
+    """In a child: errors of v+ and of its slopes, and the statuses."""
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    import jimpact as ji
+
+    with np.load(HELD) as file:
+        held = {name[:-2]: file[name] for name in file if name.endswith(f"_{contacts}")}
+    law = laws(method)
+
+    def one(mass, normals, tangents, velocity, e, mu, k):
+        scene = ji.Scene(mass, normals, tangents=tangents)
+
+        def after(change):
+            factor = jnp.ones_like(k).at[0].set(jnp.exp(change[2]))
+            out = ji.impact(
+                law(e + change[1], mu + change[0], stiffness=k * factor), scene, velocity
+            )
+            return out.velocity, (out.velocity, out.status)
+
+        slopes, (v, status) = jax.jacfwd(after, has_aux=True)(jnp.zeros(3))
+        return v, slopes.T, status
+
+    v, slopes, status = jax.jit(jax.vmap(one))(*(held[name] for name in INPUTS))
+    error = np.abs(v - held["after"]).max(axis=1)
+    wrong = np.abs(slopes - held["slopes"]).max(axis=2)
+    names = Counter(ji.STATUS[int(s)].name for s in status)
+    known = np.nan_to_num(held["slope_uncertainty"], nan=np.inf) < SHARP
+    row = {"impacts": len(status), "error": np.median(error), "worst": error.max()}
+    for i, name in enumerate(("mu", "e", "k")):
+        at = wrong[known[:, i], i]
+        row[f"slope_{name}"] = np.median(at) if len(at) else np.nan
+        row[f"worst_{name}"] = at.max(initial=0.0) if len(at) else np.nan
+    row = {name: float(x) for name, x in row.items()}
+    return row | {"statuses": ", ".join(f"{name} {n}" for name, n in names.items())}
+
+
+def agreement(options):
+    """The table of errors."""
+    rows = []
+    for contacts in ("1", "2", "4"):
+        for method in (m for m in options.methods if m != "moreau" and laws(m) is not None):
+            said = child("--agree", method, contacts, seconds=WALL * LIMIT)
+            found = json.loads(said[-1]) if said else {"statuses": "none"}
+            rows.append({"contacts": contacts, "method": method} | found)
+            print(rows[-1], file=sys.stderr, flush=True)
+    keys = ("contacts", "method", "impacts", "error", "worst", "slope_mu", "worst_mu", "slope_e")
+    keys = (*keys, "worst_e", "slope_k", "worst_k", "statuses")
+    show("Difference from an independent integration", rows, keys)
+    write_csv(options.out / "space_agreement.csv", rows)
+
+
 def add_options(parser):
-    """The choices of both tables."""
+    """The choices of the tables."""
+    parser.add_argument("--agreement", action="store_true", help="the table of errors")
     parser.add_argument("--impacts", type=int, default=0, help="so many impacts, not the table")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
@@ -310,12 +375,15 @@ def add_options(parser):
 
 
 def main():
-    """One of the two tables."""
+    """One of the tables."""
     options = arguments(__doc__, add_options)
     if options.quick:
         options.scenes, options.kinds = options.scenes[:1], options.kinds[:1]
         options.impacts = min(options.impacts, 16)
-    (many_impacts if options.impacts else first_calls)(options)
+    if options.agreement:
+        agreement(options)
+    else:
+        (many_impacts if options.impacts else first_calls)(options)
 
 
 if __name__ == "__main__":
@@ -325,6 +393,8 @@ if __name__ == "__main__":
         print(json.dumps(found))
     elif sys.argv[1:2] == ["--each"]:
         solve_each(*sys.argv[2:])
+    elif sys.argv[1:2] == ["--agree"]:
+        print(json.dumps(agree(*sys.argv[2:])))
     elif sys.argv[1:2] == ["--batch"]:
         solve_batches(*sys.argv[2:])
     else:
