@@ -97,6 +97,7 @@ MUTATIONS = [
         "stepper.py",
     ),
     Mutation("impacts of a queue end in the first slots", r"x\.at\[\.\.\., s\.impact\]", "x.at[..., jnp.arange(SLOTS)]", ("test_friction.py::test_a_large_batch_is_a_queue",), "stepper.py"),
+    Mutation("results known before their tangents are not taken apart", r"if not count or all\(known\) or not all\(known\[:count\]\):", "if True:", ("test_fast_paths.py::test_values_and_forward_derivatives_are_one_program",), "batches.py"),
     Mutation("a new impact in a slot keeps the flow of the last", r"return _Slots\(impact, following, new_flow,", "return _Slots(impact, following, s.flow,", ("test_friction.py::test_a_large_batch_is_a_queue",), "stepper.py"),
     Mutation("dips switched off", r"dipped = turns & .*", "dipped = turns & False", ("test_motion.py::test_no_event_is_missed_between_two_looks",), "stepper.py", "slow"),
     Mutation("crossings are missed", r"crossed, turns = free & \(c1 < -zero\)", "crossed, turns = free & (c1 < -1e3 * zero)", FLOW),
