@@ -16,7 +16,7 @@ import numpy as np
 
 from jimpact.contact import Contact
 from jimpact.events import implicit_steps, impulse_form, stepper
-from jimpact.events.batches import in_columns, tangents_in_columns
+from jimpact.events.batches import in_columns, with_tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -29,7 +29,7 @@ from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
-from jimpact.events.tangents import pushforward, value_of
+from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
 from jimpact.solvers.sensitivity import without_derivatives
 from jimpact.solvers.step_impulses import descent_lengths
@@ -218,7 +218,7 @@ class ImpulseProgram:
     sides: int = 0  # tangential rows
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    smooth: bool = False  # only the results that have derivatives; duals are taken
+    smooth: bool = False  # only the results that have derivatives
     repeats: bool = False  # walk the steps once more, for both modes
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
@@ -237,20 +237,21 @@ class ImpulseProgram:
     @property
     def queues(self) -> bool:
         """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
-        return self.sides > 0 and (self.takes_duals or not self.finely)
+        smooth = self.smooth and self.takes_duals  # called with tangents
+        return self.sides > 0 and (smooth or not self.finely)
 
     @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
-        return self.smooth and not self.repeats
+        return self.finely and not self.repeats
+
+    def smoothed(self) -> "ImpulseProgram":
+        """The same with only the results that have derivatives."""
+        return dataclasses.replace(self, smooth=True)
 
     def reversible(self) -> "ImpulseProgram":
         """The same in a form that both modes go through."""
         return dataclasses.replace(self, repeats=self.smooth)
-
-    def once(self, leaves: Any) -> Any:
-        """The leaves that first derivatives are taken at: they have derivatives of their own."""
-        return leaves
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
@@ -259,17 +260,18 @@ class ImpulseProgram:
         fixed = jax.lax.stop_gradient(problem) if self.repeats else problem
         flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), fixed)
         gamma = value_of(problem.gamma)
-        end = to_the_end(
-            flow, gamma, modes, y, self.most, keeps=self.finely and not self.takes_duals
-        )
-        state, dp = end.carry.y, end.impulse
+        duals = any(map(is_dual, leaves))
+        end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
+        state: Any = end.carry.y
+        dp: Any = end.impulse
         if self.repeats:
             flow, _, y = self.flow(problem, tighten)
             state = stepper.repeat(flow, modes, y, end.plan)
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
-        if self.smooth:
+        if self.smooth or duals:
             last = flow, problem.gamma, state
             dp = pushforward(lambda f, g, y: remainder(f, g, y, end.carries), *last)
+            dp = Dual(end.impulse, dp.tangents) if is_dual(dp) else dp
         rows = 3 * gamma.shape[0]
 
         def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
@@ -280,7 +282,7 @@ class ImpulseProgram:
         p, *rest = pushforward(parts, state, dp)
         if self.smooth:
             return p, *rest
-        p = stepper.with_plan(p, end.plan) if self.finely else p
+        p = stepper.with_plan(p, end.plan) if self.finely and not duals else p
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
 
 
@@ -301,10 +303,6 @@ class ImplicitProgram(ImpulseProgram):
     def reversible(self) -> "ImplicitProgram":
         """Itself."""
         return self
-
-    def once(self, leaves: Any) -> Any:
-        """The leaves, whose derivatives raise: events within steps spoil those of second order."""
-        return without_derivatives(leaves, NotImplementedError(NO_SECOND))
 
     def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.State]:
         """The contacts of a problem, and their state before the impact."""
@@ -333,19 +331,43 @@ class ImplicitProgram(ImpulseProgram):
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see `ImpulseProgram`."""
-        problem = jax.tree.unflatten(self.tree, leaves)
-        flow, start = self.steps(jax.lax.stop_gradient(problem))
-        run = implicit_steps.to_the_end(flow, start, self.most, keeps=self.finely)
-        state, m = run.state, flow.contacts
-        if self.smooth:
+
+        def to_the_end(leaves: Any) -> tuple[implicit_steps.Run, jax.Array]:
+            """The run and its status."""
+            flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
+            run = implicit_steps.to_the_end(flow, start, self.most, keeps=self.finely)
+            return run, self.code(flow, run)
+
+        def results(state: implicit_steps.State) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """Normal impulses, tangential ones, and the time."""
+            return state.impulse[:m], state.impulse[m:], state.time
+
+        @jax.custom_jvp
+        def outcome(leaves: Any) -> tuple[Any, Any]:
+            """Results with derivatives, and those without."""
+            run, code = to_the_end(leaves)
+            return results(run.state), (code, run.passes)
+
+        def tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
+            """Those of the steps that were taken; events within them spoil second ones."""
+            leaves = without_derivatives(primals[0], NotImplementedError(NO_SECOND))
+            run, code = to_the_end(jax.lax.stop_gradient(leaves))
             assert run.plan is not None
-            state = implicit_steps.repeat(*self.steps(problem), run.plan)
-        p, side, time = state.impulse[:m], state.impulse[m:], state.time
-        if self.smooth:
-            return p, side, time
-        if run.plan is not None:  # values keep the plan: one loop where both are one program
-            p = jnp.where(run.plan.lengths[0] < 0, jnp.nan, p)
-        return p, side, time, self.code(flow, run), run.passes
+            plan, whole = run.plan, (code, run.passes)
+
+            def walked(leaves: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+                """The results as smooth functions."""
+                flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
+                return results(implicit_steps.repeat(flow, start, plan))
+
+            _, rates = jax.jvp(walked, (leaves,), tangents)
+            none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), whole)
+            return (results(run.state), whole), (rates, none)
+
+        outcome.defjvp(tangent)
+        m = jax.tree.unflatten(self.tree, leaves).omega.shape[0]
+        smooth, whole = outcome(leaves)
+        return smooth if self.smooth else (*smooth, *whole)
 
     def code(self, flow: ImplicitSteps, run: implicit_steps.Run) -> jax.Array:
         """Status (1, B) of a run."""
@@ -476,11 +498,9 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
 
     def rule(primals: Any, tangents: Any) -> Any:
         """Values at the tolerance of derivatives, and their tangents."""
-        # values keep the steps for the reverse mode: one loop where they are one program
+        # in reverse mode values keep the steps: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
-        outs = evaluate(fine, primals)
-        smooth = dataclasses.replace(fine, smooth=True)
-        rates = tangents_in_columns(smooth, function.once(primals), tangents)
+        outs, rates = with_tangents_in_columns(fine, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 

@@ -20,7 +20,7 @@ from jimpact.events.impact_dynamics import (
 )
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_rtol, default_rtol
+from jimpact.laws.lzb import check_friction, check_rtol, default_rtol
 from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import diagonal
 
@@ -94,8 +94,9 @@ class Compliant(Law):
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise a ValueError for a tolerance finer than the precision can hold."""
+        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
         check_rtol(self.rtol, dtype)
+        check_friction(self.friction, scene)
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
