@@ -16,7 +16,7 @@ import numpy as np
 
 from jimpact.contact import Contact
 from jimpact.events import impulse_form, stepper
-from jimpact.events.batches import in_columns, tangents_in_columns
+from jimpact.events.batches import in_columns, with_tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -28,7 +28,7 @@ from jimpact.events.contact_flow import (
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.slip import SlipFlow
-from jimpact.events.tangents import pushforward, value_of
+from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
@@ -200,7 +200,7 @@ class ImpulseProgram:
     sides: int = 0  # tangential rows
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    smooth: bool = False  # only the results that have derivatives; duals are taken
+    smooth: bool = False  # only the results that have derivatives
     repeats: bool = False  # walk the steps once more, for both modes
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
@@ -219,12 +219,17 @@ class ImpulseProgram:
     @property
     def queues(self) -> bool:
         """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
-        return self.sides > 0 and (self.takes_duals or not self.finely)
+        smooth = self.smooth and self.takes_duals  # called with tangents
+        return self.sides > 0 and (smooth or not self.finely)
 
     @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
-        return self.smooth and not self.repeats
+        return self.finely and not self.repeats
+
+    def smoothed(self) -> "ImpulseProgram":
+        """The same with only the results that have derivatives."""
+        return dataclasses.replace(self, smooth=True)
 
     def reversible(self) -> "ImpulseProgram":
         """The same in a form that both modes go through."""
@@ -237,17 +242,18 @@ class ImpulseProgram:
         fixed = jax.lax.stop_gradient(problem) if self.repeats else problem
         flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), fixed)
         gamma = value_of(problem.gamma)
-        end = to_the_end(
-            flow, gamma, modes, y, self.most, keeps=self.finely and not self.takes_duals
-        )
-        state, dp = end.carry.y, end.impulse
+        duals = any(map(is_dual, leaves))
+        end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
+        state: Any = end.carry.y
+        dp: Any = end.impulse
         if self.repeats:
             flow, _, y = self.flow(problem, tighten)
             state = stepper.repeat(flow, modes, y, end.plan)
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
-        if self.smooth:
+        if self.smooth or duals:
             last = flow, problem.gamma, state
             dp = pushforward(lambda f, g, y: remainder(f, g, y, end.carries), *last)
+            dp = Dual(end.impulse, dp.tangents) if is_dual(dp) else dp
         rows = 3 * gamma.shape[0]
 
         def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
@@ -258,7 +264,7 @@ class ImpulseProgram:
         p, *rest = pushforward(parts, state, dp)
         if self.smooth:
             return p, *rest
-        p = stepper.with_plan(p, end.plan) if self.finely else p
+        p = stepper.with_plan(p, end.plan) if self.finely and not duals else p
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
 
 
@@ -369,11 +375,9 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
 
     def rule(primals: Any, tangents: Any) -> Any:
         """Values at the tolerance of derivatives, and their tangents."""
-        # values keep the steps for the reverse mode: one loop where they are one program
+        # in reverse mode values keep the steps: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
-        outs = evaluate(fine, primals)
-        smooth = dataclasses.replace(fine, smooth=True)
-        rates = tangents_in_columns(smooth, primals, tangents)
+        outs, rates = with_tangents_in_columns(fine, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 

@@ -13,7 +13,7 @@ from jimpact.events.contact_flow import Viscous
 from jimpact.events.impact_dynamics import Dynamics, dimensionless, sides_of, solve
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_rtol, default_rtol
+from jimpact.laws.lzb import check_friction, check_rtol, default_rtol
 from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import diagonal
 
@@ -83,8 +83,9 @@ class Compliant(Law):
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise a ValueError for a tolerance finer than the precision can hold."""
+        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
         check_rtol(self.rtol, dtype)
+        check_friction(self.friction, scene)
 
     def dynamics(self, contact: Contact) -> Dynamics:
         """The dimensionless dynamics of the whole encounter."""

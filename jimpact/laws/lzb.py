@@ -28,6 +28,10 @@ DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # method 'impulse', first order: the step in the primary impulse itself
 FINEST_RTOL_IN_EPS = 16  # below this many eps the error estimate is noise
 
+# Contacts with friction up to which impact dynamics are tried: each of their events involves all of
+# them. Ten times more would not end within hours, and no status would ever say so.
+MOST_WITH_FRICTION = 200
+
 
 def default_rtol(method: str, dtype: jnp.dtype) -> float:
     """Tolerance if the law has no `rtol`."""
@@ -41,6 +45,15 @@ def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
         raise ValueError(
             f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
             f"but has value {rtol:g}: enable jax_enable_x64 for finer tolerances."
+        )
+
+
+def check_friction(friction: Any, scene: Scene) -> None:
+    """Raise a ValueError where too many contacts have friction."""
+    if friction is not None and scene.contacts > MOST_WITH_FRICTION:
+        raise ValueError(
+            f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for impact dynamics "
+            f"with friction, but has {scene.contacts}: algebraic laws such as Moreau take more."
         )
 
 
@@ -149,8 +162,9 @@ class LZB(Law):
                 )
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """A tolerance finer than the precision can hold is an error."""
+        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
         check_rtol(self.rtol, dtype)
+        check_friction(self.friction, scene)
 
     @property
     def pads_scenes(self) -> bool:  # type: ignore[override]
