@@ -32,8 +32,10 @@ LAWS = {
         e, "earliest", friction=mu, tangential_restitution=e_t
     ),
     "poisson": lambda e, mu, e_t, k: ji.Poisson(e, friction=mu, tangential_restitution=e_t),
-    "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu),
-    "compliant": lambda e, mu, e_t, k: ji.Compliant(ji.Bistiffness(k, 1.5, e), friction=mu),
+    "lzb": lambda e, mu, e_t, k: ji.LZB(e, k, 1.5, friction=mu, method="time"),
+    "compliant": lambda e, mu, e_t, k: ji.Compliant(
+        ji.Bistiffness(k, 1.5, e), friction=mu, method="time"
+    ),
 }
 KINEMATIC = ("newton", "moreau", "matrix", "binary")
 

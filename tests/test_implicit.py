@@ -132,14 +132,16 @@ def test_history_is_that_of_the_other_method():
     assert h.force[-1, 0] == 0
 
 
-def test_auto_leaves_many_contacts_in_space_to_it():
-    """More than four contacts with friction in space; four, or none with friction, stay exact."""
-    for name, method in (("legs", "implicit"), ("flat", "time")):
+def test_auto_leaves_several_contacts_in_space_to_it():
+    """Exact: one contact, up to four where the tolerance asks for it, and all without friction."""
+    cases = [("corner", None, "time"), ("edge", None, "implicit"), ("flat", 1e-5, "implicit")]
+    cases += [("edge", 1e-8, "time"), ("flat", 1e-8, "time"), ("legs", 1e-8, "implicit")]
+    for name, rtol, method in cases:
         scene, v = pressed(name)
-        assert method_for("auto", contact_of(scene, v)) == method
-    assert method_for("impulse", contact_of(scene, v)) == "impulse"
+        assert method_for("auto", contact_of(scene, v), rtol) == method, (name, rtol)
+    assert method_for("impulse", contact_of(scene, v), None) == "impulse"
     balls = ji.chain([1.0] * 9)
-    assert method_for("auto", contact_of(balls, jnp.zeros(9))) == "time"
+    assert method_for("auto", contact_of(balls, jnp.zeros(9)), None) == "time"
 
 
 def test_random_boxes_end():

@@ -100,11 +100,15 @@ class Compliant(Law):
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
-        return self._tolerance(contact) if method_for(self.method, contact) == "implicit" else 0.0
+        return (
+            self._tolerance(contact)
+            if method_for(self.method, contact, self.rtol) == "implicit"
+            else 0.0
+        )
 
     def _tolerance(self, contact: Contact) -> float:
         """`rtol`, or the default of the method at these contacts."""
-        method = method_for(self.method, contact)
+        method = method_for(self.method, contact, self.rtol)
         return self.rtol or default_rtol(method, contact.gap_velocity.dtype)
 
     def dynamics(self, contact: Contact) -> Dynamics:
@@ -133,7 +137,7 @@ class Compliant(Law):
         problem = problem._replace(viscous=viscous)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        method = method_for(self.method, contact)
+        method = method_for(self.method, contact, self.rtol)
         return Dynamics(problem, units, exponent, contact.chain, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:

@@ -128,8 +128,8 @@ class LZB(Law):
         method: 'time', event-aligned, order 8; 'implicit', steps that know no events, order 2 to
             3, compiled in a second whatever the contacts, for many contacts with friction;
             'impulse', the published scheme in the impulse of a primary contact, order 1; 'auto'
-            (default): 'time', but 'implicit' for more than 4 contacts with friction in space,
-            where events may be endless.
+            (default): 'time', but 'implicit' for several contacts with friction in space, where
+            events may be endless; 'time' for up to 4 of them if `rtol` is below 1e-6.
         check_conditioning: solve a second time with rtol / 100 and with perturbed last digits, and
             set `ill_conditioned` if gap velocities or slips differ by more than 10 rtol of the
             fastest approach (not with 'impulse'; cost and float32: `docs/speed_accuracy.md`).
@@ -185,11 +185,15 @@ class LZB(Law):
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
-        return self._tolerance(contact) if method_for(self.method, contact) == "implicit" else 0.0
+        return (
+            self._tolerance(contact)
+            if method_for(self.method, contact, self.rtol) == "implicit"
+            else 0.0
+        )
 
     def _tolerance(self, contact: Contact) -> float:
         """`rtol`, or the default of the method at these contacts."""
-        method = method_for(self.method, contact)
+        method = method_for(self.method, contact, self.rtol)
         return self.rtol or default_rtol(method, contact.gap_velocity.dtype)
 
     @property
@@ -226,7 +230,7 @@ class LZB(Law):
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        method = method_for(self.method, contact)
+        method = method_for(self.method, contact, self.rtol)
         return Dynamics(problem, units, self.exponent, contact.chain, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:

@@ -59,7 +59,8 @@ from jimpact.status import CODE
 def _solve_aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     """What `impact` does, with its duration."""
     scaled = problem(law, scene, velocity, setting, friction=True)
-    program, leaves = scaled.dynamics.program(), scaled.dynamics.columns()[0]
+    dynamics = scaled.dynamics._replace(method="time")
+    program, leaves = dynamics.program(), dynamics.columns()[0]
     p, side, _, code, passes = evaluate(program, leaves)
     _, _, t, _, _ = evaluate(dataclasses.replace(program, whole=True), leaves)
     return in_si(scaled, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0], side[:, 0])
