@@ -17,7 +17,7 @@ from friction_reference import regularized, routh, small_steps
 from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
-from jimpact.events.stepper import SLOTS
+from jimpact.events.queues import SLOTS
 
 close = np.testing.assert_allclose
 

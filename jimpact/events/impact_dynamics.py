@@ -293,8 +293,8 @@ class ImplicitProgram(ImpulseProgram):
 
     @property
     def queues(self) -> bool:
-        """No: it is called with chunks of a batch."""
-        return False
+        """Where it keeps no plan of its steps."""
+        return not self.finely
 
     @property
     def takes_duals(self) -> bool:

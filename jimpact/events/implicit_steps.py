@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.contact_flow import Exponent, Viscous, as_pytree, per_row, power
+from jimpact.events.queues import run_queue
 from jimpact.solvers.dense import times
 from jimpact.solvers.step_impulses import StepProblem, solve, solve_smooth
 
@@ -308,9 +309,13 @@ def to_the_end(flow: ImplicitSteps, start: State, most: int, keeps: bool) -> Run
         plan = Plan(jnp.zeros((BLOCKS * BLOCK, *lanes.shape), flow.tolerance.dtype), lanes)
     run = Run(start, FIRST * jnp.ones_like(flow.tolerance), lanes, plan)
 
-    def attempt(run: Run) -> Run:
-        """One step tried in all impacts of the batch that go on."""
-        live = ~run.over(flow, most)
+    def goes_on(flow: ImplicitSteps, run: Run) -> jax.Array:
+        """Which impacts (1, B) are not over."""
+        return ~run.over(flow, most)
+
+    def attempt(flow: ImplicitSteps, run: Run) -> Run:
+        """One step tried in all impacts that go on."""
+        live = goes_on(flow, run)
         new, error = flow.step(flow.coasted(run.state), run.length)
         accepted = live & (error <= 1)
         state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, run.state)
@@ -322,10 +327,15 @@ def to_the_end(flow: ImplicitSteps, start: State, most: int, keeps: bool) -> Run
         if plan is not None:
             at = plan.used[0], 0, np.arange(lanes.shape[1])
             kept = jnp.where(accepted[0], run.length[0], plan.lengths[at])
-            plan = Plan(plan.lengths.at[at].set(kept), plan.used + accepted.astype(jnp.int32))
+            used = plan.used + accepted.astype(jnp.int32)
+            plan = Plan(plan.lengths.at[at].set(kept), used)
         return Run(state, length, run.passes + live.astype(jnp.int32), plan)
 
-    return jax.lax.while_loop(lambda run: ~jnp.all(run.over(flow, most)), attempt, run)
+    if keeps:  # a plan is long, and is not moved between slots
+        return jax.lax.while_loop(
+            lambda run: jnp.any(goes_on(flow, run)), lambda run: attempt(flow, run), run
+        )
+    return run_queue(goes_on, attempt, flow, run)
 
 
 def repeat(flow: ImplicitSteps, start: State, plan: Plan) -> State:

@@ -1,0 +1,97 @@
+"""Impacts of a batch in a queue: one that is over makes room for the next one."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+# Impacts with friction that a CPU computes side by side, whatever the size of the batch; and slots
+# that are free before they are filled with waiting impacts. Ten times more slots: more of them idle
+# while the last impacts end; ten times fewer: each operation has too few numbers to work on. Ten
+# times more free slots: all wait for the slowest impact again.
+SLOTS, FREE = 128, 8
+
+Carry = TypeVar("Carry")
+
+
+class _Slots(NamedTuple):
+    """Impacts that are being computed, one in each slot, and those that are over."""
+
+    impact: jax.Array  # (SLOTS,) the impact that is in each slot
+    following: jax.Array  # () the first impact that still waits
+    flow: Any
+    carry: Any
+    ends: Any  # of all impacts, as far as they have left their slots
+
+
+def run_queue(
+    goes_on: Callable[[Any, Any], jax.Array],
+    advance: Callable[[Any, Any], Any],
+    flow: Any,
+    carry: Carry,
+) -> Carry:
+    """All impacts to their ends, at most SLOTS of them side by side on a CPU.
+
+    `goes_on(flow, carry)` says which (1, B) are not over, `advance(flow, carry)` makes one pass;
+    the batch B is the last axis of all arrays.
+    """
+
+    def side_by_side(flow: Any, carry: Any) -> Any:
+        """All impacts at once: they wait for the slowest one."""
+        return jax.lax.while_loop(
+            lambda c: jnp.any(goes_on(flow, c)), lambda c: advance(flow, c), carry
+        )
+
+    def in_slots(flow: Any, carry: Any) -> Any:
+        """The impacts of the queue, in slots."""
+        return _in_slots(goes_on, advance, flow, carry)
+
+    if jax.tree.leaves(carry)[0].shape[-1] <= SLOTS:
+        return side_by_side(flow, carry)
+    return jax.lax.platform_dependent(flow, carry, cpu=in_slots, default=side_by_side)
+
+
+def _in_slots(
+    goes_on: Callable[[Any, Any], jax.Array],
+    advance: Callable[[Any, Any], Any],
+    flow: Any,
+    carry: Any,
+) -> Any:
+    """`run_queue` of more impacts than there are slots."""
+    count = jax.tree.leaves(carry)[0].shape[-1]
+
+    def picked(tree: Any, impact: jax.Array) -> Any:
+        """The arrays (.., B) of these impacts."""
+        return jax.tree.map(lambda x: jnp.take(x, impact, axis=-1, mode="clip"), tree)
+
+    def stored(s: _Slots) -> Any:
+        """All ends, those of the slots included."""
+        return jax.tree.map(lambda x, new: x.at[..., s.impact].set(new), s.ends, s.carry)
+
+    def refilled(s: _Slots) -> _Slots:
+        """The next impacts in place of those that are over."""
+        free = ~goes_on(s.flow, s.carry)[0]
+        next_one = s.following + jnp.cumsum(free, dtype=jnp.int32) - 1
+        enters = free & (next_one < count)
+        impact = jnp.where(enters, next_one, s.impact)
+        new_flow, new = picked((flow, carry), impact)
+        new = jax.tree.map(lambda a, b: jnp.where(enters, a, b), new, s.carry)
+        following = s.following + jnp.sum(enters, dtype=jnp.int32)
+        return _Slots(impact, following, new_flow, new, stored(s))
+
+    def one_pass(s: _Slots) -> _Slots:
+        """One pass in each slot; enough of those that are free are filled first."""
+        free = jnp.sum(~goes_on(s.flow, s.carry), dtype=jnp.int32)
+        fills = (free >= FREE) & (s.following < count)
+        s = jax.lax.cond(fills, refilled, lambda s: s, s)
+        return s._replace(carry=advance(s.flow, s.carry))
+
+    def open_work(s: _Slots) -> jax.Array:
+        """Whether () an impact goes on or waits."""
+        return jnp.any(goes_on(s.flow, s.carry)) | (s.following < count)
+
+    first = jnp.arange(SLOTS, dtype=jnp.int32)
+    own, here = picked((flow, carry), first)
+    slots = _Slots(first, jnp.asarray(SLOTS, jnp.int32), own, here, carry)
+    return stored(jax.lax.while_loop(open_work, one_pass, slots))
