@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
@@ -47,6 +48,50 @@ def known_options() -> dict[str, Any]:
 def _probe() -> Callable[..., Any]:
     """A program that does nothing, with compiler options: JAX refuses them inside another one."""
     return jax.jit(lambda *x: x, compiler_options=known_options())
+
+
+def varying_like(tree: Any, *like: Any) -> Any:
+    """The arrays of `tree`, varying over all mesh axes that an array of `like` varies over.
+
+    Inside `shard_map` a loop must begin with what it carries from pass to pass: a state that starts
+    from constants varies over no axis yet. Elsewhere nothing changes.
+    """
+    axes = frozenset().union(*map(_axes_of, jax.tree.leaves(like)))
+    if not axes:
+        return tree
+
+    def varying(x: Any) -> Any:
+        """x over all of the axes."""
+        return jax.lax.pcast(x, tuple(axes - _axes_of(x)), to="varying")
+
+    return jax.tree.map(lambda x: varying(x) if axes - _axes_of(x) else x, tree)
+
+
+def _axes_of(x: Any) -> frozenset[Any]:
+    """The mesh axes that an array varies over inside `shard_map`."""
+    return axes_of_kind(jax.typeof(x)) if eqx.is_array(x) else frozenset()
+
+
+def axes_of_kind(kind: Any) -> frozenset[Any]:
+    """The mesh axes that arrays of this abstract kind vary over.
+
+    Some versions of JAX have the axes themselves, under another name.
+    """
+    manual = getattr(kind, "manual_axis_type", None)
+    return getattr(kind, "vma", frozenset()) if manual is None else manual.varying
+
+
+def kinds_varying_like(kinds: list[Any], like: Any) -> list[Any]:
+    """The abstract kinds of arrays, varying over the mesh axes of another one."""
+    axes = tuple(axes_of_kind(like))
+    if not axes:
+        return kinds
+
+    def arrays() -> list[jax.Array]:
+        """Arrays of these kinds; nothing is computed."""
+        return [jax.lax.pcast(jnp.zeros(x.shape, x.dtype), axes, to="varying") for x in kinds]
+
+    return list(jax.make_jaxpr(arrays)().out_avals)
 
 
 def is_top_level_call(*args: Any) -> bool:

@@ -123,6 +123,7 @@ MUTATIONS = [
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
     Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
     Mutation("any number of contacts with friction is tried", r"scene\.contacts > MOST_WITH_FRICTION", "scene.contacts > 10 * MOST_WITH_FRICTION", ("test_errors.py::test_bad_input",), "lzb.py"),
+    Mutation("loops begin without the axes of a mesh", r"    if not axes:\n        return tree\n", "    return tree\n", ("test_executors.py::test_shard_map_traces_each_law",), "compiling.py"),
     Mutation("dependent tangents are not reported", r"\(least < _DEPENDENT\) & \(n >= unit\.shape\[1\]\)", "least < 0", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",), "scene.py"),
     Mutation("oblique tangents are not reported", r"oblique \|= known & ", "oblique |= known & False & ", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",), "scene.py"),
     Mutation("energies that no number holds pass", r"beyond = happens & ~_has_scale\(outcome\.size, v\)", "beyond = happens & False", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",), "impacts.py"),

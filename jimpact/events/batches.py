@@ -17,6 +17,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
+from jimpact.compiling import kinds_varying_like, varying_like
 from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, value_of
 
 # Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
@@ -38,7 +39,8 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
     It is called with the whole batch if its attribute `queues` is True, else with chunks of it.
     """
-    return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
+    varying = varying_like([jnp.asarray(x) for x in arrays], arrays)
+    return tuple(columns_p.bind(*varying, function=function))
 
 
 def _partial(
@@ -159,11 +161,11 @@ class Cotangent:
             return self._of_both(self.function, arrays)
         count = len(self.marked)
         of_marked, values = _partial(reversible(self.function), self.marked, arrays[:count])
-        _, back = jax.vjp(of_marked, *values)
+        outs, back = jax.vjp(of_marked, *values)
 
         def pull(*cotangents: jax.Array) -> Arrays:
             """Cotangents for one cotangent of the results."""
-            return back(cotangents)
+            return back(varying_like(cotangents, outs))
 
         return (jax.vmap(pull) if self.many else pull)(*arrays[count:])
 
@@ -257,6 +259,11 @@ def _run(*arrays: jax.Array, function: Callable[..., Arrays]) -> Arrays:
 
 
 @columns_p.def_abstract_eval
+def _kinds(*kinds: Any, function: Callable[..., Arrays]) -> list[Any]:
+    """Abstract results: of these shapes, and as varying inside `shard_map` as the arguments."""
+    return kinds_varying_like(_shapes(*kinds, function=function), kinds[0])
+
+
 def _shapes(*shapes: Any, function: Callable[..., Arrays]) -> list[Any]:
     """Shapes of the results, without tracing `function` where they are known: it takes long."""
     known = [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
@@ -323,7 +330,7 @@ def _jvp(
 
     def zero(x: Any) -> Any:
         """The tangent of a whole number."""
-        return ad.Zero(jax.core.ShapedArray(x.shape, jax.dtypes.float0))
+        return ad.Zero(jax.typeof(x).to_tangent_aval())
 
     return list(outs), [next(rest) if is_smooth(x) else zero(x) for x in outs]
 

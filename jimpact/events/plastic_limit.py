@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.compiling import varying_like
 from jimpact.events import stepper
 from jimpact.events.contact_flow import ContactFlow
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
@@ -102,6 +103,7 @@ def to_the_end(
     rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
     rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
     start = ImpactEnd(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
+    start = varying_like(start, flow, gamma, y)
 
     def on(end: ImpactEnd) -> ImpactEnd:
         """On to the next pause or to the end."""
@@ -127,7 +129,8 @@ def to_the_end(
         )
         settled = jnp.where(rest.ended, OVER, GOES_ON)
         progress = carry.progress.at[2:3].set(jnp.where(paused, settled, carry.progress[2:3]))
-        return ImpactEnd(carry._replace(progress=progress), pen, rest, jnp.asarray(True))
+        begun = varying_like(jnp.asarray(True), end.begun)
+        return ImpactEnd(carry._replace(progress=progress), pen, rest, begun)
 
     return jax.lax.while_loop(
         lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start
@@ -167,6 +170,7 @@ def contacts_at_rest(
         return rest & jnp.where(carries, dp > 0, after < 0), dp
 
     start = (often | (rest & (now < 0)), jnp.zeros_like(now))
+    start = varying_like(start, flow, gamma, carry)
     carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
 
     # is it a multiple of the state at the last check?
@@ -194,7 +198,8 @@ def remainder(
         """Impulses where a contact carries."""
         return impulse_of_rest(flow, carries, gamma + flow.change(state))
 
-    return jax.lax.cond(jnp.any(carries), some, lambda: jnp.zeros_like(gamma))
+    none = varying_like(jnp.zeros_like(gamma), flow, gamma, state)
+    return jax.lax.cond(jnp.any(carries), some, lambda: none)
 
 
 def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> jax.Array:
@@ -213,4 +218,5 @@ def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> 
         return (z, residual, residual + ratio * direction, new), None
 
     start = (jnp.zeros_like(right), right, right, total(right * right))
+    start = varying_like(start, flow, right)
     return jax.lax.scan(step, start, None, length=2 * right.shape[0])[0][0]

@@ -38,6 +38,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.compiling import varying_like
 from jimpact.events.tableaux import DOP853
 from jimpact.events.tangents import Dual, dual_like, is_dual, pushforward, value_of
 
@@ -304,7 +305,8 @@ def _stages(flow: Any, s: Step, y: Any, ends: bool) -> tuple[Any, ...]:
     carry = [dual_like((flow, y), k) for k in none]
     margins = [jnp.zeros_like(s.target, dtype)] * (3 if ends else 0)
     rows = (jnp.arange(count, dtype=jnp.uint32), table, jnp.asarray(_NODES[:count], dtype))
-    (slopes, added, *margins), _ = jax.lax.scan(stage, (*carry, *margins), rows)
+    begin = varying_like((*carry, *margins), flow, s, y)
+    (slopes, added, *margins), _ = jax.lax.scan(stage, begin, rows)
     change, errors = _weighted([slopes, added], weights, frame.length)
     return change, errors[:, :n], c0, margins
 
@@ -620,7 +622,9 @@ def run(flow: Any, carry: StepperState, most: int) -> StepperState:
 def _side_by_side(flow: Any, carry: StepperState, most: int) -> StepperState:
     """`run` of all impacts at once: they wait for the slowest one."""
     return jax.lax.while_loop(
-        lambda c: unwatched(c, most), lambda c: advance(flow, c, most)[0], carry
+        lambda c: unwatched(c, most),
+        lambda c: advance(flow, c, most)[0],
+        varying_like(carry, flow, carry),
     )
 
 
@@ -729,7 +733,8 @@ def record(
         count = count + jnp.any(accept).astype(count.dtype)
         return after, Recorder(plan, count)
 
-    return jax.lax.while_loop(lambda state: unwatched(state[0], most), body, (carry, pen))
+    begin = varying_like((carry, pen), flow, carry)
+    return jax.lax.while_loop(lambda state: unwatched(state[0], most), body, begin)
 
 
 def with_plan(x: jax.Array, plan: AcceptedSteps) -> jax.Array:
@@ -813,4 +818,4 @@ def _walk(
         return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, skip, y)
 
     rows = tuple(x.reshape(BLOCKS, BLOCK, *x.shape[1:]) for x in (plan.marks, plan.clock))
-    return jax.lax.scan(jax.checkpoint(block), y, rows)
+    return jax.lax.scan(jax.checkpoint(block), varying_like(y, flow, y, plan), rows)
