@@ -211,6 +211,27 @@ def test_regularized_friction_is_rouths(rod):
     assert uncertainty < 1e-4
 
 
+HELD = np.load(Path(__file__).parent / "data" / "friction_space.npz")
+
+
+def held(contacts):
+    """Impacts in space, and what an independent integration gives (see space_reference.py)."""
+    return {name[:-2]: HELD[name] for name in HELD if name.endswith(f"_{contacts}")}
+
+
+@pytest.mark.parametrize("contacts", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_lzb_in_space_is_the_independent_one(contacts):
+    """Boxes on a corner or an edge, and the measured cube: v+ of another integration."""
+    x = held(contacts)
+    x = {name: values[x["friction"] < 1] for name, values in x.items()}  # beyond, one vibrates long
+    scenes = (x[name] for name in ("mass", "normals", "tangents", "velocity"))
+    k = np.pad(x["stiffness"], ((0, 0), (0, 2 - contacts)), constant_values=1.0)
+    out, _ = run("lzb", *scenes, x["restitution"], x["friction"], k=k)
+    assert not out.status.any()
+    error = np.abs(out.velocity - x["after"]).max(axis=1)
+    assert (error <= 1e-7 + 3 * x["uncertainty"]).all(), error
+
+
 def test_particle_of_example_6_2():
     """e = .5, mu = .3; the bound of (6.62) is sufficient, yet a particle always dissipates."""
     ratio = np.array([0.01, 0.4, 1.0, 1.6, 1.65, 3.0, 40.0])
