@@ -42,7 +42,8 @@ KINEMATIC = ("newton", "moreau", "matrix", "binary")
 def few_slots():
     """Fewer slots than impacts, so that the batches of these tests are queues."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stepper, "SLOTS", 16)
+        patch.setattr(stepper, "SLOTS", 8)
+        patch.setattr(stepper, "FREE", 3)
         yield
 
 

@@ -290,8 +290,7 @@ class ImpulseProgram:
 class ImplicitProgram(ImpulseProgram):
     """As `ImpulseProgram`, by steps without events; both modes go through it as it is."""
 
-    @property
-    def queues(self) -> bool:
+    def queues(self, *leaves: Any) -> bool:
         """No: it is called with chunks of a batch."""
         return False
 
