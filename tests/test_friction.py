@@ -17,7 +17,7 @@ from friction_reference import regularized, routh, small_steps
 from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
-from jimpact.events.stepper import SLOTS
+from jimpact.events import stepper
 
 close = np.testing.assert_allclose
 
@@ -36,6 +36,15 @@ LAWS = {
     "compliant": lambda e, mu, e_t, k: ji.Compliant(ji.Bistiffness(k, 1.5, e), friction=mu),
 }
 KINEMATIC = ("newton", "moreau", "matrix", "binary")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_slots():
+    """Fewer slots than impacts, so that the batches of these tests are queues."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stepper, "SLOTS", 8)
+        patch.setattr(stepper, "FREE", 3)
+        yield
 
 
 @functools.cache
@@ -131,20 +140,6 @@ def test_disk_in_closed_form(name):
     stuck = np.abs(side) < mu * p  # v_t+ = -e_t v_t-
     close((out.velocity @ DISK[2][:, 0])[stuck], (-e_t * slip)[stuck], atol=off)
     assert 0 < stuck.sum() < len(stuck)
-
-
-def test_a_large_batch_is_a_queue(monkeypatch):
-    """More impacts than slots, each with a restitution of its own: all come out in their places."""
-    count = 2 * SLOTS + 44
-    monkeypatch.setitem(globals(), "LANES", count)
-    e, slip = np.linspace(0.0, 1.0, count), np.where(np.arange(count) % 2, -2.0, 0.3)
-    v = np.stack([slip, np.full(count, -1.3), np.zeros(count)], axis=1)
-    out, _ = run("lzb", *(np.tile(x, (count, 1, 1)[: 1 + x.ndim]) for x in DISK), v, e, 0.1)
-    p = MASS * (1 + e) * 1.3
-    side = np.clip(-slip / (1 / MASS + RADIUS**2 / INERTIA), -0.1 * p, 0.1 * p)
-    assert not out.status.any()
-    close(out.impulse[:, 0], p, rtol=1e-8)
-    close(out.tangential_impulse[:, 0], side, atol=1e-8)
 
 
 @pytest.mark.parametrize("v", [(0.1, -1.0, 0.3), (0.5, -1.0, -1.0), (-0.4, -1.0, 0.0)])
