@@ -27,6 +27,7 @@ from jimpact.events.contact_flow import (
 )
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.plastic_limit import remainder, to_the_end
+from jimpact.events.reverse_mode import reversible_run
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import pushforward, value_of
 from jimpact.solvers.dense import unit
@@ -201,7 +202,7 @@ class ImpulseProgram:
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
     smooth: bool = False  # only the results that have derivatives; duals are taken
-    repeats: bool = False  # walk the steps once more, for both modes
+    reverses: bool = False  # in a form that has a reverse mode
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         """The flow of a problem, its first modes and state."""
@@ -219,27 +220,26 @@ class ImpulseProgram:
     @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
-        return self.smooth and not self.repeats
+        return self.smooth and not self.reverses
 
     def reversible(self) -> "ImpulseProgram":
-        """The same in a form that both modes go through."""
-        return dataclasses.replace(self, repeats=self.smooth)
+        """The same in a form that the reverse mode goes through, too."""
+        return dataclasses.replace(self, reverses=self.smooth)
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
-        fixed = jax.lax.stop_gradient(problem) if self.repeats else problem
-        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), fixed)
+        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
         gamma = value_of(problem.gamma)
-        end = to_the_end(
-            flow, gamma, modes, y, self.most, keeps=self.finely and not self.takes_duals
-        )
-        state, dp = end.carry.y, end.impulse
-        if self.repeats:
-            flow, _, y = self.flow(problem, tighten)
-            state = stepper.repeat(flow, modes, y, end.plan)
+        if self.reverses:
+            (state, _), (end, _) = reversible_run(flow, gamma, modes, y, self.most, 0)
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
+        else:
+            keeps = self.finely and not self.takes_duals
+            end = to_the_end(flow, gamma, modes, y, self.most, keeps)
+            state = end.carry.y
+        dp = end.impulse
         if self.smooth:
             last = flow, problem.gamma, state
             dp = pushforward(lambda f, g, y: remainder(f, g, y, end.carries), *last)
@@ -253,7 +253,7 @@ class ImpulseProgram:
         p, *rest = pushforward(parts, state, dp)
         if self.smooth:
             return p, *rest
-        p = stepper.with_plan(p, end.plan) if self.finely else p
+        p = end.with_kept(p) if self.finely else p
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
 
 
