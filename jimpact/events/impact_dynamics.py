@@ -234,6 +234,7 @@ class ImpulseProgram:
         gamma = value_of(problem.gamma)
         if self.reverses:
             (state, _), (end, _) = reversible_run(flow, gamma, modes, y, self.most, 0)
+            end = jax.lax.stop_gradient(end)
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
         else:
             keeps = self.finely and not self.takes_duals

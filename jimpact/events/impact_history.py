@@ -35,6 +35,7 @@ class HistoryProgram:
         gamma, most = problem.gamma, self.outcome.most
         way = reversible_run if self.reverses else run
         (end, found), (ended, places) = way(flow, gamma, modes, y, most, self.samples)
+        ended, places = jax.lax.stop_gradient((ended, places))
         no_target = jnp.zeros(ended.carry.step.target.shape, bool)
 
         def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:

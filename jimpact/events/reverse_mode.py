@@ -39,10 +39,10 @@ def run(
     flow: Any, gamma: jax.Array, modes: jax.Array, y: jax.Array, most: int, samples: int
 ) -> tuple[tuple[jax.Array, Any], tuple[ImpactEnd, Any]]:
     """State (n, B) that `to_the_end` reaches, not yet finished, and `Samples`, with derivatives;
-    the end and the `Places` of samples, without. The last two are None if no samples are wanted."""
+    the end and the `Places` of samples, for values. `samples` 0: None of both."""
     end = to_the_end(flow, gamma, modes, y, most, keeps=True)
     found, places = _samples(flow, end, most, samples) if samples else (None, None)
-    return (end.reached, found), jax.lax.stop_gradient((end, places))
+    return (end.reached, found), (end, places)
 
 
 def _samples(flow: Any, end: ImpactEnd, most: int, samples: int) -> tuple[Samples, Places]:
@@ -54,25 +54,25 @@ def _samples(flow: Any, end: ImpactEnd, most: int, samples: int) -> tuple[Sample
         return jnp.broadcast_to(x, (samples, *x.shape))
 
     parts = jnp.linspace(0.0, 1.0, samples, dtype=y.dtype)[:, None, None]
-    t = jax.lax.stop_gradient(parts * y[-1:])
+    t = jax.lax.stop_gradient(parts * y[None, -1:])
     force = flow.contact_states(modes, y).force
     ends = jnp.full((samples, 1, y.shape[-1]), END, jnp.int32)
     last = Places(
         ends, rows(modes), rows(jnp.zeros_like(clock)), jnp.full(force.shape, END, jnp.int32)
     )
-    start = Samples(rows(y), force), last, t >= y[-1:]
+    start = Samples(rows(y), force), last, t >= y[None, -1:]
 
     def visit(so_far: Any, kept: KeptStep) -> Any:
         """With this step where a sample has none yet, and none behind it does."""
         (states, force), (number, modes, clock, strongest), known = so_far
         now = flow.contact_states(kept.step.modes, kept.y).force
         stronger = kept.accepted & (now > force)
-        fits = kept.accepted & ~known & (kept.y[-1:] <= t)
-        found = Samples(jnp.where(fits, kept.y, states), jnp.where(stronger, now, force))
+        fits = kept.accepted[None] & ~known & (kept.y[None, -1:] <= t)
+        found = Samples(jnp.where(fits, kept.y[None], states), jnp.where(stronger, now, force))
         places = Places(
             jnp.where(fits, kept.number, number),
-            jnp.where(fits, kept.step.modes, modes),
-            jnp.where(fits, kept.step.clock, clock),
+            jnp.where(fits, kept.step.modes[None], modes),
+            jnp.where(fits, kept.step.clock[None], clock),
             jnp.where(stronger, kept.number, strongest),
         )
         return found, places, known | fits
