@@ -222,6 +222,40 @@ def chart_three_balls(path):
     subprocess.run(["jimpact", "chart", "--full", "--out", str(path)], check=True)
 
 
+def chart_of_a_box(contacts: int, turned: list[float], title: str) -> Figure:
+    """Error against time and work for a box that falls on its `contacts` lowest corners."""
+    box = ji.Box([0.6, 0.4, 0.3])
+    scene = box.scene(box.touching(np.array(turned) / np.linalg.norm(turned)))
+    at = np.sort(np.argsort(scene.gaps)[:contacts])
+    tangents = scene.tangents.reshape(6, 8, 2)[:, at].reshape(6, -1)
+    closed = ji.Scene(scene.mass, scene.normals[:, at], tangents=tangents)
+    velocity, mu = [1.0, 0.3, -1.0, 0.5, -0.4, 0.2], 0.3
+    result = ji.work_precision(
+        closed,
+        velocity,
+        ji.LZB(0.3, friction=mu),
+        laws={"moreau": ji.Moreau(0.3, friction=mu)},
+        batch=64,
+        repeats=3,
+        gradients=False,
+        durations=False,
+    )
+    print(result)
+    return ji.plot.work_precision(result, title)
+
+
+@picture
+def chart_box_corner():
+    """Error against time and work: a box with friction that falls on a corner."""
+    return chart_of_a_box(1, [0.9, 0.3, 0.2, 0.1], "A box on a corner, e = 0.3, mu = 0.3")
+
+
+@picture
+def chart_box_edge():
+    """Error against time and work: a box with friction that falls on an edge."""
+    return chart_of_a_box(2, [0.95, 0.3, 0.0, 0.0], "A box on an edge, e = 0.3, mu = 0.3")
+
+
 @picture
 def stability(path):
     """Where methods of integration fail, one axis of the map at a time."""

@@ -8,11 +8,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_kind, check_values, in_common_dtype, is_traced
+from jimpact._checks import (
+    check_kind,
+    check_shape,
+    check_values,
+    in_common_dtype,
+    is_traced,
+)
 from jimpact.compiling import is_top_level_call, quick_jit
 from jimpact.contact import Contact, Groups, contacts_of_groups, coupled_groups
 from jimpact.law import Impulses, Law, check_law, is_separable, restrict_law, within_domains
-from jimpact.scene import Scene, as_velocity, momentum, pad_scene, velocity_change
+from jimpact.scene import (
+    Scene,
+    as_velocity,
+    is_allowed,
+    momentum,
+    pad_scene,
+    velocity_change,
+)
 from jimpact.solvers.tridiagonal import diagonal
 from jimpact.status import CODE, STATUS, raise_for, sign_tolerance
 
@@ -70,8 +83,12 @@ def impact(
         `initial_energy` (), `status` () int32, 0 = ok (`raise_on_failure`, `jimpact.STATUS`).
 
     Raises:
-        ValueError: shapes or ranges, on the host; inside jit the status reports them. NaN in a
-            velocity raises when concrete, and is `not_finite` when traced.
+        ValueError: shapes or ranges, on the host. Where they are traced, the status reports them:
+            `not_finite` (NaN in the velocity, a gap, `noise` or `approach`), or `out_of_range` (a
+            parameter outside its domain, a normal that is 0, a mass that is asymmetric or not
+            positive, a negative gap, `noise` or `approach`, a velocity that breaks a bilateral
+            constraint). An energy of the impact, `sum gamma-^2 / W_jj`, that the floating type
+            takes for 0 or infinite is `out_of_range` on the host, too: choose other units.
 
     >>> import jimpact as ji
     >>> out = ji.impact(ji.LZB(0.9, stiffness=1.0, exponent=1.5), ji.chain([1, 1, 1]), [1, 0, 0])
@@ -85,8 +102,10 @@ def impact(
     _check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
-    check_values("noise", noise, low=0.0)
-    check_values("approach", approach, low=0.0)
+    for name, speed in (("noise", noise), ("approach", approach)):
+        check_values(name, speed, low=0.0)
+        if speed is not None:
+            check_shape(name, speed, (), "one speed")
     offsets = _Offsets(
         None if noise is None else jnp.asarray(noise, v.dtype),
         None if approach is None else jnp.asarray(approach, v.dtype),
@@ -97,15 +116,7 @@ def impact(
     pads = few and groups is None and separable and law.pads_scenes
     if pads and not is_traced((law, scene, v, offsets)) and is_top_level_call():
         return _impact_of_padded_scene(law, scene, v, offsets)
-    out = _impact(law, scene, v, groups, offsets)
-    # where its parameters are numbers they were checked when the law was made
-    return _flag_out_of_range(law, out) if is_traced(law) else out
-
-
-def _flag_out_of_range(law: Law, out: Impact) -> Impact:
-    """The outcome with the status `out_of_range` where a parameter is outside its domain."""
-    flagged = jnp.maximum(out.status, CODE["out_of_range"])
-    return dataclasses.replace(out, status=jnp.where(within_domains(law), out.status, flagged))
+    return _impact(law, scene, v, groups, offsets, _Traced.of(law, scene, v, offsets))
 
 
 class _Offsets(NamedTuple):
@@ -120,13 +131,45 @@ class _Offsets(NamedTuple):
         return contact if self.approach is None else contact.approaching(self.approach)
 
 
+class _Traced(NamedTuple):
+    """Which arguments the host could not check, because they are traced."""
+
+    law: bool = False
+    scene: bool = False
+    constrained: bool = False  # whether the velocity keeps the bilateral constraints
+    offsets: bool = False
+
+    @classmethod
+    def of(cls, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> "_Traced":
+        """Those of an impact."""
+        constrained = scene.constraints is not None and is_traced((scene.constraints, v))
+        return cls(is_traced(law), is_traced(scene), constrained, is_traced(offsets))
+
+    def code(self, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> jax.Array:
+        """`not_finite` or `out_of_range` where an argument is not allowed, else `ok`."""
+        inputs = [x for x, traced in zip((law, scene, None, offsets), self) if traced]
+        numbers = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
+        unknown = [jnp.any(jnp.isnan(x)) for x in numbers]
+        allowed = [jnp.asarray(True)]
+        if self.law:
+            allowed.append(within_domains(law))
+        if self.scene:
+            allowed.append(is_allowed(scene))
+        if self.constrained:
+            allowed.append(jnp.all(_keeps_constraints(scene.constraints, v)))
+        if self.offsets:
+            allowed += [(x >= 0) & (x < jnp.inf) for x in offsets if x is not None]
+        code = jnp.where(jnp.all(jnp.asarray(allowed)), CODE["ok"], CODE["out_of_range"])
+        return jnp.where(jnp.any(jnp.asarray(unknown, bool)), CODE["not_finite"], code)
+
+
 def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> Impact:
     """The impact by the program for SHARED contacts: those that are added are open."""
     padded = pad_scene(scene, SHARED)
     velocity: Any = np.zeros(padded.scene.size, v.dtype)
     velocity[padded.coordinates] = v
     on_host = restrict_law(jax.tree.map(np.asarray, law), padded.copied)
-    out = _impact(on_host, padded.scene, velocity, None, offsets)
+    out = _impact(on_host, padded.scene, velocity, None, offsets, _Traced())
     return dataclasses.replace(
         out,
         velocity=jnp.asarray(np.asarray(out.velocity)[padded.coordinates]),
@@ -139,19 +182,29 @@ def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
     if scene.constraints is None or is_traced((scene.constraints, velocity)):
         return
     h, v = np.asarray(scene.constraints), np.asarray(velocity)
-    rate, size = np.abs(h.T @ v), np.abs(h).T @ np.abs(v)
-    bad = rate > sign_tolerance(v.dtype) * size
-    if bad.any():
-        j = int(np.argmax(bad))
+    keeps = _keeps_constraints(h, v)
+    if not keeps.all():
+        j = int(np.argmin(keeps))
         raise ValueError(
             "Argument `velocity` must satisfy the bilateral constraints, grad h^T v = 0, but "
             f"constraint {j + 1} has the rate {(h.T @ v)[j]:g}."
         )
 
 
+def _keeps_constraints(constraints: Any, velocity: Any) -> Any:
+    """Whether (b,) a velocity satisfies each bilateral constraint within its tolerance."""
+    size = abs(constraints).T @ abs(velocity)
+    return abs(constraints.T @ velocity) <= sign_tolerance(velocity.dtype) * size
+
+
 @quick_jit
 def _impact(
-    law: Law, scene: Scene, v: jax.Array, groups: Groups | None, offsets: _Offsets
+    law: Law,
+    scene: Scene,
+    v: jax.Array,
+    groups: Groups | None,
+    offsets: _Offsets,
+    traced: _Traced,
 ) -> Impact:
     """The outcome from the law's impulses: velocities, energy and status."""
     if groups is None:
@@ -171,8 +224,24 @@ def _impact(
     code = jnp.where(change > total + tolerance, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
-    code = jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32)
+    code = jnp.where(finite, code, CODE["not_finite"])
+    beyond = happens & ~_has_scale(outcome.size, v)
+    code = jnp.where(beyond, CODE["out_of_range"], code)
+    if any(traced):
+        refused = traced.code(law, scene, v, offsets)
+        code = jnp.where(refused > CODE["ok"], refused, code)
+    code = code.astype(jnp.int32)
     return Impact(v_plus, p, tangential, change, total, code)
+
+
+def _has_scale(size: jax.Array, v: jax.Array) -> jax.Array:
+    """Whether () the energy size^2 of an impact is neither 0 nor infinite to the precision.
+
+    True as well where the velocity (n,) is not finite, and the energy can have no value.
+    """
+    tiny = float(jnp.finfo(size.dtype).tiny)
+    inside = (size**2 >= tiny) & (size**2 < jnp.inf)
+    return inside | ~jnp.all(jnp.isfinite(v))
 
 
 class _Resolved(NamedTuple):

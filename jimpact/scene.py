@@ -451,8 +451,12 @@ def _check_scene(scene: Scene) -> None:
         )
     m = normals.shape[1]
     check_values("normals", normals)
-    if not is_traced(normals) and not np.abs(np.asarray(normals)).sum(axis=0).all():
-        raise ValueError("Argument `normals` must have no zero column: such a contact has no body.")
+    if not is_traced(normals) and not _has_body(np.asarray(normals)).all():
+        contact = int(np.argmin(_has_body(np.asarray(normals)))) + 1
+        raise ValueError(
+            "Argument `normals` must have no zero column: such a contact has no body, but that of "
+            f"contact {contact} is zero."
+        )
     check_mass(mass)
     if scene.gaps is not None:
         check_shape("gaps", scene.gaps, (m,), "one gap per contact")
@@ -472,6 +476,29 @@ def _check_scene(scene: Scene) -> None:
             )
         check_values("constraints", scene.constraints)
         _check_independent(scene.constraints)
+
+
+def _has_body(normals: Any) -> Any:
+    """Contacts (m,) whose normal is not zero."""
+    return (normals != 0).any(axis=0)
+
+
+def _is_symmetric(mass: Any) -> Any:
+    """Whether () M (n, n) is symmetric but for rounding."""
+    return abs(mass - mass.T).max() <= _SYMMETRY_TOLERANCE * abs(mass).max()
+
+
+def is_allowed(scene: Scene) -> jax.Array:
+    """Whether () the values of a traced scene are those that `Scene` allows on the host.
+
+    NaN is not looked for; a dense M that is not positive definite gives energies without a value.
+    """
+    allowed = [jnp.all(scene.mass > 0) if scene.mass.ndim == 1 else _is_symmetric(scene.mass)]
+    if scene.walls is None:
+        allowed.append(jnp.all(_has_body(scene.normals)))
+    if scene.gaps is not None:
+        allowed.append(jnp.all(scene.gaps >= 0))
+    return jnp.all(jnp.asarray(allowed))
 
 
 def _check_independent(constraints: jax.Array) -> None:
@@ -495,7 +522,7 @@ def check_mass(mass: jax.Array) -> None:
     if is_traced(mass):
         return
     host = np.asarray(mass, dtype=float)
-    if np.abs(host - host.T).max() > _SYMMETRY_TOLERANCE * np.abs(host).max():
+    if not _is_symmetric(host):
         raise ValueError("Argument `mass` must be symmetric, but M - M^T is not zero.")
     smallest = np.linalg.eigvalsh(host)[0]
     if smallest <= np.finfo(mass.dtype).eps * len(host) * np.abs(host).max():

@@ -87,6 +87,7 @@ MUTATIONS = [
     Mutation("no recompression", r"after = jnp\.where\(by_g & \(phase == EXPANSION\), COMPRESSION, after\)", "pass", FLOW, "contact_flow.py"),
     Mutation("no re-closing", r"closed = \(by_x \| by_g\) & \(phase == OPEN\)", "closed = by_x & (phase == OPEN)", FLOW),
     Mutation("gaps forgotten", r"apart = 0\.0 if problem\.gap is None else -problem\.gap", "apart = 0.0 if problem.gap is None else -0.5 * problem.gap", (*FLOW, "test_compliant.py::test_gapped_chains_against_scipy")),
+    Mutation("slopes in the exponent go unwatched", r"watches=tighten < 1 and problem\.exponent is not None", "watches=False", ("test_values.py::test_slopes_in_the_exponent_of_linear_springs",)),
     # --- the stepper
     Mutation(  # the last event first, and none watched on the way; either alone repairs itself
         "events in the wrong order",
@@ -95,6 +96,8 @@ MUTATIONS = [
         FLOW,
         "stepper.py",
     ),
+    Mutation("impacts of a queue end in the first slots", r"x\.at\[\.\.\., s\.impact\]", "x.at[..., jnp.arange(SLOTS)]", ("test_friction.py::test_a_large_batch_is_a_queue",), "stepper.py"),
+    Mutation("a new impact in a slot keeps the flow of the last", r"return _Slots\(impact, following, new_flow,", "return _Slots(impact, following, s.flow,", ("test_friction.py::test_a_large_batch_is_a_queue",), "stepper.py"),
     Mutation("dips switched off", r"dipped = turns & .*", "dipped = turns & False", ("test_motion.py::test_no_event_is_missed_between_two_looks",), "stepper.py", "slow"),
     Mutation("crossings are missed", r"crossed, turns = free & \(c1 < -zero\)", "crossed, turns = free & (c1 < -1e3 * zero)", FLOW),
     Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", ("test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]",), "stepper.py", "slow"),
@@ -118,6 +121,12 @@ MUTATIONS = [
     Mutation("pulling is not reported", r"pull = jnp\.any\(p \* root < -floor\)", "pull = jnp.any(p * root < -1e9 * floor)", (examples("impacts"),)),
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
     Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
+    Mutation("energies that no number holds pass", r"beyond = happens & ~_has_scale\(outcome\.size, v\)", "beyond = happens & False", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",), "impacts.py"),
+    Mutation("gaps that are not known count as open", r"unknown = \[jnp\.any\(jnp\.isnan\(x\)\) for x in numbers\]", "unknown = []", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "impacts.py"),
+    Mutation("an asymmetric mass passes inside jit", r"else _is_symmetric\(scene\.mass\)\]", "else jnp.asarray(True)]", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "scene.py"),
+    Mutation("a normal of zero passes inside jit", r"allowed\.append\(jnp\.all\(_has_body\(scene\.normals\)\)\)", "pass", ("test_contract.py::test_what_the_host_refuses_has_a_status_inside_jit[moreau]",), "scene.py"),
+    Mutation("constraints may be broken inside jit", r"allowed\.append\(jnp\.all\(_keeps_constraints\(scene\.constraints, v\)\)\)", "pass", ("test_errors.py::test_what_the_host_refuses_has_a_status_inside_jit",), "impacts.py"),
+    Mutation("negative noise passes inside jit", r"\(x >= 0\) & \(x < jnp\.inf\)", "x < jnp.inf", ("test_errors.py::test_what_the_host_refuses_has_a_status_inside_jit",), "impacts.py"),
     # --- fits
     Mutation("a stiffness that nobody freed is fitted", r"fields\.remove\(\"stiffness\"\)", "pass", ("test_fit.py",)),
     Mutation("a correction without sigma_pre is not reported", r"if data\.lost_freedom and data\.sigma_pre is not None", "if False", ("test_experiments.py",)),
@@ -208,7 +217,9 @@ MUTATIONS = [
     Mutation("friction does not couple contacts", r"if not friction:\n", "if True:\n", ("test_methods.py::test_friction_couples_contacts_with_decoupled_normals",)),
     Mutation("advice takes LZB for the truth where contacts re-close", r"apart > tolerance / SMALL_PART", "apart > 1", ("test_methods.py::test_contacts_that_close_again",)),
     Mutation("the law farthest from the measured velocities", r"min\(self\.distances\.values\(\)", "max(self.distances.values()", ("test_pictures.py::test_the_law_closest_to_the_measured_velocities_is_named",)),
-    Mutation("halves of a chain off by one", r"jnp\.arange\(balls - 1\) >= middle", "jnp.arange(balls - 1) > middle", ("test_methods.py::test_halves_of_a_chain",)),
+    Mutation("halves of a chain off by one", r"jnp\.arange\(contacts\) >= \(contacts", "jnp.arange(contacts) > (contacts", ("test_methods.py::test_halves_of_a_chain",)),
+    Mutation("regularized friction as coarse at small steps", r"force \* step \* stiffest", "force * 0.1 * stiffest", ("test_methods.py::test_verlet_with_friction",)),
+    Mutation("friction along the slip of scipy's field", r"-\(drag\[:, None\] \* u\)", "(drag[:, None] * u)", ("test_methods.py::test_scipy_with_friction",)),
     # --- events, motion, solvers
     Mutation("contacts that break loose slide the wrong way", r"jnp\.where\(broke, -jnp\.sign\(side\)", "jnp.where(broke, jnp.sign(side)", ("test_friction.py::test_lzb_of_a_flat_block", "test_friction.py::test_lzb_in_the_plane", "test_friction.py::test_lzb_of_a_real_cube",)),
     Mutation("the base moves the wrong way", r"moved\(q, -_displaced\(system, t\)\)", "moved(q, _displaced(system, t))", ("test_motion.py::test_gaps_are_seen_from_the_base",)),

@@ -241,6 +241,26 @@ def test_one_bad_lane_stays_alone(name):
         ji.raise_on_failure(out)
 
 
+@each_law
+def test_what_the_host_refuses_has_a_status_inside_jit(name):
+    """A law may leave such values alone: an open contact, a symmetric factor, a scale."""
+    normals = np.asarray(ji.chain([1.0, 1.0, 1.0]).normals)
+    asymmetric = State(np.eye(3) + np.eye(3, k=1) / 4, normals, [1, 0, 0])
+    no_body = State(np.eye(3), normals * np.array([1, 0]), [1, 0, 0])
+    unknown, negative = (chain([1, 1, 1], [1, 0, 0], gaps=[0, gap]) for gap in (np.nan, -0.1))
+    out, _ = programs.values(name)([asymmetric, no_body, negative, unknown])
+    assert programs.names(out.status) == [*["out_of_range"] * 3, "not_finite"]
+
+
+@each_law
+def test_energies_that_no_number_holds_are_out_of_range(name):
+    """Of 1e370, 1e-430 and 1e-320 J; not of extreme masses and speeds with an ordinary energy."""
+    sizes = ((1e-30, 1e200), (1e-30, 1e-200), (1.0, 1e-160), (1e120, 1e-60))
+    states = [chain([mass, 2 * mass], [speed, 0]) for mass, speed in sizes]
+    out, _ = programs.values(name)(states)
+    assert programs.names(out.status) == [*["out_of_range"] * 3, "ok"]
+
+
 SMOOTH = [
     chain([1.0, 2.0, 1.5, 0.7], [1.0, 0.4, 0.1, -0.6], e=[0.9, 0.7, 0.8], k=[1, 2.5, 0.7], eta=1.4),
     chain([3.0, 1.0, 2.0], [1.0, 0.2, -0.5], e=[0.95, 0.6], k=[1, 3.0], eta=[1.5, 1.3]),

@@ -1,5 +1,6 @@
 """Each bad input is one clear error on the host that names argument, value and what is allowed."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -65,7 +66,10 @@ SCENES = [
     (lambda: ji.Scene([[1.0, 1.0], [1.0, 1.0]], [[1.0], [0.0]]), r"positive definite"),
     (lambda: ji.Scene([1.0, -1.0], [[1.0], [0.0]]), r"`mass`.*-1"),
     (lambda: ji.Scene([1.0, 1.0], [1.0, 0.0]), r"`normals` must have shape \(n, m\)"),
-    (lambda: ji.Scene([1.0, 1.0], [[0.0], [0.0]]), r"zero column"),
+    (
+        lambda: ji.Scene([1.0, 1.0], [[1.0, 0.0], [0.0, 0.0]]),
+        r"`normals` must have no zero column.* contact 2 is zero",
+    ),
     (lambda: ji.Scene([1.0, 1.0], [[np.nan], [0.0]]), r"`normals`"),
     (lambda: ji.Scene([1.0], [[1.0]], tangents=[[1.0, 0.0, 0.0]]), r"`tangents`"),
     (lambda: ji.Scene([1.0], [[1.0]], constraints=[1.0]), r"`constraints`"),
@@ -168,6 +172,10 @@ CALLS = [
         lambda: ji.impact(ji.Newton(0.5), WELDED, [1.0, 0.0, 0.5]),
         r"`velocity` must satisfy .*constraint 1 has the rate 0.5",
     ),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, noise=-1.0), r"`noise` must lie in \[0, inf\)"),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, noise=np.nan), r"`noise`.*nan"),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, noise=[0.1, 0.1]), r"`noise` must have shape"),
+    (lambda: ji.impact(ji.Newton(0.5), BALLS, V, approach=-1.0), r"`approach`.*-1"),
     (lambda: ji.impact(ji.Binary(0.5, (0, 1, 2)), BALLS, V), r"0 to 1"),
     (lambda: ji.impact(ji.Binary(0.5, (0,)), BALLS, V), r"contact 1 is missing"),
     (lambda: ji.impact(ji.Binary(0.5, (0, 0, 1)), BALLS, V), r"twice in a row"),
@@ -272,6 +280,24 @@ def test_bad_input(call, message):
     assert text.count("\n") == 0
     assert "Array(" not in text
     assert "Traced" not in text
+
+
+@jax.jit
+@jax.vmap
+def traced(velocity, noise, approach):
+    """Of an impact against two welded bodies."""
+    return ji.impact(ji.Newton(0.5), WELDED, velocity, noise, approach).status
+
+
+def test_what_the_host_refuses_has_a_status_inside_jit():
+    velocity = np.array([[1.0, 0, 0]] * 8)
+    velocity[0] = 1.0, 0.0, 0.5
+    velocity[1] = 1.0, 0.3, 0.3 + 1e-12  # within rounding
+    noise, approach = np.zeros(8), np.zeros(8)
+    noise[2:5] = approach[5:8] = -1e-9, np.nan, np.inf
+    wanted = ["out_of_range", "ok", *["out_of_range", "not_finite", "out_of_range"] * 2]
+    found = traced(velocity, noise, approach)
+    assert [ji.STATUS[code].name for code in found] == wanted
 
 
 @pytest.mark.parametrize(("change", "message"), MOTIONS)

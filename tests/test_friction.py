@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from friction_reference import routh, small_steps
+from friction_reference import regularized, routh, small_steps
 from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
+from jimpact.events.stepper import SLOTS
 
 close = np.testing.assert_allclose
 
@@ -132,6 +133,20 @@ def test_disk_in_closed_form(name):
     assert 0 < stuck.sum() < len(stuck)
 
 
+def test_a_large_batch_is_a_queue(monkeypatch):
+    """More impacts than slots, each with a restitution of its own: all come out in their places."""
+    count = 2 * SLOTS + 44
+    monkeypatch.setitem(globals(), "LANES", count)
+    e, slip = np.linspace(0.0, 1.0, count), np.where(np.arange(count) % 2, -2.0, 0.3)
+    v = np.stack([slip, np.full(count, -1.3), np.zeros(count)], axis=1)
+    out, _ = run("lzb", *(np.tile(x, (count, 1, 1)[: 1 + x.ndim]) for x in DISK), v, e, 0.1)
+    p = MASS * (1 + e) * 1.3
+    side = np.clip(-slip / (1 / MASS + RADIUS**2 / INERTIA), -0.1 * p, 0.1 * p)
+    assert not out.status.any()
+    close(out.impulse[:, 0], p, rtol=1e-8)
+    close(out.tangential_impulse[:, 0], side, atol=1e-8)
+
+
 @pytest.mark.parametrize("v", [(0.1, -1.0, 0.3), (0.5, -1.0, -1.0), (-0.4, -1.0, 0.0)])
 def test_binary_is_newton_at_one_contact_after_another(v):
     block, e, rubs = ji.rocking_block(1.0, 2.0), 0.5, dict(friction=0.2, tangential_restitution=0.1)
@@ -183,6 +198,17 @@ def test_rods_are_rouths():
     kinds = np.abs(expected[:, 1]) < mu * expected[:, 0] - 1e-6
     assert kinds.any()
     assert not kinds.all()
+
+
+@pytest.mark.parametrize("rod", [RODS[16], RODS[54]], ids=["slips", "jams"])
+def test_regularized_friction_is_rouths(rod):
+    """The independent integration itself, against the closed form."""
+    mass, normals, tangents, v, e, mu = rod
+    scene = ji.Scene(mass, normals, tangents=tangents)
+    p, side = routh(scene, v, mu, e)
+    after, uncertainty = regularized(scene, v, 1.0, 1.5, e, mu, eps=1e-5)
+    close(after, v + (normals[:, 0] * p + tangents[:, 0] * side) / mass, atol=1e-8)
+    assert uncertainty < 1e-4
 
 
 def test_particle_of_example_6_2():

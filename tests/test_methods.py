@@ -12,10 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from friction_reference import routh
 from programs import failed, names
+from spatial_scenes import NAMED
 
 import jimpact as ji
 from jimpact.methods.advice import situation_of
+from jimpact.methods.contenders import METHODS, outcome
 from jimpact.methods.stability import chain_of
 from jimpact.methods.validity import ValidityMap
 
@@ -99,9 +102,88 @@ def test_gradients_and_the_other_methods():
     assert all("gradient" not in axes.get_xlabel() for axes in bare.axes)
 
 
+# -------------------------------------------------------------------- the chart with friction
+
+# of a disk on the ground that slides as it falls: mass 2, inertia 0.2, radius 0.5
+DISK = ji.Scene([2.0, 2.0, 0.2], [[0.0], [1.0], [0.0]], tangents=[[1.0], [0.0], [0.5]])
+SLIDES, SLIP = [2.0, -1.0, 0.0], 2.0
+
+
+def test_verlet_with_friction():
+    """A disk in closed form: slip is a step of order 2, what sticks creeps by O(step)."""
+
+    @jax.jit
+    @jax.vmap
+    def run(mu, step):
+        law = ji.LZB(0.6, friction=mu)
+        return outcome(law, DISK, SLIDES, METHODS["verlet"].solve(law, DISK, SLIDES, step))
+
+    steps, mu = np.array([0.03, 0.003]), np.array([0.1, 2.0])
+    out = run(np.repeat(mu, 2), np.tile(steps, 2))
+    normal = 2.0 * 1.6
+    side = np.array([-0.1 * normal, -SLIP / (1 / 2.0 + 0.5**2 / 0.2)])
+    error = np.abs(np.asarray(out.tangential_impulse).reshape(2, 2) - side[:, None])
+    assert (np.asarray(out.status) == 0).all()
+    np.testing.assert_allclose(out.impulse, normal, atol=0.01)
+    assert (error[0] < [2e-3, 2e-5]).all()
+    assert (error[1] < 0.5 * steps).all()
+
+
+def rod(angle):
+    """A rod that falls on its lower end in the plane."""
+    across, up = -0.5 * np.cos(angle), 0.5 * np.sin(angle)
+    return ji.Scene([1, 1, 1 / 12], [[0.0], [1.0], [across]], tangents=[[1.0], [0.0], [up]])
+
+
+@pytest.mark.parametrize("angle", [0.3, 1.2])
+def test_scipy_with_friction(angle):
+    """A rod in Routh's closed form; between slip and stick friction is regularized."""
+    v = [0.5, -1.0, 0.0]
+    result = METHODS["scipy_radau"].solve(ji.LZB(0.5, friction=0.3), rod(angle), v, 1e-6)
+    normal, side = routh(rod(angle), v, 0.3, 0.5)
+    np.testing.assert_allclose(result.impulse, [normal], atol=1e-5)
+    np.testing.assert_allclose(result.tangential, [side], atol=1e-5)
+
+
+def on_the_ground(name):
+    """A box of the tables, its v- and a law."""
+    mass, normals, tangents, velocity = NAMED[name]()
+    return ji.Scene(mass, normals, tangents=tangents), velocity, ji.LZB(0.3, friction=0.3)
+
+
+@pytest.mark.slow
+def test_chart_of_a_box_on_a_corner():
+    """In space: the exact method at two tolerances, order 1 of Verlet, scipy; slopes in mu."""
+    scene, velocity, law = on_the_ground("corner")
+    ladder = {"dop853": [1e-4, 1e-7], "verlet": [0.03, 0.003], "scipy_radau": [1e-6]}
+    laws = {"moreau": ji.Moreau(0.3, friction=0.3)}
+    sizes = {"batch": 4, "repeats": 1}
+    chart = ji.work_precision(scene, velocity, law, list(ladder), ladder, laws, **sizes)
+    error = {n: [x.error["velocity"] for x in row] for n, row in chart.points.items()}
+    assert error["dop853"][0] < 1e-3
+    assert error["dop853"][1] < 1e-6
+    assert error["verlet"][1] < 0.2 * error["verlet"][0] < 0.01
+    assert error["scipy_radau"][0] < 1e-5
+    assert 1e-3 < error["moreau"][0] < 1
+    assert chart.reference.uncertainty["gradient"] < 1e-6
+    assert chart.points["verlet"][1].error["gradient"] < 0.1
+    assert all(point.status == "ok" for row in chart.points.values() for point in row)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
+        ({"law": ji.LZB(0.5, friction=0.1)}, ValueError, "`scene` must have tangents"),
+        (
+            {
+                "scene": DISK,
+                "velocity": SLIDES,
+                "law": ji.LZB(0.5, friction=0.1),
+                "methods": ["rk4"],
+            },
+            ValueError,
+            "it has no friction",
+        ),
         ({"velocity": [1.0, 0.0]}, ValueError, "`velocity` must have shape (3,)"),
         ({"velocity": [0.0, 0.0, 1.0]}, ValueError, "`velocity` must let a closed contact"),
         ({"velocity": [1.0, np.nan, 0.0]}, ValueError, "`velocity` must be finite"),
@@ -335,6 +417,25 @@ def test_stability_map():
     assert ji.plot.stability_map(result, "title").axes
 
 
+@pytest.mark.slow
+def test_stability_map_of_a_scene_with_friction():
+    """A rod: Verlet needs fine steps, the default method is right; a rod has no balls."""
+    axes = {"setting": [0.35, 0.8], "friction": [0.05, 2.0]}
+    base = {"exponent": 1.5, "restitution": 0.6, "friction": 2.0, "setting": 0.6}
+    result = ji.stability_map(
+        ["default", "verlet"], axes, base, scene=rod(1.2), velocity=[0.5, -1, 0], max_steps=2000
+    )
+    assert result.counts("default")["right"] == 4
+    setting, friction = result.slices["verlet"]
+    assert setting.error[1] < 0.2 * setting.error[0]
+    assert friction.error.max() < 5e-3
+    assert set(result.causes("verlet")) <= {
+        "regularized friction, or steps that straddle changes of phase"
+    }
+    assert set(result.base) == {"setting", "exponent", "restitution", "friction"}
+    assert result.confirmation.tried == result.confirmation.confirmed > 0
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -347,6 +448,21 @@ def test_stability_map():
         (lambda: ji.stability_map(slices="all"), "`slices` must be one of"),
         (lambda: ji.stability_map(samples=-1), "`samples`"),
         (lambda: ji.stability_map(resolution=1), "`resolution`"),
+        (lambda: ji.stability_map(axes={"friction": [0.1]}), "`axes` must be one of"),
+        (lambda: ji.stability_map(scene=DISK), "`velocity` must be given"),
+        (lambda: ji.stability_map(velocity=SLIDES), "`velocity` must be None"),
+        (
+            lambda: ji.stability_map(scene=DISK, velocity=[0.0, 1.0, 0.0]),
+            "`velocity` must let a closed",
+        ),
+        (
+            lambda: ji.stability_map(["rk4"], scene=DISK, velocity=SLIDES),
+            "`methods` must be one of",
+        ),
+        (
+            lambda: ji.stability_map(axes={"balls": [2]}, scene=DISK, velocity=SLIDES),
+            "`axes` must be one of",
+        ),
     ],
 )
 def test_stability_map_refuses(call, message):

@@ -118,7 +118,7 @@ def stability():
     names = [(name,) for name in AXES] + list(itertools.combinations(AXES, 2))
     slices = {method: tuple(piece(x) for x in names) for method in methods}
     confirmation = Confirmation(1, 1, 1, 0.0)
-    return StabilityMap(methods, AXES, base, slices, np.zeros((0, 6)), {}, confirmation, 100)
+    return StabilityMap(methods, AXES, base, slices, np.zeros((0, 7)), {}, confirmation, 100)
 
 
 def validity():

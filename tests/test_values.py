@@ -448,6 +448,33 @@ ELASTIC = [  # d v+ / d (k2/k1, eta) at e = 1, eta = 1.5, from rtol = 1e-12
     (0.087622672930, -0.101685435831, 0.014062762901),
 ]
 
+# d v+ / d (eta1, eta2) at eta = 1, by central differences of eighth order of values at rtol = 1e-13
+LINEAR_IN_ETA = [
+    (
+        chain([1.7, 1.9, 1.2], [1.0, -0.3, -0.3], e=[1.0, 0.9], k=[1.7, 2.6], eta=1.0),
+        [
+            [0.0414355187, 0.1654804523],
+            [-0.0745336987, -0.2956287463],
+            [0.0593113714, 0.2336482076],
+        ],
+    ),
+    (
+        chain([0.7, 1.9, 1.1], [1.1, 0.2, -0.7], e=[0.9, 0.7], k=[1.7, 0.8], eta=1.0),
+        [
+            [-0.1924378126, 0.1063167185],
+            [0.0730816396, -0.0408743232],
+            [-0.0037714967, 0.0029450101],
+        ],
+    ),
+]
+
+
+def test_slopes_in_the_exponent_of_linear_springs():
+    """Force x log x of a spring whose own force x needs no short steps."""
+    states, slopes = zip(*LINEAR_IN_ETA)
+    for *_, eta in programs.derivatives("lzb")(states):
+        np.testing.assert_allclose(eta[:, :3, :2], slopes, atol=5e-8)
+
 
 @pytest.mark.parametrize("name", ["lzb", pytest.param("compliant", marks=pytest.mark.slow)])
 def test_held_slopes(name):

@@ -222,7 +222,7 @@ class Body(eqx.Module):
         eps = float(jnp.finfo(f.dtype).eps)
         none = jnp.maximum(closed_below, _ROUNDINGS * eps * jnp.maximum(1.0, jnp.abs(q).max()))
         check_penetration("q", f, none)
-        gaps = jnp.where(f > none.astype(f.dtype), f, 0.0)
+        gaps = jnp.where(f <= none.astype(f.dtype), 0.0, f)  # NaN stays
         parts = (mass, normals, tangents, gaps)
         return Scene(*jax.tree.map(lambda x: x.astype(f.dtype), parts))
 

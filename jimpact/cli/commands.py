@@ -360,7 +360,9 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     """Speed against accuracy on one scene."""
     study, before, _ = _impact_of(command)
     law = _lzb(study)
-    laws, _ = registered_laws({"restitution": law.restitution})
+    from jimpact.methods.chart import QUANTITIES, shared_parameters
+
+    laws, _ = registered_laws(shared_parameters(law))
     result = ji.work_precision(
         study.scene,
         before,
@@ -375,8 +377,6 @@ def chart(command: options.ChartCommand, steps: Steps) -> CommandResult:
     )
     picture = ji.plot.work_precision(result, study.title)
     text = str(result) + ("" if command.full or command.methods else QUICK)
-    from jimpact.methods.chart import QUANTITIES
-
     heads = ["method", "setting", *QUANTITIES, "evaluations", "alone_s", "batch_s", "status"]
     columns = attrgetter("evaluations", "single.median", "batched.median", "status")
     rows = [

@@ -36,6 +36,7 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     `function` is hashable and compares equal where it does the same (a function of a module, or a
     frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
+    It is called with the whole batch if its attribute `queues` is True, else with chunks of it.
     """
     return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
 
@@ -163,9 +164,18 @@ def tangents_in_columns(
     return in_columns(Tangent(function, marked), *arrays, *nonzero)
 
 
+def _queues(function: Any) -> bool:
+    """Whether the function works through a batch of any size by itself."""
+    if isinstance(function, Tangent):
+        return _queues(function.function)
+    return getattr(function, "queues", False)
+
+
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
+    if _queues(function):
+        return tuple(function(*arrays))
     count = -(-size // (CHUNK_WITH_TANGENTS if isinstance(function, Tangent) else CHUNK))
     if count == 1:
         return tuple(function(*arrays))

@@ -10,7 +10,8 @@ expansion g_j = gamma_j / e_j takes the place of gamma_j, and time runs in units
 of these contacts: nothing is then divided by e, so that e = 0 is an ordinary, differentiable case
 (the whole expansion takes no time; derivatives in e there are one-sided).
 
-STATE (rows)   x, g, p (m each), time; with friction slip u and its impulse (t each).
+STATE (rows)   x, g, p (m each), time; with friction slip u and its impulse (t each). A flow that
+               `watches` its exponents has one more before the time.
 MODES (rows)   phase (m), how often each contact has closed (m); with friction the slip: 0 sticks,
                +-1 the direction (m).
 
@@ -28,7 +29,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 
-from jimpact.events.stepper import Flow, any_of
+from jimpact.events.stepper import Flow, any_of, total
 from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.solvers.tridiagonal import tridiagonal_product
 
@@ -50,6 +51,10 @@ DRAGGING = 100
 # Closings of a contact, from which on they may be endless, a power of 2: ten times more:
 # detected later.
 OFTEN = 8
+# Tolerances within which a flow watches the derivative of its forces in the exponents; the
+# tolerance is then that of derivatives, a hundred times finer than the law's. Ten times more: such
+# derivatives are ten times coarser than the others.
+WATCHED = 100.0
 # Whole and half exponents below it are products, not powers. Ten times more: longer products.
 LARGE = 6.0
 
@@ -175,7 +180,7 @@ class ContactStates(NamedTuple):
     rate: jax.Array
 
 
-COMPILED_IN = ("exponent_static", "gapped", "closed_form")  # fields that are no arrays
+COMPILED_IN = ("exponent_static", "gapped", "closed_form", "watches")  # fields that are no arrays
 
 
 def as_pytree(flow: type[T]) -> type[T]:
@@ -200,6 +205,9 @@ class ContactFlow(Flow):
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
+    # Steps are also short enough for the derivative in the exponents, F log x: it is less smooth at
+    # x = 0 than F. At exponent 1 F is linear, and steps of any length would do for it alone.
+    watches: bool = False
 
     longest = math.inf  # no rate is much larger than the others
 
@@ -234,7 +242,7 @@ class ContactFlow(Flow):
     @property
     def adding(self) -> tuple[int, ...]:
         """Blocks of rows, behind those, that only add up."""
-        return self.contacts, 1
+        return (self.contacts, 1, 1) if self.watches else (self.contacts, 1)
 
     def rows(self, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """x, g and p."""
@@ -253,7 +261,9 @@ class ContactFlow(Flow):
         phase, x = jnp.where(spent, OPEN, phase), jnp.where(spent, 0.0, x)
         g = gamma / jnp.where(phase == EXPANSION, self.restitution, 1.0)
         modes = jnp.concatenate([phase, jnp.zeros_like(phase)]).astype(jnp.int32)
-        return modes, jnp.concatenate([x, g, jnp.zeros_like(g), jnp.zeros_like(g[:1])])
+        last = jnp.zeros_like(g[:1])
+        watched = [last] if self.watches else []
+        return modes, jnp.concatenate([x, g, jnp.zeros_like(g), *watched, last])
 
     def scales(self, modes: jax.Array) -> jax.Array:
         """s_j = gamma_j / g_j (m, B)."""
@@ -291,7 +301,17 @@ class ContactFlow(Flow):
         x, g, _ = self.rows(y)
         f = self.force(const, x, g)
         dg = const.ratio * self.coupling.times(f)
-        return jnp.concatenate([const.closing * g, dg, const.unit * f, const.unit])
+        watched = []
+        if self.watches:
+            slope = f * jnp.log(jnp.where(x > 0, x, 1.0))
+            watched = [jax.lax.stop_gradient(const.unit * total(slope))]
+        return jnp.concatenate([const.closing * g, dg, const.unit * f, *watched, const.unit])
+
+    def allowance(self, modes: jax.Array, y: jax.Array) -> jax.Array | float:
+        """More in the row that only watches."""
+        if not self.watches:
+            return 1.0
+        return jnp.ones_like(y[:, :1]).at[-2].set(WATCHED)
 
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         """By indentation (an opening, a gap that closes, the onset of a force), by velocity."""

@@ -181,7 +181,7 @@ def flow_of(
     apart = 0.0 if problem.gap is None else -problem.gap
     x = jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
     if problem.sides is None:
-        flow = ContactFlow(**parts)
+        flow = ContactFlow(**parts, watches=tighten < 1 and problem.exponent is not None)
         return flow, *flow.start(problem.gamma, x)
     (normal_tangent, tangent, slip), friction = problem.sides
     kind = FrictionFlow if len(slip) == m else SlipFlow
@@ -216,6 +216,11 @@ class ImpulseProgram:
         kinds = smooth if self.smooth else (*smooth, jnp.int32, jnp.int32)
         rows = contacts, self.sides, 1, 1, 1
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
+
+    @property
+    def queues(self) -> bool:
+        """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
+        return self.sides > 0 and (self.takes_duals or not self.finely)
 
     @property
     def takes_duals(self) -> bool:

@@ -3,7 +3,7 @@
 A run keeps its accepted steps, each with the state before it, in a fixed number of slots. Once
 these are full it keeps every second step, then every fourth, and so on. `backwards` visits all
 steps, the last one first; those between two kept ones are run again, into slots that have become
-free. So the memory does not grow with the number of steps, and a run of at most SLOTS steps repeats
+free. So the memory does not grow with the number of steps, and a run of at most KEPT steps repeats
 nothing.
 """
 
@@ -19,8 +19,8 @@ from jimpact.events.stepper import GOES_ON, OVER, PAUSED, Flow, Step, StepperSta
 
 # Accepted steps that a run keeps, a power of 2. Ten times more: ten times the memory of the reverse
 # mode.
-SLOTS = 64
-FREE = -1  # number of the step in a slot that holds none
+KEPT = 64
+NONE = -1  # number of the step in a slot that holds none
 # Difference, in units of the impact, from which on a repeated step is another one than the first
 # time: no derivative is then better than a wrong one. Ten times more: worse ones pass.
 SAME = 1e-6
@@ -32,9 +32,9 @@ class Kept(NamedTuple):
     A pass that any impact of the batch accepts is one step: all count together.
     """
 
-    numbers: jax.Array  # (SLOTS,) of the steps in the slots, or FREE
-    state: jax.Array  # (SLOTS + 1, n + 8, B): y, clock and progress before the step
-    marks: jax.Array  # (SLOTS + 1, m + k + 1, B): modes, target, 1 where it is accepted
+    numbers: jax.Array  # (KEPT,) of the steps in the slots, or NONE
+    state: jax.Array  # (KEPT + 1, n + 8, B): y, clock and progress before the step
+    marks: jax.Array  # (KEPT + 1, m + k + 1, B): modes, target, 1 where it is accepted
     # (4,): numbers of the next step and of the first of this run, spacing of the steps to keep, and
     # the number before which the run ends; the step before it is always kept
     plan: jax.Array
@@ -54,9 +54,9 @@ def nothing_kept(carry: StepperState) -> Kept:
     y, (modes, target, clock), progress = carry
     rows, batch = len(y) + len(clock) + len(progress), clock.shape[1:]
     return Kept(
-        jnp.full(SLOTS, FREE, jnp.int32),
-        jnp.zeros((SLOTS + 1, rows, *batch), clock.dtype),
-        jnp.zeros((SLOTS + 1, len(modes) + len(target) + 1, *batch), jnp.int32),
+        jnp.full(KEPT, NONE, jnp.int32),
+        jnp.zeros((KEPT + 1, rows, *batch), clock.dtype),
+        jnp.zeros((KEPT + 1, len(modes) + len(target) + 1, *batch), jnp.int32),
         jnp.array([0, 0, 1, np.iinfo(np.int32).max], jnp.int32),
     )
 
@@ -90,8 +90,8 @@ def _noted(kept: Kept, carry: StepperState, accept: jax.Array) -> Kept:
     wanted = some & ((jax.lax.rem(number - first, spacing) == 0) | (number == end - 1))
     full = wanted & (jnp.min(numbers) >= 0)
     spacing = jnp.where(full, 2 * spacing, spacing)
-    numbers = jnp.where(full & (jax.lax.rem(numbers, spacing) != 0), FREE, numbers)
-    slot = jnp.where(wanted, jnp.argmin(numbers).astype(jnp.int32), SLOTS)
+    numbers = jnp.where(full & (jax.lax.rem(numbers, spacing) != 0), NONE, numbers)
+    slot = jnp.where(wanted, jnp.argmin(numbers).astype(jnp.int32), KEPT)
     y, (modes, target, clock), progress = carry
     now = jnp.concatenate([modes, target.astype(jnp.int32), accept.astype(jnp.int32)])
     return Kept(
@@ -103,8 +103,8 @@ def _noted(kept: Kept, carry: StepperState, accept: jax.Array) -> Kept:
 
 
 def _is(slot: jax.Array) -> jax.Array:
-    """One-hot (SLOTS,)."""
-    return jnp.arange(SLOTS, dtype=jnp.int32) == slot
+    """One-hot (KEPT,)."""
+    return jnp.arange(KEPT, dtype=jnp.int32) == slot
 
 
 def _in_slot(like: StepperState, kept: Kept, slot: jax.Array) -> tuple[StepperState, jax.Array]:
@@ -138,7 +138,7 @@ def _run_again(
     half = (room + 1) // 2
     spacing = jnp.where(missing > room, (missing + half - 1) // half, 1)
     none = missing == 1
-    numbers = jnp.where(_is(slot) & ~none, FREE, kept.numbers)
+    numbers = jnp.where(_is(slot) & ~none, NONE, kept.numbers)
     plan = jnp.stack([jnp.where(none, left, number), number, spacing, left])
     passes = end.progress[3:4]
     return jax.lax.while_loop(
@@ -179,7 +179,7 @@ def backwards(
         carry, accepted = _in_slot(end, sweep.kept, slot)
         step = jax.tree.map(lambda x: jnp.where(accepted, x, jnp.zeros_like(x)), carry.step)
         result = visit(sweep.result, KeptStep(step, carry.y, accepted, sweep.left - 1))
-        numbers = jnp.where(_is(slot), FREE, sweep.kept.numbers)
+        numbers = jnp.where(_is(slot), NONE, sweep.kept.numbers)
         kept = sweep.kept._replace(numbers=numbers)
         return _Sweep(kept, sweep.left - 1, carry.y, accepted, result, sweep.failed)
 
@@ -194,7 +194,7 @@ def backwards(
     numbers, spacing, left = kept.numbers, kept.plan[2], kept.plan[0]
     # room for steps that are run again, if any
     sparse = (spacing > 1) & (jax.lax.rem(numbers, 2 * spacing) != 0)
-    kept = kept._replace(numbers=jnp.where(sparse, FREE, numbers))
+    kept = kept._replace(numbers=jnp.where(sparse, NONE, numbers))
     none = jnp.zeros_like(end.progress[:1], bool)
     sweep = _Sweep(kept, left, end.y, none, start, jnp.asarray(False))
     sweep = jax.lax.while_loop(lambda sweep: (sweep.left > 0) & ~sweep.failed, on, sweep)

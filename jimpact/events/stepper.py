@@ -76,6 +76,12 @@ FINEST, COARSE_ROUNDING = 16, 64
 # half as long.
 COARSE = 0.3
 
+# Impacts with friction that a CPU computes side by side, whatever the size of the batch; and slots
+# that are free before they are filled with waiting impacts. Ten times more slots: more of them idle
+# while the last impacts end; ten times fewer: each operation has too few numbers to work on. Ten
+# times more free slots: all wait for the slowest impact again.
+SLOTS, FREE = 128, 8
+
 STAGES = len(DOP853.c)
 _TABLE = np.array([[*row, *[0.0] * (STAGES - len(row))] for row in (*DOP853.a, DOP853.b)])
 _NODES = np.array([*DOP853.c, 1.0])
@@ -90,6 +96,8 @@ class Flow(abc.ABC):
     longest: Any  # the longest step in the flow's own time that is stable, or inf
 
     near: float = 0.0  # share of a step from which landings start, 0: from anywhere
+    # whether some impacts of a batch take many times the passes of others, and none pauses
+    queues: bool = False
 
     @property
     def driving(self) -> tuple[int, ...]:
@@ -583,11 +591,73 @@ def _root_of_cubic(
     return u
 
 
-def run(flow: Flow, carry: StepperState, most: int) -> StepperState:
+def run(flow: Any, carry: StepperState, most: int) -> StepperState:
     """On to the end, the first pause, or the limit of passes; `finish` is not yet applied."""
+    if not value_of(flow).queues or carry.progress.shape[-1] <= SLOTS:
+        return _side_by_side(flow, carry, most)
+    return jax.lax.platform_dependent(
+        flow,
+        carry,
+        cpu=lambda flow, carry: _in_slots(flow, carry, most),
+        default=lambda flow, carry: _side_by_side(flow, carry, most),
+    )
+
+
+def _side_by_side(flow: Any, carry: StepperState, most: int) -> StepperState:
+    """`run` of all impacts at once: they wait for the slowest one."""
     return jax.lax.while_loop(
         lambda c: unwatched(c, most), lambda c: advance(flow, c, most)[0], carry
     )
+
+
+class _Slots(NamedTuple):
+    """Impacts that are being computed, one in each slot, and those that are over."""
+
+    impact: jax.Array  # (SLOTS,) the impact that is in each slot
+    following: jax.Array  # () the first impact that still waits
+    flow: Any
+    carry: StepperState
+    ends: StepperState  # of all impacts, as far as they have left their slots
+
+
+def _in_slots(flow: Any, carry: StepperState, most: int) -> StepperState:
+    """`run` of many impacts in SLOTS slots: an impact that is over makes room for the next one."""
+    count = carry.progress.shape[-1]
+
+    def picked(tree: Any, impact: jax.Array) -> Any:
+        """The arrays (.., B) of these impacts."""
+        return jax.tree.map(lambda x: jnp.take(x, impact, axis=-1, mode="clip"), tree)
+
+    def stored(s: _Slots) -> StepperState:
+        """All ends, those of the slots included."""
+        return jax.tree.map(lambda x, new: x.at[..., s.impact].set(new), s.ends, s.carry)
+
+    def refilled(s: _Slots) -> _Slots:
+        """The next impacts in place of those that are over."""
+        free = ~goes_on(s.carry, most)[0]
+        next_one = s.following + jnp.cumsum(free, dtype=jnp.int32) - 1
+        enters = free & (next_one < count)
+        impact = jnp.where(enters, next_one, s.impact)
+        new_flow, new = picked((flow, carry), impact)
+        new = jax.tree.map(lambda a, b: jnp.where(enters, a, b), new, s.carry)
+        following = s.following + jnp.sum(enters, dtype=jnp.int32)
+        return _Slots(impact, following, new_flow, new, stored(s))
+
+    def one_pass(s: _Slots) -> _Slots:
+        """One pass in each slot; enough of those that are free are filled first."""
+        free = jnp.sum(~goes_on(s.carry, most), dtype=jnp.int32)
+        fills = (free >= FREE) & (s.following < count)
+        s = jax.lax.cond(fills, refilled, lambda s: s, s)
+        return s._replace(carry=advance(s.flow, s.carry, most)[0])
+
+    def open_work(s: _Slots) -> jax.Array:
+        """Whether () an impact goes on or waits."""
+        return jnp.any(goes_on(s.carry, most)) | (s.following < count)
+
+    first = jnp.arange(SLOTS, dtype=jnp.int32)
+    own, here = picked((flow, carry), first)
+    slots = _Slots(first, jnp.asarray(SLOTS, jnp.int32), own, here, carry)
+    return stored(jax.lax.while_loop(open_work, one_pass, slots))
 
 
 def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:

@@ -166,17 +166,18 @@ def work_precision(
     Errors are relative, the largest over a sample of impacts with the stiffness of every contact
     spread at random over a factor of 10, the impact itself among them: `max |dv| / max |v-|`,
     `max |dp| / max |p|`, `|d(T+ - T-)| / T-`, duration, and the Jacobian
-    `(d v+ / d ln k, d v+ / d e)` by forward mode, its error over `max |v-|`. Times are per impact,
-    one alone and in a batch, taken in turns; compile times apart.
+    `(d v+ / d ln k, d v+ / d e)`, with friction also `d v+ / d mu`, by forward mode, its error over
+    `max |v-|`. Times are per impact, one alone and in a batch, taken in turns; compile times apart.
 
     Args:
         scene: n coordinates, m contacts.
         velocity: v- (n,) [m/s], at least one contact approaching.
-        law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does.
+        law: the `LZB` law; its `method` and `rtol` play no part, its `max_steps` does. With
+            `friction` (scenes with tangents, planar or in space) methods without it are left out.
         methods: names in `jimpact.methods.contenders.METHODS`; None: all that support the impact.
         settings: settings by method, in place of its default ones.
         laws: algebraic laws by name, points with their *model* error against LZB on this impact;
-            None: Newton, Moreau, Poisson and Binary with the law's restitution.
+            None: Newton, Moreau, Poisson and Binary with the law's restitution and friction.
         reference: method that errors are measured from, at rtol 1e-14; None: the
             event-aligned order 8. Its uncertainty is its distance from
             a second solution: order 8 at 1e-12.
@@ -206,7 +207,7 @@ def work_precision(
     ladders = _ladders(chosen, settings or {})
     exact, second = _reference(reference, case), METHODS["dop853"]
     if laws is None:
-        built = registered_laws({"restitution": law.restitution})[0]
+        built = registered_laws(shared_parameters(law))[0]
         laws = {name: built[name] for name in ALGEBRAIC}
     needed = {m.name: m for m in (*chosen, exact, second)}
     programs = {n: _method_programs(m, case, gradients, durations) for n, m in needed.items()}
@@ -247,6 +248,12 @@ def work_precision(
     )
 
 
+def shared_parameters(law: LZB) -> dict[str, Any]:
+    """What an algebraic law has in common with it: restitution, and friction where there is any."""
+    friction = {} if law.friction is None else {"friction": law.friction}
+    return {"restitution": law.restitution} | friction
+
+
 # ------------------------------------------------------------------ the impact, and methods
 
 
@@ -276,11 +283,9 @@ def _case(scene: Scene, velocity: Any, law: LZB, batch: int) -> Case:
     if not bool(law.contact(scene, v).happens):
         raise ValueError("Argument `velocity` must let a closed contact approach.")
     m = scene.contacts
-    law = eqx.tree_at(
-        lambda old: (old.restitution, old.stiffness),
-        law,
-        (jnp.broadcast_to(law.restitution, (m,)), jnp.broadcast_to(law.stiffness, (m,))),
-    )
+    fields = ("stiffness", *shared_parameters(law))
+    each = [jnp.broadcast_to(getattr(law, field), (m,)) for field in fields]
+    law = eqx.tree_at(lambda old: [getattr(old, field) for field in fields], law, each)
     exponents = np.random.default_rng(0).uniform(-0.5, 0.5, (batch, m))
     exponents[0] = 0.0  # the impact itself
     stiffness = law.stiffness[None, :] * jnp.asarray(SPREAD**exponents)
@@ -377,15 +382,19 @@ def _method_programs(method: Method, case: Case, gradients: bool, durations: boo
         return solution._replace(duration=jnp.nan) if without else solution
 
     def jacobian(k: jax.Array, law: LZB, scene: Scene, v: jax.Array, setting: jax.Array) -> Any:
-        """(d v+ / d ln k, d v+ / d e) (n, 2 m)."""
+        """(d v+ / d ln k, d v+ / d e) (n, 2 m), with friction also d v+ / d mu (n, 3 m)."""
+        names = tuple(shared_parameters(law))
 
-        def velocity(log_factor: jax.Array, e: jax.Array) -> jax.Array:
+        def velocity(log_factor: jax.Array, *values: jax.Array) -> jax.Array:
             """v+ (n,)."""
-            changed = with_entries(law, ("restitution",), e)
+            changed = law
+            for name, value in zip(names, values):
+                changed = with_entries(changed, (name,), value)
             return timed(k * jnp.exp(log_factor), changed, scene, v, setting).out.velocity
 
-        both = jax.jacfwd(velocity, argnums=(0, 1))(jnp.zeros_like(k), law.restitution)
-        return jnp.concatenate(both, axis=-1)
+        at = (jnp.zeros_like(k), *(getattr(law, name) for name in names))
+        parts = jax.jacfwd(velocity, argnums=tuple(range(len(at))))(*at)
+        return jnp.concatenate(parts, axis=-1)
 
     seconds: dict[str, float] = {}
     constant = (case.law, case.scene, case.velocity)

@@ -1,12 +1,13 @@
 """`stability_map`: where a method of integration is right, flagged, wrong, or worse.
 
-# notation: a point is a row (6,) of AXES
+# notation: a point is a row (7,) of AXES
 #   setting           0 coarse .. 1 fine, log-linear in what the method takes (`setting_of`)
 #   stiffness_ratio   kappa: stiffness of the right half of the contacts; the left half has 1
 #   exponent          eta of all contacts
 #   restitution       e of all contacts
 #   mass_ratio        mu: mass of the middle ball; all others have 1
 #   balls             N, a touching chain without walls; v- = (1, 0, .., 0)
+#   friction          mu of all contacts of a given scene, which has no mass_ratio and no balls
 
 One function is compiled for each method and number of balls; it runs on batches of points, which
 wait for their slowest point, so the number of steps is bounded.
@@ -24,12 +25,14 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice, check_values
 from jimpact.audits import audit
+from jimpact.contact import delassus_matrix
 from jimpact.files.records import as_data, fields_as_data, table
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders import METHODS
 from jimpact.methods.contenders.base import Method, outcome
 from jimpact.progress import counting_bar
-from jimpact.scene import chain
+from jimpact.scene import Scene, as_velocity, chain
+from jimpact.solvers.tridiagonal import as_matrix
 from jimpact.status import CODE
 
 
@@ -48,8 +51,11 @@ _AXES = {  # base: three equal Hertz balls; rtol 1e-8, time step 0.05, impulse s
     "restitution": Axis(0.9, 0.0, 1.0),
     "mass_ratio": Axis(1.0, 1e-6, 1e6),
     "balls": Axis(3.0, 2.0, 1000.0),
+    "friction": Axis(0.3, 0.0, 10.0),
 }
 AXES = tuple(_AXES)
+OF_CHAINS = tuple(name for name in AXES if name != "friction")
+OF_SCENES = tuple(name for name in AXES if name not in ("mass_ratio", "balls"))
 # kind of setting (see `jimpact.methods.contenders.Method`): value at level 0 and at level 1
 SETTINGS = {"rtol": (1e-2, 1e-12), "step": (3.0, 3e-3), "impulse step": (0.3, 3e-5)}
 
@@ -71,9 +77,13 @@ FALLS = 0.5  # and stalls unless its error falls below this part
 BATCH = 32  # points computed together
 
 REFERENCE_RTOL = 1e-12  # of the default method, the reference of all others
-CHECK_RTOL = 1e-11  # of the run by scipy
+CHECK_RTOL = 1e-11  # of the run by scipy,
+CHECK_STEPS = 100_000  # and the most evaluations that it may take; ten times more only waits longer
 CONFIRMED = 1e-7  # the reference is confirmed up to this difference of v+ from scipy's
 CHECKED = 12  # points solved by scipy, at most
+# The same two where contacts have friction: scipy regularizes it below a slip of the tolerance. Ten
+# times finer takes scipy many times longer where contacts stick.
+FRICTION_RTOL, FRICTION_CONFIRMED = 1e-8, 1e-6
 # scipy solves a point soon up to this ratio of frequencies, to the slowest contact's, and number
 # of balls.
 QUICK_RATIO, QUICK_BALLS = 1e3, 10
@@ -87,13 +97,17 @@ CAUSES = (  # limits, formulas and remedies: docs/stability.md
     "many contacts at once",
     "first order at E = 0",
     "steps straddle changes of phase",
+    "regularized friction, or steps that straddle changes of phase",
+    "contacts vibrate between stick and slip",
 )
 (_REFUSED, _UNSTABLE, _COARSE, _RECLOSES, _APART, _CLUSTER, _FIRST_ORDER, _STRADDLES) = range(8)
+_CREEPS, _VIBRATES = 8, 9
 STABLE = {"verlet": 2.0, "rk4": float(np.sqrt(8.0))}  # largest step times sqrt(lambda_max)
 RECLOSING = 0.1  # below this e three balls re-close (nearly) without end
 _LONG, _CLUSTERED = 10, 0.9  # from this number of balls on, chains below this e stay in clusters
 _FAR = 100.0  # time scales are far apart from this ratio of the contacts' frequencies on
 NAMES = ("default", "rk4", "verlet", "impulse_euler")
+FRICTION_NAMES = ("default", "implicit", "verlet")  # those of them that there are
 SLICES = ("one", "pairs")
 BALLS = (2, 3, 5, 10, 30, 100)  # numbers of balls, of the axis N of the maps
 # Each number of balls is compiled by itself: below this resolution only a few.
@@ -116,6 +130,7 @@ class Confirmation(NamedTuple):
     tried: int
     confirmed: int
     difference: float
+    within: float = CONFIRMED
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +142,7 @@ class StabilityMap:
         axes: values along every axis.
         base: the point that the slices go through.
         slices: by method, first those over one axis, then pairs.
-        samples: Latin-hypercube points (S, 6), columns `jimpact.methods.stability.AXES`.
+        samples: Latin-hypercube points (S, 7), columns `jimpact.methods.stability.AXES`.
         sampled: by method, a `Slice` over the samples.
         confirmation: of the reference, by an integrator that shares no code with it.
         max_steps: of every run.
@@ -184,7 +199,7 @@ class StabilityMap:
         lines = [
             f"base: {base}; at most {self.max_steps:,} steps",
             f"reference: {checked.points} points at rtol {REFERENCE_RTOL:g}; of {checked.tried} "
-            f"solved by scipy, too, {checked.confirmed} agree to {CONFIRMED:g}{others}",
+            f"solved by scipy, too, {checked.confirmed} agree to {checked.within:g}{others}",
             f"right: error in v+ within {HONEST:g} rtol, or {FIXED_STEP_RIGHT:g} for fixed steps, "
             "of the largest |v-|",
             "",
@@ -207,6 +222,8 @@ def stability_map(
     slices: str = "one",
     samples: int = 0,
     *,
+    scene: Scene | None = None,
+    velocity: Any = None,
     max_steps: int = 10_000,
     seed: int = 0,
     progress: float | None = None,
@@ -215,20 +232,27 @@ def stability_map(
 
     A point is a chain of N touching balls of which the first strikes the others: kappa is the
     stiffness ratio of its halves, mu the mass ratio of its middle ball (`chain_of`); and a
-    setting of the method. Classes: `right` (error in v+ within 10 rtol; 1e-3 for fixed steps, of
+    setting of the method. A `scene` takes the place of the chains: its axes are `setting`,
+    `stiffness_ratio` (two contacts and more), `exponent`, `restitution` and, with tangents,
+    `friction`. Classes: `right` (error in v+ within 10 rtol; 1e-3 for fixed steps, of
     the largest |v-|), `flagged` (a failure status, or refused beforehand), `wrong` (silently),
     `gains energy`, `stalls` (silently wrong, and a ten times finer setting does not halve the
     error), `does not end` (in `max_steps`), `not finite`, `unchecked` (no reference ends).
 
     Args:
         methods: names in `jimpact.methods.contenders.METHODS` that JAX can batch, and 'default',
-            what `impact` does; None: that, rk4, verlet and impulse_euler.
+            what `impact` does; None: that, rk4, verlet and impulse_euler. With friction: those
+            that have it.
         axes: values by name, of `setting` (0 coarse .. 1 fine), `stiffness_ratio` 1e-8..1e8,
-            `exponent` 1..5, `restitution` 0..1, `mass_ratio` 1e-6..1e6, `balls`; None: all.
-        base: point from which slices start, by name; default three equal Hertz balls, e = 0.9.
+            `exponent` 1..5, `restitution` 0..1, `mass_ratio` 1e-6..1e6, `balls`, `friction` 0..10;
+            None: all.
+        base: point from which slices start, by name; default three equal Hertz balls, e = 0.9
+            (of a scene: Hertz contacts of equal stiffness, e = 0.9, mu = 0.3).
         resolution: values along a default axis.
         slices: 'one' axis at a time, or 'pairs' of axes as well.
         samples: number of Latin-hypercube points over all axes besides.
+        scene: one scene in place of chains, planar or in space; None: chains.
+        velocity: its v- (n,) [m/s], of which only the ratios matter.
         max_steps: of every run; batches wait for their slowest point.
         seed: of the samples.
         progress: a bar on stderr; None: on a terminal, for long runs.
@@ -237,7 +261,8 @@ def stability_map(
         `StabilityMap`; in double precision (jax_enable_x64) only.
 
     Raises:
-        ValueError: unknown names, values out of range, single precision.
+        ValueError: unknown names, values out of range, single precision, a scene without a
+            velocity, nothing approaches, methods without friction for a scene that has it.
 
     Source: docs/stability.md.
 
@@ -250,20 +275,23 @@ def stability_map(
     samples, max_steps = as_whole("samples", samples, 0), as_whole("max_steps", max_steps, 1)
     if not jnp.zeros(()).dtype == jnp.float64:
         raise ValueError("A stability map needs double precision: enable jax_enable_x64.")
-    chosen, lines = _methods(methods), _axis_values(axes, as_whole("resolution", resolution, 2))
+    given = _given(scene, velocity)
+    names = _axes_of(given)
+    chosen = _methods(methods, given)
+    lines = _axis_values(axes, as_whole("resolution", resolution, 2), names)
     start = {name: axis.base for name, axis in _AXES.items()}
-    start |= {name: float(x) for name, x in _checked("base", base or {}).items()}
+    start |= {name: float(x) for name, x in _checked("base", base or {}, names).items()}
     axis_sets: list[tuple[str, ...]] = [(name,) for name in lines]
     if slices == "pairs":
         axis_sets += list(combinations(lines, 2))
     parts = [_slice_points(start, lines, names) for names in axis_sets]
     sampled = _sample_points(start, lines, samples, seed)
     points = np.concatenate([*(part.reshape(-1, len(AXES)) for part in parts), sampled])
-    runners = cache(partial(runner, max_steps))
+    runners = cache(partial(runner, max_steps, given))
     total = len(points) * (len(chosen) + 1)
     with counting_bar(total, "impacts", progress) as advance:
-        exact, confirmation = references(points, runners, advance)
-        results = {m.name: classes_of(m, points, exact, runners, advance) for m in chosen}
+        exact, confirmation = references(points, given, runners, advance)
+        results = {m.name: classes_of(m, points, given, exact, runners, advance) for m in chosen}
     ends = np.cumsum([part[..., 0].size for part in parts])
     by_slice, by_sample = {}, {}
     for name, columns in results.items():
@@ -276,7 +304,7 @@ def stability_map(
     return StabilityMap(
         methods=tuple(results),
         axes=lines,
-        base=start,
+        base={name: start[name] for name in names},
         slices=by_slice,
         samples=sampled,
         sampled=by_sample,
@@ -285,41 +313,87 @@ def stability_map(
     )
 
 
-def _methods(names: Sequence[str] | None) -> list[Method]:
+class Given(NamedTuple):
+    """A scene in place of chains, its v- (n,) with 1 as the largest, and W (m, m)."""
+
+    scene: Scene
+    velocity: jax.Array
+    delassus: np.ndarray
+
+    @property
+    def friction(self) -> bool:
+        """Whether its contacts have friction."""
+        return self.scene.tangents is not None
+
+
+def _given(scene: Scene | None, velocity: Any) -> Given | None:
+    """The scene with its velocity, checked; None for chains."""
+    if scene is None:
+        if velocity is not None:
+            raise ValueError("Argument `velocity` must be None without a `scene`.")
+        return None
+    if velocity is None:
+        raise ValueError("Argument `velocity` must be given with a `scene`, but is None.")
+    v = as_velocity(scene, velocity)
+    check_values("velocity", v)
+    if not bool(LZB(1.0).contact(scene, v).happens):
+        raise ValueError("Argument `velocity` must let a closed contact approach.")
+    w = np.asarray(as_matrix(delassus_matrix(scene)), float)
+    return Given(scene, v / jnp.max(jnp.abs(v)), w)
+
+
+def _axes_of(given: Given | None) -> tuple[str, ...]:
+    """The axes of chains, or of a scene."""
+    if given is None:
+        return OF_CHAINS
+    missing = set() if given.scene.contacts > 1 else {"stiffness_ratio"}
+    missing |= set() if given.friction else {"friction"}
+    return tuple(name for name in OF_SCENES if name not in missing)
+
+
+def _methods(names: Sequence[str] | None, given: Given | None) -> list[Method]:
     """Methods by name, those to map by default."""
     known = {"default": DEFAULT} | {name: m for name, m in METHODS.items() if m.jax}
-    names = NAMES if names is None else tuple(names)
+    defaults: tuple[str, ...] = NAMES
+    if given is not None and given.friction:
+        known = {name: m for name, m in known.items() if m.friction}
+        defaults = tuple(name for name in FRICTION_NAMES if name in known)
+    names = defaults if names is None else tuple(names)
     for name in names or ("",):
         check_choice("methods", name, known)
     return [known[name] for name in names]
 
 
-def _checked(argument: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+def _checked(argument: str, values: Mapping[str, Any], names: tuple[str, ...]) -> Mapping[str, Any]:
     """Values by axis, checked."""
     for name, value in values.items():
-        check_choice(argument, name, AXES)
+        check_choice(argument, name, names)
         axis = _AXES[name]
         check_values(f"{argument}[{name!r}]", value, low=axis.low, high=axis.high)
     return values
 
 
-def default_axes(r: int) -> dict[str, np.ndarray]:
+def default_axes(r: int, names: tuple[str, ...] = OF_CHAINS) -> dict[str, np.ndarray]:
     """r values of each axis (number of balls: at most six)."""
-    return {
+    values = {
         "setting": np.linspace(0, 1, r),
         "stiffness_ratio": np.logspace(-8, 8, r),
         "exponent": np.linspace(1, 5, r),
         "restitution": np.append(0.0, np.logspace(-3, 0, r - 1)),
         "mass_ratio": np.logspace(-6, 6, r),
         "balls": np.array(BALLS if r >= _FEW else _FEW_BALLS, float),
+        "friction": np.append(0.0, np.logspace(-1.5, 1, r - 1)),
     }
+    return {name: values[name] for name in names}
 
 
-def _axis_values(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str, np.ndarray]:
+def _axis_values(
+    axes: Mapping[str, Sequence[float]] | None, r: int, names: tuple[str, ...]
+) -> dict[str, np.ndarray]:
     """The values of the axes to map."""
     if axes is None:
-        return default_axes(r)
-    axes = _checked("axes", axes or {"": ()})
+        return default_axes(r, names)
+    axes = _checked("axes", axes or {"": ()}, names)
     lines = {name: np.unique(np.asarray(x, float)) for name, x in axes.items()}
     balls = lines.get("balls", np.zeros(0))
     if (balls != np.round(balls)).any():
@@ -330,7 +404,7 @@ def _axis_values(axes: Mapping[str, Sequence[float]] | None, r: int) -> dict[str
 def _slice_points(
     base: Mapping[str, float], axes: Mapping[str, np.ndarray], varied: tuple[str, ...]
 ) -> np.ndarray:
-    """Points (K_1 .. K_d, 6) in which the axes `varied` run over their values."""
+    """Points (K_1 .. K_d, 7) in which the axes `varied` run over their values."""
     columns = [axes[name] if name in varied else np.array([base[name]]) for name in AXES]
     grid = np.stack(np.meshgrid(*columns, indexing="ij"), axis=-1)
     return grid.reshape(*(len(axes[name]) for name in varied), len(AXES))
@@ -339,7 +413,7 @@ def _slice_points(
 def _sample_points(
     base: Mapping[str, float], axes: Mapping[str, np.ndarray], samples: int, seed: int
 ) -> np.ndarray:
-    """Latin-hypercube points (samples, 6), between the values of `axes`; others from `base`."""
+    """Latin-hypercube points (samples, 7), between the values of `axes`; others from `base`."""
     from scipy.stats import qmc  # late: slow to import
 
     points = np.tile([base[name] for name in AXES], (samples, 1))
@@ -380,10 +454,34 @@ def chain_of(kappa: Any, mu: Any, balls: int) -> tuple[jax.Array, jax.Array]:
     [[1.0, 1.0, 0.5, 1.0], [1.0, 1.0, 10.0]]
     """
     kappa, mu = jnp.asarray(kappa, float), jnp.asarray(mu, float)
-    middle = balls // 2
-    mass = jnp.where(jnp.arange(balls) == middle, mu, jnp.ones_like(mu))
-    stiffness = jnp.where(jnp.arange(balls - 1) >= middle, kappa, jnp.ones_like(kappa))
-    return mass, stiffness
+    mass = jnp.where(jnp.arange(balls) == balls // 2, mu, jnp.ones_like(mu))
+    return mass, stiffness_of(kappa, balls - 1)
+
+
+def stiffness_of(kappa: Any, contacts: int) -> jax.Array:
+    """Stiffnesses (m,): kappa in the right half, which has no more contacts than the left one.
+
+    >>> from jimpact.methods.stability import stiffness_of
+    >>> stiffness_of(10.0, 3).tolist()
+    [1.0, 1.0, 10.0]
+    """
+    kappa = jnp.asarray(kappa, float)
+    return jnp.where(jnp.arange(contacts) >= (contacts + 1) // 2, kappa, jnp.ones_like(kappa))
+
+
+def impact_at(
+    point: Any, balls: int, given: Given | None, max_steps: int
+) -> tuple[LZB, Scene, jax.Array]:
+    """Law, scene and v- of a point; the law's friction is None where there is none."""
+    _, kappa, eta, e, mass_ratio, _, friction = point
+    if given is None:
+        mass, stiffness = chain_of(kappa, mass_ratio, balls)
+        v = jnp.zeros_like(mass).at[0].set(1.0)
+        return LZB(e, stiffness, eta, max_steps=max_steps), chain(mass), v
+    mu = friction if given.friction else None
+    stiffness = stiffness_of(kappa, given.scene.contacts)
+    law = LZB(e, stiffness, eta, friction=mu, max_steps=max_steps)
+    return law, given.scene, given.velocity
 
 
 DEFAULT = METHODS["dop853"]._replace(name="default")
@@ -398,19 +496,16 @@ class PointOutcomes(NamedTuple):
     gain: Any
 
 
-Runner = Callable[[np.ndarray, Any], PointOutcomes]  # of points (L, 6) and settings () or (L,)
+Runner = Callable[[np.ndarray, Any], PointOutcomes]  # of points (L, 7) and settings () or (L,)
 Runners = Callable[[Method, int], Runner]
 
 
-def runner(max_steps: int, method: Method, balls: int) -> Runner:
-    """A function of points (L, 6) and settings: one method on chains of N balls."""
+def runner(max_steps: int, given: Given | None, method: Method, balls: int) -> Runner:
+    """A function of points (L, 7) and settings: one method on chains of N balls or a scene."""
 
     def one(point: jax.Array, setting: jax.Array) -> PointOutcomes:
         """The outcome at one point."""
-        _, kappa, eta, e, mu, _ = point
-        mass, stiffness = chain_of(kappa, mu, balls)
-        scene, v = chain(mass), jnp.zeros_like(mass).at[0].set(1.0)
-        law = LZB(e, stiffness, eta, max_steps=max_steps)
+        law, scene, v = impact_at(point, balls, given, max_steps)
         result = method.solve(law, scene, v, setting)
         out = outcome(law, scene, v, result)
         return PointOutcomes(
@@ -431,8 +526,11 @@ def runner(max_steps: int, method: Method, balls: int) -> Runner:
     return run
 
 
-def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-    """Points (indices) of equal shapes, and their number of balls."""
+def _groups(points: np.ndarray, given: Given | None) -> Iterator[tuple[np.ndarray, int]]:
+    """Points (indices) of equal shapes, and how many velocities they have: the number of balls."""
+    if given is not None:
+        yield np.arange(len(points)), given.scene.size
+        return
     balls = points[:, AXES.index("balls")]
     for n in np.unique(balls):
         yield np.flatnonzero(balls == n), int(n)
@@ -442,48 +540,51 @@ def _groups(points: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
 
 
 def references(
-    points: np.ndarray, runners: Runners, advance: Callable[[int], None]
+    points: np.ndarray, given: Given | None, runners: Runners, advance: Callable[[int], None]
 ) -> tuple[np.ndarray, Confirmation]:
-    """v+ of each point (P, largest N), NaN where no run ends; how many scipy confirms."""
-    exact = np.full((len(points), int(points[:, AXES.index("balls")].max())), np.nan)
-    for at, balls in _groups(points):
+    """v+ of each point (P, largest n), NaN where no run ends; how many scipy confirms."""
+    groups = list(_groups(points, given))
+    exact = np.full((len(points), max((n for _, n in groups), default=0)), np.nan)
+    for at, n in groups:
         unique, back = np.unique(points[at, 1:], axis=0, return_inverse=True)
         rows = np.column_stack([np.zeros(len(unique)), unique])
-        out = runners(DEFAULT, balls)(rows, REFERENCE_RTOL)
+        out = runners(DEFAULT, n)(rows, REFERENCE_RTOL)
         ended = (out.code == CODE["ok"]) | (out.code == CODE["plastic_limit"])
-        exact[at, :balls] = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
+        exact[at, :n] = np.where(ended[:, None], out.velocity, np.nan)[np.ravel(back)]
         advance(len(at))
-    return exact, _confirm(points, exact)
+    return exact, _confirm(points, given, exact)
 
 
-def _confirm(points: np.ndarray, exact: np.ndarray) -> Confirmation:
+def _confirm(points: np.ndarray, given: Given | None, exact: np.ndarray) -> Confirmation:
     """Differences from scipy's integrator at points spread over those that it solves quickly."""
-    quick = np.array([_is_quick(point) for point in points])
+    quick = np.array([_is_quick(point, given) for point in points])
     candidates = np.flatnonzero(np.isfinite(exact[:, 0]) & quick)
     _, first = np.unique(points[candidates, 1:], axis=0, return_index=True)
     candidates = candidates[np.sort(first)]
     stride = max(1, -(-len(candidates) // CHECKED))
-    differences = np.array([_from_scipy(points[i], exact[i]) for i in candidates[::stride]])
+    differences = np.array([_from_scipy(points[i], given, exact[i]) for i in candidates[::stride]])
     largest = float(differences.max(initial=0.0)) if len(differences) else float("nan")
-    agree = int((differences <= CONFIRMED).sum())
-    return Confirmation(len(points), len(differences), agree, largest)
+    within = FRICTION_CONFIRMED if given is not None and given.friction else CONFIRMED
+    agree = int((differences <= within).sum())
+    return Confirmation(len(points), len(differences), agree, largest, within)
 
 
-def _is_quick(point: np.ndarray) -> bool:
+def _is_quick(point: np.ndarray, given: Given | None) -> bool:
     """Whether scipy solves the point soon, and does not end it too early (small e)."""
-    highest, ratio = frequencies(point)
+    highest, ratio = frequencies(point, given)
     separates = point[AXES.index("restitution")] >= RECLOSING
-    few = point[AXES.index("balls")] <= QUICK_BALLS
-    return bool(separates and few and highest * ratio < QUICK_RATIO)
+    balls = point[AXES.index("balls")] if given is None else given.scene.contacts
+    return bool(separates and balls <= QUICK_BALLS and highest * ratio < QUICK_RATIO)
 
 
-def _from_scipy(point: np.ndarray, exact: np.ndarray) -> float:
+def _from_scipy(point: np.ndarray, given: Given | None, exact: np.ndarray) -> float:
     """Largest difference of v+ from what scipy gives."""
-    _, kappa, eta, e, mu, balls = map(float, point)
-    mass, stiffness = chain_of(kappa, mu, int(balls))
-    scene, v = chain(mass), np.eye(int(balls))[0]
-    law = LZB(e, stiffness, eta)
-    result = METHODS["scipy_dop853"].solve(law, scene, v, CHECK_RTOL)
+    balls = int(point[AXES.index("balls")])
+    law, scene, v = impact_at(list(map(float, point)), balls, given, CHECK_STEPS)
+    name, rtol = "scipy_dop853", CHECK_RTOL
+    if law.friction is not None:
+        name, rtol = "scipy_radau", FRICTION_RTOL
+    result = METHODS[name].solve(law, scene, v, rtol)
     return float(np.abs(outcome(law, scene, v, result).velocity - exact[: len(v)]).max())
 
 
@@ -493,6 +594,7 @@ def _from_scipy(point: np.ndarray, exact: np.ndarray) -> float:
 def classes_of(
     method: Method,
     points: np.ndarray,
+    given: Given | None,
     exact: np.ndarray,
     runners: Runners,
     advance: Callable[[int], None],
@@ -505,24 +607,24 @@ def classes_of(
     if method.setting == "rtol":
         allowed = HONEST * setting
     e = points[:, AXES.index("restitution")]
-    for group, balls in _groups(points):
-        run = runners(method, balls)
+    for group, n in _groups(points, given):
+        run = runners(method, n)
 
         at = group[e[group] > 0] if method.divides else group
         if len(at):
             out = run(points[at], setting[at])
-            errors[at] = np.abs(out.velocity - exact[at, :balls]).max(axis=1)
+            errors[at] = np.abs(out.velocity - exact[at, :n]).max(axis=1)
             codes[at] = _classified(out, errors[at], allowed[at])
         wrong = at[codes[at] == WRONG]
         if len(wrong):
             finer = run(points[wrong], FINER * setting[wrong])
-            error = np.abs(finer.velocity - exact[wrong, :balls]).max(axis=1)
+            error = np.abs(finer.velocity - exact[wrong, :n]).max(axis=1)
             falls = error < FALLS * errors[wrong]
             codes[wrong[(finer.code == CODE["ok"]) & ~falls]] = STALLS
         advance(len(group))
     causes = np.full(len(points), -1)
     for i in np.flatnonzero(codes != RIGHT):
-        causes[i] = _cause(method, points[i], CLASSES[codes[i]], float(setting[i]))
+        causes[i] = _cause(method, points[i], given, CLASSES[codes[i]], float(setting[i]))
     return codes, errors, causes
 
 
@@ -540,7 +642,7 @@ def _classified(out: PointOutcomes, error: np.ndarray, allowed: np.ndarray) -> n
     return np.select(list(cases.values()), list(cases), UNCHECKED)
 
 
-def frequencies(point: np.ndarray) -> tuple[float, float]:
+def frequencies(point: np.ndarray, given: Given | None = None) -> tuple[float, float]:
     """`sqrt(lambda_max)` of the linearized flow in units of the fastest contact, and the ratio of
     the fastest contact's frequency to the slowest's.
 
@@ -548,27 +650,35 @@ def frequencies(point: np.ndarray) -> tuple[float, float]:
 
     >>> import numpy as np
     >>> from jimpact.methods.stability import frequencies
-    >>> [round(x, 3) for x in frequencies(np.array([0.5, 1.0, 1.0, 1.0, 1.0, 2]))]
+    >>> [round(x, 3) for x in frequencies(np.array([0.5, 1.0, 1.0, 1.0, 1.0, 2, 0]))]
     [1.0, 1.0]
     """
-    _, kappa, eta, e, mu, balls = map(float, point)
-    mass, k = (np.asarray(x, float) for x in chain_of(kappa, mu, int(balls)))
-    w = 1 / mass[:-1] + 1 / mass[1:]
+    _, kappa, eta, e, mu, balls, _ = map(float, point)
+    if given is None:
+        mass, k = (np.asarray(x, float) for x in chain_of(kappa, mu, int(balls)))
+        delassus = np.diag(1 / mass[:-1] + 1 / mass[1:])
+        delassus -= np.diag(1 / mass[1:-1], 1) + np.diag(1 / mass[1:-1], -1)
+    else:
+        k, delassus = np.asarray(stiffness_of(kappa, given.scene.contacts)), given.delassus
+    w = np.diag(delassus)
     # 1 / t_ref at the largest normalized speed, up to a common factor
     omega = k ** (1 / (eta + 1)) * np.sqrt(w)
     ratio = omega.max() / omega.min()
     omega = omega / omega.max()
-    neighbours = -1 / mass[1:-1] / np.sqrt(w[:-1] * w[1:])
-    g = np.eye(len(w)) + np.diag(neighbours, 1) + np.diag(neighbours, -1)
+    g = delassus / np.sqrt(w[:, None] * w[None, :])
     largest = np.linalg.eigvalsh(omega[:, None] * g * omega[None, :])[-1]
     fastest = float(np.sqrt(largest * eta * (eta + 1) / 2) / e) if e else np.inf
     return fastest, float(ratio)
 
 
-def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
+def _cause(
+    method: Method, point: np.ndarray, given: Given | None, name: str, setting: float
+) -> int:
     """Index of CAUSES."""
     e, balls = point[AXES.index("restitution")], point[AXES.index("balls")]
-    highest, ratio = frequencies(point)
+    friction = given is not None and given.friction and point[AXES.index("friction")] > 0
+    light = given is None and point[AXES.index("mass_ratio")] < 1 / _FAR
+    highest, ratio = frequencies(point, given)
     reach = setting * highest
     if name == "flagged" and e == 0:
         return _REFUSED
@@ -577,10 +687,14 @@ def _cause(method: Method, point: np.ndarray, name: str, setting: float) -> int:
     if name in ("does not end", "flagged", "unchecked"):
         if e < RECLOSING:
             return _RECLOSES
-        if ratio > _FAR or point[AXES.index("mass_ratio")] < 1 / _FAR:
+        if ratio > _FAR or light:
             return _APART
+        if friction:
+            return _VIBRATES
         if balls >= _LONG and e < _CLUSTERED:
             return _CLUSTER
     if method.setting == "impulse step":
         return _FIRST_ORDER
+    if method.setting == "step" and friction:
+        return _CREEPS
     return _STRADDLES if name in ("wrong", "stalls", "gains energy") else _APART

@@ -49,7 +49,12 @@ CLASS_COLOURS = (
     "#000000",
     "#DDDDDD",
 )
-_LABELS = {"setting": "setting, 1 finest", "restitution": "restitution e", "balls": "balls N"}
+_LABELS = {
+    "setting": "setting, 1 finest",
+    "restitution": "restitution e",
+    "balls": "balls N",
+    "friction": "friction μ",
+}
 _TICKS = 5  # labelled values along an axis, at most
 _STYLES = {"moreau": "--", "binary": ":"}
 _FLOOR = 1e-9  # smaller errors are drawn here

@@ -34,9 +34,13 @@ class Timing(NamedTuple):
     cpu: np.ndarray
 
 
-def arguments(description: str) -> argparse.Namespace:
-    """`--quick` (tiny batches: does it run?) and `--out`."""
+def arguments(
+    description: str, add: Callable[[argparse.ArgumentParser], None] | None = None
+) -> argparse.Namespace:
+    """`--quick` (tiny batches: does it run?), `--out`, and what `add` adds."""
     parser = argparse.ArgumentParser(description=description.splitlines()[0])
+    if add is not None:
+        add(parser)
     parser.add_argument("--quick", action="store_true", help="tiny batches: only whether it runs")
     parser.add_argument("--out", type=Path, default=None, help=f"folder; default {RESULTS.name}/")
     options = parser.parse_args()

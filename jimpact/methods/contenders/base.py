@@ -4,6 +4,9 @@ All work on the dimensionless flow of `events/contact_flow.py`. In time form, wi
 compression and 1/e_j^2 in expansion, and stored energy x_j^(eta_j + 1) / 2,
 
     x_j' = -omega_j c_j gamma_j,   p_j' = (eta_j + 1)/2 omega_j x_j^eta_j,   gamma = gamma- + G p
+
+With friction `gamma = gamma- + G p + K_nt p_t`, `u = u- + K_tn p + K_tt p_t`, and tangential forces
+regularized below a slip s: `p_t,j' = -mu_j p_j' u_j / sqrt(|u_j|^2 + s_j^2)`.
 """
 
 from collections.abc import Callable
@@ -18,24 +21,29 @@ from jimpact._checks import as_float_array, in_common_dtype
 from jimpact.contact import Contact
 from jimpact.events import impact_dynamics
 from jimpact.events.contact_flow import power
-from jimpact.events.impact_dynamics import Dynamics, ImpactUnits
+from jimpact.events.impact_dynamics import Dynamics, ImpactUnits, Sides
 from jimpact.events.impulse_form import Rule, rule_of
 from jimpact.impacts import Impact, impact
 from jimpact.law import Impulses, Law
 from jimpact.laws.lzb import LZB
 from jimpact.scene import Scene
+from jimpact.solvers.tangential import per_tangent
 from jimpact.status import CODE
 
 UNCOUNTED = -1  # evaluations of a method that does not count them
 
 
 class MethodResult(NamedTuple):
-    """Impulses (m,) [N s], duration () [s] (NaN: not known), field evaluations (), status ()."""
+    """Impulses (m,) [N s], duration () [s] (NaN: not known), field evaluations (), status ().
+
+    With friction also tangential impulses (t,) [N s].
+    """
 
     impulse: jax.Array
     duration: jax.Array
     evaluations: jax.Array
     code: jax.Array
+    tangential: jax.Array | None = None
 
 
 Solve = Callable[[LZB, Scene, Any, Any], MethodResult]
@@ -49,7 +57,7 @@ class Method(NamedTuple):
     step in the primary impulse, in units of the impact's momentum. `ladder`: settings from coarse
     to fine. `divides`: by e, which must not be 0. `jax`: `solve(law, scene, velocity, setting)` can
     be jitted, vmapped and differentiated forward, over the setting too; otherwise it takes concrete
-    values. `duration_apart`: the duration takes a run of its own.
+    values. `duration_apart`: the duration takes a run of its own. `friction`: has Coulomb friction.
     """
 
     name: str
@@ -60,9 +68,12 @@ class Method(NamedTuple):
     divides: bool = True
     jax: bool = True
     duration_apart: bool = False
+    friction: bool = False
 
     def supports(self, law: LZB) -> str | None:
         """None, or why it cannot integrate this law."""
+        if law.friction is not None and not self.friction:
+            return "it has no friction"
         refused = self.divides and np.any(law.restitution == 0)
         return "it divides by e^2, and a restitution is 0" if refused else None
 
@@ -85,6 +96,11 @@ class ScaledImpact(NamedTuple):
         return self.dynamics.units
 
     @property
+    def sides(self) -> Sides | None:
+        """The tangential block and mu; None without friction."""
+        return self.inputs.sides
+
+    @property
     def x(self) -> jax.Array:
         """Indentations (m,) before the impact."""
         energy, eta = self.inputs.energy, jnp.asarray(self.dynamics.exponent)
@@ -97,10 +113,12 @@ class ScaledImpact(NamedTuple):
         return rule_of(self.inputs, self.dynamics.static_exponent, self.dynamics.chain)
 
 
-def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> ScaledImpact:
-    """The impact in dimensionless form, without open contacts."""
-    if law.friction is not None:
-        raise TypeError("Argument `law` must have no friction: these methods have none.")
+def problem(
+    law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0, friction: bool = False
+) -> ScaledImpact:
+    """The impact in dimensionless form, without open contacts; `friction`: it may have some."""
+    if law.friction is not None and not friction:
+        raise TypeError("Argument `law` must have no friction: this method has none.")
     v = as_float_array("velocity", velocity)
     law, scene, v = in_common_dtype(law, scene, v)
     contact = law.contact(scene, v)
@@ -111,17 +129,30 @@ def problem(law: LZB, scene: Scene, velocity: Any, rtol: Any = 1.0) -> ScaledImp
 
 
 def in_si(
-    scaled: ScaledImpact, p: jax.Array, t: jax.Array, evaluations: jax.Array, code: jax.Array
+    scaled: ScaledImpact,
+    p: jax.Array,
+    t: jax.Array,
+    evaluations: jax.Array,
+    code: jax.Array,
+    side: jax.Array | None = None,
 ) -> MethodResult:
-    """The result in SI units, nothing where nothing happens, `not_finite` where it is not."""
-    impulse = jnp.where(scaled.happens, p * scaled.units.velocity / scaled.units.root, 0.0)
+    """The result in SI units, nothing where nothing happens, `not_finite` where it is not.
+
+    `side`: tangential impulses (t,), where the impact has friction.
+    """
+    momentum, tangential = scaled.units.momentum, None
+    impulse = jnp.where(scaled.happens, p * momentum, 0.0)
     finite = jnp.all(jnp.isfinite(impulse))
+    if scaled.sides is not None and side is not None:
+        tangential = jnp.where(scaled.happens, side * per_tangent(momentum, side), 0.0)
+        finite = finite & jnp.all(jnp.isfinite(tangential))
     code = jnp.where(scaled.happens, code, CODE["ok"])
     return MethodResult(
         impulse=impulse,
         duration=jnp.where(scaled.happens, t * scaled.units.time, 0.0),
         evaluations=jnp.asarray(evaluations, jnp.int32),
         code=jnp.where(finite, code, CODE["not_finite"]).astype(jnp.int32),
+        tangential=tangential,
     )
 
 
@@ -136,24 +167,26 @@ def time_scale(law: LZB, scene: Scene, velocity: Any) -> jax.Array:
     >>> float(time_scale(ji.LZB(1.0, 4.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0]))
     0.5
     """
-    return problem(law, scene, velocity).units.time
+    return problem(law, scene, velocity, friction=True).units.time
 
 
 class _KnownImpulses(Law):
     """A law whose impulses are known beforehand."""
 
     known: jax.Array
+    tangential: jax.Array | None
     code: jax.Array
     initial_energy: jax.Array
 
     def impulses(self, contact: Contact) -> Impulses:
         """These impulses, whatever the contacts are."""
-        return Impulses(self.known, None, self.code)
+        return Impulses(self.known, self.tangential, self.code)
 
 
 def outcome(law: LZB, scene: Scene, velocity: Any, result: MethodResult) -> Impact:
     """Velocities, energy and full status (`impact`'s own checks included) of a method's result."""
-    return impact(_KnownImpulses(result.impulse, result.code, law.initial_energy), scene, velocity)
+    known = (result.impulse, result.tangential, result.code, law.initial_energy)
+    return impact(_KnownImpulses(*known), scene, velocity)
 
 
 def time_form(
@@ -165,6 +198,36 @@ def time_form(
     closing = -flow.omega * jnp.where(now > 0, opening, 1.0) * now
     factor = (jnp.asarray(flow.exponent, x.dtype) + 1) / 2
     return closing, factor * flow.omega * power(x, flow.exponent)
+
+
+def pull(sides: Sides | None, side: jax.Array) -> jax.Array | float:
+    """What tangential impulses (t,) change of the gap velocities (m,)."""
+    return 0.0 if sides is None else sides.block.normal_tangent @ side
+
+
+def slip(sides: Sides, p: jax.Array, side: jax.Array) -> jax.Array:
+    """u (t,) after impulses p (m,) and tangential ones (t,)."""
+    return sides.block.slip + sides.block.normal_tangent.T @ p + sides.block.tangent @ side
+
+
+def regularized(sides: Sides, force: jax.Array, u: jax.Array, slow: jax.Array) -> jax.Array:
+    """Friction forces (t,) at forces (m,) and slip (t,), regularized below the slip `slow` (m,)."""
+    each = u.reshape(len(force), -1)
+    square = jnp.sum(each**2, axis=1) + slow**2
+    moves = square > 0
+    size = jnp.sqrt(jnp.where(moves, square, 1.0))
+    drag = jnp.where(moves, sides.friction * force / size, 0.0)
+    return -(drag[:, None] * each).ravel()
+
+
+def stopped_within(sides: Sides, force: jax.Array, step: jax.Array) -> jax.Array:
+    """Slip (m,) that full friction stops within a step: slower slip needs a smaller force.
+
+    `mu F step |K_tt|`, with the largest absolute row sum, which no eigenvalue exceeds: friction
+    regularized below it is stable for whatever step.
+    """
+    stiffest = jnp.max(jnp.sum(jnp.abs(sides.block.tangent), axis=1))
+    return sides.friction * force * step * stiffest
 
 
 setup = eqx.filter_jit(problem)

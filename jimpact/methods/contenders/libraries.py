@@ -2,7 +2,8 @@
 
 Steps do not know of the changes of phase: the step-size control has to find them. The impact is
 over when no contact holds or approaches by more than the tolerance; the event must be crossed
-downwards, for it begins at the approach itself.
+downwards, for it begins at the approach itself. Friction (scipy) is regularized below a slip of the
+tolerance, over the fastest approach: what sticks is stiff.
 """
 
 from typing import Any
@@ -18,6 +19,7 @@ from jimpact.methods.contenders.base import (
     UNCOUNTED,
     Method,
     MethodResult,
+    ScaledImpact,
     Solve,
     in_si,
     problem,
@@ -104,6 +106,45 @@ class _GaveUpError(Exception):
     """There were more evaluations than the law allows steps."""
 
 
+class _HostField:
+    """The field in NumPy at y = (x, p, p_t); friction is regularized below the slip `slow`."""
+
+    def __init__(self, scaled: ScaledImpact, slow: float):
+        inputs, flow, m = scaled.inputs, scaled.flow, len(scaled.inputs.gamma)
+        arrays = (inputs.gamma, flow.omega, flow.restitution, flow.exponent)
+        self.gamma, self.omega, self.e, self.eta = (np.asarray(a, float) for a in arrays)
+        self.coupling, self.slow = np.asarray(as_matrix(flow.coupling), float), slow
+        block = (np.zeros((m, 0)), np.zeros((0, 0)), np.zeros(0)), np.zeros(m)
+        if scaled.sides is not None:
+            block = jax.tree.map(np.asarray, scaled.sides)
+        (self.cross, self.tangent, self.slip), self.friction = block
+
+    @property
+    def start(self) -> np.ndarray:
+        """Zeros for (p, p_t)."""
+        return np.zeros(len(self.gamma) + len(self.slip))
+
+    def parts(self, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """x (m,), p (m,) and p_t (t,)."""
+        m = len(self.gamma)
+        return y[:m], y[m : 2 * m], y[2 * m :]
+
+    def gap_velocity(self, y: np.ndarray) -> np.ndarray:
+        """gamma (m,)."""
+        _, p, side = self.parts(y)
+        return self.gamma + self.coupling @ p + self.cross @ side
+
+    def rates(self, y: np.ndarray) -> np.ndarray:
+        """(x', p', p_t')."""
+        (x, p, side), now = self.parts(y), self.gap_velocity(y)
+        closing = -self.omega * np.where(now > 0, 1 / self.e**2, 1.0) * now
+        closing = np.where((x <= 0) & (closing < 0), 0.0, closing)
+        force = (self.eta + 1) / 2 * self.omega * np.maximum(x, 0.0) ** self.eta
+        u = (self.slip + self.cross.T @ p + self.tangent @ side).reshape(len(x), -1)
+        drag = self.friction * force / np.sqrt(np.sum(u**2, axis=1) + self.slow**2)
+        return np.concatenate([closing, force, -(drag[:, None] * u).ravel()])
+
+
 def _scipy_solver(name: str) -> Solve:
     """`solve` by one of the solvers of `scipy.integrate.solve_ivp`."""
 
@@ -111,46 +152,37 @@ def _scipy_solver(name: str) -> Solve:
         """The impact at this rtol."""
         from scipy.integrate import solve_ivp  # late: scipy is slow to import
 
-        scaled = setup(law, scene, velocity)
-        inputs, flow = scaled.inputs, scaled.flow
-        gamma, omega, e = (
-            np.asarray(a, float) for a in (inputs.gamma, flow.omega, flow.restitution)
-        )
-        coupling = np.asarray(as_matrix(flow.coupling), float)
-        eta = np.asarray(flow.exponent, float)
-        m = len(gamma)
+        scaled = setup(law, scene, velocity, friction=True)
+        m, dtype = len(scaled.inputs.gamma), scaled.inputs.gamma.dtype
         rtol = max(float(setting), FINEST)
-
-        count, reached = 0, (0.0, np.zeros(2 * m))
+        field = _HostField(scaled, rtol)
+        start = np.concatenate([np.asarray(scaled.x, float), field.start])
+        count, reached = 0, (0.0, start)
 
         def rates(t: float, y: np.ndarray) -> np.ndarray:
-            """(x', p') (2 m,) at y = (x, p)."""
+            """The field, counted."""
             nonlocal count, reached
             count, reached = count + 1, (t, y)
             if count > min(scaled.max_steps, GIVE_UP * m):
                 raise _GaveUpError
-            x, now = y[:m], gamma + coupling @ y[m:]
-            closing = -omega * np.where(now > 0, 1 / e**2, 1.0) * now
-            closing = np.where((x <= 0) & (closing < 0), 0.0, closing)
-            return np.concatenate([closing, (eta + 1) / 2 * omega * np.maximum(x, 0.0) ** eta])
+            return field.rates(y)
 
         def at_work(_: float, y: np.ndarray) -> float:
             """Positive while a contact is loaded or approaches."""
-            return max(y[:m].max(), -(gamma + coupling @ y[m:]).min()) - rtol
+            return max(y[:m].max(), -field.gap_velocity(y).min()) - rtol
 
         at_work.terminal, at_work.direction = True, -1.0  # type: ignore[attr-defined]
-        start = np.concatenate([np.asarray(scaled.x, float), np.zeros(m)])
         options = {"method": name, "rtol": rtol, "atol": rtol, "events": at_work}
         try:
             result = solve_ivp(rates, (0.0, FOREVER), start, **options)
         except _GaveUpError:
-            p, t, code = reached[1][m:], reached[0], CODE["max_steps"]
+            (t, y), code = reached, CODE["max_steps"]
         else:
             code = CODE["ok"] if result.status == 1 else CODE["max_steps"]
-            p, t = result.y[m:, -1], result.t[-1]
-        # `nfev`, and what LSODA's own differences take
-        impulse, duration = (jnp.asarray(x, inputs.gamma.dtype) for x in (p, t))
-        return in_si(scaled, impulse, duration, jnp.asarray(count), jnp.asarray(code))
+            t, y = result.t[-1], result.y[:, -1]
+        # `nfev`, and what the solver's own differences take
+        p, side, duration = (jnp.asarray(a, dtype) for a in (*field.parts(y)[1:], t))
+        return in_si(scaled, p, duration, jnp.asarray(count), jnp.asarray(code), side)
 
     return solve
 
@@ -158,10 +190,12 @@ def _scipy_solver(name: str) -> Solve:
 def _scipy_method(name: str, solver: str, ladder: tuple[float, ...]) -> Method:
     """The row of a solver of scipy."""
     label = f"scipy {solver} with event"
-    return Method(name, label, "rtol", ladder, _scipy_solver(solver), jax=False)
+    solve = _scipy_solver(solver)
+    return Method(name, label, "rtol", ladder, solve, jax=False, friction=True)
 
 
 SCIPY = (
     _scipy_method("scipy_dop853", "DOP853", (1e-3, 1e-5, 1e-7, 1e-9)),
     _scipy_method("scipy_lsoda", "LSODA", (1e-3, 1e-4, 1e-5)),
+    _scipy_method("scipy_radau", "Radau", (1e-3, 1e-5, 1e-7)),
 )

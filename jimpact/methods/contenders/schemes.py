@@ -3,12 +3,14 @@
 **Event-aligned** (`events/stepper.py`): no step straddles a change of phase. Impulses come from the
 run that finishes an isolated contact in closed form, as `impact` does; the duration needs that
 stroke integrated too, by a second run (which the compiler leaves out where the duration is not
-used). Evaluations: stages of all passes, rejected ones included.
+used). Evaluations: stages of all passes, rejected ones included. **Implicit friction** is the law's
+own method without events, where this version of the package has it.
 
 **Fixed steps in time** do not look for events, x_j is only clamped at 0. A change of phase anywhere
 in a step costs O(step^2), whatever the order of the formula. Explicit steps are stable while `step
 * sqrt(lambda) < 2.83` (Runge-Kutta 4) or 2 (Verlet) with lambda the largest eigenvalue of `omega G
-omega c` (exponent 1), c = 1/e^2 in expansion: small e is stiff.
+omega c` (exponent 1), c = 1/e^2 in expansion: small e is stiff. Verlet has friction, regularized
+below the slip that it stops within half a step: contacts that should stick creep by O(step).
 
 **Steps in impulse** integrate the distributing rule. With primary contact i (the one with the
 largest force; it may change from step to step),
@@ -31,18 +33,23 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import impulse_form
+from jimpact.events import impact_dynamics, impulse_form
 from jimpact.events.contact_flow import power
-from jimpact.events.impact_dynamics import ImpulseProgram, evaluate
+from jimpact.events.impact_dynamics import ImpulseProgram, Sides, evaluate
 from jimpact.events.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import (
+    UNCOUNTED,
     Method,
     MethodResult,
     Solve,
     in_si,
     problem,
+    pull,
+    regularized,
+    slip,
+    stopped_within,
     time_form,
 )
 from jimpact.scene import Scene
@@ -51,14 +58,26 @@ from jimpact.status import CODE
 
 def _solve_aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     """What `impact` does, with its duration."""
-    scaled = problem(law, scene, velocity, setting)
-    leaves, tree = scaled.dynamics.columns()
+    scaled = problem(law, scene, velocity, setting, friction=True)
+    dynamics = scaled.dynamics
+    leaves, tree = dynamics.columns()
     function = ImpulseProgram(
-        tree, scaled.dynamics.static_exponent, scaled.dynamics.chain, scaled.max_steps
+        tree, dynamics.static_exponent, dynamics.chain, scaled.max_steps, dynamics.tangents
     )
-    p, _, _, code, passes = evaluate(function, leaves)
+    p, side, _, code, passes = evaluate(function, leaves)
     _, _, t, _, _ = evaluate(dataclasses.replace(function, whole=True), leaves)
-    return in_si(scaled, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0])
+    return in_si(scaled, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0], side[:, 0])
+
+
+def _solve_implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
+    """The law's own method without events."""
+    scaled = problem(law, scene, velocity, setting, friction=True)
+    p, side, code = impact_dynamics.solve(scaled.dynamics, "implicit")
+    unit = scaled.units.momentum  # its impulses are in SI units already
+    if side is not None:
+        side = side / jnp.repeat(unit, len(side) // len(unit))
+    nothing = jnp.full_like(p[0], jnp.nan)
+    return in_si(scaled, p / unit, nothing, jnp.full_like(code, UNCOUNTED), code, side)
 
 
 Pair = tuple[jax.Array, jax.Array]
@@ -78,27 +97,38 @@ def _runge_kutta(rates: Callable[[Pair], Pair], h: jax.Array, zero: jax.Array) -
 
 
 class _TimeWalk(NamedTuple):
-    """Indentation, impulse, gap velocity and force (m,), steps taken."""
+    """Indentation, impulse, gap velocity and force (m,), steps taken, tangential impulse (t,)."""
 
     x: jax.Array
     p: jax.Array
     gamma: jax.Array
     force: jax.Array
     steps: jax.Array
+    side: jax.Array
 
 
-# (flow, gamma-, h, walk) -> x (to be clamped), p, force
-TimeStep = Callable[[Rule, jax.Array, jax.Array, _TimeWalk], tuple[jax.Array, jax.Array, jax.Array]]
+class _Field(NamedTuple):
+    """The flow, gap velocities (m,) before the impact, and what friction acts on."""
+
+    flow: Rule
+    before: jax.Array
+    sides: Sides | None
 
 
-def _in_time(step: TimeStep, stages: int, first: int) -> Solve:
+# (field, h, walk) -> x (to be clamped), p, force, tangential impulses
+TimeStep = Callable[[_Field, jax.Array, _TimeWalk], tuple[jax.Array, ...]]
+
+
+def _in_time(step: TimeStep, stages: int, first: int, friction: bool = False) -> Solve:
     """`solve` by fixed steps in time of `stages` evaluations each; `first`: those at the start."""
 
     def solve(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
         """The impact with this time step."""
-        scaled = problem(law, scene, velocity)
+        scaled = problem(law, scene, velocity, friction=friction)
         flow, before, start = scaled.flow, scaled.inputs.gamma, scaled.x
+        field = _Field(flow, before, scaled.sides)
         h, zero = jnp.asarray(setting, before.dtype), jnp.zeros_like(before)
+        none = zero[:0] if scaled.sides is None else jnp.zeros_like(scaled.sides.block.slip)
 
         def at_work(walk: _TimeWalk) -> jax.Array:
             """Whether a contact is loaded or approaches."""
@@ -106,44 +136,55 @@ def _in_time(step: TimeStep, stages: int, first: int) -> Solve:
 
         def advance(walk: _TimeWalk) -> _TimeWalk:
             """One step."""
-            x, p, force = step(flow, before, h, walk)
-            gamma = before + flow.coupling @ p
-            return _TimeWalk(jnp.maximum(x, 0.0), p, gamma, force, walk.steps + 1)
+            x, p, force, side = step(field, h, walk)
+            gamma = before + flow.coupling @ p + pull(field.sides, side)
+            return _TimeWalk(jnp.maximum(x, 0.0), p, gamma, force, walk.steps + 1, side)
 
         _, force = time_form(flow, before, start, zero)
         end = jax.lax.while_loop(
             lambda walk: at_work(walk) & (walk.steps < scaled.max_steps),
             advance,
-            _TimeWalk(start, zero, before, force, jnp.zeros((), jnp.int32)),
+            _TimeWalk(start, zero, before, force, jnp.zeros((), jnp.int32), none),
         )
         code = jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
-        return in_si(scaled, end.p, h * end.steps.astype(h.dtype), stages * end.steps + first, code)
+        evaluations = stages * end.steps + first
+        return in_si(scaled, end.p, h * end.steps.astype(h.dtype), evaluations, code, end.side)
 
     return solve
 
 
-def _rk4(
-    flow: Rule, before: jax.Array, h: jax.Array, walk: _TimeWalk
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _rk4(field: _Field, h: jax.Array, walk: _TimeWalk) -> tuple[jax.Array, ...]:
     """A classical Runge-Kutta step."""
 
     def rates(change: Pair) -> Pair:
         """(x', p') at a change of (x, p)."""
-        return time_form(flow, before, walk.x + change[0], walk.p + change[1])
+        return time_form(field.flow, field.before, walk.x + change[0], walk.p + change[1])
 
-    dx, dp = _runge_kutta(rates, h, jnp.zeros_like(before))
-    return walk.x + dx, walk.p + dp, walk.force
+    dx, dp = _runge_kutta(rates, h, jnp.zeros_like(field.before))
+    return walk.x + dx, walk.p + dp, walk.force, walk.side
 
 
-def _verlet(
-    flow: Rule, before: jax.Array, h: jax.Array, walk: _TimeWalk
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _verlet(field: _Field, h: jax.Array, walk: _TimeWalk) -> tuple[jax.Array, ...]:
     """A step of velocity Verlet."""
+    flow, before, sides = field
     p = walk.p + 0.5 * h * walk.force
-    closing, _ = time_form(flow, before, walk.x, p)  # compression or expansion: at mid-step
+    side = _dragged(sides, 0.5 * h, walk.force, p, walk.side)
+    now = before + pull(sides, side)
+    closing, _ = time_form(flow, now, walk.x, p)  # compression or expansion: at mid-step
     x = jnp.maximum(walk.x + h * closing, 0.0)
-    _, force = time_form(flow, before, x, p)
-    return x, p + 0.5 * h * force, force
+    _, force = time_form(flow, now, x, p)
+    p = p + 0.5 * h * force
+    return x, p, force, _dragged(sides, 0.5 * h, force, p, side)
+
+
+def _dragged(
+    sides: Sides | None, h: jax.Array, force: jax.Array, p: jax.Array, side: jax.Array
+) -> jax.Array:
+    """Tangential impulses (t,) after friction has acted for a time h."""
+    if sides is None:
+        return side
+    slow = stopped_within(sides, force, h)
+    return side + h * regularized(sides, force, slip(sides, p, side), slow)
 
 
 # -------------------------------------------------------------------------- steps in impulse
@@ -213,6 +254,16 @@ DOP853_ALIGNED = Method(
     _solve_aligned,
     divides=False,
     duration_apart=True,
+    friction=True,
+)
+IMPLICIT = Method(
+    "implicit",
+    "without events, implicit friction",
+    "rtol",
+    (1e-2, 1e-3, 1e-4, 1e-5),
+    _solve_implicit,
+    divides=False,
+    friction=True,
 )
 SCHEMES = (
     Method(
@@ -231,6 +282,14 @@ SCHEMES = (
         _in_impulse(_impulse_rk4, 4),
     ),
     Method("rk4", "time, fixed Runge-Kutta 4", "step", _TIME_STEPS, _in_time(_rk4, 4, 0)),
-    Method("verlet", "time, velocity Verlet", "step", _TIME_STEPS, _in_time(_verlet, 1, 1)),
+    Method(
+        "verlet",
+        "time, velocity Verlet",
+        "step",
+        _TIME_STEPS,
+        _in_time(_verlet, 1, 1, friction=True),
+        friction=True,
+    ),
     DOP853_ALIGNED,
+    *((IMPLICIT,) if "implicit" in impact_dynamics.METHODS else ()),
 )
