@@ -102,6 +102,8 @@ MUTATIONS = [
     Mutation("crossings are missed", r"crossed, turns = free & \(c1 < -zero\)", "crossed, turns = free & (c1 < -1e3 * zero)", FLOW),
     Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", ("test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]",), "stepper.py", "slow"),
     Mutation("every step accepted", r"ok = error2 <= 1\n", "ok = error2 <= 1e6\n", FLOW),
+    Mutation("cotangents of the last step only", r"return jax\.tree\.map\(jnp\.add, sums, change\), before", "return change, before", ("test_reverse.py::test_steps_that_are_run_again_have_their_derivatives",), "reverse_mode.py"),
+    Mutation("steps are run again from the wrong state", r"progress\]\), slot\)", "progress]), jnp.maximum(slot - 1, 0))", ("test_reverse.py::test_steps_that_are_run_again_have_their_derivatives",), "kept_steps.py"),
     # --- complementarity
     Mutation("LCP: tie rules removed", r"own = candidates & ", "own = (candidates & False) & ", KINEMATIC),
     Mutation("LCP: the least ratio becomes the first", r"jnp\.argmin\(jnp\.where\(own, -jnp\.inf, ratio\)\)", "jnp.argmax(candidates)", KINEMATIC),
