@@ -257,6 +257,12 @@ def chart_box_edge():
 
 
 @picture
+def chart_box_flat():
+    """Error against time and work: a box with friction that falls flat on four corners."""
+    return chart_of_a_box(4, [1.0, 0.0, 0.0, 0.0], "A box flat on four corners, e = 0.3, mu = 0.3")
+
+
+@picture
 def stability(path):
     """Where methods of integration fail, one axis of the map at a time."""
     subprocess.run(["jimpact", "stability", "--out", str(path)], check=True)

@@ -379,6 +379,8 @@ class Law(Declared):
         separable: contacts that W does not couple may be solved separately: the law itself couples
             none, and its parameters are scalars or (m,).
         pads_scenes: open contacts may be added, so that small scenes share one compiled program.
+        accuracy: relative error of v+ that it allows itself at a `Contact`; signs and energy are
+            judged beyond it.
         contact_force: the `Force` of its contacts (`gap_scale`, `crossover`).
         has_history: whether `dynamics` may be sampled over the impact's time (`history`).
         joins_step: True if the law is Moreau's, with `restitution` and `tangential_restitution` of
@@ -423,6 +425,10 @@ class Law(Declared):
     def contact_force(self) -> Any:
         """The `Force` of its contacts; None: they are rigid."""
         return None
+
+    def accuracy(self, contact: Contact) -> float:
+        """Relative error of v+ at this `contact`: `impact` judges signs and energy beyond it."""
+        return 0.0
 
     @property
     def stored(self) -> jax.Array:

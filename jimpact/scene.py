@@ -13,6 +13,7 @@
 
 import dataclasses
 import operator
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -26,6 +27,14 @@ from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 # Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten times more
 # would accept a mass matrix with a wrong fourth digit.
 _SYMMETRY_TOLERANCE = 1e-6
+
+# Part of the length of a normal by which tangents may miss right angles, or its length, before a
+# warning. Ten times more would pass a tilt of half a degree.
+_SQUARE = 1e-3
+
+# Least eigenvalue of the products of a contact's directions, of length 1 in the metric of the mass,
+# below which they depend on each other. Ten times more reports bodies that turn very easily.
+_DEPENDENT = 1e-13
 
 _CONSTRAINTS = operator.attrgetter("constraints")
 WALLS = {
@@ -51,7 +60,8 @@ class Scene(eqx.Module):
 
     Raises:
         ValueError: wrong shapes, NaN, mass not symmetric or not positive, negative gap,
-            a normal that is zero.
+            a normal that is zero. A warning says where the directions of a contact depend on each
+            other, and, where the mass shows it, are not at right angles and of one length.
 
     Source: Brogliato, Nonsmooth Mechanics (3rd ed., 2016), (6.22)-(6.35).
 
@@ -468,6 +478,7 @@ def _check_scene(scene: Scene) -> None:
                 f"but has shape {scene.tangents.shape}."
             )
         check_values("tangents", scene.tangents)
+        _check_directions(scene)
     if scene.constraints is not None:
         if scene.constraints.ndim != 2 or scene.constraints.shape[0] != n:
             raise ValueError(
@@ -476,6 +487,60 @@ def _check_scene(scene: Scene) -> None:
             )
         check_values("constraints", scene.constraints)
         _check_independent(scene.constraints)
+
+
+def _check_directions(scene: Scene) -> None:
+    """Warn where directions of a contact depend on each other, or are not at right angles."""
+    if is_traced((scene.mass, scene.normals, scene.tangents)):
+        return
+    n, m, mass = scene.size, scene.contacts, np.asarray(scene.mass, float)
+    tangents = np.asarray(scene.tangents, float).reshape(n, m, -1)
+    directions = np.concatenate([np.asarray(scene.normals, float)[:, :, None], tangents], axis=2)
+    rows = directions.reshape(n, -1)
+    diagonal = mass.ndim == 1
+    kinetic = (
+        rows.T / np.sqrt(mass) if diagonal else np.linalg.solve(np.linalg.cholesky(mass), rows).T
+    )
+    length = np.linalg.norm(kinetic, axis=1, keepdims=True)
+    unit = (kinetic / np.where(length > 0, length, 1.0)).reshape(m, -1, n)
+    least = np.linalg.eigvalsh(unit @ np.swapaxes(unit, 1, 2))[:, 0]
+    dependent = (least < _DEPENDENT) & (n >= unit.shape[1])
+    oblique = _is_oblique(dense_mass(scene), np.moveaxis(directions, 1, 0))
+    if dependent.any():
+        warnings.warn(
+            f"The normal and tangents of contact {int(np.argmax(dependent)) + 1} depend on each "
+            "other: this is right only if its bodies cannot move in all of these directions.",
+            stacklevel=2,
+        )
+    elif oblique.any():
+        warnings.warn(
+            f"The tangents of contact {int(np.argmax(oblique)) + 1} are not at right angles to its "
+            "normal and to each other, and of its length, where the mass matrix looks like that "
+            "of a body's position: slip velocities and Coulomb's cone are then distorted.",
+            stacklevel=2,
+        )
+
+
+def _is_oblique(mass: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Contacts (m,) whose directions (m, n, d) are not orthonormal in the bodies' positions.
+
+    A scene does not say which coordinates are positions. Those of bodies of one mass are taken for
+    positions if they are uncoupled in M, as many as the directions of each body that the contact
+    moves, and if the normal has length 1 in each body. Rotations do not fit this but by chance.
+    """
+    masses, count = np.diag(mass), directions.shape[2]
+    moves: np.ndarray = np.any(directions, axis=2)
+    uncoupled = np.count_nonzero(mass, axis=1) == 1
+    oblique = np.zeros(len(directions), bool)
+    for value in np.unique(masses[uncoupled]):
+        position = np.flatnonzero(uncoupled & (masses == value))
+        part = directions[:, position]
+        gram = np.swapaxes(part, 1, 2) @ part
+        bodies, coordinates = gram[:, 0, 0], moves[:, position].sum(axis=1)
+        known = np.isclose(coordinates, count * bodies, rtol=_SQUARE) & (bodies > 0)
+        off = np.abs(gram - bodies[:, None, None] * np.eye(count)).max(axis=(1, 2))
+        oblique |= known & (off > _SQUARE * bodies)
+    return oblique
 
 
 def _has_body(normals: Any) -> Any:

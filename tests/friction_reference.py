@@ -100,14 +100,14 @@ class Regularized:
     The state is (v, x); phases are frozen between events, so that the field is smooth there.
     """
 
-    def __init__(self, scene, stiffness, exponent, e, mu, eps, method="Radau"):
+    def __init__(self, scene, stiffness, exponent, e, mu, eps, method="Radau", rtol=RTOL):
         mass = np.asarray(scene.mass, float)
         self.inverse = np.linalg.inv(np.diag(mass) if mass.ndim == 1 else mass)
         self.n, self.h = np.asarray(scene.normals), np.asarray(scene.tangents)
         m = self.m = self.n.shape[1]
         given = (stiffness, exponent, e, mu)
         self.k, self.eta, self.e, self.mu = (np.broadcast_to(x, (m,)).astype(float) for x in given)
-        self.eps, self.method, self.phase = eps, method, np.full(m, OPEN)
+        self.eps, self.method, self.rtol, self.phase = eps, method, rtol, np.full(m, OPEN)
 
     def rates(self, _, state):
         """(v', x')."""
@@ -160,11 +160,16 @@ class Regularized:
         self.stroke, time = strokes.max(), LONGEST * strokes.max() / self.speed
         state = np.concatenate([v, np.zeros(self.m)])
         self.phase = np.where(gamma < 0, CLOSES, OPEN)
-        atol = RTOL * np.append(np.full(len(v), self.speed), np.full(self.m, self.stroke))
+        atol = self.rtol * np.append(np.full(len(v), self.speed), np.full(self.m, self.stroke))
         for _ in range(1000):
             if (self.phase == OPEN).all():
                 return state[: -self.m]
-            options = {"method": self.method, "rtol": RTOL, "atol": atol, "events": self.events()}
+            options = {
+                "method": self.method,
+                "rtol": self.rtol,
+                "atol": atol,
+                "events": self.events(),
+            }
             run = solve_ivp(self.rates, (0.0, time), state, **options)
             if run.status != 1:
                 break

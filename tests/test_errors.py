@@ -141,6 +141,7 @@ SCENES = [
     (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, 0.1, [0.1, 0.1]), r"`gaps`"),
     (lambda: ji.pendulum_cradle([1.0, 1.0], 1.0, 0.1, angles=[0.0] * 3), r"`q`"),
 ]
+MANY = ji.Scene(np.ones(402), np.eye(402)[:, ::2], tangents=np.eye(402)[:, 1::2])
 WELDED = ji.Scene([1.0] * 3, [[-1.0], [1.0], [0.0]], constraints=[[0.0], [-1.0], [1.0]])
 CALLS = [
     (lambda: ji.impact(ji.LZB(0.9), BALLS, [1.0, 0.0]), r"`velocity` must have shape \(3,\)"),
@@ -166,6 +167,16 @@ CALLS = [
         lambda: ji.impact(ji.Compliant(ji.KelvinVoigt(1.0, [0.1, 0.2])), PAIR, [1.0, 0.0]),
         r"`damping`",
     ),
+    (
+        lambda: ji.impact(ji.LZB(0.9, friction=0.1), MANY, np.ones(402)),
+        r"`scene` must have at most 200 contacts .*, but has 201",
+    ),
+    (
+        lambda: ji.impact(ji.Compliant(ji.Hertz(1.0), friction=0.1), MANY, np.ones(402)),
+        r"`scene` must have at most 200 contacts .*, but has 201",
+    ),
+    (lambda: ji.LZB(0.9, friction=np.nan), r"`friction` must lie in \[0, inf\).*nan"),
+    (lambda: ji.Moreau(0.9, friction=[0.1, -0.1]), r"`friction`.*-0\.1 at index 1"),
     (lambda: ji.impact(ji.LZB, BALLS, V), r"`law` must be of type Law"),
     (lambda: ji.impact(ji.LZB(0.9), [1.0, 1.0, 1.0], V), r"`scene` must be of type Scene"),
     (

@@ -166,3 +166,17 @@ def test_a_chain_is_never_made_dense():
     text = str(trace(jnp.ones(137)))
     assert "136" in text
     assert "136,136" not in text
+
+
+def test_values_and_forward_derivatives_are_one_program():
+    """The reverse mode needs two: values, and what pulls cotangents back."""
+    v = jnp.array([1.0, 0.0, 0.0])
+
+    def last(e):
+        return ji.impact(ji.LZB(e), ji.chain(jnp.ones(3)), v).velocity[2]
+
+    def programs(derivative):
+        return str(jax.make_jaxpr(derivative)(jnp.full(2, 0.9))).count("columns[")
+
+    assert programs(jax.jacfwd(last)) == programs(jax.jacfwd(jax.jacfwd(last))) == 1
+    assert programs(jax.grad(last)) == programs(jax.grad(jax.checkpoint(last))) == 2

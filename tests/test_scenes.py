@@ -1,5 +1,8 @@
 """Scenes and bodies: contact space, kinetic angles, gaps and tangents against mechanics; statuses."""
 
+import re
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -315,3 +318,40 @@ def test_statuses_go_from_mild_to_grave():
     wanted = "max_steps out_of_range not_finite infeasible inadmissible_velocity negative_impulse energy_gain"
     wanted += " impulse_not_unique order_dependent plastic_limit several_outcomes ill_conditioned"
     assert set(wanted.split()) <= set(reported)
+
+
+FLAT = [[0.0, 0.0], [1.0, 1.0], [0.5, -0.5]]  # normals of a block of width 1, (x, y, angle)
+UPRIGHT = [[1.0, 1.0], [0.0, 0.0], [0.7, 0.7]]
+
+
+@pytest.mark.parametrize(
+    ("mass", "normals", "tangents", "message"),
+    [
+        ([2.0, 2.0, 0.4], FLAT, [[1, 1.0], [0, 0.2], [0.7, 0.7]], r"contact 2 are not at right"),
+        ([2.0, 2.0, 0.4], FLAT, [[1, 2.0], [0, 0.0], [0.7, 1.4]], r"contact 2 are not .*length"),
+        ([2.0, 2.0, 0.4], FLAT, np.array(FLAT)[:, [1, 1]], r"contact 2 depend on each other"),
+        ([2.0, 2.0, 0.4], FLAT, [[1, 0.0], [0, 0.0], [0.7, 0.0]], r"contact 2 depend on each"),
+        ([1.0] * 3, [[0.0], [0.0], [1.0]], [[1, 1.0], [0, 0], [0, 0]], r"contact 1 depend on each"),
+        ([1.0] * 3, [[0.0], [0.0], [1.0]], [[1, 0.6], [0, 0.8], [0, 0]], r"contact 1 are not at"),
+        (np.eye(3) + np.eye(3)[::-1] / 2, FLAT, [[1, 1], [0.2] * 2, [0.7] * 2], None),  # coupled
+        ([2.0, 2.0, 0.4], FLAT, UPRIGHT, None),
+        ([2.0, 2.0, 2.0], FLAT, UPRIGHT, None),  # an inertia that happens to be the mass
+        ([2.0], [[1.0]], [[0.5]], None),  # one coordinate, a pendulum
+    ],
+)
+def test_tangents_that_distort_friction_are_reported(mass, normals, tangents, message):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        ji.Scene(mass, normals, tangents=tangents)
+    assert len(caught) == (message is not None)
+    assert message is None or re.search(message, str(caught[0].message))
+
+
+def test_tangents_of_bodies_are_not_reported():
+    box, turned = ji.Box([1.0, 1.2, 0.8]), [0.9, 0.1, 0.3, 0.3]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        box.scene(box.touching(np.array(turned)))
+        ji.rocking_block(1.0, 2.0, angle=0.3)
+        ji.dimer(0.1, 1.0)
+        ji.dimer_3d(0.1, 1.0)

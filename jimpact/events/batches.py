@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
-from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like
+from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, value_of
 
 # Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
 # stay in a core's cache: 64 are no faster, 1024 take half as long again.
@@ -32,7 +32,7 @@ columns_p.multiple_results = True
 def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """`function(*arrays)`, where all arrays in and out have the batch in their last axis.
 
-    Where it is differentiated all its results are floating-point numbers.
+    Results that are whole numbers have no derivatives; `function.smoothed()` leaves them out.
     `function` is hashable and compares equal where it does the same (a function of a module, or a
     frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
@@ -71,12 +71,7 @@ class Tangent:
         count = len(self.marked)
         primals, tangents = arrays[:count], arrays[count:]
         if getattr(self.function, "takes_duals", False):
-            tangents = tangents if self.many else tuple(x[None] for x in tangents)
-            inner = iter(jnp.moveaxis(x, 0, TANGENT_AXIS) for x in tangents)
-            duals = [Dual(x, next(inner)) if m else x for x, m in zip(primals, self.marked)]
-            outs = [dual_like(duals, x) for x in self.function(*duals)]
-            rates = [jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in outs]
-            return tuple(rates if self.many else (x[0] for x in rates))
+            return _by_duals(self, primals, tangents)[1]
         of_marked, values = _partial(self.function, self.marked, primals)
 
         def push(*tangents: jax.Array) -> Arrays:
@@ -84,6 +79,62 @@ class Tangent:
             return jax.jvp(of_marked, values, tangents)[1]
 
         return (jax.vmap(push) if self.many else push)(*tangents)
+
+
+@dataclasses.dataclass(frozen=True)
+class WithTangents:
+    """The results of `function` and, behind them, the tangents of the floating-point ones.
+
+    One program for both: in forward mode nothing is computed or compiled twice. The reverse mode
+    takes it apart again, into `function` and its `Tangent`.
+    """
+
+    function: Callable[..., Arrays]
+    marked: tuple[bool, ...]
+    many: bool = False
+
+    def __call__(self, *arrays: jax.Array) -> Arrays:
+        """Results (.., B), and tangents (.., B); with `many`, directions first."""
+        count = len(self.marked)
+        primals, tangents = arrays[:count], arrays[count:]
+        if getattr(self.function, "takes_duals", False):
+            return sum(_by_duals(self, primals, tangents), ())
+        of_marked, values = _partial(self.function, self.marked, primals)
+
+        def push(*tangents: jax.Array) -> tuple[Arrays, Arrays]:
+            """Results, and tangents in one direction."""
+            outs, rates = jax.jvp(of_marked, values, tangents)
+            return outs, tuple(rate for x, rate in zip(outs, rates) if is_smooth(x))
+
+        outs, rates = (jax.vmap(push, out_axes=(None, 0)) if self.many else push)(*tangents)
+        return *outs, *rates
+
+
+def is_smooth(x: Any) -> bool:
+    """Whether an array, or its shape, has floating-point numbers, which may have tangents."""
+    return bool(jnp.issubdtype(x.dtype, jnp.floating))
+
+
+def _by_duals(
+    derivative: "Tangent | WithTangents", primals: Arrays, tangents: Arrays
+) -> tuple[Arrays, Arrays]:
+    """Results of a function that takes duals, and the tangents of the floating-point ones."""
+    many = derivative.many
+    tangents = tangents if many else tuple(x[None] for x in tangents)
+    inner = iter(jnp.moveaxis(x, 0, TANGENT_AXIS) for x in tangents)
+    duals = [Dual(x, next(inner)) if m else x for x, m in zip(primals, derivative.marked)]
+    outs = derivative.function(*duals)
+    smooth = [dual_like(duals, x) for x in outs if is_dual(x) or is_smooth(x)]
+    rates = [jnp.moveaxis(x.tangents, TANGENT_AXIS, 0) for x in smooth]
+    return value_of(tuple(outs)), tuple(rates if many else (x[0] for x in rates))
+
+
+def smoothed(function: Any) -> Any:
+    """The function without results that are no floating-point numbers."""
+    if isinstance(function, WithTangents):
+        return dataclasses.replace(function, function=smoothed(function.function))
+    form = getattr(function, "smoothed", None)
+    return function if form is None else form()
 
 
 def reversible(function: Any) -> Any:
@@ -105,6 +156,8 @@ class Cotangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         """Cotangents (.., B) of the marked arguments; with `many`, directions first."""
+        if isinstance(self.function, WithTangents):
+            return self._of_both(self.function, arrays)
         count = len(self.marked)
         primals, cotangents = arrays[:count], arrays[count:]
         if isinstance(self.function, Tangent | Cotangent):
@@ -154,20 +207,48 @@ class Cotangent:
             results += [x for x, mark in zip(rates, of_t) if mark]
         return tuple(results)
 
+    def _of_both(self, both: WithTangents, arrays: Arrays) -> Arrays:
+        """Of results and their tangents: the sum of what each of them gives."""
+        count, inner = len(self.marked), len(both.marked)
+        primals, cotangents = arrays[:count], arrays[count:]
+        half = len(cotangents) // 2  # results without tangents have no cotangents
+        rates = Tangent(both.function, both.marked, both.many)
+        whole = Cotangent(rates, self.marked, self.many)(*primals, *cotangents[half:])
+        if not any(self.marked[:inner]):
+            return whole
+        first = Cotangent(both.function, self.marked[:inner], self.many)
+        added = first(*primals[:inner], *cotangents[:half])
+        return *(a + b for a, b in zip(whole, added)), *whole[len(added) :]
 
-def tangents_in_columns(
+
+def with_tangents_in_columns(
     function: Callable[..., Arrays], arrays: Arrays, tangents: tuple[Any, ...]
-) -> Arrays:
-    """Tangents of `in_columns(function, *arrays)`, without its value."""
+) -> tuple[Arrays, Arrays]:
+    """`in_columns(function, *arrays)`, and the tangents of the results that have some."""
     marked = tuple(not isinstance(t, SymbolicZero) for t in tangents)
     nonzero = (t for t, mark in zip(tangents, marked) if mark)
-    return in_columns(Tangent(function, marked), *arrays, *nonzero)
+    return _bind_with_tangents(function, marked, (*arrays, *nonzero))
+
+
+def _bind_with_tangents(
+    function: Callable[..., Arrays], marked: tuple[bool, ...], arrays: Arrays
+) -> tuple[Arrays, Arrays]:
+    """Results and tangents of `WithTangents`, apart."""
+    outs = in_columns(WithTangents(function, marked), *arrays)
+    count = _count_of_values(outs)
+    return outs[:count], outs[count:]
+
+
+def _count_of_values(outs: Any) -> int:
+    """How many of the results, or shapes, of `WithTangents` are no tangents."""
+    smooth = [is_smooth(x) for x in outs]
+    return next(n for n in range(len(outs)) if n + sum(smooth[:n]) == len(outs))
 
 
 def _queues(function: Any) -> bool:
     """Whether the function works through a batch of any size by itself."""
-    if isinstance(function, Tangent):
-        return _queues(function.function)
+    if isinstance(function, Tangent | WithTangents):
+        return _queues(smoothed(function.function))
     return getattr(function, "queues", False)
 
 
@@ -176,7 +257,8 @@ def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     size = arrays[0].shape[-1]
     if _queues(function):
         return tuple(function(*arrays))
-    count = -(-size // (CHUNK_WITH_TANGENTS if isinstance(function, Tangent) else CHUNK))
+    tangents = isinstance(function, Tangent | WithTangents)
+    count = -(-size // (CHUNK_WITH_TANGENTS if tangents else CHUNK))
     if count == 1:
         return tuple(function(*arrays))
     width = -(-size // count)
@@ -218,14 +300,17 @@ def _run(*arrays: jax.Array, function: Callable[..., Arrays]) -> Arrays:
 def _shapes(*shapes: Any, function: Callable[..., Arrays]) -> list[Any]:
     """Shapes of the results, without tracing `function` where they are known: it takes long."""
     known = [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
-    if isinstance(function, Tangent | Cotangent):
+    if isinstance(function, Tangent | WithTangents | Cotangent):
         primals, rest = known[: len(function.marked)], shapes[len(function.marked) :]
-        if isinstance(function, Tangent):
-            outs = _shapes(*primals, function=function.function)
-        else:
+        values: list[Any] = []
+        if isinstance(function, Cotangent):
             outs = [x for x, mark in zip(primals, function.marked) if mark]
+        else:
+            values = _shapes(*primals, function=function.function)
+            outs = [x for x in values if is_smooth(x)]
         many = rest[0].shape[:1] if function.many else ()
-        return [jax.core.ShapedArray((*many, *x.shape), x.dtype) for x in outs]
+        rates = [jax.core.ShapedArray((*many, *x.shape), x.dtype) for x in outs]
+        return [*values, *rates] if isinstance(function, WithTangents) else rates
     shapes_of = getattr(function, "shapes", None) or functools.partial(jax.eval_shape, function)
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in shapes_of(*known)]
 
@@ -235,10 +320,10 @@ mlir.register_lowering(columns_p, mlir.lower_fun(_run, multiple_results=True))
 
 def _wider(
     arrays: Any, axes: Any, *, function: Callable[..., Arrays]
-) -> tuple[list[jax.Array], list[int]]:
+) -> tuple[list[jax.Array], list[int | None]]:
     """Rule of `vmap`: its batch becomes part of the last axis."""
     size = next(x.shape[axis] for x, axis in zip(arrays, axes) if axis is not None)
-    if isinstance(function, Tangent | Cotangent) and not function.many:
+    if isinstance(function, Tangent | WithTangents | Cotangent) and not function.many:
         count = len(function.marked)
         if all(axis is None for axis in axes[:count]):
             # many directions at one point: its steps are computed once
@@ -247,7 +332,9 @@ def _wider(
                 for x, axis in zip(arrays[count:], axes[count:])
             ]
             outs = in_columns(dataclasses.replace(function, many=True), *arrays[:count], *rest)
-            return list(outs), [0] * len(outs)
+            both = isinstance(function, WithTangents)
+            values = _count_of_values(outs) if both else 0
+            return list(outs), [None] * values + [0] * (len(outs) - values)
 
     def wide(x: jax.Array, axis: int | None) -> jax.Array:
         """The array with the batch of `vmap` in its last axis."""
@@ -269,13 +356,61 @@ def _jvp(
     primals: Any, tangents: Any, *, function: Callable[..., Arrays]
 ) -> tuple[list[Any], list[Any]]:
     """Rule of the forward mode."""
-    outs = columns_p.bind(*primals, function=function)
     marked = tuple(type(t) is not ad.Zero for t in tangents)
     nonzero = [t for t, mark in zip(tangents, marked) if mark]
-    return outs, columns_p.bind(*primals, *nonzero, function=Tangent(function, marked))
+    outs, rates = _bind_with_tangents(function, marked, (*primals, *nonzero))
+    rest = iter(rates)
+
+    def zero(x: Any) -> Any:
+        """The tangent of a whole number."""
+        return ad.Zero(jax.core.ShapedArray(x.shape, jax.dtypes.float0))
+
+    return list(outs), [next(rest) if is_smooth(x) else zero(x) for x in outs]
 
 
 ad.primitive_jvps[columns_p] = _jvp
+
+
+def _apart(function: WithTangents) -> tuple[Any, Tangent]:
+    """What gives its results, and what its tangents."""
+    inner = function.function
+    return inner, Tangent(smoothed(inner), function.marked, function.many)
+
+
+def _partial_eval(trace: Any, *arrays: Any, function: Any) -> list[Any]:
+    """Rule of the reverse mode: where only tangents are unknown, the results are known."""
+    known = [x.is_known() for x in arrays]
+    count = len(function.marked) if isinstance(function, WithTangents) else 0
+    if not count or all(known) or not all(known[:count]):
+        return list(trace.default_process_primitive(columns_p, arrays, {"function": function}))
+    inner, tangent = _apart(function)
+    values = columns_p.bind(*(x.pval.get_known() for x in arrays[:count]), function=inner)
+    rates = trace.default_process_primitive(columns_p, arrays, {"function": tangent})
+    return [*values, *rates]
+
+
+pe.custom_partial_eval_rules[columns_p] = _partial_eval
+
+
+def _partial_eval_of_program(_: Any, unknown: Any, at_hand: Any, eqn: Any) -> Any:
+    """The same rule within `jax.checkpoint`. Results are small and dear: they are kept."""
+    function, size = eqn.params["function"], len(eqn.outvars)
+    if not any(unknown):
+        return eqn, None, [False] * size, [False] * size, []
+    missing = [x for x, there in zip(eqn.invars, at_hand) if not there and hasattr(x, "count")]
+    count = len(function.marked) if isinstance(function, WithTangents) else 0
+    if not count or any(unknown[:count]):
+        return None, eqn, [True] * size, [True] * size, missing
+    inner, tangent = _apart(function)
+    whole = _count_of_values([x.aval for x in eqn.outvars])
+    first = {"invars": eqn.invars[:count], "outvars": eqn.outvars[:whole]}
+    values = eqn.replace(**first, params={"function": inner})
+    rates = eqn.replace(outvars=eqn.outvars[whole:], params={"function": tangent})
+    late = [False] * whole + [True] * (size - whole)
+    return values, rates, late, late, missing
+
+
+pe.partial_eval_jaxpr_custom_rules[columns_p] = _partial_eval_of_program
 
 
 def _transpose(cotangents: Any, *arrays: Any, function: Callable[..., Arrays]) -> list[Any]:

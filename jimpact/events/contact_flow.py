@@ -187,7 +187,8 @@ def as_pytree(flow: type[T]) -> type[T]:
     """A dataclass of arrays as a pytree; the fields COMPILED_IN belong to its structure."""
     names = [field.name for field in dataclasses.fields(flow)]  # type: ignore[arg-type]
     arrays = [name for name in names if name not in COMPILED_IN]
-    return jax.tree_util.register_dataclass(flow, arrays, list(COMPILED_IN))
+    fixed = [name for name in names if name in COMPILED_IN]
+    return jax.tree_util.register_dataclass(flow, arrays, fixed)
 
 
 @as_pytree

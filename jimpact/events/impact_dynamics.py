@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.contact import Contact
-from jimpact.events import impulse_form, stepper
-from jimpact.events.batches import in_columns, tangents_in_columns
+from jimpact.events import implicit_steps, impulse_form, stepper
+from jimpact.events.batches import in_columns, with_tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
@@ -26,11 +26,14 @@ from jimpact.events.contact_flow import (
     per_row,
 )
 from jimpact.events.friction_flow import FrictionFlow
+from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import remainder, to_the_end
 from jimpact.events.reverse_mode import reversible_run
 from jimpact.events.slip import SlipFlow
-from jimpact.events.tangents import pushforward, value_of
+from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
+from jimpact.solvers.sensitivity import without_derivatives
+from jimpact.solvers.step_impulses import descent_lengths
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -39,10 +42,18 @@ from jimpact.status import CODE
 # digits worse at the same one. At order 8 these two digits cost a third more steps; ten times more
 # would lose one of them.
 GRADIENT_TIGHTENING = 0.01
+NO_SECOND = (
+    "Argument `method` must be 'time' for second derivatives, but has value 'implicit': steps that "
+    "do not end at events have first derivatives only."
+)
+IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost more
 # A contact slower than the fastest by more than this factor sees many of its periods, whose errors
 # add up, so the tolerance falls with their number. Ten times more: it begins to fall too late.
 WIDE_SPREAD = 5.0
-METHODS = ("time", "impulse")
+METHODS = ("auto", "time", "implicit", "impulse")
+# Contacts with friction in space up to which 'auto' is 'time'. More of them change between stick
+# and slip thousands of times, one after the other. Ten times more: some impacts do not end.
+EXACT_CONTACTS = 4
 # Tolerance of the second run that shows how well an outcome is conditioned, as a multiple of that
 # of the first one: FINER, or APART coarser where the precision allows none so fine. Ten times more:
 # runs that differ too little, or the error of a coarse one.
@@ -148,21 +159,32 @@ def sides_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Sides
     return Sides(block, friction * jnp.ones_like(units.root))
 
 
+def normal_coupling(problem: Problem, chain: bool) -> jax.Array:
+    """G (m, m, B) from the entries that a problem holds."""
+    m, (_, *batch) = problem.omega.shape[0], problem.omega.shape
+    i, j = (jnp.arange(m - 1), jnp.arange(1, m)) if chain else jnp.triu_indices(m, 1)
+    upper = jnp.zeros((m, m, *batch), problem.omega.dtype).at[i, j].set(problem.off_diagonal)
+    return unit(upper) + upper + jnp.swapaxes(upper, 0, 1)
+
+
+def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
+    """Indentations x (m, B) before the impact: of what is stored, otherwise minus the gap."""
+    eta: Any = exponent if problem.exponent is None else problem.exponent
+    loaded = problem.energy > 0
+    energy = jnp.where(loaded, problem.energy, 1.0)
+    # not loaded: minus the gap, at 0 too, where its derivative is the one-sided one
+    apart = 0.0 if problem.gap is None else -problem.gap
+    return jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
+
+
 def flow_of(
     problem: Problem, exponent: Exponent | None, chain: bool, tighten: float = 1.0
 ) -> tuple[ContactFlow, jax.Array, jax.Array]:
     """The flow of a problem in columns (.., B), and its first modes and state."""
-    m, dtype = problem.omega.shape[0], problem.omega.dtype
-    batch = problem.omega.shape[1:]
+    m, viscous = problem.omega.shape[0], problem.viscous
     coupling: Chain | Dense = Chain(problem.off_diagonal)
     if not chain or m <= DENSE_CHAIN:
-        i, j = jnp.triu_indices(m, 1)
-        if chain:
-            i, j = jnp.arange(m - 1), jnp.arange(1, m)
-        upper = jnp.zeros((m, m, *batch), dtype).at[i, j].set(problem.off_diagonal)
-        coupling = Dense(unit(upper) + upper + jnp.swapaxes(upper, 0, 1))
-    eta: Any = exponent if problem.exponent is None else problem.exponent
-    viscous = problem.viscous
+        coupling = Dense(normal_coupling(problem, chain))
     parts: dict[str, Any] = dict(
         coupling=coupling,
         omega=problem.omega,
@@ -175,11 +197,7 @@ def flow_of(
         gapped=problem.gap is not None,
         closed_form=viscous is None,
     )
-    loaded = problem.energy > 0
-    energy = jnp.where(loaded, problem.energy, 1.0)
-    # not loaded: minus the gap, at 0 too, where its derivative is the one-sided one
-    apart = 0.0 if problem.gap is None else -problem.gap
-    x = jnp.where(loaded, energy ** (1 / (per_row(eta, energy) + 1)), apart)
+    x = first_indentation(problem, exponent)
     if problem.sides is None:
         flow = ContactFlow(**parts, watches=tighten < 1 and problem.exponent is not None)
         return flow, *flow.start(problem.gamma, x)
@@ -201,7 +219,7 @@ class ImpulseProgram:
     sides: int = 0  # tangential rows
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
-    smooth: bool = False  # only the results that have derivatives; duals are taken
+    smooth: bool = False  # only the results that have derivatives
     reverses: bool = False  # in a form that has a reverse mode
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
@@ -220,12 +238,17 @@ class ImpulseProgram:
     @property
     def queues(self) -> bool:
         """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
-        return self.sides > 0 and (self.takes_duals or not self.finely)
+        smooth = self.smooth and self.takes_duals  # called with tangents
+        return self.sides > 0 and (smooth or not self.finely)
 
     @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
-        return self.smooth and not self.reverses
+        return self.finely and not self.reverses
+
+    def smoothed(self) -> "ImpulseProgram":
+        """The same with only the results that have derivatives."""
+        return dataclasses.replace(self, smooth=True)
 
     def reversible(self) -> "ImpulseProgram":
         """The same in a form that the reverse mode goes through, too."""
@@ -237,18 +260,20 @@ class ImpulseProgram:
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
         flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
         gamma = value_of(problem.gamma)
+        duals = any(map(is_dual, leaves))
+        state: Any
         if self.reverses:
             (state, _), (end, _) = reversible_run(flow, gamma, modes, y, self.most, 0)
             end = jax.lax.stop_gradient(end)
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
         else:
-            keeps = self.finely and not self.takes_duals
-            end = to_the_end(flow, gamma, modes, y, self.most, keeps)
+            end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
             state = end.carry.y
-        dp = end.impulse
-        if self.smooth:
+        dp: Any = end.impulse
+        if self.smooth or duals:
             last = flow, problem.gamma, state
             dp = pushforward(lambda f, g, y: remainder(f, g, y, end.carries), *last)
+            dp = Dual(end.impulse, dp.tangents) if is_dual(dp) else dp
         rows = 3 * gamma.shape[0]
 
         def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
@@ -259,8 +284,105 @@ class ImpulseProgram:
         p, *rest = pushforward(parts, state, dp)
         if self.smooth:
             return p, *rest
-        p = end.with_kept(p) if self.finely else p
+        p = end.with_kept(p) if self.finely and not duals else p
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
+
+
+@dataclasses.dataclass(frozen=True)
+class ImplicitProgram(ImpulseProgram):
+    """As `ImpulseProgram`, by steps without events; both modes go through it as it is."""
+
+    @property
+    def queues(self) -> bool:
+        """No: it is called with chunks of a batch."""
+        return False
+
+    @property
+    def takes_duals(self) -> bool:
+        """No: derivatives walk the steps of the plan."""
+        return False
+
+    def reversible(self) -> "ImplicitProgram":
+        """Itself."""
+        return self
+
+    def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.State]:
+        """The contacts of a problem, and their state before the impact."""
+        coupling = normal_coupling(problem, self.chain)
+        friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
+        if problem.sides is not None:
+            (across, tangent, slip), friction = problem.sides
+            back = jnp.swapaxes(across, 0, 1)
+            rows = [jnp.concatenate(x, axis=1) for x in ((coupling, across), (back, tangent))]
+            coupling = jnp.concatenate(rows)
+            velocity = jnp.concatenate([velocity, slip])
+        flow = ImplicitSteps(
+            coupling=coupling,
+            omega=problem.omega,
+            restitution=problem.restitution,
+            exponent_array=problem.exponent,
+            friction=friction,
+            descent=jax.lax.stop_gradient(descent_lengths(coupling, problem.omega.shape[0])),
+            tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
+            kept=jnp.full_like(problem.tolerance, 1.0 if self.finely else 0.0),
+            viscous=problem.viscous,
+            exponent_static=None if problem.exponent is not None else self.exponent,
+            gapped=problem.gap is not None,
+        )
+        return flow, flow.start(first_indentation(problem, self.exponent), velocity)
+
+    def __call__(self, *leaves: Any) -> tuple[Any, ...]:
+        """The results from the leaves of a problem; see `ImpulseProgram`."""
+
+        def to_the_end(leaves: Any) -> tuple[implicit_steps.Run, jax.Array]:
+            """The run and its status."""
+            flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
+            run = implicit_steps.to_the_end(flow, start, self.most, keeps=self.finely)
+            return run, self.code(flow, run)
+
+        def results(state: implicit_steps.State) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """Normal impulses, tangential ones, and the time."""
+            return state.impulse[:m], state.impulse[m:], state.time
+
+        @jax.custom_jvp
+        def outcome(leaves: Any) -> tuple[Any, Any]:
+            """Results with derivatives, and those without."""
+            run, code = to_the_end(leaves)
+            return results(run.state), (code, run.passes)
+
+        def tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
+            """Those of the steps that were taken; events within them spoil second ones."""
+            leaves = without_derivatives(primals[0], NotImplementedError(NO_SECOND))
+            run, code = to_the_end(jax.lax.stop_gradient(leaves))
+            assert run.plan is not None
+            plan, whole = run.plan, (code, run.passes)
+
+            def walked(leaves: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+                """The results as smooth functions."""
+                flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
+                return results(implicit_steps.repeat(flow, start, plan))
+
+            _, rates = jax.jvp(walked, (leaves,), tangents)
+            none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), whole)
+            return (results(run.state), whole), (rates, none)
+
+        outcome.defjvp(tangent)
+        m = jax.tree.unflatten(self.tree, leaves).omega.shape[0]
+        smooth, whole = outcome(leaves)
+        return smooth if self.smooth else (*smooth, *whole)
+
+    def code(self, flow: ImplicitSteps, run: implicit_steps.Run) -> jax.Array:
+        """Status (1, B) of a run."""
+        code = jnp.where(flow.busy(run.state), CODE["max_steps"], CODE["ok"])
+        return code.astype(jnp.int32)
+
+
+def method_for(method: str, contact: Contact) -> str:
+    """What 'auto' stands for at these contacts; another method is itself."""
+    if method != "auto":
+        return method
+    many = contact.tangents == 2 and contact.contacts > EXACT_CONTACTS
+    return "implicit" if many else "time"
 
 
 class Dynamics(NamedTuple):
@@ -271,6 +393,7 @@ class Dynamics(NamedTuple):
     exponent: Exponent
     chain: bool
     max_steps: int
+    method: str = "time"
 
     @property
     def static_exponent(self) -> float | tuple[float, ...] | None:
@@ -287,25 +410,32 @@ class Dynamics(NamedTuple):
         leaves, tree = jax.tree.flatten(self.problem)
         return tuple(x[..., None] for x in leaves), tree
 
+    def program(self, whole: bool = False) -> ImpulseProgram:
+        """From `columns` to impulses; `whole`: no closed form ends it."""
+        kind = ImplicitProgram if self.method == "implicit" else ImpulseProgram
+        tree = self.columns()[1]
+        parts = tree, self.static_exponent, self.chain, self.max_steps, self.tangents
+        return kind(*parts, whole=whole)
+
 
 def solve(
-    dynamics: Dynamics, method: str = "time", condition_check: Contact | None = None
+    dynamics: Dynamics, condition_check: Contact | None = None
 ) -> tuple[jax.Array, jax.Array | None, jax.Array]:
     """Impulses p (m,) and p_t (t,) [N s] (None without friction) and the status ().
 
     `condition_check`: the contacts, if a second run is to show whether the outcome is
     `ill_conditioned`. Differentiable in both modes; method 'time' in all orders.
     """
-    units, exponent, max_steps = dynamics.units, dynamics.static_exponent, dynamics.max_steps
-    if method == "impulse":
-        p, code = impulse_form.solve(dynamics.problem, exponent, dynamics.chain, max_steps)
+    units, problem = dynamics.units, dynamics.problem
+    if dynamics.method == "impulse":
+        exponent, most = dynamics.static_exponent, dynamics.max_steps
+        p, code = impulse_form.solve(problem, exponent, dynamics.chain, most)
         return p * units.momentum, None, code
-    leaves, tree = dynamics.columns()
+    leaves, _ = dynamics.columns()
     if condition_check is not None:
-        second = dynamics._replace(problem=perturbed(dynamics.problem)).columns()[0]
+        second = dynamics._replace(problem=perturbed(problem)).columns()[0]
         leaves = tuple(jnp.concatenate(both, axis=-1) for both in zip(leaves, second))
-    program = ImpulseProgram(tree, exponent, dynamics.chain, max_steps, dynamics.tangents)
-    p, side, _, code, _ = evaluate(program, leaves)
+    p, side, _, code, _ = evaluate(dynamics.program(), leaves)
     p, code = p * units.momentum[:, None], code[0]
     tangential = None
     if dynamics.tangents > 0:
@@ -370,11 +500,9 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
 
     def rule(primals: Any, tangents: Any) -> Any:
         """Values at the tolerance of derivatives, and their tangents."""
-        # values keep the steps for the reverse mode: one loop where they are one program
+        # in reverse mode values keep the steps: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
-        outs = evaluate(fine, primals)
-        smooth = dataclasses.replace(fine, smooth=True)
-        rates = tangents_in_columns(smooth, primals, tangents)
+        outs, rates = with_tangents_in_columns(fine, primals, tangents)
         whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 

@@ -76,7 +76,8 @@ class SlipRates(NamedTuple):
     sliding: jax.Array  # lambda of those that slide (t, B)
     holding: jax.Array  # lambda of those that stick (t, B)
     rate: jax.Array  # of the rows of slip (m, 2, B)
-    stiffness: jax.Array  # mu F K_tt (m, B)
+    direction: jax.Array  # of slip (m, 2, B)
+    turning: jax.Array  # its rate (m, B); of those that creep to first order in their deviation
     haste: jax.Array  # (1, B) >= 1: by how much time is shortened
 
 
@@ -102,10 +103,36 @@ def length(pair: jax.Array) -> jax.Array:
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, 1.0)), 0.0)
 
 
+def perpendicular_to(direction: jax.Array) -> jax.Array:
+    """Vectors (m, 2, B) turned by a right angle."""
+    return jnp.stack([-direction[:, 1], direction[:, 0]], 1)
+
+
+@jax.custom_jvp
+def towards(angle: jax.Array) -> jax.Array:
+    """Unit vectors (m, 2, B) in this direction; tangents evaluate no cosine again."""
+    return jnp.stack([jnp.cos(angle), jnp.sin(angle)], 1)
+
+
+@towards.defjvp
+def _turning(angle: Any, rate: Any) -> tuple[jax.Array, jax.Array]:
+    """The vector turns at right angles to itself."""
+    direction = towards(*angle)
+    return direction, perpendicular_to(direction) * rate[0][:, None]
+
+
 def polar(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Unit vectors (m, 2, B) in this direction and at right angles to it."""
-    cosine, sine = jnp.cos(angle), jnp.sin(angle)
-    return jnp.stack([cosine, sine], 1), jnp.stack([-sine, cosine], 1)
+    direction = towards(angle)
+    return direction, perpendicular_to(direction)
+
+
+def turned(vectors: tuple[jax.Array, jax.Array], angle: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Vectors as those of `polar`, turned by small angles, to second order: without a cosine."""
+    direction, perpendicular = vectors
+    half = (angle / 2)[:, None]
+    cosine, sine = (1 - half**2) / (1 + half**2), 2 * half / (1 + half**2)
+    return cosine * direction + sine * perpendicular, cosine * perpendicular - sine * direction
 
 
 def angle_of(pair: jax.Array) -> jax.Array:
@@ -206,8 +233,9 @@ class SlipFlow(FrictionFlow):
         c = jnp.where(slides, self.friction * f, 0.0)
         angle, r = jnp.where(slides, q[:, 1], 0.0), self.speed(modes, q)
         over_r = jnp.where(slips, frozen.unit / jnp.where(slips, r, 1.0), 0.0)
-        drift, correction = self._creep(const, modes, y, f, c, angle, over_r)
-        direction, perpendicular = polar(angle + correction)
+        frame = polar(angle)
+        drift, correction = self._creep(const, modes, y, f, c, frame, over_r)
+        direction, perpendicular = turned(frame, correction)
         side = flat(-c[:, None] * direction)
         a = pairs(times(const.pull, f) + times(const.tangent, side))
         grows, turns = dot(direction, a), dot(perpendicular, a)
@@ -221,11 +249,25 @@ class SlipFlow(FrictionFlow):
         rate = jnp.where(
             self.loaded(modes)[:, None], rate, (frozen.unit * jnp.ones_like(x))[:, None] * a
         )
-        diagonal = pairs(const.tangent[np.arange(len(side)), np.arange(len(side))])
-        stiffness = c * (diagonal[:, 0] + diagonal[:, 1]) / 2
-        haste = 1 + total(over_r * (length(a) + 2 * stiffness))
-        holding = -(times(const.held, f) + times(const.carried, side))
-        return SlipRates(f, side, jnp.where(twice(stick), holding, 0.0), rate, stiffness, haste)
+        haste = 1 + total(over_r * (length(a) + 2 * self._stiffness(const, c)))
+        holding = self._holding(const, stick, f, side)
+        turning = jnp.where(slips, over_r * turns, drift)
+        return SlipRates(f, side, holding, rate, direction, turning, haste)
+
+    def _stiffness(self, const: Reduced, c: jax.Array) -> jax.Array:
+        """c K_tt (m, B), K_tt the mean of its two directions."""
+        rows = np.arange(2 * self.contacts)
+        diagonal = pairs(const.tangent[rows, rows])
+        return c * (diagonal[:, 0] + diagonal[:, 1]) / 2
+
+    def _holding(
+        self, const: Reduced, stick: jax.Array, f: jax.Array, side: jax.Array
+    ) -> jax.Array:
+        """Forces of sticking (2 m, B), or their rates, from those of F and of sliding forces."""
+        holding = times(const.held, f)
+        if self.contacts > 1:  # one contact alone sticks or slides
+            holding = holding + times(const.carried, side)
+        return jnp.where(twice(stick), -holding, 0.0)
 
     def _blocks(self, const: Reduced) -> jax.Array:
         """K_tt (m, 2, m, 2, B)."""
@@ -239,10 +281,10 @@ class SlipFlow(FrictionFlow):
         y: jax.Array,
         f: jax.Array,
         c: jax.Array,
-        angle: jax.Array,
+        frame: tuple[jax.Array, jax.Array],
         over_r: jax.Array,
     ) -> tuple[jax.Array, jax.Array]:
-        """How fast the directions (m, B) of creep drift, and their deviation from `angle`.
+        """How fast the directions (m, B) of creep drift, and their deviation from those of `frame`.
 
         With G = n . a of all contacts that creep, G' at fixed angles and J = -dG/d angle, the
         quasi-static solution G = 0 drifts by J^-1 G'. The directions lag behind it by
@@ -252,7 +294,7 @@ class SlipFlow(FrictionFlow):
         x, g, _ = self.rows(y)
         *_, creeps = self.sliding(modes)
         r = jnp.where(creeps, self.slip(y)[:, 0], 0.0)
-        direction, perpendicular = polar(angle)
+        direction, perpendicular = frame
 
         def acceleration(f: jax.Array, side: jax.Array) -> jax.Array:
             """u' (m, 2, B) of normal forces and those of sliding."""
@@ -265,8 +307,8 @@ class SlipFlow(FrictionFlow):
         rates = (frozen.closing * g, frozen.ratio * pull)
         _, df = jax.jvp(lambda x, g: self.force(frozen, x, g), (x, g), rates)
         dc = jnp.where(c > 0, self.friction * df, 0.0)
-        turned = (c * over_r * turns)[:, None] * perpendicular  # of those that slip
-        changes = dot(perpendicular, acceleration(df, -dc[:, None] * direction - turned))
+        swung = (c * over_r * turns)[:, None] * perpendicular  # of those that slip
+        changes = dot(perpendicular, acceleration(df, -dc[:, None] * direction - swung))
         # all in units of the largest entry: forces begin at 0
         blocks = self._blocks(const)
         j = sum(
@@ -281,9 +323,8 @@ class SlipFlow(FrictionFlow):
         j, eye = j / size[None], unit(j)
         turns, changes = (jnp.where(creeps, z / size, 0.0) for z in (turns, changes))
         away = jnp.where(creeps, LEAST_STIFFNESS, 1.0)
-        both = jnp.stack([changes, turns], axis=1)
-        both = solve(j + eye * (growth + away)[:, None], both)
-        drift, newton = both[:, 0], both[:, 1]
+        whole = j + eye * (growth + away)[:, None]
+        drift, newton = (solve(whole, z[:, None])[:, 0] for z in (changes, turns))
         lagging = jnp.where(creeps, frozen.unit, 1.0)[:, None] * (
             j + eye * (2 * growth + away)[:, None]
         )
@@ -296,7 +337,7 @@ class SlipFlow(FrictionFlow):
         m, (x, g, p) = self.contacts, self.rows(y)
         const, loaded, q = self.constants(modes), self.loaded(modes), self.slip(y)
         motion = self.motion(const, modes, y)
-        turned = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
+        cartesian = self.speed(modes, q)[:, None] * polar(jnp.where(loaded, q[:, 1], 0.0))[0]
         return ContactStates(
             force=motion.force,
             indentation=x,
@@ -304,7 +345,7 @@ class SlipFlow(FrictionFlow):
             gap_velocity=const.frozen.scale * g,
             tangential_force=motion.sliding + motion.holding,
             tangential_impulse=y[5 * m : 7 * m],
-            slip=flat(jnp.where(loaded[:, None], turned, q)),
+            slip=flat(jnp.where(loaded[:, None], cartesian, q)),
             rate=const.frozen.unit / motion.haste,
         )
 
@@ -327,19 +368,58 @@ class SlipFlow(FrictionFlow):
 
     def margins(self, const: Reduced, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Beside those of the normal flow: until slip stops; until stick, or creep, ends."""
-        motion, r = self.motion(const, modes, y), self.slip(y)[:, 0]
+        motion = self.motion(const, modes, y)
+        return self._margins_of(const, modes, y, motion.force, motion.holding)
+
+    def _margins_of(
+        self, const: Reduced, modes: jax.Array, y: jax.Array, f: jax.Array, holding: jax.Array
+    ) -> jax.Array:
+        """The margins from the state, F (m, B) and the forces of sticking (2 m, B)."""
+        r = self.slip(y)[:, 0]
         stick, slips, creeps = self.sliding(modes)
         floor = FLOOR * self.tolerance
         stops = jnp.where(slips, r - jnp.log(floor), jnp.where(creeps, r + floor, 1.0))
         # all forces of an impact vanish together: the room in the cone is one in parts of them
-        size = total(motion.force)
-        room = self.friction * motion.force - length(pairs(motion.holding))
+        size = total(f)
+        room = self.friction * f - length(pairs(holding))
         room = jnp.where(size > 0, room / jnp.where(size > 0, size, 1.0), 1.0)
-        slow = CREEP * jnp.sqrt(self.tolerance) * const.frozen.unit * motion.stiffness
+        stiffness = self._stiffness(const, jnp.where(slips | creeps, self.friction * f, 0.0))
+        slow = CREEP * jnp.sqrt(self.tolerance) * const.frozen.unit * stiffness
         creep = jnp.where(creeps, r, 0.0) - 2 * floor
         slow = (slow - creep) / (slow + jnp.abs(creep))
         ends = jnp.where(stick, room, jnp.where(creeps, slow, 1.0))
         return jnp.concatenate([ContactFlow.margins(self, const.frozen, modes, y), stops, ends])
+
+    def margins_with_rates(
+        self, const: Reduced, modes: jax.Array, y: jax.Array, dy: jax.Array, target: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The margins, and their rates from those of the forces.
+
+        Forces of sticking depend on the directions of creep, whose rates are those of first order,
+        but where a step lands on the rim of a cone.
+        """
+        m, motion = self.contacts, self.motion(const, modes, y)
+        stick, slips, creeps = self.sliding(modes)
+        (x, g, _), (dx, dg, _) = self.rows(y), self.rows(dy)
+        _, df = jax.jvp(lambda x, g: self.force(const.frozen, x, g), (x, g), (dx, dg))
+        dc = jnp.where(slips | creeps, self.friction * df, 0.0)[:, None]
+        c = jnp.where(slips | creeps, self.friction * motion.force, 0.0)
+        turned = (c * motion.turning / motion.haste)[:, None] * perpendicular_to(motion.direction)
+        dside = -flat(dc * motion.direction + turned)
+        value, rates = jax.jvp(
+            lambda y, f, holding: self._margins_of(const, modes, y, f, holding),
+            (y, motion.force, motion.holding),
+            (dy, df, self._holding(const, stick, df, dside)),
+        )
+        if m == 1:
+            return value, rates
+        needed = jnp.any(target[3 * m :] & stick & any_of(creeps))
+        rates = jax.lax.cond(
+            needed,
+            lambda: jax.jvp(lambda z: self.margins(const, modes, z), (y,), (dy,))[1],
+            lambda: rates,
+        )
+        return value, rates
 
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array

@@ -122,6 +122,15 @@ class Flow(abc.ABC):
     def margins(self, const: Any, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Margins (k, B): each is >= 0 while its mode lasts."""
 
+    def margins_with_rates(
+        self, const: Any, modes: jax.Array, y: jax.Array, dy: jax.Array, target: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Margins and their rates (k, B) while y changes at the rates dy.
+
+        Those of the `target` of a landing have to be exact, others are looked at to predict events.
+        """
+        return jax.jvp(lambda z: self.margins(const, modes, z), (y,), (dy,))
+
     @abc.abstractmethod
     def switch(
         self, modes: jax.Array, y: jax.Array, which: jax.Array
@@ -238,7 +247,7 @@ def _slopes(
 
     def rates_of_margins() -> tuple[jax.Array, jax.Array]:
         """Margins and their rates in the flow's own time."""
-        return jax.jvp(lambda z: flow.margins(const, s.modes, z), (now,), (dy[: len(now)],))
+        return flow.margins_with_rates(const, s.modes, now, dy[: len(now)], s.target)
 
     if flow.near:  # of costly margins: steps in time need them at their ends only
         needed = jnp.any(lands > 0) | (i == 0) | (i == STAGES)

@@ -10,10 +10,17 @@ import jax.numpy as jnp
 from jimpact._checks import check_choice, check_values
 from jimpact.contact import Contact
 from jimpact.events.contact_flow import Viscous
-from jimpact.events.impact_dynamics import Dynamics, dimensionless, sides_of, solve
+from jimpact.events.impact_dynamics import (
+    METHODS,
+    Dynamics,
+    dimensionless,
+    method_for,
+    sides_of,
+    solve,
+)
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_rtol, default_rtol
+from jimpact.laws.lzb import check_friction, check_rtol, default_rtol
 from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import diagonal
 
@@ -33,8 +40,10 @@ class Compliant(Law):
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
         initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed contacts; not with
             a viscous force.
-        rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
+        rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with method
+            'implicit' 1e-5 (float32: 1e-4).
         max_steps: maximum attempted steps.
+        method: 'time', 'implicit' or 'auto' (default), as in `LZB`.
         check_conditioning: solve a second time to detect `ill_conditioned`, as in `LZB`.
 
     Status: `max_steps`; `plastic_limit` where contacts re-close without end; `ill_conditioned`
@@ -43,6 +52,7 @@ class Compliant(Law):
     Derivatives, forward and reverse, in the force's parameters, gaps, W and gamma-; one-sided
     where a gap is 0 and at grazing events. Where two orders of collision meet, the outcome changes
     within gaps of about `gap_scale`; there derivatives are of order |change of v+| / `gap_scale`.
+    Method 'implicit' has first derivatives only, as in `LZB`.
 
     Source: Brogliato, Nonsmooth Mechanics (2016), (6.14)-(6.16).
 
@@ -60,6 +70,7 @@ class Compliant(Law):
     initial_energy: Values = parameter(low=0.0, default=0.0, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
+    method: str = option("auto", METHODS[:-1])
     check_conditioning: bool = option(False, (False, True))
 
     def __check_init__(self) -> None:
@@ -83,8 +94,18 @@ class Compliant(Law):
         return self.force.bistiffness is not None
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """Raise a ValueError for a tolerance finer than the precision can hold."""
+        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
         check_rtol(self.rtol, dtype)
+        check_friction(self.friction, scene)
+
+    def accuracy(self, contact: Contact) -> float:
+        """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
+        return self._tolerance(contact) if method_for(self.method, contact) == "implicit" else 0.0
+
+    def _tolerance(self, contact: Contact) -> float:
+        """`rtol`, or the default of the method at these contacts."""
+        method = method_for(self.method, contact)
+        return self.rtol or default_rtol(method, contact.gap_velocity.dtype)
 
     def dynamics(self, contact: Contact) -> Dynamics:
         """The dimensionless dynamics of the whole encounter."""
@@ -103,7 +124,7 @@ class Compliant(Law):
             k,
             exponent,
             contact.stored,
-            self.rtol or default_rtol("time", gamma.dtype),
+            self._tolerance(contact),
             contact.gaps,
         )
         if bistiffness is None:
@@ -112,12 +133,13 @@ class Compliant(Law):
         problem = problem._replace(viscous=viscous)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, exponent, contact.chain, self.max_steps)
+        method = method_for(self.method, contact)
+        return Dynamics(problem, units, exponent, contact.chain, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""
         checked = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), condition_check=checked))
+        return Impulses(*solve(self.dynamics(contact), checked))
 
 
 RHEOLOGIES = ("bistiffness", "kelvin-voigt", "hunt-crossley", "kuwabara-kono")

@@ -10,8 +10,7 @@ from jimpact._checks import as_whole, check_values, in_common_dtype
 from jimpact.compiling import quick_jit
 from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import ContactStates
-from jimpact.events.impact_dynamics import ImpulseProgram
-from jimpact.events.impact_history import HistoryProgram
+from jimpact.events.impact_history import history_program
 from jimpact.law import Law, check_law
 from jimpact.scene import Scene, as_velocity, velocity_change
 
@@ -48,7 +47,7 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     are only nearly equal: see `time`.)
 
     Args:
-        law: an `LZB` with method 'time', or a `Compliant` with a power law or a `Bistiffness`
+        law: an `LZB` (not with method 'impulse'), a `Compliant` with a power law or a `Bistiffness`
             (gaps included: `indentation` is 0 while a contact is open), a `VelocityDependent` of
             these, or a law of your own with `has_history` and `dynamics`; a stiffness in SI units
             makes time and force SI.
@@ -71,8 +70,9 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     """
     if not law.has_history:
         raise TypeError(
-            "Argument `law` must have a history (`has_history`: LZB with method='time', Compliant "
-            f"with a Bistiffness force, a law of your own with `dynamics`), but is {law!r}."
+            "Argument `law` must have a history (`has_history`: LZB, not by method 'impulse', a "
+            "Compliant with a Bistiffness force, a law of your own with `dynamics`), "
+            f"but is {law!r}."
         )
     as_whole("samples", samples, 2)
     v = as_velocity(scene, velocity)
@@ -89,12 +89,9 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int) -> History:
     happens, gamma = contact.happens, contact.gap_velocity
     harmless = jnp.where(happens, gamma, -jnp.ones_like(gamma))
     dynamics = law.dynamics(eqx.tree_at(lambda c: c.gap_velocity, contact, harmless))
-    leaves, tree = dynamics.columns()
     t, units = dynamics.tangents, dynamics.units
-    program = ImpulseProgram(
-        tree, dynamics.static_exponent, dynamics.chain, dynamics.max_steps, t, whole=True
-    )
-    time, energy, *rest = in_columns(HistoryProgram(program, samples), *leaves)
+    program = dynamics.program(whole=True)
+    time, energy, *rest = in_columns(history_program(program, samples), *dynamics.columns()[0])
     *rows, maximum, code = (x[..., 0] for x in rest)
     states = ContactStates(*rows)
     force, root = units.momentum / units.time, jnp.repeat(units.root, t // len(gamma))

@@ -8,7 +8,14 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_values
 from jimpact.contact import Contact
-from jimpact.events.impact_dynamics import METHODS, Dynamics, dimensionless, sides_of, solve
+from jimpact.events.impact_dynamics import (
+    METHODS,
+    Dynamics,
+    dimensionless,
+    method_for,
+    sides_of,
+    solve,
+)
 from jimpact.law import (
     LARGEST_EXPONENT,
     Impulses,
@@ -26,12 +33,21 @@ from jimpact.scene import Scene
 # outcome right to one digit less.
 DEFAULT_RTOL = {"float64": 1e-8, "float32": 1e-5}
 DEFAULT_RTOL_IMPULSE = 1e-4  # method 'impulse', first order: the step in the primary impulse itself
+# Method 'implicit': finer than what is measured, some 100 steps. Ten times more saves half of them.
+DEFAULT_RTOL_IMPLICIT = {"float64": 1e-5, "float32": 1e-4}
 FINEST_RTOL_IN_EPS = 16  # below this many eps the error estimate is noise
+
+# Contacts with friction up to which impact dynamics are tried: each of their events involves all of
+# them. Ten times more would not end within hours, and no status would ever say so.
+MOST_WITH_FRICTION = 200
 
 
 def default_rtol(method: str, dtype: jnp.dtype) -> float:
     """Tolerance if the law has no `rtol`."""
-    return DEFAULT_RTOL_IMPULSE if method == "impulse" else DEFAULT_RTOL.get(str(dtype), 1e-5)
+    if method == "impulse":
+        return DEFAULT_RTOL_IMPULSE
+    table = DEFAULT_RTOL_IMPLICIT if method == "implicit" else DEFAULT_RTOL
+    return table.get(str(dtype), table["float32"])
 
 
 def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
@@ -41,6 +57,15 @@ def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
         raise ValueError(
             f"Argument `rtol` must be at least {finest:.2g} in {dtype}, "
             f"but has value {rtol:g}: enable jax_enable_x64 for finer tolerances."
+        )
+
+
+def check_friction(friction: Any, scene: Scene) -> None:
+    """Raise a ValueError where too many contacts have friction."""
+    if friction is not None and scene.contacts > MOST_WITH_FRICTION:
+        raise ValueError(
+            f"Argument `scene` must have at most {MOST_WITH_FRICTION} contacts for impact dynamics "
+            f"with friction, but has {scene.contacts}: algebraic laws such as Moreau take more."
         )
 
 
@@ -97,13 +122,17 @@ class LZB(Law):
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents (planar or spatial);
             None: none. While a contact slips, the tangential force is `lambda = -mu F u / |u|`;
             while it sticks, u is exactly 0 and `|lambda| <= mu F` (`docs/friction.md`).
-        rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5).
+        rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with method
+            'implicit' 1e-5 (float32: 1e-4).
         max_steps: maximum attempted steps.
-        method: 'time' (default), event-aligned, order 8; 'impulse', the published scheme in the
-            impulse of a primary contact, order 1.
+        method: 'time', event-aligned, order 8; 'implicit', steps that know no events, order 2 to
+            3, compiled in a second whatever the contacts, for many contacts with friction;
+            'impulse', the published scheme in the impulse of a primary contact, order 1; 'auto'
+            (default): 'time', but 'implicit' for more than 4 contacts with friction in space,
+            where events may be endless.
         check_conditioning: solve a second time with rtol / 100 and with perturbed last digits, and
             set `ill_conditioned` if gap velocities or slips differ by more than 10 rtol of the
-            fastest approach (method 'time' only; cost and float32: `docs/speed_accuracy.md`).
+            fastest approach (not with 'impulse'; cost and float32: `docs/speed_accuracy.md`).
 
     Status: `plastic_limit` where contacts re-close without end; `max_steps`, also because large
     friction can jam contacts, which then vibrate for a long time; `ill_conditioned` if checked.
@@ -111,7 +140,8 @@ class LZB(Law):
     Derivatives, forward and reverse, in all parameters, W and gamma-; one-sided at e = 0 and
     e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three equal
     linear balls), and where slip stops just as a contact opens. In `initial_energy` at 0 the true
-    slope may be infinite; 0 is returned.
+    slope may be infinite; 0 is returned. Method 'implicit' has first derivatives only, of what it
+    computes: at the default `rtol` they are right to some 1e-3; second ones raise.
 
     Source: Liu, Zhao and Brogliato, Proc. R. Soc. A 464 (2008) 3193 and 465 (2009) 1;
     Brogliato, Nonsmooth Mechanics (2016), (6.67)-(6.73) with the errata of `docs/equations.md`.
@@ -134,7 +164,7 @@ class LZB(Law):
     friction: OptionalValues = parameter(low=0.0, default=None, kw_only=True)
     rtol: float | None = option(None, low=0.0, high=1.0, open_low=True)
     max_steps: int = option(100_000, low=1)
-    method: str = option("time", METHODS)
+    method: str = option("auto", METHODS)
     check_conditioning: bool = option(False, (False, True))
 
     def __check_init__(self) -> None:
@@ -143,24 +173,34 @@ class LZB(Law):
             ("friction", self.friction is not None),
             ("check_conditioning", self.check_conditioning),
         ):
-            if self.method != "time" and used:
+            if self.method == "impulse" and used:
                 raise ValueError(
-                    f"Argument `method` must be 'time' with {name}, but has value {self.method!r}."
+                    f"Argument `method` must not be 'impulse' with {name}, but has this value."
                 )
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
-        """A tolerance finer than the precision can hold is an error."""
+        """Raise for a tolerance finer than the precision can hold, and too many contacts."""
         check_rtol(self.rtol, dtype)
+        check_friction(self.friction, scene)
+
+    def accuracy(self, contact: Contact) -> float:
+        """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
+        return self._tolerance(contact) if method_for(self.method, contact) == "implicit" else 0.0
+
+    def _tolerance(self, contact: Contact) -> float:
+        """`rtol`, or the default of the method at these contacts."""
+        method = method_for(self.method, contact)
+        return self.rtol or default_rtol(method, contact.gap_velocity.dtype)
 
     @property
     def pads_scenes(self) -> bool:  # type: ignore[override]
-        """True for method 'time' without friction."""
-        return self.method == "time" and self.friction is None
+        """True without friction, but for method 'impulse'."""
+        return self.method != "impulse" and self.friction is None
 
     @property
     def has_history(self) -> bool:  # type: ignore[override]
-        """True for method 'time'."""
-        return self.method == "time"
+        """True but for method 'impulse'."""
+        return self.method != "impulse"
 
     @property
     def only_stiffness_ratios(self) -> bool:  # type: ignore[override]
@@ -181,16 +221,15 @@ class LZB(Law):
             self.stiffness,
             self.exponent,
             contact.stored,
-            self.rtol or default_rtol(self.method, contact.gap_velocity.dtype)
-            if rtol is None
-            else rtol,
+            self._tolerance(contact) if rtol is None else rtol,
             closed=contact.closed,
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, self.exponent, contact.chain, self.max_steps)
+        method = method_for(self.method, contact)
+        return Dynamics(problem, units, self.exponent, contact.chain, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""
         checked = contact if self.check_conditioning else None
-        return Impulses(*solve(self.dynamics(contact), self.method, checked))
+        return Impulses(*solve(self.dynamics(contact), checked))

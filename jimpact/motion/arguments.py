@@ -176,9 +176,15 @@ def without_closures(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -
     return eqx.tree_at(parts, system, new, is_leaf=lambda x: x is None)
 
 
-def friction_of(
-    system: System, law: Law, friction: Any, q: jax.Array, in_space: bool
-) -> jax.Array | None:
+def friction_in_space(system: System, mu: jax.Array | None, q: jax.Array) -> bool:
+    """Whether contacts with friction have two tangents each."""
+    if mu is None or is_pile(system):
+        return False
+    tangents = jax.eval_shape(system.body.tangents, q)
+    return tangents is not None and tangents.shape[1] == 2 * contacts_of(system, q)
+
+
+def friction_of(system: System, law: Law, friction: Any, q: jax.Array) -> jax.Array | None:
     """mu (m,), () of a pile: the argument, or that of the law; None without friction."""
     mu = getattr(law, "friction", None) if friction is None else friction
     tangents = jax.eval_shape(system.body.tangents, q)
@@ -197,11 +203,6 @@ def friction_of(
         raise ValueError(
             "Argument `system` must have one tangent a contact in the plane, two in space: "
             f"{m} or {2 * m} for its {m} contacts, but has {tangents.shape[1]}."
-        )
-    if not (in_space or tangents.shape[1] == m):
-        raise ValueError(
-            "Argument `friction` must be 0 for a body with tangents in space: with "
-            "method='time_stepping' alone motions know friction in space."
         )
     if is_pile(system):
         check_shape("friction", mu, (), "one for all contacts of a pile")

@@ -375,7 +375,15 @@ def _turning(
     """The impact as one program, from time 0 to `horizon` () [s] at most."""
     zero = jnp.zeros_like(horizon)
     settings = Settings(
-        rtol, rtol * 1e-3, jnp.asarray(PENETRATION), zero, max_steps, False, horizon, zero
+        rtol,
+        rtol * 1e-3,
+        jnp.asarray(PENETRATION),
+        zero,
+        max_steps,
+        False,
+        False,
+        horizon,
+        zero,
     )
     times = jnp.stack([zero, horizon])
     _, end, apart = compliant_motion(system, force, settings, q, v, times, MOST_EVENTS, True)

@@ -47,7 +47,7 @@ from jimpact.motion.flow import (
 from jimpact.motion.persistent_contact import no_modes
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events
 from jimpact.motion.system import System
-from jimpact.motion.transitions import After, Decision, resolve, resolved_again
+from jimpact.motion.transitions import After, Decision, resolve, resolved_again, sides_of
 
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6
@@ -78,6 +78,11 @@ class MotionProblem(NamedTuple):
     times: jax.Array  # (S,)
     contacts: int  # m
     past: Past | None = None  # where the motion may go on, run after run
+
+    @property
+    def sides(self) -> int:
+        """The number of tangential impulses."""
+        return sides_of(self.system, self.q0, self.contacts)
 
     @property
     def start(self) -> State:
@@ -433,7 +438,7 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
 
 def _width(problem: MotionProblem) -> int:
     """Numbers of an event."""
-    return 3 + problem.q0.size + 2 * problem.v0.size + 4 * problem.contacts
+    return 3 + problem.q0.size + 2 * problem.v0.size + 3 * problem.contacts + problem.sides
 
 
 def _numbers(before: State, after: After) -> jax.Array:
@@ -449,7 +454,7 @@ def _events(table: MotionTable, count: jax.Array, problem: MotionProblem) -> Eve
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
     rows = jnp.where(used[:, None], table.events[:-1], jnp.nan)
     n, m = problem.v0.size, problem.contacts
-    sizes = np.cumsum([1, problem.q0.size, n, n, m, m, 2 * m])
+    sizes = np.cumsum([1, problem.q0.size, n, n, m, problem.sides, 2 * m])
     time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
     ends = marks[:, 0] == KIND_CODE["accumulation"]
     return Events(

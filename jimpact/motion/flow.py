@@ -23,17 +23,22 @@ from jimpact.motion.dynamics import (
     user_force,
 )
 from jimpact.motion.persistent_contact import (
+    BEGINS,
     Contacts,
     Modes,
+    by_contact,
     constraint_impulse,
     contact_powers,
     contacts_at,
     forces,
     least_regularity,
+    length,
     regularity,
     rest_acceleration,
+    slip_margins,
 )
 from jimpact.motion.record import MOTION_CODE, Events
+from jimpact.motion.slip_in_space import SlipAxes, slip_axes, slip_within
 from jimpact.motion.system import System
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
@@ -68,6 +73,7 @@ class Settings(NamedTuple):
     gap_rounding: jax.Array  # gaps below it are rounding
     max_steps: int
     friction: bool
+    spatial: bool  # friction has two rows a contact
     duration: jax.Array
     accumulation: jax.Array  # `slow`: see `transitions.resolve`
 
@@ -89,24 +95,33 @@ class Course(NamedTuple):
     status: jax.Array
 
 
-def watched(contacts: Contacts, mu: jax.Array | None, modes: Modes, scales: Scales) -> jax.Array:
-    """What must stay positive (k,): gaps or normal forces, then friction."""
+def watched(
+    contacts: Contacts,
+    mu: jax.Array | None,
+    modes: Modes,
+    scales: Scales,
+    slip: jax.Array | None = None,
+) -> jax.Array:
+    """What must stay positive (k,): gaps or normal forces, then friction.
+
+    `slip`: as in `forces`.
+    """
     m = modes.active.shape[0]
-    force = forces(contacts, mu, modes)
+    force = forces(contacts, mu, modes, slip)
     w = jnp.diagonal(contacts.delassus)
     slack = rest_acceleration(w.dtype) * scales.acceleration
     normal = jnp.where(modes.active, force.normal * w[:m] + slack, contacts.normal.value)
     if contacts.tangent is None or mu is None or force.tangential is None:
         return normal
-    cone = (mu * force.normal - jnp.abs(force.tangential)) * w[m:] + slack
+    sizes = by_contact(w[m:], m).mean(axis=1)
+    cone = (mu * force.normal - length(by_contact(force.tangential, m))) * sizes + slack
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
     lasts = jax.lax.cond(
-        slides, lambda: regularity(contacts, mu, modes), lambda: jnp.ones((), w.dtype)
+        slides, lambda: regularity(contacts, mu, modes, slip), lambda: jnp.ones((), w.dtype)
     ) - least_regularity(w.dtype)
-    slip = modes.sign * contacts.tangent.rate
-    slip = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
-    side = jnp.where(modes.active, jnp.where(modes.stick, cone, slip), 1.0)
+    ends = slip_margins(contacts, mu, modes, force, lasts, scales.speed)
+    side = jnp.where(modes.active, jnp.where(modes.stick, cone, ends), 1.0)
     return jnp.concatenate([normal, side])
 
 
@@ -176,11 +191,13 @@ class MechanicalFlow(MotionFlow):
 
     Modes (rows): for each contact, whether it is persistent, whether it sticks, the sign of its
     sliding. Margins: gaps of open contacts, normal forces of persistent ones, then friction (the
-    cone, or the speed of sliding times what is left of `regularity`).
+    cone, or the speed of sliding times what is left of `regularity`). In space tangents are along
+    the `axes` of the step.
     """
 
     mu: jax.Array | None
     scales: Scales
+    axes: SlipAxes | None
 
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
@@ -195,13 +212,20 @@ class MechanicalFlow(MotionFlow):
 
     def _contacts(self, at: State) -> Contacts:
         """Contact space at this state."""
-        return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None)
+        along = None if self.axes is None else self.axes.along
+        return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None, along)
+
+    def _slip(self, const: Modes, contacts: Contacts) -> jax.Array | None:
+        """Directions of slip (m, 2) in space."""
+        if self.axes is None or contacts.tangent is None:
+            return None
+        return slip_within(self.axes, const, contacts.tangent.rate)
 
     def field(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Rates of the state."""
         at = unpacked(self.like, y)
         contacts = self._contacts(at)
-        force = forces(contacts, self.mu, const)
+        force = forces(contacts, self.mu, const, self._slip(const, contacts))
         friction, base = contact_powers(self.system, contacts, force, at.t)
         power = user_force(self.system, at.q, at.v, at.t) @ at.v
         per_contact = jnp.stack([jnp.zeros_like(friction), friction])
@@ -215,7 +239,8 @@ class MechanicalFlow(MotionFlow):
     def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """What must stay positive."""
         at = unpacked(self.like, y)
-        margins = watched(self._contacts(at), self.mu, const, self.scales)
+        contacts = self._contacts(at)
+        margins = watched(contacts, self.mu, const, self.scales, self._slip(const, contacts))
         return self.from_margins(margins, at)
 
     def projected(self, const: Modes, at: State) -> State:
@@ -223,7 +248,7 @@ class MechanicalFlow(MotionFlow):
         contacts = self._contacts(at)
         value, rate = contacts.normal.value, contacts.normal.rate
         if contacts.tangent is not None:  # tangentially only velocities drift
-            value = jnp.concatenate([value, jnp.zeros_like(value)])
+            value = jnp.concatenate([value, jnp.zeros_like(contacts.tangent.rate)])
             rate = jnp.concatenate([rate, contacts.tangent.rate])
         p = constraint_impulse(contacts, self.mu, const, jnp.stack([value, rate], axis=1))
         move = contacts.moved @ p
@@ -482,10 +507,15 @@ def flow_of(
     share = rest_acceleration(state.q.dtype)
     slack = share * scales.acceleration
     normal = jnp.where(modes.active, slack, settings.gap_rounding)
-    side = jnp.where(modes.stick, slack, share * scales.speed)
+    stuck = modes.stick | (modes.sign == BEGINS)
+    side = jnp.where(stuck, slack, share * scales.speed)
     margins = jnp.concatenate([normal, side]) if settings.friction else normal
     rounded, longest = roundings(settings, margins, targets), longest_step(system, targets)
     blank = jnp.zeros((1, 1), state.q.dtype)
+    axes = None
+    if mu is not None and settings.spatial:
+        contacts = contacts_at(system, state.q, state.v, state.t, True)
+        axes = slip_axes(contacts, mu, modes, scales.speed)
     return MechanicalFlow(
-        system, rounded, state.t, settings.rtol, blank, state, longest, mu, scales
+        system, rounded, state.t, settings.rtol, blank, state, longest, mu, scales, axes
     )

@@ -1,8 +1,9 @@
 """Persistent contact: its modes (open, sliding, sticking), and the forces that keep them.
 
 The modes are frozen between events, so that forces are one linear solve: `rate' = 0` at every
-active contact, and at sticking ones tangentially, too; `lambda_t = -sign mu lambda_n` at sliding
-ones. Which modes hold after an event is decided by complementarity of forces and accelerations.
+active contact, and at sticking ones tangentially, too; `lambda_t = -mu lambda_n d` at sliding ones,
+in the direction d of slip. Which modes hold after an event is decided by complementarity of forces
+and accelerations. A contact in space has two rows of slip where one in the plane has one.
 """
 
 from typing import NamedTuple
@@ -37,6 +38,13 @@ _LEAST_SHARE = 1e-3  # of the pressing force: keeps the weights of contacts with
 # Contacts with |lambda_n| and |rate'| below this share of the largest gap acceleration of the
 # motion stay together: bodies that move side by side press on each other by rounding only.
 _REST_ACCELERATION = 1e-11
+BEGINS = 2  # `Modes.sign` of a contact in space whose slip begins
+# Slip in space that grows from rest slower than this part of what friction changes it by only
+# begins: see `slip_in_space.py`. Ten times more: errors a thousand times as large, steps a tenth.
+_BEGINNING = 2e-3
+# Part of the cone that may hold a contact across its slip, as long as that begins. Ten times more:
+# the contact may be held by all of it.
+_LEANING = 0.1
 _PASSES = 3  # choices: contacts whose slip contradicts their choice are re-evaluated
 # A power of rounding: of the matrix of the forces the rest would be rounding. What happens until it
 # has fallen from there to 0 is as small.
@@ -44,7 +52,11 @@ _LEAST_REGULARITY, _FAINT_RIDGE = 1 / 2, 3 / 4  # the second with redundant cont
 
 
 class Modes(NamedTuple):
-    """Of the m contacts: `active` (persistent), `stick`, `sign` (of sliding: -1, 0, 1)."""
+    """Of the m contacts: `active` (persistent), `stick`, `sign` (of sliding: -1, 0, 1).
+
+    In space, where `slip_in_space.py` has the directions, `sign` is 1 of those that slide, and
+    `BEGINS` of those that begin to.
+    """
 
     active: jax.Array
     stick: jax.Array
@@ -76,14 +88,62 @@ def no_modes(m: int, dtype: jnp.dtype) -> Modes:
     return Modes(jnp.zeros(m, bool), jnp.zeros(m, bool), jnp.zeros(m, dtype))
 
 
+def by_contact(rows: jax.Array, m: int) -> jax.Array:
+    """Tangential rows (t,) as (m, rows)."""
+    return rows.reshape(m, -1)
+
+
+def length(rows: jax.Array) -> jax.Array:
+    """|u_j| (m,) of (m, rows), with derivative 0 at 0."""
+    if rows.shape[1] == 1:
+        return jnp.abs(rows[:, 0])
+    square = jnp.sum(rows**2, axis=1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+def direction(rows: jax.Array) -> jax.Array:
+    """Unit vectors of (m, rows), 0 of 0."""
+    if rows.shape[1] == 1:
+        return jnp.sign(rows)
+    size = length(rows)[:, None]
+    return jnp.where(size > 0, rows / jnp.where(size > 0, size, 1.0), 0.0)
+
+
+def in_space(contacts: Contacts) -> bool:
+    """Whether slip has two rows a contact."""
+    tangent = contacts.tangent
+    return tangent is not None and len(tangent.rate) == 2 * len(contacts.normal.rate)
+
+
+def held_rows(modes: Modes, size: int) -> jax.Array:
+    """Which of the first `size` rows (normals, then tangents) the modes hold.
+
+    In space the first row of a contact is along its slip: where slip begins the other one is held.
+    """
+    m, stick = modes.active.shape[0], modes.active & modes.stick
+    if size == m:
+        return modes.active
+    if size == 2 * m:
+        return jnp.concatenate([modes.active, stick])
+    across = stick | (modes.active & (modes.sign == BEGINS))
+    return jnp.concatenate([modes.active, jnp.stack([stick, across], axis=1).reshape(-1)])
+
+
 def contacts_at(
-    system: System, q: jax.Array, v: jax.Array, t: jax.Array, friction: bool
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    t: jax.Array,
+    friction: bool,
+    along: jax.Array | None = None,
 ) -> Contacts:
-    """Contact space of the system at (q, v, t)."""
+    """Contact space of the system at (q, v, t); in space with tangents `along` (m, 2)."""
     mass = mass_at(system, q)
     normal = kinematics(system, q, v, t)
     tangent = kinematics(system, q, v, t, of_tangents=True) if friction else None
     directions, drift = normal.gradient, normal.drift
+    if tangent is not None and along is not None:
+        tangent = _turned(tangent, along)
     if tangent is not None:
         directions = jnp.concatenate([directions, tangent.gradient], axis=1)
         drift = jnp.concatenate([drift, tangent.drift])
@@ -94,15 +154,45 @@ def contacts_at(
     )
 
 
-def forces(contacts: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
-    """The forces that keep the modes, and the acceleration with them."""
+def _turned(tangent: Kinematics, along: jax.Array) -> Kinematics:
+    """What slides in space, along (m, 2) and at right angles to it."""
+    axes = jnp.stack([along, jnp.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)
+
+    def turned(rows: jax.Array) -> jax.Array:
+        """Rows (.., 2 m) along the axes."""
+        each = rows.reshape(*rows.shape[:-1], -1, 2)
+        return jnp.einsum("...mk,mjk->...mj", each, axes).reshape(rows.shape)
+
+    return Kinematics(*(turned(x) for x in tangent))
+
+
+def friction_acceleration(contacts: Contacts, mu: jax.Array, normal: jax.Array) -> jax.Array:
+    """How much friction can change the slip of each contact itself (m,) [m/s^2]."""
+    m = len(mu)
+    return mu * normal * by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
+
+
+def slip_begins(
+    contacts: Contacts, mu: jax.Array, normal: jax.Array, growth: jax.Array
+) -> jax.Array:
+    """How much faster (m,) slip may grow, than at the rate `growth` (m,), and yet only begin."""
+    return _BEGINNING * friction_acceleration(contacts, mu, normal) - growth
+
+
+def forces(
+    contacts: Contacts, mu: jax.Array | None, modes: Modes, slip: jax.Array | None = None
+) -> Forces:
+    """The forces that keep the modes, and the acceleration with them.
+
+    `slip` (m, rows): unit vectors of those that slide; None: in the plane, `modes.sign`.
+    """
     m = contacts.normal.value.shape[0]
     if contacts.tangent is None or mu is None:
         normal = _without_friction(contacts.delassus, -contacts.approach[:, None], modes.active)[
             :, 0
         ]
         return Forces(normal, None, contacts.free + contacts.moved @ normal)
-    w, held, drag = _dragged(contacts, mu, modes)
+    w, held, drag = _dragged(contacts, mu, modes, slip)
     right = -contacts.approach
     none = jnp.zeros(m, w.dtype)
 
@@ -111,34 +201,38 @@ def forces(contacts: Contacts, mu: jax.Array | None, modes: Modes) -> Forces:
         # redundant sticking contacts share what they hold in proportion to mu lambda_n, as in
         # `solvers.friction`: they break loose together
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
-        weight = jnp.concatenate([none + 1, load_shares(press, _LEAST_SHARE)])
-        return _least(w, right[:, None], held, weight)[:, 0]
+        share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
+        return _least(w, right[:, None], held, jnp.concatenate([none + 1, share]))[:, 0]
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
-    both = both.at[m:].add(-drag * both[:m])
+    both = both.at[m:].add(-(drag * both[:m, None]).reshape(-1))
     return Forces(both[:m], both[m:], contacts.free + contacts.moved @ both)
 
 
 def _dragged(
-    contacts: Contacts, mu: jax.Array, modes: Modes
+    contacts: Contacts, mu: jax.Array, modes: Modes, slip: jax.Array | None
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """What forces do to accelerations (k, k), friction going with the normal force where it slides.
 
-    Beside it, which rows are held (k,), and `-lambda_t / lambda_n` of what slides (m,).
+    Beside it, which rows are held (k,), and `-lambda_t / lambda_n` of what slides (m, rows).
     """
-    m = modes.active.shape[0]
-    held = jnp.concatenate([modes.active, modes.active & modes.stick])
-    drag = jnp.where(modes.active & ~modes.stick, modes.sign * mu, 0.0)
-    return contacts.delassus.at[:, :m].add(-contacts.delassus[:, m:] * drag[None]), held, drag
+    m, k = modes.active.shape[0], contacts.delassus.shape[0]
+    slides = (modes.active & ~modes.stick)[:, None]
+    along = modes.sign[:, None] if slip is None else slip
+    drag = jnp.where(slides, along * mu[:, None], 0.0)
+    pull = (contacts.delassus[:, m:] * drag.reshape(-1)[None]).reshape(k, m, -1).sum(axis=2)
+    return contacts.delassus.at[:, :m].add(-pull), held_rows(modes, k), drag
 
 
-def regularity(contacts: Contacts, mu: jax.Array, modes: Modes) -> jax.Array:
+def regularity(
+    contacts: Contacts, mu: jax.Array, modes: Modes, slip: jax.Array | None = None
+) -> jax.Array:
     """Determinant () of the matrix of the forces, over what it is if nothing slides with friction.
 
     Of one contact `1 - mu s W_nt / W_nn`, with s the sign of slip. Where it has fallen to 0 forces
     that keep the modes do not exist, or elastic contacts would not settle at them.
     """
-    w, held, _ = _dragged(contacts, mu, modes)
+    w, held, _ = _dragged(contacts, mu, modes, slip)
     scale = 1 / jnp.sqrt(jnp.where(held, jnp.diagonal(contacts.delassus), 1.0))
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = (held[:, None] & held[None, :])[None]
@@ -193,11 +287,8 @@ def constraint_impulse(
     `contacts.moved @ p` is the change of velocity; of position, if `rates` are gaps (first order).
     """
     friction = contacts.tangent is not None and mu is not None
-    held = modes.active
-    if friction:
-        held = jnp.concatenate([modes.active, modes.active & modes.stick])
-    held = held[: rates.shape[0]]
-    size = held.shape[0]
+    size = rates.shape[0]
+    held = held_rows(modes, size if friction else len(modes.active))[:size]
     w, columns = contacts.delassus[:size, :size], rates.reshape(size, -1)
     if friction:
         p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
@@ -214,10 +305,44 @@ def contact_powers(
     friction = jnp.zeros_like(result.normal)
     push = contacts.normal.gradient @ result.normal
     if contacts.tangent is not None and result.tangential is not None:
-        friction = result.tangential * contacts.tangent.rate
+        powers = result.tangential * contacts.tangent.rate
+        friction = by_contact(powers, len(result.normal)).sum(axis=1)
         push = push + contacts.tangent.gradient @ result.tangential
     carried = base_velocity(system, t)
     return friction, jnp.zeros_like(t) if carried is None else push @ carried
+
+
+def slip_margins(
+    contacts: Contacts,
+    mu: jax.Array,
+    modes: Modes,
+    force: Forces,
+    lasts: jax.Array,
+    speed_scale: jax.Array,
+) -> jax.Array:
+    """What must stay positive (m,) of contacts that slide, in space along the first of their rows.
+
+    Slip times what `lasts` of the regularity of the forces. Where slip begins, accelerations: that
+    ends where slip grows faster or falls back to 0, or where the contact leans aside.
+    """
+    m = len(mu)
+    assert contacts.tangent is not None
+    assert force.tangential is not None
+    slip = by_contact(contacts.tangent.rate, m)[:, 0]
+    if not in_space(contacts):
+        slip = modes.sign * slip
+    ends = slip * jnp.where(slip < 0, jnp.abs(lasts), lasts)
+    if not in_space(contacts):
+        return ends
+    both = jnp.concatenate([force.normal, force.tangential])
+    growth = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)[:, 0]
+    by_friction = friction_acceleration(contacts, mu, force.normal)
+    some = speed_scale > 0
+    falls = by_friction * slip / jnp.where(some, speed_scale, 1.0) + jnp.maximum(growth, 0.0)
+    across = by_contact(force.tangential, m)[:, 1] / jnp.where(force.normal > 0, force.normal, 1.0)
+    aside = by_friction - jnp.abs(across) * by_friction / (_LEANING * jnp.where(mu > 0, mu, 1.0))
+    faster = slip_begins(contacts, mu, force.normal, growth)
+    return jnp.where(modes.sign == BEGINS, jnp.minimum(jnp.minimum(falls, faster), aside), ends)
 
 
 class ModeChoice(NamedTuple):
@@ -257,54 +382,71 @@ def choose_with_friction(
     contacts, mu = jax.lax.stop_gradient((contacts, mu))
     assert contacts.tangent is not None
     m = touching.shape[0]
+    spatial, moves = in_space(contacts), direction(by_contact(contacts.tangent.rate, m))
     slid = before.active & ~before.stick
     broken = released[m:] & before.stick & ~sliding
     ended = jnp.any(released[m:] & slid)
     # where sticking breaks at one contact of a body, those that began to slide before go on
     goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
-    now = Modes(touching, ~sliding & ~goes_on, jnp.where(goes_on, before.sign, 0.0))
-    now = now._replace(sign=jnp.where(sliding, jnp.sign(contacts.tangent.rate), now.sign))
+    starts = broken | goes_on if spatial else broken  # in space directions are not remembered
+    now = Modes(touching, ~sliding & (starts | ~goes_on), jnp.where(goes_on, before.sign, 0.0))
+    slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
     # sliding begins against the last force of sticking
-    held = forces(contacts, mu, now._replace(active=touching & ~released[:m]))
+    held = forces(contacts, mu, now._replace(active=touching & ~released[:m]), slides)
     assert held.tangential is not None
-    sign = jnp.where(broken, jnp.where(held.tangential > 0, -1.0, 1.0), now.sign)
-    eye, diagonal = jnp.eye(2 * m, dtype=sign.dtype), jnp.diagonal(contacts.delassus)[:m]
-    least = 2 * least_regularity(sign.dtype)  # twice: flights end at once it
+    against = by_contact(held.tangential, m)
+    against = -direction(against) if spatial else jnp.where(against > 0, -1.0, 1.0)
+    begin = jnp.where(starts[:, None], against, slides)
+    k = len(contacts.approach)
+    eye, diagonal = jnp.eye(k, dtype=begin.dtype), jnp.diagonal(contacts.delassus)[:m]
+    least = 2 * least_regularity(begin.dtype)  # twice: flights end at once it
 
     def choose(tried: _ModeTrial) -> _ModeTrial:
         """Modes by a complementarity problem, and what the next try must change."""
-        known, rows = tried.known, jnp.tile(tried.allowed, 2)
+        known = tried.known
+        rows = jnp.concatenate([tried.allowed, jnp.repeat(tried.allowed, begin.shape[1])])
         w = jnp.where(rows[:, None] & rows[None], contacts.delassus, eye)
         free = jnp.where(rows, contacts.approach, 0.0)
         solution = solve(
-            w, free[:m], free[m:], mu * jnp.ones(m, sign.dtype), complementary=True, sliding=known
-        )
+            w, free[:m], free[m:], mu * jnp.ones(m, begin.dtype), complementary=True,
+            sliding=known.reshape(-1),
+        )  # fmt: skip
         rate = contacts.approach + contacts.delassus @ jnp.concatenate(
             [solution.normal, solution.tangential]
         )
+        turns, is_known = by_contact(rate[m:], m), length(known) > 0
         active = tried.allowed & (rate[:m] <= slack)
         active = active & (~released[:m] | (solution.normal * diagonal > slack))
-        slips = (known != 0) | (jnp.abs(rate[m:]) > slack)
-        modes = Modes(active, active & ~slips, jnp.where(known != 0, known, jnp.sign(rate[m:])))
+        slips = is_known | (length(turns) > slack)
+        slide = jnp.where(is_known[:, None], known, direction(turns))
+        sign = slide[:, 0]
+        if spatial:
+            growth = jnp.sum(turns * slide, axis=1)
+            slow = slip_begins(contacts, mu, solution.normal, growth) > 0
+            sign = jnp.where(slow & ~sliding, float(BEGINS), 1.0)
+        modes = Modes(active, active & ~slips, sign)
         # what was taken to slide from rest must do so
-        returns = active & (known != 0) & ~sliding & (known * rate[m:] < -slack)
+        returns = active & is_known & ~sliding & (jnp.sum(known * turns, axis=1) < -slack)
         several = solution.status == CODE["several_outcomes"]
         solved = solution.status <= CODE["several_outcomes"]
-        known = jnp.where(jnp.where(solved, returns, ~sliding), 0.0, known)
+        given = jnp.where(solved, returns, ~sliding)[:, None]
         # what would go on sliding though it cannot parts, where that is a solution, too
         pressed = jnp.where(solved, active, tried.allowed)
-        regular = regularity(contacts, mu, modes._replace(active=pressed, stick=pressed & ~slips))
+        pressing = modes._replace(active=pressed, stick=pressed & ~slips)
+        regular = regularity(contacts, mu, pressing, slide)
         wedged = active & slips & (regular <= least)
         leaves = wedged & several
         open_ones_part = jnp.all(~touching | tried.allowed | (rate[:m] >= -slack))
         solved = solved & open_ones_part & ~jnp.any(wedged)
         done = solved & ~jnp.any(returns)
         several = several | tried.several
-        allowed = tried.allowed & ~leaves
-        return _ModeTrial(modes, known, allowed, regular, several, solved, done, tried.passes + 1)
+        return _ModeTrial(
+            modes, jnp.where(given, 0.0, known), tried.allowed & ~leaves, regular, several, solved,
+            done, tried.passes + 1,
+        )  # fmt: skip
 
     no = jnp.asarray(False)
-    start = _ModeTrial(now, sign, touching, jnp.ones_like(slack), no, no, no, jnp.asarray(0))
+    start = _ModeTrial(now, begin, touching, jnp.ones_like(slack), no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(lambda t: ~t.done & (t.passes < _PASSES), choose, start)
     parts, several = touching & ~end.allowed, end.several & end.solved
     return ModeChoice(end.modes, end.solved, end.regularity, several, parts)
@@ -314,7 +456,7 @@ class _ModeTrial(NamedTuple):
     """One try of `choose_with_friction`."""
 
     modes: Modes
-    known: jax.Array  # (m,) directions of slip that are fixed, 0 where they are solved for
+    known: jax.Array  # (m, rows) directions of slip that are fixed, 0 where they are solved for
     allowed: jax.Array  # (m,) contacts that may be pressed
     regularity: jax.Array
     several: jax.Array

@@ -26,6 +26,7 @@ from jimpact.motion.arguments import (
     check_stepped_law,
     contacts_of,
     force_of,
+    friction_in_space,
     friction_of,
     substeps_of,
     without_closures,
@@ -96,8 +97,8 @@ def simulate(
             a `Compliant` law act throughout: contacts take time, and may start in penetration).
         step: of the time stepping [s].
         friction: coefficient mu of persistent contacts, scalar or (m,), for systems with a
-            `tangent_function`, in time stepping with any tangents; None: that of the law, if it
-            has a field `friction`.
+            `tangent_function` and for bodies with tangents, in the plane or in space; None: that
+            of the law, if it has a field `friction`.
         max_events: largest number of recorded events; the next one ends the motion with status
             `max_events` (time stepping goes on without recording). None: 500; for a direct call
             with method 'events' (outside jit, vmap, derivatives) 100 000, computed in runs of 500.
@@ -151,14 +152,15 @@ def simulate(
     check_values("slow", slow, low=0.0, high=1.0)
     check_choice("method", method, METHODS)
     rtol, atol = _tolerances(method, dtype, rtol, atol)
-    mu = friction_of(system, law, friction, q, in_space=method == "time_stepping")
+    mu = friction_of(system, law, friction, q)
     system = without_closures(system, q, v, start)
     below, rounding = _closed_gaps(q, f, closed_below)
     if method != "contact_forces":
         check_penetration("q0", f, below)
     share = jnp.asarray(slow, dtype)
     settings = Settings(
-        rtol, atol, below, rounding, max_steps, mu is not None, end - start, share
+        rtol, atol, below, rounding, max_steps, mu is not None, friction_in_space(system, mu, q),
+        end - start, share,
     )  # fmt: skip
     arguments: Any
     if method == "time_stepping":

@@ -20,10 +20,13 @@ from jimpact.motion.persistent_contact import (
     Contacts,
     ModeChoice,
     Modes,
+    by_contact,
     choose_with_friction,
     constraint_impulse,
     contacts_at,
+    in_space,
     least_regularity,
+    length,
     no_modes,
     pressed_together,
     rest_acceleration,
@@ -45,6 +48,9 @@ ROUNDINGS = 64  # of the time: velocities that arise within them are 0
 APPROACH, MORE = 1 / 2, 10.0
 # Slips that change by less than SUPPLIED approaches change by what any impact does.
 SUPPLIED = 100.0
+# Of the speed scale of the motion: slip in space below it has stopped where a step landed on its
+# end. Ten times more: slip that turns round as slowly as this is taken to stop.
+STOPPED = 1e-7
 
 
 class Jump(NamedTuple):
@@ -52,17 +58,17 @@ class Jump(NamedTuple):
 
     v: jax.Array
     impulse: jax.Array  # (m,)
-    tangential: jax.Array  # (m,)
+    tangential: jax.Array  # (m,), in space (2 m,)
     energy: jax.Array  # (2, m): change by each contact, normal and tangential
     base_work: jax.Array
     code: jax.Array  # of the law
 
 
-def no_jump(state: State, m: int) -> Jump:
-    """Nothing happens."""
+def no_jump(state: State, m: int, sides: int) -> Jump:
+    """Nothing happens, at m contacts with so many tangential impulses."""
     zero = jnp.zeros_like(state.work)
-    none = jnp.zeros(m, state.v.dtype)
-    return Jump(state.v, none, none, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
+    none, side = jnp.zeros(m, state.v.dtype), jnp.zeros(sides, state.v.dtype)
+    return Jump(state.v, none, side, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
 
 
 def scene_at(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
@@ -95,12 +101,18 @@ def impact_jump(
     push = scene.normals @ out.impulse
     normal = (scene.normals.T @ mean) * out.impulse
     tangential, side = jnp.zeros(m, normal.dtype), jnp.zeros(m, normal.dtype)
-    if scene.tangents is not None and scene.tangents.shape[1] == m:  # in space: no friction here
+    if scene.tangents is not None:
         tangential = out.tangential_impulse
-        side = (scene.tangents.T @ mean) * tangential
+        side = by_contact((scene.tangents.T @ mean) * tangential, m).sum(axis=1)
         push = push + scene.tangents @ tangential
     energy = jnp.stack([normal, side])
     return Jump(out.velocity + carried, out.impulse, tangential, energy, push @ carried, out.status)
+
+
+def sides_of(system: System, q: jax.Array, m: int) -> int:
+    """The number of tangential impulses of m contacts; m without tangents, too."""
+    tangents = jax.eval_shape(system.body.tangents, q)
+    return m if tangents is None else int(tangents.shape[1])
 
 
 class Decision(NamedTuple):
@@ -174,11 +186,14 @@ def resolve(
     """
     strike = _impact_first(system, law, settings, state, scales, approach)
     tight = strike.closed & (jnp.abs(strike.contacts.normal.rate) <= strike.rest)
-    stick, result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight)
+    m = before.active.shape[0]
+    stopped = jnp.zeros(m, bool)
+    if settings.spatial:
+        fired, stopped = _fired_in_space(strike, before, fired)
+    stick, result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight, stopped)
     jump = result.jump
     choice, held, released = _next_modes(system, mu, settings, strike, result, before, fired)
     status, code, wedges = _status(strike, jump, choice, held)
-    m = before.active.shape[0]
     took = jnp.where(strike.happens, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
     took = took | choice.parts
     decision = Decision(
@@ -188,6 +203,22 @@ def resolve(
     parts = released[:m] | choice.parts
     kind = _kind(strike.happens, strike.jams, jnp.any(result.ends), parts, fired)
     return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
+
+
+def _fired_in_space(
+    strike: "_Strike", before: Modes, fired: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """What has `fired` (2 m,), and where slip in space has stopped (m,).
+
+    A step may turn slip by so much that it lands although slip goes on, or slip may no longer
+    only begin: these are no events.
+    """
+    assert strike.contacts.tangent is not None
+    m = before.active.shape[0]
+    speed = length(by_contact(strike.contacts.tangent.rate, m))
+    slid = fired[m:] & ~before.stick
+    stopped = slid & (speed <= STOPPED * strike.scales.speed)
+    return fired.at[m:].set(fired[m:] & (before.stick | stopped)), stopped
 
 
 class _Strike(NamedTuple):
@@ -233,8 +264,12 @@ def _brought_slow_to_rest(
     strike: _Strike,
     struck: jax.Array,
     tight: jax.Array,
+    stopped: jax.Array,
 ) -> "tuple[jax.Array, _Resting]":
-    """Which contacts (m,) stick, and what comes to rest: those that are `tight`, and slow ones."""
+    """Which contacts (m,) stick, and what comes to rest: those that are `tight`, and slow ones.
+
+    Slip comes to rest where it has `stopped` (m,) or is slow.
+    """
     contacts, scales, closed = strike.contacts, strike.scales, strike.closed
     m, gamma = tight.shape[0], contacts.normal.rate
     slowly = settings.accumulation * scales.gap_velocity
@@ -244,7 +279,7 @@ def _brought_slow_to_rest(
     slowly = jnp.maximum(slowly, SUPPLIED * strike.approach)
     stick = jnp.zeros(m, bool)
     if contacts.tangent is not None:
-        stick = jnp.abs(contacts.tangent.rate) <= slowly
+        stick = stopped | (length(by_contact(contacts.tangent.rate, m)) <= slowly)
 
     def resting(slow: jax.Array) -> _Resting:
         """What comes to rest if `slow` contacts (m,) may."""
@@ -314,7 +349,8 @@ def _status(
     now, earlier = strike.contacts.tangent, strike.before.tangent
     if now is not None and earlier is not None:
         change = jnp.max(jnp.abs(now.rate - earlier.rate))
-        wedges = jnp.where(choice.consistent, 0.0, _approach(choice, now.rate, held))
+        if not in_space(strike.contacts):
+            wedges = jnp.where(choice.consistent, 0.0, _approach(choice, now.rate, held))
         jammed = strike.jams & (change <= SUPPLIED * strike.approach)
         none = jammed | (~choice.consistent & (wedges == 0))
         status = jnp.where(none, MOTION_CODE["no_contact_force"], status)
@@ -402,10 +438,11 @@ def _struck(
     """The impact where it `strikes`, else nothing."""
     lead = approach if settings.friction else None
     noise = _rest(settings, scales)
+    m = closed.shape[0]
     return jax.lax.cond(
         strikes,
         lambda: impact_jump(system, law, state.t, state, closed, noise, lead),
-        lambda: no_jump(state, closed.shape[0]),
+        lambda: no_jump(state, m, sides_of(system, state.q, m)),
     )
 
 
@@ -432,7 +469,8 @@ def _with_friction(
     assert contacts.tangent is not None
     rate = contacts.tangent.gradient.T @ relative
     now = contacts._replace(tangent=contacts.tangent._replace(rate=rate))
-    return choose_with_friction(now, mu, before, held, released, jnp.abs(rate) > rest, slack)
+    slides = length(by_contact(rate, len(mu))) > rest
+    return choose_with_friction(now, mu, before, held, released, slides, slack)
 
 
 def _grown(
@@ -475,10 +513,12 @@ def _brought_to_rest(
     columns = jnp.stack([rates, contacts.approach[:size]], axis=1)
     p, force = constraint_impulse(contacts, mu, modes, columns).T
     # work at the mean velocity: half of that before, 0 after
-    energy = jnp.pad(0.5 * p * rates, (0, 2 * m - size)).reshape(2, m)
+    work, side = 0.5 * p * rates, jnp.zeros_like(jump.tangential)
+    energy = jnp.stack([work[:m], jnp.zeros_like(work[:m])])
+    if contacts.tangent is not None:
+        energy, side = energy.at[1].set(by_contact(work[m:], m).sum(axis=1)), p[m:]
     # the gaps, up to `closed_below`, are closed by the flight that follows
     fallen = jnp.where(held, jnp.maximum(force[:m], 0.0) * contacts.normal.value, 0.0)
-    side = jnp.pad(p, (0, 2 * m - size))[m:]
     carried = carried_along(system, jump.v, t)
     passed = _passed(p[:m], force[:m], ends, -jnp.sum(energy), -jnp.sum(jump.energy))
     jump = jump._replace(

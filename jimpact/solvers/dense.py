@@ -75,6 +75,8 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     positive definite one do not need that.
     """
     n = len(matrix)
+    if n == 1:
+        return right / matrix
     if n == 2:  # written out: the loop takes 8 % of a batch of impacts with planar friction
         return _solve_two(matrix, right)
     number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))

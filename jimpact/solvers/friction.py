@@ -206,7 +206,7 @@ def _over(vectors: jax.Array, length: jax.Array) -> jax.Array:
     return jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)[:, None] * vectors
 
 
-def _in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
+def in_disc(side: jax.Array, radius: jax.Array) -> jax.Array:
     """The points of discs (m, N) next to `side` (m, rows, N)."""
     length = _length(side)
     return jnp.where((length > radius)[:, None], _over(side, length) * radius[:, None], side)
@@ -228,7 +228,7 @@ def _misfit(problem: _FrictionProblem, x: jax.Array) -> jax.Array:
     rate = _rates(problem, x)
     p, r, side = x[:, 0], rate[:, 0], x[:, 1:]
     normal = jnp.minimum(p, r) if problem.complementary else r
-    wrong = side - _in_disc(side - rate[:, 1:], _bound(problem, x))
+    wrong = side - in_disc(side - rate[:, 1:], _bound(problem, x))
     return jnp.maximum(jnp.abs(normal).max(axis=0), jnp.abs(wrong).max(axis=(0, 1))) / _size(x)
 
 
@@ -542,7 +542,7 @@ def _sweeps(
         )
         bound = problem.friction[i] * bound
         side = (x[i, 1:] - rate / stiffest[i])[None, :, None]
-        side = _in_disc(side, bound[None, None])[0, :, 0]
+        side = in_disc(side, bound[None, None])[0, :, 0]
         return x.at[i].set(jnp.concatenate([p[None], side]))
 
     State = tuple[jax.Array, jax.Array, jax.Array]

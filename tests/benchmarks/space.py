@@ -311,7 +311,7 @@ def many_impacts(options):
 
 
 def agree(method, contacts):
-    """In a child: errors of v+ and of its slopes, and the statuses."""
+    """In a child: errors of v+ and of its slopes where impacts end, and the statuses."""
     import jax
     import jax.numpy as jnp
 
@@ -336,10 +336,11 @@ def agree(method, contacts):
         return v, slopes.T, status
 
     v, slopes, status = jax.jit(jax.vmap(one))(*(held[name] for name in INPUTS))
-    error = np.abs(v - held["after"]).max(axis=1)
+    ends = ~np.array([ji.STATUS[int(s)].failure for s in status])
+    error = np.abs(v - held["after"]).max(axis=1)[ends]
     wrong = np.abs(slopes - held["slopes"]).max(axis=2)
     names = Counter(ji.STATUS[int(s)].name for s in status)
-    known = np.nan_to_num(held["slope_uncertainty"], nan=np.inf) < SHARP
+    known = (np.nan_to_num(held["slope_uncertainty"], nan=np.inf) < SHARP) & ends[:, None]
     row = {"impacts": len(status), "error": np.median(error), "worst": error.max()}
     for i, name in enumerate(("mu", "e", "k")):
         at = wrong[known[:, i], i]

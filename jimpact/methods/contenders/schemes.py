@@ -33,14 +33,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.events import impact_dynamics, impulse_form
+from jimpact.events import impulse_form
 from jimpact.events.contact_flow import power
-from jimpact.events.impact_dynamics import ImpulseProgram, Sides, evaluate
+from jimpact.events.impact_dynamics import Sides, evaluate
+from jimpact.events.implicit_steps import FORCES_A_STEP
 from jimpact.events.impulse_form import EMPTY, Rule, Walk, force
 from jimpact.events.stepper import STAGES
 from jimpact.laws.lzb import LZB
 from jimpact.methods.contenders.base import (
-    UNCOUNTED,
     Method,
     MethodResult,
     Solve,
@@ -59,25 +59,19 @@ from jimpact.status import CODE
 def _solve_aligned(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     """What `impact` does, with its duration."""
     scaled = problem(law, scene, velocity, setting, friction=True)
-    dynamics = scaled.dynamics
-    leaves, tree = dynamics.columns()
-    function = ImpulseProgram(
-        tree, dynamics.static_exponent, dynamics.chain, scaled.max_steps, dynamics.tangents
-    )
-    p, side, _, code, passes = evaluate(function, leaves)
-    _, _, t, _, _ = evaluate(dataclasses.replace(function, whole=True), leaves)
+    program, leaves = scaled.dynamics.program(), scaled.dynamics.columns()[0]
+    p, side, _, code, passes = evaluate(program, leaves)
+    _, _, t, _, _ = evaluate(dataclasses.replace(program, whole=True), leaves)
     return in_si(scaled, p[:, 0], t[0, 0], (STAGES + 1) * passes[0, 0], code[0, 0], side[:, 0])
 
 
 def _solve_implicit(law: LZB, scene: Scene, velocity: Any, setting: Any) -> MethodResult:
     """The law's own method without events."""
     scaled = problem(law, scene, velocity, setting, friction=True)
-    p, side, code = impact_dynamics.solve(scaled.dynamics, "implicit")
-    unit = scaled.units.momentum  # its impulses are in SI units already
-    if side is not None:
-        side = side / jnp.repeat(unit, len(side) // len(unit))
-    nothing = jnp.full_like(p[0], jnp.nan)
-    return in_si(scaled, p / unit, nothing, jnp.full_like(code, UNCOUNTED), code, side)
+    dynamics = scaled.dynamics._replace(method="implicit")
+    p, side, t, code, passes = evaluate(dynamics.program(), dynamics.columns()[0])
+    forces = FORCES_A_STEP * passes[0, 0]
+    return in_si(scaled, p[:, 0], t[0, 0], forces, code[0, 0], side[:, 0])
 
 
 Pair = tuple[jax.Array, jax.Array]
@@ -291,5 +285,5 @@ SCHEMES = (
         friction=True,
     ),
     DOP853_ALIGNED,
-    *((IMPLICIT,) if "implicit" in impact_dynamics.METHODS else ()),
+    IMPLICIT,
 )

@@ -1,0 +1,385 @@
+"""Impacts by a step without events: `LZB` and `Compliant` with method 'implicit'.
+
+A step of length h advances indentations x and velocities w = (gamma, u) by Verlet's method along
+the normals, and by one convex problem in each of two stages of friction (`step_impulses.py`):
+
+    x_half = x - h/2 omega c(gamma) gamma              c = 1 in compression, 1 / e^2 in expansion
+    f      = h (eta + 1)/2 omega x_half^eta            impulses of the normal forces
+    y1     in the discs mu f, against u at the end of a first stage of length PART h
+    y2     in the discs mu f, against u at the end of the step, after (1 - PART) y1 + PART y2
+    w     <- w + K (f, (1 - PART) y1 + PART y2)
+    x     <- x_half - h/2 omega c(gamma) gamma
+
+The stages are the two of an L-stable Runge-Kutta method of order 2, so that slip which stops, or
+creeps in balance with its forces, does not oscillate. An expansion much faster than the step is
+implicit, too: the force that it takes away within the step is part of the convex problem.
+
+Each step is done once whole and once in halves. The difference is its error and, added by a third,
+makes smooth steps one order better. The errors of the few dozen steps of an impact stay together
+at about twice the one allowed in a step, but nothing bounds them where an outcome depends on its
+course without limit: a second run shows that (`check_conditioning`).
+
+Units are those of `impact_dynamics.py`. Derivatives walk the accepted steps once more, with their
+lengths fixed: they are the derivatives of what is computed, and converge with the tolerance.
+"""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact.events.contact_flow import Exponent, Viscous, as_pytree, per_row, power
+from jimpact.solvers.dense import times
+from jimpact.solvers.step_impulses import StepProblem, solve, solve_smooth
+
+# The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
+# other value is both.
+PART = 1 - 2**-0.5
+FORCES_A_STEP = 3  # normal forces that a step asks for: a whole one and two halves
+# First step, in units of the shortest time of loading; ten times more: it is rejected.
+FIRST = 0.02
+# The next step aims at SAFETY^3 of the error allowed, and changes by these factors at most; the
+# values of other adaptive methods. Ten times more: rejected steps.
+SAFETY, SHRINK, GROWTH = 0.85, 0.2, 2.5
+# Error allowed in a step, in tolerances of the outcome: those of all steps came to at most twice
+# the one allowed. Ten times more: tolerances are not kept.
+ALLOWED = 0.3
+# A step in units of the shortest time of loading that cannot be distinguished from none. Jumps of
+# the forces at e = 0 are found by steps of about e_min^2. Ten times more: these end as `max_steps`.
+SHORTEST = 1e-24
+# Velocity and square root of energy, in tolerances, that do nothing more. Ten times more would lose
+# what the tolerance promises.
+NEGLIGIBLE = 0.1
+# Least restitution, in tolerances: at e = 0 it selects the limit e -> 0+ where contacts are
+# redundant. Ten times more changes velocities by a hundredth of it.
+LEAST_RESTITUTION = 0.001
+# Error of the velocities of a convex problem, in tolerances. Ten times more: its noise is taken for
+# an error of the step, which becomes shorter.
+INNER = 1e-3
+# Roundings of velocities below which an error estimate is noise. Ten times more loosens the finest
+# tolerances.
+ROUNDINGS = 64
+# A contact unloads implicitly where explicit expansion changes its force within a step by more than
+# this part. Ten times more is unstable.
+STIFF = 0.5
+# Accepted steps that derivatives can walk, in blocks; more end as `max_steps`. At the default
+# tolerance an impact takes 50 to 500. Ten times more: memory in batches.
+BLOCKS, BLOCK = 64, 64
+
+
+class State(NamedTuple):
+    """x (m, B), w (n, B), impulses in unit time of the last step and in all (n, B), time (1, B)."""
+
+    indentation: jax.Array
+    velocity: jax.Array
+    rate: jax.Array
+    impulse: jax.Array
+    time: jax.Array
+
+
+@as_pytree
+@dataclasses.dataclass
+class ImplicitSteps:
+    """Contacts with or without friction, arrays with the batch last; n = m + t rows."""
+
+    coupling: jax.Array  # K (n, n, B): G and the tangential block
+    omega: jax.Array  # (m, B)
+    restitution: jax.Array  # (m, B)
+    exponent_array: jax.Array | None  # (m, B)
+    friction: jax.Array  # (m, B)
+    descent: jax.Array  # (n, B), see `descent_lengths`
+    tolerance: jax.Array  # (1, B)
+    # (1, B) part of the stored energy's root that an opening must not lose: 1 in runs for
+    # derivatives, because the derivative of the speed e sqrt(energy) in e is the root itself
+    kept: jax.Array
+    viscous: Viscous | None = None
+    exponent_static: float | tuple[float, ...] | None = None
+    gapped: bool = False
+
+    @property
+    def contacts(self) -> int:
+        """Number m of contacts."""
+        return self.omega.shape[0]
+
+    @property
+    def exponent(self) -> Exponent:
+        """Exponents of the contacts: compiled in, or an array (m, B)."""
+        static = self.exponent_static
+        return static if static is not None else self.exponent_array  # type: ignore[return-value]
+
+    @property
+    def eta(self) -> jax.Array:
+        """Exponents as rows that broadcast against (m, B)."""
+        return per_row(self.exponent, self.omega)
+
+    @property
+    def least(self) -> jax.Array:
+        """e (m, B), not below the least one."""
+        return self.restitution + LEAST_RESTITUTION * jax.lax.stop_gradient(self.tolerance)
+
+    @property
+    def force_scale(self) -> jax.Array:
+        """Force over x^eta (m, B)."""
+        return (self.eta + 1) / 2 * self.omega
+
+    def start(self, x: jax.Array, velocity: jax.Array) -> State:
+        """The state before the impact."""
+        none = jnp.zeros_like(velocity)
+        return State(x, velocity, none, none, jnp.zeros_like(self.tolerance))
+
+    def energy(self, x: jax.Array) -> jax.Array:
+        """Twice the stored energy (m, B)."""
+        return power(x, self.exponent) * jnp.where(x > 0, x, 0.0)
+
+    def busy(self, s: State) -> jax.Array:
+        """Whether (1, B) the impact goes on: a contact is loaded, or approaches."""
+        idle = NEGLIGIBLE * self.tolerance
+        loaded = self.energy(s.indentation) > idle**2
+        return jnp.any(loaded | (s.velocity[: self.contacts] < -idle), axis=0, keepdims=True)
+
+    def coasted(self, s: State) -> State:
+        """The state when the next gap closes, if no contact is loaded."""
+        x, gamma = s.indentation, s.velocity[: self.contacts]
+        closes = (x < 0) & (gamma < 0)
+        rate = self.omega * jnp.where(closes, gamma, -1.0)
+        wait = jnp.min(jnp.where(closes, x / rate, jnp.inf), axis=0, keepdims=True)
+        free = ~jnp.any((x > 0) | ((x >= 0) & (gamma < 0)), axis=0, keepdims=True)
+        wait = jnp.where(free & (wait < jnp.inf), wait, 0.0)
+        ahead = x - wait * self.omega * gamma
+        return s._replace(indentation=jnp.where(wait > 0, ahead, x), time=s.time + wait)
+
+    # ---- one step
+
+    def force_of(self, x: jax.Array, gamma: jax.Array) -> jax.Array:
+        """Normal forces (m, B)."""
+        if self.viscous is None:
+            return self.force_scale * power(x, self.exponent)
+        return jnp.where(x > 0, self.viscous.push(x, gamma), 0.0)
+
+    def unloading(self, x: jax.Array, h: jax.Array) -> jax.Array:
+        """By how much (m, B) a step's normal impulse falls with the velocity of separation."""
+        if self.viscous is not None:
+            return jnp.zeros_like(x)
+        slope = self.eta * power(x, self.eta - 1) * self.force_scale
+        return h**2 * slope * self.omega / self.least**2
+
+    def moved(self, x: jax.Array, gamma: jax.Array, h: jax.Array, stiff: jax.Array) -> jax.Array:
+        """Indentations (m, B) after the time h; those that expand implicitly (`stiff`) stay.
+
+        A contact that opens within this time goes on as a gap: `e^2` as fast.
+        """
+        expands = (x > 0) & (gamma > 0)
+        square = self.least**2 if self.viscous is None else jnp.ones_like(x)
+        way = h * self.omega * gamma
+        ahead = x - way / jnp.where(expands, square, 1.0)
+        ahead = jnp.where(expands & (ahead < 0), x * square - way, ahead)
+        ahead = jnp.where(stiff & expands, x, ahead)
+        return ahead if self.gapped else jnp.maximum(ahead, 0.0)
+
+    def problem(
+        self, velocity: jax.Array, load: jax.Array, unloading: jax.Array, friction: jax.Array
+    ) -> StepProblem:
+        """The convex problem of a stage."""
+        return StepProblem(self.coupling, velocity, load, unloading, friction, self.descent)
+
+    def substep(self, s: State, h: jax.Array, smooth: bool) -> tuple[State, jax.Array]:
+        """The state after h (1, B), and what it loses (1, B) by opening within the step."""
+        m, solver = self.contacts, solve_smooth if smooth else solve
+        inner = INNER * self.tolerance
+        x, gamma = s.indentation, s.velocity[:m]
+        stiff = jax.lax.stop_gradient(self.unloading(x, h)) > STIFF
+        half = self.moved(x, gamma, h / 2, stiff)
+        load = h * self.force_of(half, gamma)
+        unloading = jnp.where(stiff, self.unloading(half, h), 0.0)
+
+        # first stage of friction; the normal rows are those at the end of the step
+        ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
+        stage = self.problem(ahead, load, unloading, self.friction)
+        first = solver(stage, h * s.rate, inner)
+        if self.viscous is not None:  # the force at the velocity in the middle of the step
+            middle = gamma + times(self.coupling, first)[:m] / 2
+            load = h * self.force_of(half, middle)
+        side = (1 - PART) * first[m:]
+        base = s.velocity + times(self.coupling, jnp.concatenate([jnp.zeros_like(gamma), side]))
+        # second stage, in units in which both rows have the weight PART
+        stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
+        guess = jnp.concatenate([first[:m] / PART, first[m:]])
+        second = solver(stage, guess, inner)
+        velocity = base + PART * times(self.coupling, second)
+        normal, gamma = PART * second[:m], velocity[:m]
+
+        cut = stiff & (normal < load)
+        middle = jnp.where(cut, self.indentation_of(normal, h), half)
+        x = self.moved(middle, gamma, h / 2, stiff)
+        opened = cut & (normal <= 0) & (gamma > 0)
+        x = jnp.where(opened, -h / 2 * self.omega * gamma if self.gapped else 0.0, x)
+        loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, gamma)
+        impulse = jnp.concatenate([normal, side + PART * second[m:]])
+        rate = jnp.concatenate([normal, second[m:]]) / h
+        return State(x, velocity, rate, s.impulse + impulse, s.time + h), loss
+
+    def indentation_of(self, impulse: jax.Array, h: jax.Array) -> jax.Array:
+        """Where (m, B) the force gives this normal impulse in h."""
+        part = impulse / (h * self.force_scale)
+        some = part > 0
+        root = jnp.exp(jnp.log(jnp.where(some, part, 1.0)) / self.eta)
+        return jnp.where(some, root, 0.0)
+
+    def lost(self, begun: jax.Array, last: jax.Array, x: jax.Array, gamma: jax.Array) -> jax.Array:
+        """Speed (1, B) that contacts would still have gained from what they stored last."""
+        if self.viscous is not None:
+            return jnp.zeros_like(self.tolerance)
+        left = self.energy(jnp.where(last > 0, last, begun))
+        gone = (begun > 0) & (x <= 0) & (gamma > 0)
+        weight = jnp.maximum(self.least, self.kept)
+        speed = weight * jnp.sqrt(left)
+        faster = weight * self.least * left / jnp.where(gamma > 0, gamma, 1.0)
+        speed = jnp.where(gone, jnp.minimum(speed, faster), 0.0)
+        return jnp.max(speed, axis=0, keepdims=True)
+
+    def unseen(self, s: State, end: State, h: jax.Array) -> jax.Array:
+        """Part (1, B) of a force that sets in with a jump which a step may miss by its estimate."""
+        closes = (s.indentation <= 0) & (end.indentation > 0)
+        force = self.force_of(end.indentation, end.velocity[: self.contacts])
+        return jnp.max(jnp.where(closes, h * force / 2, 0.0), axis=0, keepdims=True)
+
+    def step(self, s: State, h: jax.Array, smooth: bool = False) -> tuple[State, jax.Array]:
+        """The state after h (1, B), whole and in halves, and its error (1, B) in tolerances."""
+        lengths = jnp.stack([h, h / 2, h / 2])
+        whole = jnp.asarray([True, False, False])
+
+        def part(
+            carry: tuple[State, State], which: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[State, State], jax.Array]:
+            """The whole step first, then both halves from the same start."""
+            at, big = carry
+            length, is_whole = which
+            after, loss = self.substep(at, length, smooth)
+            at = jax.tree.map(lambda a, b: jnp.where(is_whole, a, b), at, after)
+            big = jax.tree.map(lambda a, b: jnp.where(is_whole, b, a), big, after)
+            return (at, big), jnp.where(is_whole, 0.0, loss)
+
+        (end, big), losses = jax.lax.scan(part, (s, s), (lengths, whole))
+        loaded = (end.indentation > 0) & (big.indentation > 0)
+        counts = jnp.ones_like(loaded) if self.gapped else end.indentation > 0
+        moved = jnp.where(counts, jnp.abs(end.indentation - big.indentation), 0.0)
+        changed = jnp.abs(end.velocity - big.velocity)
+        error = jnp.max(jnp.concatenate([moved, changed]), axis=0, keepdims=True) / 3
+        size = jnp.max(jnp.abs(end.velocity), axis=0, keepdims=True)
+        if self.viscous is not None:
+            error = error + self.unseen(s, end, h)
+        allowed = ALLOWED * self.tolerance + ROUNDINGS * float(jnp.finfo(h.dtype).eps) * size
+        better = jax.tree.map(lambda a, b: a + (a - b) / 3, end, big)
+        x = jnp.where(loaded, jnp.maximum(better.indentation, 0.0), end.indentation)
+        new = better._replace(indentation=x, rate=end.rate, time=end.time)
+        return new, (error + jnp.sum(losses, axis=0)) / allowed
+
+
+class Plan(NamedTuple):
+    """Lengths of the accepted steps (BLOCKS * BLOCK, 1, B), 0 where there are no more."""
+
+    lengths: jax.Array
+    used: jax.Array  # (1, B) how many
+
+
+class Run(NamedTuple):
+    """An impact on its way: its state, the next step (1, B), attempts (1, B), the plan."""
+
+    state: State
+    length: jax.Array
+    passes: jax.Array
+    plan: Plan | None
+
+    def over(self, flow: ImplicitSteps, most: int) -> jax.Array:
+        """Whether (1, B) it has ended or is given up."""
+        stalled = (self.length < SHORTEST) | (self.passes >= most)
+        if self.plan is not None:
+            stalled = stalled | (self.plan.used >= BLOCKS * BLOCK)
+        return stalled | ~flow.busy(self.state)
+
+
+def to_the_end(flow: ImplicitSteps, start: State, most: int, keeps: bool) -> Run:
+    """From the start to the end of the impact; `keeps` the plan of the steps."""
+    lanes = jnp.zeros(flow.tolerance.shape, jnp.int32)
+    plan = None
+    if keeps:
+        plan = Plan(jnp.zeros((BLOCKS * BLOCK, *lanes.shape), flow.tolerance.dtype), lanes)
+    run = Run(start, FIRST * jnp.ones_like(flow.tolerance), lanes, plan)
+
+    def attempt(run: Run) -> Run:
+        """One step tried in all impacts of the batch that go on."""
+        live = ~run.over(flow, most)
+        new, error = flow.step(flow.coasted(run.state), run.length)
+        accepted = live & (error <= 1)
+        state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, run.state)
+        # the error falls with h^3; 1e-12 keeps the root from 0, far beyond GROWTH
+        factor = jnp.clip(SAFETY / jnp.cbrt(error + 1e-12), SHRINK, GROWTH)
+        factor = jnp.where(error < jnp.inf, factor, SHRINK)
+        length = jnp.where(live, factor * run.length, run.length)
+        plan = run.plan
+        if plan is not None:
+            at = plan.used[0], 0, np.arange(lanes.shape[1])
+            kept = jnp.where(accepted[0], run.length[0], plan.lengths[at])
+            plan = Plan(plan.lengths.at[at].set(kept), plan.used + accepted.astype(jnp.int32))
+        return Run(state, length, run.passes + live.astype(jnp.int32), plan)
+
+    return jax.lax.while_loop(lambda run: ~jnp.all(run.over(flow, most)), attempt, run)
+
+
+def repeat(flow: ImplicitSteps, start: State, plan: Plan) -> State:
+    """The state after the steps of the plan, as a smooth function of `flow` and `start`."""
+    return _walk(flow, start, plan, states=False)[0]
+
+
+def path(flow: ImplicitSteps, start: State, plan: Plan) -> State:
+    """States (steps + 1, .., B) before the first step and after each one, smooth as well."""
+    after = _walk(flow, start, plan, states=True)[1]
+
+    def joined(first: jax.Array, blocks: jax.Array) -> jax.Array:
+        """The first one and those of all blocks."""
+        return jnp.concatenate([first[None], blocks.reshape(-1, *first.shape)])
+
+    return jax.tree.map(joined, start, after)
+
+
+def _walk(flow: ImplicitSteps, start: State, plan: Plan, states: bool) -> tuple[State, Any]:
+    """The state after the steps of the plan; with `states` those after each step, in blocks."""
+
+    def step(s: State, length: jax.Array) -> tuple[State, State | None]:
+        """One step of the plan."""
+        taken = length > 0
+        new, _ = flow.step(flow.coasted(s), jnp.where(taken, length, FIRST), smooth=True)
+        s = jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, s)
+        return s, s if states else None
+
+    def block(s: State, lengths: jax.Array) -> tuple[State, Any]:
+        """One block of steps; an empty one costs nothing."""
+
+        def walk(s: State) -> tuple[State, Any]:
+            """The state after the block."""
+            return jax.lax.scan(jax.checkpoint(step), s, lengths)
+
+        def skip(s: State) -> tuple[State, Any]:
+            """The state as it is."""
+            same = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), s)
+            return s, same if states else None
+
+        return jax.lax.cond(jnp.any(lengths > 0), walk, skip, s)
+
+    rows = plan.lengths.reshape(BLOCKS, BLOCK, *plan.lengths.shape[1:])
+    return jax.lax.scan(jax.checkpoint(block), start, rows)
+
+
+def between(flow: ImplicitSteps, s: State, ahead: jax.Array) -> State:
+    """The state at `ahead` (1, B) after s, within the step that follows it."""
+    coasted = flow.coasted(s)
+    waits = ahead < coasted.time - s.time
+    drifted = s.indentation - ahead * flow.omega * s.velocity[: flow.contacts]
+    length = ahead - (coasted.time - s.time)
+    steps = ~waits & (length > 0)
+    new, _ = flow.substep(coasted, jnp.where(steps, length, FIRST), smooth=True)
+    new = jax.tree.map(lambda a, b: jnp.where(steps, a, b), new, s)
+    at = jnp.where(waits, drifted, new.indentation)
+    return new._replace(indentation=at, time=s.time + ahead)

@@ -1,0 +1,123 @@
+"""Directions of slip of contacts in space; each step has tangents of its own.
+
+The friction of a contact that slides is `-mu lambda_n u / |u|`: smooth but where slip ends or
+begins. At the beginning of a step the tangents of each contact are therefore turned: d is along its
+slip u_0, n at right angles to it.
+
+SLIP ENDS where `u . d` falls to 0, which a step lands on. The field has to go on behind it, so the
+direction is that of `max(|u . d|, AHEAD |u_0|) d + (u . n) n`. Slip that ends without turning is
+then as smooth as in the plane. Where it turns, steps become shorter and shorter towards its end,
+and little is left of it in the landing.
+
+SLIP BEGINS, at a contact that stuck, slowly: its rate r' grows from 0, while its direction follows
+the forces at a rate c / r, with c the acceleration by friction. As long as `r' < BEGINNING c` the
+contact therefore slides along its first direction, and is held across it. The force for this is
+too long by the square of the turn, and velocities err by BEGINNING^3 / 6 of `c^2 / c'`.
+
+THE FIRST DIRECTION of slip, from u = 0, is that of u', which depends on it: `n . u' = 0`.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.events.batches import any_lane
+from jimpact.motion.persistent_contact import (
+    BEGINS,
+    Contacts,
+    Modes,
+    by_contact,
+    direction,
+    forces,
+    length,
+)
+
+# Least part of the slip at the beginning of a step that lies ahead within it. Ten times more, and
+# what a landing leaves of slip that turns is ten times as large.
+AHEAD = 1e-2
+# Of the speed scale of the motion: less slip is none yet. Ten times more is still rounding.
+NO_SLIP = 1e-13
+# Iterations for first directions: 1 for one contact, 3 to 4 for contacts of one body. Ten times
+# more only take time.
+_NEWTON = 6
+_MOST_TURN = 0.5  # [rad] in one of them; ten times more does not bound it
+# Beside a matrix of order 1: contacts of one body turn together, which makes it singular. Ten times
+# more: directions converge a tenth as fast.
+_RIDGE = 1e-6
+
+
+class SlipAxes(NamedTuple):
+    """Of the m contacts at the beginning of a step: d (m, 2) and |u_0| (m,)."""
+
+    along: jax.Array
+    speed: jax.Array
+
+
+def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.Array) -> SlipAxes:
+    """The axes of a step that begins here."""
+    assert contacts.tangent is not None
+    m = len(mu)
+    u = by_contact(contacts.tangent.rate, m)
+    speed, slides = length(u), modes.active & ~modes.stick
+    starts = slides & (speed <= NO_SLIP * speed_scale)
+    first = jnp.stack([jnp.ones_like(mu), jnp.zeros_like(mu)], axis=1)
+    moving = jnp.where((slides & ~starts)[:, None], direction(u), first)
+    along = jax.lax.cond(
+        any_lane(jnp.any(starts)),
+        lambda: _first_directions(contacts, mu, modes, starts, moving),
+        lambda: moving,
+    )
+    return SlipAxes(along, jnp.where(starts, 0.0, speed))
+
+
+def slip_within(axes: SlipAxes, modes: Modes, rate: jax.Array) -> jax.Array:
+    """Unit vectors (m, 2) of slip along the axes of the step; `rate` (t,) is along them, too."""
+    u = by_contact(rate, len(axes.speed))
+    least = AHEAD * jax.lax.stop_gradient(axes.speed)
+    # behind its end slip counts as in front of it: its direction would be stiff at the least one
+    ahead, none = jnp.maximum(jnp.abs(u[:, 0]), least), (axes.speed == 0) & (u[:, 0] <= 0)
+    straight = (modes.sign == BEGINS) | none
+    ahead, across = jnp.where(straight, 1.0, ahead), jnp.where(straight, 0.0, u[:, 1])
+    return direction(jnp.stack([ahead, across], axis=1))
+
+
+def _first_directions(
+    contacts: Contacts, mu: jax.Array, modes: Modes, starts: jax.Array, moving: jax.Array
+) -> jax.Array:
+    """d (m, 2) with `n . u' = 0` where slip `starts`; first against the force that would hold."""
+    m = len(mu)
+    plain = modes._replace(sign=jnp.ones_like(modes.sign))
+    stuck = forces(contacts, mu, plain._replace(stick=modes.stick | starts), moving)
+    assert stuck.tangential is not None
+    against = -by_contact(stuck.tangential, m)
+    some = starts & (length(against) > 0)
+    angle = jnp.arctan2(jnp.where(some, against[:, 1], 0.0), jnp.where(some, against[:, 0], 1.0))
+
+    def unit(angle: jax.Array) -> jax.Array:
+        """Directions (m, 2)."""
+        turned = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        return jnp.where(starts[:, None], turned, moving)
+
+    def across(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`n . u'` (m,) of what starts, twice."""
+        along = unit(angle)
+        held = forces(contacts, mu, plain, along)
+        assert held.tangential is not None
+        both = jnp.concatenate([held.normal, held.tangential])
+        rate = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)
+        turn = jnp.where(starts, along[:, 0] * rate[:, 1] - along[:, 1] * rate[:, 0], 0.0)
+        return turn, turn
+
+    eye = jnp.eye(m, dtype=mu.dtype)
+
+    def newton(_: int, angle: jax.Array) -> jax.Array:
+        """One iteration."""
+        jacobian, turn = jax.jacfwd(across, has_aux=True)(angle)
+        size = jax.lax.stop_gradient(jnp.max(jnp.abs(jacobian)))
+        size = jnp.where(size > 0, size, 1.0)
+        away = jnp.where(starts, -_RIDGE, 1.0)
+        change = jnp.linalg.solve(jacobian / size + eye * away[:, None], -turn / size)
+        return angle + jnp.clip(change, -_MOST_TURN, _MOST_TURN)
+
+    return unit(jax.lax.fori_loop(0, _NEWTON, newton, angle))

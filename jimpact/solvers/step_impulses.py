@@ -1,0 +1,131 @@
+"""The impulses of one implicit step: friction in discs, and normal impulses that unloading cuts.
+
+A step looks for impulses q = (f, y), normal (m) and tangential (t), at which the velocities
+`w = b + K q` after it satisfy
+
+    friction    y_j in the disc of radius mu_j f_j, against u_j: at its rim where u_j is not 0
+    normal      f_j = F_j - a_j max(gamma_j, 0), not below 0
+
+with the force F_j that the indentation at the beginning of the step gives, and the part a_j gamma_j
+of it that a fast unloading takes away within the step (0: none). With F_j and the radii known this
+is a convex problem; accelerated projected gradients with restarts solve it from the impulses of the
+step before. Which contacts stick, which slip and where to, and who carries what where contacts are
+redundant, comes out of the minimum: no modes, nothing to be compiled for each contact.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jimpact.solvers.dense import regularized_once, times
+from jimpact.solvers.friction import in_disc
+
+# Sweeps of one solve at most; 5 to 30 are usual. What is left then is an error of the step, which
+# its estimate sees. Ten times more: a few scenes with many contacts take ten times longer.
+SWEEPS = 100
+# Added to the diagonal of the tangent equations, which are singular where contacts stick
+# redundantly. Velocities do not depend on it. Ten times more: derivatives err by ten times the
+# rounding that it amplifies.
+RIDGE = 1e-10
+
+
+class StepProblem(NamedTuple):
+    """What the impulses (n, B) of a step have to satisfy, n = m + t."""
+
+    coupling: jax.Array  # K (n, n, B)
+    velocity: jax.Array  # b (n, B), the velocities without the impulses
+    load: jax.Array  # F (m, B), the largest normal impulses
+    unloading: jax.Array  # a >= 0 (m, B)
+    friction: jax.Array  # mu (m, B)
+    descent: jax.Array  # (n, B), lengths of the steps of descent, see `descent_lengths`
+
+    def projected(self, impulses: jax.Array, velocities: jax.Array) -> jax.Array:
+        """The admissible impulses (n, B) next to a step of gradient descent."""
+        m, step = len(self.load), self.descent[: len(self.load)]
+        tried = impulses - self.descent * velocities
+        cut = (self.unloading * tried[:m] + step * self.load) / (self.unloading + step)
+        normal = jnp.where(self.unloading > 0, jnp.clip(cut, 0.0, self.load), self.load)
+        side = tried[m:].reshape(m, -1, tried.shape[-1])
+        side = in_disc(side, self.friction * normal)
+        return jnp.concatenate([normal, side.reshape(tried[m:].shape)])
+
+    def velocities(self, impulses: jax.Array) -> jax.Array:
+        """w (n, B) after the impulses."""
+        return self.velocity + times(self.coupling, impulses)
+
+    def residual(self, impulses: jax.Array) -> jax.Array:
+        """Impulses (n, B) less their projection: 0 at the solution."""
+        return impulses - self.projected(impulses, self.velocities(impulses))
+
+
+def descent_lengths(coupling: jax.Array, contacts: int) -> jax.Array:
+    """Lengths d (n, B) with which descent converges: diag(1/d) - K is positive semidefinite.
+
+    Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the largest
+    eigenvalue is then at most the Frobenius norm, and the largest sum of a row.
+    """
+    n = len(coupling)
+    size = coupling[jnp.arange(n), jnp.arange(n)]
+    side = size[contacts:].reshape(contacts, -1, size.shape[-1])
+    rows = side.shape[1]
+    if rows:
+        largest = jnp.repeat(jnp.max(side, axis=1), rows, axis=0)
+        size = jnp.concatenate([size[:contacts], largest])
+    size = jnp.where(size > 0, size, 1.0)
+    root = jnp.sqrt(size)
+    scaled = jnp.abs(coupling) / (root[:, None] * root[None])
+    row_sum = jnp.max(jnp.sum(scaled, axis=1), axis=0, keepdims=True)
+    norm = jnp.sqrt(jnp.sum(scaled**2, axis=(0, 1)))[None]
+    return 1 / (size * jnp.minimum(row_sum, norm))
+
+
+def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.Array:
+    """Impulses (n, B) that leave velocities right to `tolerance` (1, B), from a guess."""
+
+    class Sweep(NamedTuple):
+        """Impulses, the point that the next sweep starts from, momentum, error, sweeps done."""
+
+        impulses: jax.Array
+        ahead: jax.Array
+        momentum: jax.Array
+        error: jax.Array
+        done: jax.Array
+
+    def going(s: Sweep) -> jax.Array:
+        """Whether a lane of the batch is not yet right."""
+        return (s.done < SWEEPS) & jnp.any(s.error > tolerance)
+
+    def sweep(s: Sweep) -> Sweep:
+        """One step of descent, and Nesterov's extrapolation unless it points uphill."""
+        new = problem.projected(s.ahead, problem.velocities(s.ahead))
+        moved = (s.ahead - new) / problem.descent
+        change = jnp.max(jnp.abs(moved), axis=0, keepdims=True)
+        uphill = jnp.sum(moved * (new - s.impulses), axis=0, keepdims=True) > 0
+        momentum = jnp.where(uphill, 1.0, (1 + jnp.sqrt(1 + 4 * s.momentum**2)) / 2)
+        weight = jnp.where(uphill, 0.0, (s.momentum - 1) / momentum)
+        ahead = new + weight * (new - s.impulses)
+        return Sweep(new, ahead, momentum, change, s.done + 1)
+
+    one = jnp.ones_like(tolerance)
+    first = Sweep(start, start, one, one * jnp.inf, jnp.asarray(0))
+    return jax.lax.while_loop(going, sweep, first).impulses
+
+
+def solve_smooth(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.Array:
+    """As `solve`, as a smooth function of the problem: derivatives solve the tangent equations."""
+    still = jax.lax.stop_gradient((problem, start, tolerance))
+
+    def iterate(_residual: Any, _start: jax.Array) -> jax.Array:
+        """The impulses."""
+        return solve(*still)
+
+    def tangent_solve(linear: Any, right: jax.Array) -> jax.Array:
+        """The impulses (n, B) whose image under the residual's derivative is `right`."""
+        n = len(right)
+        units = jnp.broadcast_to(jnp.eye(n, dtype=right.dtype)[:, :, None], (n, *right.shape))
+        matrix = jnp.swapaxes(jax.vmap(linear)(units), 0, 1)
+        ridge = jnp.full_like(right, RIDGE)
+        return regularized_once(matrix, ridge, right)
+
+    return jax.lax.custom_root(problem.residual, still[1], iterate, tangent_solve)

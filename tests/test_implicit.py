@@ -1,0 +1,208 @@
+"""Method 'implicit': impacts by steps without events, of `LZB` and `Compliant`."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from spatial_scenes import NAMED, random_boxes
+
+import jimpact as ji
+from jimpact.contact import contact_of
+from jimpact.events import implicit_steps
+from jimpact.events.impact_dynamics import method_for
+from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
+from jimpact.status import CODE
+
+# v+ by method 'time' at rtol 1e-11, k = 1, eta = 1.5, mu = .3, by name and e
+EDGE = [0.7057231279, 0.3448930544, 0.0365790838, -2.9887916746, -0.3493685294, -0.0909271875]
+FLAT = [0.6299348115, 0.1993363367, 0.2798615911, 0.0212017465, -0.394785253, 0.0517198202]
+EVENT_BY_EVENT = {
+    ("edge", 0.3): EDGE,
+    ("edge", 0.0): [0.7669362833, 0.3074755598, -0.2007867887, -2.4982569377, 0.0, -0.1149629959],
+    ("flat", 0.3): FLAT,
+    ("flat", 0.0): [0.7126974225, 0.2149277049, 0.0, 0.0, 0.0, 0.0798893306],
+}
+# of a box on a corner at e = mu = .3: d v+ / d (e, mu)
+CORNER_JACOBIAN = [
+    [-0.15552754376, -0.85593442434],
+    [0.01648494272, -0.01323109553],
+    [0.52132917949, 0.65157966400],
+    [-1.09477701996, -0.96566689232],
+    [-1.59569569688, 3.48455862744],
+    [-0.00642955078, -0.86463167619],
+]
+DEFAULT_RTOL = 1e-5  # of the method, in the fastest approach
+
+
+def pressed(name):
+    """Scene and velocity of a body on the ground."""
+    body = NAMED[name]()
+    return ji.Scene(body.mass, body.normals, body.tangents), jnp.asarray(body.velocity)
+
+
+def test_agrees_with_the_method_that_stops_at_every_event():
+    """Two and four corners, e = 0 included: right to the tolerance asked for."""
+    for (name, e), expected in EVENT_BY_EVENT.items():
+        scene, v = pressed(name)
+        for rtol in (DEFAULT_RTOL, 1e-7):
+            law = ji.LZB(e, 1.0, 1.5, friction=0.3, method="implicit", rtol=rtol)
+            out = ji.impact(law, scene, v)
+            error = np.abs(np.asarray(out.velocity) - expected).max()
+            assert out.status == 0
+            assert error < 1.5 * rtol * np.abs(v).max(), (name, e, rtol, error)
+
+
+SLIDES_OR_ROLLS = [(0.5, 0.1, False), (0.5, 1.0, True), (0.0, 0.3, True)]
+
+
+@pytest.mark.parametrize(("e", "mu", "rolls"), SLIDES_OR_ROLLS)
+def test_a_ball_slides_or_rolls(e, mu, rolls):
+    """One contact whose friction does not change its normal force: closed forms."""
+    arm = np.array([0.0, 0.0, -1.0])
+    mass = np.diag([1.0, 1.0, 1.0, 0.4, 0.4, 0.4])
+    rows = np.array([[*np.eye(3)[i], *np.cross(arm, np.eye(3)[i])] for i in range(3)])
+    scene = ji.Scene(mass, rows[2:].T, rows[:2].T)
+    law = ji.LZB(e, 2.0, 1.5, friction=mu, method="implicit")
+    out = ji.impact(law, scene, [0.6, 0.8, -1.0, 0.0, 0.0, 0.0])
+    speed = 5 / 7 if rolls else 1 - mu * (1 + e)
+    expected = np.array([0.6 * speed, 0.8 * speed, e])
+    np.testing.assert_allclose(out.velocity[:3], expected, atol=2 * DEFAULT_RTOL)
+    assert out.energy_change < 0
+
+
+def test_forces_gaps_and_exponents():
+    """Three balls with a gap: v+ by method 'time', for forces of each kind."""
+    scene = ji.chain([1.0, 1.0, 1.0], gaps=[0.0, 0.1])
+    cases = [
+        (ji.Hertz(1.0), [-0.04134429, 0.04313068, 0.9982136]),
+        (ji.KelvinVoigt(2.0, 0.5), [0.07501565, 0.27741732, 0.64756704]),
+        (ji.Bistiffness(1.0, jnp.array([1.3, 1.7]), 0.6), [0.171364, 0.18514237, 0.64349363]),
+    ]
+    for force, expected in cases:
+        out = ji.impact(ji.Compliant(force, method="implicit"), scene, [1.0, 0.0, 0.0])
+        np.testing.assert_allclose(out.velocity, expected, atol=1.5 * DEFAULT_RTOL)
+        assert out.status == 0
+
+
+def test_derivatives():
+    """They are those of the event-aligned method, also in e at e = 0; second ones raise."""
+    scene, v = pressed("corner")
+
+    def after(parameters):
+        e, mu = parameters
+        law = ji.LZB(e, 1.0, 1.5, friction=mu, method="implicit")
+        return ji.impact(law, scene, v).velocity
+
+    at = jnp.array([0.3, 0.3])
+    forward = jax.jacfwd(after)(at)
+    np.testing.assert_allclose(forward, CORNER_JACOBIAN, atol=5e-4)
+    # one contact, no friction: v+ = -e v-, whatever e
+    ball = ji.chain([1.0], wall=True)
+    slope = jax.grad(
+        lambda e: ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), ball, [1.0]).velocity[0]
+    )
+    assert slope(0.0) == pytest.approx(-1.0, abs=5e-4)
+    with pytest.raises(NotImplementedError, match="must be 'time' for second derivatives"):
+        jax.hessian(lambda x: after(x)[0])(at)
+
+
+@pytest.mark.slow
+def test_reverse_mode_is_the_forward_one():
+    """Both walk the same steps: equal to rounding, on a corner and an edge."""
+    for name in ("corner", "edge"):
+        scene, v = pressed(name)
+
+        def after(parameters, scene=scene, v=v):
+            e, mu = parameters
+            law = ji.LZB(e, 1.0, 1.5, friction=mu, method="implicit")
+            return ji.impact(law, scene, v).velocity
+
+        at = jnp.array([0.3, 0.3])
+        np.testing.assert_allclose(jax.jacrev(after)(at), jax.jacfwd(after)(at), rtol=1e-8)
+
+
+def test_history_is_that_of_the_other_method():
+    """Force, indentation, duration and end of an impact of two contacts, frozen from 'time'."""
+    law = ji.LZB([0.9, 0.8], [1.0, 0.5], 1.5, method="implicit", rtol=1e-7)
+    h = ji.history(law, ji.chain([1.0, 2.0, 3.0]), [1.0, 0.0, 0.0], samples=6)
+    np.testing.assert_allclose(h.maximum_force, [0.89726283, 0.54923729], rtol=1e-3)
+    np.testing.assert_allclose(h.force[1:3, 0], [0.85873828, 0.17296348], rtol=2e-2)
+    np.testing.assert_allclose(h.velocity[-1], [-0.27931205, -0.04382761, 0.45565576], atol=1e-6)
+    assert h.status == 0
+    assert h.force[-1, 0] == 0
+
+
+def test_auto_leaves_many_contacts_in_space_to_it():
+    """More than four contacts with friction in space; four, or none with friction, stay exact."""
+    for name, method in (("legs", "implicit"), ("flat", "time")):
+        scene, v = pressed(name)
+        assert method_for("auto", contact_of(scene, v)) == method
+    assert method_for("impulse", contact_of(scene, v)) == "impulse"
+    balls = ji.chain([1.0] * 9)
+    assert method_for("auto", contact_of(balls, jnp.zeros(9))) == "time"
+
+
+def test_random_boxes_end():
+    """Boxes nearly flat on four corners, mu up to 1.5, e from 0 to 1: every impact ends, lossy."""
+    draw = random_boxes("nearly flat", 16)
+
+    def one(mass, normals, tangents, v, e, mu):
+        law = ji.LZB(e, 1.0, 1.5, friction=mu, method="implicit", rtol=1e-4)
+        return ji.impact(law, ji.Scene(mass, normals, tangents), v)
+
+    out = jax.jit(jax.vmap(one))(*draw)
+    assert not np.asarray(out.status).any()
+    size = np.abs(draw.velocity).max(axis=1) ** 2
+    assert (np.asarray(out.energy_change) < 1e-3 * size).all()
+
+
+def test_what_does_not_end_says_so():
+    """Too few steps: `max_steps`."""
+    scene, v = pressed("edge")
+    law = ji.LZB(0.3, 1.0, 1.5, friction=0.3, method="implicit", max_steps=5)
+    assert int(ji.impact(law, scene, v).status) == CODE["max_steps"]
+
+
+def test_impulses_of_a_step():
+    """Slip beyond the cone, stick within it, a contact whose unloading takes its force away."""
+    k = jnp.diag(jnp.array([1.0, 1.0, 2.0, 2.0]))[..., None]  # two contacts in the plane
+    lengths = descent_lengths(k, 2)
+    np.testing.assert_allclose(lengths[:, 0], [1.0, 1.0, 0.5, 0.5])
+    load, zero = jnp.ones((2, 1)), jnp.zeros((2, 1))
+    velocity = jnp.array([[-3.0], [-3.0], [0.4], [3.0]])
+    problem = StepProblem(k, velocity, load, zero, 0.5 * load, lengths)
+    q = solve(problem, jnp.zeros((4, 1)), jnp.full((1, 1), 1e-12))
+    np.testing.assert_allclose(q[:, 0], [1.0, 1.0, -0.2, -0.5], atol=1e-12)
+    # gamma = -.5 + f: with a = 3 the force that is left solves f = 1 - 3 (f - .5)
+    problem = problem._replace(velocity=velocity.at[0].set(-0.5), unloading=3 * load)
+    q = solve(problem, jnp.zeros((4, 1)), jnp.full((1, 1), 1e-12))
+    np.testing.assert_allclose(q[:2, 0], [0.625, 1.0], atol=1e-12)
+
+
+def test_redundant_contacts_keep_descent_lengths_safe():
+    """diag(1/d) - K has no negative eigenvalue, for K of low rank."""
+    rng = np.random.default_rng(0)
+    factor = rng.normal(size=(3, 12))
+    k = factor.T @ factor
+    d = np.asarray(descent_lengths(jnp.asarray(k)[..., None], 4))[:, 0]
+    assert np.linalg.eigvalsh(np.diag(1 / d) - k).min() > -1e-12
+
+
+def test_a_wait_ends_where_the_gap_closes():
+    """Free flight is one exact step to the next contact."""
+    flow = implicit_steps.ImplicitSteps(
+        coupling=jnp.eye(2)[..., None],
+        omega=jnp.array([[1.0], [2.0]]),
+        restitution=jnp.ones((2, 1)),
+        exponent_array=None,
+        friction=jnp.zeros((2, 1)),
+        descent=jnp.ones((2, 1)),
+        tolerance=jnp.full((1, 1), 1e-5),
+        kept=jnp.zeros((1, 1)),
+        exponent_static=1.5,
+        gapped=True,
+    )
+    start = flow.start(jnp.array([[-3.0], [-8.0]]), jnp.array([[-0.5], [-1.0]]))
+    after = flow.coasted(start)
+    np.testing.assert_allclose(after.indentation[:, 0], [-1.0, 0.0], atol=1e-14)
+    assert float(after.time[0, 0]) == pytest.approx(4.0)

@@ -1,0 +1,204 @@
+"""Motions with friction in space, event by event: closed forms, time stepping, derivatives."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jimpact as ji
+from jimpact.bodies.base import STANDARD_GRAVITY as G
+from jimpact.motion.record import EVENT_KINDS, MOTION_STATUS
+
+RADIUS = 0.1
+
+
+class Pull(eqx.Module):
+    """A force on the middle that grows with time and turns: rate [N/s], turning [rad/s]."""
+
+    rate: jax.Array
+    turning: jax.Array
+
+    def __call__(self, q, v, t):
+        angle = self.turning * t
+        push = self.rate * t * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        return jnp.concatenate([push, jnp.zeros(4, t.dtype)])
+
+
+def on_slope(speed, across, mu, tilt, rate, turning, duration=0.6):
+    """A sphere of 1 kg that slides down (x) and `across` (y, rad) a slope, and is pulled."""
+    normal = jnp.stack([jnp.sin(tilt), 0 * tilt, jnp.cos(tilt)])
+    ball = ji.Sphere(RADIUS, normal=normal)
+    system = ji.System(ball, force=Pull(rate, turning), potential=ji.gravity(ball))
+    down = jnp.stack([jnp.cos(tilt), 0 * tilt, -jnp.sin(tilt)])
+    velocity = speed * (jnp.cos(across) * down + jnp.sin(across) * jnp.eye(3)[1])
+    q0 = jnp.concatenate([RADIUS * normal, jnp.array([1.0, 0, 0, 0])])
+    v0 = jnp.concatenate([velocity, jnp.zeros(3)])
+    return ji.simulate(
+        system, ji.Moreau(0.5, friction=mu), q0, v0, duration, samples=3, max_events=5
+    )  # fmt: skip
+
+
+def rolls(x):
+    """When a sphere begins to roll, how fast, and what friction took; u' = g e_x - c u / |u|.
+
+    `c |u| + g u_x` changes at the rate g^2 - c^2, whichever way u turns.
+    """
+    speed, across, mu, tilt = x[:4]
+    g, c = G * jnp.sin(tilt), 3.5 * mu * G * jnp.cos(tilt)
+    time = (c * speed + g * speed * jnp.cos(across)) / (c**2 - g**2)
+    e = jnp.stack([jnp.cos(across), jnp.sin(across)])
+    down = jnp.array([1.0, 0.0])
+    return time, 5 / 7 * speed * e + 5 / 7 * g * time * down
+
+
+ROWS = [
+    (0.7, 0.3, 0.3, 0.0, 0.0, 0.0),  # level
+    (0.7, 0.0, 0.3, 0.2, 0.0, 0.0),  # straight down
+    (0.7, 2.0, 0.3, 0.2, 0.0, 0.0),  # across: slip turns
+    (0.0, 0.0, 0.3, np.arctan(1.2), 0.0, 0.0),  # from rest, steeper than 7/2 mu: it slides on
+    (0.0, 0.0, 0.3, np.arctan(0.9), 0.0, 0.0),  # it rolls
+    (0.0, 0.0, 0.1, 0.0, 14.0, 0.0),  # pulled until it slides
+    (0.0, 0.0, 0.1, 0.0, 14.0, 3.0),  # while the pull turns
+]
+
+
+@pytest.fixture(scope="module")
+def spheres():
+    return jax.jit(jax.vmap(on_slope))(*np.array(ROWS).T)
+
+
+def lane(motions, i):
+    return jax.tree.map(lambda x: x[i], motions)
+
+
+def kinds(motion):
+    return [EVENT_KINDS[k] for k in motion.events.kind[: int(motion.events.count)]]
+
+
+def on_plane(v, tilt):
+    """Velocities (.., 2) down and across a slope."""
+    return np.stack([v[..., 0] * np.cos(tilt) - v[..., 2] * np.sin(tilt), v[..., 1]], axis=-1)
+
+
+@pytest.mark.parametrize("row", [0, 1, 2])
+def test_a_sphere_slides_until_it_rolls(spheres, row):
+    motion, (time, velocity) = lane(spheres, row), rolls(jnp.array(ROWS[row]))
+    assert kinds(motion) == ["friction"]
+    np.testing.assert_allclose(motion.events.time[0], time, rtol=1e-9)
+    after = on_plane(np.asarray(motion.events.velocity_after[0]), ROWS[row][3])
+    np.testing.assert_allclose(after, velocity, atol=1e-9)
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
+
+
+def test_a_level_sphere_keeps_five_sevenths(spheres):
+    motion = lane(spheres, 0)
+    np.testing.assert_allclose(motion.events.time[0], 2 * 0.7 / (7 * 0.3 * G), rtol=1e-13)
+    np.testing.assert_allclose(np.linalg.norm(motion.velocity[-1, :2]), 0.5, rtol=1e-14)
+
+
+def test_a_sphere_slides_or_rolls_from_rest(spheres):
+    for row, share in ((3, 1.2 - 0.3), (4, 0.9 * 5 / 7)):
+        motion, tilt = lane(spheres, row), ROWS[row][3]
+        way = 0.5 * share * G * np.cos(tilt) * 0.6**2
+        assert kinds(motion) == []
+        np.testing.assert_allclose(motion.q[-1, 0] - motion.q[0, 0], way * np.cos(tilt), rtol=1e-12)
+
+
+def test_a_sphere_that_is_pulled_begins_to_slide(spheres):
+    """At 2/7 of the pull = mu m g; then v' = (pull - mu m g) / m."""
+    motion, start = lane(spheres, 5), 0.1 * G * 3.5 / 14
+    assert kinds(motion) == ["friction"]
+    np.testing.assert_allclose(motion.events.time[0], start, rtol=1e-9)
+    speed = 5 / 7 * 7 * start**2 + 7 * (0.6**2 - start**2) - 0.1 * G * (0.6 - start)
+    np.testing.assert_allclose(motion.velocity[-1, 0], speed, rtol=1e-9)
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_slip_that_begins_turns_with_the_forces(spheres):
+    """Radau's method for `u / sqrt(u^2 + 1e-20)`."""
+    from scipy.integrate import solve_ivp
+
+    start, friction = 0.1 * G * 3.5 / 14, 0.1 * G
+
+    def pull(t):
+        return 14 * t * np.array([np.cos(3 * t), np.sin(3 * t)])
+
+    def rates(t, y):
+        d = y[2:] / np.sqrt(y[2:] @ y[2:] + 1e-20)
+        return np.concatenate([pull(t) - friction * d, pull(t) - 3.5 * friction * d])
+
+    options = {"method": "Radau", "rtol": 1e-11, "atol": 1e-13}
+    stick = solve_ivp(lambda t, y: 5 / 7 * pull(t), (0, start), [0.0, 0.0], **options).y[:, -1]
+    first = np.concatenate([stick, 1e-14 * pull(start)])
+    end = solve_ivp(rates, (start, 0.6), first, **options).y[:2, -1]
+    np.testing.assert_allclose(lane(spheres, 6).velocity[-1, :2], end, atol=3e-8)
+
+
+@pytest.mark.release
+def test_derivatives_of_a_sphere_that_begins_to_roll():
+    """Its slip turns; when it ends and how fast the sphere rolls, in both modes."""
+
+    def found(x):
+        motion = on_slope(*x, jnp.zeros(()), jnp.zeros(()))
+        v = motion.events.velocity_after[0]
+        return jnp.stack([motion.events.time[0], v[1]])
+
+    def exact(x):
+        time, velocity = rolls(x)
+        return jnp.stack([time, velocity[1]])
+
+    x = jnp.array(ROWS[2][:4])
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(found))(x), jax.jacfwd(exact)(x), atol=1e-7)
+
+
+# ---------------------------------------------------------------------------------- boxes
+
+BRICK = ji.Box([0.1, 0.06, 0.04], mass=0.5)
+SYSTEM, LAW = ji.System(BRICK, potential=ji.gravity(BRICK)), ji.Moreau(0.3, friction=0.4)
+
+
+def thrown(q0, v0, duration, **options):
+    return ji.simulate(SYSTEM, LAW, q0, v0, duration, samples=21, **options)
+
+
+@pytest.mark.slow
+def test_a_box_slides_to_rest():
+    motion = thrown(BRICK.touching(), [1.0, 0.5, 0, 0, 0, 0], 0.6)
+    speed = np.hypot(1.0, 0.5)
+    assert kinds(motion) == ["friction"]
+    np.testing.assert_allclose(motion.events.time[0], speed / (0.4 * G), rtol=1e-9)
+    way = speed**2 / (2 * 0.4 * G)
+    np.testing.assert_allclose(motion.q[-1, :2], way * np.array([1.0, 0.5]) / speed, atol=1e-10)
+
+
+@pytest.mark.slow
+def test_a_spinning_box_slides_as_by_time_stepping():
+    """Slip of four corners turns until all stop at once; the error falls with the step."""
+    q0, v0 = BRICK.touching(), np.array([0.5, 0.2, 0, 0, 0, 10.0])
+    motion = thrown(q0, v0, 0.6)
+    assert MOTION_STATUS[int(motion.status)].name == "ok"
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
+    wrong = [
+        np.abs(thrown(q0, v0, 0.6, method="time_stepping", step=h).q[-1] - motion.q[-1]).max()
+        for h in (1e-3, 1e-4)
+    ]
+    assert wrong[1] < 1e-4
+    assert wrong[1] < 0.3 * wrong[0]
+
+
+@pytest.mark.slow
+def test_a_thrown_brick_comes_to_rest_on_a_face():
+    motion = thrown(
+        BRICK.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]), [0.5, 0.2, 0.0, 3.0, 12.0, 5.0], 0.6
+    )
+    assert MOTION_STATUS[int(motion.status)].name == "ok"
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-11)
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-10)
+    np.testing.assert_allclose(np.sort(np.asarray(motion.gaps[-1]))[:4], 0, atol=1e-12)
+    # the first impact is on one corner, at the time of free fall
+    assert int(motion.events.contacts[0].sum()) == 1
+    assert motion.events.tangential_impulse.shape[1] == 16
