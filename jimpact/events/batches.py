@@ -36,7 +36,7 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     `function` is hashable and compares equal where it does the same (a function of a module, or a
     frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
-    It is called with the whole batch if its attribute `queues` is True, else with chunks of it.
+    It gets the whole batch if it has a method `queues` that returns True, else chunks of it.
     """
     return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
 
@@ -245,17 +245,18 @@ def _count_of_values(outs: Any) -> int:
     return next(n for n in range(len(outs)) if n + sum(smooth[:n]) == len(outs))
 
 
-def _queues(function: Any) -> bool:
+def _queues(function: Any, arrays: Arrays) -> bool:
     """Whether the function works through a batch of any size by itself."""
     if isinstance(function, Tangent | WithTangents):
-        return _queues(smoothed(function.function))
-    return getattr(function, "queues", False)
+        return _queues(smoothed(function.function), arrays[: len(function.marked)])
+    queues = getattr(function, "queues", None)
+    return queues is not None and queues(*arrays)
 
 
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
-    if _queues(function):
+    if _queues(function, arrays):
         return tuple(function(*arrays))
     tangents = isinstance(function, Tangent | WithTangents)
     count = -(-size // (CHUNK_WITH_TANGENTS if tangents else CHUNK))

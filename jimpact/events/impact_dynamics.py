@@ -235,11 +235,11 @@ class ImpulseProgram:
         rows = contacts, self.sides, 1, 1, 1
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
 
-    @property
-    def queues(self) -> bool:
-        """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
+    def queues(self, *leaves: Any) -> bool:
+        """Whether a batch of any size is worked through as a queue (`stepper.run`): in space."""
         smooth = self.smooth and self.takes_duals  # called with tangents
-        return self.sides > 0 and (smooth or not self.finely)
+        in_space = self.sides > jax.tree.unflatten(self.tree, leaves).omega.shape[0]
+        return in_space and (smooth or not self.finely)
 
     @property
     def takes_duals(self) -> bool:
@@ -292,8 +292,7 @@ class ImpulseProgram:
 class ImplicitProgram(ImpulseProgram):
     """As `ImpulseProgram`, by steps without events; both modes go through it as it is."""
 
-    @property
-    def queues(self) -> bool:
+    def queues(self, *leaves: Any) -> bool:
         """No: it is called with chunks of a batch."""
         return False
 

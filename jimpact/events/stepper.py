@@ -76,10 +76,10 @@ FINEST, COARSE_ROUNDING = 16, 64
 # half as long.
 COARSE = 0.3
 
-# Impacts with friction that a CPU computes side by side, whatever the size of the batch; and slots
-# that are free before they are filled with waiting impacts. Ten times more slots: more of them idle
-# while the last impacts end; ten times fewer: each operation has too few numbers to work on. Ten
-# times more free slots: all wait for the slowest impact again.
+# Impacts with friction in space that a CPU computes side by side, whatever the size of the batch;
+# and slots that are free before they are filled with waiting impacts. Ten times more slots: more of
+# them idle while the last impacts end; ten times fewer: each operation has too few numbers to work
+# on. Ten times more free slots: all wait for the slowest impact again.
 SLOTS, FREE = 128, 8
 
 STAGES = len(DOP853.c)
