@@ -8,7 +8,6 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 # XLA's newer emitters of fused loops on CPUs make code that runs 4 % faster in large batches, and
@@ -79,19 +78,6 @@ def axes_of_kind(kind: Any) -> frozenset[Any]:
     """
     manual = getattr(kind, "manual_axis_type", None)
     return getattr(kind, "vma", frozenset()) if manual is None else manual.varying
-
-
-def kinds_varying_like(kinds: list[Any], like: Any) -> list[Any]:
-    """The abstract kinds of arrays, varying over the mesh axes of another one."""
-    axes = tuple(axes_of_kind(like))
-    if not axes:
-        return kinds
-
-    def arrays() -> list[jax.Array]:
-        """Arrays of these kinds; nothing is computed."""
-        return [jax.lax.pcast(jnp.zeros(x.shape, x.dtype), axes, to="varying") for x in kinds]
-
-    return list(jax.make_jaxpr(arrays)().out_avals)
 
 
 def is_top_level_call(*args: Any) -> bool:

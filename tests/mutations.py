@@ -103,6 +103,8 @@ MUTATIONS = [
     Mutation("crossings are missed", r"crossed, turns = free & \(c1 < -zero\)", "crossed, turns = free & (c1 < -1e3 * zero)", FLOW),
     Mutation("tolerance does not fall with passes", r"flow\.tolerance \* \(full / jnp\.maximum\(passes, full\)\)", "flow.tolerance * jnp.ones_like(passes)", ("test_methods.py::test_right_or_flagged_with_more_steps[3-0.7]",), "stepper.py", "slow"),
     Mutation("every step accepted", r"ok = error2 <= 1\n", "ok = error2 <= 1e6\n", FLOW),
+    Mutation("cotangents of the last step only", r"return jax\.tree\.map\(jnp\.add, sums, change\), before", "return change, before", ("test_reverse.py::test_steps_that_are_run_again_have_their_derivatives",), "reverse_mode.py"),
+    Mutation("steps are run again from the wrong state", r"progress\]\), slot\)", "progress]), jnp.maximum(slot - 1, 0))", ("test_reverse.py::test_steps_that_are_run_again_have_their_derivatives",), "kept_steps.py"),
     # --- complementarity
     Mutation("LCP: tie rules removed", r"own = candidates & ", "own = (candidates & False) & ", KINEMATIC),
     Mutation("LCP: the least ratio becomes the first", r"jnp\.argmin\(jnp\.where\(own, -jnp\.inf, ratio\)\)", "jnp.argmax(candidates)", KINEMATIC),
@@ -123,7 +125,7 @@ MUTATIONS = [
     Mutation("energy change without v+", r"change = 0\.5 \* momentum\(scene, jump\) @ \(v \+ v_plus\)", "change = momentum(scene, jump) @ v", ("test_seams.py::test_groups_are_judged_on_the_scale_of_their_impact",)),
     Mutation("open contacts take part", r"part = happens & \(contact\.closed \| law\.uses_gaps\)", "part = happens & (contact.closed | True)", ("test_own_law.py::test_what_every_law_gets_for_nothing",)),
     Mutation("any number of contacts with friction is tried", r"scene\.contacts > MOST_WITH_FRICTION", "scene.contacts > 10 * MOST_WITH_FRICTION", ("test_errors.py::test_bad_input",), "lzb.py"),
-    Mutation("loops begin without the axes of a mesh", r"    if not axes:\n        return tree\n", "    return tree\n", ("test_executors.py::test_shard_map_traces_each_law",), "compiling.py"),
+    Mutation("loops begin without the axes of a mesh", r"    if not axes:\n        return tree\n", "    return tree\n", ("test_executors.py::test_shard_map_traces_algebraic_laws",), "compiling.py"),
     Mutation("dependent tangents are not reported", r"\(least < _DEPENDENT\) & \(n >= unit\.shape\[1\]\)", "least < 0", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",), "scene.py"),
     Mutation("oblique tangents are not reported", r"oblique \|= known & ", "oblique |= known & False & ", ("test_scenes.py::test_tangents_that_distort_friction_are_reported",), "scene.py"),
     Mutation("energies that no number holds pass", r"beyond = happens & ~_has_scale\(outcome\.size, v\)", "beyond = happens & False", ("test_contract.py::test_energies_that_no_number_holds_are_out_of_range[moreau]",), "impacts.py"),

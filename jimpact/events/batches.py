@@ -17,7 +17,6 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
-from jimpact.compiling import kinds_varying_like, varying_like
 from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, value_of
 
 # Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
@@ -39,8 +38,7 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
     It gets the whole batch if it has a method `queues` that returns True, else chunks of it.
     """
-    varying = varying_like([jnp.asarray(x) for x in arrays], arrays)
-    return tuple(columns_p.bind(*varying, function=function))
+    return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
 
 
 def _partial(
@@ -141,15 +139,16 @@ def smoothed(function: Any) -> Any:
 
 def reversible(function: Any) -> Any:
     """The function in a form that the reverse mode goes through, too."""
-    if isinstance(function, Tangent | Cotangent):
-        return dataclasses.replace(function, function=reversible(function.function))
     form = getattr(function, "reversible", None)
     return function if form is None else form()
 
 
 @dataclasses.dataclass(frozen=True)
 class Cotangent:
-    """Cotangents of the marked arguments of `function`, from its arguments and cotangents."""
+    """Cotangents of the marked arguments of `function`, from its arguments and cotangents.
+
+    No derivative is transposed a second time: see `_of_derivative`.
+    """
 
     function: Callable[..., Arrays]
     marked: tuple[bool, ...]
@@ -160,14 +159,53 @@ class Cotangent:
         if isinstance(self.function, WithTangents):
             return self._of_both(self.function, arrays)
         count = len(self.marked)
-        of_marked, values = _partial(reversible(self.function), self.marked, arrays[:count])
-        outs, back = jax.vjp(of_marked, *values)
+        primals, cotangents = arrays[:count], arrays[count:]
+        if isinstance(self.function, Tangent | Cotangent):
 
-        def pull(*cotangents: jax.Array) -> Arrays:
-            """Cotangents for one cotangent of the results."""
-            return back(varying_like(cotangents, outs))
+            def pull(*cotangents: jax.Array) -> Arrays:
+                """Cotangents for one cotangent of the results."""
+                return self._of_derivative(self.function, primals, cotangents)
+        else:
+            of_marked, values = _partial(reversible(self.function), self.marked, primals)
+            _, back = jax.vjp(of_marked, *values)
 
-        return (jax.vmap(pull) if self.many else pull)(*arrays[count:])
+            def pull(*cotangents: jax.Array) -> Arrays:
+                """Cotangents for one cotangent of the results."""
+                return back(cotangents)
+
+        return (jax.vmap(pull) if self.many else pull)(*cotangents)
+
+    def _of_derivative(self, inner: Any, arrays: Arrays, cotangents: Arrays) -> Arrays:
+        """Of a tangent J(x) t, or of a cotangent J(x)^T t, for one cotangent w.
+
+        Second derivatives are symmetric: with respect to x both are the tangent of J(x)^T w in the
+        direction t, or of J(x)^T t in the direction w. With respect to t they are J^T w and J w.
+        """
+        function, count = inner.function, len(inner.marked)
+        at, linear = arrays[:count], arrays[count:]
+        of_x, of_t = self.marked[:count], self.marked[count:]
+        forward = isinstance(inner, Tangent)
+        results: list[jax.Array] = []
+        if any(of_x):
+            back = Cotangent(function, of_x)
+            covectors, directions = (cotangents, linear) if forward else (linear, cotangents)
+            tangent = Tangent(back, inner.marked + (False,) * len(covectors))
+
+            def one(covectors: Arrays, directions: Arrays) -> Arrays:
+                """Of one direction."""
+                return tangent(*at, *covectors, *directions)
+
+            if inner.many:
+                each = jax.vmap(one)(covectors, directions)
+                results += [jnp.sum(x, axis=0) for x in each]
+            else:
+                results += one(covectors, directions)
+        if any(of_t):
+            other = Cotangent(function, inner.marked, inner.many)
+            change = other if forward else Tangent(function, inner.marked, inner.many)
+            rates = change(*at, *cotangents)
+            results += [x for x, mark in zip(rates, of_t) if mark]
+        return tuple(results)
 
     def _of_both(self, both: WithTangents, arrays: Arrays) -> Arrays:
         """Of results and their tangents: the sum of what each of them gives."""
@@ -260,11 +298,6 @@ def _run(*arrays: jax.Array, function: Callable[..., Arrays]) -> Arrays:
 
 
 @columns_p.def_abstract_eval
-def _kinds(*kinds: Any, function: Callable[..., Arrays]) -> list[Any]:
-    """Abstract results: of these shapes, and as varying inside `shard_map` as the arguments."""
-    return kinds_varying_like(_shapes(*kinds, function=function), kinds[0])
-
-
 def _shapes(*shapes: Any, function: Callable[..., Arrays]) -> list[Any]:
     """Shapes of the results, without tracing `function` where they are known: it takes long."""
     known = [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
@@ -331,7 +364,7 @@ def _jvp(
 
     def zero(x: Any) -> Any:
         """The tangent of a whole number."""
-        return ad.Zero(jax.typeof(x).to_tangent_aval())
+        return ad.Zero(jax.core.ShapedArray(x.shape, jax.dtypes.float0))
 
     return list(outs), [next(rest) if is_smooth(x) else zero(x) for x in outs]
 

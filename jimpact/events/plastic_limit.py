@@ -13,14 +13,15 @@ on both sides of a light one still approach. A light body that does not lose its
 them apart in the end; meanwhile its states are no multiples of each other.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jimpact.compiling import varying_like
 from jimpact.events import stepper
 from jimpact.events.contact_flow import ContactFlow
+from jimpact.events.kept_steps import Kept, nothing_kept, record
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
 from jimpact.events.tangents import dual_like, pushforward, value_of
 from jimpact.status import CODE
@@ -52,13 +53,14 @@ class ImpactEnd(NamedTuple):
     """An impact at its end, finished but for the impulse of the contacts at rest."""
 
     carry: stepper.StepperState
-    pen: stepper.Recorder | None
+    kept: Kept | None  # its steps
+    reached: Any  # the state (n, B) before it was finished; None where no steps are kept
     rest: Rest
     begun: jax.Array  # ()
 
     @property
     def carries(self) -> jax.Array:
-        """Contacts at rest that carry an impulse (m, B); uses both, see `with_plan`."""
+        """Contacts at rest that carry an impulse (m, B); uses both, see it."""
         return self.rest.carries & self.rest.contacts
 
     @property
@@ -66,11 +68,17 @@ class ImpactEnd(NamedTuple):
         """Of the contacts at rest (m, B)."""
         return jnp.where(self.carries, self.rest.rows[2], 0.0)
 
-    @property
-    def plan(self) -> stepper.AcceptedSteps:
-        """The recorded steps."""
-        assert self.pen is not None
-        return self.pen.plan
+    def with_kept(self, x: jax.Array) -> jax.Array:
+        """x, of a program that has to keep steps even if only x is used.
+
+        Values and their derivatives keep the same steps. The compiler merges two loops that are the
+        same; it would first remove the slots from one of them.
+        """
+        assert self.kept is not None
+        numbers = self.kept.state[0, -1:], self.kept.marks[0, -1:], self.kept.plan[:1, None]
+        negative = functools.reduce(jnp.logical_or, [number < 0 for number in numbers])
+        never = negative | (self.reached[-1:] < 0)  # passes, flags, steps and time are not
+        return jnp.where(never, jnp.nan, x)
 
     @property
     def over(self) -> jax.Array:
@@ -92,7 +100,7 @@ class ImpactEnd(NamedTuple):
 def to_the_end(
     flow: Any, gamma: jax.Array, modes: jax.Array, y: Any, most: int, keeps: bool
 ) -> ImpactEnd:
-    """From gap velocities gamma (m, B) to the end; `keeps` the plan of the steps.
+    """From gap velocities gamma (m, B) to the end; `keeps` steps, for the reverse mode.
 
     What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents.
     """
@@ -102,16 +110,17 @@ def to_the_end(
     no = jnp.zeros(gamma.shape, bool)
     rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
     rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
-    start = ImpactEnd(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
-    start = varying_like(start, flow, gamma, y)
+    kept, reached = (nothing_kept(carry), carry.y) if keeps else (None, None)
+    start = ImpactEnd(carry, kept, reached, rest, jnp.asarray(False))
 
     def on(end: ImpactEnd) -> ImpactEnd:
         """On to the next pause or to the end."""
         finished = (end.carry.progress[2:3] == OVER) & end.begun
-        if end.pen is None:
-            carry, pen = stepper.run(flow, end.carry, most), None
+        if end.kept is None:
+            carry, kept, reached = stepper.run(flow, end.carry, most), None, None
         else:
-            carry, pen = stepper.record(flow, end.carry, end.pen, most)
+            carry, kept = record(flow, end.carry, end.kept, most)
+            reached = jnp.where(finished, end.reached, carry.y)
         over, paused = (carry.progress[2:3] == OVER) & ~finished, carry.progress[2:3] == PAUSED
         values = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
         quiet = over & at_rest(still, values)
@@ -129,8 +138,7 @@ def to_the_end(
         )
         settled = jnp.where(rest.ended, OVER, GOES_ON)
         progress = carry.progress.at[2:3].set(jnp.where(paused, settled, carry.progress[2:3]))
-        begun = varying_like(jnp.asarray(True), end.begun)
-        return ImpactEnd(carry._replace(progress=progress), pen, rest, begun)
+        return ImpactEnd(carry._replace(progress=progress), kept, reached, rest, jnp.asarray(True))
 
     return jax.lax.while_loop(
         lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start
@@ -170,7 +178,6 @@ def contacts_at_rest(
         return rest & jnp.where(carries, dp > 0, after < 0), dp
 
     start = (often | (rest & (now < 0)), jnp.zeros_like(now))
-    start = varying_like(start, flow, gamma, carry)
     carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
 
     # is it a multiple of the state at the last check?
@@ -198,8 +205,7 @@ def remainder(
         """Impulses where a contact carries."""
         return impulse_of_rest(flow, carries, gamma + flow.change(state))
 
-    none = varying_like(jnp.zeros_like(gamma), flow, gamma, state)
-    return jax.lax.cond(jnp.any(carries), some, lambda: none)
+    return jax.lax.cond(jnp.any(carries), some, lambda: jnp.zeros_like(gamma))
 
 
 def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> jax.Array:
@@ -218,5 +224,4 @@ def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> 
         return (z, residual, residual + ratio * direction, new), None
 
     start = (jnp.zeros_like(right), right, right, total(right * right))
-    start = varying_like(start, flow, right)
     return jax.lax.scan(step, start, None, length=2 * right.shape[0])[0][0]
