@@ -7,8 +7,12 @@ import sys
 import threading
 import time
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import jimpact as ji
 from jimpact import Binary, RandomLaw, Uniform, chain, monte_carlo
 from jimpact.montecarlo.executors import Devices, Executor, Serial, as_executor
 from jimpact.montecarlo.store import fingerprint
@@ -94,6 +98,77 @@ def test_one_two_and_four_devices(wanted):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == [wanted] * 3
+
+
+# ------------------------------------------------------------------- shard_map
+
+
+SHARDED = {
+    "moreau": ji.Moreau(0.5),
+    "poisson": ji.Poisson(0.5),
+    "matrix": ji.RestitutionMatrix(0.5 * np.eye(2)),
+    "binary": Binary(0.5),
+    "velocity": ji.VelocityDependent(ji.Moreau(0.5), speed_exponent=0.25),
+}
+
+
+def on_a_mesh(function):
+    """`function` of velocities shared out among all devices, and their sum over the devices."""
+    mesh, axis = jax.sharding.Mesh(np.array(jax.devices()), ("shot",)), jax.sharding.PartitionSpec
+
+    def part(parameter, velocities):
+        here = jax.vmap(function, (None, 0))(parameter, velocities)
+        return here, jax.lax.psum(here.sum(axis=0), "shot")
+
+    return jax.shard_map(
+        part, mesh=mesh, in_specs=(axis(), axis("shot")), out_specs=(axis("shot"), axis())
+    )
+
+
+@pytest.mark.parametrize("name", SHARDED)
+def test_shard_map_traces_algebraic_laws(name):
+    """With its default check of what varies among devices; nothing is compiled."""
+
+    def after(_, velocity):
+        return ji.impact(SHARDED[name], BALLS, velocity).velocity
+
+    for mode in (after, jax.jacfwd(after, argnums=1)):
+        each, total = jax.eval_shape(on_a_mesh(mode), jnp.ones(()), jnp.ones((4, 3)))
+        assert each.shape[1:] == total.shape
+
+
+ON_TWO_DEVICES = """
+import sys
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, sys.argv[1])
+from test_executors import BALLS, ji, on_a_mesh
+assert len(jax.devices()) == 2
+v = jnp.array([[1.0, 0.0, -1.0], [1.0, 0.2, 0.1], [0.5, 0.0, -0.3], [2.0, 0.1, 0.0]])
+for make in (ji.Binary, ji.Moreau):
+    after = lambda e, v: ji.impact(make(e), BALLS, v).velocity
+    each, total = jax.jit(on_a_mesh(after))(jnp.asarray(0.7), v)
+    alone = jax.vmap(after, (None, 0))(jnp.asarray(0.7), v)
+    np.testing.assert_allclose(each, alone, atol=1e-8)
+    np.testing.assert_allclose(total, alone.sum(axis=0), atol=1e-8)
+    slope = jax.jacfwd(after, argnums=1)
+    each, total = jax.jit(on_a_mesh(slope))(jnp.asarray(0.7), v)
+    np.testing.assert_allclose(each, jax.vmap(slope, (None, 0))(jnp.asarray(0.7), v), atol=1e-7)
+"""
+
+
+@pytest.mark.slow
+def test_shard_map_on_two_devices():
+    """Values, sums and forward derivatives are those of one device."""
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    done = subprocess.run(
+        [sys.executable, "-c", ON_TWO_DEVICES, os.path.dirname(__file__)],
+        env=os.environ | flags,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 # ------------------------------------------------------------------------ Dask

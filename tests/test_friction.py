@@ -17,7 +17,7 @@ from friction_reference import regularized, routh, small_steps
 from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
-from jimpact.events.queues import SLOTS
+from jimpact.events import queues
 
 close = np.testing.assert_allclose
 
@@ -38,6 +38,15 @@ LAWS = {
     ),
 }
 KINEMATIC = ("newton", "moreau", "matrix", "binary")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_slots():
+    """Fewer slots than impacts, so that the batches of these tests are queues."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(queues, "SLOTS", 8)
+        patch.setattr(queues, "FREE", 3)
+        yield
 
 
 @functools.cache
@@ -135,20 +144,6 @@ def test_disk_in_closed_form(name):
     assert 0 < stuck.sum() < len(stuck)
 
 
-def test_a_large_batch_is_a_queue(monkeypatch):
-    """More impacts than slots, each with a restitution of its own: all come out in their places."""
-    count = 2 * SLOTS + 44
-    monkeypatch.setitem(globals(), "LANES", count)
-    e, slip = np.linspace(0.0, 1.0, count), np.where(np.arange(count) % 2, -2.0, 0.3)
-    v = np.stack([slip, np.full(count, -1.3), np.zeros(count)], axis=1)
-    out, _ = run("lzb", *(np.tile(x, (count, 1, 1)[: 1 + x.ndim]) for x in DISK), v, e, 0.1)
-    p = MASS * (1 + e) * 1.3
-    side = np.clip(-slip / (1 / MASS + RADIUS**2 / INERTIA), -0.1 * p, 0.1 * p)
-    assert not out.status.any()
-    close(out.impulse[:, 0], p, rtol=1e-8)
-    close(out.tangential_impulse[:, 0], side, atol=1e-8)
-
-
 @pytest.mark.parametrize("v", [(0.1, -1.0, 0.3), (0.5, -1.0, -1.0), (-0.4, -1.0, 0.0)])
 def test_binary_is_newton_at_one_contact_after_another(v):
     block, e, rubs = ji.rocking_block(1.0, 2.0), 0.5, dict(friction=0.2, tangential_restitution=0.1)
@@ -211,6 +206,27 @@ def test_regularized_friction_is_rouths(rod):
     after, uncertainty = regularized(scene, v, 1.0, 1.5, e, mu, eps=1e-5)
     close(after, v + (normals[:, 0] * p + tangents[:, 0] * side) / mass, atol=1e-8)
     assert uncertainty < 1e-4
+
+
+HELD = np.load(Path(__file__).parent / "data" / "friction_space.npz")
+
+
+def held(contacts):
+    """Impacts in space, and what an independent integration gives (see space_reference.py)."""
+    return {name[:-2]: HELD[name] for name in HELD if name.endswith(f"_{contacts}")}
+
+
+@pytest.mark.parametrize("contacts", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_lzb_in_space_is_the_independent_one(contacts):
+    """Boxes on a corner or an edge, and the measured cube: v+ of another integration."""
+    x = held(contacts)
+    x = {name: values[x["friction"] < 1] for name, values in x.items()}  # beyond, one vibrates long
+    scenes = (x[name] for name in ("mass", "normals", "tangents", "velocity"))
+    k = np.pad(x["stiffness"], ((0, 0), (0, 2 - contacts)), constant_values=1.0)
+    out, _ = run("lzb", *scenes, x["restitution"], x["friction"], k=k)
+    assert not out.status.any()
+    error = np.abs(out.velocity - x["after"]).max(axis=1)
+    assert (error <= 1e-7 + 3 * x["uncertainty"]).all(), error
 
 
 def test_particle_of_example_6_2():

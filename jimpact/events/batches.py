@@ -36,7 +36,7 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     `function` is hashable and compares equal where it does the same (a function of a module, or a
     frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
-    It is called with the whole batch if its attribute `queues` is True, else with chunks of it.
+    It gets the whole batch if it has a method `queues` that returns True, else chunks of it.
     """
     return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
 
@@ -139,15 +139,16 @@ def smoothed(function: Any) -> Any:
 
 def reversible(function: Any) -> Any:
     """The function in a form that the reverse mode goes through, too."""
-    if isinstance(function, Tangent | Cotangent):
-        return dataclasses.replace(function, function=reversible(function.function))
     form = getattr(function, "reversible", None)
     return function if form is None else form()
 
 
 @dataclasses.dataclass(frozen=True)
 class Cotangent:
-    """Cotangents of the marked arguments of `function`, from its arguments and cotangents."""
+    """Cotangents of the marked arguments of `function`, from its arguments and cotangents.
+
+    No derivative is transposed a second time: see `_of_derivative`.
+    """
 
     function: Callable[..., Arrays]
     marked: tuple[bool, ...]
@@ -158,14 +159,53 @@ class Cotangent:
         if isinstance(self.function, WithTangents):
             return self._of_both(self.function, arrays)
         count = len(self.marked)
-        of_marked, values = _partial(reversible(self.function), self.marked, arrays[:count])
-        _, back = jax.vjp(of_marked, *values)
+        primals, cotangents = arrays[:count], arrays[count:]
+        if isinstance(self.function, Tangent | Cotangent):
 
-        def pull(*cotangents: jax.Array) -> Arrays:
-            """Cotangents for one cotangent of the results."""
-            return back(cotangents)
+            def pull(*cotangents: jax.Array) -> Arrays:
+                """Cotangents for one cotangent of the results."""
+                return self._of_derivative(self.function, primals, cotangents)
+        else:
+            of_marked, values = _partial(reversible(self.function), self.marked, primals)
+            _, back = jax.vjp(of_marked, *values)
 
-        return (jax.vmap(pull) if self.many else pull)(*arrays[count:])
+            def pull(*cotangents: jax.Array) -> Arrays:
+                """Cotangents for one cotangent of the results."""
+                return back(cotangents)
+
+        return (jax.vmap(pull) if self.many else pull)(*cotangents)
+
+    def _of_derivative(self, inner: Any, arrays: Arrays, cotangents: Arrays) -> Arrays:
+        """Of a tangent J(x) t, or of a cotangent J(x)^T t, for one cotangent w.
+
+        Second derivatives are symmetric: with respect to x both are the tangent of J(x)^T w in the
+        direction t, or of J(x)^T t in the direction w. With respect to t they are J^T w and J w.
+        """
+        function, count = inner.function, len(inner.marked)
+        at, linear = arrays[:count], arrays[count:]
+        of_x, of_t = self.marked[:count], self.marked[count:]
+        forward = isinstance(inner, Tangent)
+        results: list[jax.Array] = []
+        if any(of_x):
+            back = Cotangent(function, of_x)
+            covectors, directions = (cotangents, linear) if forward else (linear, cotangents)
+            tangent = Tangent(back, inner.marked + (False,) * len(covectors))
+
+            def one(covectors: Arrays, directions: Arrays) -> Arrays:
+                """Of one direction."""
+                return tangent(*at, *covectors, *directions)
+
+            if inner.many:
+                each = jax.vmap(one)(covectors, directions)
+                results += [jnp.sum(x, axis=0) for x in each]
+            else:
+                results += one(covectors, directions)
+        if any(of_t):
+            other = Cotangent(function, inner.marked, inner.many)
+            change = other if forward else Tangent(function, inner.marked, inner.many)
+            rates = change(*at, *cotangents)
+            results += [x for x, mark in zip(rates, of_t) if mark]
+        return tuple(results)
 
     def _of_both(self, both: WithTangents, arrays: Arrays) -> Arrays:
         """Of results and their tangents: the sum of what each of them gives."""
@@ -205,17 +245,18 @@ def _count_of_values(outs: Any) -> int:
     return next(n for n in range(len(outs)) if n + sum(smooth[:n]) == len(outs))
 
 
-def _queues(function: Any) -> bool:
+def _queues(function: Any, arrays: Arrays) -> bool:
     """Whether the function works through a batch of any size by itself."""
     if isinstance(function, Tangent | WithTangents):
-        return _queues(smoothed(function.function))
-    return getattr(function, "queues", False)
+        return _queues(smoothed(function.function), arrays[: len(function.marked)])
+    queues = getattr(function, "queues", None)
+    return queues is not None and queues(*arrays)
 
 
 def _in_chunks(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     """On a CPU piece by piece, the last one filled up; on accelerators all at once."""
     size = arrays[0].shape[-1]
-    if _queues(function):
+    if _queues(function, arrays):
         return tuple(function(*arrays))
     tangents = isinstance(function, Tangent | WithTangents)
     count = -(-size // (CHUNK_WITH_TANGENTS if tangents else CHUNK))

@@ -80,8 +80,6 @@ class FrictionFlow(ContactFlow):
     tangent: jax.Array  # K_tt (m, m, B)
     friction: jax.Array  # mu (m, B)
 
-    queues = True
-
     # ---- the state: x, g, p, slip u, its impulse, time
 
     @property

@@ -28,6 +28,7 @@ from jimpact.events.contact_flow import (
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
 from jimpact.events.plastic_limit import remainder, to_the_end
+from jimpact.events.reverse_mode import reversible_run
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
@@ -220,7 +221,7 @@ class ImpulseProgram:
     whole: bool = False
     finely: bool = False  # at the tolerance of derivatives
     smooth: bool = False  # only the results that have derivatives
-    repeats: bool = False  # walk the steps once more, for both modes
+    reverses: bool = False  # in a form that has a reverse mode
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         """The flow of a problem, its first modes and state."""
@@ -235,40 +236,41 @@ class ImpulseProgram:
         rows = contacts, self.sides, 1, 1, 1
         return tuple(jax.ShapeDtypeStruct((n, batch), kind) for n, kind in zip(rows, kinds))
 
-    @property
-    def queues(self) -> bool:
-        """Whether a batch of any size is worked through as a queue (`stepper.run`)."""
+    def queues(self, *leaves: Any) -> bool:
+        """Whether a batch of any size is worked through as a queue (`stepper.run`): in space."""
         smooth = self.smooth and self.takes_duals  # called with tangents
-        return self.sides > 0 and (smooth or not self.finely)
+        in_space = self.sides > jax.tree.unflatten(self.tree, leaves).omega.shape[0]
+        return in_space and (smooth or not self.finely)
 
     @property
     def takes_duals(self) -> bool:
         """Whether its arguments may have tangents (see `tangents.py`)."""
-        return self.finely and not self.repeats
+        return self.finely and not self.reverses
 
     def smoothed(self) -> "ImpulseProgram":
         """The same with only the results that have derivatives."""
         return dataclasses.replace(self, smooth=True)
 
     def reversible(self) -> "ImpulseProgram":
-        """The same in a form that both modes go through."""
-        return dataclasses.replace(self, repeats=self.smooth)
+        """The same in a form that the reverse mode goes through, too."""
+        return dataclasses.replace(self, reverses=self.smooth)
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.tree, leaves)
         tighten = GRADIENT_TIGHTENING if self.finely else 1.0
-        fixed = jax.lax.stop_gradient(problem) if self.repeats else problem
-        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), fixed)
+        flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
         gamma = value_of(problem.gamma)
         duals = any(map(is_dual, leaves))
-        end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
-        state: Any = end.carry.y
-        dp: Any = end.impulse
-        if self.repeats:
-            flow, _, y = self.flow(problem, tighten)
-            state = stepper.repeat(flow, modes, y, end.plan)
+        state: Any
+        if self.reverses:
+            (state, _), (end, _) = reversible_run(flow, gamma, modes, y, self.most, 0)
+            end = jax.lax.stop_gradient(end)
             state = jnp.where(end.finishes, flow.finish(end.carry.step.modes, state)[1], state)
+        else:
+            end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
+            state = end.carry.y
+        dp: Any = end.impulse
         if self.smooth or duals:
             last = flow, problem.gamma, state
             dp = pushforward(lambda f, g, y: remainder(f, g, y, end.carries), *last)
@@ -283,7 +285,7 @@ class ImpulseProgram:
         p, *rest = pushforward(parts, state, dp)
         if self.smooth:
             return p, *rest
-        p = stepper.with_plan(p, end.plan) if self.finely and not duals else p
+        p = end.with_kept(p) if self.finely and not duals else p
         return p, *rest, end.status, end.carry.progress[3:4].astype(jnp.int32)
 
 
@@ -291,8 +293,7 @@ class ImpulseProgram:
 class ImplicitProgram(ImpulseProgram):
     """As `ImpulseProgram`, by steps without events; both modes go through it as it is."""
 
-    @property
-    def queues(self) -> bool:
+    def queues(self, *leaves: Any) -> bool:
         """Where it keeps no plan of its steps."""
         return not self.finely
 

@@ -1,6 +1,7 @@
 """What a flow of contacts does over the time of an impact, sampled between its steps."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 from jimpact.events import implicit_steps, stepper
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_dynamics import ImplicitProgram, ImpulseProgram
-from jimpact.events.plastic_limit import to_the_end
+from jimpact.events.reverse_mode import reversible_run, run
 
 
 def history_program(outcome: ImpulseProgram, samples: int) -> "HistoryProgram":
@@ -28,47 +29,37 @@ class HistoryProgram:
 
     outcome: ImpulseProgram  # `whole`: no closed form ends it
     samples: int
+    reverses: bool = False  # in a form that has a reverse mode
+
+    def reversible(self) -> "HistoryProgram":
+        """The same in a form that the reverse mode goes through, too."""
+        return dataclasses.replace(self, reverses=True)
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         """The results from the leaves of a problem; see the class."""
         problem = jax.tree.unflatten(self.outcome.tree, leaves)
-        still = jax.lax.stop_gradient(problem)
-        flow, modes, y = self.outcome.flow(still, 1.0)
-        ended = to_the_end(flow, still.gamma, modes, y, self.outcome.most, keeps=True)
-        end, plan = ended.carry, ended.plan
-        moving, _, y = self.outcome.flow(problem, 1.0)
-        states = stepper.path(moving, modes, y, plan)
-        marks = jnp.where(plan.marks[:, -1:] > 0, plan.marks, 0)
-        last = end.step.modes[None]
-        modes_before = jnp.where(marks[:, -1:] > 0, marks[:, : len(modes)].astype(last.dtype), last)
-        phases = jnp.concatenate([modes_before, last])
-        clocks = jnp.concatenate([plan.clock, jnp.zeros_like(plan.clock[:1])])
-        times = states[:, -1]  # (steps + 1, B)
-        no_target = jnp.zeros(end.step.target.shape, bool)
+        flow, modes, y = self.outcome.flow(problem, 1.0)
+        gamma, most = problem.gamma, self.outcome.most
+        way = reversible_run if self.reverses else run
+        (end, found), (ended, places) = way(flow, gamma, modes, y, most, self.samples)
+        ended, places = jax.lax.stop_gradient((ended, places))
+        no_target = jnp.zeros(ended.carry.step.target.shape, bool)
 
-        def at(part: jax.Array) -> tuple[jax.Array, jax.Array, ContactStates]:
+        def at(sample: Any) -> tuple[jax.Array, jax.Array, ContactStates]:
             """A sample is one more step, in time, from the state before it."""
-            t = part * times[-1:]
-            before = jnp.sum((times <= jax.lax.stop_gradient(t)).astype(jnp.int32), axis=0) - 1
-
-            def of(rows: jax.Array) -> jax.Array:
-                """Rows of the step before the sample."""
-                return jnp.take_along_axis(rows, before[None, None], axis=0)[0]
-
-            state, now = of(states), of(phases)
-            rate = moving.contact_states(now, state).rate
-            ahead = jnp.where(rate > 0, (t - state[-1:]) / jnp.where(rate > 0, rate, 1.0), 0.0)
-            step = stepper.Step(now, no_target, of(clocks))
-            state = stepper.between(moving, step, state, ahead)
-            sample = moving.contact_states(now, state)
+            part, state, now, clock = sample
+            rate = flow.contact_states(now, state).rate
+            since = part * end[-1:] - state[-1:]
+            ahead = jnp.where(rate > 0, since / jnp.where(rate > 0, rate, 1.0), 0.0)
+            state = stepper.between(flow, stepper.Step(now, no_target, clock), state, ahead)
+            sample = flow.contact_states(now, state)
             x = jnp.maximum(sample.indentation, 0.0)
-            return state[-1:], moving.energy(x, jnp.zeros_like(x)), sample._replace(indentation=x)
+            return state[-1:], flow.energy(x, jnp.zeros_like(x)), sample._replace(indentation=x)
 
         parts = jnp.linspace(0.0, 1.0, self.samples, dtype=y.dtype)
-        time, energy, states_at = jax.lax.map(at, parts)
-        force = jax.lax.map(lambda both: moving.contact_states(*both).force, (phases, states))
-        code = ended.status.astype(y.dtype)
-        return time, energy, *states_at, jnp.max(force, axis=0), code
+        samples = parts, found.states, places.modes, places.clock
+        time, energy, states_at = jax.lax.map(at, samples)
+        return time, energy, *states_at, found.force, ended.status.astype(y.dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +70,10 @@ class ImplicitHistoryProgram(HistoryProgram):
     """
 
     outcome: ImplicitProgram
+
+    def reversible(self) -> "ImplicitHistoryProgram":
+        """Itself."""
+        return self
 
     def __call__(self, *leaves: jax.Array) -> tuple[jax.Array, ...]:
         """The results from the leaves of a problem; see `HistoryProgram`."""

@@ -13,6 +13,7 @@ on both sides of a light one still approach. A light body that does not lose its
 them apart in the end; meanwhile its states are no multiples of each other.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 
 from jimpact.events import stepper
 from jimpact.events.contact_flow import ContactFlow
+from jimpact.events.kept_steps import Kept, nothing_kept, record
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
 from jimpact.events.tangents import dual_like, pushforward, value_of
 from jimpact.status import CODE
@@ -51,13 +53,14 @@ class ImpactEnd(NamedTuple):
     """An impact at its end, finished but for the impulse of the contacts at rest."""
 
     carry: stepper.StepperState
-    pen: stepper.Recorder | None
+    kept: Kept | None  # its steps
+    reached: Any  # the state (n, B) before it was finished; None where no steps are kept
     rest: Rest
     begun: jax.Array  # ()
 
     @property
     def carries(self) -> jax.Array:
-        """Contacts at rest that carry an impulse (m, B); uses both, see `with_plan`."""
+        """Contacts at rest that carry an impulse (m, B); uses both, see it."""
         return self.rest.carries & self.rest.contacts
 
     @property
@@ -65,11 +68,17 @@ class ImpactEnd(NamedTuple):
         """Of the contacts at rest (m, B)."""
         return jnp.where(self.carries, self.rest.rows[2], 0.0)
 
-    @property
-    def plan(self) -> stepper.AcceptedSteps:
-        """The recorded steps."""
-        assert self.pen is not None
-        return self.pen.plan
+    def with_kept(self, x: jax.Array) -> jax.Array:
+        """x, of a program that has to keep steps even if only x is used.
+
+        Values and their derivatives keep the same steps. The compiler merges two loops that are the
+        same; it would first remove the slots from one of them.
+        """
+        assert self.kept is not None
+        numbers = self.kept.state[0, -1:], self.kept.marks[0, -1:], self.kept.plan[:1, None]
+        negative = functools.reduce(jnp.logical_or, [number < 0 for number in numbers])
+        never = negative | (self.reached[-1:] < 0)  # passes, flags, steps and time are not
+        return jnp.where(never, jnp.nan, x)
 
     @property
     def over(self) -> jax.Array:
@@ -91,7 +100,7 @@ class ImpactEnd(NamedTuple):
 def to_the_end(
     flow: Any, gamma: jax.Array, modes: jax.Array, y: Any, most: int, keeps: bool
 ) -> ImpactEnd:
-    """From gap velocities gamma (m, B) to the end; `keeps` the plan of the steps.
+    """From gap velocities gamma (m, B) to the end; `keeps` steps, for the reverse mode.
 
     What of `flow` and y has tangents (see `tangents.py`) gives a state with tangents.
     """
@@ -101,15 +110,17 @@ def to_the_end(
     no = jnp.zeros(gamma.shape, bool)
     rows = jnp.zeros((3, *gamma.shape), gamma.dtype)
     rest = Rest(no, no, rows, jnp.zeros(gamma.shape, modes.dtype), no[:1])
-    start = ImpactEnd(carry, stepper.recorder(carry) if keeps else None, rest, jnp.asarray(False))
+    kept, reached = (nothing_kept(carry), carry.y) if keeps else (None, None)
+    start = ImpactEnd(carry, kept, reached, rest, jnp.asarray(False))
 
     def on(end: ImpactEnd) -> ImpactEnd:
         """On to the next pause or to the end."""
         finished = (end.carry.progress[2:3] == OVER) & end.begun
-        if end.pen is None:
-            carry, pen = stepper.run(flow, end.carry, most), None
+        if end.kept is None:
+            carry, kept, reached = stepper.run(flow, end.carry, most), None, None
         else:
-            carry, pen = stepper.record(flow, end.carry, end.pen, most)
+            carry, kept = record(flow, end.carry, end.kept, most)
+            reached = jnp.where(finished, end.reached, carry.y)
         over, paused = (carry.progress[2:3] == OVER) & ~finished, carry.progress[2:3] == PAUSED
         values = jax.lax.stop_gradient(carry._replace(y=value_of(carry.y)))
         quiet = over & at_rest(still, values)
@@ -127,7 +138,7 @@ def to_the_end(
         )
         settled = jnp.where(rest.ended, OVER, GOES_ON)
         progress = carry.progress.at[2:3].set(jnp.where(paused, settled, carry.progress[2:3]))
-        return ImpactEnd(carry._replace(progress=progress), pen, rest, jnp.asarray(True))
+        return ImpactEnd(carry._replace(progress=progress), kept, reached, rest, jnp.asarray(True))
 
     return jax.lax.while_loop(
         lambda end: ~end.begun | jnp.any(stepper.goes_on(end.carry, most)), on, start

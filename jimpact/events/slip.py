@@ -154,6 +154,7 @@ class SlipFlow(FrictionFlow):
     # normal_tangent: K_nt (m, 2 m, B); tangent: K_tt (2 m, 2 m, B)
 
     longest = STABLE
+    queues = True
 
     # ---- the state: x, g, p (m each), slip, its impulse (2 m each), time
 

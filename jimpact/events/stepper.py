@@ -20,9 +20,8 @@ WHAT COMES NEXT   Each margin gets an intention (SHORTEN, LAND, AHEAD) and a dis
 the step just tried; the most urgent one decides (`advance`).
 
 DERIVATIVES   In forward mode the state carries tangents (`tangents.py`); step sizes and events
-depend on values, not on tangents. For the reverse mode the run records its accepted steps, and
-`repeat` walks through them once more as a scan with all decisions fixed. JAX differentiates both:
-any order.
+depend on values, not on tangents. For the reverse mode a run keeps accepted steps
+(`kept_steps.py`), and `step_again` is one of them once more, with all decisions fixed.
 
 COMPILING costs some 20 ms a kernel, and a kernel starts at every shared root or quotient, every
 reduction, every array that a loop carries. So the field occurs once (a 13th stage with the weights
@@ -78,9 +77,6 @@ FINEST, COARSE_ROUNDING = 16, 64
 # half as long.
 COARSE = 0.3
 
-# Accepted steps recorded for the reverse mode, in blocks; a block without a step is skipped. An
-# impact of more steps has no derivative there: NaN, whatever its status. Ten times more: memory.
-BLOCKS, BLOCK = 64, 16
 
 STAGES = len(DOP853.c)
 _TABLE = np.array([[*row, *[0.0] * (STAGES - len(row))] for row in (*DOP853.a, DOP853.b)])
@@ -185,7 +181,7 @@ def _rows(x: jax.Array) -> list[jax.Array]:
     return [x[i : i + 1] for i in range(len(x))]
 
 
-def _put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
+def put(buffer: jax.Array, value: jax.Array, index: jax.Array) -> jax.Array:
     """The buffer with `value` in the row `index`."""
     return jax.lax.dynamic_update_slice_in_dim(
         buffer, value[None], index, 0, allow_negative_indices=False
@@ -321,7 +317,7 @@ def _with_row(table: Any, new: list[Any], i: jax.Array) -> Any:
     Each block of tangents is a kernel: one for all would compute them entry by entry.
     """
     value = value_of(table)
-    value = _put(value, jnp.concatenate(value_of(new)), i)
+    value = put(value, jnp.concatenate(value_of(new)), i)
     if not is_dual(table):
         return value
     tangents, first, none = table.tangents, 0, jnp.zeros((), i.dtype)
@@ -611,85 +607,6 @@ def run(flow: Any, carry: StepperState, most: int) -> StepperState:
     )
 
 
-# ---- derivatives: the accepted steps once more -------------------------------------------------
-
-
-class AcceptedSteps(NamedTuple):
-    """Accepted steps in order, at most BLOCKS * BLOCK; rows without a step are zeros."""
-
-    marks: jax.Array  # (steps, m + k + 1, B) int8: modes, target, 1 for an accepted step
-    clock: jax.Array  # (steps, 4, B)
-    # (1, B): there were too few rows. Such an impact has no derivative: NaN, not a wrong number
-    lost: jax.Array
-
-
-class Recorder(NamedTuple):
-    """A plan that is being written, and the number of rows used."""
-
-    plan: AcceptedSteps
-    used: jax.Array
-
-
-def recorder(carry: StepperState) -> Recorder:
-    """An empty plan."""
-    modes, target, clock = carry.step
-    size, rows = BLOCKS * BLOCK, len(modes) + len(target) + 1
-    plan = AcceptedSteps(
-        jnp.zeros((size, rows, *clock.shape[1:]), jnp.int8),
-        jnp.zeros((size, *clock.shape), clock.dtype),
-        jnp.zeros(clock[:1].shape, bool),
-    )
-    return Recorder(plan, jnp.zeros((), jnp.uint32))
-
-
-def record(
-    flow: Flow, carry: StepperState, pen: Recorder, most: int
-) -> tuple[StepperState, Recorder]:
-    """As `run`; it also records the plan of its steps."""
-    size = BLOCKS * BLOCK
-
-    def body(state: tuple[StepperState, Recorder]) -> tuple[StepperState, Recorder]:
-        """One pass, its step recorded where it is accepted."""
-        carry, (plan, count) = state
-        after, accept = advance(flow, carry, most)
-        s = carry.step
-        marks = jnp.concatenate(
-            [s.modes.astype(jnp.int8), s.target.astype(jnp.int8), jnp.ones_like(accept, jnp.int8)]
-        )
-        # a pass that no impact of the batch accepts leaves its row to the next one
-        index = jnp.minimum(count, size - 1)
-        plan = AcceptedSteps(
-            _put(plan.marks, jnp.where(accept, marks, 0), index),
-            _put(plan.clock, jnp.where(accept, s.clock, 0.0), index),
-            plan.lost | (accept & (count >= size)),
-        )
-        count = count + jnp.any(accept).astype(count.dtype)
-        return after, Recorder(plan, count)
-
-    return jax.lax.while_loop(lambda state: unwatched(state[0], most), body, (carry, pen))
-
-
-def with_plan(x: jax.Array, plan: AcceptedSteps) -> jax.Array:
-    """x, of a program that has to record the plan even if only x is used.
-
-    Values and their derivatives record the same steps. The compiler merges two loops that are the
-    same; it would first remove the plan from one of them.
-    """
-    marks, clock = plan.marks[0, -1:], plan.clock[0, 2:3]  # each is 0 or 1
-    return jnp.where((marks < 0) | (clock < 0), jnp.nan, x)
-
-
-def repeat(flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps) -> jax.Array:
-    """The state that `run` ends with, as a smooth function of `flow` and `y`."""
-    return _walk(flow, modes, y, plan, states=False)[0]
-
-
-def path(flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps) -> jax.Array:
-    """States (steps + 1, n, B) at the beginning and after each step of the plan, smooth as well."""
-    after: Any = _walk(flow, modes, y, plan, states=True)[1]
-    return jnp.concatenate([y[None], after.reshape(-1, *y.shape)])
-
-
 def between(flow: Flow, s: Step, y: jax.Array, ahead: jax.Array) -> jax.Array:
     """The state within the step from y at `ahead` (1, B) after it, in the flow's own time."""
     begun, in_root, lands = s.clock[:1], s.clock[2:3], s.clock[3:4]
@@ -707,47 +624,3 @@ def step_again(flow: Flow, s: Step, y: jax.Array) -> jax.Array:
     """The state after an accepted step, as a smooth function of `flow` and `y`."""
     change, *_ = _stages(flow, s, y, ends=False)
     return y + change[:-1]
-
-
-Row = tuple[jax.Array, jax.Array]  # marks and clock of a step of the plan
-
-
-def step_of(row: Row, modes: int) -> tuple[Step, jax.Array]:
-    """A step of the plan, and whether (1, B) there is one."""
-    marks, clock = row
-    return Step(marks[:modes].astype(jnp.int32), marks[modes:-1] > 0, clock), marks[-1:] > 0
-
-
-def _walk(
-    flow: Flow, modes: jax.Array, y: jax.Array, plan: AcceptedSteps, states: bool
-) -> tuple[jax.Array, jax.Array | None]:
-    """The state after all recorded steps; empty blocks cost nothing."""
-    y = jnp.where(plan.lost, jnp.nan, 1.0) * y
-
-    def step(y: jax.Array, row: Row) -> tuple[jax.Array, jax.Array | None]:
-        """One recorded step."""
-        s, accept = step_of(row, modes.shape[0])
-
-        def walk(y: jax.Array) -> jax.Array:
-            """The state after it."""
-            end = flow.switch(s.modes, step_again(flow, s, y), s.target)[1]
-            return jnp.where(accept, end, y)
-
-        y = jax.lax.cond(jnp.any(accept), walk, lambda y: y, y)
-        return y, y if states else None
-
-    def block(y: jax.Array, rows: Row) -> tuple[jax.Array, jax.Array | None]:
-        """One block of recorded steps."""
-
-        def walk(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-            """The state after the block."""
-            return jax.lax.scan(jax.checkpoint(step), y, rows)
-
-        def skip(y: jax.Array) -> tuple[jax.Array, jax.Array | None]:
-            """The state as it is: the block is empty."""
-            return y, jnp.broadcast_to(y, (BLOCK, *y.shape)) if states else None
-
-        return jax.lax.cond(jnp.any(rows[0][:, -1] > 0), walk, skip, y)
-
-    rows = tuple(x.reshape(BLOCKS, BLOCK, *x.shape[1:]) for x in (plan.marks, plan.clock))
-    return jax.lax.scan(jax.checkpoint(block), y, rows)

@@ -58,6 +58,11 @@ ROWS_PER_EVENT, ROWS_MORE = 16, 1024
 ROOM = 32  # numbers a contact that a run may hand over, in addition to states
 BLOCK = 16  # rows between two checkpoints
 
+NO_SLOPES = (
+    "Argument `friction` must be 0 where derivatives of the motion of a body in space are taken: "
+    "its slip turns ever faster until it ends, and derivatives of that time would be wrong."
+)
+
 
 class Past(NamedTuple):
     """What a run takes over from the one before it."""
@@ -178,6 +183,8 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
 
     def rule(arrays: Any, tangents: Any) -> Any:
         """Values by the run, tangents by walking through its plan again."""
+        if problem.settings.spatial:
+            raise NotImplementedError(NO_SLOPES)
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
         end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
         assert end.plan is not None

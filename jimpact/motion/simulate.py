@@ -123,7 +123,8 @@ def simulate(
         samples + 16 `max_events` + 1024. Method 'contact_forces' has forward ones (jvp, jacfwd).
 
     Raises:
-        NotImplementedError: derivatives of time stepping, which do not converge with the step.
+        NotImplementedError: derivatives of time stepping, which do not converge with the step, and
+            of motions with friction in space.
         ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
             host; inside jit the status reports them (`raise_on_failed_motion`).
 

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from jimpact.compiling import varying_like
+
 
 def both_modes(
     solve: Callable[..., tuple[Any, Any]],
@@ -49,12 +51,14 @@ def both_modes(
                 """Outputs and their tangent in one direction."""
                 return jax.jvp(outputs_of, (values,), (directions,), has_aux=True)
 
-            return jax.vmap(push, out_axes=(None, 0, None))(_directions(values))
+            return jax.vmap(push, out_axes=(None, 0, None))(
+                varying_like(_directions(values), values)
+            )
 
         out, jacobian, aux = with_jacobian(leaves)
         tangent = jnp.concatenate([jnp.ravel(rates[i]) for i in moving])
         rate = jax.tree.map(lambda rows: jnp.tensordot(tangent, rows, axes=1), jacobian)
-        still = jax.tree.map(lambda x: jnp.zeros(jnp.shape(x), jax.dtypes.float0), aux)
+        still = jax.tree.map(lambda x: SymbolicZero(jax.typeof(x).to_tangent_aval()), aux)
         return (out, aux), (rate, still)
 
     differentiable.defjvp(rule, symbolic_zeros=True)
