@@ -200,7 +200,6 @@ def test_a_wait_ends_where_the_gap_closes():
         friction=jnp.zeros((2, 1)),
         descent=jnp.ones((2, 1)),
         tolerance=jnp.full((1, 1), 1e-5),
-        kept=jnp.zeros((1, 1)),
         exponent_static=1.5,
         gapped=True,
     )

@@ -324,7 +324,6 @@ class ImplicitProgram(ImpulseProgram):
             friction=friction,
             descent=jax.lax.stop_gradient(descent_lengths(coupling, problem.omega.shape[0])),
             tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
-            kept=jnp.full_like(problem.tolerance, 1.0 if self.finely else 0.0),
             viscous=problem.viscous,
             exponent_static=None if problem.exponent is not None else self.exponent,
             gapped=problem.gap is not None,

@@ -21,9 +21,9 @@ import jax.numpy as jnp
 from jimpact.solvers.dense import regularized_once, times
 from jimpact.solvers.friction import in_disc
 
-# Sweeps of one solve at most; 5 to 30 are usual. What is left then is an error of the step, which
-# its estimate sees. Ten times more: a few scenes with many contacts take ten times longer.
-SWEEPS = 100
+# Sweeps of one solve at most; 5 to 15 are usual. What is left then is an error of the step, which
+# its estimate sees. Ten times more: batches take three times as long, for the same errors.
+SWEEPS = 30
 # Added to the diagonal of the tangent equations, which are singular where contacts stick
 # redundantly. Velocities do not depend on it. Ten times more: derivatives err by ten times the
 # rounding that it amplifies.
