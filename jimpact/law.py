@@ -232,7 +232,7 @@ def option(
     >>> ji.LZB(0.9, method="euler")
     Traceback (most recent call last):
         ...
-    ValueError: Argument `method` must be one of time, impulse, but has value 'euler'.
+    ValueError: Argument `method` must be one of auto, time, implicit, impulse, but has value 'euler'.
     """
     declared = Option(choices, low, high, open_low, converter)
     return _field(declared, default, kw_only, True)
