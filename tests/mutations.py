@@ -264,8 +264,8 @@ MUTATIONS = [
     Mutation("bootstrap without the noise", r"fit\.noise \* np\.moveaxis", "np.moveaxis", ("test_fit.py::test_bootstrap_scatters_as_much_as_the_standard_error",)),
     Mutation("given samples of the next chunk", r"values\[number \* size : \(number \+ 1\) \* size\]", "values[(number + 1) * size : (number + 2) * size]", ("test_montecarlo.py::test_given_samples_are_used_row_by_row",)),
     Mutation("friction that pushes along the sliding", r"along \* mu\[:, None\], 0\.0", "-along * mu[:, None], 0.0", ("test_motion.py::test_sliding_block_comes_to_stick",)),
-    Mutation("slip in space turned to the wrong side", r"jnp\.where\(straight, 0\.0, u\[:, 1\]\)", "jnp.where(straight, 0.0, -u[:, 1])", ("test_motion_in_space.py::test_a_sphere_slides_until_it_rolls",)),
-    Mutation("slip in space that begins held along itself", r"jnp\.stack\(\[stick, across\], axis=1\)", "jnp.stack([across, stick], axis=1)", ("test_motion_in_space.py::test_a_sphere_that_is_pulled_begins_to_slide",)),
+    Mutation("slip in space turned to the wrong side", r"jnp\.where\(straight, 0\.0, u\[:, 1\]\)", "jnp.where(straight, 0.0, -u[:, 1])", ("test_motion_in_space.py::test_a_sphere_slides_until_it_rolls",), "*.py", "slow"),
+    Mutation("slip in space that begins held along itself", r"jnp\.stack\(\[stick, across\], axis=1\)", "jnp.stack([across, stick], axis=1)", ("test_motion_in_space.py::test_a_sphere_that_is_pulled_begins_to_slide",), "*.py", "slow"),
     Mutation("elastic energy of a history doubled", r"0\.5 \* units\.velocity\*\*2 \* energy", "units.velocity**2 * energy", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
     # --- pictures
     Mutation("histogram in shares, not per cent", r"100 \* bars / max", "bars / max", ("test_pictures.py::test_a_histogram_is_in_per_cent",)),

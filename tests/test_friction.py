@@ -216,7 +216,8 @@ def held(contacts):
     return {name[:-2]: HELD[name] for name in HELD if name.endswith(f"_{contacts}")}
 
 
-@pytest.mark.parametrize("contacts", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("contacts", [1, 2])
 def test_lzb_in_space_is_the_independent_one(contacts):
     """Boxes on a corner or an edge, and the measured cube: v+ of another integration."""
     x = held(contacts)
