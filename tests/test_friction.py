@@ -18,6 +18,7 @@ from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
 from jimpact.events import queues
+from jimpact.status import CODE
 
 close = np.testing.assert_allclose
 
@@ -219,15 +220,19 @@ def held(contacts):
 @pytest.mark.slow
 @pytest.mark.parametrize("contacts", [1, 2])
 def test_lzb_in_space_is_the_independent_one(contacts):
-    """Boxes on a corner or an edge, and the measured cube: v+ of another integration."""
+    """Boxes on a corner or an edge, and the measured cube: v+ of another integration.
+
+    Of those on an edge one or two vibrate between stick and slip, and say so.
+    """
     x = held(contacts)
-    x = {name: values[x["friction"] < 1] for name, values in x.items()}  # beyond, one vibrates long
     scenes = (x[name] for name in ("mass", "normals", "tangents", "velocity"))
     k = np.pad(x["stiffness"], ((0, 0), (0, 2 - contacts)), constant_values=1.0)
     out, _ = run("lzb", *scenes, x["restitution"], x["friction"], k=k)
-    assert not out.status.any()
+    ends = out.status == 0
+    assert (ends | (contacts > 1) & (out.status == CODE["max_steps"])).all()
+    assert ends.sum() >= 4
     error = np.abs(out.velocity - x["after"]).max(axis=1)
-    assert (error <= 1e-7 + 3 * x["uncertainty"]).all(), error
+    assert (error <= 1e-7 + 3 * x["uncertainty"])[ends].all(), error
 
 
 def test_particle_of_example_6_2():

@@ -1,5 +1,7 @@
 """Method 'implicit': impacts by steps without events, of `LZB` and `Compliant`."""
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,7 +93,7 @@ def test_derivatives():
     def after(e):
         return ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), ball, [1.0]).velocity[0]
 
-    assert jax.grad(after)(0.0) == pytest.approx(-1.0, abs=5e-4)
+    assert jax.jacfwd(after)(0.0) == pytest.approx(-1.0, abs=5e-4)
     with pytest.raises(NotImplementedError, match="must be 'time' for second derivatives"):
         jax.hessian(after)(0.5)
 
@@ -123,6 +125,26 @@ def test_reverse_mode_is_the_forward_one():
 
         at = jnp.array([0.3, 0.3])
         np.testing.assert_allclose(jax.jacrev(after)(at), jax.jacfwd(after)(at), rtol=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("contacts", [1, 2, 4])
+def test_agrees_with_an_independent_integration(contacts):
+    """Boxes and the measured cube, mu up to 1, by regularized friction (see space_reference.py)."""
+    path = Path(__file__).parent / "data" / "friction_space.npz"
+    with np.load(path) as file:
+        held = {name[:-2]: file[name] for name in file if name.endswith(f"_{contacts}")}
+
+    def one(mass, normals, tangents, v, e, mu, k):
+        law = ji.LZB(e, k, 1.5, friction=mu, method="implicit", rtol=TIGHT)
+        return ji.impact(law, ji.Scene(mass, normals, tangents), v)
+
+    names = ("mass", "normals", "tangents", "velocity", "restitution", "friction", "stiffness")
+    out = jax.jit(jax.vmap(one))(*(held[name] for name in names))
+    assert not np.asarray(out.status).any()
+    error = np.abs(out.velocity - held["after"]).max(axis=1)
+    speed = np.abs(held["velocity"]).max(axis=1)
+    assert (error <= 3 * TIGHT * speed + 3 * held["uncertainty"]).all(), error
 
 
 def test_history_is_that_of_the_other_method():

@@ -141,7 +141,7 @@ class LZB(Law):
     e = 1, at touching contacts, and at grazing events (e.g. k2/k1 = 6.1713 for three equal
     linear balls), and where slip stops just as a contact opens. In `initial_energy` at 0 the true
     slope may be infinite; 0 is returned. Method 'implicit' has first derivatives only, of what it
-    computes: at the default `rtol` they are right to some 1e-3; second ones raise.
+    computes: at the default `rtol` they are right to 1e-3 or 5e-3; second ones raise.
 
     Source: Liu, Zhao and Brogliato, Proc. R. Soc. A 464 (2008) 3193 and 465 (2009) 1;
     Brogliato, Nonsmooth Mechanics (2016), (6.67)-(6.73) with the errata of `docs/equations.md`.
