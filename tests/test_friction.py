@@ -217,8 +217,13 @@ def held(contacts):
     return {name[:-2]: HELD[name] for name in HELD if name.endswith(f"_{contacts}")}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("contacts", [1, 2])
+HELD_CONTACTS = [
+    pytest.param(1, marks=pytest.mark.slow),
+    pytest.param(2, marks=pytest.mark.release),
+]
+
+
+@pytest.mark.parametrize("contacts", HELD_CONTACTS)
 def test_lzb_in_space_is_the_independent_one(contacts):
     """Boxes on a corner or an edge, and the measured cube: v+ of another integration.
 

@@ -119,7 +119,7 @@ def test_a_sphere_that_is_pulled_begins_to_slide(spheres):
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_slip_that_begins_turns_with_the_forces(spheres):
     """Radau's method for `u / sqrt(u^2 + 1e-20)`."""
     from scipy.integrate import solve_ivp
@@ -155,7 +155,7 @@ def thrown(q0, v0, duration, **options):
     return ji.simulate(SYSTEM, LAW, q0, v0, duration, samples=21, **options)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_box_slides_to_rest():
     motion = thrown(BRICK.touching(), [1.0, 0.5, 0, 0, 0, 0], 0.6)
     speed = np.hypot(1.0, 0.5)
@@ -165,7 +165,7 @@ def test_a_box_slides_to_rest():
     np.testing.assert_allclose(motion.q[-1, :2], way * np.array([1.0, 0.5]) / speed, atol=1e-10)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_spinning_box_slides_as_by_time_stepping():
     """Slip of four corners turns until all stop at once; the error falls with the step."""
     q0, v0 = BRICK.touching(), np.array([0.5, 0.2, 0, 0, 0, 10.0])
@@ -181,7 +181,7 @@ def test_a_spinning_box_slides_as_by_time_stepping():
     assert wrong[1] < 0.3 * wrong[0]
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_thrown_brick_comes_to_rest_on_a_face():
     motion = thrown(
         BRICK.at([0.0, 0.0, 0.3], [0.8, 0.6, 0.0, 0.0]), [0.5, 0.2, 0.0, 3.0, 12.0, 5.0], 0.6

@@ -43,7 +43,7 @@ def both_modes(law, scene, v, e, k):
     return jax.jit(jax.vmap(forward))(e), jax.jit(jax.vmap(reverse))(e)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 @pytest.mark.parametrize("masses", [[1.0] * 5, [1.0, 1e-2, 1.0, 3.0]])
 def test_few_kept_steps_in_batches(monkeypatch, masses):
     """Impacts of different length side by side; some pause and end in the plastic limit."""
@@ -56,7 +56,7 @@ def test_few_kept_steps_in_batches(monkeypatch, masses):
     np.testing.assert_allclose(reverse, forward, rtol=1e-7, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_impacts_of_more_than_a_thousand_steps():
     """Fifty balls; six with a wall, and their second derivative forward over reverse."""
     v = jnp.zeros(50).at[0].set(1.0)
