@@ -306,7 +306,7 @@ class ImplicitProgram(ImpulseProgram):
         """Itself."""
         return self
 
-    def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.State]:
+    def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
         """The contacts of a problem, and their state before the impact."""
         coupling = normal_coupling(problem, self.chain)
         friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
@@ -333,13 +333,13 @@ class ImplicitProgram(ImpulseProgram):
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see `ImpulseProgram`."""
 
-        def to_the_end(leaves: Any) -> tuple[implicit_steps.Run, jax.Array]:
+        def to_the_end(leaves: Any) -> tuple[implicit_steps.ImplicitRun, jax.Array]:
             """The run and its status."""
             flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
             run = implicit_steps.to_the_end(flow, start, self.most, keeps=self.finely)
             return run, self.code(flow, run)
 
-        def results(state: implicit_steps.State) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def results(state: implicit_steps.ImplicitState) -> tuple[jax.Array, jax.Array, jax.Array]:
             """Normal impulses, tangential ones, and the time."""
             return state.impulse[:m], state.impulse[m:], state.time
 
@@ -370,7 +370,7 @@ class ImplicitProgram(ImpulseProgram):
         smooth, whole = outcome(leaves)
         return smooth if self.smooth else (*smooth, *whole)
 
-    def code(self, flow: ImplicitSteps, run: implicit_steps.Run) -> jax.Array:
+    def code(self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun) -> jax.Array:
         """Status (1, B) of a run."""
         code = jnp.where(flow.busy(run.state), CODE["max_steps"], CODE["ok"])
         return code.astype(jnp.int32)

@@ -71,7 +71,7 @@ STIFF = 0.5
 BLOCKS, BLOCK = 64, 64
 
 
-class State(NamedTuple):
+class ImplicitState(NamedTuple):
     """x (m, B), w (n, B), impulses in unit time of the last step and in all (n, B), time (1, B)."""
 
     indentation: jax.Array
@@ -123,22 +123,22 @@ class ImplicitSteps:
         """Force over x^eta (m, B)."""
         return (self.eta + 1) / 2 * self.omega
 
-    def start(self, x: jax.Array, velocity: jax.Array) -> State:
+    def start(self, x: jax.Array, velocity: jax.Array) -> ImplicitState:
         """The state before the impact."""
         none = jnp.zeros_like(velocity)
-        return State(x, velocity, none, none, jnp.zeros_like(self.tolerance))
+        return ImplicitState(x, velocity, none, none, jnp.zeros_like(self.tolerance))
 
     def energy(self, x: jax.Array) -> jax.Array:
         """Twice the stored energy (m, B)."""
         return power(x, self.exponent) * jnp.where(x > 0, x, 0.0)
 
-    def busy(self, s: State) -> jax.Array:
+    def busy(self, s: ImplicitState) -> jax.Array:
         """Whether (1, B) the impact goes on: a contact is loaded, or approaches."""
         idle = NEGLIGIBLE * self.tolerance
         loaded = self.energy(s.indentation) > idle**2
         return jnp.any(loaded | (s.velocity[: self.contacts] < -idle), axis=0, keepdims=True)
 
-    def coasted(self, s: State) -> State:
+    def coasted(self, s: ImplicitState) -> ImplicitState:
         """The state when the next gap closes, if no contact is loaded."""
         x, gamma = s.indentation, s.velocity[: self.contacts]
         closes = (x < 0) & (gamma < 0)
@@ -183,7 +183,9 @@ class ImplicitSteps:
         """The convex problem of a stage."""
         return StepProblem(self.coupling, velocity, load, unloading, friction, self.descent)
 
-    def substep(self, s: State, h: jax.Array, smooth: bool) -> tuple[State, jax.Array]:
+    def substep(
+        self, s: ImplicitState, h: jax.Array, smooth: bool
+    ) -> tuple[ImplicitState, jax.Array]:
         """The state after h (1, B), and what it loses (1, B) by opening within the step."""
         m, solver = self.contacts, solve_smooth if smooth else solve
         inner = INNER * self.tolerance
@@ -217,7 +219,7 @@ class ImplicitSteps:
         loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, gamma)
         impulse = jnp.concatenate([normal, side + PART * second[m:]])
         rate = jnp.concatenate([normal, second[m:]]) / h
-        return State(x, velocity, rate, s.impulse + impulse, s.time + h), loss
+        return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
 
     def indentation_of(self, impulse: jax.Array, h: jax.Array) -> jax.Array:
         """Where (m, B) the force gives this normal impulse in h."""
@@ -240,20 +242,22 @@ class ImplicitSteps:
         speed = jnp.where(gone, jnp.minimum(root, faster), 0.0)
         return jnp.max(speed, axis=0, keepdims=True)
 
-    def unseen(self, s: State, end: State, h: jax.Array) -> jax.Array:
+    def unseen(self, s: ImplicitState, end: ImplicitState, h: jax.Array) -> jax.Array:
         """Part (1, B) of a force that sets in with a jump which a step may miss by its estimate."""
         closes = (s.indentation <= 0) & (end.indentation > 0)
         force = self.force_of(end.indentation, end.velocity[: self.contacts])
         return jnp.max(jnp.where(closes, h * force / 2, 0.0), axis=0, keepdims=True)
 
-    def step(self, s: State, h: jax.Array, smooth: bool = False) -> tuple[State, jax.Array]:
+    def step(
+        self, s: ImplicitState, h: jax.Array, smooth: bool = False
+    ) -> tuple[ImplicitState, jax.Array]:
         """The state after h (1, B), whole and in halves, and its error (1, B) in tolerances."""
         lengths = jnp.stack([h, h / 2, h / 2])
         whole = jnp.asarray([True, False, False])
 
         def part(
-            carry: tuple[State, State], which: tuple[jax.Array, jax.Array]
-        ) -> tuple[tuple[State, State], jax.Array]:
+            carry: tuple[ImplicitState, ImplicitState], which: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[ImplicitState, ImplicitState], jax.Array]:
             """The whole step first, then both halves from the same start."""
             at, big = carry
             length, is_whole = which
@@ -285,10 +289,10 @@ class Plan(NamedTuple):
     used: jax.Array  # (1, B) how many
 
 
-class Run(NamedTuple):
+class ImplicitRun(NamedTuple):
     """An impact on its way: its state, the next step (1, B), attempts (1, B), the plan."""
 
-    state: State
+    state: ImplicitState
     length: jax.Array
     passes: jax.Array
     plan: Plan | None
@@ -301,19 +305,19 @@ class Run(NamedTuple):
         return stalled | ~flow.busy(self.state)
 
 
-def to_the_end(flow: ImplicitSteps, start: State, most: int, keeps: bool) -> Run:
+def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool) -> ImplicitRun:
     """From the start to the end of the impact; `keeps` the plan of the steps."""
     lanes = jnp.zeros(flow.tolerance.shape, jnp.int32)
     plan = None
     if keeps:
         plan = Plan(jnp.zeros((BLOCKS * BLOCK, *lanes.shape), flow.tolerance.dtype), lanes)
-    run = Run(start, FIRST * jnp.ones_like(flow.tolerance), lanes, plan)
+    run = ImplicitRun(start, FIRST * jnp.ones_like(flow.tolerance), lanes, plan)
 
-    def goes_on(flow: ImplicitSteps, run: Run) -> jax.Array:
+    def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> jax.Array:
         """Which impacts (1, B) are not over."""
         return ~run.over(flow, most)
 
-    def attempt(flow: ImplicitSteps, run: Run) -> Run:
+    def attempt(flow: ImplicitSteps, run: ImplicitRun) -> ImplicitRun:
         """One step tried in all impacts that go on."""
         live = goes_on(flow, run)
         new, error = flow.step(flow.coasted(run.state), run.length)
@@ -329,7 +333,7 @@ def to_the_end(flow: ImplicitSteps, start: State, most: int, keeps: bool) -> Run
             kept = jnp.where(accepted[0], run.length[0], plan.lengths[at])
             used = plan.used + accepted.astype(jnp.int32)
             plan = Plan(plan.lengths.at[at].set(kept), used)
-        return Run(state, length, run.passes + live.astype(jnp.int32), plan)
+        return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), plan)
 
     if keeps:  # a plan is long, and is not moved between slots
         return jax.lax.while_loop(
@@ -338,12 +342,12 @@ def to_the_end(flow: ImplicitSteps, start: State, most: int, keeps: bool) -> Run
     return run_queue(goes_on, attempt, flow, run)
 
 
-def repeat(flow: ImplicitSteps, start: State, plan: Plan) -> State:
+def repeat(flow: ImplicitSteps, start: ImplicitState, plan: Plan) -> ImplicitState:
     """The state after the steps of the plan, as a smooth function of `flow` and `start`."""
     return _walk(flow, start, plan, states=False)[0]
 
 
-def path(flow: ImplicitSteps, start: State, plan: Plan) -> State:
+def path(flow: ImplicitSteps, start: ImplicitState, plan: Plan) -> ImplicitState:
     """States (steps + 1, .., B) before the first step and after each one, smooth as well."""
     after = _walk(flow, start, plan, states=True)[1]
 
@@ -354,24 +358,26 @@ def path(flow: ImplicitSteps, start: State, plan: Plan) -> State:
     return jax.tree.map(joined, start, after)
 
 
-def _walk(flow: ImplicitSteps, start: State, plan: Plan, states: bool) -> tuple[State, Any]:
+def _walk(
+    flow: ImplicitSteps, start: ImplicitState, plan: Plan, states: bool
+) -> tuple[ImplicitState, Any]:
     """The state after the steps of the plan; with `states` those after each step, in blocks."""
 
-    def step(s: State, length: jax.Array) -> tuple[State, State | None]:
+    def step(s: ImplicitState, length: jax.Array) -> tuple[ImplicitState, ImplicitState | None]:
         """One step of the plan."""
         taken = length > 0
         new, _ = flow.step(flow.coasted(s), jnp.where(taken, length, FIRST), smooth=True)
         s = jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, s)
         return s, s if states else None
 
-    def block(s: State, lengths: jax.Array) -> tuple[State, Any]:
+    def block(s: ImplicitState, lengths: jax.Array) -> tuple[ImplicitState, Any]:
         """One block of steps; an empty one costs nothing."""
 
-        def walk(s: State) -> tuple[State, Any]:
+        def walk(s: ImplicitState) -> tuple[ImplicitState, Any]:
             """The state after the block."""
             return jax.lax.scan(jax.checkpoint(step), s, lengths)
 
-        def skip(s: State) -> tuple[State, Any]:
+        def skip(s: ImplicitState) -> tuple[ImplicitState, Any]:
             """The state as it is."""
             same = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), s)
             return s, same if states else None
@@ -382,7 +388,7 @@ def _walk(flow: ImplicitSteps, start: State, plan: Plan, states: bool) -> tuple[
     return jax.lax.scan(jax.checkpoint(block), start, rows)
 
 
-def between(flow: ImplicitSteps, s: State, ahead: jax.Array) -> State:
+def between(flow: ImplicitSteps, s: ImplicitState, ahead: jax.Array) -> ImplicitState:
     """The state at `ahead` (1, B) after s, within the step that follows it."""
     coasted = flow.coasted(s)
     waits = ahead < coasted.time - s.time
