@@ -175,7 +175,8 @@ class LZB(Law):
         ):
             if self.method == "impulse" and used:
                 raise ValueError(
-                    f"Argument `method` must not be 'impulse' with {name}, but has this value."
+                    f"Argument `method` must be 'auto', 'time' or 'implicit' with {name}, "
+                    f"but has value {self.method!r}."
                 )
 
     def check(self, scene: Scene, dtype: jnp.dtype) -> None:
