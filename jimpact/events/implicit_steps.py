@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.contact_flow import Exponent, Viscous, as_pytree, per_row, power
-from jimpact.events.queues import run_queue
+from jimpact.events.queues import run_queue, side_by_side
 from jimpact.solvers.dense import times
 from jimpact.solvers.step_impulses import StepProblem, solve, solve_smooth
 
@@ -335,11 +335,8 @@ def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool
             plan = Plan(plan.lengths.at[at].set(kept), used)
         return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), plan)
 
-    if keeps:  # a plan is long, and is not moved between slots
-        return jax.lax.while_loop(
-            lambda run: jnp.any(goes_on(flow, run)), lambda run: attempt(flow, run), run
-        )
-    return run_queue(goes_on, attempt, flow, run)
+    # a plan is long, and is not moved between slots
+    return (side_by_side if keeps else run_queue)(goes_on, attempt, flow, run)
 
 
 def repeat(flow: ImplicitSteps, start: ImplicitState, plan: Plan) -> ImplicitState:

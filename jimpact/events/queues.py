@@ -25,6 +25,18 @@ class _Slots(NamedTuple):
     ends: Any  # of all impacts, as far as they have left their slots
 
 
+def side_by_side(
+    goes_on: Callable[[Any, Any], jax.Array],
+    advance: Callable[[Any, Any], Any],
+    flow: Any,
+    carry: Carry,
+) -> Carry:
+    """All impacts at once, as in `run_queue`: they wait for the slowest one."""
+    return jax.lax.while_loop(
+        lambda c: jnp.any(goes_on(flow, c)), lambda c: advance(flow, c), carry
+    )
+
+
 def run_queue(
     goes_on: Callable[[Any, Any], jax.Array],
     advance: Callable[[Any, Any], Any],
@@ -37,19 +49,17 @@ def run_queue(
     the batch B is the last axis of all arrays.
     """
 
-    def side_by_side(flow: Any, carry: Any) -> Any:
-        """All impacts at once: they wait for the slowest one."""
-        return jax.lax.while_loop(
-            lambda c: jnp.any(goes_on(flow, c)), lambda c: advance(flow, c), carry
-        )
+    def at_once(flow: Any, carry: Any) -> Any:
+        """The impacts of the queue, all of them at once."""
+        return side_by_side(goes_on, advance, flow, carry)
 
     def in_slots(flow: Any, carry: Any) -> Any:
         """The impacts of the queue, in slots."""
         return _in_slots(goes_on, advance, flow, carry)
 
     if jax.tree.leaves(carry)[0].shape[-1] <= SLOTS:
-        return side_by_side(flow, carry)
-    return jax.lax.platform_dependent(flow, carry, cpu=in_slots, default=side_by_side)
+        return at_once(flow, carry)
+    return jax.lax.platform_dependent(flow, carry, cpu=in_slots, default=at_once)
 
 
 def _in_slots(

@@ -14,13 +14,12 @@ from jimpact.events.impact_dynamics import (
     METHODS,
     Dynamics,
     dimensionless,
-    method_for,
     sides_of,
     solve,
 )
 from jimpact.law import Impulses, Law, OptionalValues, Values, option, parameter
 from jimpact.laws.forces import Bistiffness, Force, HuntCrossley, KelvinVoigt, KuwabaraKono
-from jimpact.laws.lzb import check_friction, check_rtol, default_rtol
+from jimpact.laws.lzb import check_friction, check_rtol, solver_of
 from jimpact.scene import Scene
 from jimpact.solvers.tridiagonal import diagonal
 
@@ -100,16 +99,8 @@ class Compliant(Law):
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
-        return (
-            self._tolerance(contact)
-            if method_for(self.method, contact, self.rtol) == "implicit"
-            else 0.0
-        )
-
-    def _tolerance(self, contact: Contact) -> float:
-        """`rtol`, or the default of the method at these contacts."""
-        method = method_for(self.method, contact, self.rtol)
-        return self.rtol or default_rtol(method, contact.gap_velocity.dtype)
+        method, rtol = solver_of(self, contact)
+        return rtol if method == "implicit" else 0.0
 
     def dynamics(self, contact: Contact) -> Dynamics:
         """The dimensionless dynamics of the whole encounter."""
@@ -121,6 +112,7 @@ class Compliant(Law):
             q = jnp.max(jnp.where(gamma < 0, -gamma, 0.0) / jnp.sqrt(diagonal(contact.delassus)))
             k = (q / force.indentation_scale(0.5 * q**2 * jnp.ones_like(gamma))) ** 2
             k, e, exponent = jax.lax.stop_gradient(k), jnp.ones_like(gamma), 1.0
+        method, rtol = solver_of(self, contact)
         problem, units = dimensionless(
             contact.delassus,
             gamma,
@@ -128,7 +120,7 @@ class Compliant(Law):
             k,
             exponent,
             contact.stored,
-            self._tolerance(contact),
+            rtol,
             contact.gaps,
         )
         if bistiffness is None:
@@ -137,7 +129,6 @@ class Compliant(Law):
         problem = problem._replace(viscous=viscous)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        method = method_for(self.method, contact, self.rtol)
         return Dynamics(problem, units, exponent, contact.chain, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:

@@ -50,6 +50,12 @@ def default_rtol(method: str, dtype: jnp.dtype) -> float:
     return table.get(str(dtype), table["float32"])
 
 
+def solver_of(law: Any, contact: Contact) -> tuple[str, float]:
+    """The method of a law with impact dynamics at these contacts, and its tolerance there."""
+    method = method_for(law.method, contact, law.rtol)
+    return method, law.rtol or default_rtol(method, contact.gap_velocity.dtype)
+
+
 def check_rtol(rtol: float | None, dtype: jnp.dtype) -> None:
     """Raise a ValueError where the precision cannot hold this tolerance."""
     finest = FINEST_RTOL_IN_EPS * float(jnp.finfo(dtype).eps)
@@ -126,7 +132,7 @@ class LZB(Law):
             'implicit' 1e-5 (float32: 1e-4).
         max_steps: maximum attempted steps.
         method: 'time', event-aligned, order 8; 'implicit', steps that know no events, order 2 to
-            3, compiled in a second whatever the contacts, for many contacts with friction;
+            3, compiled as soon for many contacts with friction as for one;
             'impulse', the published scheme in the impulse of a primary contact, order 1; 'auto'
             (default): 'time', but 'implicit' for several contacts with friction in space, where
             events may be endless; 'time' for up to 4 of them if `rtol` is below 1e-6.
@@ -186,16 +192,8 @@ class LZB(Law):
 
     def accuracy(self, contact: Contact) -> float:
         """`rtol` where method 'implicit' solves this `contact`, else 0: `impact` sees no error."""
-        return (
-            self._tolerance(contact)
-            if method_for(self.method, contact, self.rtol) == "implicit"
-            else 0.0
-        )
-
-    def _tolerance(self, contact: Contact) -> float:
-        """`rtol`, or the default of the method at these contacts."""
-        method = method_for(self.method, contact, self.rtol)
-        return self.rtol or default_rtol(method, contact.gap_velocity.dtype)
+        method, rtol = solver_of(self, contact)
+        return rtol if method == "implicit" else 0.0
 
     @property
     def pads_scenes(self) -> bool:  # type: ignore[override]
@@ -219,6 +217,7 @@ class LZB(Law):
 
     def dynamics(self, contact: Contact, rtol: Any = None) -> Dynamics:
         """The dimensionless dynamics of the contacts; `rtol` replaces that of the law."""
+        method, default = solver_of(self, contact)
         problem, units = dimensionless(
             contact.delassus,
             contact.gap_velocity,
@@ -226,12 +225,11 @@ class LZB(Law):
             self.stiffness,
             self.exponent,
             contact.stored,
-            self._tolerance(contact) if rtol is None else rtol,
+            default if rtol is None else rtol,
             closed=contact.closed,
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        method = method_for(self.method, contact, self.rtol)
         return Dynamics(problem, units, self.exponent, contact.chain, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:
