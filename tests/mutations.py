@@ -197,6 +197,9 @@ MUTATIONS = [
     Mutation("gap scale of a single ball", r"work = 2 / diagonal", "work = 1 / diagonal", ("test_compliant.py::test_gap_scale",)),
     # --- fits
     Mutation("degrees of freedom of the noise swapped", r"fdtrc\(rest, count, ratio\)", "fdtrc(count, rest, ratio)", ("test_fit.py::test_lack_of_fit_is_reported_from_its_level_on",)),
+    Mutation("a lower minimum stays with the profile that found it", r"self\._lower\(\*best\)", "self.least = best[0]", ("test_fit.py::test_a_lower_minimum_of_one_profile_is_that_of_all",)),
+    Mutation("profiles after lack of fit", r"fit\.linearization_misleads and not fit\.shows_lack_of_fit", "fit.linearization_misleads", ("test_fit.py::test_lack_of_fit_gets_no_profiles_of_itself",)),
+    Mutation("holes of a scan are left", r"not self\.fill_holes\(\) and", "True and", ("test_fit.py::test_holes_that_a_scan_left_are_filled",)),
     Mutation("many shots tested each at the full level", r"LEVEL / count\)", "LEVEL)", ("test_fit.py::test_honest_shots_are_seldom_suspicious",)),
     Mutation("region of two parameters with estimated noise", r"\(-2 / freedom\) - 1\)", "(-1 / freedom) - 1)", ("test_fit.py::test_contours_of_linear_problems_are_ellipses",)),
     Mutation("chance of scatter not halved", r"chance=0\.5 \* float\(chdtrc", "chance=float(chdtrc", ("test_selection.py::test_the_chance_of_scatter_is_half_that_of_chi_squared",)),

@@ -14,6 +14,8 @@ from scipy import stats
 
 import jimpact as ji
 from jimpact import Law
+from jimpact.fits.multistart import quiet
+from jimpact.fits.profiles import _Scans
 
 DATA = files("jimpact") / "data"
 PAIR = ji.chain([1.0, 2.0])
@@ -667,6 +669,13 @@ def test_profile_ends_at_a_bound_on_one_side():
     np.testing.assert_allclose(reported, scan.intervals, rtol=1e-6)
 
 
+def test_lack_of_fit_gets_no_profiles_of_itself():
+    post = simulated(ji.Newton(1.0), PAIR, SHOTS)
+    for times, count in ((1.0, 1), (1.2, 0)):  # at the bound both times
+        data = ji.Experiments(SHOTS, times * post, sigma=0.02)
+        assert len(ji.fit(ji.Newton(0.9), PAIR, data).profiles) == count
+
+
 def test_profile_of_two_minima_is_a_union():
     data = ji.Experiments(SHOTS, simulated(ji.Newton(0.49), PAIR, SHOTS), sigma=0.01)
     found = ji.fit(Even(jnp.asarray(0.5)), PAIR, data, free="root", starts=1)
@@ -674,6 +683,50 @@ def test_profile_of_two_minima_is_a_union():
     np.testing.assert_allclose(scan.intervals[1], 0.7, atol=0.02)
     np.testing.assert_allclose(scan.intervals[0], -np.array(scan.intervals[1])[::-1], atol=1e-5)
     assert " or " in scan.words
+
+
+class Cubic(Law):
+    """-gamma+ / gamma- = a cubic of `root` plus `other` |gamma-|: .45 at a side maximum, .5 at .8."""
+
+    root: jax.Array = ji.parameter(low=-1, high=1)
+    other: jax.Array = ji.parameter(low=-1, high=1)
+
+    def impulses(self, contact):
+        x = self.root
+        e = 0.4236 + 0.507 * (x**3 / 3 + x**2 / 8 - x / 8) - self.other * contact.gap_velocity
+        change = -(1 + e) * contact.gap_velocity
+        return ji.Impulses(jnp.linalg.solve(as_matrix(contact.delassus), change))
+
+
+def test_a_lower_minimum_of_one_profile_is_that_of_all():
+    """The fit ends at the side maximum of the cubic; the true `other` is 0.05."""
+    pre = SHOTS * [[1.0, 0.0]]
+    post = simulated(Cubic(0.8, 0.05), PAIR, pre)
+    data, start = ji.Experiments(pre, post, 1e-4), Cubic(-0.5, 0.05)
+    found = ji.fit(start, PAIR, data, ("root", "other"), starts=1)
+    assert found.value[0] < 0
+    root, other = ji.profile(found, points=9)
+    assert len(root.intervals) == 2
+    np.testing.assert_allclose(root.better, [0.8, 0.05], atol=1e-4)
+    for scan, value in zip((root, other), root.better):
+        assert scan.deviance.min() == 0.0
+        assert scan.value[scan.deviance.argmin()] == value
+        assert any(low <= value <= high for low, high in scan.intervals)
+    warned = ji.fit(start, PAIR, data, ("root", "other"), starts=1, profiles=True)
+    assert "A profile found a lower minimum than the fit (root 0.8, other 0.05)" in reported(warned)
+
+
+def test_holes_that_a_scan_left_are_filled():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, 0.02))
+    scans = _Scans(found, [0], 0.95, quiet)
+    scans.scan(5, 2.0)
+    values, deviance = scans.deviance(0)
+    lost = values[np.flatnonzero(deviance < scans.limit)[1]]
+    scans.solved[0][lost] = (1e3, scans.solved[0][lost][1])
+    assert len(scans.profile(0).intervals) == 2
+    scans.finish(2.0)
+    np.testing.assert_allclose(scans.profile(0).intervals, found.intervals()[0:1][0], rtol=1e-5)
 
 
 def test_profile_of_a_valley_is_what_the_bounds_leave_of_it():
