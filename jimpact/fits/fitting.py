@@ -9,7 +9,7 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice
 from jimpact.files.records import listed
-from jimpact.fits.adequacy import stretch, unusable, weighted
+from jimpact.fits.adequacy import reproduced, stretch, unusable, weighted
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.intervals import Profile
 from jimpact.fits.least_squares import Method, check_method, default_steps
@@ -295,10 +295,15 @@ def _jacobian(problem: FitProblem, solution: SearchResult) -> np.ndarray:
 def _uncertainty(
     problem: FitProblem, solution: SearchResult, minimum: Minimum, noise: float | None = None
 ) -> Uncertainty:
-    """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
+    """Linearized errors at a minimum; noise: None: as stated, or of its residuals.
+
+    Data without sigma that are reproduced to the last digit do not show their noise.
+    """
     size = problem.size
     if noise is None and problem.sigma is not None:
         noise = 1.0
+    elif noise is None and reproduced(problem, minimum):
+        noise = np.nan
     return uncertainty(
         names=problem.names,
         jacobian=size * minimum.jacobian,
