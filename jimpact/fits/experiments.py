@@ -198,28 +198,9 @@ class Experiments(eqx.Module):
         for k, (m, pre, row) in enumerate(self.balances(scene)):
             if len(m) == 0 or np.isnan(row).any():
                 continue
-            post[k] -= self._smallest_change(k, m) @ (m @ (row - pre))
+            post[k] -= _smallest_change(self, k, m) @ (m @ (row - pre))
             lost[k] += len(m)
         return self._with(post=post, lost_freedom=lost)
-
-    def _smallest_change(self, k: int, rows: np.ndarray) -> np.ndarray:
-        """The least change (n, c) of v+ of shot k, in sigmas, for momenta of rows (c, n)."""
-        n = rows.shape[1]
-        variance = np.ones(n) if self.sigma is None else np.asarray(self.sigma[k], float) ** 2
-        weighted = variance[:, None] * rows.T
-        return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
-
-    def kept_by_corrections(self, scene: Scene | None) -> list[np.ndarray | None]:
-        """Of every shot the projector (n, n) by which its momentum was corrected; None: it was not.
-
-        Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S = diag(sigma^2).
-        """
-        kept: list[np.ndarray | None] = []
-        for k, (m, pre, post) in enumerate(self.balances(scene)):
-            rounding = CONSERVED * np.abs(m) @ (np.abs(pre) + np.abs(post))
-            corrected = 0 < len(m) <= self.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all()
-            kept.append(np.eye(len(pre)) - self._smallest_change(k, m) @ m if corrected else None)
-        return kept
 
     def _with(self, **changed: Any) -> "Experiments":
         """A copy with other fields."""
@@ -286,6 +267,27 @@ class Experiments(eqx.Module):
         if self.scenes is None:
             return [function(self.scene_of(scene, 0))] * len(self.shots)
         return [function(self.scene_of(scene, k)) for k in range(len(self.shots))]
+
+
+def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:
+    """The least change (n, c) of v+ of shot k, in sigmas, for momenta of rows (c, n)."""
+    n = rows.shape[1]
+    variance = np.ones(n) if data.sigma is None else np.asarray(data.sigma[k], float) ** 2
+    weighted = variance[:, None] * rows.T
+    return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
+
+
+def kept_by_corrections(data: Experiments, scene: Scene | None) -> list[np.ndarray | None]:
+    """Of every shot the projector (n, n) by which its momentum was corrected; None: it was not.
+
+    Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S = diag(sigma^2).
+    """
+    kept: list[np.ndarray | None] = []
+    for k, (m, pre, post) in enumerate(data.balances(scene)):
+        rounding = CONSERVED * np.abs(m) @ (np.abs(pre) + np.abs(post))
+        corrected = 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all()
+        kept.append(np.eye(len(pre)) - _smallest_change(data, k, m) @ m if corrected else None)
+    return kept
 
 
 def _filled(rows: list[np.ndarray]) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import quick_jit
-from jimpact.fits.experiments import Experiments
+from jimpact.fits.experiments import Experiments, kept_by_corrections
 from jimpact.fits.least_squares import BoxRegion, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import (
@@ -241,7 +241,7 @@ class FitProblem:
         count, n = self.measured.shape
         slope = slopes_before(law, filled_up(r).observe)[:count]
         slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
-        for k, kept in enumerate(data.kept_by_corrections(self.scene)):
+        for k, kept in enumerate(kept_by_corrections(data, self.scene)):
             if kept is not None:  # a residual that conserves momentum shows that part of the errors
                 slope[k] = kept @ slope[k]
         here = ~np.isnan(self.measured)

@@ -5,6 +5,7 @@ import numpy as np
 from jimpact.files.records import listed
 from jimpact.fits.adequacy import adequacy, reproduced
 from jimpact.fits.defects import data_defects
+from jimpact.fits.experiments import kept_by_corrections
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import SearchResult
 from jimpact.fits.problem import EXACT, FitProblem
@@ -76,7 +77,7 @@ def _unknown_corrections(problem: FitProblem) -> list[str]:
     assert data is not None
     if data.sigma_pre is None:
         return []
-    kept = data.kept_by_corrections(problem.scene)
+    kept = kept_by_corrections(data, problem.scene)
     unknown = [data.shots[k] for k, one in enumerate(kept) if data.lost[k] and one is None]
     if not unknown:
         return []
