@@ -155,15 +155,34 @@ def test_shots_that_do_not_belong_are_named_and_can_be_outvoted():
         assert "Suspicious: shot 18," in reported(found)
 
 
+def test_outliers_do_not_hide_each_other_from_a_robust_loss():
+    """Three of twelve shots, 25 to 50 sigma off: momentum and the scale of the others are kept."""
+    pre = np.stack([np.linspace(1, 2, 12), np.zeros(12)], axis=1)
+    post = simulated(ji.Newton(0.8), PAIR, pre, noise=0.01)
+    post[[2, 5, 9]] += np.outer([0.25, -0.35, 0.5], [1.0, -0.5])
+    data = ji.Experiments(pre, post)
+    for loss in ("huber", "student"):
+        (line,) = (
+            x
+            for x in ji.fit(ji.Newton(0.5), PAIR, data, loss=loss).warnings
+            if x.startswith("Suspicious")
+        )
+        assert line.startswith("Suspicious: shots 10, 6, 3, which")
+
+
 def test_honest_shots_are_seldom_suspicious():
     """The level holds for all shots of a data set together: 1 in 100 sets, not 1 in 5."""
-    pre, named = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1), 0
+    pre = np.stack([np.linspace(1, 2, 24), np.zeros(24)], axis=1)
+    named = outvoted = 0
     for seed in range(40):
         post = simulated_at_once(0.9, pre) + 0.005 * np.random.default_rng(seed).normal(
             size=(24, 2)
         )
-        named += "Suspicious" in reported(ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(pre, post)))
+        data = ji.Experiments(pre, post)
+        named += "Suspicious" in reported(ji.fit(ji.Newton(0.9), PAIR, data))
+        outvoted += "Suspicious" in reported(ji.fit(ji.Newton(0.9), PAIR, data, loss="huber"))
     assert named <= 3
+    assert outvoted <= 3
 
 
 def simulated_at_once(e, pre):

@@ -18,6 +18,10 @@ LEVEL = 0.01  # of each test: how often it flags data that the law itself made
 _LEAST = 3  # degrees of freedom of the noise too few to test against
 _RANGE = 1e-6  # singular values below this share count as 0 (derivatives are good to 1e-7)
 _LISTED = 6  # shots named one by one
+MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
+# A median of absolute values is as uncertain as a standard deviation of this share of the values
+# (Huber, 1981). Ten times more would make honest shots of small sets suspicious.
+MEDIAN_FREEDOM = 0.37
 # Largest derivative of a velocity, over the largest velocity and a natural step of a parameter (as
 # far as from 0 to 1 for a restitution): those beyond are errors and would shorten every step.
 ABSURD = 1e3
@@ -207,9 +211,34 @@ def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
 def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool) -> list[str]:
     """Shots that the others, fitted without them, would not expect."""
     assert problem.experiments is not None
-    known, labels = _range(data.jacobian), problem.experiments.shots
+    labels = problem.experiments.shots
+    shots = np.unique(data.shot)
+    find = _beyond_median if robust else _beyond_others
+    suspects = [
+        (squares, labels[k])
+        for k, squares, chance in find(problem, data, freedom)
+        if squares > 0 and chance < LEVEL / len(shots)
+    ]
+    count = len(shots)
+    if not suspects:
+        return []
+    advice = "" if robust else ", or fit with loss='huber'"
+    worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:_LISTED])
+    more = f" and {len(suspects) - _LISTED} more" if len(suspects) > _LISTED else ""
+    return [
+        f"Suspicious: shot{'s' * (len(suspects) > 1)} {worst}{more}, which the others do not "
+        f"expect (of {count}); look there for errors{advice}."
+    ]
+
+
+_Chances = list[tuple[int, float, float]]  # shot, its sum of squares, how often it is as large
+
+
+def _beyond_others(problem: FitProblem, data: Weighted, freedom: int) -> _Chances:
+    """Every shot against the noise of the others: F tests."""
+    known, reading = _range(data.jacobian), _reading_variance(problem)
     total = float(data.residual @ data.residual)
-    suspects, count, reading = [], len(np.unique(data.shot)), _reading_variance(problem)
+    found: _Chances = []
     for k in np.unique(data.shot):
         rows = data.shot == k
         r, q, n = data.residual[rows], known[rows], int(rows.sum())
@@ -220,14 +249,24 @@ def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool)
         noise = max(total - squares, 0.0) / rest + reading
         if problem.sigma is not None:
             noise = max(noise, 1.0)
-        if squares > 0 and (noise == 0 or fdtrc(n, rest, squares / n / noise) < LEVEL / count):
-            suspects.append((squares, labels[k]))
-    if not suspects:
+        chance = 0.0 if noise == 0 else float(fdtrc(n, rest, squares / n / noise))
+        found.append((int(k), squares, chance))
+    return found
+
+
+def _beyond_median(problem: FitProblem, data: Weighted, freedom: int) -> _Chances:
+    """Every shot against the median residual, which many outliers together do not hide in."""
+    rest = MEDIAN_FREEDOM * freedom
+    if rest < _LEAST:
         return []
-    advice = "" if robust else ", or fit with loss='huber'"
-    worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:_LISTED])
-    more = f" and {len(suspects) - _LISTED} more" if len(suspects) > _LISTED else ""
-    return [
-        f"Suspicious: shot{'s' * (len(suspects) > 1)} {worst}{more}, which the others do not "
-        f"expect (of {count}); look there for errors{advice}."
-    ]
+    scale = MEDIAN * float(np.median(np.abs(data.residual)))
+    noise = scale**2 * len(data.residual) / freedom + _reading_variance(problem)
+    if problem.sigma is not None:
+        noise = max(noise, 1.0)
+    found: _Chances = []
+    for k in np.unique(data.shot):
+        r = data.residual[data.shot == k]
+        squares = float(r @ r)
+        chance = 0.0 if noise == 0 else float(fdtrc(len(r), rest, squares / len(r) / noise))
+        found.append((int(k), squares, chance))
+    return found
