@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
+from jimpact.fits.findings import Finding
 from jimpact.fits.multistart import Minimum, SearchResult
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
@@ -63,13 +64,13 @@ def reproduced(problem: FitProblem, minimum: Minimum) -> bool:
     return problem.size**2 * minimum.squares <= problem.exact_squares
 
 
-def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: bool) -> list[str]:
+def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: bool) -> list[Finding]:
     """Lack of fit and suspicious shots, in words; none if the data are reproduced exactly."""
     data = weighted(problem, solution)
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
     if freedom < 1 or squares <= problem.exact_squares:
         return []
-    lines = []
+    lines: list[str] = []
     if problem.sigma is not None:
         if (times := stretch(problem, data, rank)) > 1:
             lines.append(
@@ -80,9 +81,10 @@ def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: boo
             )
     elif problem.experiments is not None:
         lines += _beyond_noise(problem, data, freedom) or _pattern(problem, data, freedom)
+    found = [Finding(line) for line in lines]
     if problem.experiments is not None:
-        lines += _suspicious(problem, data, freedom, robust)
-    return lines
+        found += _suspicious(problem, data, freedom, robust)
+    return found
 
 
 def stretch(problem: FitProblem, data: Weighted, rank: int) -> float:
@@ -208,7 +210,7 @@ def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
     return u[:, singular > _RANGE * (singular[0] if size is None else size)]
 
 
-def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool) -> list[str]:
+def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool) -> list[Finding]:
     """Shots that the others, fitted without them, would not expect."""
     assert problem.experiments is not None
     labels = problem.experiments.shots
@@ -225,9 +227,13 @@ def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool)
     advice = "" if robust else ", or fit with loss='huber'"
     worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:_LISTED])
     more = f" and {len(suspects) - _LISTED} more" if len(suspects) > _LISTED else ""
+    several = len(suspects) > 1
     return [
-        f"Suspicious: shot{'s' * (len(suspects) > 1)} {worst}{more}, which the others do not "
-        f"expect (of {count}); look there for errors{advice}."
+        Finding(
+            f"Suspicious: shot{'s' * several} {worst}{more}, which the others do not "
+            f"expect (of {count}); look there for errors{advice}.",
+            f"shot{'s' * several} {worst}{more} {'are' if several else 'is'} suspicious",
+        )
     ]
 
 
