@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jimpact.loops import while_loop
 from jimpact.solvers.dense import regularized_once, times
 from jimpact.solvers.friction import in_disc
 
@@ -109,7 +110,7 @@ def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.A
 
     one = jnp.ones_like(tolerance)
     first = Sweep(start, start, one, one * jnp.inf, jnp.asarray(0))
-    return jax.lax.while_loop(going, sweep, first).impulses
+    return while_loop(going, sweep, first).impulses
 
 
 def solve_smooth(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.Array:
