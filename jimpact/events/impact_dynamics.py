@@ -169,6 +169,22 @@ def normal_coupling(problem: Problem, chain: bool) -> jax.Array:
     return unit(upper) + upper + jnp.swapaxes(upper, 0, 1)
 
 
+def coupling_of(problem: Problem, chain: bool) -> Chain | Dense:
+    """G in the form in which it is multiplied."""
+    if chain and problem.omega.shape[0] > DENSE_CHAIN:
+        return Chain(problem.off_diagonal)
+    return Dense(normal_coupling(problem, chain))
+
+
+def descent_of(coupling: Chain | Dense, contacts: int) -> jax.Array:
+    """Lengths (n, B) of descent of a coupling; see `descent_lengths`."""
+    if isinstance(coupling, Dense):
+        return descent_lengths(coupling.matrix, contacts)
+    ones = jnp.ones_like(coupling.off_diagonal[:1])
+    row_sums = coupling.magnitude().times(jnp.broadcast_to(ones, (contacts, *ones.shape[1:])))
+    return ones / jnp.max(row_sums, axis=0, keepdims=True) * jnp.ones_like(row_sums)
+
+
 def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
     """Indentations x (m, B) before the impact: of what is stored, otherwise minus the gap."""
     eta: Any = exponent if problem.exponent is None else problem.exponent
@@ -184,11 +200,8 @@ def flow_of(
 ) -> tuple[ContactFlow, jax.Array, jax.Array]:
     """The flow of a problem in columns (.., B), and its first modes and state."""
     m, viscous = problem.omega.shape[0], problem.viscous
-    coupling: Chain | Dense = Chain(problem.off_diagonal)
-    if not chain or m <= DENSE_CHAIN:
-        coupling = Dense(normal_coupling(problem, chain))
     parts: dict[str, Any] = dict(
-        coupling=coupling,
+        coupling=coupling_of(problem, chain),
         omega=problem.omega,
         restitution=problem.restitution,
         exponent_array=problem.exponent,
@@ -309,13 +322,13 @@ class ImplicitProgram(ImpulseProgram):
 
     def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
         """The contacts of a problem, and their state before the impact."""
-        coupling = normal_coupling(problem, self.chain)
+        coupling, m = coupling_of(problem, self.chain), problem.omega.shape[0]
         friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
         if problem.sides is not None:
             (across, tangent, slip), friction = problem.sides
-            back = jnp.swapaxes(across, 0, 1)
-            rows = [jnp.concatenate(x, axis=1) for x in ((coupling, across), (back, tangent))]
-            coupling = jnp.concatenate(rows)
+            back, normal = jnp.swapaxes(across, 0, 1), normal_coupling(problem, self.chain)
+            rows = [jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))]
+            coupling = Dense(jnp.concatenate(rows))
             velocity = jnp.concatenate([velocity, slip])
         flow = ImplicitSteps(
             coupling=coupling,
@@ -323,7 +336,7 @@ class ImplicitProgram(ImpulseProgram):
             restitution=problem.restitution,
             exponent_array=problem.exponent,
             friction=friction,
-            descent=jax.lax.stop_gradient(descent_lengths(coupling, problem.omega.shape[0])),
+            descent=jax.lax.stop_gradient(descent_of(coupling, m)),
             tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
             viscous=problem.viscous,
             exponent_static=None if problem.exponent is not None else self.exponent,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from jimpact.fits.multistart import SearchResult
+from jimpact.fits.multistart import Minimum, SearchResult
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
 
@@ -52,6 +52,11 @@ def weighted(problem: FitProblem, solution: SearchResult) -> Weighted:
         problem.size * solution.jacobian[here.ravel()],
         problem.shot_of_value,
     )
+
+
+def reproduced(problem: FitProblem, minimum: Minimum) -> bool:
+    """Whether all measured values are reproduced to the last digit."""
+    return problem.size**2 * minimum.squares <= problem.exact_squares
 
 
 def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: bool) -> list[str]:

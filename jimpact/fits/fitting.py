@@ -9,8 +9,9 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice
 from jimpact.files.records import listed
-from jimpact.fits.adequacy import stretch, unusable, weighted
+from jimpact.fits.adequacy import reproduced, stretch, unusable, weighted
 from jimpact.fits.experiments import Experiments
+from jimpact.fits.intervals import Profile
 from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Minimum, SearchResult, ends, search, settled
 from jimpact.fits.page import write_page
@@ -52,7 +53,8 @@ class Fit(FitResult[AnyLaw]):
 
         Args:
             path: the file, ending in .html; an existing file is replaced.
-            profiles: compute the profile likelihoods, too, unless the fit has them; some seconds.
+            profiles: compute the profile likelihoods, too, unless the fit has them or shows lack
+                of fit; some seconds.
 
         Returns:
             The path.
@@ -115,8 +117,8 @@ def fit(
         max_steps: iterations per start.
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
             trusted (at a bound, in a valley, with several minima, or for weakly determined
-            parameters), of up to 256 shots, with a single start of up to 64; else the report says
-            how to get them.
+            parameters) and the law fits, of up to 256 shots, with a single start of up to 64; else
+            the report says how to get them.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 
     Returns:
@@ -166,10 +168,19 @@ def fit(
         problem, robust = robust_solution(problem, solution, loss, method, steps)
     result = replace(as_fit(problem, solution, method, robust), loss=loss, seed=seed)
     if profiles:
-        return replace(result, profiles=profile(result, progress=progress))
+        return _with_profiles(result, profile(result, progress=progress))
     if profiles is None and needs_profiles(result):
-        return replace(result, profiles=quick_profiles(result, progress))
+        return _with_profiles(result, quick_profiles(result, progress))
     return result
+
+
+def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[AnyLaw]:
+    """The fit with its profiles, and a warning if they found a lower minimum."""
+    if (better := profiles[0].better) is not None:
+        values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
+        line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
+        result = replace(result, warnings=(*result.warnings, line))
+    return replace(result, profiles=profiles)
 
 
 def _check_derivatives(problem: FitProblem, solution: SearchResult) -> None:
@@ -284,10 +295,15 @@ def _jacobian(problem: FitProblem, solution: SearchResult) -> np.ndarray:
 def _uncertainty(
     problem: FitProblem, solution: SearchResult, minimum: Minimum, noise: float | None = None
 ) -> Uncertainty:
-    """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
+    """Linearized errors at a minimum; noise: None: as stated, or of its residuals.
+
+    Data without sigma that are reproduced to the last digit do not show their noise.
+    """
     size = problem.size
     if noise is None and problem.sigma is not None:
         noise = 1.0
+    elif noise is None and reproduced(problem, minimum):
+        noise = np.nan
     return uncertainty(
         names=problem.names,
         jacobian=size * minimum.jacobian,

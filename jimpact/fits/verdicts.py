@@ -3,8 +3,9 @@
 import numpy as np
 
 from jimpact.files.records import listed
-from jimpact.fits.adequacy import adequacy
+from jimpact.fits.adequacy import adequacy, reproduced
 from jimpact.fits.defects import data_defects
+from jimpact.fits.experiments import kept_by_corrections
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import SearchResult
 from jimpact.fits.problem import EXACT, FitProblem
@@ -26,11 +27,7 @@ def fit_warnings(
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
         lines += data_defects(data, problem.scene, stored)
-        if data.lost_freedom and data.sigma_pre is not None:
-            lines.append(
-                "The momentum was corrected as if `sigma_pre` were 0, and the fit weighs the shots "
-                "as if they were not corrected: chi^2 and standard errors are approximate."
-            )
+        lines += _unknown_corrections(problem)
     if not solution.converged:
         lines.append(
             "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
@@ -61,12 +58,34 @@ def fit_warnings(
         lines.append(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
+    elif problem.sigma is None and reproduced(problem, solution.minima[0]):
+        lines.append(
+            "The data are reproduced to the last digit and do not show their noise: errors are "
+            "unknown without `sigma` or `resolution`."
+        )
     if problem.precision == "float32":
         lines.append(
             "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
             'jax.config.update("jax_enable_x64", True) gives float64.'
         )
     return lines
+
+
+def _unknown_corrections(problem: FitProblem) -> list[str]:
+    """Shots with `sigma_pre` and a correction that is not that of momentum."""
+    data = problem.experiments
+    assert data is not None
+    if data.sigma_pre is None:
+        return []
+    kept = kept_by_corrections(data, problem.scene)
+    unknown = [data.shots[k] for k, one in enumerate(kept) if data.lost[k] and one is None]
+    if not unknown:
+        return []
+    return [
+        f"The fit weighs shots {listed(unknown)} as if they were not corrected: they have "
+        "`lost_freedom`, but do not conserve momentum, so that the errors that `sigma_pre` leaves "
+        "in them are unknown; chi^2 and standard errors are approximate."
+    ]
 
 
 def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:

@@ -43,6 +43,7 @@ class Row:
     noise: float = NOISE
     spoiled: Callable[[np.ndarray], np.ndarray] = lambda post: post
     swapped: bool = False
+    ends: bool = False  # every other shot comes from the other end
     expected: str = ""  # the warning that should come
 
     def data(self, count):
@@ -55,6 +56,8 @@ class Row:
             pre[..., -1] = rng.uniform(-1.0, 0.0, (count, self.shots))
         if self.repeated:
             pre[:] = np.eye(n)[0]
+        if self.ends:
+            pre[:, 1::2] = -pre[:, 1::2, ::-1]
         exact = np.asarray(impact(pre.reshape(-1, n))).reshape(pre.shape)
         post = exact + self.noise * rng.normal(size=exact.shape)
         pairs = [(a, self.spoiled(b)) for a, b in zip(pre, post)]
@@ -80,6 +83,7 @@ HONEST = (
     Row("Moreau, wall, 12 shots", M([0.8, 0.6]), M([0.9, 0.9]), WALLED, 12),
     Row("Poisson, 12 shots, sigma", P([0.8, 0.6]), P([0.9, 0.9]), UNEQUAL, 12, sigma=True),
     Row("Newton, 10 repeats", N(0.8), N(0.9), UNEQUAL, 10, repeated=True),
+    Row("Newton, from both ends, 8 shots", N(0.9), N(0.8), BALLS, 8, repeated=True, ends=True),
     Row(
         "Newton, 10 repeats read to .01",
         N(0.8), N(0.9), UNEQUAL, 10, noise=0.004, repeated=True, spoiled=lambda v: v.round(2),
@@ -109,6 +113,16 @@ SPOILED = (
     Row(
         "the last ball read 5 % too fast",
         N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 12, spoiled=lambda v: v * [1.0, 1.0, 1.05],
+        expected="The data violate conservation of momentum",
+    ),
+    Row(
+        "5 % lost, from both ends",
+        N(0.9), N(0.8), BALLS, 8, repeated=True, ends=True, spoiled=lambda v: 0.95 * v,
+        expected="The data violate conservation of momentum",
+    ),
+    Row(
+        "two shots in cm/s",
+        N(0.9), N(0.8), shots=2, spoiled=lambda v: 100 * v,
         expected="The data violate conservation of momentum",
     ),
     Row(
