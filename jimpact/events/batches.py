@@ -19,6 +19,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
 from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, value_of
+from jimpact.loops import kinds_like, varying_like
 
 # Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
 # stay in a core's cache: 64 are no faster, 1024 take half as long again.
@@ -42,8 +43,11 @@ def in_columns(function: Callable[..., Arrays], *arrays: jax.Array) -> Arrays:
     frozen dataclass with `__call__`): its derivatives are made and compiled once. Its method
     `shapes`, if it has one, returns the shapes of its results from those of its arguments.
     It gets the whole batch if it has a method `queues` that returns True, else chunks of it.
+    Inside `shard_map` the results vary over all mesh axes that an array varies over; `function`
+    itself does not know of the mesh.
     """
-    return tuple(columns_p.bind(*map(jnp.asarray, arrays), function=function))
+    varying = varying_like([jnp.asarray(x) for x in arrays], arrays)
+    return tuple(columns_p.bind(*varying, function=function))
 
 
 def _partial(
@@ -323,6 +327,11 @@ def _run(*arrays: jax.Array, function: Callable[..., Arrays]) -> Arrays:
 
 
 @columns_p.def_abstract_eval
+def _kinds(*kinds: Any, function: Callable[..., Arrays]) -> list[Any]:
+    """Abstract results: of these shapes, as varying inside `shard_map` as the arguments."""
+    return kinds_like(_shapes(*kinds, function=function), kinds[0])
+
+
 def _shapes(*shapes: Any, function: Callable[..., Arrays]) -> list[Any]:
     """Shapes of the results, without tracing `function` where they are known: it takes long."""
     known = [jax.core.ShapedArray(s.shape, s.dtype) for s in shapes]
@@ -341,7 +350,14 @@ def _shapes(*shapes: Any, function: Callable[..., Arrays]) -> list[Any]:
     return [jax.core.ShapedArray(x.shape, x.dtype) for x in shapes_of(*known)]
 
 
-mlir.register_lowering(columns_p, mlir.lower_fun(_run, multiple_results=True))
+def _lower(context: Any, *arrays: Any, function: Callable[..., Arrays]) -> Any:
+    """Rule of compilation: `function` of arrays that vary over no axis of a mesh."""
+    alone = [jax.core.ShapedArray(x.shape, x.dtype) for x in context.avals_in]
+    lower = mlir.lower_fun(_run, multiple_results=True)
+    return lower(context.replace(avals_in=alone), *arrays, function=function)
+
+
+mlir.register_lowering(columns_p, _lower)
 
 
 def _wider(
@@ -389,7 +405,7 @@ def _jvp(
 
     def zero(x: Any) -> Any:
         """The tangent of a whole number."""
-        return ad.Zero(jax.core.ShapedArray(x.shape, jax.dtypes.float0))
+        return ad.Zero(jax.typeof(x).to_tangent_aval())
 
     return list(outs), [next(rest) if is_smooth(x) else zero(x) for x in outs]
 
@@ -487,7 +503,7 @@ def _transpose(cotangents: Any, *arrays: Any, function: Callable[..., Arrays]) -
         # linear in what is undefined: its derivative at 0 is the map itself
         primals = [zeros(x) if undefined else x for x, undefined in zip(arrays, linear)]
         back = Cotangent(function, linear)
-    pulled = iter(columns_p.bind(*primals, *filled, function=back))
+    pulled = iter(in_columns(back, *primals, *filled))
     return [next(pulled) if u else None for u in linear]
 
 
