@@ -25,9 +25,9 @@ from jimpact.loops import kinds_like, varying_like
 # stay in a core's cache: 64 are no faster, 1024 take half as long again.
 CHUNK = 256
 CHUNK_WITH_TANGENTS = 128  # of impacts with tangents, which take more room in the cache
-# Entries of the arguments with derivatives up to which the reverse mode multiplies with a Jacobian of
-# the forward mode: compiled in half of the time, and run in two thirds. Ten times more: chains of
-# twenty balls take several times as long.
+# Entries of the arguments with derivatives up to which the reverse mode multiplies with a Jacobian
+# of the forward mode: compiled in half of the time, and run in two thirds. Ten times more: chains
+# of twenty balls take half as long again.
 MOST_DIRECTIONS = 16
 
 Arrays = tuple[jax.Array, ...]
