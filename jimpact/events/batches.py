@@ -77,17 +77,8 @@ class Tangent:
 
     def __call__(self, *arrays: jax.Array) -> Arrays:
         """Tangents (.., B) of all results; with `many`, directions first."""
-        count = len(self.marked)
-        primals, tangents = arrays[:count], arrays[count:]
-        if getattr(self.function, "takes_duals", False):
-            return _by_duals(self, primals, tangents)[1]
-        of_marked, values = _partial(self.function, self.marked, primals)
-
-        def push(*tangents: jax.Array) -> Arrays:
-            """Tangents in one direction."""
-            return jax.jvp(of_marked, values, tangents)[1]
-
-        return (jax.vmap(push) if self.many else push)(*tangents)
+        outs = WithTangents(self.function, self.marked, self.many)(*arrays)
+        return outs[_count_of_values(outs) :]
 
 
 @dataclasses.dataclass(frozen=True)
