@@ -20,6 +20,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval as pe
 
 from jimpact.events.tangents import TANGENT_AXIS, Dual, dual_like, is_dual, value_of
 from jimpact.loops import kinds_like, varying_like
+from jimpact.solvers.sensitivity import unit_directions
 
 # Impacts that a CPU solves at a time. A chunk ends with its slowest member, and its stages should
 # stay in a core's cache: 64 are no faster, 1024 take half as long again.
@@ -418,13 +419,9 @@ def _directions(function: WithTangents, shapes: Any) -> int:
 
 def _with_jacobian(function: WithTangents, arrays: Arrays) -> tuple[Arrays, Arrays]:
     """Results, and rates (D, .., B) of the smooth ones along all entries of marked arguments."""
-    count, first, units = _directions(function, arrays), 0, []
-    for x, mark in zip(arrays, function.marked):
-        if mark:
-            size = math.prod(x.shape[:-1])
-            unit = jnp.eye(count, size, -first, dtype=x.dtype).reshape(count, *x.shape[:-1], 1)
-            units.append(jnp.broadcast_to(unit, (count, *x.shape)))
-            first += size
+    moving = [x for x, mark in zip(arrays, function.marked) if mark]
+    of_one = unit_directions([x[..., 0] for x in moving])
+    units = [jnp.broadcast_to(u[..., None], (len(u), *x.shape)) for u, x in zip(of_one, moving)]
     outs = in_columns(dataclasses.replace(function, many=True), *arrays, *units)
     values = _count_of_values(outs)
     return outs[:values], outs[values:]
