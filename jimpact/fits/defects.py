@@ -7,6 +7,7 @@ from scipy.special import ndtri, stdtr
 
 from jimpact.files.records import listed
 from jimpact.fits.experiments import Experiments, closed_normals
+from jimpact.fits.findings import Finding, share
 from jimpact.scene import Scene, dense_mass
 
 # Defects below this share of the momentum or energy before are not reported: a good measurement of
@@ -48,6 +49,13 @@ def data_defects(
     >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
     'The data gain energy (1 = conserved): shot 1: 1.4400.'
     """
+    return [found.line for found in find_defects(experiments, scene, stored_energy)]
+
+
+def find_defects(
+    experiments: Experiments, scene: Scene | None, stored_energy: float
+) -> list[Finding]:
+    """The same, and what a quoted value has to say of each."""
     momenta: dict[int, list[tuple[int, _Defect]]] = {}
     energies, resting = [], []
     energy_ratios = experiments.energy_ratio(scene)
@@ -81,28 +89,42 @@ def data_defects(
         for k, ratio in _beyond_noise(each, DEFECT_LEVEL / len(momenta)).items()
     }
     energy = _beyond_noise(energies, DEFECT_LEVEL, gains=True)
-    lines = []
+    total, found = len(experiments.shots), []
     if momentum:
-        lines.append(
-            "The data violate conservation of momentum (1 = conserved): "
-            f"{_listed(experiments, momentum)}; "
-            f"no law can reproduce that part{_floor(experiments, scene)}."
+        found.append(
+            Finding(
+                "The data violate conservation of momentum (1 = conserved): "
+                f"{_listed(experiments, momentum)}; "
+                f"no law can reproduce that part{_floor(experiments, scene)}.",
+                f"the data violate conservation of momentum in {share(len(momentum), total)}",
+            )
         )
     if energy:
-        lines.append(f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.")
+        found.append(
+            Finding(
+                f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.",
+                f"kinetic energy grows in {share(len(energy), total)}",
+            )
+        )
     if resting:
         labels = [experiments.shots[k] for k in resting]
-        lines.append(
-            f"No contact approaches in {len(labels)} of {len(experiments.shots)} shots "
-            f"({listed(labels)}): are pre and post swapped, or is a sign wrong?"
+        found.append(
+            Finding(
+                f"No contact approaches in {len(labels)} of {total} shots "
+                f"({listed(labels)}): are pre and post swapped, or is a sign wrong?",
+                f"no contact approaches in {share(len(labels), total)}",
+            )
         )
     if experiments.sigma is None and _are_copies(experiments):
-        lines.append(
-            f"All {len(experiments.shots)} shots are equal to the last digit, but for a factor: "
-            "they carry no more information than one of them, and none on the noise; without "
-            "`sigma` or `resolution` the errors are meaningless."
+        found.append(
+            Finding(
+                f"All {total} shots are equal to the last digit, but for a factor: they carry no "
+                "more information than one of them, and none on the noise; without `sigma` or "
+                "`resolution` the errors are meaningless.",
+                f"the {total} shots are copies of one",
+            )
         )
-    return lines
+    return found
 
 
 def _are_copies(experiments: Experiments) -> bool:

@@ -42,7 +42,10 @@ class Fit(FitResult[AnyLaw]):
 
     @property
     def verdict(self) -> str:
-        """The result in one sentence: the last one of `print(fit)`."""
+        """The result in one sentence that can be quoted: the first one of `print(fit)`.
+
+        Values with their errors, what they assume, and what speaks against them.
+        """
         return verdict(self)
 
     def report(self, path: str | Path, profiles: bool = True) -> Path:
@@ -179,7 +182,12 @@ def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[An
     if (better := profiles[0].better) is not None:
         values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
         line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
-        result = replace(result, warnings=(*result.warnings, line))
+        short = "a profile found a lower minimum"
+        result = replace(
+            result,
+            warnings=(*result.warnings, line),
+            reservations=(*result.reservations, short),
+        )
     return replace(result, profiles=profiles)
 
 
@@ -237,6 +245,7 @@ def as_fit(
         if times > 1:
             errors = _uncertainty(problem, solution, best, times)
     residual = np.asarray(problem.measured, float) - solution.predicted
+    findings = fit_warnings(problem, solution, errors, robust is not None)
     return Fit(
         law=with_entries(problem.law, problem.residuals.fields, solution.entries),
         method=method if isinstance(method, str) else "optax",
@@ -268,7 +277,8 @@ def as_fit(
         converged=solution.converged,
         steps=solution.steps,
         lost_starts=solution.lost,
-        warnings=tuple(fit_warnings(problem, solution, errors, robust is not None)),
+        warnings=tuple(found.line for found in findings),
+        reservations=tuple(found.reservation for found in findings if found.reservation),
         problem=problem,
         jacobian=_jacobian(problem, solution),
     )

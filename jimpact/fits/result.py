@@ -69,6 +69,7 @@ class FitResult(Generic[AnyLaw]):
         loss: see `fit`.
         seed: of the random starts.
         profiles: if `fit` computed them.
+        reservations: in words, what has to be said where a value is quoted.
     """
 
     law: AnyLaw
@@ -99,6 +100,15 @@ class FitResult(Generic[AnyLaw]):
     loss: str = "squares"
     seed: int = 0
     profiles: tuple[Profile, ...] = ()
+    reservations: tuple[str, ...] = ()
+
+    @property
+    def determined(self) -> np.ndarray:
+        """(P,) which parameters the data say anything about; the values of others are starts."""
+        seen = ~np.isinf(self.standard_error)
+        for i, each in enumerate(self.profiles):
+            seen[i] &= each.words != "anything"
+        return seen
 
     @property
     def experiments(self) -> Experiments | None:

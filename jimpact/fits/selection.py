@@ -17,6 +17,7 @@ from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
+from jimpact.fits.report import named_values
 from jimpact.fits.result import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws.velocity_dependent import VelocityDependent
@@ -121,16 +122,18 @@ class LawFits:
         heads = ["law", "free", "rms", "left out", "AICc", "verdict", "values"]
         rows = []
         for name, x in self.entries.items():
-            values = ", ".join(f"{v:.4g}" for v in x.fit.value)
+            values = named_values(x.fit, x.fit.value)
             numbers = [number(x.fit.rms, ".4g"), number(x.left_out_error, ".4g")]
             aicc = number(x.aicc, ".1f")
             rows.append([name, str(x.parameters), *numbers, aicc, x.verdict, values])
         lines = table(heads, rows, left=["verdict", "values"])
         lines.append("rms and error of shots left out in m/s; simplest adequate law first.")
+        if not all(x.fit.determined.all() for x in self.entries.values()):
+            lines.append("Values in brackets are starts, which the data do not determine.")
         lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         if self.speed is not None:
             lines.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
-        return "\n".join([*lines, self.verdict])
+        return "\n".join([self.verdict, "", *lines])
 
 
 class NestedTest(NamedTuple):

@@ -4,8 +4,9 @@ import numpy as np
 
 from jimpact.files.records import listed
 from jimpact.fits.adequacy import adequacy, reproduced
-from jimpact.fits.defects import data_defects
+from jimpact.fits.defects import find_defects
 from jimpact.fits.experiments import kept_by_corrections
+from jimpact.fits.findings import Finding
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import SearchResult
 from jimpact.fits.problem import EXACT, FitProblem
@@ -20,14 +21,15 @@ EQUALLY_GOOD = 1.0
 
 def fit_warnings(
     problem: FitProblem, solution: SearchResult, errors: Uncertainty, robust: bool
-) -> list[str]:
+) -> list[Finding]:
     """All warnings, those about the data first."""
-    lines, data = list(problem.left_out), problem.experiments
+    data, found = problem.experiments, [Finding(line, _left_out(line)) for line in problem.left_out]
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
-        lines += data_defects(data, problem.scene, stored)
-        lines += _unknown_corrections(problem)
+        found += find_defects(data, problem.scene, stored)
+        found += map(Finding, _unknown_corrections(problem))
+    lines: list[str] = []
     if not solution.converged:
         lines.append(
             "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
@@ -37,7 +39,14 @@ def fit_warnings(
         lines += _statuses(solution.status, data.shots)
         lines += _matrix(problem, solution, contacts)
     lines += _not_finite(problem, solution)
-    lines += adequacy(problem, solution, errors.rank, robust)
+    found += map(Finding, lines)
+    found += adequacy(problem, solution, errors.rank, robust)
+    return [*found, *map(Finding, _of_parameters(problem, solution, errors))]
+
+
+def _of_parameters(problem: FitProblem, solution: SearchResult, errors: Uncertainty) -> list[str]:
+    """What the data do not tell about the parameters and their errors."""
+    lines, data = [], problem.experiments
     if data is not None and problem.sigma is None and len(set(data.units)) > 1:
         lines.append(
             "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
@@ -69,6 +78,11 @@ def fit_warnings(
             'jax.config.update("jax_enable_x64", True) gives float64.'
         )
     return lines
+
+
+def _left_out(line: str) -> str:
+    """Of a line on shots that are left out, what a quoted value has to say."""
+    return f"{line.removeprefix('Left out: ').split(' (')[0]} are left out"
 
 
 def _unknown_corrections(problem: FitProblem) -> list[str]:
