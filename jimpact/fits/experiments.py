@@ -129,23 +129,11 @@ class Experiments(eqx.Module):
 
     def scene_of(self, scene: Scene | None, shot: int) -> Scene:
         """The scene of one shot (counted from 0): its own, or else the given common one."""
-        if self.scenes is not None:
-            scene = self.scenes[shot]
-        if scene is None:
-            raise ValueError(
-                "Argument `scene` must be a Scene where the experiments carry none, but is None."
-            )
-        if scene.size != self.pre.shape[1]:
-            raise ValueError(
-                "Argument `experiments` must have one velocity per body of the scene: it has "
-                f"{self.pre.shape[1]} a shot, but the scene has {scene.size}."
-            )
-        return scene
+        return _scene_of(self, scene, shot)
 
     def largest_scene(self, scene: Scene | None) -> Scene:
         """The first of the scenes (or the given common scene) with the most contacts."""
-        scenes = [self.scene_of(scene, k) for k in range(len(self.shots))]
-        return max(scenes, key=lambda each: each.contacts)
+        return max(self.each(scene, lambda s: s), key=lambda each: each.contacts)
 
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
         """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
@@ -265,8 +253,24 @@ class Experiments(eqx.Module):
     def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
         """`function` of the scene of every shot; of a common one only once."""
         if self.scenes is None:
-            return [function(self.scene_of(scene, 0))] * len(self.shots)
-        return [function(self.scene_of(scene, k)) for k in range(len(self.shots))]
+            return [function(_scene_of(self, scene, 0))] * len(self.shots)
+        return [function(_scene_of(self, scene, k)) for k in range(len(self.shots))]
+
+
+def _scene_of(data: Experiments, scene: Scene | None, shot: int) -> Scene:
+    """`Experiments.scene_of`. Calling a method would go through all arrays of `data`."""
+    if data.scenes is not None:
+        scene = data.scenes[shot]
+    if scene is None:
+        raise ValueError(
+            "Argument `scene` must be a Scene where the experiments carry none, but is None."
+        )
+    if scene.size != data.pre.shape[1]:
+        raise ValueError(
+            "Argument `experiments` must have one velocity per body of the scene: it has "
+            f"{data.pre.shape[1]} a shot, but the scene has {scene.size}."
+        )
+    return scene
 
 
 def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:

@@ -271,7 +271,7 @@ def fit_laws(
     ('newton', True)
     """
     check_kind("data", data, Experiments)
-    scenes = [data.scene_of(scene, k) for k in range(len(data.shots))]
+    scenes = data.each(scene, lambda s: s)
     candidates, left_out = _candidates(scenes, laws, dict(values), tuple(free))
     fits: dict[str, Fit] = {}
     options: dict[str, Any] = {"starts": starts, "seed": seed, "progress": False}
