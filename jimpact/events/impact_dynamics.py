@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from jimpact.contact import Contact
 from jimpact.events import implicit_steps, impulse_form, stepper
@@ -506,7 +507,7 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
         # in reverse mode values keep the steps: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
         outs, rates = with_tangents_in_columns(fine, primals, tangents)
-        whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
+        whole = [SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 
     value.defjvp(rule, symbolic_zeros=True)
