@@ -49,37 +49,6 @@ def _probe() -> Callable[..., Any]:
     return jax.jit(lambda *x: x, compiler_options=known_options())
 
 
-def varying_like(tree: Any, *like: Any) -> Any:
-    """The arrays of `tree`, varying over all mesh axes that an array of `like` varies over.
-
-    Inside `shard_map` a loop must begin with what it carries from pass to pass: a state that starts
-    from constants varies over no axis yet. Elsewhere nothing changes.
-    """
-    axes = frozenset().union(*map(_axes_of, jax.tree.leaves(like)))
-    if not axes:
-        return tree
-
-    def varying(x: Any) -> Any:
-        """x over all of the axes."""
-        return jax.lax.pcast(x, tuple(axes - _axes_of(x)), to="varying")
-
-    return jax.tree.map(lambda x: varying(x) if axes - _axes_of(x) else x, tree)
-
-
-def _axes_of(x: Any) -> frozenset[Any]:
-    """The mesh axes that an array varies over inside `shard_map`."""
-    return axes_of_kind(jax.typeof(x)) if eqx.is_array(x) else frozenset()
-
-
-def axes_of_kind(kind: Any) -> frozenset[Any]:
-    """The mesh axes that arrays of this abstract kind vary over.
-
-    Some versions of JAX have the axes themselves, under another name.
-    """
-    manual = getattr(kind, "manual_axis_type", None)
-    return getattr(kind, "vma", frozenset()) if manual is None else manual.varying
-
-
 def is_top_level_call(*args: Any) -> bool:
     """Whether a program called with these arguments now is compiled and run by itself.
 

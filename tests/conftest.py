@@ -9,6 +9,8 @@ more than BUDGET programs.
 import hashlib
 import os
 import random
+import subprocess
+import sys
 import tempfile
 from collections import Counter
 from pathlib import Path
@@ -38,6 +40,9 @@ COUNTS_FROM = 200  # operations of StableHLO
 # Programs of the default suite, over all processes.
 BUDGET = 450
 COMPILED = "/jax/core/compile/backend_compile_duration"
+
+# XLA's newer emitters of loops take twice as long to compile; users compile batches with them.
+QUICK = "--xla_cpu_use_fusion_emitters=false"
 
 BY_LAW = ("test_contract", "test_systems")  # a law's tests share its programs
 OF_LAW = {
@@ -80,6 +85,13 @@ def optimize(fully):
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(not fully)
 
 
+def is_known(flag):
+    """Whether this version's compiler knows the flag: it aborts a process over others."""
+    start = [sys.executable, "-c", "import jax; jax.devices()"]
+    process = subprocess.run(start, env=os.environ | {"XLA_FLAGS": flag}, capture_output=True)
+    return process.returncode == 0
+
+
 def pytest_configure(config):
     """Compiled programs are kept for this run only, by the first process (not one of xdist's)."""
     jax.config.update("jax_dump_ir_to", texts.name)
@@ -88,6 +100,8 @@ def pytest_configure(config):
     optimize(False)
     if hasattr(config, "workerinput"):
         return
+    if "XLA_FLAGS" not in os.environ and is_known(QUICK):
+        os.environ["XLA_FLAGS"] = QUICK
     config.pluginmanager.register(Workers())
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = tempfile.TemporaryDirectory(prefix="jimpact-tests-")

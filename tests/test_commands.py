@@ -372,6 +372,7 @@ def test_where_programs_are_kept(tmp_path, monkeypatch):
     assert os.environ[enabled] == "false"
 
 
+@pytest.mark.slow
 def test_simulate(tmp_path, capsys):
     options = ["--out", "m.png", "--gif", "m.gif", "--portrait", "p.svg", "--json"]
     short = ["--t-end", "0.3", "--samples", "11", "--coordinate", "3"]

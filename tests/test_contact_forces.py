@@ -24,6 +24,7 @@ def dropped(force, **options):
     return ji.simulate(*given, 1.0, method="contact_forces", **options)
 
 
+@pytest.mark.slow
 def test_ball_on_a_linear_spring():
     def run(stiffness):
         motion = dropped(ji.LinearSpring(stiffness))

@@ -169,7 +169,7 @@ def test_a_chain_is_never_made_dense():
 
 
 def test_values_and_forward_derivatives_are_one_program():
-    """The reverse mode needs two: values, and what pulls cotangents back."""
+    """The reverse mode needs two: values with their Jacobian, and its product."""
     v = jnp.array([1.0, 0.0, 0.0])
 
     def last(e):

@@ -11,6 +11,7 @@ from spatial_scenes import NAMED, random_boxes
 import jimpact as ji
 from jimpact.contact import contact_of
 from jimpact.events import implicit_steps
+from jimpact.events.contact_flow import Chain, Dense
 from jimpact.events.impact_dynamics import method_for
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 from jimpact.status import CODE
@@ -198,7 +199,7 @@ def test_impulses_of_a_step():
     np.testing.assert_allclose(lengths[:, 0], [1.0, 1.0, 0.5, 0.5])
     load, zero = jnp.ones((2, 1)), jnp.zeros((2, 1))
     velocity = jnp.array([[-3.0], [-3.0], [0.4], [3.0]])
-    problem = StepProblem(k, velocity, load, zero, 0.5 * load, lengths)
+    problem = StepProblem(Dense(k), velocity, load, zero, 0.5 * load, lengths)
     q = solve(problem, jnp.zeros((4, 1)), jnp.full((1, 1), 1e-12))
     np.testing.assert_allclose(q[:, 0], [1.0, 1.0, -0.2, -0.5], atol=1e-12)
     # gamma = -.5 + f: with a = 3 the force that is left solves f = 1 - 3 (f - .5)
@@ -216,20 +217,54 @@ def test_redundant_contacts_keep_descent_lengths_safe():
     assert np.linalg.eigvalsh(np.diag(1 / d) - k).min() > -1e-12
 
 
-def test_a_wait_ends_where_the_gap_closes():
-    """Free flight is one exact step to the next contact."""
-    flow = implicit_steps.ImplicitSteps(
-        coupling=jnp.eye(2)[..., None],
+def steps_of_two(restitution, gapped):
+    """Steps of two contacts without friction that do not act on each other."""
+    return implicit_steps.ImplicitSteps(
+        coupling=Dense(jnp.eye(2)[..., None]),
         omega=jnp.array([[1.0], [2.0]]),
-        restitution=jnp.ones((2, 1)),
+        restitution=restitution * jnp.ones((2, 1)),
         exponent_array=None,
         friction=jnp.zeros((2, 1)),
         descent=jnp.ones((2, 1)),
         tolerance=jnp.full((1, 1), 1e-5),
         exponent_static=1.5,
-        gapped=True,
+        gapped=gapped,
     )
+
+
+def test_a_wait_ends_where_the_gap_closes():
+    """Free flight is one exact step to the next contact."""
+    flow = steps_of_two(1.0, gapped=True)
     start = flow.start(jnp.array([[-3.0], [-8.0]]), jnp.array([[-0.5], [-1.0]]))
     after = flow.coasted(start)
     np.testing.assert_allclose(after.indentation[:, 0], [-1.0, 0.0], atol=1e-14)
     assert float(after.time[0, 0]) == pytest.approx(4.0)
+
+
+def test_the_moment_of_a_turn_counts():
+    """gamma linear in time through 0: the integral of c gamma, c = 1 or 1 / e^2, in fine steps."""
+    e, h, begins = 0.5, 0.1, np.array([[-0.3, 0.4], [-0.3, 0.4], [0.2, 0.1]])
+    ends = np.array([[0.2, -0.1], [-0.2, 0.3], [-0.4, -0.1]])
+    flow = steps_of_two(e, gapped=False)
+    part = (np.arange(100_000) + 0.5)[:, None] / 100_000
+    for loaded, before, after in zip([1.0, 1.0, 0.0], begins, ends):
+        gamma = before + part * (after - before)
+        rate = np.where(gamma > 0, gamma / e**2 if loaded else 0.0, gamma)
+        way = -h * np.array([1.0, 2.0]) * rate.mean(axis=0)
+        x, first, last = (jnp.asarray(y)[:, None] for y in (loaded + 0 * before, before, after))
+        none = jnp.zeros((2, 1), bool)
+        half = flow.moved(x, first, h / 2, none)
+        end = flow.moved(half, last, h / 2, none)
+        end = end + flow.turned(x, half, first, last, jnp.full((1, 1), h))
+        np.testing.assert_allclose(end[:, 0], loaded + way, rtol=3e-5, atol=1e-7)
+
+
+def test_a_chain_needs_its_two_diagonals_only():
+    """Descent in a chain is safe, and its product that of the matrix."""
+    off = jnp.array([-0.9, -0.2, -0.5, -0.6])[:, None]
+    k = np.eye(5) + np.diag(np.asarray(off)[:, 0], 1) + np.diag(np.asarray(off)[:, 0], -1)
+    d = np.asarray(implicit_steps.descent_of(Chain(off), 5))[:, 0]
+    assert np.linalg.eigvalsh(np.diag(1 / d) - k).min() > 0
+    assert d.min() > 0.4
+    f = jnp.arange(5.0)[:, None] ** 2
+    np.testing.assert_allclose(Chain(off).times(f)[:, 0], k @ np.arange(5.0) ** 2, rtol=1e-14)

@@ -70,6 +70,7 @@ def test_one_shot_is_always_reproduced():
         assert any("Nothing keeps this matrix consistent" in line for line in found.warnings)
 
 
+@pytest.mark.slow
 def test_all_entries_are_free_by_default():
     data = shots(E_TRUE)
     found = fit(RestitutionMatrix(START), CHAIN, data, starts=2)

@@ -515,6 +515,7 @@ def test_known_ratio(ratio, tolerance, name):
     assert f"k2/k1 = {ratio:.3g}" in result.reason
 
 
+@pytest.mark.slow
 def test_tolerance_from_both_sides():
     """At the error of binary collisions the advice changes, and nowhere near it."""
     known = {"stiffness": [1.0, 0.5]}

@@ -4,13 +4,16 @@ import json
 import sys
 from dataclasses import replace
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from programs import CODE
 
 import jimpact as ji
 from jimpact.fits.fitting import Fit
 from jimpact.fits.result import FitMinimum
+from jimpact.fits.selection import LawFit, LawFits
 from jimpact.motion.record import KIND_CODE, no_events, with_row
 
 
@@ -97,7 +100,7 @@ def test_a_fit_in_one_sentence():
     seen = {"names": ("restitution",), "value": np.array([0.9912]), "warnings": ()}
     seen |= {"standard_error": np.array([0.0042]), "at_bound": np.array([False]), "rank": 1}
     assert canned(4, **seen).verdict == "restitution = 0.991 ± 0.004."
-    assert str(canned(4)).endswith(f"\n\n{canned(4).verdict}")
+    assert str(canned(4)).startswith(f"{canned(4).verdict}\n\n")
     both = canned(1)
     assert both.verdict == (
         "restitution[1] = 0.600 ± 0.010; stiffness[1] cannot be determined from this shot."
@@ -116,6 +119,50 @@ def test_a_fit_in_one_sentence():
     assert reported.verdict == (
         "restitution[1] = 0.600 ± 0.010, at least 0.97 (95 %); stiffness[1] cannot be determined from these 4 shots."
     )
+
+
+def test_a_sentence_to_quote_holds_its_reservations():
+    """What it assumes of several contacts, what is wrong with the data, how many shots fail."""
+    pre = np.ones((4, 3)) * [1.0, 0.0, -1.0]
+    shots, balls = ji.Experiments(pre, pre), ji.chain([1.0, 1.0, 1.0])
+    problem = ji.FitProblem.from_shots(ji.LZB(0.6), balls, shots)
+    one = {"names": ("restitution",), "value": np.array([0.77]), "at_bound": np.array([False])}
+    one |= {"standard_error": np.array([0.017]), "rank": 1, "problem": problem, "warnings": ()}
+    broken = "the data violate conservation of momentum in all 4 shots"
+    shared = "one restitution for both contacts, equal stiffnesses and the exponent 1.5 (Hertz)"
+    assert canned(4, **one, reservations=(broken, "shot 3 is suspicious")).verdict == (
+        f"restitution = 0.770 ± 0.017, assuming {shared}; but {broken} and shot 3 is suspicious."
+    )
+    mixed = replace(problem, parameters=replace(problem.parameters, names=("restitution[1]",)))
+    law = ji.LZB([0.6, 0.7], [1.0, 2.0], exponent=(1.5, 1.0))
+    mixed = replace(mixed, residuals=replace_law(mixed.residuals, law))
+    own = canned(4, **(one | {"problem": mixed, "names": ("restitution[1]",)}))
+    assert own.verdict.endswith(
+        ", assuming the stiffness of each contact and the exponent of each contact."
+    )
+    fails = {"warnings": ("The fitted law fails in all.",), "status": np.full(4, CODE["max_steps"])}
+    assert canned(4, **fails).verdict.startswith("LZB fails in all of these 4 shots; it comes near")
+    fails["status"] = fails["status"] * [1, 0, 1, 0]
+    assert canned(4, **fails).verdict.startswith("LZB fails in 2 of these 4 shots; it comes near")
+
+
+def replace_law(residuals, law):
+    return eqx.tree_at(lambda r: r.law, residuals, law)
+
+
+def test_values_that_the_data_do_not_determine_are_marked():
+    found = canned(4)
+    lines = str(found).splitlines()
+    assert any(line.endswith("a start: the data do not determine it") for line in lines)
+    assert any("restitution[1] 0.4, stiffness[1] (2)" in line for line in lines)
+    every = LawFits({"lzb": LawFit("lzb", found, 0.01, np.nan, "fits", "fits")})
+    table = str(every)
+    assert "restitution[1] 0.6, stiffness[1] (2)" in table
+    assert "Values in brackets are starts" in table
+    assert table.startswith("The simplest law that fits is lzb: restitution[1] = 0.600")
+    np.testing.assert_array_equal(found.determined, [True, False])
+    flat = ji.Profile("restitution[1]", *np.zeros((2, 1)), 4.0, 0.95, ((0.0, 1.0),), (0.0, 1.0))
+    assert not canned(4, profiles=(flat, flat)).determined.any()
 
 
 def test_page_of_a_fit(tmp_path):

@@ -46,6 +46,7 @@ def test_block_on_one_corner():
     assert float(0.5 * MASS @ moving.velocity**2) == pytest.approx(0.125, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [Hertz(jnp.ones(2)), HuntCrossley(1.0, 0.4)])
 def test_straight_chain_does_not_turn(force):
     gaps = jnp.array([0.0, 0.2])
@@ -56,6 +57,7 @@ def test_straight_chain_does_not_turn(force):
     assert bool(out.ended)
 
 
+@pytest.mark.slow
 def test_mass_that_depends_on_the_configuration():
     """Polar coordinates of a bouncing point: the same motion as in Cartesian ones."""
 

@@ -153,7 +153,7 @@ def fit(command: options.FitCommand, steps: Steps) -> CommandResult:
         fits = _fit_and_yardsticks(study, chosen | {"method": command.method}, steps)
     others = {"Newton fitted": fits[YARDSTICK]} if YARDSTICK in fits else None
     picture = ji.plot.fit(fits[RAW], others, study.title)
-    text = "\n".join([*_fits_table(fits), "", str(fits[RAW]), ""])
+    text = "\n".join([str(fits[RAW]), "", *_fits_table(fits), ""])
     heads = ["fit", "law", "parameter", "value", "standard_error", "rms_m_per_s", "rank"]
     rows = [
         [name, type(x.law).__name__, parameter, x.value[i], x.standard_error[i], x.rms, x.rank]
@@ -280,10 +280,10 @@ def _fit_in_words(name: str, fit: "ji.Fit") -> str:
 def _value(fit: "ji.Fit", i: int) -> str:
     """A fitted value with its standard error."""
     error = fit.standard_error[i]
-    if fit.at_bound[i]:
-        spread = "(bound)"
-    elif np.isinf(error):
+    if not fit.determined[i]:
         spread = "(not determined)"
+    elif fit.at_bound[i]:
+        spread = "(bound)"
     elif np.isnan(error):
         spread = "± unknown"
     else:

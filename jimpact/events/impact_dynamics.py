@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_derivatives import SymbolicZero
 
 from jimpact.contact import Contact
 from jimpact.events import implicit_steps, impulse_form, stepper
@@ -33,7 +34,6 @@ from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
 from jimpact.solvers.sensitivity import without_derivatives
-from jimpact.solvers.step_impulses import descent_lengths
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -168,6 +168,13 @@ def normal_coupling(problem: Problem, chain: bool) -> jax.Array:
     return unit(upper) + upper + jnp.swapaxes(upper, 0, 1)
 
 
+def coupling_of(problem: Problem, chain: bool) -> Chain | Dense:
+    """G in the form in which it is multiplied."""
+    if chain and problem.omega.shape[0] > DENSE_CHAIN:
+        return Chain(problem.off_diagonal)
+    return Dense(normal_coupling(problem, chain))
+
+
 def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
     """Indentations x (m, B) before the impact: of what is stored, otherwise minus the gap."""
     eta: Any = exponent if problem.exponent is None else problem.exponent
@@ -183,11 +190,8 @@ def flow_of(
 ) -> tuple[ContactFlow, jax.Array, jax.Array]:
     """The flow of a problem in columns (.., B), and its first modes and state."""
     m, viscous = problem.omega.shape[0], problem.viscous
-    coupling: Chain | Dense = Chain(problem.off_diagonal)
-    if not chain or m <= DENSE_CHAIN:
-        coupling = Dense(normal_coupling(problem, chain))
     parts: dict[str, Any] = dict(
-        coupling=coupling,
+        coupling=coupling_of(problem, chain),
         omega=problem.omega,
         restitution=problem.restitution,
         exponent_array=problem.exponent,
@@ -308,13 +312,13 @@ class ImplicitProgram(ImpulseProgram):
 
     def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
         """The contacts of a problem, and their state before the impact."""
-        coupling = normal_coupling(problem, self.chain)
+        coupling, m = coupling_of(problem, self.chain), problem.omega.shape[0]
         friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
         if problem.sides is not None:
             (across, tangent, slip), friction = problem.sides
-            back = jnp.swapaxes(across, 0, 1)
-            rows = [jnp.concatenate(x, axis=1) for x in ((coupling, across), (back, tangent))]
-            coupling = jnp.concatenate(rows)
+            back, normal = jnp.swapaxes(across, 0, 1), normal_coupling(problem, self.chain)
+            rows = [jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))]
+            coupling = Dense(jnp.concatenate(rows))
             velocity = jnp.concatenate([velocity, slip])
         flow = ImplicitSteps(
             coupling=coupling,
@@ -322,7 +326,7 @@ class ImplicitProgram(ImpulseProgram):
             restitution=problem.restitution,
             exponent_array=problem.exponent,
             friction=friction,
-            descent=jax.lax.stop_gradient(descent_lengths(coupling, problem.omega.shape[0])),
+            descent=jax.lax.stop_gradient(implicit_steps.descent_of(coupling, m)),
             tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
             viscous=problem.viscous,
             exponent_static=None if problem.exponent is not None else self.exponent,
@@ -503,7 +507,7 @@ def evaluate(function: ImpulseProgram, leaves: tuple[jax.Array, ...]) -> tuple[j
         # in reverse mode values keep the steps: one loop where they are one program
         fine = dataclasses.replace(function, finely=True)
         outs, rates = with_tangents_in_columns(fine, primals, tangents)
-        whole = [np.zeros(x.shape, jax.dtypes.float0) for x in outs[len(rates) :]]
+        whole = [SymbolicZero(jax.typeof(x).to_tangent_aval()) for x in outs[len(rates) :]]
         return outs, (*rates, *whole)
 
     value.defjvp(rule, symbolic_zeros=True)

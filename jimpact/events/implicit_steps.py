@@ -30,10 +30,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact.events.contact_flow import Exponent, Viscous, as_pytree, per_row, power
+from jimpact.events.contact_flow import (
+    Chain,
+    Dense,
+    Exponent,
+    Viscous,
+    as_pytree,
+    per_row,
+    power,
+)
 from jimpact.events.queues import run_queue, side_by_side
-from jimpact.solvers.dense import times
-from jimpact.solvers.step_impulses import StepProblem, solve, solve_smooth
+from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve, solve_smooth
 
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
 # other value is both.
@@ -86,7 +93,7 @@ class ImplicitState(NamedTuple):
 class ImplicitSteps:
     """Contacts with or without friction, arrays with the batch last; n = m + t rows."""
 
-    coupling: jax.Array  # K (n, n, B): G and the tangential block
+    coupling: Chain | Dense  # K (n, n, B): G and the tangential block
     omega: jax.Array  # (m, B)
     restitution: jax.Array  # (m, B)
     exponent_array: jax.Array | None  # (m, B)
@@ -161,7 +168,8 @@ class ImplicitSteps:
         """By how much (m, B) a step's normal impulse falls with the velocity of separation."""
         if self.viscous is not None:
             return jnp.zeros_like(x)
-        slope = self.eta * power(x, self.eta - 1) * self.force_scale
+        some = x > 0
+        slope = self.eta * self.force_scale * power(x, self.exponent) / jnp.where(some, x, 1.0)
         return h**2 * slope * self.omega / self.least**2
 
     def moved(self, x: jax.Array, gamma: jax.Array, h: jax.Array, stiff: jax.Array) -> jax.Array:
@@ -187,39 +195,101 @@ class ImplicitSteps:
         self, s: ImplicitState, h: jax.Array, smooth: bool
     ) -> tuple[ImplicitState, jax.Array]:
         """The state after h (1, B), and what it loses (1, B) by opening within the step."""
-        m, solver = self.contacts, solve_smooth if smooth else solve
-        inner = INNER * self.tolerance
+        m = self.contacts
         x, gamma = s.indentation, s.velocity[:m]
         stiff = jax.lax.stop_gradient(self.unloading(x, h)) > STIFF
         half = self.moved(x, gamma, h / 2, stiff)
         load = h * self.force_of(half, gamma)
         unloading = jnp.where(stiff, self.unloading(half, h), 0.0)
+        impulses = self.frictional_impulses if len(s.velocity) > m else self.normal_impulses
+        impulse, rate, load = impulses(s, h, half, load, unloading, smooth)
+        velocity = s.velocity + self.coupling.times(impulse)
+        normal, after = impulse[:m], velocity[:m]
 
+        cut = stiff & (normal < load)
+        middle = jax.lax.cond(
+            jnp.any(cut),
+            lambda f, x: jnp.where(cut, self.indentation_of(f, h), x),
+            lambda _, x: x,
+            *(normal, half),
+        )
+        x = self.moved(middle, after, h / 2, stiff)
+        x = x + jnp.where(stiff, 0.0, self.turned(s.indentation, half, gamma, after, h))
+        opened = cut & (normal <= 0) & (after > 0)
+        x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
+        loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
+        return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
+
+    def frictional_impulses(
+        self,
+        s: ImplicitState,
+        h: jax.Array,
+        half: jax.Array,
+        load: jax.Array,
+        unloading: jax.Array,
+        smooth: bool,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Impulses (n, B) of both stages, those in unit time of the last one, and the load."""
+        m, solver = self.contacts, solve_smooth if smooth else solve
+        inner, gamma = INNER * self.tolerance, s.velocity[:m]
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
         first = solver(stage, h * s.rate, inner)
         if self.viscous is not None:  # the force at the velocity in the middle of the step
-            middle = gamma + times(self.coupling, first)[:m] / 2
-            load = h * self.force_of(half, middle)
+            load = h * self.force_of(half, gamma + self.coupling.times(first)[:m] / 2)
         side = (1 - PART) * first[m:]
-        base = s.velocity + times(self.coupling, jnp.concatenate([jnp.zeros_like(gamma), side]))
+        none = jnp.zeros_like(gamma)
+        base = s.velocity + self.coupling.times(jnp.concatenate([none, side]))
         # second stage, in units in which both rows have the weight PART
         stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
         guess = jnp.concatenate([first[:m] / PART, first[m:]])
         second = solver(stage, guess, inner)
-        velocity = base + PART * times(self.coupling, second)
-        normal, gamma = PART * second[:m], velocity[:m]
-
-        cut = stiff & (normal < load)
-        middle = jnp.where(cut, self.indentation_of(normal, h), half)
-        x = self.moved(middle, gamma, h / 2, stiff)
-        opened = cut & (normal <= 0) & (gamma > 0)
-        x = jnp.where(opened, -h / 2 * self.omega * gamma if self.gapped else 0.0, x)
-        loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, gamma)
+        normal = PART * second[:m]
         impulse = jnp.concatenate([normal, side + PART * second[m:]])
-        rate = jnp.concatenate([normal, second[m:]]) / h
-        return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
+        return impulse, jnp.concatenate([normal, second[m:]]) / h, load
+
+    def normal_impulses(
+        self,
+        s: ImplicitState,
+        h: jax.Array,
+        half: jax.Array,
+        load: jax.Array,
+        unloading: jax.Array,
+        smooth: bool,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """As `frictional_impulses`, without friction: the load, where nothing expands too fast."""
+        if self.viscous is not None:  # never stiff; the force at the velocity in the middle
+            load = h * self.force_of(half, s.velocity + self.coupling.times(load) / 2)
+            return load, load / h, load
+
+        def cut(load: jax.Array, unloading: jax.Array) -> jax.Array:
+            """What fast expansions leave of the load."""
+            problem = self.problem(s.velocity, load, unloading, self.friction)
+            solver = solve_smooth if smooth else solve
+            return solver(problem, h * s.rate, INNER * self.tolerance)
+
+        some = jnp.any(unloading > 0)
+        normal = jax.lax.cond(some, cut, lambda load, _: load, load, unloading)
+        return normal, normal / h, load
+
+    def turned(
+        self, x: jax.Array, half: jax.Array, before: jax.Array, after: jax.Array, h: jax.Array
+    ) -> jax.Array:
+        """What (m, B) the moment at which gamma changes its sign within a step adds to x.
+
+        With gamma linear in time, the integral of c gamma differs from h/2 (c gamma + c' gamma')
+        by h/2 (c - c') |gamma gamma'| / (|gamma| + |gamma'|): compression and expansion; or, where
+        an open contact closes, nothing and compression.
+        """
+        turns = before * after < 0
+        size = jnp.where(turns, jnp.abs(before) + jnp.abs(after), 1.0)
+        part = jnp.where(turns, -before * after / size, 0.0)
+        loaded = (x > 0) & (half > 0)
+        square = self.least**2 if self.viscous is None else jnp.ones_like(x)
+        closes = 0.0 if self.gapped else jnp.where(before > 0, -1.0, 0.0)
+        kink = jnp.where(loaded, 1 / square - 1, closes)
+        return h / 2 * self.omega * kink * part
 
     def indentation_of(self, impulse: jax.Array, h: jax.Array) -> jax.Array:
         """Where (m, B) the force gives this normal impulse in h."""
@@ -282,6 +352,15 @@ class ImplicitSteps:
         return new, (error + jnp.sum(losses, axis=0)) / allowed
 
 
+def descent_of(coupling: Chain | Dense, contacts: int) -> jax.Array:
+    """Lengths (n, B) of descent of a coupling; see `descent_lengths`."""
+    if isinstance(coupling, Dense):
+        return descent_lengths(coupling.matrix, contacts)
+    ones = jnp.ones_like(coupling.off_diagonal[:1])
+    row_sums = coupling.magnitude().times(jnp.broadcast_to(ones, (contacts, *ones.shape[1:])))
+    return ones / jnp.max(row_sums, axis=0, keepdims=True) * jnp.ones_like(row_sums)
+
+
 class Plan(NamedTuple):
     """Lengths of the accepted steps (BLOCKS * BLOCK, 1, B), 0 where there are no more."""
 
@@ -305,6 +384,13 @@ class ImplicitRun(NamedTuple):
         return stalled | ~flow.busy(self.state)
 
 
+def next_length(length: jax.Array, error: jax.Array) -> jax.Array:
+    """The length (1, B) of the step after one of this error (1, B), which falls with h^3."""
+    # 1e-12 keeps the root from 0, far beyond GROWTH
+    factor = jnp.clip(SAFETY / jnp.cbrt(error + 1e-12), SHRINK, GROWTH)
+    return jnp.where(error < jnp.inf, factor, SHRINK) * length
+
+
 def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool) -> ImplicitRun:
     """From the start to the end of the impact; `keeps` the plan of the steps."""
     lanes = jnp.zeros(flow.tolerance.shape, jnp.int32)
@@ -323,10 +409,7 @@ def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool
         new, error = flow.step(flow.coasted(run.state), run.length)
         accepted = live & (error <= 1)
         state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, run.state)
-        # the error falls with h^3; 1e-12 keeps the root from 0, far beyond GROWTH
-        factor = jnp.clip(SAFETY / jnp.cbrt(error + 1e-12), SHRINK, GROWTH)
-        factor = jnp.where(error < jnp.inf, factor, SHRINK)
-        length = jnp.where(live, factor * run.length, run.length)
+        length = jnp.where(live, next_length(run.length, error), run.length)
         plan = run.plan
         if plan is not None:
             at = plan.used[0], 0, np.arange(lanes.shape[1])

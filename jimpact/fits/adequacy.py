@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc
 
-from jimpact.fits.multistart import SearchResult
+from jimpact.fits.findings import Finding
+from jimpact.fits.multistart import Minimum, SearchResult
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
 
@@ -18,6 +19,10 @@ LEVEL = 0.01  # of each test: how often it flags data that the law itself made
 _LEAST = 3  # degrees of freedom of the noise too few to test against
 _RANGE = 1e-6  # singular values below this share count as 0 (derivatives are good to 1e-7)
 _LISTED = 6  # shots named one by one
+MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
+# A median of absolute values is as uncertain as a standard deviation of this share of the values
+# (Huber, 1981). Ten times more would make honest shots of small sets suspicious.
+MEDIAN_FREEDOM = 0.37
 # Largest derivative of a velocity, over the largest velocity and a natural step of a parameter (as
 # far as from 0 to 1 for a restitution): those beyond are errors and would shorten every step.
 ABSURD = 1e3
@@ -54,13 +59,18 @@ def weighted(problem: FitProblem, solution: SearchResult) -> Weighted:
     )
 
 
-def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: bool) -> list[str]:
+def reproduced(problem: FitProblem, minimum: Minimum) -> bool:
+    """Whether all measured values are reproduced to the last digit."""
+    return problem.size**2 * minimum.squares <= problem.exact_squares
+
+
+def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: bool) -> list[Finding]:
     """Lack of fit and suspicious shots, in words; none if the data are reproduced exactly."""
     data = weighted(problem, solution)
     squares, freedom = float(data.residual @ data.residual), problem.values - rank
     if freedom < 1 or squares <= problem.exact_squares:
         return []
-    lines = []
+    lines: list[str] = []
     if problem.sigma is not None:
         if (times := stretch(problem, data, rank)) > 1:
             lines.append(
@@ -71,9 +81,10 @@ def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: boo
             )
     elif problem.experiments is not None:
         lines += _beyond_noise(problem, data, freedom) or _pattern(problem, data, freedom)
+    found = [Finding(line) for line in lines]
     if problem.experiments is not None:
-        lines += _suspicious(problem, data, freedom, robust)
-    return lines
+        found += _suspicious(problem, data, freedom, robust)
+    return found
 
 
 def stretch(problem: FitProblem, data: Weighted, rank: int) -> float:
@@ -199,12 +210,41 @@ def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
     return u[:, singular > _RANGE * (singular[0] if size is None else size)]
 
 
-def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool) -> list[str]:
+def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool) -> list[Finding]:
     """Shots that the others, fitted without them, would not expect."""
     assert problem.experiments is not None
-    known, labels = _range(data.jacobian), problem.experiments.shots
+    labels = problem.experiments.shots
+    shots = np.unique(data.shot)
+    find = _beyond_median if robust else _beyond_others
+    suspects = [
+        (squares, labels[k])
+        for k, squares, chance in find(problem, data, freedom)
+        if squares > 0 and chance < LEVEL / len(shots)
+    ]
+    count = len(shots)
+    if not suspects:
+        return []
+    advice = "" if robust else ", or fit with loss='huber'"
+    worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:_LISTED])
+    more = f" and {len(suspects) - _LISTED} more" if len(suspects) > _LISTED else ""
+    several = len(suspects) > 1
+    return [
+        Finding(
+            f"Suspicious: shot{'s' * several} {worst}{more}, which the others do not "
+            f"expect (of {count}); look there for errors{advice}.",
+            f"shot{'s' * several} {worst}{more} {'are' if several else 'is'} suspicious",
+        )
+    ]
+
+
+_Chances = list[tuple[int, float, float]]  # shot, its sum of squares, how often it is as large
+
+
+def _beyond_others(problem: FitProblem, data: Weighted, freedom: int) -> _Chances:
+    """Every shot against the noise of the others: F tests."""
+    known, reading = _range(data.jacobian), _reading_variance(problem)
     total = float(data.residual @ data.residual)
-    suspects, count, reading = [], len(np.unique(data.shot)), _reading_variance(problem)
+    found: _Chances = []
     for k in np.unique(data.shot):
         rows = data.shot == k
         r, q, n = data.residual[rows], known[rows], int(rows.sum())
@@ -215,14 +255,24 @@ def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool)
         noise = max(total - squares, 0.0) / rest + reading
         if problem.sigma is not None:
             noise = max(noise, 1.0)
-        if squares > 0 and (noise == 0 or fdtrc(n, rest, squares / n / noise) < LEVEL / count):
-            suspects.append((squares, labels[k]))
-    if not suspects:
+        chance = 0.0 if noise == 0 else float(fdtrc(n, rest, squares / n / noise))
+        found.append((int(k), squares, chance))
+    return found
+
+
+def _beyond_median(problem: FitProblem, data: Weighted, freedom: int) -> _Chances:
+    """Every shot against the median residual, which many outliers together do not hide in."""
+    rest = MEDIAN_FREEDOM * freedom
+    if rest < _LEAST:
         return []
-    advice = "" if robust else ", or fit with loss='huber'"
-    worst = ", ".join(label for _, label in sorted(suspects, reverse=True)[:_LISTED])
-    more = f" and {len(suspects) - _LISTED} more" if len(suspects) > _LISTED else ""
-    return [
-        f"Suspicious: shot{'s' * (len(suspects) > 1)} {worst}{more}, which the others do not "
-        f"expect (of {count}); look there for errors{advice}."
-    ]
+    scale = MEDIAN * float(np.median(np.abs(data.residual)))
+    noise = scale**2 * len(data.residual) / freedom + _reading_variance(problem)
+    if problem.sigma is not None:
+        noise = max(noise, 1.0)
+    found: _Chances = []
+    for k in np.unique(data.shot):
+        r = data.residual[data.shot == k]
+        squares = float(r @ r)
+        chance = 0.0 if noise == 0 else float(fdtrc(len(r), rest, squares / len(r) / noise))
+        found.append((int(k), squares, chance))
+    return found

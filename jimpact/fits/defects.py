@@ -7,6 +7,7 @@ from scipy.special import ndtri, stdtr
 
 from jimpact.files.records import listed
 from jimpact.fits.experiments import Experiments, closed_normals
+from jimpact.fits.findings import Finding, share
 from jimpact.scene import Scene, dense_mass
 
 # Defects below this share of the momentum or energy before are not reported: a good measurement of
@@ -16,7 +17,14 @@ DEFECT_TOLERANCE = 1e-3
 DEFECT_SIGMAS = 3.0
 # ... or beyond more, so that all shots together show one by chance at most this often.
 DEFECT_LEVEL = 0.02
+# Beyond this share of the momentum or energy before, in half of the shots or more, a defect needs
+# no test: no noise of a useful measurement is as large, but a wrong unit is. With ten times more, a
+# factor of 3.6 (km/h) in two shots would go unseen.
+GROSS = 0.5
 SEPARATION = 1e-9  # share of the velocities up to which an approach is rounding
+# Share of the velocities by which copies of a shot, scaled, may differ: rounding. Ten times more
+# would still be far below what is measured.
+COPIED = 1e-9
 _LISTED = 6  # shots listed one by one with their ratios; of more, the range is reported
 
 
@@ -25,9 +33,11 @@ def data_defects(
 ) -> list[str]:
     """What the data break beyond their error, a line each: momentum, energy, approach; copies.
 
-    Momentum is reported as `1 + excess / sum |m v-|`: after over before where all bodies move one
-    way. Without `sigma` the shots show their noise: a defect is one that they have in common (a t
-    test), of a single shot any above a tenth of a percent.
+    Momentum is reported as `1 + excess / sum |m v-|`, the excess in the direction of the momentum
+    before: after over before where all bodies move one way. Without `sigma` the shots show their
+    noise: a defect is one that they have in common, the same excess or the same share of the
+    momentum before, whichever way that points (t tests), or one of half of the momentum in half of
+    the shots; of a single shot any above a tenth of a percent.
 
     Args:
         experiments: the shots; those with missing values are not judged.
@@ -39,6 +49,13 @@ def data_defects(
     >>> data_defects(ji.Experiments([1.0, 0.0], [0.0, 1.2]), ji.chain([1.0, 1.0]))[1]
     'The data gain energy (1 = conserved): shot 1: 1.4400.'
     """
+    return [found.line for found in find_defects(experiments, scene, stored_energy)]
+
+
+def find_defects(
+    experiments: Experiments, scene: Scene | None, stored_energy: float
+) -> list[Finding]:
+    """The same, and what a quoted value has to say of each."""
     momenta: dict[int, list[tuple[int, _Defect]]] = {}
     energies, resting = [], []
     energy_ratios = experiments.energy_ratio(scene)
@@ -57,77 +74,114 @@ def data_defects(
         both = slice(None) if experiments.sigma_pre is not None else slice(len(post))
         for j, row in enumerate(rows):
             excess, scale = row @ (post - pre), np.abs(row) @ np.abs(pre)
-            ratio = 1 + excess / scale if scale else np.inf
-            defect = _Defect(excess, scale, np.append(row, -row)[both], sigma, ratio)
+            back = row @ pre < -SEPARATION * scale
+            ratio = 1 + (-excess if back else excess) / scale if scale else np.inf
+            slope = np.append(row, -row)[both]
+            defect = _Defect(excess, scale, row @ pre, slope, sigma, ratio)
             momenta.setdefault(j, []).append((k, defect))
         t_minus, t_plus = 0.5 * pre @ mass @ pre, 0.5 * post @ mass @ post
         gain = t_plus - t_minus - stored_energy
         slope = np.append(mass @ post, -mass @ pre)[both]
-        energies.append((k, _Defect(gain, t_minus, slope, sigma, energy_ratios[k])))
+        energies.append((k, _Defect(gain, t_minus, t_minus, slope, sigma, energy_ratios[k])))
     momentum = {
         k: ratio
-        for momentum_ratios in momenta.values()
-        for k, ratio in _beyond_noise(momentum_ratios).items()
+        for each in momenta.values()
+        for k, ratio in _beyond_noise(each, DEFECT_LEVEL / len(momenta)).items()
     }
-    energy = _beyond_noise(energies, gains=True)
-    lines = []
+    energy = _beyond_noise(energies, DEFECT_LEVEL, gains=True)
+    total, found = len(experiments.shots), []
     if momentum:
-        lines.append(
-            "The data violate conservation of momentum (1 = conserved): "
-            f"{_listed(experiments, momentum)}; "
-            f"no law can reproduce that part{_floor(experiments, scene)}."
+        found.append(
+            Finding(
+                "The data violate conservation of momentum (1 = conserved): "
+                f"{_listed(experiments, momentum)}; "
+                f"no law can reproduce that part{_floor(experiments, scene)}.",
+                f"the data violate conservation of momentum in {share(len(momentum), total)}",
+            )
         )
     if energy:
-        lines.append(f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.")
+        found.append(
+            Finding(
+                f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.",
+                f"kinetic energy grows in {share(len(energy), total)}",
+            )
+        )
     if resting:
         labels = [experiments.shots[k] for k in resting]
-        lines.append(
-            f"No contact approaches in {len(labels)} of {len(experiments.shots)} shots "
-            f"({listed(labels)}): are pre and post swapped, or is a sign wrong?"
+        found.append(
+            Finding(
+                f"No contact approaches in {len(labels)} of {total} shots "
+                f"({listed(labels)}): are pre and post swapped, or is a sign wrong?",
+                f"no contact approaches in {share(len(labels), total)}",
+            )
         )
+    if experiments.sigma is None and _are_copies(experiments):
+        found.append(
+            Finding(
+                f"All {total} shots are equal to the last digit, but for a factor: they carry no "
+                "more information than one of them, and none on the noise; without `sigma` or "
+                "`resolution` the errors are meaningless.",
+                f"the {total} shots are copies of one",
+            )
+        )
+    return found
+
+
+def _are_copies(experiments: Experiments) -> bool:
+    """Whether all shots of a scene are one, several times or scaled."""
     rows = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
-    copies = len(rows) > 1 and experiments.sigma is None and (rows == rows[:1]).all()
-    if copies and experiments.scenes is None:
-        lines.append(
-            f"All {len(rows)} shots are equal to the last digit: they carry no more information "
-            "than one of them, and none on the noise; without `sigma` the errors are meaningless."
-        )
-    return lines
+    if len(rows) < 2 or experiments.scenes is not None:
+        return False
+    size = np.sqrt(np.nansum(rows**2, axis=1, keepdims=True))
+    unit = rows / np.where(size > 0, size, 1.0)
+    return bool(np.allclose(unit, unit[:1], rtol=0, atol=COPIED, equal_nan=True))
 
 
 class _Defect(NamedTuple):
-    """By how much a balance fails, its scale, derivatives in v+ (and v-), their errors, a ratio."""
+    """By how much a balance fails, its scale, the momentum or energy before, derivatives in v+
+    (and v-), their errors, a ratio."""
 
     excess: float
     scale: float
+    before: float
     slope: np.ndarray
     sigma: np.ndarray | None
     ratio: float
 
 
-def _beyond_noise(defects: list[tuple[int, _Defect]], gains: bool = False) -> dict[int, float]:
+def _beyond_noise(
+    defects: list[tuple[int, _Defect]], level: float, gains: bool = False
+) -> dict[int, float]:
     """Ratios of the shots whose balance fails by more than their noise; gains: upwards only."""
+    size = np.array([d.excess if gains else abs(d.excess) for _, d in defects])
     if any(d.sigma is not None for _, d in defects):
-        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * DEFECT_LEVEL / len(defects))))
-        return {
-            k: d.ratio
-            for k, d in defects
-            if d.sigma is not None
-            and (d.excess if gains else abs(d.excess)) > sigmas * np.linalg.norm(d.slope * d.sigma)
-        }
-    flagged = {
-        k: d.ratio
-        for k, d in defects
-        if (d.excess if gains else abs(d.excess)) > DEFECT_TOLERANCE * d.scale
-    }
-    if len(defects) < 2 or not flagged:
+        sigmas = max(DEFECT_SIGMAS, float(ndtri(1 - 0.5 * level / len(defects))))
+        limit = [
+            np.inf if d.sigma is None else np.linalg.norm(d.slope * d.sigma) for _, d in defects
+        ]
+        return {k: d.ratio for (k, d), x, y in zip(defects, size, limit) if x > sigmas * y}
+    scale = np.array([d.scale for _, d in defects])
+    flagged = {k: d.ratio for (k, d), x in zip(defects, size > DEFECT_TOLERANCE * scale) if x}
+    if len(defects) < 2 or not flagged or np.mean(size > GROSS * scale) >= 0.5:
         return flagged
-    noise = np.array([d.excess / np.linalg.norm(d.slope) for _, d in defects if d.slope.any()])
-    if len(noise) < 2:
-        return flagged
-    mean, error = noise.mean(), noise.std(ddof=1) / np.sqrt(len(noise))
-    chance = stdtr(len(noise) - 1, -mean / error if error else -np.inf * np.sign(mean))
-    return flagged if (chance if gains else 2 * min(chance, 1 - chance)) < DEFECT_LEVEL else {}
+    weight = np.array([1 / np.linalg.norm(d.slope) if d.slope.any() else 0.0 for _, d in defects])
+    excess = weight * [d.excess for _, d in defects]
+    shapes = [np.sign(weight), weight * [d.before for _, d in defects]]
+    chances = [_chance(excess[weight > 0], shape[weight > 0], gains) for shape in shapes]
+    return flagged if min(chances) < level / len(shapes) else {}
+
+
+def _chance(excess: np.ndarray, shape: np.ndarray, gains: bool) -> float:
+    """How often noise alone follows a shape as much: Student's t; 1 where it cannot be judged."""
+    squares, freedom = float(shape @ shape), len(excess) - 1
+    if freedom < 1 or squares == 0:
+        return 1.0
+    share = float(shape @ excess) / squares
+    rest = float(np.sum((excess - share * shape) ** 2))
+    error = np.sqrt(rest / freedom / squares)
+    t = share / error if error else np.inf * np.sign(share)
+    above = float(stdtr(freedom, -t))
+    return above if gains else 2 * min(above, 1 - above)
 
 
 def _listed(experiments: Experiments, ratios: dict[int, float]) -> str:

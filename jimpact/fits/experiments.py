@@ -16,6 +16,9 @@ from jimpact.bodies.base import CLOSED_BELOW, Body
 from jimpact.files.shots_file import ANGULAR, LINEAR, read_shots
 from jimpact.scene import WALLS, Scene, chain, dense_mass, stackable, with_gaps
 
+# Share of the momentum up to which a corrected shot counts as conserving it: rounding, also in
+# files of ten digits. Ten times more would take measured shots for corrected ones no more often.
+CONSERVED = 1e-9
 _RESOLUTION = operator.attrgetter("resolution")
 
 
@@ -126,23 +129,11 @@ class Experiments(eqx.Module):
 
     def scene_of(self, scene: Scene | None, shot: int) -> Scene:
         """The scene of one shot (counted from 0): its own, or else the given common one."""
-        if self.scenes is not None:
-            scene = self.scenes[shot]
-        if scene is None:
-            raise ValueError(
-                "Argument `scene` must be a Scene where the experiments carry none, but is None."
-            )
-        if scene.size != self.pre.shape[1]:
-            raise ValueError(
-                "Argument `experiments` must have one velocity per body of the scene: it has "
-                f"{self.pre.shape[1]} a shot, but the scene has {scene.size}."
-            )
-        return scene
+        return _scene_of(self, scene, shot)
 
     def largest_scene(self, scene: Scene | None) -> Scene:
         """The first of the scenes (or the given common scene) with the most contacts."""
-        scenes = [self.scene_of(scene, k) for k in range(len(self.shots))]
-        return max(scenes, key=lambda each: each.contacts)
+        return max(self.each(scene, lambda s: s), key=lambda each: each.contacts)
 
     def momentum_excess(self, scene: Scene | None = None) -> np.ndarray:
         """Momentum that the contacts cannot have changed, but the data did: (K, c) [N s].
@@ -181,8 +172,9 @@ class Experiments(eqx.Module):
 
         Equation: minimize `sum ((v+' - v+) / sigma)^2` subject to `C^T M (v+' - v-) = 0`
         (sigma = 1 where unknown). For equal masses in a chain: the mean excess is taken from each
-        component. Shots with missing values stay as they are. v- are taken as exact: `fit` warns
-        where they have a `sigma_pre`. `scene`: where shots carry none.
+        component. Shots with missing values stay as they are. v- stay as they were measured; where
+        they have a `sigma_pre`, `fit` passes it on through the correction. `scene`: where shots
+        carry none.
 
         >>> import jimpact as ji
         >>> data = ji.Experiments(pre=[1.0, 0.0], post=[0.2, 0.9])
@@ -190,14 +182,11 @@ class Experiments(eqx.Module):
         >>> [round(float(v), 6) for v in corrected.post[0]]
         [0.15, 0.85]
         """
-        post = np.array(self.post, dtype=float)
-        variance = np.ones_like(post) if self.sigma is None else np.asarray(self.sigma, float) ** 2
-        lost = list(self.lost)
+        post, lost = np.array(self.post, dtype=float), list(self.lost)
         for k, (m, pre, row) in enumerate(self.balances(scene)):
             if len(m) == 0 or np.isnan(row).any():
                 continue
-            weighted = variance[k][:, None] * m.T
-            post[k] -= weighted @ np.linalg.solve(m @ weighted, m @ (row - pre))
+            post[k] -= _smallest_change(self, k, m) @ (m @ (row - pre))
             lost[k] += len(m)
         return self._with(post=post, lost_freedom=lost)
 
@@ -264,8 +253,45 @@ class Experiments(eqx.Module):
     def each(self, scene: Scene | None, function: Callable[[Scene], Any]) -> list[Any]:
         """`function` of the scene of every shot; of a common one only once."""
         if self.scenes is None:
-            return [function(self.scene_of(scene, 0))] * len(self.shots)
-        return [function(self.scene_of(scene, k)) for k in range(len(self.shots))]
+            return [function(_scene_of(self, scene, 0))] * len(self.shots)
+        return [function(_scene_of(self, scene, k)) for k in range(len(self.shots))]
+
+
+def _scene_of(data: Experiments, scene: Scene | None, shot: int) -> Scene:
+    """`Experiments.scene_of`. Calling a method would go through all arrays of `data`."""
+    if data.scenes is not None:
+        scene = data.scenes[shot]
+    if scene is None:
+        raise ValueError(
+            "Argument `scene` must be a Scene where the experiments carry none, but is None."
+        )
+    if scene.size != data.pre.shape[1]:
+        raise ValueError(
+            "Argument `experiments` must have one velocity per body of the scene: it has "
+            f"{data.pre.shape[1]} a shot, but the scene has {scene.size}."
+        )
+    return scene
+
+
+def _smallest_change(data: Experiments, k: int, rows: np.ndarray) -> np.ndarray:
+    """The least change (n, c) of v+ of shot k, in sigmas, for momenta of rows (c, n)."""
+    n = rows.shape[1]
+    variance = np.ones(n) if data.sigma is None else np.asarray(data.sigma[k], float) ** 2
+    weighted = variance[:, None] * rows.T
+    return np.asarray(weighted @ np.linalg.inv(rows @ weighted))
+
+
+def kept_by_corrections(data: Experiments, scene: Scene | None) -> list[np.ndarray | None]:
+    """Of every shot the projector (n, n) by which its momentum was corrected; None: it was not.
+
+    Equation: `I - S m^T (m S m^T)^-1 m` with m = C^T M and S = diag(sigma^2).
+    """
+    kept: list[np.ndarray | None] = []
+    for k, (m, pre, post) in enumerate(data.balances(scene)):
+        rounding = CONSERVED * np.abs(m) @ (np.abs(pre) + np.abs(post))
+        corrected = 0 < len(m) <= data.lost[k] and (np.abs(m @ (post - pre)) <= rounding).all()
+        kept.append(np.eye(len(pre)) - _smallest_change(data, k, m) @ m if corrected else None)
+    return kept
 
 
 def _filled(rows: list[np.ndarray]) -> np.ndarray:

@@ -9,8 +9,9 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_choice
 from jimpact.files.records import listed
-from jimpact.fits.adequacy import stretch, unusable, weighted
+from jimpact.fits.adequacy import reproduced, stretch, unusable, weighted
 from jimpact.fits.experiments import Experiments
+from jimpact.fits.intervals import Profile
 from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Minimum, SearchResult, ends, search, settled
 from jimpact.fits.page import write_page
@@ -41,7 +42,10 @@ class Fit(FitResult[AnyLaw]):
 
     @property
     def verdict(self) -> str:
-        """The result in one sentence: the last one of `print(fit)`."""
+        """The result in one sentence that can be quoted: the first one of `print(fit)`.
+
+        Values with their errors, what they assume, and what speaks against them.
+        """
         return verdict(self)
 
     def report(self, path: str | Path, profiles: bool = True) -> Path:
@@ -52,7 +56,8 @@ class Fit(FitResult[AnyLaw]):
 
         Args:
             path: the file, ending in .html; an existing file is replaced.
-            profiles: compute the profile likelihoods, too, unless the fit has them; some seconds.
+            profiles: compute the profile likelihoods, too, unless the fit has them or shows lack
+                of fit; some seconds.
 
         Returns:
             The path.
@@ -100,9 +105,11 @@ def fit(
             Or a `FitProblem`, which holds the next three arguments and `bounds`.
         scene: the scene of all shots; ignored if each shot has its own scene.
         experiments: measured shots.
-        free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of
-            groups}: contacts with equal numbers share one value, 0 is fixed.
-        bounds: {field: (low, high)}; default [0, 1] for restitution, > 0 for stiffness, ...
+        free: names of fields or entries ('restitution[2]'), or {field: True, or a boolean mask over
+            contacts, or numbers of groups}: contacts with equal numbers share one value, 0 is
+            fixed.
+        bounds: {field or entry: (low, high)}; default [0, 1] for restitution, > 0 for
+            stiffness, ...
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
@@ -115,8 +122,8 @@ def fit(
         max_steps: iterations per start.
         profiles: whether intervals are those of `profile`; None: where standard errors cannot be
             trusted (at a bound, in a valley, with several minima, or for weakly determined
-            parameters), of up to 256 shots, with a single start of up to 64; else the report says
-            how to get them.
+            parameters) and the law fits, of up to 256 shots, with a single start of up to 64; else
+            the report says how to get them.
         progress: bar on stderr; None: on a terminal, for fits longer than two seconds.
 
     Returns:
@@ -166,10 +173,24 @@ def fit(
         problem, robust = robust_solution(problem, solution, loss, method, steps)
     result = replace(as_fit(problem, solution, method, robust), loss=loss, seed=seed)
     if profiles:
-        return replace(result, profiles=profile(result, progress=progress))
+        return _with_profiles(result, profile(result, progress=progress))
     if profiles is None and needs_profiles(result):
-        return replace(result, profiles=quick_profiles(result, progress))
+        return _with_profiles(result, quick_profiles(result, progress))
     return result
+
+
+def _with_profiles(result: Fit[AnyLaw], profiles: tuple[Profile, ...]) -> Fit[AnyLaw]:
+    """The fit with its profiles, and a warning if they found a lower minimum."""
+    if (better := profiles[0].better) is not None:
+        values = ", ".join(f"{name} {x:.4g}" for name, x in zip(result.names, better))
+        line = f"A profile found a lower minimum than the fit ({values}): allow more `starts`."
+        short = "a profile found a lower minimum"
+        result = replace(
+            result,
+            warnings=(*result.warnings, line),
+            reservations=(*result.reservations, short),
+        )
+    return replace(result, profiles=profiles)
 
 
 def _check_derivatives(problem: FitProblem, solution: SearchResult) -> None:
@@ -226,6 +247,7 @@ def as_fit(
         if times > 1:
             errors = _uncertainty(problem, solution, best, times)
     residual = np.asarray(problem.measured, float) - solution.predicted
+    findings = fit_warnings(problem, solution, errors, robust is not None)
     return Fit(
         law=with_entries(problem.law, problem.residuals.fields, solution.entries),
         method=method if isinstance(method, str) else "optax",
@@ -257,7 +279,8 @@ def as_fit(
         converged=solution.converged,
         steps=solution.steps,
         lost_starts=solution.lost,
-        warnings=tuple(fit_warnings(problem, solution, errors, robust is not None)),
+        warnings=tuple(found.line for found in findings),
+        reservations=tuple(found.reservation for found in findings if found.reservation),
         problem=problem,
         jacobian=_jacobian(problem, solution),
     )
@@ -284,10 +307,15 @@ def _jacobian(problem: FitProblem, solution: SearchResult) -> np.ndarray:
 def _uncertainty(
     problem: FitProblem, solution: SearchResult, minimum: Minimum, noise: float | None = None
 ) -> Uncertainty:
-    """Linearized errors at a minimum; noise: None: as stated, or of its residuals."""
+    """Linearized errors at a minimum; noise: None: as stated, or of its residuals.
+
+    Data without sigma that are reproduced to the last digit do not show their noise.
+    """
     size = problem.size
     if noise is None and problem.sigma is not None:
         noise = 1.0
+    elif noise is None and reproduced(problem, minimum):
+        noise = np.nan
     return uncertainty(
         names=problem.names,
         jacobian=size * minimum.jacobian,

@@ -41,7 +41,7 @@ def write_page(fit: FitResult, path: Path, profiles: bool) -> Path:
     """Write `Fit.report`."""
     if path.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"Argument `path` must end in .html, but is '{path}'.")
-    if profiles and not fit.profiles and fit.can_be_profiled:
+    if profiles and not fit.profiles and fit.can_be_profiled and not fit.shows_lack_of_fit:
         fit = replace(fit, profiles=profile(fit))
     text = page(fit)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import quick_jit
-from jimpact.fits.experiments import Experiments
+from jimpact.fits.experiments import Experiments, kept_by_corrections
 from jimpact.fits.least_squares import BoxRegion, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import (
@@ -160,7 +160,8 @@ class FitProblem:
 
     Errors S of v- are passed on: with `J = dv+/dv-` of the law, those of a shot have the covariance
     `C = diag(sigma^2) + J S J^T`, and its residual is multiplied by the inverse of the Cholesky
-    factor of C (J of the start; `fit` takes J of the law it finds).
+    factor of C (J of the start; `fit` takes J of the law it finds). Of shots whose momentum was
+    corrected, `post - K m (post - pre)`, the residual has `(I - K m) J` in the place of J.
 
     Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where no
     value was), `sigma`, `experiments` and `scene` or None, how many independent `values`
@@ -240,6 +241,9 @@ class FitProblem:
         count, n = self.measured.shape
         slope = slopes_before(law, filled_up(r).observe)[:count]
         slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
+        for k, kept in enumerate(kept_by_corrections(data, self.scene)):
+            if kept is not None:  # a residual that conserves momentum shows that part of the errors
+                slope[k] = kept @ slope[k]
         here = ~np.isnan(self.measured)
         before = slope * np.asarray(data.sigma_pre, float)[:, None, :]
         variance = np.where(here, np.asarray(data.sigma, float), 1.0) ** 2

@@ -6,13 +6,14 @@ several pieces.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from jimpact._checks import as_whole, check_choice
 from jimpact.fits.intervals import Profile, check_level
-from jimpact.fits.least_squares import DEFAULT_STEPS
+from jimpact.fits.least_squares import DEFAULT_STEPS, SolverState
 from jimpact.fits.problem import FEW
 from jimpact.fits.result import FitResult
 from jimpact.fits.scaled import ScaledFit, check_profiled, with_entry
@@ -76,7 +77,7 @@ def profile(
         scans = _Scans(fit, [fit.names.index(name) for name in wanted], level, show)
         scans.scan(points, FAR, whole=True)
         scans.follow_valleys()
-        scans.find_ends()
+        scans.finish(FAR)
     return tuple(scans.profile(i) for i in scans.which)
 
 
@@ -85,7 +86,7 @@ def quick_profiles(fit: FitResult, progress: float | None) -> tuple[Profile, ...
     with progress_bar(progress) as show:
         scans = _Scans(fit, range(len(fit.names)), QUICK_LEVEL, show)
         scans.scan(QUICK_POINTS, 1.0)
-        scans.find_ends()
+        scans.finish(1.0)
     return tuple(scans.profile(i) for i in scans.which)
 
 
@@ -104,7 +105,8 @@ class _Scans(ScaledFit):
             y = self.problem.point(start.value)
             for i in which:
                 self.solved[i].setdefault(float(y[i]), (start.sum_of_squares, y))
-        self.lower: np.ndarray | None = None
+        self.lower: np.ndarray | None = None  # a point below the minimum of the fit
+        self.grid: dict[int, np.ndarray] = {}  # values to hold
         self.rough: set[tuple[int, float]] = set()  # what was not solved to its end
 
     def minima(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -139,6 +141,7 @@ class _Scans(ScaledFit):
                 parts.append(self.near(i, y, float(error[i])))
                 fronts += [_Front(i, step, y) for step in (-1, 1)]
             values[i] = np.unique(np.concatenate(parts))
+        self.grid = values
         alone = len(self.fit.names) == 1  # no other parameter to solve for
         if not (whole and alone):
             self.advance(fronts, values, far * self.limit)
@@ -194,8 +197,14 @@ class _Scans(ScaledFit):
         all_ends = (end for solved in self.solved.values() for end in solved.values())
         best = min(all_ends, key=_squares)
         if best[0] < self.least * (1 - SAME) - self.problem.exact_squares:
-            self.least, self.lower = best
+            self._lower(*best)
         return ends
+
+    def _lower(self, squares: float, y: np.ndarray) -> None:
+        """A point below all others: all parameters get it, whichever's scan found it."""
+        self.least, self.lower = squares, y
+        for i in self.which:
+            self.solved[i][float(y[i])] = (squares, y)
 
     def _nearest(self, i: int, y: float) -> np.ndarray:
         """The minimum with the fixed value that is nearest to y."""
@@ -229,16 +238,57 @@ class _Scans(ScaledFit):
         fronts: list[_Front] = []
         near: dict[int, np.ndarray] = {}
         for k, (i, _) in enumerate(starts):
-            jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
-            inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
-            error = np.sqrt(self.variance * inverse[i, i])
             y = np.asarray(states.y[k], float)
             if self.deviance_of(squares[k]) <= self.limit:
                 self.solved[i].setdefault(float(y[i]), (float(squares[k]), y))
-                more = self.near(i, y, float(error))
+                more = self.near(i, y, self._error(i, states, k))
                 near[i] = np.unique(np.concatenate([near.get(i, np.zeros(0)), more]))
                 fronts += [_Front(i, step, y) for step in (-1, 1)]
         self.advance(fronts, near, np.inf)
+
+    def _error(self, i: int, states: SolverState, k: int) -> float:
+        """Scaled standard error of the i-th parameter at the k-th of these ends."""
+        jacobian = np.asarray(states.jacobian[k], float)[:, : len(self.fit.names)]
+        inverse = np.linalg.pinv(self.size**2 * jacobian.T @ jacobian)
+        return float(np.sqrt(self.variance * inverse[i, i]))
+
+    def finish(self, far: float) -> None:
+        """The ends of the intervals, and what lies around a minimum below that of the fit."""
+        followed = None
+        for _ in range(ROUNDS):
+            if self.lower is not None and self.lower is not followed:
+                self._scan_from_lower(far)
+                followed = self.lower
+            self.find_ends()
+            if not self.fill_holes() and self.lower is followed:
+                return
+
+    def _scan_from_lower(self, far: float) -> None:
+        """Scan all parameters from the minimum that a scan of one of them has led to."""
+        assert self.lower is not None
+        squares, states = self.minimize([((), self.lower)], self.show)
+        if squares[0] < self.least:
+            self._lower(float(squares[0]), np.asarray(states.y[0], float))
+        fronts, values = [], {}
+        for i in self.which:
+            near = self.near(i, self.lower, self._error(i, states, 0))
+            values[i] = np.unique(np.concatenate([self.grid[i], near]))
+            fronts += [_Front(i, step, self.lower) for step in (-1, 1)]
+        self.advance(fronts, values, far * self.limit)
+
+    def fill_holes(self) -> bool:
+        """Try again between two pieces, from straight lines: whether a hole was an artefact."""
+        trials = []
+        for i in self.which:
+            values, d = self.deviance(i)
+            inside = np.flatnonzero(d <= self.limit)
+            for a, b in pairwise(inside):
+                start, end = (self.solved[i][values[k]][1] for k in (a, b))
+                for value in values[a + 1 : b]:
+                    share = (value - values[a]) / (values[b] - values[a])
+                    trials.append((i, with_entry(start + share * (end - start), i, value)))
+        ends = self._solve(trials)
+        return any(self.deviance_of(squares) <= self.limit for squares, _ in ends)
 
     def find_ends(self) -> None:
         """Where deviances pass the limit: regula falsi in their roots, all ends side by side."""
@@ -314,10 +364,13 @@ class _Front(NamedTuple):
 
 
 def needs_profiles(fit: FitResult) -> bool:
-    """Whether standard errors may mislead, and profiles cost no more than the fit did."""
+    """Whether standard errors may mislead, and profiles cost no more than the fit did.
+
+    Not after lack of fit: no interval of such a law means anything, and its valleys are rough.
+    """
     most = FEW if fit.start_count == 1 else MANY
     few = fit.experiments is not None and len(fit.predicted) <= most
-    return few and fit.linearization_misleads
+    return few and fit.linearization_misleads and not fit.shows_lack_of_fit
 
 
 def _squares(end: tuple[float, np.ndarray]) -> float:

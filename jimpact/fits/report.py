@@ -1,9 +1,11 @@
-"""A fit as text: parameters with errors, quality, minima, warnings, shots and a verdict."""
+"""A fit as text: a verdict, parameters with errors, quality, minima, warnings and shots."""
 
 import numpy as np
 
 from jimpact.files.records import with_error
+from jimpact.fits.findings import joined_words
 from jimpact.fits.intervals import in_words
+from jimpact.fits.parameters import value_of
 from jimpact.fits.result import FitResult
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.status import STATUS
@@ -11,6 +13,8 @@ from jimpact.status import STATUS
 _VELOCITIES_SHOWN = 24  # in the table of shots
 _MINIMA_SHOWN = 5  # in the list of minima, the lowest first
 _PARAMETERS_NAMED = 6  # in one sentence; of more, the least certain
+OF_A_CONTACT = ("restitution", "friction", "tangential_restitution")  # each may have its own
+UNSEEN = "a start: the data do not determine it"  # note on a value in brackets
 
 
 def report(fit: FitResult) -> str:
@@ -21,6 +25,7 @@ def report(fit: FitResult) -> str:
 def report_blocks(fit: FitResult) -> dict[str, list[str]]:
     """The lines of the report, block by block."""
     return {
+        "verdict": [verdict(fit)],
         "headline": [_headline(fit)],
         "parameters": _parameters(fit),
         "quality": _quality(fit),
@@ -29,44 +34,85 @@ def report_blocks(fit: FitResult) -> dict[str, list[str]]:
         "scatter": _scatter(fit),
         "warnings": _section("Warnings", fit.warnings),
         "shots": _shots(fit),
-        "verdict": [verdict(fit)],
     }
 
 
 def verdict(fit: FitResult) -> str:
-    """One sentence: the values with their errors, what is undetermined, whether to believe it."""
+    """One sentence: values with errors, what they assume, what is undetermined, what is wrong."""
     law, data = type(fit.law).__name__, _data_name(fit)
     if not fit.converged:
         return f"No answer: the search for the parameters of {law} has not converged."
-    determined = [i for i in range(len(fit.names)) if _is_determined(fit, i)]
-    others = [_full_name(fit, i) for i in range(len(fit.names)) if i not in determined]
-    parts = [_with_error(fit, i) for i in determined]
+    scatter, reserved = shown_scatter(fit), joined_words(fit.reservations)
+    if scatter is not None and scatter.explains:
+        text = f"{law} fits {data} if {scatter}".rstrip(".")
+        return f"{text}; but {reserved}." if reserved else f"{text}."
+    sentence = _values_in_words(fit)
+    if scatter is not None:
+        sentence += f"; {scatter.name} scatters by {scatter.value:.2g} from shot to shot"
+    against = _objection(fit)
+    if against:
+        nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence
+        sentence = f"{law} {against}; {nearest}"
+    if reserved:
+        sentence += f"; {'and' if against else 'but'} {reserved}"
+    return f"{sentence}."
+
+
+def _values_in_words(fit: FitResult) -> str:
+    """Values with their errors, what they assume, and what the data do not determine."""
+    seen, data = fit.determined, _data_name(fit)
+    determined = np.flatnonzero(seen)
+    others = [_full_name(fit, int(i)) for i in np.flatnonzero(~seen)]
+    parts = [_with_error(fit, int(i)) for i in determined]
     if len(determined) > _PARAMETERS_NAMED:
         worst = determined[int(np.argmax(np.nan_to_num(fit.standard_error[determined])))]
-        least_certain = _with_error(fit, worst)
+        least_certain = _with_error(fit, int(worst))
         parts = [f"{len(determined)} parameters are fitted, the least certain {least_certain}"]
+    assumed = _assumptions(fit)
+    if parts and assumed:
+        parts[-1] += f", assuming {joined_words(assumed)}"
     if others:
         parts.append(f"{' and '.join(others)} cannot be determined from {data}")
     if any("different minima fit equally well" in line for line in fit.warnings):
         parts.append("other values fit equally well")
-    sentence = "; ".join(parts)
-    scatter = shown_scatter(fit)
-    if scatter is not None and scatter.explains:
-        return f"{law} fits {data} if {scatter}"
-    if scatter is not None:
-        sentence += f"; {scatter.name} scatters by {scatter.value:.2g} from shot to shot"
-    nearest = f"it comes nearest with {sentence}" if determined else sentence
+    return "; ".join(parts)
+
+
+def _objection(fit: FitResult) -> str:
+    """Why the law is not one for these data; an empty text if nothing speaks against it."""
+    data = _data_name(fit)
     if fit.shows_lack_of_fit:
-        return f"{law} does not fit {data}; {nearest}."
-    if any(line.startswith("The fitted law fails") for line in fit.warnings):
-        return f"{law} fails in some of these {'shots' if fit.experiments else 'data'}; {nearest}."
-    return f"{sentence}."
+        return f"does not fit {data}"
+    if not any(line.startswith("The fitted law fails") for line in fit.warnings):
+        return ""
+    if fit.experiments is None:
+        lost = ~np.isfinite(fit.predicted[np.isfinite(fit.problem.measured)])
+        return f"fails in {'all' if lost.all() else 'some'} of these data"
+    failing = sum(STATUS[int(code)].failure for code in fit.status)
+    if failing == len(fit.status):
+        return f"fails in {'this shot' if failing == 1 else f'all of {data}'}"
+    return f"fails in {failing} of {data}"
 
 
-def _is_determined(fit: FitResult, i: int) -> bool:
-    """Whether the data say anything about a parameter."""
-    anything = bool(fit.profiles) and fit.profiles[i].words == "anything"
-    return not (np.isinf(fit.standard_error[i]) or anything)
+def _assumptions(fit: FitResult) -> list[str]:
+    """What is taken for granted of several contacts: common values, stiffnesses, exponents."""
+    if fit.experiments is None:
+        return []
+    law, fitted = fit.problem.law, set(fit.problem.parameters.fields)
+    contacts = fit.experiments.largest_scene(fit.problem.scene).contacts
+    if contacts < 2:
+        return []
+    each = f"{'both' if contacts == 2 else f'all {contacts}'} contacts"
+    assumed = [f"one {name} for {each}" for name in fit.names if name in OF_A_CONTACT]
+    for name, words in (("stiffness", "equal stiffnesses"), ("exponent", "the exponent {:g}")):
+        value = value_of(law, name)
+        if value is None or name in fitted:
+            continue
+        values = np.unique(np.asarray(value, float))
+        known = {1.5: " (Hertz)", 1.0: " (linear)"}.get(values[0], "") if name == "exponent" else ""
+        same = words.format(values[0]) + known
+        assumed.append(same if len(values) == 1 else f"the {name} of each contact")
+    return assumed
 
 
 def _data_name(fit: FitResult) -> str:
@@ -112,7 +158,7 @@ def _headline(fit: FitResult) -> str:
 
 def parameter_rows(fit: FitResult) -> list[list[str]]:
     """Name, value, standard error, 95 % interval, remark of every parameter."""
-    rows = []
+    rows, seen = [], fit.determined
     for i, pieces in enumerate(fit.intervals()):
         error = fit.standard_error[i]
         if np.isinf(error):
@@ -123,8 +169,22 @@ def parameter_rows(fit: FitResult) -> list[list[str]]:
         if np.isfinite(error) or fit.profiles:
             interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
         note = "at its bound" if fit.at_bound[i] else ""
-        rows.append([fit.names[i], f"{fit.value[i]:.6g}", error_text, interval, note])
+        note = note if seen[i] else UNSEEN
+        rows.append(
+            [fit.names[i], marked(fit.value[i], seen[i], ".6g"), error_text, interval, note]
+        )
     return rows
+
+
+def marked(value: float, seen: bool, digits: str) -> str:
+    """A value of a table, in brackets where the data do not determine it."""
+    return f"{value:{digits}}" if seen else f"({value:{digits}})"
+
+
+def named_values(fit: FitResult, values: np.ndarray) -> str:
+    """Names and values (P,) of the parameters, in brackets what the data do not determine."""
+    cells = zip(fit.names, values, fit.determined)
+    return ", ".join(f"{name} {marked(value, seen, '.4g')}" for name, value, seen in cells)
 
 
 def _parameters(fit: FitResult) -> list[str]:
@@ -215,7 +275,7 @@ def _minima(fit: FitResult) -> list[str]:
         where = f"{len(fit.starts)} points of one valley"
     lines = [f"{total} starts ended in {where}:  sum of squares, number of starts, values"]
     for minimum in fit.starts[:_MINIMA_SHOWN]:
-        values = ", ".join(f"{name} {v:.4g}" for name, v in zip(fit.names, minimum.value))
+        values = named_values(fit, minimum.value)
         lines.append(f"  {minimum.sum_of_squares:12.5g} {minimum.count:4d}   {values}")
     if len(fit.starts) > _MINIMA_SHOWN:
         lines.append(f"  ... and {len(fit.starts) - _MINIMA_SHOWN} more")

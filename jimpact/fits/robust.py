@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jimpact.fits.adequacy import MEDIAN
 from jimpact.fits.least_squares import Method
 from jimpact.fits.multistart import SearchResult, search_near
 from jimpact.fits.problem import FitProblem
 
 HUBER = 1.345  # sigmas up to which a residual counts squared: 95 % of the efficiency
 STUDENT = 4.0  # degrees of freedom of the tails
-MEDIAN = 1.4826  # sigma of a normal distribution over the median of its absolute values
 ROUNDS = 50  # of weights
 SAME = 1e-7  # in natural scales of the parameters: the weights have settled
 

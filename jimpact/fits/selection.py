@@ -17,6 +17,7 @@ from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.parameters import OF_SPEED, default_free
 from jimpact.fits.problem import FEW
 from jimpact.fits.profiles import needs_profiles, profile
+from jimpact.fits.report import named_values
 from jimpact.fits.result import check_squares
 from jimpact.law import Law, free_parameters_of, with_parameter
 from jimpact.laws.velocity_dependent import VelocityDependent
@@ -121,16 +122,18 @@ class LawFits:
         heads = ["law", "free", "rms", "left out", "AICc", "verdict", "values"]
         rows = []
         for name, x in self.entries.items():
-            values = ", ".join(f"{v:.4g}" for v in x.fit.value)
+            values = named_values(x.fit, x.fit.value)
             numbers = [number(x.fit.rms, ".4g"), number(x.left_out_error, ".4g")]
             aicc = number(x.aicc, ".1f")
             rows.append([name, str(x.parameters), *numbers, aicc, x.verdict, values])
         lines = table(heads, rows, left=["verdict", "values"])
         lines.append("rms and error of shots left out in m/s; simplest adequate law first.")
+        if not all(x.fit.determined.all() for x in self.entries.values()):
+            lines.append("Values in brackets are starts, which the data do not determine.")
         lines += [f"{name} is left out: it {reason}" for name, reason in self.left_out.items()]
         if self.speed is not None:
             lines.append(f"Restitution that depends on the speed ({self.best.name}): {self.speed}")
-        return "\n".join([*lines, self.verdict])
+        return "\n".join([self.verdict, "", *lines])
 
 
 class NestedTest(NamedTuple):
@@ -268,7 +271,7 @@ def fit_laws(
     ('newton', True)
     """
     check_kind("data", data, Experiments)
-    scenes = [data.scene_of(scene, k) for k in range(len(data.shots))]
+    scenes = data.each(scene, lambda s: s)
     candidates, left_out = _candidates(scenes, laws, dict(values), tuple(free))
     fits: dict[str, Fit] = {}
     options: dict[str, Any] = {"starts": starts, "seed": seed, "progress": False}
@@ -519,16 +522,13 @@ def _left_out_rms(result: Fit, error: np.ndarray) -> float:
 def _aicc(result: Fit) -> float:
     """Akaike's criterion; with unknown noise corrected for few data; NaN if meaningless."""
     n, count = result.problem.values, len(result.names)
-    squares = result.starts[0].sum_of_squares
     whole = result.rank == count and not result.at_bound.any() and not result.problem.left_out
     if not whole or not result.converged:
         return np.nan
     if result.problem.sigma is not None:
-        return squares + 2 * count
+        return result.aic
     k = count + 1  # and the noise
-    if n - k - 1 < 1 or squares <= result.problem.exact_squares:
-        return np.nan
-    return float(n * np.log(squares / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
+    return result.aic + 2 * k * (k + 1) / (n - k - 1) if n - k - 1 >= 1 else np.nan
 
 
 def _speed_test(

@@ -21,7 +21,7 @@ def needed(module: str, how: str) -> ModuleType:
 
 
 def parameters_frame(fit: FitResult) -> Any:
-    """A row a parameter: value, standard error, the ends of its 95 % interval, at its bound."""
+    """A row a parameter: value, standard error, ends of its 95 % interval, at its bound, seen."""
     interval = fit.confidence_interval()
     columns = {
         "value": fit.value,
@@ -29,6 +29,7 @@ def parameters_frame(fit: FitResult) -> Any:
         "low_95": interval[:, 0],
         "high_95": interval[:, 1],
         "at_bound": fit.at_bound,
+        "determined": fit.determined,
     }
     index = list(fit.names)
     return needed("pandas", "pip install pandas").DataFrame(columns, index=index)
@@ -40,6 +41,7 @@ def dataset(fit: FitResult) -> Any:
     arrays: dict[str, Any] = {
         "value": ("parameter", fit.value),
         "standard_error": ("parameter", fit.standard_error),
+        "determined": ("parameter", fit.determined),
         "covariance": (pair, fit.covariance),
         "correlation": (pair, fit.correlation),
     }
@@ -72,7 +74,7 @@ def as_dict(fit: FitResult) -> dict[str, Any]:
             "standard_error": as_data(fit.standard_error[i]),
             "confidence_interval_95": as_data(interval[i]),
             "at_bound": bool(fit.at_bound[i]),
-            "seen": bool(not np.isinf(fit.standard_error[i])),
+            "seen": bool(fit.determined[i]),
             "profile_95": as_data(fit.profiles[i].intervals) if fit.profiles else None,
         }
         for i, name in enumerate(fit.names)
@@ -92,6 +94,7 @@ def as_dict(fit: FitResult) -> dict[str, Any]:
         "identifiability": list(fit.identifiability),
         "warnings": list(fit.warnings),
         "verdict": verdict(fit),
+        "reservations": list(fit.reservations),
         "seed": fit.seed,
         "converged": fit.converged,
         "covariance": as_data(fit.covariance),

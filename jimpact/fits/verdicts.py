@@ -3,8 +3,10 @@
 import numpy as np
 
 from jimpact.files.records import listed
-from jimpact.fits.adequacy import adequacy
-from jimpact.fits.defects import data_defects
+from jimpact.fits.adequacy import adequacy, reproduced
+from jimpact.fits.defects import find_defects
+from jimpact.fits.experiments import kept_by_corrections
+from jimpact.fits.findings import Finding
 from jimpact.fits.matrix_fit import boundary, encloses
 from jimpact.fits.multistart import SearchResult
 from jimpact.fits.problem import EXACT, FitProblem
@@ -19,18 +21,15 @@ EQUALLY_GOOD = 1.0
 
 def fit_warnings(
     problem: FitProblem, solution: SearchResult, errors: Uncertainty, robust: bool
-) -> list[str]:
+) -> list[Finding]:
     """All warnings, those about the data first."""
-    lines, data = list(problem.left_out), problem.experiments
+    data, found = problem.experiments, [Finding(line, _left_out(line)) for line in problem.left_out]
     if data is not None:
         contacts = data.largest_scene(problem.scene).contacts
         stored = float(np.sum(np.broadcast_to(np.asarray(problem.law.stored), contacts)))
-        lines += data_defects(data, problem.scene, stored)
-        if data.lost_freedom and data.sigma_pre is not None:
-            lines.append(
-                "The momentum was corrected as if `sigma_pre` were 0, and the fit weighs the shots "
-                "as if they were not corrected: chi^2 and standard errors are approximate."
-            )
+        found += find_defects(data, problem.scene, stored)
+        found += map(Finding, _unknown_corrections(problem))
+    lines: list[str] = []
     if not solution.converged:
         lines.append(
             "The fit has not converged: allow more `max_steps` or `starts` (or the minimum sits on "
@@ -40,7 +39,14 @@ def fit_warnings(
         lines += _statuses(solution.status, data.shots)
         lines += _matrix(problem, solution, contacts)
     lines += _not_finite(problem, solution)
-    lines += adequacy(problem, solution, errors.rank, robust)
+    found += map(Finding, lines)
+    found += adequacy(problem, solution, errors.rank, robust)
+    return [*found, *map(Finding, _of_parameters(problem, solution, errors))]
+
+
+def _of_parameters(problem: FitProblem, solution: SearchResult, errors: Uncertainty) -> list[str]:
+    """What the data do not tell about the parameters and their errors."""
+    lines, data = [], problem.experiments
     if data is not None and problem.sigma is None and len(set(data.units)) > 1:
         lines.append(
             "Without sigma, velocities in rad/s weigh like those in m/s of the same kinetic energy."
@@ -61,12 +67,39 @@ def fit_warnings(
         lines.append(
             "No degree of freedom is left to estimate the noise: errors are unknown without sigma."
         )
+    elif problem.sigma is None and reproduced(problem, solution.minima[0]):
+        lines.append(
+            "The data are reproduced to the last digit and do not show their noise: errors are "
+            "unknown without `sigma` or `resolution`."
+        )
     if problem.precision == "float32":
         lines.append(
             "Computed in float32: values are good to about 1e-3, and the rank is judged coarsely. "
             'jax.config.update("jax_enable_x64", True) gives float64.'
         )
     return lines
+
+
+def _left_out(line: str) -> str:
+    """Of a line on shots that are left out, what a quoted value has to say."""
+    return f"{line.removeprefix('Left out: ').split(' (')[0]} are left out"
+
+
+def _unknown_corrections(problem: FitProblem) -> list[str]:
+    """Shots with `sigma_pre` and a correction that is not that of momentum."""
+    data = problem.experiments
+    assert data is not None
+    if data.sigma_pre is None:
+        return []
+    kept = kept_by_corrections(data, problem.scene)
+    unknown = [data.shots[k] for k, one in enumerate(kept) if data.lost[k] and one is None]
+    if not unknown:
+        return []
+    return [
+        f"The fit weighs shots {listed(unknown)} as if they were not corrected: they have "
+        "`lost_freedom`, but do not conserve momentum, so that the errors that `sigma_pre` leaves "
+        "in them are unknown; chi^2 and standard errors are approximate."
+    ]
 
 
 def _statuses(status: np.ndarray, shots: tuple[str, ...]) -> list[str]:

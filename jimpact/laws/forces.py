@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from jimpact._checks import as_float_array
 from jimpact.law import LARGEST_EXPONENT, Declared, StaticOrValues, Values, parameter
+from jimpact.loops import fori_loop
 
 _SEARCH = (-60.0, 60.0)  # decades [m] in which the indentation scale of a force is searched
 _BISECTIONS = 50  # halvings of these decades, to about 1e-13 of one
@@ -79,7 +80,7 @@ class Force(Declared):
             above = excess(middle) > 0
             return jnp.where(above, ends[0], middle), jnp.where(above, middle, ends[1])
 
-        low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, (low, high))
+        low, high = fori_loop(0, _BISECTIONS, halve, (low, high))
         return jax.lax.stop_gradient(10.0 ** (0.5 * (low + high)))
 
 

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_kind
-from jimpact.compiling import varying_like
 from jimpact.contact import Contact
 from jimpact.events.impact_dynamics import Dynamics
 from jimpact.law import (
@@ -20,6 +19,7 @@ from jimpact.law import (
     parameter,
     with_parameter,
 )
+from jimpact.loops import while_loop
 from jimpact.registry import REGISTRY
 from jimpact.solvers.tridiagonal import as_matrix, diagonal
 
@@ -150,8 +150,8 @@ def approach_speed(contact: Contact) -> jax.Array:
         faster = known[other] > known[leader]
         return jnp.where(faster, other, leader), jnp.any(faster)
 
-    first = varying_like((jnp.arange(len(speed)), jnp.asarray(True)), joined, known)
-    leader, _ = jax.lax.while_loop(lambda state: state[1], passed_on, first)
+    first = jnp.arange(len(speed)), jnp.asarray(True)
+    leader, _ = while_loop(lambda state: state[1], passed_on, first)
     return speed[leader]
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.compiling import varying_like
+from jimpact.loops import while_loop
 from jimpact.solvers.friction import solve as solve_friction
 from jimpact.solvers.sensitivity import both_modes
 from jimpact.solvers.tangential import TangentialBlock, per_tangent
@@ -159,8 +159,7 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
         """Whether there is a collision to come, and the limit is not reached."""
         return ~endless & approaches(inputs, at) & (at.number < options.max_collisions)
 
-    start = varying_like(start, inputs, g)
-    end = jax.lax.while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
+    end = while_loop(unfinished, lambda at: collide(inputs, options, g, at), start)
     stopped = ~endless & approaches(inputs, end)
     if not pair:
         slow = end.speed < DECAYED.get(str(end.qn.dtype), 3e-4) * scale_of(inputs)

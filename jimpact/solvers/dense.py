@@ -24,6 +24,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.loops import fori_loop
+
 # Rows up to which one system is solved by the loop, not by LAPACK: in a batch that is three to six
 # times as fast. With ten times more the cubic cost of many contacts would not be blocked.
 _BY_LOOP = 4
@@ -88,7 +90,7 @@ def solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
         factor = jax.lax.dynamic_index_in_dim(rows, k, 1)
         return jnp.where(number == k, row, rows - factor * row)
 
-    return jax.lax.fori_loop(0, n, eliminate, jnp.concatenate([matrix, right], axis=1))[:, n:]
+    return fori_loop(0, n, eliminate, jnp.concatenate([matrix, right], axis=1))[:, n:]
 
 
 def _solve_two(matrix: jax.Array, right: jax.Array) -> jax.Array:
@@ -131,7 +133,7 @@ def block_inverse(matrix: jax.Array) -> jax.Array:
         spread = jnp.sum(column[:, :, :, None, None] * row[None, None], axis=2)
         return jnp.where(replaced, 0.0, inverse) - spread
 
-    return jax.lax.fori_loop(0, m, eliminate, matrix)
+    return fori_loop(0, m, eliminate, matrix)
 
 
 def _small_inverse(block: jax.Array, perturbation: float) -> jax.Array:

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.loops import fori_loop, while_loop
 from jimpact.solvers.dense import SINGULAR, block_inverse, load_shares, times
 from jimpact.solvers.lcp import gathered_rounding, solve_lcp
 from jimpact.status import CODE
@@ -288,7 +289,7 @@ def _solved(problem: _FrictionProblem, modes: _Modes) -> jax.Array:
         """One refinement by the approximate inverse."""
         return x + _times(inverse, right - _times(matrix, x))
 
-    return jax.lax.fori_loop(0, 3, refine, jnp.zeros_like(right))
+    return fori_loop(0, 3, refine, jnp.zeros_like(right))
 
 
 # ------------------------------------------------------------------- the decision
@@ -358,7 +359,7 @@ def _newton(problem: _FrictionProblem, modes: _Modes) -> tuple[_Modes, jax.Array
         return _turned(problem, state[0], x), x
 
     none = jnp.zeros((*problem.rate.shape, modes.taking.shape[1]), problem.matrix.dtype)
-    return jax.lax.fori_loop(0, _ITERATIONS, step, (modes, none))
+    return fori_loop(0, _ITERATIONS, step, (modes, none))
 
 
 def _at_rest(problem: _FrictionProblem, x: jax.Array, margin: jax.Array) -> _Modes:
@@ -447,7 +448,7 @@ def _on_modes(
         missed = matrix.reshape(n, n) @ x.reshape(n) - right.reshape(n) + free
         return y - inverted.inverse @ missed
 
-    return (weight * jax.lax.fori_loop(0, 3, step, start)).reshape(shape)
+    return (weight * fori_loop(0, 3, step, start)).reshape(shape)
 
 
 # ------------------------------------------------------------------- many contacts
@@ -490,7 +491,7 @@ def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
     first = jnp.asarray(-1 if started else 0)
     blank = _at_rest(problem, x, jnp.zeros((), x.dtype))
     none = code == CODE["infeasible"]
-    end = jax.lax.while_loop(
+    end = while_loop(
         lambda s: ~s.done & ~none & (s.level < _LEVELS),
         refine,
         _Searched(x, blank, jnp.asarray(False), first),
@@ -555,11 +556,11 @@ def _sweeps(
     def sweep(state: State) -> State:
         """All contacts once."""
         x, _, count = state
-        new = jax.lax.fori_loop(0, m, contact, x)
+        new = fori_loop(0, m, contact, x)
         return new, jnp.abs(new - x).max(), count + 1
 
     change = jnp.where(skip, 0.0, jnp.inf).astype(x.dtype)
-    return jax.lax.while_loop(going, sweep, (x, change, jnp.asarray(0)))[0]
+    return while_loop(going, sweep, (x, change, jnp.asarray(0)))[0]
 
 
 # ------------------------------------------------------------------- known normal forces
@@ -639,8 +640,8 @@ def _relaxed(matrix: jax.Array, rate: jax.Array, limit: jax.Array) -> jax.Array:
     def sweep(state: State) -> State:
         """All contacts once."""
         before, _, count = state
-        force = jax.lax.fori_loop(0, m, relax, before)
+        force = fori_loop(0, m, relax, before)
         return force, jnp.any(jnp.abs(force - before) > least), count + 1
 
     start = (jnp.zeros_like(rate), jnp.any(limit > 0), jnp.asarray(0))
-    return jax.lax.while_loop(lambda s: s[1] & (s[2] < _RELAXATIONS), sweep, start)[0]
+    return while_loop(lambda s: s[1] & (s[2] < _RELAXATIONS), sweep, start)[0]

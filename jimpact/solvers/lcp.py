@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.compiling import varying_like
+from jimpact.loops import while_loop
 from jimpact.solvers.dense import null_projector
 from jimpact.status import CODE
 
@@ -136,7 +136,7 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
         chosen = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
         return chosen._replace(ray=ray)
 
-    end = jax.lax.while_loop(going, one, varying_like(first, first, tolerance))
+    end = while_loop(going, one, first)
     number = jnp.arange(m)
     support = needed & jnp.any(end.basis[:, None] == (m + number)[None, :], axis=0)
     left = jnp.max(jnp.where(end.basis == artificial, end.rows[:, -1], 0.0))

@@ -17,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.loops import while_loop
+
 # Factors of the inverse step size, the estimate of the largest eigenvalue: where a step shows that
 # it is too small, and at the beginning of the next problem. Further from 1: short steps, or steps
 # taken back.
@@ -107,7 +109,7 @@ def solve_many(
     unit = jnp.ones((), x.dtype)
     inverse_step_size = jnp.maximum(RELAX * inverse_step_size, unit)
     begin = _At(x, ax, x, ax, unit, inverse_step_size, x, jnp.inf * unit, jnp.int32(0))
-    end = jax.lax.while_loop(going, iterate, begin)
+    end = while_loop(going, iterate, begin)
     relative = end.misfit / jnp.where(size > 0, size, 1.0)
     residual = end.misfit * jnp.sqrt(jnp.max(diagonal))
     return Many(end.best * scale, relative, residual, end.tries, end.inverse_step_size)

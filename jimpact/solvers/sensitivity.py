@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
-from jimpact.compiling import varying_like
+from jimpact.loops import varying_like
 
 
 def both_modes(
@@ -51,9 +51,7 @@ def both_modes(
                 """Outputs and their tangent in one direction."""
                 return jax.jvp(outputs_of, (values,), (directions,), has_aux=True)
 
-            return jax.vmap(push, out_axes=(None, 0, None))(
-                varying_like(_directions(values), values)
-            )
+            return jax.vmap(push, out_axes=(None, 0, None))(unit_directions(values))
 
         out, jacobian, aux = with_jacobian(leaves)
         tangent = jnp.concatenate([jnp.ravel(rates[i]) for i in moving])
@@ -87,11 +85,12 @@ def without_derivatives(values: Any, why: Exception) -> Any:
     return jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
 
 
-def _directions(values: list[jax.Array]) -> list[jax.Array]:
+def unit_directions(values: list[jax.Array]) -> list[jax.Array]:
     """Unit perturbations (d, ...) of each entry in turn."""
     counts = [x.size for x in values]
     unit, first, directions = jnp.eye(sum(counts), dtype=values[0].dtype), 0, []
     for x, count in zip(values, counts):
-        directions.append(unit[:, first : first + count].reshape(-1, *x.shape))
+        rows = unit[:, first : first + count].reshape(-1, *x.shape)
+        directions.append(varying_like(rows, x))
         first += count
     return directions

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.solvers.dense import regularized_once, times
+from jimpact.solvers.dense import regularized_once
 from jimpact.solvers.friction import in_disc
 
 # Sweeps of one solve at most; 5 to 15 are usual. What is left then is an error of the step, which
@@ -33,7 +33,7 @@ RIDGE = 1e-10
 class StepProblem(NamedTuple):
     """What the impulses (n, B) of a step have to satisfy, n = m + t."""
 
-    coupling: jax.Array  # K (n, n, B)
+    coupling: Any  # K (n, n, B), whose `times` multiplies
     velocity: jax.Array  # b (n, B), the velocities without the impulses
     load: jax.Array  # F (m, B), the largest normal impulses
     unloading: jax.Array  # a >= 0 (m, B)
@@ -52,7 +52,7 @@ class StepProblem(NamedTuple):
 
     def velocities(self, impulses: jax.Array) -> jax.Array:
         """w (n, B) after the impulses."""
-        return self.velocity + times(self.coupling, impulses)
+        return self.velocity + self.coupling.times(impulses)
 
     def residual(self, impulses: jax.Array) -> jax.Array:
         """Impulses (n, B) less their projection: 0 at the solution."""
