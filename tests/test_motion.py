@@ -777,7 +777,7 @@ def test_lost_derivatives_are_reported(monkeypatch):
 
     def last(height):
         motion = ji.simulate(
-            ji.ball_system(), ji.Newton(0.8), height[None], [0.0], 3.0, samples=3, max_events=7
+            ji.ball_system(), ji.Newton(0.8), height[None], [0.0], 4.0, samples=3, max_events=60
         )
         return motion.q[-1, 0], motion.status
 

@@ -175,9 +175,9 @@ def thrown(q0, v0, duration, **options):
 
 
 def test_derivatives_at_several_contacts_are_refused():
+    slope = jax.grad(lambda v: thrown(BRICK.touching(), v, 0.6).q[-1, 0])
     with pytest.raises(NotImplementedError, match="several"):
-        v = jnp.array([1.0, 0.5, 0, 0, 0, 0])
-        jax.eval_shape(jax.grad(lambda v: thrown(BRICK.touching(), v, 0.6).q[-1, 0]), v)
+        jax.eval_shape(slope, jnp.zeros(6))
 
 
 @pytest.mark.release
