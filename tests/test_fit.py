@@ -15,6 +15,7 @@ from scipy import stats
 import jimpact as ji
 from jimpact import Law
 from jimpact.fits.multistart import quiet
+from jimpact.fits.parameters import bounds_of, free_parameters
 from jimpact.fits.profiles import _Scans
 
 DATA = files("jimpact") / "data"
@@ -497,6 +498,47 @@ def test_what_is_seen_weakly_is_seen():
     found = ji.fit(ji.Newton([0.9, 0.9]), BALLS, data, starts=1)
     assert found.rank == 2
     np.testing.assert_allclose(found.value, [0.6, 0.3], atol=1e-7)
+
+
+def test_entries_are_named_as_in_the_report():
+    """`free` and `bounds` take the names that a fit prints: the same groups as with masks."""
+    law = ji.Newton([0.8, 0.7, 0.6])
+    named, _ = free_parameters(law, ("restitution[2]", "restitution[1=3]"))
+    assert named.names == ("restitution[1=3]", "restitution[2]")
+    assert named.groups == ((0, 2), (1,))
+    but_one, _ = free_parameters(law, {"restitution": True, "restitution[2]": False})
+    assert but_one.names == ("restitution[1]", "restitution[3]")
+    low, high = bounds_of(but_one, law, {"restitution[3]": (0.5, 0.9)})
+    np.testing.assert_array_equal([low, high], [[0.0, 0.5], [1.0, 0.9]])
+    matrix, _ = free_parameters(Coupled(jnp.eye(2)), "matrix[2,1]")
+    assert (matrix.names, matrix.groups) == (("matrix[2,1]",), ((2,),))
+    for free, message in (
+        ("restitution[4]", r"`free` must name entries that the field has.*of shape \(3,\)"),
+        ({"restitution[1]": 2}, "must map `restitution.1.` to True or False"),
+        ("friction[1]", "must name parameters of Newton"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            free_parameters(law, free)
+    with pytest.raises(ValueError, match="one value for all contacts"):
+        free_parameters(ji.Newton(0.8), "restitution[1]")
+
+
+def test_parameters_by_name_and_criteria():
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    known = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, 0.02))
+    e = known["restitution"]
+    assert (e.value, e.standard_error) == (known.value[0], known.standard_error[0])
+    assert e.intervals == known.intervals()[0]
+    assert e.determined
+    squares = np.sum((known.residual / 0.02) ** 2)
+    np.testing.assert_allclose([known.chi_squared, known.aic], [squares, squares + 2], rtol=1e-12)
+    unknown = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    assert np.isnan(unknown.chi_squared)
+    likelihood = stats.norm.logpdf(unknown.residual, scale=unknown.rms).sum()
+    constant = 8 * (1 + np.log(2 * np.pi))
+    np.testing.assert_allclose(unknown.aic, 4 - 2 * likelihood - constant, rtol=1e-10)
+    with pytest.raises(ValueError, match="`name` must be one of restitution"):
+        known["stiffness"]
 
 
 def test_masks_groups_and_held_contacts():

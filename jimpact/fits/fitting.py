@@ -105,9 +105,11 @@ def fit(
             Or a `FitProblem`, which holds the next three arguments and `bounds`.
         scene: the scene of all shots; ignored if each shot has its own scene.
         experiments: measured shots.
-        free: names of fields, or {field: True, or a boolean mask over contacts, or numbers of
-            groups}: contacts with equal numbers share one value, 0 is fixed.
-        bounds: {field: (low, high)}; default [0, 1] for restitution, > 0 for stiffness, ...
+        free: names of fields or entries ('restitution[2]'), or {field: True, or a boolean mask over
+            contacts, or numbers of groups}: contacts with equal numbers share one value, 0 is
+            fixed.
+        bounds: {field or entry: (low, high)}; default [0, 1] for restitution, > 0 for
+            stiffness, ...
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute

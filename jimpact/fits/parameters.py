@@ -1,6 +1,7 @@
 """Which entries of a law are free, their names, bounds and natural scales."""
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
@@ -16,6 +17,8 @@ OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
 # beyond, the softer contact has no further influence that a measurement could see.
 LOG_RANGE = 1e4
+
+_ENTRY = re.compile(r"(\w+)\[([1-9]\d*(?:[,=][1-9]\d*)*)\]")  # a name with entries, from 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,10 +84,17 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
         if "stiffness" in known and "stiffness" not in free:
             fixed = "stiffness"
     choices = dict(free) if isinstance(free, Mapping) else dict.fromkeys(_as_names(free), True)
-    for field, choice in choices.items():
+    for name, choice in choices.items():
+        field, entry = _split(name)
         if field not in known:
-            raise ValueError(_unknown_field(law, field, list(known)))
-        labels[field] = _as_labels(field, choice, np.shape(value_of(law, field)))
+            raise ValueError(_unknown_field(law, name, list(known)))
+        shape = np.shape(value_of(law, field))
+        if entry is None:
+            labels[field] = _as_labels(field, choice, shape)
+        else:
+            label = labels.setdefault(field, np.zeros(shape, int))
+            at = _places("free", name, entry, shape)
+            label.flat[at] = (label.max() + 1) * _as_flag(name, choice)
     ratios = not absolute and _only_ratios(law, labels)
     if ratios and "stiffness" in labels and labels["stiffness"].all():
         shared = labels["stiffness"] == labels["stiffness"].flat[0]
@@ -121,6 +131,40 @@ def _name(field: str, members: np.ndarray, size: int) -> str:
     if len(members) == size and (size > 1 or members.shape[1] == 0):
         return field
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
+
+
+def _split(name: str) -> tuple[str, str | None]:
+    """The field of a name as in `Parameters.names`, and what is in its brackets.
+
+    >>> from jimpact.fits.parameters import _split
+    >>> _split("restitution"), _split("restitution[1=3]")
+    (('restitution', None), ('restitution', '1=3'))
+    """
+    found = _ENTRY.fullmatch(name)
+    return (found[1], found[2]) if found else (name, None)
+
+
+def _places(argument: str, name: str, entry: str, shape: tuple[int, ...]) -> list[int]:
+    """Where in the flattened field the entries of a name are, counted from 0."""
+    members = [tuple(int(i) - 1 for i in part.split(",")) for part in entry.split("=")]
+    for index in members:
+        inside = len(index) == len(shape) and all(0 <= i < n for i, n in zip(index, shape))
+        if not inside:
+            kind = f"of shape {shape}" if shape else "one value for all contacts"
+            raise ValueError(
+                f"Argument `{argument}` must name entries that the field has, counted from 1, but "
+                f"has {name!r} of a field that is {kind}."
+            )
+    return [int(np.ravel_multi_index(index, shape)) for index in members]
+
+
+def _as_flag(name: str, choice: Any) -> bool:
+    """Whether a single entry is free."""
+    if not isinstance(choice, (bool, np.bool_)):
+        raise ValueError(
+            f"Argument `free` must map `{name}` to True or False, but has value {choice!r}."
+        )
+    return bool(choice)
 
 
 def _as_names(free: Any) -> tuple[str, ...]:
@@ -188,7 +232,7 @@ def bounds_of(
     chosen = dict(bounds or {})
     known = {parameters.field_of(i) for i in range(len(parameters.names))}
     for field in chosen:
-        if field not in known:
+        if _split(field)[0] not in known:
             raise ValueError(
                 f"Argument `bounds` must name free parameters, {', '.join(sorted(known))}, "
                 f"but has {field!r}."
@@ -206,6 +250,12 @@ def bounds_of(
             ends[:, inside] = np.array(domain.bounds)[:, None]
             searched = np.maximum(values[inside], domain.searched_high)
             ends[1, inside] = np.minimum(ends[1, inside], searched)
+    for name, pair in chosen.items():
+        field, entry = _split(name)
+        if entry is not None:
+            at = _places("bounds", name, entry, np.shape(value_of(law, field)))
+            first = parameters.entry_fields.index(field)
+            ends[:, first + np.array(at)] = np.array(_bound_pair(field, pair, law))[:, at]
     low = np.array([ends[0, list(group)].max() for group in parameters.groups])
     high = np.array([ends[1, list(group)].min() for group in parameters.groups])
     for name, start, a, b in zip(parameters.names, values[parameters.first], low, high):

@@ -1,12 +1,12 @@
 """What a fit stores, and its confidence intervals: below every module that reads a fit."""
 
 from dataclasses import dataclass
-from typing import Any, Generic
+from typing import Any, Generic, NamedTuple
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from jimpact._checks import check_kind
+from jimpact._checks import check_choice, check_kind
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.intervals import Profile, check_level, joined
 from jimpact.fits.least_squares import BoxRegion
@@ -28,6 +28,16 @@ class FitMinimum:
     value: np.ndarray
     count: int
     standard_error: np.ndarray | None = None
+
+
+class FittedParameter(NamedTuple):
+    """A parameter of a fit: its value, standard error, 95 % interval in pieces, and whether the
+    data determine it."""
+
+    value: float
+    standard_error: float
+    intervals: tuple[tuple[float, float], ...]
+    determined: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +135,33 @@ class FitResult(Generic[AnyLaw]):
     def start_count(self) -> int:
         """Starts, those that did not converge included."""
         return sum(minimum.count for minimum in self.starts) + self.lost_starts
+
+    def __getitem__(self, name: str) -> FittedParameter:
+        """The parameter of this name, as in `names`."""
+        check_choice("name", name, self.names)
+        i = self.names.index(name)
+        value, error = float(self.value[i]), float(self.standard_error[i])
+        return FittedParameter(value, error, self.intervals()[i], bool(self.determined[i]))
+
+    @property
+    def chi_squared(self) -> float:
+        """The sum of squared residuals in units of sigma; NaN where sigma is unknown."""
+        return np.nan if self.problem.sigma is None else self.starts[0].sum_of_squares
+
+    @property
+    def aic(self) -> float:
+        """Akaike's criterion of a fit by least squares; NaN of other losses and of exact data.
+
+        Equation: `chi^2 + 2 P`; where sigma is unknown `n log(|r|^2 / n) + 2 (P + 1)`, n values.
+        """
+        squares, values = self.starts[0].sum_of_squares, self.problem.values
+        if self.loss != "squares":
+            return np.nan
+        if self.problem.sigma is not None:
+            return squares + 2 * len(self.names)
+        if squares <= self.problem.exact_squares:
+            return np.nan
+        return float(values * np.log(squares / values) + 2 * (len(self.names) + 1))
 
     def intervals(self, level: float = 0.95) -> tuple[tuple[tuple[float, float], ...], ...]:
         """The pieces, in order, of the confidence interval of each of the P parameters.

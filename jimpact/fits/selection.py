@@ -522,16 +522,13 @@ def _left_out_rms(result: Fit, error: np.ndarray) -> float:
 def _aicc(result: Fit) -> float:
     """Akaike's criterion; with unknown noise corrected for few data; NaN if meaningless."""
     n, count = result.problem.values, len(result.names)
-    squares = result.starts[0].sum_of_squares
     whole = result.rank == count and not result.at_bound.any() and not result.problem.left_out
     if not whole or not result.converged:
         return np.nan
     if result.problem.sigma is not None:
-        return squares + 2 * count
+        return result.aic
     k = count + 1  # and the noise
-    if n - k - 1 < 1 or squares <= result.problem.exact_squares:
-        return np.nan
-    return float(n * np.log(squares / n) + 2 * k + 2 * k * (k + 1) / (n - k - 1))
+    return result.aic + 2 * k * (k + 1) / (n - k - 1) if n - k - 1 >= 1 else np.nan
 
 
 def _speed_test(
