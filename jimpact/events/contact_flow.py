@@ -51,6 +51,10 @@ DRAGGING = 100
 # Closings of a contact, from which on they may be endless, a power of 2: ten times more:
 # detected later.
 OFTEN = 8
+# Contacts of a chain, more of which may come to rest together in no order that returns; passes per
+# contact after which a look ahead tells (`look_ahead.py`), again after twice, four times as many.
+# Ten times more contacts: chains of 20 take 30 times as long; ten times more passes: as much later.
+MANY, LOOKS = 8, 15
 # Tolerances within which a flow watches the derivative of its forces in the exponents; the
 # tolerance is then that of derivatives, a hundred times finer than the law's. Ten times more: such
 # derivatives are ten times coarser than the others.
@@ -401,6 +405,20 @@ class ContactFlow(Flow):
 
     # ---- the end
 
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether it is so long a chain that a look ahead tells whether it comes to rest."""
+        self_similar = not self.gapped and self.viscous is None
+        return isinstance(self.coupling, Chain) and self.contacts > MANY and self_similar
+
+    def look_due(self, passes: jax.Array) -> jax.Array:
+        """Whether (1, B) passes per contact are LOOKS times 1, 2, 4, ..., and energy is lost."""
+        each = LOOKS * self.contacts
+        whole = passes.astype(jnp.int32)
+        number = jax.lax.div(whole, jnp.full_like(whole, each))
+        due = (whole == number * each) & (number > 0) & (number & (number - 1) == 0)
+        return due & any_of(self.restitution < 1)
+
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
         """Where the most closings of a contact become 8, 16, 32, ...: see `plastic_limit.py`."""
         if self.gapped or self.viscous is not None:
@@ -408,7 +426,8 @@ class ContactFlow(Flow):
         m = self.contacts
         count, old = (jnp.max(x[m : 2 * m], axis=0, keepdims=True) for x in (after, before))
         doubled = (count > old) & (count >= OFTEN) & (count & (count - 1) == 0)
-        return doubled & (passes > DRAGGING * m)
+        doubled = doubled & (passes > DRAGGING * m)
+        return doubled | self.look_due(passes) if self.looks_ahead else doubled
 
     def patience(self, passes: jax.Array) -> jax.Array:
         """The tolerance (1, B), WIDENED once an impact drags on."""

@@ -248,6 +248,11 @@ class FrictionFlow(ContactFlow):
 
     # ---- the end: a contact with friction is never alone, and no multiple of another state
 
+    @property
+    def looks_ahead(self) -> bool:
+        """No: see `pauses`."""
+        return False
+
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
         """Never: the states of an impact with friction are not self-similar."""
         return None

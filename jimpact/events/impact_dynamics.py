@@ -34,7 +34,6 @@ from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
 from jimpact.solvers.sensitivity import without_derivatives
-from jimpact.solvers.step_impulses import descent_lengths
 from jimpact.solvers.tangential import TangentialBlock
 from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
 from jimpact.status import CODE
@@ -44,8 +43,9 @@ from jimpact.status import CODE
 # would lose one of them.
 GRADIENT_TIGHTENING = 0.01
 NO_SECOND = (
-    "Argument `method` must be 'time' for second derivatives, but has value 'implicit': steps that "
-    "do not end at events have first derivatives only."
+    "Argument `method` must be 'time' for second derivatives, but has value 'implicit', or 'auto', "
+    "which is 'implicit' for several contacts with friction in space: steps that do not end at "
+    "events have first derivatives only."
 )
 IMPLICIT_TIGHTENING = 0.1  # the same of method 'implicit', whose steps cost more
 # A contact slower than the fastest by more than this factor sees many of its periods, whose errors
@@ -174,15 +174,6 @@ def coupling_of(problem: Problem, chain: bool) -> Chain | Dense:
     if chain and problem.omega.shape[0] > DENSE_CHAIN:
         return Chain(problem.off_diagonal)
     return Dense(normal_coupling(problem, chain))
-
-
-def descent_of(coupling: Chain | Dense, contacts: int) -> jax.Array:
-    """Lengths (n, B) of descent of a coupling; see `descent_lengths`."""
-    if isinstance(coupling, Dense):
-        return descent_lengths(coupling.matrix, contacts)
-    ones = jnp.ones_like(coupling.off_diagonal[:1])
-    row_sums = coupling.magnitude().times(jnp.broadcast_to(ones, (contacts, *ones.shape[1:])))
-    return ones / jnp.max(row_sums, axis=0, keepdims=True) * jnp.ones_like(row_sums)
 
 
 def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
@@ -336,7 +327,7 @@ class ImplicitProgram(ImpulseProgram):
             restitution=problem.restitution,
             exponent_array=problem.exponent,
             friction=friction,
-            descent=jax.lax.stop_gradient(descent_of(coupling, m)),
+            descent=jax.lax.stop_gradient(implicit_steps.descent_of(coupling, m)),
             tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
             viscous=problem.viscous,
             exponent_static=None if problem.exponent is not None else self.exponent,

@@ -40,7 +40,7 @@ from jimpact.events.contact_flow import (
     power,
 )
 from jimpact.events.queues import run_queue, side_by_side
-from jimpact.solvers.step_impulses import StepProblem, solve, solve_smooth
+from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve, solve_smooth
 
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
 # other value is both.
@@ -352,6 +352,15 @@ class ImplicitSteps:
         return new, (error + jnp.sum(losses, axis=0)) / allowed
 
 
+def descent_of(coupling: Chain | Dense, contacts: int) -> jax.Array:
+    """Lengths (n, B) of descent of a coupling; see `descent_lengths`."""
+    if isinstance(coupling, Dense):
+        return descent_lengths(coupling.matrix, contacts)
+    ones = jnp.ones_like(coupling.off_diagonal[:1])
+    row_sums = coupling.magnitude().times(jnp.broadcast_to(ones, (contacts, *ones.shape[1:])))
+    return ones / jnp.max(row_sums, axis=0, keepdims=True) * jnp.ones_like(row_sums)
+
+
 class Plan(NamedTuple):
     """Lengths of the accepted steps (BLOCKS * BLOCK, 1, B), 0 where there are no more."""
 
@@ -375,6 +384,13 @@ class ImplicitRun(NamedTuple):
         return stalled | ~flow.busy(self.state)
 
 
+def next_length(length: jax.Array, error: jax.Array) -> jax.Array:
+    """The length (1, B) of the step after one of this error (1, B), which falls with h^3."""
+    # 1e-12 keeps the root from 0, far beyond GROWTH
+    factor = jnp.clip(SAFETY / jnp.cbrt(error + 1e-12), SHRINK, GROWTH)
+    return jnp.where(error < jnp.inf, factor, SHRINK) * length
+
+
 def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool) -> ImplicitRun:
     """From the start to the end of the impact; `keeps` the plan of the steps."""
     lanes = jnp.zeros(flow.tolerance.shape, jnp.int32)
@@ -393,10 +409,7 @@ def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool
         new, error = flow.step(flow.coasted(run.state), run.length)
         accepted = live & (error <= 1)
         state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, run.state)
-        # the error falls with h^3; 1e-12 keeps the root from 0, far beyond GROWTH
-        factor = jnp.clip(SAFETY / jnp.cbrt(error + 1e-12), SHRINK, GROWTH)
-        factor = jnp.where(error < jnp.inf, factor, SHRINK)
-        length = jnp.where(live, factor * run.length, run.length)
+        length = jnp.where(live, next_length(run.length, error), run.length)
         plan = run.plan
         if plan is not None:
             at = plan.used[0], 0, np.arange(lanes.shape[1])

@@ -11,6 +11,8 @@ such number apart are compared by `gamma`, by the energy in each contact, and by
 would bring the contacts to rest now. These see, as `gamma` alone does not, how fast heavy bodies
 on both sides of a light one still approach. A light body that does not lose its energy may push
 them apart in the end; meanwhile its states are no multiples of each other.
+
+The states of many contacts return in no order. There a look ahead tells (`look_ahead.py`).
 """
 
 import functools
@@ -20,8 +22,9 @@ import jax
 import jax.numpy as jnp
 
 from jimpact.events import stepper
-from jimpact.events.contact_flow import ContactFlow
+from jimpact.events.contact_flow import OFTEN, ContactFlow
 from jimpact.events.kept_steps import Kept, nothing_kept, record
+from jimpact.events.look_ahead import comes_to_rest
 from jimpact.events.stepper import GOES_ON, OVER, PAUSED, any_of, total
 from jimpact.events.tangents import dual_like, pushforward, value_of
 from jimpact.status import CODE
@@ -136,6 +139,11 @@ def to_the_end(
             lambda: contacts_at_rest(still, gamma, values, end.rest, quiet),
             lambda: end.rest,
         )
+        if still.looks_ahead:
+            due = paused & ~rest.ended & still.look_due(values.progress[3:4])
+            rest = jax.lax.cond(
+                jnp.any(due), lambda: block_at_rest(still, gamma, values, rest, due), lambda: rest
+            )
         settled = jnp.where(rest.ended, OVER, GOES_ON)
         progress = carry.progress.at[2:3].set(jnp.where(paused, settled, carry.progress[2:3]))
         return ImpactEnd(carry._replace(progress=progress), kept, reached, rest, jnp.asarray(True))
@@ -163,28 +171,22 @@ def contacts_at_rest(
     the gamma+ that their impulses give: errors of many closings add up.
     """
     m, modes, state = flow.contacts, carry.step.modes, carry.y
-    paused = carry.progress[2:3] == PAUSED
     count = modes[m : 2 * m]
     since = count - last.closings
+    most, before = (jnp.max(x, axis=0, keepdims=True) for x in (count, last.closings))
+    paused = (carry.progress[2:3] == PAUSED) & (most > before) & (most >= OFTEN)
     often = paused & (2 * since >= jnp.max(since, axis=0, keepdims=True)) & (count > 0)
     rest = quiet | often
     now = gamma + flow.change(state)
 
-    def choose(_: Any, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        """Those that would pull leave, those that still approach carry, too."""
-        carries, _ = both
-        dp = impulse_of_rest(flow, carries, now)
-        after = now + flow.coupling.times(dp)
-        return rest & jnp.where(carries, dp > 0, after < 0), dp
-
-    start = (often | (rest & (now < 0)), jnp.zeros_like(now))
-    carries, dp = jax.lax.fori_loop(0, CHOICES, choose, start)
+    start = often | (rest & (now < 0))
+    carries, dp = plastic_impulses(flow, rest, start, now)
 
     # is it a multiple of the state at the last check?
     root = jnp.sqrt(flow.energy(state[:m], jnp.zeros_like(now)))
     rows = jnp.where(often, jnp.stack([now, root, dp]), 0.0)
-    size, before = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))
-    ratio = size[:1] / jnp.where(before[:1] > 0, before[:1], size[:1])
+    size, old = (jnp.max(jnp.abs(x), axis=1, keepdims=True) for x in (rows, last.rows))
+    ratio = size[:1] / jnp.where(old[:1] > 0, old[:1], size[:1])
     returns = jnp.abs(rows - ratio * last.rows) <= SHAPE * (1 - ratio) * size
     after = now + flow.coupling.times(dp)
     settled = ~flow.at_work(modes, state, flow.tolerance)[0] & (after >= -flow.tolerance)
@@ -194,6 +196,38 @@ def contacts_at_rest(
     new = Rest(rest, rest & carries, rows.at[2].set(dp), count, ends)
     fresh = paused | any_of(quiet)
     return jax.tree.map(lambda a, b: jnp.where(fresh, a, b), new, last)
+
+
+def block_at_rest(
+    flow: ContactFlow, gamma: jax.Array, carry: stepper.StepperState, rest: Rest, due: jax.Array
+) -> Rest:
+    """As `rest`; but where a look ahead is `due` (1, B) and shows a block, its contacts."""
+    now = gamma + flow.change(carry.y)
+    everywhere = jnp.ones_like(now, bool)
+    block, dp = plastic_impulses(flow, everywhere, everywhere, now)
+    after = now + flow.coupling.times(dp)
+    right = ~any_of((jnp.where(block, dp, 0.0) < 0) | (after < -flow.tolerance))
+    ended = comes_to_rest(flow, carry.step.modes, carry.y, block, dp, due & right)
+    new = Rest(block, block, rest.rows.at[2].set(dp), rest.closings, ended)
+    return jax.tree.map(lambda a, b: jnp.where(ended, a, b), new, rest)
+
+
+def plastic_impulses(
+    flow: ContactFlow, allowed: jax.Array, start: jax.Array, now: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Which `allowed` contacts (m, B) carry, and the impulses with which `0 <= dp _|_ gamma+ >= 0`.
+
+    `start`: those that are taken to carry at first; `now` gamma (m, B).
+    """
+
+    def choose(_: Any, both: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        """Those that would pull leave, those that still approach carry, too."""
+        carries, _ = both
+        dp = impulse_of_rest(flow, carries, now)
+        after = now + flow.coupling.times(dp)
+        return allowed & jnp.where(carries, dp > 0, after < 0), dp
+
+    return jax.lax.fori_loop(0, CHOICES, choose, (start, jnp.zeros_like(now)))
 
 
 def remainder(

@@ -158,7 +158,7 @@ class Flow(abc.ABC):
         return None
 
     def pauses(self, before: jax.Array, after: jax.Array, passes: jax.Array) -> jax.Array | None:
-        """Whether (1, B) the caller has to inspect the state after this event; None: never."""
+        """Whether (1, B) the caller has to inspect the state after this pass; None: never."""
         return None
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -411,7 +411,7 @@ def advance(flow: Flow, state: StepperState, most: int) -> tuple[StepperState, j
     step, next_duration = _next_step(flow, s, modes, urgent, accept, error2, duration)
     passes = passes + active.astype(y.dtype)
     pauses = flow.pauses(s.modes, modes, passes)
-    mark = mark if pauses is None else jnp.where(landed & pauses, PAUSED, mark)
+    mark = mark if pauses is None else jnp.where(active & pauses, PAUSED, mark)
     over = flow.over(modes, value_of(end), passes) | broken
     aimed_twice = (step.clock[3:4] > 0) & (lands > 0) & (urgent.intention < AHEAD)
     mark = jnp.where(over, OVER, mark)
