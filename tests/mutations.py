@@ -214,6 +214,7 @@ MUTATIONS = [
     Mutation("entries counted from 0", r"tuple\(int\(i\) - 1 for i in part", "tuple(int(i) - 0 for i in part", ("test_fit.py::test_entries_are_named_as_in_the_report",)),
     Mutation("bounds of an entry are those of the first", r"ends\[:, first \+ np\.array\(at\)\]", "ends[:, [first] * len(at)]", ("test_fit.py::test_entries_are_named_as_in_the_report",)),
     Mutation("Akaike's criterion without the noise", r"np\.log\(squares / values\) \+ 2 \* \(len\(self\.names\) \+ 1\)", "np.log(squares / values) + 2 * len(self.names)", ("test_fit.py::test_parameters_by_name_and_criteria",)),
+    Mutation("predictions from starts have errors", r"np\.where\(blind, np\.inf, np\.sqrt\(variance\)\)", "np.sqrt(variance)", ("test_fit.py::test_further_shots_are_predicted_with_errors",)),
     Mutation("a start is printed as a value", r"if seen else f\"\(\{value:\{digits\}\}\)\"", 'if True else ""', ("test_reports.py::test_values_that_the_data_do_not_determine_are_marked",)),
     Mutation("a profile of anything counts as a value", r"seen\[i\] &= each\.words != \"anything\"", "pass", ("test_reports.py::test_values_that_the_data_do_not_determine_are_marked",)),
     Mutation("reservations are left out of the sentence", r"    if reserved:\n        sentence \+=", "    if False:\n        sentence +=", ("test_reports.py::test_a_sentence_to_quote_holds_its_reservations",)),

@@ -136,6 +136,16 @@ def test_equations_6_19_and_6_20():
     assert (count, int(np.ceil(ratio) - 1), int(np.floor(ratio - 1))) == (3, 3, 2)
 
 
+@pytest.mark.parametrize(("masses", "e"), [((1, 1, 1), 1), ((1, 1, 1), 0.5), ((4, 1, 4), 1), ((1, 4, 1), 1), ((1, 2, 3), 0.8)])  # fmt: skip
+def test_three_collisions_or_more(masses, e):
+    """N >= 3, not N <= 3, where z > 1/2."""
+    first, middle, last = masses
+    cosine = 1 / np.sqrt((1 + middle / first) * (1 + middle / last))
+    z = (1 + e) / (2 * np.sqrt(e)) * cosine
+    exactly = ([Fraction(x) for x in row] for row in (masses, (1, 0, 0), (e, e)))
+    assert (collide(*exactly, (0, 1), end=True)[1] >= 3) == (z > 0.5 + 1e-12)
+
+
 @pytest.mark.parametrize("ratio", [0.3, 1.0, 2.0])
 def test_equation_6_16(ratio):
     """Three equal balls on linear springs: where contact 1 opens, x_1 = x_2."""
@@ -160,6 +170,34 @@ def test_equation_6_16(ratio):
     assert used(opens - 2e-3) > 0 > used(opens + 2e-3)
     printed = [used(t, -1) for t in (opens - 2e-3, opens + 2e-3)]
     assert printed[0] * printed[1] > 0
+
+
+def linear_balls(ratio):
+    """Squared frequencies and modes of three equal balls on linear springs."""
+    return np.linalg.eigh(np.array([[1.0, -1, 0], [-1, 1 + ratio, -ratio], [0, -ratio, ratio]]))
+
+
+def test_limit_without_a_second_spring():
+    """k2 = 0: contact 1 opens after half a period of omega_2 = sqrt(2) omega; omega_1 is 0."""
+    low, high = np.sqrt(np.abs(linear_balls(0.0)[0][1:]))
+    assert np.isclose(low, 0, atol=1e-7)
+    # two equal balls of 1 kg on a spring of 1 N/m, reduced mass 1/2
+    assert np.isclose(np.pi / high, np.pi / np.sqrt(1 / 0.5), rtol=1e-12)
+
+
+def test_remark_6_4():
+    """v+ = (-1/3, 2/3, 2/3) comes back, but not after equal steps of k2/k1."""
+    ratios = []
+    for n in (3, 5, 7):  # omega_2 = n omega_1
+        roots = np.roots([4 * n**2, -(3 * n**4 - 2 * n**2 + 3), 4 * n**2])
+        ratios.append(max(roots))
+        squares, modes = linear_balls(ratios[-1])
+        rates = np.sqrt(np.abs(squares))
+        assert np.isclose(rates[2], n * rates[1], rtol=1e-9)
+        after = modes @ (modes[0] * np.cos(rates * np.pi / rates[1]))
+        np.testing.assert_allclose(after, [-1 / 3, 2 / 3, 2 / 3], atol=1e-6)
+    np.testing.assert_allclose(ratios, [6.171, 18.225, 36.238], rtol=1e-4)
+    assert ratios[2] - ratios[1] > 1.4 * (ratios[1] - ratios[0])
 
 
 def test_limit_of_a_stiff_second_contact():
@@ -212,6 +250,13 @@ def test_proposition_6_4_and_remark_6_6():
     assert np.linalg.norm(E @ before) > np.linalg.norm(before)
     G = np.array([[1.0, 0.25], [0.25, 1.0]])  # a block twice as high as wide
     assert (-np.linalg.solve(G, 1.5 * before)).min() < 0  # an impulse that pulls
+
+
+def test_after_proposition_6_4():
+    """E = G E^T G^-1 holds for e I, not for unequal coefficients on a diagonal."""
+    G = np.array([[1.0, -0.5], [-0.5, 1.0]])  # three equal balls
+    for E, holds in ((0.7 * np.eye(2), True), (np.diag([0.9, 0.3]), False)):
+        assert np.allclose(E, G @ E.T @ np.linalg.inv(G), atol=1e-12) == holds
 
 
 class Block:
@@ -328,6 +373,17 @@ def test_remark_6_10():
     mass, N = np.diag([1, 1, (1 + high**2) / 12]), np.array([[0, 0], [1, 1], [-0.5, 0.5]])
     W = N.T @ np.linalg.inv(mass) @ N
     assert np.isclose(np.arccos(-W[0, 1] / W[0, 0]), np.pi / 3, atol=1e-6)
+
+
+def test_remark_6_11():
+    """Two spheres of radius a and a rod of length 1: the least kinetic angle is at a = 5/24."""
+    a = np.linspace(0, 5, 24_001)
+    ratio = (1 + 2 * a) ** 2 / (16 * a**2 / 5 + 1 / 3 + 2 * (1 + 2 * a) ** 2)
+    angle = np.arccos(-(1 / 3 - ratio) / (1 / 3 + ratio))
+    assert np.isclose(a[angle.argmin()], 5 / 24, atol=1e-3)
+    assert np.isclose(angle.min(), 1.42420445174657522, atol=1e-9)
+    assert angle.min() < angle[0] - 0.02  # of a rod alone
+    assert angle.min() < angle[-1] - 0.02
 
 
 def test_rocking_matrix():
