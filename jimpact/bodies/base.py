@@ -95,7 +95,7 @@ class Body(eqx.Module):
         return q + u
 
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
-        """As `moved`, up to the second order in u; derivatives at u = 0 take it."""
+        """q after the displacement u, to second order in u; derivatives at u = 0 take it."""
         return self.moved(q, u)
 
     def rates(self, q: jax.Array, v: jax.Array) -> jax.Array:

@@ -100,7 +100,7 @@ class Solid(Body):
         return jnp.concatenate([q[:3] + u[:3], _product(e, cosine, ratio * half)])
 
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
-        """As `moved`, up to the second order in u: without sine and cosine."""
+        """q after the displacement u, to second order in u: without sine and cosine."""
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
         half = 0.5 * u[3:]
         return jnp.concatenate([q[:3] + u[:3], _product(e, 1 - 0.5 * (half @ half), half)])
