@@ -281,7 +281,8 @@ def _least(
     scaled = w * scale[:, None] * (scale * weight)[None]
     k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
-    z = regularized(k[..., None], right, jnp.where(held, ridge, 0.0)[:, None], _REFINEMENTS)
+    ridges = jnp.where(held, ridge, 0.0)[:, None]
+    z = regularized(k[..., None], right, ridges, _REFINEMENTS, without_null=True)
     return (scale * weight)[:, None] * z
 
 
