@@ -188,12 +188,19 @@ def regularized(
     """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) added to it.
 
     Each refinement removes what the ridge changes where the matrix is regular, and makes the
-    derivatives right in one order more: the inverse has none.
+    derivatives right in one order more: the inverse has none. In its null space the inverse is
+    large, and so is its rounding: this part of what it gives is subtracted again.
     """
     inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
-    z = times(inverted, right)
+
+    def solved(right: jax.Array) -> jax.Array:
+        """What the inverse gives, without its part in the null space."""
+        z = times(inverted, right)
+        return z - times(inverted, ridge * z)
+
+    z = solved(right)
     for _ in range(refinements):
-        z = z + times(inverted, right - times(matrix, z))
+        z = z + solved(right - times(matrix, z))
     return z
 
 
