@@ -58,11 +58,6 @@ ROWS_PER_EVENT, ROWS_MORE = 16, 1024
 ROOM = 32  # numbers a contact that a run may hand over, in addition to states
 BLOCK = 16  # rows between two checkpoints
 
-NO_SLOPES = (
-    "Argument `friction` must be 0 where derivatives of the motion of a body in space with several "
-    "contacts are taken: they are not verified yet."
-)
-
 
 class Past(NamedTuple):
     """What a run takes over from the one before it."""
@@ -183,8 +178,6 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
 
     def rule(arrays: Any, tangents: Any) -> Any:
         """Values by the run, tangents by walking through its plan again."""
-        if problem.settings.spatial and problem.contacts > 1:
-            raise NotImplementedError(NO_SLOPES)
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
         end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
         assert end.plan is not None

@@ -124,8 +124,7 @@ def simulate(
         forward ones (jvp, jacfwd).
 
     Raises:
-        NotImplementedError: derivatives of time stepping, which do not converge with the step, and
-            of motions with friction in space at several contacts.
+        NotImplementedError: derivatives of time stepping, which do not converge with the step.
         ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
             host; inside jit the status reports them (`raise_on_failed_motion`).
 
