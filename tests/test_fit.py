@@ -541,6 +541,22 @@ def test_parameters_by_name_and_criteria():
         known["stiffness"]
 
 
+def test_further_shots_are_predicted_with_errors():
+    """Newton's law is linear in e: v+ and its error in closed form; inf where e is unknown."""
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    found = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post, 0.02))
+    further = 1.5 * SHOTS[::-1]
+    at_0, at_1 = (simulated(ji.Newton(e), PAIR, further) for e in (0.0, 1.0))
+    (e,), (error,) = found.value, found.standard_error
+    for shots in (further, ji.Experiments(further, further)):
+        out = found.predict(shots)
+        np.testing.assert_allclose(out.velocity, at_0 + e * (at_1 - at_0), rtol=1e-9)
+        np.testing.assert_allclose(out.standard_error, error * np.abs(at_1 - at_0), rtol=1e-6)
+        assert (out.status == 0).all()
+    unseen = replace(found, standard_error=np.array([np.inf]))
+    assert np.isinf(unseen.predict(further).standard_error).all()
+
+
 def test_masks_groups_and_held_contacts():
     truth = ji.LZB([0.9, 0.9], [3.0, 6.0])
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))

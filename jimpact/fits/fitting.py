@@ -16,6 +16,7 @@ from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Minimum, SearchResult, ends, search, settled
 from jimpact.fits.page import write_page
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
+from jimpact.fits.prediction import Predicted, jacobian_of, predicted
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.profiles import needs_profiles, profile, quick_profiles
 from jimpact.fits.report import report, verdict
@@ -47,6 +48,25 @@ class Fit(FitResult[AnyLaw]):
         Values with their errors, what they assume, and what speaks against them.
         """
         return verdict(self)
+
+    def predict(self, shots: Any, scene: Scene | None = None) -> Predicted:
+        """Velocities after further shots, with the errors that the parameters leave in them.
+
+        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; the error of
+        a measurement, `noise`, comes on top of it (in squares).
+
+        Args:
+            shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
+            scene: of all shots; None: that of the fit, or those of the shots.
+
+        Returns:
+            `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
+            do not determine, NaN where the errors are unknown; `status` (K,).
+
+        Raises:
+            ValueError: a fit of something else than shots; velocities that do not fit the scene.
+        """
+        return predicted(self, shots, scene)
 
     def report(self, path: str | Path, profiles: bool = True) -> Path:
         """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
@@ -282,7 +302,7 @@ def as_fit(
         warnings=tuple(found.line for found in findings),
         reservations=tuple(found.reservation for found in findings if found.reservation),
         problem=problem,
-        jacobian=_jacobian(problem, solution),
+        jacobian=jacobian_of(problem, solution),
     )
 
 
@@ -295,13 +315,6 @@ def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Sear
     squares, jacobian = float(np.sum(residual**2)), back * solution.jacobian
     minimum = Minimum(squares, solution.value, 1, jacobian)
     return solution._replace(jacobian=jacobian, minima=[minimum])
-
-
-def _jacobian(problem: FitProblem, solution: SearchResult) -> np.ndarray:
-    """Derivatives (K, n, P) of what was measured in the parameters; NaN where none was measured."""
-    shape = (*problem.measured.shape, len(problem.names))
-    slope = solution.jacobian.reshape(shape) / solution.scale
-    return problem.errors_of(problem.size * slope)
 
 
 def _uncertainty(

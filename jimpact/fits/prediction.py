@@ -1,0 +1,55 @@
+"""What a fitted law predicts for further shots, with errors of its parameters."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from jimpact.fits.experiments import Experiments
+from jimpact.fits.least_squares import BoxRegion
+from jimpact.fits.multistart import SearchResult, ends, quiet, repeated, run
+from jimpact.fits.problem import FitProblem, filled_up
+from jimpact.fits.result import FitResult
+from jimpact.scene import Scene
+
+
+class Predicted(NamedTuple):
+    """Velocities after each shot (K, n) [m/s], their standard errors (K, n), status codes (K,)."""
+
+    velocity: np.ndarray
+    standard_error: np.ndarray
+    status: np.ndarray
+
+
+def predicted(fit: FitResult, shots: Any, scene: Scene | None) -> Predicted:
+    """Values at the fitted parameters, and `sqrt(J C J^T)` with their covariance C."""
+    if fit.experiments is None:
+        raise ValueError("Argument `fit` must be to shots.")
+    data, scenes, units = shots, None, fit.experiments.units
+    if isinstance(shots, Experiments):
+        data, scenes, units = shots.pre, shots.scenes, shots.units
+    data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
+    own = fit.problem.scene if scene is None else scene
+    problem = FitProblem.from_shots(fit.law, own, data, fit.problem.parameters.labels)
+    y = problem.point(problem.start)
+    box: Any = BoxRegion(*np.broadcast_to(y.astype(problem.residuals.offset.dtype), (2, len(y))))
+    held = eqx.tree_at(
+        lambda r: (r.low, r.high, r.region),
+        filled_up(problem.residuals),
+        (box.low, box.high, box),
+    )
+    states = run(repeated(held, 1), y[None], "levenberg-marquardt", 1, quiet)
+    solution = ends(problem, states)
+    slope, seen = jacobian_of(problem, solution), fit.determined
+    known = slope[..., seen]
+    variance = np.einsum("kip,pq,kiq->ki", known, fit.covariance[np.ix_(seen, seen)], known)
+    blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
+    error = np.where(blind, np.inf, np.sqrt(variance))
+    return Predicted(solution.predicted, error, np.asarray(solution.status))
+
+
+def jacobian_of(problem: FitProblem, solution: SearchResult) -> np.ndarray:
+    """Derivatives (K, n, P) of what was measured in the parameters; NaN where none was measured."""
+    shape = (*problem.measured.shape, len(problem.names))
+    slope = solution.jacobian.reshape(shape) / solution.scale
+    return problem.errors_of(problem.size * slope)
