@@ -768,3 +768,19 @@ def test_fit_through_event_times():
     np.testing.assert_allclose(found.value, 0.75, atol=1e-9)
     assert found.degrees_of_freedom == 5
     assert found.rank == 1
+
+
+def test_lost_derivatives_are_reported(monkeypatch):
+    """Where a plan has no room for the steps, derivatives are NaN and the status says so."""
+    monkeypatch.setattr(event_driven, "ROWS_PER_EVENT", 0)
+    monkeypatch.setattr(event_driven, "ROWS_MORE", 0)
+
+    def last(height):
+        motion = ji.simulate(
+            ji.ball_system(), ji.Newton(0.8), height[None], [0.0], 4.0, samples=3, max_events=60
+        )
+        return motion.q[-1, 0], motion.status
+
+    (_, status), (slope, _) = jax.jvp(last, (jnp.asarray(1.0),), (jnp.asarray(1.0),))
+    assert bool(jnp.isnan(slope))
+    assert MOTION_STATUS[int(status)].name == "no_derivatives"

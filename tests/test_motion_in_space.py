@@ -8,6 +8,14 @@ import pytest
 
 import jimpact as ji
 from jimpact.bodies.base import STANDARD_GRAVITY as G
+from jimpact.motion.persistent_contact import (
+    Modes,
+    by_contact,
+    choose_with_friction,
+    contacts_at,
+    direction,
+    forces,
+)
 from jimpact.motion.record import EVENT_KINDS, MOTION_STATUS
 
 RADIUS = 0.1
@@ -140,9 +148,20 @@ def test_slip_that_begins_turns_with_the_forces(spheres):
     np.testing.assert_allclose(lane(spheres, 6).velocity[-1, :2], end, atol=3e-8)
 
 
-def test_derivatives_are_refused():
-    with pytest.raises(NotImplementedError, match="friction"):
-        jax.eval_shape(jax.grad(lambda v: on_slope(v, *ROWS[0][1:]).q[-1, 0]), 0.7)
+@pytest.mark.release
+def test_derivatives_of_a_sphere_that_begins_to_roll():
+    """Both modes, at slip that turns until it ends; those of the closed form are exact."""
+    x = jnp.array(ROWS[2][:4])
+
+    def ends(x):
+        motion = on_slope(*x, 0.0, 0.0)
+        v, tilt = motion.events.velocity_after[0], x[3]
+        down = v[0] * jnp.cos(tilt) - v[2] * jnp.sin(tilt)
+        return jnp.stack([motion.events.time[0], down, v[1]])
+
+    exact = jax.jacfwd(lambda x: jnp.append(rolls(x)[0], rolls(x)[1]))(x)
+    np.testing.assert_allclose(jax.jacfwd(ends)(x), exact, atol=1e-6)
+    np.testing.assert_allclose(jax.jacrev(ends)(x), exact, atol=1e-6)
 
 
 # ---------------------------------------------------------------------------------- boxes
@@ -153,6 +172,12 @@ SYSTEM, LAW = ji.System(BRICK, potential=ji.gravity(BRICK)), ji.Moreau(0.3, fric
 
 def thrown(q0, v0, duration, **options):
     return ji.simulate(SYSTEM, LAW, q0, v0, duration, samples=21, **options)
+
+
+def test_derivatives_at_several_contacts_are_refused():
+    slope = jax.grad(lambda v: thrown(BRICK.touching(), v, 0.6).q[-1, 0])
+    with pytest.raises(NotImplementedError, match="several"):
+        jax.eval_shape(slope, jnp.zeros(6))
 
 
 @pytest.mark.release
@@ -193,3 +218,49 @@ def test_a_thrown_brick_comes_to_rest_on_a_face():
     # the first impact is on one corner, at the time of free fall
     assert int(motion.events.contacts[0].sum()) == 1
     assert motion.events.tangential_impulse.shape[1] == 16
+
+
+def test_derivatives_at_no_displacement_take_two_terms():
+    q, v = BRICK.at([0.1, 0.2, 0.3], [0.8, 0.6, 0.0, 0.0]), jnp.arange(1.0, 7.0)
+
+    def rates(moved):
+        path = lambda s: BRICK.gap_function(moved(q, s * v))  # noqa: E731
+        once = lambda s: jax.jvp(path, (s,), (1.0,))[1]  # noqa: E731
+        return jnp.stack(jax.jvp(once, (0.0,), (1.0,)))
+
+    np.testing.assert_allclose(rates(BRICK.nearby), rates(BRICK.moved), rtol=1e-12, atol=1e-12)
+
+
+def sliding(x):
+    """Contact forces on a brick flat on the ground at x = (v_x, v_y, omega_z, mu)."""
+    q, still = BRICK.touching(), jnp.zeros(())
+    contacts = contacts_at(SYSTEM, q, jnp.zeros(6).at[jnp.array([0, 1, 5])].set(x[:3]), still, True)
+    touch = contacts.normal.value < 1e-9
+    slip = direction(by_contact(contacts.tangent.rate, 8))
+    modes = Modes(touch, touch & False, jnp.ones(8))
+    return forces(contacts, x[3] * jnp.ones(8), modes, slip).normal
+
+
+def test_forces_of_a_brick_that_slides_flat_have_derivatives():
+    """Redundant contacts share the load in a way that does not depend on their slip."""
+    x, h = jnp.array([0.9, -0.2, 3.0, 0.15]), 1e-4
+    share = jax.jit(lambda x: (sliding(x), jax.jacfwd(sliding)(x)))
+    normal, slope = share(x)
+    np.testing.assert_allclose(normal.sum(), 0.5 * G, rtol=1e-12)
+    # least squares: no part along the load of corners that cancels itself
+    np.testing.assert_allclose(normal @ jnp.array([1.0, 0, -1, 0, -1, 0, 1, 0]), 0, atol=1e-11)
+    central = [(share(x + h * e)[0] - share(x - h * e)[0]) / (2 * h) for e in jnp.eye(4)]
+    np.testing.assert_allclose(slope, jnp.stack(central, axis=1), atol=1e-6)
+
+
+def test_a_brick_that_could_stay_at_rest_does():
+    """At mu = 1, where complementarity alone finds other modes as well."""
+    contacts = contacts_at(SYSTEM, BRICK.touching(), jnp.zeros(6), jnp.zeros(()), True)
+    touch, mu = contacts.normal.value < 1e-9, jnp.ones(8)
+    before = Modes(touch & False, touch & False, jnp.zeros(8))
+    none = jnp.zeros(16, bool)
+    choice = jax.jit(choose_with_friction)(
+        contacts, mu, before, touch, none, none[:8], jnp.asarray(1e-10)
+    )
+    assert bool(choice.consistent)
+    assert (choice.modes.stick == touch).all()

@@ -111,7 +111,7 @@ def test_shots_with_different_numbers_of_contacts_are_fitted_together():
     np.testing.assert_allclose(found.value, true, atol=1e-9)
     assert not found.status.any()
     assert found.predicted.shape == (3, 3)
-    assert found.warnings == ()
+    assert len(found.warnings) == 1  # reproduced to the last digit
     excess = data.momentum_excess()
     assert np.isnan(excess[1]).all()
     np.testing.assert_allclose(excess[[0, 2]][:, 0], 0.0, atol=1e-14)

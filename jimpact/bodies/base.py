@@ -94,9 +94,13 @@ class Body(eqx.Module):
         """q after the displacement u (n,), a constant velocity times its time: `q + u`."""
         return q + u
 
+    def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
+        """q after the displacement u, to second order in u; derivatives at u = 0 take it."""
+        return self.moved(q, u)
+
     def rates(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """q' at velocities v (n,)."""
-        return jax.jvp(lambda u: self.moved(q, u), (jnp.zeros_like(v),), (v,))[1]
+        return jax.jvp(lambda u: self.nearby(q, u), (jnp.zeros_like(v),), (v,))[1]
 
     @property
     def mass(self) -> Any:
@@ -141,14 +145,14 @@ class Body(eqx.Module):
     def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
         """Gradient in q as one in the displacements (n,): `(dq'/dv)^T gradient`."""
         still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
-        return jax.vjp(lambda u: self.moved(q, u), still)[1](gradient)[0]
+        return jax.vjp(lambda u: self.nearby(q, u), still)[1](gradient)[0]
 
     def _gradient(self, function: Callable[[jax.Array], Any], q: jax.Array) -> jax.Array:
         """(n, k) of a function q -> (k,), in the displacements."""
         if self.coordinates is None:
             return jax.jacobian(function)(q).T
         still = jnp.zeros(self.mass_matrix(q).shape[:1], q.dtype)
-        return jax.jacfwd(lambda u: function(self.moved(q, u)))(still).T
+        return jax.jacfwd(lambda u: function(self.nearby(q, u)))(still).T
 
     @property
     def pair_count(self) -> int | None:

@@ -99,6 +99,12 @@ class Solid(Body):
         cosine, ratio = _cosine_and_sine_ratio(half @ half)
         return jnp.concatenate([q[:3] + u[:3], _product(e, cosine, ratio * half)])
 
+    def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
+        """q after the displacement u, to second order in u: without sine and cosine."""
+        e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
+        half = 0.5 * u[3:]
+        return jnp.concatenate([q[:3] + u[:3], _product(e, 1 - 0.5 * (half @ half), half)])
+
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """`-(0, omega x I omega)` (6,)."""
         omega = v[3:]

@@ -62,11 +62,11 @@ def kinematics(
 
     def gap(u: jax.Array, s: jax.Array) -> jax.Array:
         """Gaps (m,) after the displacement u (n,) and the time s."""
-        return gaps(system, body.moved(q, u), t + s)
+        return gaps(system, body.nearby(q, u), t + s)
 
     def slips(s: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Slip (k,) and tangents (n, k) after the time s."""
-        h = body.tangents(seen_from_base(system, body.moved(q, s * v), t + s))
+        h = body.tangents(seen_from_base(system, body.nearby(q, s * v), t + s))
         assert h is not None
         carried = base_velocity(system, t + s)
         return h.T @ (v if carried is None else v - carried), h

@@ -59,8 +59,8 @@ ROOM = 32  # numbers a contact that a run may hand over, in addition to states
 BLOCK = 16  # rows between two checkpoints
 
 NO_SLOPES = (
-    "Argument `friction` must be 0 where derivatives of the motion of a body in space are taken: "
-    "its slip turns ever faster until it ends, and derivatives of that time would be wrong."
+    "Argument `friction` must be 0 where derivatives of the motion of a body in space with several "
+    "contacts are taken: they are not verified yet."
 )
 
 
@@ -183,7 +183,7 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
 
     def rule(arrays: Any, tangents: Any) -> Any:
         """Values by the run, tangents by walking through its plan again."""
-        if problem.settings.spatial:
+        if problem.settings.spatial and problem.contacts > 1:
             raise NotImplementedError(NO_SLOPES)
         marked = [not isinstance(t, SymbolicZero) for t in tangents]
         end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
@@ -200,7 +200,10 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
         results, slopes = jax.jvp(smooth, values, rates)
         recorded = end.table.samples, end.table.events
         samples, events = selected(plan.lost, recorded, results)
-        end = end._replace(table=MotionTable(samples, events, end.table.marks), plan=None)
+        lost = plan.lost & (end.status == MOTION_CODE["ok"])
+        status = jnp.where(lost, MOTION_CODE["no_derivatives"], end.status).astype(jnp.int32)
+        table = MotionTable(samples, events, end.table.marks)
+        end = end._replace(table=table, status=status, plan=None)
         none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)
         return end, none._replace(table=MotionTable(slopes[0], slopes[1], none.table.marks))
 

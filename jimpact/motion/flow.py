@@ -38,7 +38,13 @@ from jimpact.motion.persistent_contact import (
     slip_margins,
 )
 from jimpact.motion.record import MOTION_CODE, Events
-from jimpact.motion.slip_in_space import SlipAxes, slip_axes, slip_within
+from jimpact.motion.slip_in_space import (
+    SlipAxes,
+    log_rates,
+    slip_axes,
+    slip_within,
+    turning_errors,
+)
 from jimpact.motion.system import System
 
 SMALLEST_STEP = 1e-15  # of the time: below it a step does not move time any more
@@ -165,6 +171,12 @@ class MotionFlow(eqx.Module, stepper.Flow):
         """Rows (k, 1) of margins, with that of the next sample."""
         return (jnp.append(margins, self.sample - at.t) / self.rounding)[:, None]
 
+    def spare_errors(
+        self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
+    ) -> list[jax.Array]:
+        """Errors that a step may make in its spare rows."""
+        return []
+
     def projected(self, const: Any, at: State) -> State:
         """The state back on the constraints of its modes."""
         return at
@@ -203,8 +215,26 @@ class MechanicalFlow(MotionFlow):
 
     @property
     def spare(self) -> int:  # type: ignore[override]
-        """The gaps by integration: steps follow them where the base moves faster than the body."""
-        return self.like.contact_work.shape[1]
+        """Rows that only limit steps: gaps by integration, in space logarithms of slip.
+
+        Steps follow gaps where the base moves faster than the body, and slip until little is left.
+        """
+        m = self.like.contact_work.shape[1]
+        return m if self.axes is None else 2 * m
+
+    def spare_errors(
+        self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
+    ) -> list[jax.Array]:
+        """Errors that a step of length h may make in its spare rows; `of_q`: sizes of q in it."""
+        of_u = of_q if self.system.body.coordinates is None else h * jnp.abs(state.v)
+        normal = kinematics(self.system, state.q, state.v, state.t)
+        of_gap = (
+            jnp.abs(normal.value) + h * jnp.abs(normal.rate) + jnp.abs(normal.gradient).T @ of_u
+        )
+        errors = [settings.atol + settings.rtol * of_gap]
+        if self.axes is not None:
+            errors.append(turning_errors(self.axes, settings.rtol, self.scales.speed))
+        return errors
 
     def constants(self, modes: jax.Array) -> Modes:
         """The modes, of each contact."""
@@ -233,8 +263,10 @@ class MechanicalFlow(MotionFlow):
         one = jnp.ones_like(at.t)
         moves = self.system.body.rates(at.q, at.v)
         rates = State(moves, force.acceleration, one, power, base, per_contact, still)
-        parting = jnp.where(const.active, 0.0, contacts.normal.rate)
-        return jnp.concatenate([self.regular(rates, at), parting[:, None]])
+        spare = [jnp.where(const.active, 0.0, contacts.normal.rate)]
+        if self.axes is not None:
+            spare.append(log_rates(self.axes, const, contacts, force))
+        return jnp.concatenate([self.regular(rates, at), *(x[:, None] for x in spare)])
 
     def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """What must stay positive."""
@@ -455,14 +487,7 @@ def _errors(flow: MotionFlow, settings: Settings, allowed: jax.Array, flight: Fl
     of_q = jnp.abs(state.q) + h * jnp.abs(system.body.rates(state.q, state.v))
     of_v = jnp.abs(state.v) + h * jnp.abs(rates)
     errors = [settings.atol + settings.rtol * jnp.concatenate([of_q, of_v]), allowed]
-    if flow.spare:
-        of_u = of_q if system.body.coordinates is None else h * jnp.abs(state.v)
-        normal = kinematics(system, state.q, state.v, state.t)
-        of_gap = (
-            jnp.abs(normal.value) + h * jnp.abs(normal.rate) + jnp.abs(normal.gradient).T @ of_u
-        )
-        errors.append(settings.atol + settings.rtol * of_gap)
-    return jnp.concatenate(errors)
+    return jnp.concatenate([*errors, *flow.spare_errors(settings, state, h, of_q)])
 
 
 def _smallest_step(targets: jax.Array) -> jax.Array:

@@ -202,7 +202,8 @@ def forces(
         # `solvers.friction`: they break loose together
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
         share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
-        return _least(w, right[:, None], held, jnp.concatenate([none + 1, share]))[:, 0]
+        weight = jnp.concatenate([none + 1, share])
+        return _least(w, right[:, None], held, weight, jnp.diagonal(contacts.delassus))[:, 0]
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
     both = both.at[m:].add(-(drag * both[:m, None]).reshape(-1))
@@ -256,25 +257,32 @@ def least_regularity(dtype: jnp.dtype) -> float:
 def _without_friction(w: jax.Array, right: jax.Array, held: jax.Array) -> jax.Array:
     """As `_least`; few contacts are taken not to be redundant."""
     if len(held) > _INDEPENDENT:
-        return _least(w, right, held, jnp.ones_like(right[:, 0]), _THIN_RIDGE)
+        return _least(w, right, held, jnp.ones_like(right[:, 0]), jnp.diagonal(w), _THIN_RIDGE)
     k = jnp.where(held[:, None] & held[None, :], w, jnp.eye(len(held), dtype=w.dtype))
     return solve_definite(k, jnp.where(held[:, None], right, 0.0))
 
 
 def _least(
-    w: jax.Array, right: jax.Array, held: jax.Array, weight: jax.Array, ridge: float = _RIDGE
+    w: jax.Array,
+    right: jax.Array,
+    held: jax.Array,
+    weight: jax.Array,
+    size: jax.Array,
+    ridge: float = _RIDGE,
 ) -> jax.Array:
     """`w x = right` (k, columns) on the rows that are held; 0 elsewhere.
 
-    Where that has many solutions, the one of least `sum w_jj x_j^2 / weight_j`.
+    Where that has many solutions, the one of least `sum size_j x_j^2 / weight_j` if w is symmetric.
+    Derivatives take `size` for constant: it must not change with slip.
     """
-    scale = jnp.where(held, 1 / jnp.sqrt(jnp.diagonal(w)), 1.0)
+    scale = jnp.where(held, 1 / jnp.sqrt(size), 1.0)
     scale = jax.lax.stop_gradient(jnp.where(scale < jnp.inf, scale, 1.0))
     both = held[:, None] & held[None, :]
     scaled = w * scale[:, None] * (scale * weight)[None]
     k = jnp.where(both, scaled, jnp.eye(len(held), dtype=w.dtype))
     right = jnp.where(held[:, None], right * scale[:, None], 0.0)
-    z = regularized(k[..., None], right, jnp.where(held, ridge, 0.0)[:, None], _REFINEMENTS)
+    ridges = jnp.where(held, ridge, 0.0)[:, None]
+    z = regularized(k[..., None], right, ridges, _REFINEMENTS, without_null=True)
     return (scale * weight)[:, None] * z
 
 
@@ -291,7 +299,7 @@ def constraint_impulse(
     held = held_rows(modes, size if friction else len(modes.active))[:size]
     w, columns = contacts.delassus[:size, :size], rates.reshape(size, -1)
     if friction:
-        p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]))
+        p = _least(w, -columns, held, jnp.ones_like(columns[:, 0]), jnp.diagonal(w))
     else:
         p = _without_friction(w, -columns, held)
     rest = contacts.delassus.shape[0] - size
@@ -386,13 +394,19 @@ def choose_with_friction(
     slid = before.active & ~before.stick
     broken = released[m:] & before.stick & ~sliding
     ended = jnp.any(released[m:] & slid)
+    begun = jnp.any(slid & (before.sign == BEGINS))  # then nothing begins: it slides or sticks
     # where sticking breaks at one contact of a body, those that began to slide before go on
     goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
     starts = broken | goes_on if spatial else broken  # in space directions are not remembered
     now = Modes(touching, ~sliding & (starts | ~goes_on), jnp.where(goes_on, before.sign, 0.0))
     slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
     # sliding begins against the last force of sticking
-    held = forces(contacts, mu, now._replace(active=touching & ~released[:m]), slides)
+    stays = Modes(touching, touching & ~sliding, jnp.ones_like(now.sign))
+    tries = jax.tree.map(
+        lambda *x: jnp.stack(x), now._replace(active=touching & ~released[:m]), stays
+    )
+    both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), tries)
+    held, without_slip = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     assert held.tangential is not None
     against = by_contact(held.tangential, m)
     against = -direction(against) if spatial else jnp.where(against > 0, -1.0, 1.0)
@@ -423,7 +437,7 @@ def choose_with_friction(
         if spatial:
             growth = jnp.sum(turns * slide, axis=1)
             slow = slip_begins(contacts, mu, solution.normal, growth) > 0
-            sign = jnp.where(slow & ~sliding, float(BEGINS), 1.0)
+            sign = jnp.where(slow & ~sliding & ~begun, float(BEGINS), 1.0)
         modes = Modes(active, active & ~slips, sign)
         # what was taken to slide from rest must do so
         returns = active & is_known & ~sliding & (jnp.sum(known * turns, axis=1) < -slack)
@@ -445,11 +459,40 @@ def choose_with_friction(
             done, tried.passes + 1,
         )  # fmt: skip
 
-    no = jnp.asarray(False)
-    start = _ModeTrial(now, begin, touching, jnp.ones_like(slack), no, no, no, jnp.asarray(0))
+    no, one = jnp.asarray(False), jnp.ones_like(slack)
+    start = _ModeTrial(now, begin, touching, one, no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(lambda t: ~t.done & (t.passes < _PASSES), choose, start)
     parts, several = touching & ~end.allowed, end.several & end.solved
-    return ModeChoice(end.modes, end.solved, end.regularity, several, parts)
+    choice = ModeChoice(end.modes, end.solved, end.regularity, several, parts)
+    if not spatial:
+        return choice
+    lets_go = jnp.any(released[:m]) | jnp.any(released[m:] & before.stick)
+    sticks = _all_stick(contacts, without_slip, mu, touching & ~sliding, touching, slack)
+    sticks = sticks & ~lets_go
+    return jax.tree.map(
+        lambda a, b: jnp.where(sticks, a, b),
+        ModeChoice(stays, ~no, one, several, no & touching),
+        choice,
+    )
+
+
+def _all_stick(
+    contacts: Contacts,
+    force: Forces,
+    mu: jax.Array,
+    stick: jax.Array,
+    touching: jax.Array,
+    slack: jax.Array,
+) -> jax.Array:
+    """Whether () these forces press all that is touching, and hold all that shall `stick`.
+
+    Half of the slack is for slip that has fallen back to 0: flights end beyond all of it.
+    """
+    assert force.tangential is not None
+    m = len(mu)
+    sizes = by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
+    cone = (mu * force.normal - length(by_contact(force.tangential, m))) * sizes
+    return jnp.all(~touching | (force.normal > 0)) & jnp.all(~stick | (cone > -0.5 * slack))
 
 
 class _ModeTrial(NamedTuple):

@@ -42,6 +42,12 @@ MOTION_STATUS = (
         False,
     ),
     Status("backward", "t_end is before t_start", True),
+    Status(
+        "no_derivatives",
+        "the motion is right, but its derivatives are NaN: it takes more steps than they keep "
+        "(samples + 16 `max_events` + 1024)",
+        False,
+    ),
 )
 MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 

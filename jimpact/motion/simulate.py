@@ -119,12 +119,13 @@ def simulate(
         Method 'events' has derivatives in both modes (grad, jvp, hessian) of everything in it,
         event times and accumulated works included, in all arrays, also those captured by the
         system's functions. They hold for the order of events that occurs: one-sided where
-        two events change places or a contact is grazed; NaN for motions of more steps than
-        samples + 16 `max_events` + 1024. Method 'contact_forces' has forward ones (jvp, jacfwd).
+        two events change places or a contact is grazed; NaN, with status `no_derivatives`, for
+        motions of more steps than samples + 16 `max_events` + 1024. Method 'contact_forces' has
+        forward ones (jvp, jacfwd).
 
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step, and
-            of motions with friction in space.
+            of motions with friction in space at several contacts.
         ValueError: shapes, t_end <= t_start, penetration, NaN in base motion or mass, on the
             host; inside jit the status reports them (`raise_on_failed_motion`).
 

@@ -6,8 +6,12 @@ slip u_0, n at right angles to it.
 
 SLIP ENDS where `u . d` falls to 0, which a step lands on. The field has to go on behind it, so the
 direction is that of `max(|u . d|, AHEAD |u_0|) d + (u . n) n`. Slip that ends without turning is
-then as smooth as in the plane. Where it turns, steps become shorter and shorter towards its end,
-and little is left of it in the landing.
+then as smooth as in the plane.
+
+ERRORS of slip count by what is left of it: a small error of a small slip is a large one of its
+direction, and of all derivatives. So steps integrate `ln |u|`, too, whose error limits their
+length: each takes a part of the slip, until less than LAST is left for the landing. Within it the
+direction changes as if all of this were still there.
 
 SLIP BEGINS, at a contact that stuck, slowly: its rate r' grows from 0, while its direction follows
 the forces at a rate c / r, with c the acceleration by friction. As long as `r' < BEGINNING c` the
@@ -26,6 +30,7 @@ from jimpact.events.batches import any_lane
 from jimpact.motion.persistent_contact import (
     BEGINS,
     Contacts,
+    Forces,
     Modes,
     by_contact,
     direction,
@@ -38,6 +43,12 @@ from jimpact.motion.persistent_contact import (
 AHEAD = 1e-2
 # Of the speed scale of the motion: less slip is none yet. Ten times more is still rounding.
 NO_SLIP = 1e-13
+# Of the speed scale of the motion: slip that is left for the landing. Ten times more: derivatives
+# of motions err by ten times as much where slip ends, ten times less: by rounding.
+LAST = 1e-8
+# Error of `ln |u|` that a step may make, as a share of the speed scale over the slip, in tolerances
+# of the flight, and at most. Ten times more: derivatives err by ten times as much.
+TURNING, MOST_TURNING = 10.0, 1e-3
 # Iterations for first directions: 1 for one contact, 3 to 4 for contacts of one body. Ten times
 # more only take time.
 _NEWTON = 6
@@ -48,10 +59,12 @@ _RIDGE = 1e-6
 
 
 class SlipAxes(NamedTuple):
-    """Of the m contacts at the beginning of a step: d (m, 2) and |u_0| (m,)."""
+    """Of the m contacts at the beginning of a step."""
 
-    along: jax.Array
-    speed: jax.Array
+    along: jax.Array  # d (m, 2)
+    speed: jax.Array  # |u_0| (m,), 0 where slip starts
+    least: jax.Array  # (m,) slip that at least lies ahead
+    last: jax.Array  # (m,) whether little of it is left
 
 
 def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.Array) -> SlipAxes:
@@ -68,18 +81,40 @@ def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.
         lambda: _first_directions(contacts, mu, modes, starts, moving),
         lambda: moving,
     )
-    return SlipAxes(along, jnp.where(starts, 0.0, speed))
+    last, speed = speed <= LAST * speed_scale, jnp.where(starts, 0.0, speed)
+    least = jnp.where(last, 1.0, AHEAD) * jax.lax.stop_gradient(speed)
+    return SlipAxes(along, speed, jnp.where(starts, NO_SLIP * speed_scale, least), last)
 
 
 def slip_within(axes: SlipAxes, modes: Modes, rate: jax.Array) -> jax.Array:
     """Unit vectors (m, 2) of slip along the axes of the step; `rate` (t,) is along them, too."""
     u = by_contact(rate, len(axes.speed))
-    least = AHEAD * jax.lax.stop_gradient(axes.speed)
     # behind its end slip counts as in front of it: its direction would be stiff at the least one
-    ahead, none = jnp.maximum(jnp.abs(u[:, 0]), least), (axes.speed == 0) & (u[:, 0] <= 0)
+    ahead = jnp.maximum(jnp.abs(u[:, 0]), axes.least)
+    none = (axes.speed == 0) & (u[:, 0] <= axes.least)
     straight = (modes.sign == BEGINS) | none
     ahead, across = jnp.where(straight, 1.0, ahead), jnp.where(straight, 0.0, u[:, 1])
     return direction(jnp.stack([ahead, across], axis=1))
+
+
+def log_rates(axes: SlipAxes, modes: Modes, contacts: Contacts, force: Forces) -> jax.Array:
+    """Rates (m,) of `ln |u|` where contacts slide, 0 elsewhere and where little of u is left."""
+    assert contacts.tangent is not None
+    assert force.tangential is not None
+    m = len(axes.speed)
+    both = jnp.concatenate([force.normal, force.tangential])
+    growth = by_contact((contacts.approach + contacts.delassus @ both)[m:], m)
+    u = by_contact(contacts.tangent.rate, m)
+    square = jnp.maximum(jnp.sum(u * u, axis=1), axes.least**2)
+    slides = modes.active & ~modes.stick & (modes.sign != BEGINS) & ~axes.last
+    return jnp.where(slides, jnp.sum(u * growth, axis=1) / jnp.where(slides, square, 1.0), 0.0)
+
+
+def turning_errors(axes: SlipAxes, rtol: float, speed_scale: jax.Array) -> jax.Array:
+    """Errors (m,) of `ln |u|` that a step may make: more where little of the slip is left."""
+    share = speed_scale / jnp.where(axes.last, 1.0, axes.speed)
+    errors = TURNING * rtol * jnp.maximum(share, 1.0)
+    return jnp.where(axes.last, MOST_TURNING, jnp.minimum(errors, MOST_TURNING))
 
 
 def _first_directions(

@@ -192,7 +192,10 @@ def resolve(
         fired, stopped = _fired_in_space(strike, before, fired)
     stick, result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight, stopped)
     jump = result.jump
-    choice, held, released = _next_modes(system, mu, settings, strike, result, before, fired)
+    at_rest = state._replace(v=jump.v)
+    choice, held, released = _next_modes(
+        system, mu, settings, strike, result, at_rest, before, fired
+    )
     status, code, wedges = _status(strike, jump, choice, held)
     took = jnp.where(strike.happens, jump.impulse != 0, jnp.any(fired.reshape(-1, m), axis=0))
     took = took | choice.parts
@@ -315,22 +318,23 @@ def _next_modes(
     settings: Settings,
     strike: _Strike,
     result: "_Resting",
+    state: State,
     before: Modes,
     fired: jax.Array,
 ) -> tuple[ModeChoice, jax.Array, jax.Array]:
-    """The modes after the event, contacts (m,) that are at rest, and constraints released."""
-    contacts, jump, rest = strike.contacts, result.jump, strike.rest
+    """The modes after the event at this state, contacts (m,) at rest, and constraints released."""
+    contacts, rest = strike.contacts, strike.rest
+    if mu is not None:  # what velocities before the rest would still turn, redundant contacts fight
+        contacts = contacts_at(system, state.q, state.v, strike.t, True)
     # redundant contacts come to rest with others
-    relative = jump.v - carried_along(system, jump.v, strike.t)
+    relative = state.v - carried_along(system, state.v, strike.t)
     rate = contacts.normal.gradient.T @ relative
     at_rest = strike.closed & (jnp.abs(rate) <= rest)
     held = result.held | at_rest
     held_before = before.active if not settings.friction else jnp.tile(before.active, 2)
     released = fired & held_before & ~strike.happens
     if mu is not None:
-        choice = _with_friction(
-            contacts, mu, before, held, released, relative, rest, _slack(strike)
-        )
+        choice = _with_friction(contacts, mu, before, held, released, rest, _slack(strike))
         return choice, held, released
     m = held.shape[0]
     active = result.pressed | (at_rest & result.still & ~released)
@@ -461,16 +465,13 @@ def _with_friction(
     before: Modes,
     held: jax.Array,
     released: jax.Array,
-    relative: jax.Array,
     rest: jax.Array,
     slack: jax.Array,
 ) -> ModeChoice:
-    """Modes with friction, at velocities `relative` (n,) to the base."""
+    """Modes with friction."""
     assert contacts.tangent is not None
-    rate = contacts.tangent.gradient.T @ relative
-    now = contacts._replace(tangent=contacts.tangent._replace(rate=rate))
-    slides = length(by_contact(rate, len(mu))) > rest
-    return choose_with_friction(now, mu, before, held, released, slides, slack)
+    slides = length(by_contact(contacts.tangent.rate, len(mu))) > rest
+    return choose_with_friction(contacts, mu, before, held, released, slides, slack)
 
 
 def _grown(

@@ -183,17 +183,28 @@ def load_shares(limit: jax.Array, least: float = 0.0) -> jax.Array:
 
 
 def regularized(
-    matrix: jax.Array, right: jax.Array, ridge: jax.Array, refinements: int
+    matrix: jax.Array,
+    right: jax.Array,
+    ridge: jax.Array,
+    refinements: int,
+    without_null: bool = False,
 ) -> jax.Array:
     """`matrix z = right` (n, B) where it may be singular: solved with a ridge (n, B) added to it.
 
     Each refinement removes what the ridge changes where the matrix is regular, and makes the
-    derivatives right in one order more: the inverse has none.
+    derivatives right in one order more: the inverse has none. In its null space the inverse is
+    large, and so is its rounding: `without_null` subtracts this part of what it gives.
     """
     inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
-    z = times(inverted, right)
+
+    def solved(right: jax.Array) -> jax.Array:
+        """What the inverse gives."""
+        z = times(inverted, right)
+        return z - times(inverted, ridge * z) if without_null else z
+
+    z = solved(right)
     for _ in range(refinements):
-        z = z + times(inverted, right - times(matrix, z))
+        z = z + solved(right - times(matrix, z))
     return z
 
 
