@@ -375,8 +375,11 @@ def kinetic_angles(scene: Scene) -> jax.Array:
     Returns:
         Angles (m, m) [rad], pi on the diagonal.
 
+    G is the normalized `delassus_matrix`, so bilateral constraints count: contacts of bodies that a
+    constraint ties together are coupled. (6.66) takes the masses alone, where they are decoupled.
+
     Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
-    Source: Brogliato (2016), (6.66).
+    Source: Brogliato (2016), (6.66), with the W of the constrained bodies.
 
     >>> import jimpact as ji
     >>> float(ji.kinetic_angles(ji.chain([1.0, 2.0, 3.0]))[0, 1].round(4))

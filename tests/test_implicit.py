@@ -99,6 +99,43 @@ def test_derivatives():
         jax.hessian(after)(0.5)
 
 
+def edge_problem():
+    """Restitution and friction of four impacts of a box on its edge, not yet at the fit."""
+    scene, velocity = pressed("edge")
+    shots = np.outer([0.8, 1.0, 1.2, 1.4], velocity)
+    after = np.outer([0.8, 1.0, 1.2, 1.4], EDGE)
+    data = ji.Experiments(shots, after, sigma=0.01)
+    law = ji.LZB(0.4, friction=0.25)
+    return ji.FitProblem.from_shots(law, scene, data, ("restitution", "friction"))
+
+
+def test_second_derivatives_of_a_fit_say_what_auto_is():
+    """The error names what the user may not have asked for; nothing is compiled."""
+    problem = edge_problem()
+
+    def cost(x):
+        return jnp.sum(problem.residual(x) ** 2)
+
+    with pytest.raises(NotImplementedError, match="or 'auto', which is 'implicit' for several"):
+        jax.jit(jax.hessian(cost)).lower(jnp.asarray(problem.start))
+
+
+@pytest.mark.slow
+def test_gradient_of_a_fit():
+    """Of the sum of squares, in both modes 2 J^T r; and the fit finds what the impacts had."""
+    problem = edge_problem()
+
+    def cost(x):
+        return jnp.sum(problem.residual(x) ** 2)
+
+    x = jnp.asarray(problem.start)
+    wanted = 2 * problem.residual(x) @ problem.jacobian(x)
+    for mode in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(jax.jit(mode(cost))(x), wanted, rtol=1e-4)
+    found = ji.fit(problem, starts=1, profiles=False)
+    np.testing.assert_allclose(found.value, 0.3, atol=1e-3)
+
+
 @pytest.mark.slow
 def test_derivatives_with_friction():
     """Those of the event-aligned method, for a box on a corner."""

@@ -230,7 +230,7 @@ def critical_kinetic_angle(friction: Any) -> jax.Array:
     Raises:
         ValueError: friction < 0.
 
-    Source: own derivation; Brogliato (2016), section 6.3.2.2 has mu = 0.
+    Source: own derivation; Brogliato (2016), section 6.3.2.2, shows the angle in a figure only.
 
     >>> import jimpact as ji
     >>> [round(float(ji.theory.critical_kinetic_angle(mu)), 4) for mu in (0.0, 0.3, 1.0)]
