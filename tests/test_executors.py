@@ -210,8 +210,15 @@ for name in sys.argv[2:] or SHARDED:
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SHARDED)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(
+            x, marks=pytest.mark.slow if x in ("moreau", "friction-lzb") else pytest.mark.release
+        )
+        for x in SHARDED
+    ],
+)
 def test_shard_map_on_four_devices(name):
     """Values and derivatives in both modes are those of one device."""
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=4"}

@@ -120,7 +120,7 @@ def test_second_derivatives_of_a_fit_say_what_auto_is():
         jax.jit(jax.hessian(cost)).lower(jnp.asarray(problem.start))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_gradient_of_a_fit():
     """Of the sum of squares, in both modes 2 J^T r; and the fit finds what the impacts had."""
     problem = edge_problem()

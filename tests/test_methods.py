@@ -151,7 +151,7 @@ def on_the_ground(name):
     return ji.Scene(mass, normals, tangents=tangents), velocity, ji.LZB(0.3, friction=0.3)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_chart_of_a_box_on_a_corner():
     """In space: the exact method at two tolerances, order 1 of Verlet, scipy; slopes in mu."""
     scene, velocity, law = on_the_ground("corner")

@@ -30,6 +30,10 @@ from jimpact.status import CODE
 # Beside a matrix with unit diagonal: it decides where that is singular (redundant contacts that
 # stick), and refinements remove what it changes elsewhere. Much less, and rounding decides, too.
 _RIDGE, _REFINEMENTS = 1e-7, 3
+# Part of its diagonal entry that friction leaves a contact which is about to jam. Ten times more:
+# redundant contacts share by their slip, which derivatives do not see; ten times less: the ridge is
+# felt for longer.
+_JAMS = 1e-2
 # Without friction masses may differ by as much as rounding lets them; how redundant contacts share
 # the load may err by rounding over this.
 _THIN_RIDGE = 1e-9
@@ -203,7 +207,7 @@ def forces(
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
         share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
         weight = jnp.concatenate([none + 1, share])
-        return _least(w, right[:, None], held, weight, jnp.diagonal(contacts.delassus))[:, 0]
+        return _least(w, right[:, None], held, weight, _sizes(w, contacts.delassus))[:, 0]
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
     both = both.at[m:].add(-(drag * both[:m, None]).reshape(-1))
@@ -252,6 +256,15 @@ def rest_acceleration(dtype: jnp.dtype) -> float:
 def least_regularity(dtype: jnp.dtype) -> float:
     """What of `regularity` is 0."""
     return float(jnp.finfo(dtype).eps) ** _LEAST_REGULARITY
+
+
+def _sizes(dragged: jax.Array, delassus: jax.Array) -> jax.Array:
+    """Diagonal (k,) that scales forces: that without friction, which slip does not change.
+
+    Where a contact jams, that with friction: beside the other one it would be less than the ridge.
+    """
+    with_friction, without = jnp.diagonal(dragged), jnp.diagonal(delassus)
+    return jnp.where(with_friction < _JAMS * without, with_friction, without)
 
 
 def _without_friction(w: jax.Array, right: jax.Array, held: jax.Array) -> jax.Array:
