@@ -52,7 +52,7 @@ DRAGGING = 100
 # detected later.
 OFTEN = 8
 # Contacts of a chain, more of which may come to rest together in no order that returns; passes per
-# contact after which a look ahead tells (`look_ahead.py`), again after twice, four times as many.
+# contact after which a look ahead decides (`look_ahead.py`), again after twice, four times as many.
 # Ten times more contacts: chains of 20 take 30 times as long; ten times more passes: as much later.
 MANY, LOOKS = 8, 15
 # Tolerances within which a flow watches the derivative of its forces in the exponents; the
@@ -407,7 +407,7 @@ class ContactFlow(Flow):
 
     @property
     def looks_ahead(self) -> bool:
-        """Whether it is so long a chain that a look ahead tells whether it comes to rest."""
+        """Whether the chain is so long that a look ahead decides whether it comes to rest."""
         self_similar = not self.gapped and self.viscous is None
         return isinstance(self.coupling, Chain) and self.contacts > MANY and self_similar
 

@@ -88,6 +88,14 @@ class ImplicitState(NamedTuple):
     time: jax.Array
 
 
+class Middle(NamedTuple):
+    """The contacts (m, B) in the middle of a step: x, normal impulse, and how fast it falls."""
+
+    indentation: jax.Array
+    load: jax.Array
+    unloading: jax.Array
+
+
 @as_pytree
 @dataclasses.dataclass
 class ImplicitSteps:
@@ -202,7 +210,7 @@ class ImplicitSteps:
         load = h * self.force_of(half, gamma)
         unloading = jnp.where(stiff, self.unloading(half, h), 0.0)
         impulses = self.frictional_impulses if len(s.velocity) > m else self.normal_impulses
-        impulse, rate, load = impulses(s, h, half, load, unloading, smooth)
+        impulse, rate, load = impulses(s, h, Middle(half, load, unloading), smooth)
         velocity = s.velocity + self.coupling.times(impulse)
         normal, after = impulse[:m], velocity[:m]
 
@@ -221,17 +229,12 @@ class ImplicitSteps:
         return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
 
     def frictional_impulses(
-        self,
-        s: ImplicitState,
-        h: jax.Array,
-        half: jax.Array,
-        load: jax.Array,
-        unloading: jax.Array,
-        smooth: bool,
+        self, s: ImplicitState, h: jax.Array, middle: Middle, smooth: bool
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Impulses (n, B) of both stages, those in unit time of the last one, and the load."""
         m, solver = self.contacts, solve_smooth if smooth else solve
         inner, gamma = INNER * self.tolerance, s.velocity[:m]
+        half, load, unloading = middle
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
@@ -250,15 +253,10 @@ class ImplicitSteps:
         return impulse, jnp.concatenate([normal, second[m:]]) / h, load
 
     def normal_impulses(
-        self,
-        s: ImplicitState,
-        h: jax.Array,
-        half: jax.Array,
-        load: jax.Array,
-        unloading: jax.Array,
-        smooth: bool,
+        self, s: ImplicitState, h: jax.Array, middle: Middle, smooth: bool
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """As `frictional_impulses`, without friction: the load, where nothing expands too fast."""
+        half, load, unloading = middle
         if self.viscous is not None:  # never stiff; the force at the velocity in the middle
             load = h * self.force_of(half, s.velocity + self.coupling.times(load) / 2)
             return load, load / h, load

@@ -12,7 +12,7 @@ would bring the contacts to rest now. These see, as `gamma` alone does not, how 
 on both sides of a light one still approach. A light body that does not lose its energy may push
 them apart in the end; meanwhile its states are no multiples of each other.
 
-The states of many contacts return in no order. There a look ahead tells (`look_ahead.py`).
+The states of many contacts return in no order. There a look ahead decides (`look_ahead.py`).
 """
 
 import functools
