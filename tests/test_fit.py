@@ -555,6 +555,8 @@ def test_further_shots_are_predicted_with_errors():
         assert (out.status == 0).all()
     unseen = replace(found, standard_error=np.array([np.inf]))
     assert np.isinf(unseen.predict(further).standard_error).all()
+    with pytest.raises(ValueError, match=r"`shots` must have shape \(K, 2\), .* \(1, 3\)"):
+        found.predict([[1.0, 0.0, 0.0]])
 
 
 def test_masks_groups_and_held_contacts():

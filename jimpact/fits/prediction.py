@@ -28,6 +28,11 @@ def predicted(fit: FitResult, shots: Any, scene: Scene | None) -> Predicted:
     data, scenes, units = shots, None, fit.experiments.units
     if isinstance(shots, Experiments):
         data, scenes, units = shots.pre, shots.scenes, shots.units
+    if np.ndim(data) != 2 or np.shape(data)[1] != len(units):
+        raise ValueError(
+            f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of the "
+            f"fit, but has shape {np.shape(data)}."
+        )
     data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
     own = fit.problem.scene if scene is None else scene
     problem = FitProblem.from_shots(fit.law, own, data, fit.problem.parameters.labels)
