@@ -14,9 +14,11 @@ from scipy import stats
 
 import jimpact as ji
 from jimpact import Law
+from jimpact.files.records import with_error
 from jimpact.fits.multistart import quiet
 from jimpact.fits.parameters import bounds_of, free_parameters
 from jimpact.fits.profiles import _Scans
+from jimpact.fits.ties import tied
 
 DATA = files("jimpact") / "data"
 PAIR = ji.chain([1.0, 2.0])
@@ -559,6 +561,121 @@ def test_further_shots_are_predicted_with_errors():
         found.predict([[1.0, 0.0, 0.0]])
 
 
+# --------------------------------------------------------------------- priors and ties
+
+
+def test_a_prior_weighs_like_one_more_measured_value():
+    """Newton's law is linear in e: mean, error, chi^2 and interval in closed form."""
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    data, mean, std = ji.Experiments(SHOTS, post, 0.02), 0.63, 0.01
+    e, error, rest = newton_in_closed_form(post, np.full_like(post, 50.0))
+    found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": ji.Normal(mean, std)})
+    variance = 1 / (error**-2 + std**-2)
+    best = variance * (e / error**2 + mean / std**2)
+    squares = rest + (best - e) ** 2 / error**2 + (best - mean) ** 2 / std**2
+    np.testing.assert_allclose(found.value, [best], rtol=1e-9)
+    np.testing.assert_allclose(found.standard_error, [np.sqrt(variance)], rtol=1e-9)
+    np.testing.assert_allclose([found.chi_squared, found.aic], [squares, squares + 2], rtol=1e-9)
+    assert found.degrees_of_freedom == 8 + 1 - 1
+    half = stats.norm.ppf(0.975) * np.sqrt(variance)
+    (profiled,) = ji.profile(found)
+    np.testing.assert_allclose(profiled.intervals, [(best - half, best + half)], rtol=1e-4)
+    problem = found.problem
+    np.testing.assert_allclose(problem.residual([0.5])[-1], (0.5 - mean) / std)
+    assert len(problem.residual([0.5])) == len(problem.jacobian([0.5])) == 9
+    without = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, data).log_density([0.5])
+    np.testing.assert_allclose(problem.log_density([0.5]), without)
+    assert found.verdict.endswith("assuming the prior 0.63 ± 0.01 of restitution.")
+    many = ji.bootstrap(found, samples=400)
+    np.testing.assert_allclose(many.value.std(ddof=1), np.sqrt(variance), rtol=0.15)
+
+
+def test_a_prior_that_the_data_contradict_is_named():
+    """Its distance from the data alone, over both errors: named beyond 2.58 of them."""
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    data, std = ji.Experiments(SHOTS, post, 0.02), 0.01
+    e, error, _ = newton_in_closed_form(post, np.full_like(post, 50.0))
+    for far, named in ((2.5, False), (2.65, True)):
+        mean = e + far * np.hypot(error, std)
+        found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": (mean, std)})
+        assert (f"is {far:.2g} standard errors off" in reported(found)) is named
+        assert ("the prior of restitution contradicts the data" in found.verdict) is named
+
+
+def test_what_only_a_prior_knows_is_said_to_be_its():
+    law = ji.Newton([0.8, 0.6])
+    seen = ji.Experiments(PRE_3[:1], simulated(law, BALLS, PRE_3[:1]), 0.01)  # not contact 2
+    found = ji.fit(law, BALLS, seen, starts=1, priors={"restitution[2]": (0.7, 0.05)})
+    np.testing.assert_allclose(found["restitution[2]"][:2], [0.7, 0.05], rtol=1e-6)
+    assert (found.rank, found.from_prior.tolist()) == (2, [False, True])
+    assert "restitution[2] = 0.70 ± 0.05, which is its prior" in found.verdict
+    assert "prior alone 0.7 ± 0.05" in str(found)
+    plan = ji.design(found, ji.Experiments(PRE_3[2:3], PRE_3[2:3], 0.01))
+    alone = ji.design(
+        ji.fit(law, BALLS, seen, starts=1), ji.Experiments(PRE_3[2:3], PRE_3[2:3], 0.01)
+    )
+    together = 1 / (alone.standard_error[0, 1] ** -2 + 0.05**-2)
+    np.testing.assert_allclose(plan.standard_error[0, 1], np.sqrt(together), rtol=1e-4)
+
+
+def two_thirds(p):
+    return p["restitution[1]"] * 2 / 3
+
+
+def test_ties_follow_and_pass_their_errors_on():
+    """e2 = 2/3 e1 by a tie, and by linear regression: v+ of Newton's law is linear in both."""
+    post = simulated(ji.Newton([0.9, 0.6]), BALLS, PRE_3, noise=0.01)
+    corners = [simulated(ji.Newton(e), BALLS, PRE_3) for e in ([0.0, 0.0], [0.9, 0.6])]
+    x, y = (corners[1] - corners[0]).ravel() / 0.9, (post - corners[0]).ravel()
+    data, ties = ji.Experiments(PRE_3, post, 0.01), {"restitution[2]": two_thirds}
+    found = ji.fit(ji.Newton([0.5, 0.5]), BALLS, data, ties=ties, starts=1)
+    e, error = x @ y / (x @ x), 0.01 / np.sqrt(x @ x)
+    assert found.names == ("restitution[1]",)
+    np.testing.assert_allclose(found.law.restitution, [e, e * 2 / 3], rtol=1e-9)
+    np.testing.assert_allclose(found.tied["restitution[2]"], [e * 2 / 3, error * 2 / 3], rtol=1e-6)
+    np.testing.assert_allclose(found.standard_error, [error], rtol=1e-6)
+    assert f"restitution[2] = {with_error(e * 2 / 3, error * 2 / 3)} is tied" in str(found)
+    further = found.predict(2 * PRE_3)
+    slope = 2 * x.reshape(PRE_3.shape)
+    np.testing.assert_allclose(further.standard_error, error * np.abs(slope), atol=1e-9)
+
+
+def test_ties_reach_across_fields_in_any_order():
+    law = ji.LZB([0.5, 0.5, 0.5], [1.0, 1.0, 1.0])
+    ties = (
+        ("stiffness[3]", lambda p: p["stiffness[2]"] + p["restitution"][1]),
+        ("stiffness[2]", lambda p: 2 * p["stiffness[1]"]),
+        ("restitution[2]", lambda p: p["restitution[1]"] / 2),
+    )
+    for order in (ties, ties[::-1]):
+        np.testing.assert_array_equal(tied(law, order).stiffness, [1.0, 2.0, 2.25])
+    chosen, _ = free_parameters(law, ("restitution", "stiffness"), ties=ties)
+    assert chosen.names == ("restitution[1]", "restitution[3]")  # stiffness[1]: only ratios matter
+
+
+@pytest.mark.parametrize(
+    ("ties", "message"),
+    [
+        (
+            {"restitution[1]": lambda p: p["restitution[2]"], "restitution[2]": two_thirds},
+            r"circle, but restitution\[1\] needs restitution\[2\], which needs restitution\[1\]",
+        ),
+        ({"restitution[2]": lambda p: p["restitution"][0]}, "needs restitution.2."),
+        ({"restitution[2]": lambda p: 3.0}, r"`restitution\[2\]` in \[0, 1\], but its function gives \[3.0\]"),
+        ({"friction": lambda p: 0.1}, "parameters of Newton, one of restitution, but uses 'friction'"),
+        ({"restitution[2]": lambda p: p["mass"]}, "but uses 'mass'"),
+        ({"restitution[2]": 0.3}, "must map `restitution.2.` to a function"),
+        ({"restitution[2]": lambda p: p["restitution"]}, "needs restitution"),
+        ({"restitution[2]": lambda p: jnp.ones(2)}, r"one number for `restitution.2.`, but .* shape \(2,\)"),
+        ({"restitution": lambda p: jnp.ones(2), "restitution[2]": two_thirds}, "overlap"),
+        ({"restitution": lambda p: 0.5}, "leaves none free"),
+    ],
+)  # fmt: skip
+def test_bad_ties(ties, message):
+    with pytest.raises(ValueError, match=message):
+        ji.fit(ji.Newton([0.5, 0.5]), BALLS, THREE, ties=ties)
+
+
 def test_masks_groups_and_held_contacts():
     truth = ji.LZB([0.9, 0.9], [3.0, 6.0])
     data = ji.Experiments(PRE_3, simulated(truth, BALLS, PRE_3))
@@ -1054,6 +1171,11 @@ PER_CONTACT = ji.LZB([0.9, 0.9], [1.0, 1.0])
         (ji.Newton(0.9), PAIR, TWO, {"bounds": {"restitution": 0.5}}, r"map `restitution` to \(low, high\)"),
         (ji.Newton(0.9), PAIR, TWO, {"bounds": {"stiffness": (1.0, 2.0)}}, r"name free parameters, restitution, but has 'stiffness'"),
         (PER_CONTACT, BALLS, THREE, {"bounds": {"stiffness": (0.0, 2.0)}}, r"must be > 0 for `stiffness`"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": (1.2, 0.1)}}, r"mean in \[0, 1\] for `restitution`, but has \(1.2, 0.1\)"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": (0.9, 0.0)}}, r"standard deviation > 0 for `restitution`"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": 0.9}}, r"map `restitution` to \(mean, standard deviation\)"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution[2]": (0.9, 0.1)}}, r"name free parameters, restitution, but has 'restitution.2.'"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": (0.9, 0.1)}}, r"`priors` must be left out where no `sigma`"),
         (ji.Newton(0.9), BALLS, TWO, {}, r"one velocity per body of the scene: it has 2 a shot, but the scene has 3"),
         (ji.Newton(0.9), None, TWO, {}, r"`scene` must be a Scene"),
         (ji.Newton([0.9, 0.9]), PAIR, TWO, {}, r"`restitution` must have shape \(1,\)"),

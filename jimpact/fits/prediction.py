@@ -3,13 +3,17 @@
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.multistart import SearchResult, ends, quiet, repeated, run
+from jimpact.fits.parameters import value_of
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.fits.result import FitResult
+from jimpact.fits.ties import entry_of, tied_names, tied_places
 from jimpact.scene import Scene
 
 
@@ -35,7 +39,8 @@ def predicted(fit: FitResult, shots: Any, scene: Scene | None) -> Predicted:
         )
     data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
     own = fit.problem.scene if scene is None else scene
-    problem = FitProblem.from_shots(fit.law, own, data, fit.problem.parameters.labels)
+    ties = dict(fit.problem.ties)
+    problem = FitProblem.from_shots(fit.law, own, data, fit.problem.parameters.labels, ties=ties)
     y = problem.point(problem.start)
     box: Any = BoxRegion(*np.broadcast_to(y.astype(problem.residuals.offset.dtype), (2, len(y))))
     held = eqx.tree_at(
@@ -45,11 +50,7 @@ def predicted(fit: FitResult, shots: Any, scene: Scene | None) -> Predicted:
     )
     states = run(repeated(held, 1), y[None], "levenberg-marquardt", 1, quiet)
     solution = ends(problem, states)
-    slope, seen = jacobian_of(problem, solution), fit.determined
-    known = slope[..., seen]
-    variance = np.einsum("kip,pq,kiq->ki", known, fit.covariance[np.ix_(seen, seen)], known)
-    blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
-    error = np.where(blind, np.inf, np.sqrt(variance))
+    error = fit.errors_of(jacobian_of(problem, solution))
     return Predicted(solution.predicted, error, np.asarray(solution.status))
 
 
@@ -58,3 +59,25 @@ def jacobian_of(problem: FitProblem, solution: SearchResult) -> np.ndarray:
     shape = (*problem.measured.shape, len(problem.names))
     slope = solution.jacobian.reshape(shape) / solution.scale
     return problem.errors_of(problem.size * slope)
+
+
+def tied_values(fit: FitResult) -> dict[str, tuple[float, float]]:
+    """What follows from the parameters by ties: values and standard errors, by name of the entry.
+
+    The errors are those that the derivatives of the ties leave.
+    """
+    problem, ties = fit.problem, fit.problem.ties
+
+    def values(x: jax.Array) -> jax.Array:
+        """The tied entries of parameters x."""
+        law = problem.to_law(x)
+        parts = [jnp.ravel(value_of(law, entry_of(name)[0])) for name, _ in ties]
+        places = tied_places(law, ties).values()
+        return jnp.concatenate([part[np.array(at)] for part, at in zip(parts, places)])
+
+    if not ties:
+        return {}
+    x = jnp.asarray(fit.value, problem.precision)
+    errors = fit.errors_of(np.asarray(jax.jacfwd(values)(x), float))
+    pairs = zip(np.asarray(values(x), float).tolist(), errors.tolist())
+    return dict(zip(tied_names(fit.law, ties), pairs))
