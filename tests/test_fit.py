@@ -18,6 +18,7 @@ from jimpact.files.records import with_error
 from jimpact.fits.multistart import quiet
 from jimpact.fits.parameters import bounds_of, free_parameters
 from jimpact.fits.profiles import _Scans
+from jimpact.fits.saved import write_fit
 from jimpact.fits.ties import tied
 
 DATA = files("jimpact") / "data"
@@ -295,7 +296,10 @@ def test_derivatives_that_are_no_numbers_are_left_out_or_refused():
     )
     with pytest.raises(ValueError, match=r"at restitution = 0.9 those of 1 measured values \(1\)"):
         ji.fit(problem)
-    with pytest.raises(ValueError, match="`bounds` must be left out where a FitProblem is given"):
+    with pytest.raises(
+        ValueError,
+        match="`bounds`, `priors` and `ties` must be left out where a FitProblem is given",
+    ):
         ji.fit(problem, bounds={"restitution": (0.5, 1.0)})
 
 
@@ -555,10 +559,72 @@ def test_further_shots_are_predicted_with_errors():
         np.testing.assert_allclose(out.velocity, at_0 + e * (at_1 - at_0), rtol=1e-9)
         np.testing.assert_allclose(out.standard_error, error * np.abs(at_1 - at_0), rtol=1e-6)
         assert (out.status == 0).all()
+    q = stats.norm.ppf(0.9)
+    half = q * np.sqrt((error * (at_1 - at_0)) ** 2 + 0.02**2)
+    band = found.predict(further, level=0.8)
+    np.testing.assert_allclose([band.velocity - band.low, band.high - band.velocity], [half] * 2)
+    own = found.predict(ji.Experiments(further, further, 0.1))
+    np.testing.assert_allclose(own.noise, 0.1)
+    unknown = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    np.testing.assert_allclose(unknown.predict(further).noise, unknown.noise)
     unseen = replace(found, standard_error=np.array([np.inf]))
     assert np.isinf(unseen.predict(further).standard_error).all()
-    with pytest.raises(ValueError, match=r"`shots` must have shape \(K, 2\), .* \(1, 3\)"):
-        found.predict([[1.0, 0.0, 0.0]])
+    each = replace(found, law=ji.Newton([0.6]))
+    for fit, shots, scene, message in (
+        (found, [[1.0, 0.0, 0.0]], None, r"`shots` must have shape \(K, 2\), .* \(1, 3\)"),
+        (found, further, BALLS, r"`scene` must have 2 velocities as the fit, but has 3 and 2"),
+        (each, further, WALLED, r"2 velocities as the fit and 1 contacts, .*but has 2 and 2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fit.predict(shots, scene)
+
+
+@pytest.mark.parametrize("options", [{}, {"sigma_pre": 0.01}])
+def test_a_saved_fit_is_the_same_fit(tmp_path, options):
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    post[2, 1] = np.nan
+    data = ji.Experiments(SHOTS, post, 0.02, shots="abcd", **options)
+    found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": (0.6, 0.1)})
+    path = found.save(tmp_path / "fit.json")
+    again = ji.load_fit(path)
+    assert (str(again), again.to_dict()) == (str(found), found.to_dict())
+    for a, b in zip(*(jax.tree.leaves(x.problem.residuals) for x in (found, again))):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+    np.testing.assert_array_equal(again.problem.residual([0.7]), found.problem.residual([0.7]))
+    np.testing.assert_array_equal(again.predict(SHOTS).low, found.predict(SHOTS).low)
+    record = json.loads(path.read_text())
+    assert record["versions"]["jax"] == jax.__version__
+    law = record["result"]["law"]
+    for change, message in (
+        ({"format": 2, "versions": {"jimpact": "9.9"}}, r"format 1, but has format 2 \(written by jimpact 9.9; this"),
+        ({"result": record["result"] | {"law": law | {"class": "mine:Law"}}}, "law of your own must be imported"),
+        ({"result": record["result"] | {"law": law | {"class": "os:remove"}}}, "is no class of a law"),
+        ({"result": record["result"] | {"law": law | {"fields": {}}}}, "Newton has the fields"),
+    ):  # fmt: skip
+        path.write_text(json.dumps(record | change))
+        with pytest.raises(ValueError, match=message):
+            ji.load_fit(path)
+    for text, message in (("[1]", "has no `format`"), ("e = 0.9", "a saved fit .JSON., but")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            ji.load_fit(path)
+
+
+def test_functions_cannot_be_saved(tmp_path):
+    observed = ji.FitProblem.from_observable(ji.Newton(0.9), lambda law: law.restitution, 0.5)
+    for problem, message in (
+        (observed, "must be to shots to be saved"),
+        (ji.FitProblem.from_shots(ji.Newton([0.5, 0.5]), BALLS, THREE, ties={"restitution[2]": two_thirds}), "must have no ties"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            write_fit(Saved(problem), tmp_path / "fit.json")
+
+
+class Saved:
+    """What `write_fit` looks at first."""
+
+    def __init__(self, problem):
+        self.problem, self.experiments = problem, problem.experiments
 
 
 # --------------------------------------------------------------------- priors and ties

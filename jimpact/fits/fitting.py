@@ -22,6 +22,7 @@ from jimpact.fits.profiles import needs_profiles, profile, quick_profiles
 from jimpact.fits.report import report, verdict
 from jimpact.fits.result import FitMinimum, FitResult
 from jimpact.fits.robust import LOSSES, RobustSolution, robust_solution
+from jimpact.fits.saved import read_fit, write_fit
 from jimpact.fits.tables import as_dict, dataset, parameters_frame
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.fits.verdicts import fit_warnings
@@ -54,24 +55,43 @@ class Fit(FitResult[AnyLaw]):
         """What is tied to parameters, by name: values with their standard errors."""
         return tied_values(self)
 
-    def predict(self, shots: Any, scene: Scene | None = None) -> Predicted:
+    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
         """Velocities after further shots, with the errors that the parameters leave in them.
 
-        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; the error of
-        a measurement, `noise`, comes on top of it (in squares).
+        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
+        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
+        quantile as in `intervals`.
 
         Args:
             shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
             scene: of all shots; None: that of the fit, or those of the shots.
+            level: of the band.
 
         Returns:
             `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
-            do not determine, NaN where the errors are unknown; `status` (K,).
+            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
+            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
+            `high` (K, n), the band of a measurement.
 
         Raises:
-            ValueError: a fit of something else than shots; velocities that do not fit the scene.
+            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
+                scene that does not fit the law; a level outside (0, 1).
         """
-        return predicted(self, shots, scene)
+        return predicted(self, shots, scene, level)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the fit to a file (JSON) that `ji.load_fit` reads: problem, result, versions.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+        """
+        return write_fit(self, Path(path))
 
     def report(self, path: str | Path, profiles: bool = True) -> Path:
         """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
@@ -99,6 +119,34 @@ class Fit(FitResult[AnyLaw]):
 
     def __str__(self) -> str:
         return report(self)
+
+
+def load_fit(path: str | Path) -> Fit[Any]:
+    """The fit that `Fit.save` has written, with all that one can do with a fit.
+
+    The classes of laws and scenes are imported by name, so read only files that you trust.
+
+    Args:
+        path: the file.
+
+    Returns:
+        `Fit`.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no saved fit, one of another format, a law that cannot be imported.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = ji.load_fit(result.save(Path(folder) / "fit.json"))
+    >>> again.verdict == result.verdict
+    True
+    """
+    return Fit(**read_fit(Path(path)))
 
 
 def fit(
