@@ -75,6 +75,10 @@ from .laws.forces import (
     UserForce as UserForce,
 )
 from .laws.histories import history as history
+from .laws.impulse_correlation import (
+    ImpulseCorrelation as ImpulseCorrelation,
+    correlation_interval as correlation_interval,
+)
 from .laws.kinematic import (
     Moreau as Moreau,
     Newton as Newton,
@@ -87,6 +91,7 @@ from .laws.lzb import (
 )
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
 from .laws.poisson import Poisson as Poisson
+from .laws.routh import Routh as Routh
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent
 from .methods.advice import advise as advise
 from .methods.chart import work_precision as work_precision
