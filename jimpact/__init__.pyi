@@ -12,6 +12,7 @@ from .bodies.dimers import (
     dimer_3d as dimer_3d,
 )
 from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
+from .bodies.mujoco_scene import MujocoScene as MujocoScene, from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
 from .bodies.piles import Discs as Discs
