@@ -81,7 +81,11 @@ from .laws.kinematic import (
     Newton as Newton,
     RestitutionMatrix as RestitutionMatrix,
 )
-from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
+from .laws.lzb import (
+    LZB as LZB,
+    distributing_rule as distributing_rule,
+    precompression_energy as precompression_energy,
+)
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
 from .laws.poisson import Poisson as Poisson
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent

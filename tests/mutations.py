@@ -286,6 +286,8 @@ MUTATIONS = [
     Mutation("Newby's ratio", r"\(3 \* n\*\*4 - 2 \* n\*\*2", "(3 * n**4 + 2 * n**2", (examples("theory.linear_chain"),)),
     Mutation("sign of e_t in binary collisions", r"\(1 \+ friction\.restitution\[contact\]\)", "(1 - friction.restitution[contact])", ("test_friction.py::test_disk_in_closed_form[binary]",)),
     Mutation("sign of e_t in time stepping", r"e_t\[:, None\] \* slip", "-e_t[:, None] * slip", ("test_motion_stepped.py::test_a_superball_leaves_with_its_slip_reversed",)),
+    Mutation("precompression by the printed exponent", r"\(\(eta \+ 1\) \* stiffness \*\* \(1 / eta\)\)", "((eta + 1) * stiffness ** (1 / (eta + 1)))", ("test_compliant.py::test_precompression_energy",)),
+    Mutation("kinetic angles of free bodies", r"return _angles\(delassus_matrix\(scene\)\)", "return _angles(delassus_matrix(without_constraints(scene)))", ("test_scenes.py::test_kinetic_angles_of_tied_bodies",)),
     Mutation("quasi-velocities without the mass", r"tangent\.T @ momentum\(scene, v\)", "tangent.T @ v", ("test_quasi.py",)),
     Mutation("factor 2 of Theorem 6.2", r"reach = 2 \* _norm", "reach = _norm", ("test_consistency.py::test_least_ratio_is_sharp_for_one_contact",)),
     Mutation("kilometres an hour", r"1 / 3\.6", "3.6", ("test_experiments.py",)),
