@@ -12,6 +12,7 @@ from .bodies.dimers import (
     dimer_3d as dimer_3d,
 )
 from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
+from .bodies.mujoco_scene import MujocoScene as MujocoScene, from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
 from .bodies.piles import Discs as Discs
@@ -80,7 +81,11 @@ from .laws.kinematic import (
     Newton as Newton,
     RestitutionMatrix as RestitutionMatrix,
 )
-from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
+from .laws.lzb import (
+    LZB as LZB,
+    distributing_rule as distributing_rule,
+    precompression_energy as precompression_energy,
+)
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
 from .laws.poisson import Poisson as Poisson
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent

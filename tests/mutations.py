@@ -287,6 +287,8 @@ MUTATIONS = [
     Mutation("Newby's ratio", r"\(3 \* n\*\*4 - 2 \* n\*\*2", "(3 * n**4 + 2 * n**2", (examples("theory.linear_chain"),)),
     Mutation("sign of e_t in binary collisions", r"\(1 \+ friction\.restitution\[contact\]\)", "(1 - friction.restitution[contact])", ("test_friction.py::test_disk_in_closed_form[binary]",)),
     Mutation("sign of e_t in time stepping", r"e_t\[:, None\] \* slip", "-e_t[:, None] * slip", ("test_motion_stepped.py::test_a_superball_leaves_with_its_slip_reversed",)),
+    Mutation("precompression by the printed exponent", r"\(\(eta \+ 1\) \* stiffness \*\* \(1 / eta\)\)", "((eta + 1) * stiffness ** (1 / (eta + 1)))", ("test_compliant.py::test_precompression_energy",)),
+    Mutation("kinetic angles of free bodies", r"return _angles\(delassus_matrix\(scene\)\)", "return _angles(delassus_matrix(without_constraints(scene)))", ("test_scenes.py::test_kinetic_angles_of_tied_bodies",)),
     Mutation("quasi-velocities without the mass", r"tangent\.T @ momentum\(scene, v\)", "tangent.T @ v", ("test_quasi.py",)),
     Mutation("factor 2 of Theorem 6.2", r"reach = 2 \* _norm", "reach = _norm", ("test_consistency.py::test_least_ratio_is_sharp_for_one_contact",)),
     Mutation("kilometres an hour", r"1 / 3\.6", "3.6", ("test_experiments.py",)),
@@ -306,6 +308,13 @@ MUTATIONS = [
     Mutation("histogram in shares, not per cent", r"100 \* bars / max", "bars / max", ("test_pictures.py::test_a_histogram_is_in_per_cent",)),
     Mutation("measured and fitted exchanged in a picture", r"first\.plot\(fit\.predicted\[here\], measured\[here\]", "first.plot(measured[here], fit.predicted[here]", ("test_pictures.py::test_residuals_are_drawn_over_what_was_fitted",)),
     Mutation("residual indentation in a picture with e", r"1 - float\((\w+)\.restitution\) \*\* 2", r"1 - float(\1.restitution)", ("test_pictures.py::test_a_loop_encloses_the_energy_lost",)),
+    Mutation("MuJoCo's normals from the second geom", r"\(second - first\)", "(first - second)", ("test_mujoco.py::test_gap_velocities_are_rates_of_distances",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's balls apart by rounding", r"_TOUCHING = 1e-9", "_TOUCHING = 0.0", ("test_mujoco.py::test_balls_that_touch_but_for_rounding_touch",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's model keeps the margin", r"model, data = copy\.copy\(model\), copy\.copy\(data\)", "data = copy.copy(data)", ("test_mujoco.py::test_a_margin_finds_gaps",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's planar models in space", r"if \(mobility\[:, 0\] <= least\)\.all\(\)", "if False", ("test_mujoco.py::test_a_planar_model_has_planar_tangents",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's constraints repeat each other", r"sizes > _REPEATED \* sizes", "sizes >= 0.0 * sizes", ("test_mujoco.py::test_equality_constraints_are_bilateral_constraints",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's velocity projected without the mass", r"return np\.linalg\.solve\(root\.T, scaled - broken\)", "return velocity - constraints @ np.linalg.lstsq(constraints, velocity)[0]", ("test_mujoco.py::test_equality_constraints_are_bilateral_constraints",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's frictionless contacts rub", r"c\.friction\[0\] if c\.dim > 1 else 0\.0", "c.friction[0]", ("test_mujoco.py::test_contacts_without_friction_have_none",), "bodies/mujoco_scene.py"),
 ]  # fmt: skip
 
 

@@ -345,6 +345,15 @@ def test_distributing_rule():
     np.testing.assert_allclose(rule[1, 0], 0.640744299507361192, rtol=1e-14)
 
 
+def test_precompression_energy():
+    """`k x^(eta + 1) / (eta + 1)` at the x of the force; the chapter's number."""
+    energy = ji.precompression_energy(0.328633534503099668, 2.0, 1.5)
+    np.testing.assert_allclose(energy, 0.0394360241403719602, rtol=1e-14)
+    x, k, eta = np.array([0.1, 2.0]), np.array([3.0, 0.7]), np.array([1.0, 3.0])
+    energy = ji.precompression_energy(k * x**eta, k, eta)
+    np.testing.assert_allclose(energy, k * x ** (eta + 1) / (eta + 1), rtol=1e-14)
+
+
 def test_history_of_one_ball_on_a_linear_spring():
     """Half a period of `x = v / w sin(w t)`, of 1 kg, k = 2 N/m and 1 m/s."""
     history = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])

@@ -36,7 +36,7 @@ register(
     right_when="one contact, or contacts with kinetic angle pi/2",
     fails_when="contacts at rest (no dispersion), kinetic angles above pi/2 (p < 0)",
     promises={"velocity_scaling", "mass_scaling"},
-    source="Brogliato, Nonsmooth Mechanics (2016), (6.41) with diagonal E",
+    source="Brogliato, Nonsmooth Mechanics (2016), (6.44) with diagonal E",
     bibtex=_BIBTEX["brogliato2016"],
     simplicity=1,
 )
