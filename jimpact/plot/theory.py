@@ -22,6 +22,7 @@ from jimpact.plot.style import (
     mark,
     new_figure,
     new_panels,
+    write,
 )
 from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
@@ -99,9 +100,9 @@ def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.n
         _line(axes, frame, frame.before, away, f"no impulse at contact {closed[k] + 1}", ":")
     arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
-    _write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
+    write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
     for name, end in (("A", arc[0]), ("B", arc[-1])):
-        _write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
+        write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
     axes.plot(*frame.before, "o", color="black", ms=8, ls="none", label="before the impact")
     mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
     for i, (name, v) in enumerate(marked.items()):
@@ -114,12 +115,6 @@ def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.n
     axes.spines[["top", "right"]].set_visible(False)
     _legend(figure, axes, 3)
     return figure
-
-
-def _write(axes: Axes, at: np.ndarray, text: str, **style: Any) -> None:
-    """A centred text."""
-    centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
-    axes.annotate(text, (at[0], at[1]), **centred | style)
 
 
 def _legend(figure: Figure, axes: Axes, columns: int) -> None:
@@ -174,7 +169,7 @@ def _line(
     angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
     share, side = (0.45, "top") if style == "-" else (0.3, "bottom")
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
-    _write(axes, start + share * length * direction, text, color=GREY, **turned)
+    write(axes, start + share * length * direction, text, color=GREY, **turned)
 
 
 def _projections(
