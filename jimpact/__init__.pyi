@@ -99,6 +99,7 @@ from .methods.chart import work_precision as work_precision
 from .methods.comparison import (
     compare as compare,
     dispersion_index as dispersion_index,
+    energy_dispersion as energy_dispersion,
     energy_ratio as energy_ratio,
 )
 from .methods.rheologies import compare_rheologies as compare_rheologies

@@ -52,6 +52,15 @@ def comparison():
     return ji.plot.comparison(Comparison(BALLS, STRIKE, entries), AFTER, "three balls")
 
 
+def energy_plane():
+    rows = {"newton": AFTER, "moreau": [-1 / 3, 2 / 3, 2 / 3], "binary": [0.0, 0.0, 1.0]}
+    entries = {
+        name: dataclasses.replace(entry(ji.Newton(0.5), name != "newton"), outcome=outcome(v))
+        for name, v in rows.items()
+    }
+    return ji.plot.energy_plane(Comparison(BALLS, STRIKE, entries), "three balls")
+
+
 def rheologies():
     names = ("Hertz, bistiffness", "linear, bistiffness", "Kelvin-Voigt", "Hunt-Crossley")
     return ji.plot.rheologies(Comparison(BALLS, STRIKE, {x: entry(HERTZ) for x in names}), "forces")
@@ -200,6 +209,7 @@ PICTURES = {
     "residuals": lambda: ji.plot.residuals(canned(50)),
     "forces": lambda: ji.plot.forces({"soft": impact_history(), "hard": impact_history()}),
     "history": lambda: ji.plot.history(impact_history(), "three balls"),
+    "energy_plane": energy_plane,
     "rheologies": rheologies,
     "stability_map": lambda: ji.plot.stability_map(stability(), "where methods fail"),
     "stability_pairs": lambda: ji.plot.stability_pairs(stability(), "rk4"),
@@ -293,6 +303,18 @@ def test_a_loop_encloses_the_energy_lost():
     assert x.max() == pytest.approx(deepest)
     assert force.max() == pytest.approx(3.0 * deepest**1.5)
     assert np.trapezoid(force, x) == pytest.approx((1 - 0.6**2) * 1.0, rel=1e-3)
+
+
+def test_laws_stand_at_their_energy_and_dispersion():
+    """A at (1, sqrt 2), B at (1, sqrt 2 / 3); what is allowed lies between 1/3 and 1."""
+    axes = energy_plane().axes[0]
+    allowed, newton, moreau, binary = axes.lines
+    np.testing.assert_allclose(np.ravel(moreau.get_data()), [1, 2**0.5 / 3])
+    np.testing.assert_allclose(np.ravel(binary.get_data()), [1, 2**0.5])
+    assert newton.get_mfc() == "none"
+    kept, spread = allowed.get_data()
+    assert 1 / 3 < kept.min() < 0.4 and 0.9 < kept.max() < 1
+    assert spread.max() < 2**0.5
 
 
 def test_every_kind_of_picture_is_here():

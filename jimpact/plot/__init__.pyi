@@ -11,6 +11,7 @@ from .fits import contour as contour, fit as fit
 from .inference import correlation as correlation, profiles as profiles, residuals as residuals
 from .laws import (
     comparison as comparison,
+    energy_plane as energy_plane,
     forces as forces,
     history as history,
     rheologies as rheologies,

@@ -15,7 +15,7 @@ from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.laws.forces import Force
 from jimpact.laws.histories import History
-from jimpact.methods.comparison import Comparison
+from jimpact.methods.comparison import Comparison, energy_dispersion, energy_ratio
 from jimpact.plot.style import (
     COLOURS,
     GREY,
@@ -25,15 +25,18 @@ from jimpact.plot.style import (
     heading,
     legend_below,
     legend_within,
+    mark,
     new_figure,
     side_by_side,
     wrapped,
 )
 from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
+from jimpact.theory.admissible import admissible_set
 
 _SAMPLES = 120  # points of a force-indentation loop
 _UPRIGHT = 8  # names that stand side by side, at most
+_OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
 
 
 def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
@@ -124,6 +127,52 @@ def _laws_axis(axes: Axes, names: list[str]) -> None:
     labels = names if many else [wrapped(name) for name in names]
     axes.set_xticks(np.arange(len(names)), labels, fontsize=SMALL, rotation=90 if many else 0)
     axes.set_xlabel("law")
+
+
+def energy_plane(result: Comparison, title: str = "") -> Figure:
+    """Every law in the plane of energy kept (K_ER = T+/T-) and of its dispersion (C_KE).
+
+    Dots are samples of the outcomes that mechanics allows; a law whose outcome fails the audit is
+    hollow.
+
+    Args:
+        result: what `ji.compare` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: something else.
+
+    >>> import jimpact as ji
+    >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+    >>> ji.plot.energy_plane(result).axes[0].get_xlabel()
+    'energy ratio K_ER = T+/T-'
+    """
+    check_kind("result", result, Comparison)
+    figure = new_figure(5.4)
+    axes = figure.subplots()
+    allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
+    axes.plot(
+        *_kept_and_spread(result, allowed), ".", color=COLOURS[4], alpha=0.3, ms=3, label="allowed"
+    )
+    for i, (name, entry) in enumerate(result.entries.items()):
+        at = _kept_and_spread(result, np.asarray(entry.outcome.velocity)[None])
+        mark(axes, np.ravel(at), name, i, bool(entry.audit.consistent))
+    axes.set_xlabel("energy ratio K_ER = T+/T-")
+    axes.set_ylabel("energy dispersion C_KE (0: equal shares)")
+    heading(figure, title)
+    finish(axes)
+    legend_below(figure, axes.get_legend_handles_labels()[0], 4)
+    return figure
+
+
+def _kept_and_spread(result: Comparison, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """K_ER and C_KE (k,) of velocities after (k, n)."""
+    v, scene = jnp.asarray(after), result.scene
+    kept = jax.vmap(lambda x: energy_ratio(scene, result.velocity, x))(v)
+    return np.asarray(kept), np.asarray(jax.vmap(lambda x: energy_dispersion(scene, x))(v))
 
 
 def rheologies(result: Comparison, title: str = "") -> Figure:
