@@ -87,6 +87,11 @@ from .laws.lzb import (
     precompression_energy as precompression_energy,
 )
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
+from .laws.mujoco_contact import (
+    MujocoRestitution as MujocoRestitution,
+    mujoco_restitution as mujoco_restitution,
+    mujoco_solref as mujoco_solref,
+)
 from .laws.poisson import Poisson as Poisson
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent
 from .methods.advice import advise as advise

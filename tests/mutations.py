@@ -318,6 +318,8 @@ MUTATIONS = [
     Mutation("MuJoCo's constraints repeat each other", r"sizes > _REPEATED \* sizes", "sizes >= 0.0 * sizes", ("test_mujoco.py::test_equality_constraints_are_bilateral_constraints",), "bodies/mujoco_scene.py"),
     Mutation("MuJoCo's velocity projected without the mass", r"return np\.linalg\.solve\(root\.T, scaled - broken\)", "return velocity - constraints @ np.linalg.lstsq(constraints, velocity)[0]", ("test_mujoco.py::test_equality_constraints_are_bilateral_constraints",), "bodies/mujoco_scene.py"),
     Mutation("MuJoCo's frictionless contacts rub", r"c\.friction\[0\] if c\.dim > 1 else 0\.0", "c.friction[0]", ("test_mujoco.py::test_contacts_without_friction_have_none",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's time constants below two steps", r"time = max\(first, 2 \* timestep\)", "time = first", ("test_mujoco.py::test_restitution_is_that_of_mujoco",), "laws/mujoco_contact.py"),
+    Mutation("MuJoCo's impedance acts once on stiffness", r"stiffness \* d \* r\)", "stiffness * r)", ("test_mujoco.py::test_restitution_is_that_of_mujoco",), "laws/mujoco_contact.py"),
 ]  # fmt: skip
 
 

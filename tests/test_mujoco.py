@@ -229,3 +229,64 @@ def test_an_outcome_goes_back():
     world = ji.from_mujoco(model, data)
     data.qvel[:] = ji.impact(ji.Newton(0.5), world.scene, world.velocity).velocity
     np.testing.assert_allclose(data.qvel, [1.0, 2.0, 1.5, 0.1, 0.2, 0.3], rtol=1e-12)
+
+
+# ------------------------------------------------------------ the restitution of its own contacts
+
+FLAT, RISING = (0.95, 0.95, 0.001, 0.5, 2.0), (0.3, 0.9, 0.01, 0.3, 3.0)
+
+
+def bounce(solref, step, solimp, speed, phase):
+    """e of a ball on a plane in MuJoCo; the contact begins at this part of a step."""
+    default = f'<default><geom solref="{solref[0]} {solref[1]}" solimp="{" ".join(map(str, solimp))}"/></default>'
+    options = f'<option timestep="{step}" gravity="0 0 0"/>{default}'
+    model, data = load(body("0 0 1", 'size=".1" mass=".3"'), options)
+    data.qpos[2] = 0.1 - speed * step * phase
+    data.qvel[2] = -speed
+    while data.qpos[2] < 0.1:
+        mujoco.mj_step(model, data)
+    return data.qvel[2] / speed
+
+
+@pytest.mark.parametrize("solref", [(0.02, 0.554), (0.02, 0.1), (0.002, 1.0), (-1e5, -30.0)])
+@pytest.mark.parametrize("solimp", [FLAT, RISING])
+def test_restitution_is_that_of_mujoco(solref, solimp):
+    step, speed = 0.004, 0.7
+    e = [bounce(solref, step, solimp, speed, (i + 0.5) / 64) for i in range(64)]
+    ours = ji.mujoco_restitution(solref, step, solimp, speed)
+    assert ours == pytest.approx((np.mean(e), min(e), max(e)), rel=1e-12)
+
+
+def test_small_steps_give_the_linear_oscillator():
+    """Without pull it ends at e = exp(-2 z / r atan(r / z)) with r^2 = 1 - z^2."""
+    for zeta in (0.1, 0.554, 0.9):
+        root = np.sqrt(1 - zeta**2)
+        e = np.exp(-2 * zeta / root * np.arctan(root / zeta))
+        assert ji.mujoco_restitution((0.02, zeta), 1e-5, FLAT).mean == pytest.approx(e, abs=1e-3)
+
+
+@pytest.mark.parametrize("e", [0.02, 0.27, 0.9, 1.0])
+def test_a_solref_gives_its_restitution(e):
+    solref = ji.mujoco_solref(e, 0.002)
+    measured = [
+        bounce(solref, 0.002, (0.9, 0.95, 0.001, 0.5, 2.0), 1.0, x / 16) for x in range(1, 17)
+    ]
+    assert np.mean(measured) == pytest.approx(e, abs=3e-3)
+    assert ji.mujoco_restitution(solref, 0.002).mean == pytest.approx(e, abs=1e-6)
+
+
+def test_bad_parameters_of_contacts_are_named():
+    for argument, call in {
+        "solref": lambda: ji.mujoco_restitution((0.02, -1.0), 0.002),
+        "solimp": lambda: ji.mujoco_restitution((0.02, 1.0), 0.002, (0.9, 0.95)),
+        "timestep": lambda: ji.mujoco_restitution((0.02, 1.0), 0.0),
+        "speed": lambda: ji.mujoco_solref(0.5, 0.002, speed=-1.0),
+        "restitution": lambda: ji.mujoco_solref(1.2, 0.002),
+        "duration": lambda: ji.mujoco_solref(0.5, 0.002, duration=0.0),
+    }.items():
+        with pytest.raises(ValueError, match=argument):
+            call()
+    with pytest.raises(ValueError, match=r"must be at least .* shorter timestep"):
+        ji.mujoco_solref(0.01, 0.002, duration=0.008)
+    with pytest.raises(ValueError, match="lasts more than 100000 steps"):
+        ji.mujoco_restitution((100.0, 0.1), 1e-4)
