@@ -282,7 +282,11 @@ MUTATIONS = [
     Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py::test_compare",)),
     Mutation("vertical and horizontal bases exchanged", r"\(0 \* y, y\) if self\.direction == \"vertical\"", '(0 * y, y) if self.direction == "horizontal"', (examples("motion.system"),)),
     Mutation("limits of validity from the wrong end", r"if law == \"moreau\" else slice", 'if law == "binary" else slice', ("test_methods.py::test_limits_are_of_the_unbroken_run_from_their_end",)),
-    Mutation("dispersion of n instead of n - 1", r"jnp\.asarray\(scene\.size - 1, v\.dtype\)", "jnp.asarray(scene.size, v.dtype)", ("test_methods.py::test_dispersion_index_and_energy_ratio",)),
+    Mutation("dispersion over the sum, not the mean", r"return deviation / mean\n", "return deviation / jnp.sum(share)\n", ("test_methods.py::test_energy_kept_and_its_dispersion",)),
+    Mutation("integral of a history without its correction", r"step\*\*2 / 12 \* \(rates", "0 * step**2 / 12 * (rates", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
+    Mutation("approach is the opening", r"approach=-_integral", "approach=_integral", ("test_compliant.py::test_history_of_one_ball_on_a_linear_spring",)),
+    Mutation("pictures of figures without their number", r"return self\.number or \"\"", 'return ""', ("test_commands.py::test_figure",)),
+    Mutation("dispersion of n instead of n - 1", r"jnp\.asarray\(scene\.size - 1, spread\.dtype\)", "jnp.asarray(scene.size, spread.dtype)", ("test_methods.py::test_dispersion_index_and_energy_ratio",)),
     Mutation("Newby's ratio", r"\(3 \* n\*\*4 - 2 \* n\*\*2", "(3 * n**4 + 2 * n**2", (examples("theory.linear_chain"),)),
     Mutation("sign of e_t in binary collisions", r"\(1 \+ friction\.restitution\[contact\]\)", "(1 - friction.restitution[contact])", ("test_friction.py::test_disk_in_closed_form[binary]",)),
     Mutation("sign of e_t in time stepping", r"e_t\[:, None\] \* slip", "-e_t[:, None] * slip", ("test_motion_stepped.py::test_a_superball_leaves_with_its_slip_reversed",)),
@@ -312,6 +316,15 @@ MUTATIONS = [
     Mutation("histogram in shares, not per cent", r"100 \* bars / max", "bars / max", ("test_pictures.py::test_a_histogram_is_in_per_cent",)),
     Mutation("measured and fitted exchanged in a picture", r"first\.plot\(fit\.predicted\[here\], measured\[here\]", "first.plot(measured[here], fit.predicted[here]", ("test_pictures.py::test_residuals_are_drawn_over_what_was_fitted",)),
     Mutation("residual indentation in a picture with e", r"1 - float\((\w+)\.restitution\) \*\* 2", r"1 - float(\1.restitution)", ("test_pictures.py::test_a_loop_encloses_the_energy_lost",)),
+    Mutation("MuJoCo's normals from the second geom", r"\(second - first\)", "(first - second)", ("test_mujoco.py::test_gap_velocities_are_rates_of_distances",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's balls apart by rounding", r"_TOUCHING = 1e-9", "_TOUCHING = 0.0", ("test_mujoco.py::test_balls_that_touch_but_for_rounding_touch",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's model keeps the margin", r"model, data = copy\.copy\(model\), copy\.copy\(data\)", "data = copy.copy(data)", ("test_mujoco.py::test_a_margin_finds_gaps",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's planar models in space", r"if \(mobility\[:, 0\] <= least\)\.all\(\)", "if False", ("test_mujoco.py::test_a_planar_model_has_planar_tangents",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's constraints repeat each other", r"sizes > _REPEATED \* sizes", "sizes >= 0.0 * sizes", ("test_mujoco.py::test_equality_constraints_are_bilateral_constraints",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's velocity projected without the mass", r"return np\.linalg\.solve\(root\.T, scaled - broken\)", "return velocity - constraints @ np.linalg.lstsq(constraints, velocity)[0]", ("test_mujoco.py::test_equality_constraints_are_bilateral_constraints",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's frictionless contacts rub", r"c\.friction\[0\] if c\.dim > 1 else 0\.0", "c.friction[0]", ("test_mujoco.py::test_contacts_without_friction_have_none",), "bodies/mujoco_scene.py"),
+    Mutation("MuJoCo's time constants below two steps", r"time = max\(first, 2 \* timestep\)", "time = first", ("test_mujoco.py::test_restitution_is_that_of_mujoco",), "laws/mujoco_contact.py"),
+    Mutation("MuJoCo's impedance acts once on stiffness", r"stiffness \* d \* r\)", "stiffness * r)", ("test_mujoco.py::test_restitution_is_that_of_mujoco",), "laws/mujoco_contact.py"),
 ]  # fmt: skip
 
 
