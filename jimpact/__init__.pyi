@@ -66,6 +66,7 @@ from .laws.calibration import (
 from .laws.compliant import Compliant as Compliant
 from .laws.forces import (
     Bistiffness as Bistiffness,
+    ElastoPlastic as ElastoPlastic,
     Force as Force,
     Hertz as Hertz,
     HuntCrossley as HuntCrossley,
