@@ -259,6 +259,9 @@ MUTATIONS = [
     Mutation("off-diagonal of a chain's Delassus matrix shifted", r"off_diagonal \* vector\[1:\], none", "off_diagonal * vector[:-1], none", ("test_scenes.py::test_chain_is_the_dense_scene",)),
     Mutation("elimination takes the pivot's row for the others", r"return jnp\.where\(number == k, row, rows - factor \* row\)", "return jnp.where(number == 0, row, rows - factor * row)", ("test_friction_solver.py::test_dense_solves_are_those_of_numpy",), "dense.py"),
     Mutation("two rows: the upper unknown ignores the lower one", r"jnp\.stack\(\[x - above \* last, last\]\)", "jnp.stack([x, last])", ("test_friction_solver.py::test_dense_solves_are_those_of_numpy",), "dense.py"),
+    Mutation("normal velocities of sliding contacts are those of a convex problem", r"missed\.at\[:, 0\]\.add\(slip\)", "missed", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
+    Mutation("contacts that take no part are looked at", r"alone\.astype\(rate\.dtype\)", "0", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
+    Mutation("one attempt to find impulses in their cones", r"np\.array\(\[100\.0, 1\.0\]\)", "np.array([100.0])", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
     Mutation("redundant forces are shared equally", r"return jnp\.maximum\(share, least\) if least > 0 else share", "return jnp.ones_like(share)", ("test_friction_solver.py::test_shares_of_redundant_forces",), "dense.py"),
     Mutation("friction of many contacts in a box, not a disc", r"length = jnp\.sqrt\(jnp\.sum\(side\*\*2, axis=1, keepdims=True\)\)", "length = jnp.max(jnp.abs(side), axis=1, keepdims=True)", ("test_friction_solver.py::test_friction_of_many_contacts_has_a_round_cone",)),
     # --- method 'implicit'
