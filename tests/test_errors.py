@@ -53,6 +53,8 @@ LAWS = [
     (lambda: ji.UserForce(3.0), r"`function`"),
     (lambda: ji.UserForce(lambda x, rate, p: x, "hard"), r"`parameters`"),
     (lambda: ji.distributing_rule([-1.0, 1.0], 1.0, 1.5), r"`energy`"),
+    (lambda: ji.precompression_energy(-1.0, 1.0), r"`force`"),
+    (lambda: ji.precompression_energy(1.0, 0.0), r"`stiffness`"),
 ]
 SCENES = [
     (lambda: ji.chain([1.0, -1.0]), r"`masses` must lie in \(0, inf\).*-1 at index 1"),
@@ -125,7 +127,8 @@ SCENES = [
     (lambda: ji.Sphere(1.0).touching([1.0, 1.0, 0, 0]), r"`quaternion` must have length 1"),
     (lambda: ji.Sphere(1.0).scene([0, 0, 1.0, 1, 0, 0]), r"`q` must have shape \(7,\)"),
     (lambda: ji.dimer(-0.1, 1.0), r"`radius`"),
-    (lambda: ji.dimer(0.1, 0.0), r"`length`"),
+    (lambda: ji.dimer(0.1, -1.0), r"`length`"),
+    (lambda: ji.dimer(0.0, 0.0), r"`length`"),
     (lambda: ji.dimer(0.1, 1.0, rod_mass=-1.0), r"`rod_mass`"),
     (lambda: ji.dimer_3d(0.0, 1.0), r"`radius`"),
     (lambda: ji.dimer_3d(0.1, 1.0, angle=1.6), r"`angle`"),
