@@ -156,6 +156,12 @@ MUTATIONS = [
     Mutation("the seed of a chunk", r"jax\.random\.fold_in\(key, np\.uint32\(task\.number\)\)", "key", ("test_montecarlo.py::test_random_parameters_velocities_and_their_analytic_moments", "test_montecarlo.py::test_each_sample_is_the_impact_of_its_gaps")),
     Mutation("variance by n", r"self\.products / \(self\.count - 1\)", "self.products / self.count", ("test_montecarlo.py::test_chunks_of_unequal_size_are_merged",)),
     Mutation("restitution not in the base's frame", r"relative = state\.v - carried\n    out = impact", "relative = state.v\n    out = impact", ("test_motion.py::test_the_base_works_at_its_own_speed",)),
+    Mutation("what was not reached has derivatives 0", r"nan_derivatives\(problem, known\)", "0 * known[:, None]", ("test_motion.py::test_a_bad_motion_ends_alone",)),
+    Mutation("unknown derivatives hide behind each other", r"huge \* \(huge \* times_infinity\)", "times_infinity", ("test_motion.py::test_what_a_motion_does_not_reach_has_no_derivatives",)),
+    Mutation("energies not reached have derivatives 0", r"values, at\.t\.reshape\(each\)", "values, jnp.nan", ("test_motion.py::test_a_bad_motion_ends_alone",)),
+    Mutation("a motion without duration is ok", r"end <= at\.t", "end < at.t", ("test_motion.py::test_a_motion_back_in_time_is_reported",)),
+    Mutation("soft impacts within three steps are coarse", r"-HARD \* setup\.speed", "0 * setup.speed", ("test_motion.py::test_time_stepping_of_many_beads_comes_to_rest[law0]",)),
+    Mutation("bodies beside a fast one pass each other unnoticed", r"TURN \* \((jnp\.abs\(contacts\.normals\)\.T @ jnp\.abs\(relative\))\)", r"TURN * jnp.max(\1)", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",)),
     Mutation("bodies that pass each other are not reported", r"struck_again \| \(\(progress", "struck_again | (False & (progress", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
     # --- the command line
@@ -259,6 +265,9 @@ MUTATIONS = [
     Mutation("off-diagonal of a chain's Delassus matrix shifted", r"off_diagonal \* vector\[1:\], none", "off_diagonal * vector[:-1], none", ("test_scenes.py::test_chain_is_the_dense_scene",)),
     Mutation("elimination takes the pivot's row for the others", r"return jnp\.where\(number == k, row, rows - factor \* row\)", "return jnp.where(number == 0, row, rows - factor * row)", ("test_friction_solver.py::test_dense_solves_are_those_of_numpy",), "dense.py"),
     Mutation("two rows: the upper unknown ignores the lower one", r"jnp\.stack\(\[x - above \* last, last\]\)", "jnp.stack([x, last])", ("test_friction_solver.py::test_dense_solves_are_those_of_numpy",), "dense.py"),
+    Mutation("normal velocities of sliding contacts are those of a convex problem", r"missed\.at\[:, 0\]\.add\(slip\)", "missed", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
+    Mutation("contacts that take no part are looked at", r"alone\.astype\(rate\.dtype\)", "0", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
+    Mutation("one attempt to find impulses in their cones", r"np\.array\(\[100\.0, 1\.0\]\)", "np.array([100.0])", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
     Mutation("redundant forces are shared equally", r"return jnp\.maximum\(share, least\) if least > 0 else share", "return jnp.ones_like(share)", ("test_friction_solver.py::test_shares_of_redundant_forces",), "dense.py"),
     Mutation("friction of many contacts in a box, not a disc", r"length = jnp\.sqrt\(jnp\.sum\(side\*\*2, axis=1, keepdims=True\)\)", "length = jnp.max(jnp.abs(side), axis=1, keepdims=True)", ("test_friction_solver.py::test_friction_of_many_contacts_has_a_round_cone",)),
     # --- method 'implicit'

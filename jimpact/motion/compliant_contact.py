@@ -27,6 +27,7 @@ from jimpact.motion.flow import (
     check_rtol,
     first_flight,
     longest_step,
+    nan_derivatives,
     no_samples,
     one_pass,
     packed,
@@ -207,7 +208,10 @@ def compliant_motion(
         return on & ~run.apart if until_apart else on
 
     end = jax.lax.while_loop(going, lambda run: _one_pass(problem, run), start)
-    samples = sampled_states(end.samples, state, end.flight.sample)
+    table = end.samples
+    reached = jnp.arange(table.shape[0], dtype=jnp.int32) < end.flight.sample
+    table = table + nan_derivatives((system, force, q0, v0, times), reached).astype(table.dtype)
+    samples = sampled_states(table, state, end.flight.sample)
     course = Course(samples, end.events, end.flight.steps, end.status)
     return course, end.flight.state, end.apart
 
