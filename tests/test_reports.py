@@ -5,6 +5,7 @@ import sys
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -247,6 +248,66 @@ def rocked(base=None):
         *(zero, zero, work, np.full((6, 2), 0.1), events, jnp.int32(9), jnp.int32(0)),
     )
     return system, record
+
+
+def test_motions_are_saved_and_loaded(tmp_path):
+    _, found = rocked()
+    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found)
+    for motion in (found, batch):
+        loaded = ji.load_motion(motion.save(tmp_path / "dimer.npz"))
+        assert jax.tree.structure(loaded) == jax.tree.structure(motion)
+        for one, other in zip(jax.tree.leaves(loaded), jax.tree.leaves(motion)):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+
+
+def test_files_that_hold_no_motion_are_refused(tmp_path):
+    _, found = rocked()
+    path = found.save(tmp_path / "dimer.npz")
+    with np.load(path) as file:
+        arrays = dict(file)
+    assert (str(arrays["status"]), arrays["events.kind"][0]) == ("ok", "impact")  # not codes
+    for name, content, message in (
+        (
+            "later",
+            arrays | {"format": 2, "jimpact": "9.0"},
+            "has format 2, of jimpact 9.0; .* reads 1",
+        ),
+        ("other", {"x": np.ones(2)}, "holds something else"),
+    ):
+        np.savez(tmp_path / name, **content)
+        with pytest.raises(ValueError, match=message):
+            ji.load_motion(tmp_path / f"{name}.npz")
+    path.write_bytes(b"not a file of numbers")
+    with pytest.raises(ValueError, match="cannot be read"):
+        ji.load_motion(path)
+    with pytest.raises(ValueError, match=r"must end in \.npz, but is 'motion\.csv'"):
+        found.save("motion.csv")
+
+
+def test_a_motion_goes_on():
+    """From the last sample that was reached; works and events of both make one record."""
+    _, found = rocked()
+    late = replace(found.events, time=found.events.time.at[1].set(0.45), count=jnp.int32(2))
+    late = replace(late, kind=late.kind.at[1].set(KIND_CODE["impact"]))
+    # it ended after the sample at .4 s and an impact at .45 s, which comes again later
+    ended = replace(found, q=np.where(np.arange(6)[:, None] < 5, found.q, np.nan), events=late)
+    end = ended.end
+    assert end["t_start"] == 0.4
+    np.testing.assert_array_equal(end["q0"], found.q[4])
+    np.testing.assert_array_equal(end["v0"], found.velocity[4])
+    later = replace(
+        found, time=0.4 + found.time, events=replace(found.events, time=found.events.time + 0.4)
+    )
+    both = ended.then(later)
+    np.testing.assert_array_equal(both.time, [*found.time[:5], *(0.4 + found.time[1:])])
+    np.testing.assert_allclose(both.contact_work[:, 0, 0], [0] * 3 + [-0.5] * 4 + [-1.0] * 3)
+    np.testing.assert_allclose(both.event_times(), [0.25, 0.65])
+    assert (int(both.events.count), int(both.steps)) == (2, 18)
+    with pytest.raises(ValueError, match=r"`later` must begin at 0\.4 s, .* begins at 0 s"):
+        ended.then(found)
+    with pytest.raises(ValueError, match="pick one motion"):
+        jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found).then(later)
 
 
 def test_picture_of_a_motion(tmp_path):
