@@ -12,6 +12,7 @@ from .bodies.dimers import (
     dimer_3d as dimer_3d,
 )
 from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
+from .bodies.mujoco_scene import MujocoScene as MujocoScene, from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
 from .bodies.piles import Discs as Discs
@@ -75,6 +76,10 @@ from .laws.forces import (
     UserForce as UserForce,
 )
 from .laws.histories import history as history
+from .laws.impulse_correlation import (
+    ImpulseCorrelation as ImpulseCorrelation,
+    correlation_interval as correlation_interval,
+)
 from .laws.kinematic import (
     Moreau as Moreau,
     Newton as Newton,
@@ -86,13 +91,20 @@ from .laws.lzb import (
     precompression_energy as precompression_energy,
 )
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
+from .laws.mujoco_contact import (
+    MujocoRestitution as MujocoRestitution,
+    mujoco_restitution as mujoco_restitution,
+    mujoco_solref as mujoco_solref,
+)
 from .laws.poisson import Poisson as Poisson
+from .laws.routh import Routh as Routh
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent
 from .methods.advice import advise as advise
 from .methods.chart import work_precision as work_precision
 from .methods.comparison import (
     compare as compare,
     dispersion_index as dispersion_index,
+    energy_dispersion as energy_dispersion,
     energy_ratio as energy_ratio,
 )
 from .methods.rheologies import compare_rheologies as compare_rheologies

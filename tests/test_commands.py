@@ -26,6 +26,7 @@ from jimpact.cli.main import keep_programs, main
 from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
 from jimpact.files import study_file
 from jimpact.motion.system import HarmonicBase
+from jimpact.plot.chapter.figures import CAPTIONS
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
 STUDY = """
@@ -564,10 +565,22 @@ def test_stability(tmp_path, capsys):
     assert json.loads(said.out)["methods"]["verlet"]["counts"]["right"] > 3
 
 
+def test_figure(tmp_path, capsys):
+    listed = call(capsys, "figure")[1].out
+    numbers = [line.split()[0] for line in listed.splitlines()]
+    assert numbers == list(CAPTIONS)
+    assert json.loads(call(capsys, "figure", "--json")[1].out) == CAPTIONS
+    assert len(call(capsys, "figure", "--csv")[1].out.splitlines()) == 1 + len(CAPTIONS)
+    code, said = call(capsys, "figure", "6.3a", "--out", str(tmp_path))
+    assert code == 0
+    assert said.out.startswith("Figure 6.3a: ")
+    assert (tmp_path / "jimpact-figure-6.3a.png").stat().st_size > 10_000
+
+
 def test_bare_call_greets(capsys):
     code, said = call(capsys)
     assert code == 0
-    for verb in (*VERBS, "new", "laws"):
+    for verb in (*VERBS, "figure", "new", "laws"):
         assert f"{verb}" in said.out
     assert max(map(len, said.out.splitlines())) <= 80
 
@@ -654,6 +667,8 @@ def test_laws(capsys, tmp_path, monkeypatch):
         (["chart", "--methods", "magic"], "`methods` must be one of"),
         (["chart", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["chart", "three_balls_gaps.toml"], "--velocity must be given"),
+        (["figure", "6.10"], "`number` must be one of 5.5, 6.1, 6.2, 6.3a"),
+        (["figure", "6.4", "--out", "6.9"], "--out must end in .png"),
         (["stability", "--methods", "rk5"], "`methods` must be one of"),
     ],
 )

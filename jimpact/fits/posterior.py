@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_whole
+from jimpact._checks import as_whole, needed
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.result import check_squares
-from jimpact.fits.tables import needed
 from jimpact.montecarlo.distributions import Normal, Uniform
 
 HOW = 'pip install "jimpact[bayes]"'
