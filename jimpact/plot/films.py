@@ -65,8 +65,8 @@ def animation(
         path: the file, ending in .gif, .mp4 (needs ffmpeg) or .html.
         title: of the picture; the time stands below it.
         progress: a bar on stderr; None: on a terminal, where it takes long.
-        speed: seconds of the motion that a second of the film shows; 1: real time, 0.1: slow
-            motion. None: 1, and less for motions of less than two seconds.
+        speed: of the film, not in [m/s]: seconds of the motion that a second of it shows; 1: real
+            time, 0.1: slow motion. None: 1, and less for motions of less than two seconds.
         frames_per_second: of the film; a GIF has the nearest rate of 100 / k.
 
     Returns:

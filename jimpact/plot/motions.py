@@ -112,7 +112,7 @@ def motion(
 def _finish(axes: Axes, scale: float, note: str = "") -> None:
     """Frame, legend with a note, and limits that do not enlarge rounding, of panels of a motion."""
     finish(axes, grid="y")
-    low, high = axes.get_ylim()
+    low, high = axes.dataLim.intervaly
     if high - low < _FLAT * scale:
         middle = (low + high) / 2
         axes.set_ylim(middle - scale / 2, middle + scale / 2)
