@@ -234,7 +234,7 @@ class Motion(eqx.Module):
         return dataclasses.replace(later, **samples, events=table, steps=self.steps + later.steps)
 
     def save(self, path: str | Path) -> Path:
-        """Write everything to a file that ends in .npz; `ji.load_motion` reads it."""
+        """Write everything to `path`, which ends in .npz; `ji.load_motion` reads it."""
         path = Path(path)
         if path.suffix != ".npz":
             raise ValueError(f"Argument `path` must end in .npz, but is '{path}'.")
