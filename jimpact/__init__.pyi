@@ -128,7 +128,11 @@ from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
 from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
-from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
+from .motion.record import (
+    Motion as Motion,
+    load_motion as load_motion,
+    raise_on_failed_motion as raise_on_failed_motion,
+)
 from .motion.simulate import simulate as simulate
 from .motion.system import (
     HarmonicBase as HarmonicBase,

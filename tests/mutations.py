@@ -162,6 +162,13 @@ MUTATIONS = [
     Mutation("a motion without duration is ok", r"end <= at\.t", "end < at.t", ("test_motion.py::test_a_motion_back_in_time_is_reported",)),
     Mutation("soft impacts within three steps are coarse", r"-HARD \* setup\.speed", "0 * setup.speed", ("test_motion.py::test_time_stepping_of_many_beads_comes_to_rest[law0]",)),
     Mutation("bodies beside a fast one pass each other unnoticed", r"TURN \* \((jnp\.abs\(contacts\.normals\)\.T @ jnp\.abs\(relative\))\)", r"TURN * jnp.max(\1)", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",)),
+    Mutation("works of a motion that goes on begin anew", r"if name\.endswith\(\"_work\"\) else", 'if name.endswith("_works") else', ("test_reports.py::test_a_motion_goes_on",)),
+    Mutation("events after the end of a motion are kept", r"known = (np\.asarray\(self\.events\.kind > 0\)) & .*", r"known = \1", ("test_reports.py::test_a_motion_goes_on",)),
+    Mutation("files of another version are read", r"if int\(found\) != FORMAT", "if False", ("test_reports.py::test_files_that_hold_no_motion_are_refused",)),
+    Mutation("films forget the velocities", r"return begin \* q\[k\] \+ end \* q\[k \+ 1\] \+ turns", "return begin * q[k] + end * q[k + 1]", ("test_reports.py::test_positions_between_states_follow_their_velocities",)),
+    Mutation("slow films are as long as fast ones", r"int\(\(at\[-1\] - at\[0\]\) / speed \* rate", "int((at[-1] - at[0]) * rate", ("test_reports.py::test_films_run_in_time",)),
+    Mutation("pictures enlarge rounding", r"if high - low < _FLAT \* scale", "if False", ("test_reports.py::test_pictures_of_many_bodies_show_those_that_move_most",)),
+    Mutation("pictures show the bodies that move least", r"reverse=True\)\[:_FEW\]", "reverse=False)[:_FEW]", ("test_reports.py::test_pictures_of_many_bodies_show_those_that_move_most",)),
     Mutation("bodies that pass each other are not reported", r"struck_again \| \(\(progress", "struck_again | (False & (progress", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
     # --- the command line
