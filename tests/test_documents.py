@@ -90,6 +90,7 @@ LONG_PAGES = (
     "gradient_descent",
     "motions",
     "speed_accuracy",
+    "waves",
 )
 
 
