@@ -87,6 +87,7 @@ LONG_PAGES = (
     "embedding",
     "fitting",
     "fitting_reference",
+    "from_lmfit",
     "gradient_descent",
     "motions",
     "speed_accuracy",
