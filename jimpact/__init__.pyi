@@ -33,7 +33,7 @@ from .contact import (
 from .fits.contours import Contour as Contour, contour as contour
 from .fits.designs import Design as Design, design as design
 from .fits.experiments import Experiments as Experiments, read_experiments as read_experiments
-from .fits.fitting import Fit as Fit, fit as fit
+from .fits.fitting import Fit as Fit, fit as fit, load_fit as load_fit
 from .fits.many import (
     Refits as Refits,
     bootstrap as bootstrap,
