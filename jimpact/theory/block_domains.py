@@ -21,7 +21,7 @@ class RockingDomain(NamedTuple):
     corners: np.ndarray
 
     def contains(self, own: Any, cross: Any) -> np.ndarray:
-        """Whether entries are admissible, ends included; arrays broadcast."""
+        """Whether entries `own` and `cross` are admissible, ends included; arrays broadcast."""
         a, b = np.asarray(own, float), np.asarray(cross, float)
         inside: np.ndarray = (a >= 0) & (b >= 0) & (a + b <= 1) & (b >= self.coupling * (1 + a))
         return inside

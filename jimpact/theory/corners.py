@@ -14,7 +14,7 @@ EQUAL = 1e-9
 
 
 class CornerOutcome(NamedTuple):
-    """v+ (n,) [m/s], the contact that acts, its impulse p [N s], and whether it is nearest."""
+    """`velocity` v+ (n,) [m/s]; the `contact` that acts, its `impulse` [N s]; is it `nearest`?"""
 
     velocity: np.ndarray
     contact: int

@@ -94,7 +94,7 @@ def newby_ratio(n: int) -> float:
 
 
 class SeparationTimes(NamedTuple):
-    """When each spring of three balls is first without load [sqrt(m / k1)]; infinite: never."""
+    """When the `first` and the `second` spring of three balls lose their load [sqrt(m / k1)]."""
 
     first: float
     second: float
