@@ -33,7 +33,7 @@ from .contact import (
 from .fits.contours import Contour as Contour, contour as contour
 from .fits.designs import Design as Design, design as design
 from .fits.experiments import Experiments as Experiments, read_experiments as read_experiments
-from .fits.fitting import Fit as Fit, fit as fit
+from .fits.fitting import Fit as Fit, fit as fit, load_fit as load_fit
 from .fits.many import (
     Refits as Refits,
     bootstrap as bootstrap,
@@ -66,6 +66,7 @@ from .laws.calibration import (
 from .laws.compliant import Compliant as Compliant
 from .laws.forces import (
     Bistiffness as Bistiffness,
+    ElastoPlastic as ElastoPlastic,
     Force as Force,
     Hertz as Hertz,
     HuntCrossley as HuntCrossley,
@@ -76,6 +77,10 @@ from .laws.forces import (
     UserForce as UserForce,
 )
 from .laws.histories import history as history
+from .laws.impulse_correlation import (
+    ImpulseCorrelation as ImpulseCorrelation,
+    correlation_interval as correlation_interval,
+)
 from .laws.kinematic import (
     Moreau as Moreau,
     Newton as Newton,
@@ -93,6 +98,7 @@ from .laws.mujoco_contact import (
     mujoco_solref as mujoco_solref,
 )
 from .laws.poisson import Poisson as Poisson
+from .laws.routh import Routh as Routh
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent
 from .methods.advice import advise as advise
 from .methods.chart import work_precision as work_precision
@@ -105,6 +111,12 @@ from .methods.comparison import (
 from .methods.rheologies import compare_rheologies as compare_rheologies
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
+from .methods.waves import (
+    Pulses as Pulses,
+    Trains as Trains,
+    colliding_trains as colliding_trains,
+    pulses as pulses,
+)
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .montecarlo.gaps import (
     crossover as crossover,
@@ -114,9 +126,19 @@ from .montecarlo.gaps import (
 from .montecarlo.results import MonteCarlo as MonteCarlo
 from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
+from .motion.accelerations import (
+    ContactProblem as ContactProblem,
+    QuasiLagrange as QuasiLagrange,
+    contact_problem as contact_problem,
+    quasi_lagrange as quasi_lagrange,
+)
 from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
-from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
+from .motion.record import (
+    Motion as Motion,
+    load_motion as load_motion,
+    raise_on_failed_motion as raise_on_failed_motion,
+)
 from .motion.simulate import simulate as simulate
 from .motion.system import (
     HarmonicBase as HarmonicBase,

@@ -1,9 +1,11 @@
 """Pictures of every kind, on small records made by hand: nothing overlaps, every axis is labelled.
 
-Nothing is simulated here, so that the layout of all pictures costs seconds.
+Nothing is simulated here but some figures of the chapter (slow), so that the layout of all pictures
+costs seconds.
 """
 
 import dataclasses
+import functools
 import itertools
 
 import jax
@@ -22,6 +24,7 @@ from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
 from jimpact.methods.comparison import Comparison, Entry
 from jimpact.methods.stability import Confirmation, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
+from jimpact.plot.chapter.figures import CAPTIONS
 from jimpact.plot.charts import _styles
 from jimpact.plot.style import SMALL, WIDTH
 
@@ -71,7 +74,8 @@ def impact_history():
     rows = np.sin(np.pi * t) * np.array([1.0, 0.5])
     none = np.zeros((9, 0))
     return History(
-        *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, np.zeros((9, 3))),
+        *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, 0.6 * rows + 0.4 * t),
+        np.zeros((9, 3)),
         *(none, none, none, np.float64(37e-6), rows.max(axis=0), np.int32(0)),
     )
 
@@ -198,6 +202,7 @@ def valley(name):
 
 
 BLOCK = ji.Block(width=0.2, height=0.6)
+COMPUTED = ("5.5", "6.2", "6.3b", "6.6", "6.8b", "6.9")  # figures of impacts, which are compiled
 PICTURES = {
     "advice": advice,
     "comparison": comparison,
@@ -208,6 +213,7 @@ PICTURES = {
     "profiles": lambda: ji.plot.profiles([valley("restitution[1]"), valley("stiffness[2]")] * 2),
     "residuals": lambda: ji.plot.residuals(canned(50)),
     "forces": lambda: ji.plot.forces({"soft": impact_history(), "hard": impact_history()}),
+    "contact_loop": lambda: ji.plot.contact_loop(impact_history(), title="a loop"),
     "history": lambda: ji.plot.history(impact_history(), "three balls"),
     "energy_plane": energy_plane,
     "rheologies": rheologies,
@@ -222,11 +228,15 @@ PICTURES = {
     "phase_portrait": lambda: motion("phase_portrait"),
     "rocking_dispersion": lambda: ji.plot.rocking_dispersion(rocking(), "by LZB"),
     "rocking_outcomes": lambda: ji.plot.rocking_outcomes(rocking()),
+    "rocking_domains": lambda: ji.plot.rocking_domains(
+        [ji.theory.rocking_domain(a, s) for a in (1.0, 2.0) for s in (True, False)]
+    ),
     "admissible_set": lambda: outcomes([1.0, 1.0, 1.0], False),
     "admissible_set of three contacts": lambda: outcomes([1.0, 1.0, 1.0], True),
     "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),
     "system, a block": lambda: ji.plot.system(BLOCK, BLOCK.touching(0.2), "a block"),
-}  # fmt: skip
+} | {f"chapter_figure {x}": functools.partial(ji.plot.chapter_figure, x) for x in CAPTIONS}  # fmt: skip
+SLOW = [f"chapter_figure {number}" for number in COMPUTED]
 
 
 def texts(figure):
@@ -252,7 +262,9 @@ def labelled(label):
     return has_unit or label in COUNTED or any(word in label for word in DIMENSIONLESS)
 
 
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in PICTURES]
+)
 def test_layout(name):
     figure = PICTURES[name]()
     FigureCanvasAgg(figure).draw()

@@ -1,5 +1,6 @@
 """Public names of `ji.plot` and where they live."""
 
+from .chapter.figures import chapter_figure as chapter_figure
 from .charts import (
     advice as advice,
     stability_map as stability_map,
@@ -7,20 +8,23 @@ from .charts import (
     validity_map as validity_map,
     work_precision as work_precision,
 )
+from .films import animation as animation
 from .fits import contour as contour, fit as fit
 from .inference import correlation as correlation, profiles as profiles, residuals as residuals
 from .laws import (
     comparison as comparison,
+    contact_loop as contact_loop,
     energy_plane as energy_plane,
     forces as forces,
     history as history,
     rheologies as rheologies,
 )
 from .montecarlo import monte_carlo as monte_carlo
-from .motions import animation as animation, motion as motion, phase_portrait as phase_portrait
+from .motions import motion as motion, phase_portrait as phase_portrait
 from .systems import system as system
 from .theory import (
     admissible_set as admissible_set,
     rocking_dispersion as rocking_dispersion,
+    rocking_domains as rocking_domains,
     rocking_outcomes as rocking_outcomes,
 )
