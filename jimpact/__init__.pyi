@@ -12,6 +12,7 @@ from .bodies.dimers import (
     dimer_3d as dimer_3d,
 )
 from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
+from .bodies.mujoco_scene import MujocoScene as MujocoScene, from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
 from .bodies.piles import Discs as Discs
@@ -32,7 +33,7 @@ from .contact import (
 from .fits.contours import Contour as Contour, contour as contour
 from .fits.designs import Design as Design, design as design
 from .fits.experiments import Experiments as Experiments, read_experiments as read_experiments
-from .fits.fitting import Fit as Fit, fit as fit
+from .fits.fitting import Fit as Fit, fit as fit, load_fit as load_fit
 from .fits.many import (
     Refits as Refits,
     bootstrap as bootstrap,
@@ -65,6 +66,7 @@ from .laws.calibration import (
 from .laws.compliant import Compliant as Compliant
 from .laws.forces import (
     Bistiffness as Bistiffness,
+    ElastoPlastic as ElastoPlastic,
     Force as Force,
     Hertz as Hertz,
     HuntCrossley as HuntCrossley,
@@ -75,20 +77,35 @@ from .laws.forces import (
     UserForce as UserForce,
 )
 from .laws.histories import history as history
+from .laws.impulse_correlation import (
+    ImpulseCorrelation as ImpulseCorrelation,
+    correlation_interval as correlation_interval,
+)
 from .laws.kinematic import (
     Moreau as Moreau,
     Newton as Newton,
     RestitutionMatrix as RestitutionMatrix,
 )
-from .laws.lzb import LZB as LZB, distributing_rule as distributing_rule
+from .laws.lzb import (
+    LZB as LZB,
+    distributing_rule as distributing_rule,
+    precompression_energy as precompression_energy,
+)
 from .laws.materials import hertz_stiffness as hertz_stiffness, sphere_mass as sphere_mass
+from .laws.mujoco_contact import (
+    MujocoRestitution as MujocoRestitution,
+    mujoco_restitution as mujoco_restitution,
+    mujoco_solref as mujoco_solref,
+)
 from .laws.poisson import Poisson as Poisson
+from .laws.routh import Routh as Routh
 from .laws.velocity_dependent import VelocityDependent as VelocityDependent
 from .methods.advice import advise as advise
 from .methods.chart import work_precision as work_precision
 from .methods.comparison import (
     compare as compare,
     dispersion_index as dispersion_index,
+    energy_dispersion as energy_dispersion,
     energy_ratio as energy_ratio,
 )
 from .methods.rheologies import compare_rheologies as compare_rheologies

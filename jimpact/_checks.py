@@ -3,15 +3,25 @@
 JAX is imported by those functions that need it: a study file is checked without.
 """
 
+import importlib
 import operator
 import sys
 from collections.abc import Iterable
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     import jax
+
+
+def needed(module: str, how: str) -> ModuleType:
+    """The module, or an ImportError that says how to get it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ImportError(f"{module} must be installed for this, but is not: {how}.") from error
 
 
 def is_traced(value: Any) -> bool:

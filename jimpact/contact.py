@@ -357,7 +357,7 @@ def normalized_gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     Raises:
         ValueError: not one velocity per coordinate.
 
-    Source: Brogliato (2016), (6.24).
+    Source: Brogliato (2016), (6.23).
 
     >>> import jimpact as ji
     >>> ji.normalized_gap_velocity(ji.chain([0.5, 0.5]), [1.0, 0.0]).tolist()
@@ -376,7 +376,8 @@ def kinetic_angles(scene: Scene) -> jax.Array:
         Angles (m, m) [rad], pi on the diagonal.
 
     G is the normalized `delassus_matrix`, so bilateral constraints count: contacts of bodies that a
-    constraint ties together are coupled. (6.66) takes the masses alone, where they are decoupled.
+    constraint ties together are coupled. (6.66) takes the masses alone, where they are decoupled:
+    that is the angle of `Scene(scene.mass, scene.normals)`.
 
     Not differentiable on its diagonal (theta_jj = pi) nor for redundant contacts.
     Source: Brogliato (2016), (6.66), with the W of the constrained bodies.

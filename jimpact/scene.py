@@ -320,7 +320,7 @@ def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     Raises:
         ValueError: not one velocity per coordinate.
 
-    Source: Brogliato (2016), (6.24) before normalization.
+    Source: Brogliato (2016), (6.23) before normalization.
 
     >>> import jimpact as ji
     >>> ji.gap_velocity(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.5]).tolist()

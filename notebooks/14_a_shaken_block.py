@@ -75,5 +75,4 @@ for i, level in enumerate(levels[1:], 1):
     print(f"{level:.1f} g: " + ("overturns" if overturns else f"at most {most:.2f} degrees"))
 
 # %% [markdown]
-# You have finished the course. [Your own CSV file](02_your_own_csv.ipynb) is the notebook to copy
-# for your own data.
+# Next: [robots from MuJoCo](15_robots_from_mujoco.ipynb).

@@ -49,6 +49,7 @@ OF_LAW = {
     "test_compliant": "compliant",
     "test_complementarity": "moreau",
     "test_fast_paths": "lzb",
+    "test_other_laws": "lzb",
     "test_values": "lzb",  # most of it
 }
 DEAR = (  # groups that take longest begin first, so that no process is left alone at the end

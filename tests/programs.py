@@ -61,6 +61,13 @@ LAWS = {
     "binary-left": Row(
         "binary", lambda e, k, eta, stored: ji.Binary(e, order="left_to_right"), by_order=True
     ),
+    "correlation": Row(
+        "impulse_correlation",
+        lambda e, k, eta, stored: ji.ImpulseCorrelation(e, 0.6),
+        1e-11,
+        flagged=0.35,
+    ),
+    "routh": Row("routh", lambda e, k, eta, stored: ji.Routh(e), through_w=False, flagged=0.5),
     "lzb": Row(
         "lzb",
         lambda e, k, eta, stored: ji.LZB(e, k, eta, stored, max_steps=PASSES),
@@ -76,7 +83,9 @@ LAWS = {
     ),
 }
 SEQUENTIAL = ("binary", "binary-earliest", "binary-left")
-SLOW_SLOPES = ("compliant", "binary-earliest", "binary-left")  # LZB's and Binary's code again
+SLOW_SLOPES = (  # LZB's, Binary's and Moreau's code again
+    *("compliant", "binary-earliest", "binary-left", "routh"),
+)
 
 
 # ----------------------------------------------------------------------------------- states

@@ -26,6 +26,7 @@ from jimpact.cli.main import keep_programs, main
 from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
 from jimpact.files import study_file
 from jimpact.motion.system import HarmonicBase
+from jimpact.plot.chapter.figures import CAPTIONS
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
 STUDY = """
@@ -123,6 +124,22 @@ def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path)
     assert (study.law.rtol, all_free.law.rtol) == (1e-5, 1e-5)
     np.testing.assert_array_equal(study.law.restitution, [0.9, 0.9])
     np.testing.assert_array_equal(study.free["restitution"], [1, 1])
+
+
+def test_a_study_knows_priors_and_names_of_entries(tmp_path):
+    text = STUDY.replace("restitution = 0.9", "restitution = [0.9, 0.8]")
+    text = text.replace("[1.0, 1.0]", "[1.0, 1.0, 1.0]") + (
+        '\n[law.priors]\n"restitution[2]" = [0.85, 0.01]\n[law.bounds]\n"restitution[1]" = [0.5, 1]\n'
+    )
+    shots = SHOTS.replace(
+        "post_2[m/s]", "post_2[m/s],pre_3[m/s],post_3[m/s],sigma_1[m/s],sigma_2[m/s],sigma_3[m/s]"
+    )
+    shots = shots.replace("0.83", "0.83,0,0.1,1,1,1").replace("1.62", "1.62,0,0.2,1,1,1")
+    problem = ji.read_study(written(tmp_path, text, shots)).problem
+    assert problem.priors == ((1, 0.85, 0.01),)
+    np.testing.assert_array_equal(problem.domains, [[0.5, 1.0], [0.0, 1.0]])
+    with pytest.raises(ValueError, match=r"\[law.priors\].*frictoin"):
+        ji.read_study(written(tmp_path, text.replace('"restitution[2]"', '"frictoin[2]"'), shots))
 
 
 def test_fit_of_a_study(tmp_path, capsys):
@@ -564,10 +581,22 @@ def test_stability(tmp_path, capsys):
     assert json.loads(said.out)["methods"]["verlet"]["counts"]["right"] > 3
 
 
+def test_figure(tmp_path, capsys):
+    listed = call(capsys, "figure")[1].out
+    numbers = [line.split()[0] for line in listed.splitlines()]
+    assert numbers == list(CAPTIONS)
+    assert json.loads(call(capsys, "figure", "--json")[1].out) == CAPTIONS
+    assert len(call(capsys, "figure", "--csv")[1].out.splitlines()) == 1 + len(CAPTIONS)
+    code, said = call(capsys, "figure", "6.3a", "--out", str(tmp_path))
+    assert code == 0
+    assert said.out.startswith("Figure 6.3a: ")
+    assert (tmp_path / "jimpact-figure-6.3a.png").stat().st_size > 10_000
+
+
 def test_bare_call_greets(capsys):
     code, said = call(capsys)
     assert code == 0
-    for verb in (*VERBS, "new", "laws"):
+    for verb in (*VERBS, "figure", "new", "laws"):
         assert f"{verb}" in said.out
     assert max(map(len, said.out.splitlines())) <= 80
 
@@ -654,6 +683,8 @@ def test_laws(capsys, tmp_path, monkeypatch):
         (["chart", "--methods", "magic"], "`methods` must be one of"),
         (["chart", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["chart", "three_balls_gaps.toml"], "--velocity must be given"),
+        (["figure", "6.10"], "`number` must be one of 5.5, 6.1, 6.2, 6.3a"),
+        (["figure", "6.4", "--out", "6.9"], "--out must end in .png"),
         (["stability", "--methods", "rk5"], "`methods` must be one of"),
     ],
 )

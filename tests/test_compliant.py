@@ -345,6 +345,15 @@ def test_distributing_rule():
     np.testing.assert_allclose(rule[1, 0], 0.640744299507361192, rtol=1e-14)
 
 
+def test_precompression_energy():
+    """`k x^(eta + 1) / (eta + 1)` at the x of the force; the chapter's number."""
+    energy = ji.precompression_energy(0.328633534503099668, 2.0, 1.5)
+    np.testing.assert_allclose(energy, 0.0394360241403719602, rtol=1e-14)
+    x, k, eta = np.array([0.1, 2.0]), np.array([3.0, 0.7]), np.array([1.0, 3.0])
+    energy = ji.precompression_energy(k * x**eta, k, eta)
+    np.testing.assert_allclose(energy, k * x ** (eta + 1) / (eta + 1), rtol=1e-14)
+
+
 def test_history_of_one_ball_on_a_linear_spring():
     """Half a period of `x = v / w sin(w t)`, of 1 kg, k = 2 N/m and 1 m/s."""
     history = ji.history(ji.LZB(1.0, 2.0, exponent=1.0), ji.chain([1.0], wall=True), [1.0])
@@ -356,6 +365,28 @@ def test_history_of_one_ball_on_a_linear_spring():
     np.testing.assert_allclose(history.energy[:, 0], x**2, atol=1e-7)
     np.testing.assert_allclose(history.gap_velocity[:, 0], -np.cos(w * t), atol=1e-7)
     np.testing.assert_allclose(history.impulse[:, 0], 1 - np.cos(w * t), atol=1e-7)
+    np.testing.assert_allclose(history.approach[:, 0], x, atol=1e-7)
+
+
+def test_a_contact_that_is_compressed_twice():
+    """Figure 6.6: two balls at a wall; approach and force at its turns, by another integration."""
+    law, scene = ji.LZB([0.9, 0.8], [1.0, 2**0.5], 1.5), ji.chain([1.0, 1.0], wall=True)
+    h = ji.history(law, scene, [1.0, 1.0], samples=800)
+    force, approach = np.asarray(h.force[:, 1]), np.asarray(h.approach[:, 1])
+    peak, valley, again = np.flatnonzero(np.diff(np.asarray(h.gap_velocity[:, 1]) > 0))[:3]
+    assert float(h.maximum_force[1]) == pytest.approx(1.344782, abs=1e-6)
+    assert force[peak - 1 : peak + 3].max() == pytest.approx(1.344782, abs=1e-5)
+    assert force[valley - 1 : valley + 3].min() == pytest.approx(0.6709, abs=1e-4)
+    assert float(h.time[valley]) == pytest.approx(2.628, abs=5e-3)
+    end = np.flatnonzero(force > 0)[-1]
+    assert end > again
+    x = (force[end] / 2**0.5) ** (2 / 3)  # the effective one; the true one unloads e^2 of it
+    assert approach[end] - 0.8**2 * x == pytest.approx(0.3917, abs=5e-5)
+    # the two loops enclose what is lost; the kinetic energies say how much that is
+    lost = np.trapezoid(h.force, h.approach, axis=0).sum()
+    assert lost == pytest.approx(1.0 - 0.5 * float(np.sum(h.velocity[-1] ** 2)), rel=1e-4)
+    marks = ji.plot.contact_loop(h).axes[0].texts
+    assert [text.get_text() for text in marks] == ["O", "M1", "R1", "M2", "B"]
 
 
 def test_hertz_stiffness_of_the_steel_beads():

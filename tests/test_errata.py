@@ -64,6 +64,51 @@ def test_6_3_1_force_of_stored_energy(exponent):
     assert not np.isclose(force, k ** (1 / exponent + 1) * share, rtol=0.1)
 
 
+@pytest.mark.parametrize(("exponent", "e"), [(1.0, 0.6), (1.5, 0.9)])
+def test_6_3_1_force_in_expansion(exponent, e):
+    """Slope of `F = F_max ((d - d_r) / (d_c - d_r))^eta` over the impulse, where d' = dd / dt."""
+    k, deepest, at, rate = 3.0, 0.5, 0.4, -0.8
+    stays, largest = (1 - e**2) * deepest, k * deepest**exponent
+
+    def force(d):
+        return largest * ((d - stays) / (deepest - stays)) ** exponent
+
+    slope = (force(at + 1e-6) - force(at - 1e-6)) / 2e-6 * rate / force(at)  # dp = F dt
+    left = force(at) ** (1 / exponent) * slope
+    used = exponent * largest ** (1 / exponent) * rate / (e**2 * deepest)
+    printed = exponent * force(at) ** (1 / exponent) * rate / (e**2 * at)
+    assert np.isclose(left, used, rtol=1e-8)
+    assert not np.isclose(left, printed, rtol=0.02)
+
+
+def test_number_of_contacts_of_6_1_1_and_of_definition_6_1():
+    """Three balls on the ground: impulses of three kinds change v; of no contact, none does."""
+    grounded = np.array([[1.0, 0, 0], [-1, 1, 0], [0, -1, 1]])  # ground, ball 1 on 2, ball 2 on 3
+    assert np.linalg.matrix_rank(grounded) == 3
+    assert np.linalg.matrix_rank(grounded[:, :0]) == 0
+
+
+@pytest.mark.parametrize(("strikers", "forward"), [(1, 2), (2, 4), (3, 5), (4, 6)])
+def test_five_balls_hit_by_up_to_four(strikers, forward):
+    """6.1.1.4: Hertz contacts of k = 1, balls of 1 kg at 1 m/s, by Verlet's method."""
+    v = np.where(np.arange(5 + strikers) < strikers, 1.0, 0.0)
+    x, step = np.zeros(len(v)), 2e-3
+
+    def push(x):
+        force = np.maximum(-np.diff(x), 0.0) ** 1.5
+        return np.append(0.0, force) - np.append(force, 0.0)
+
+    for _ in range(30_000):
+        v = v + step / 2 * push(x)
+        x = x + step * v
+        v = v + step / 2 * push(x)
+    assert (np.diff(v) > 0).all()  # over
+    assert (v > 0).sum() == forward
+    assert forward != strikers + 1 or strikers == 1
+    if strikers == 4:
+        assert np.isclose(v[v > 0].min(), 0.085, atol=2e-3)
+
+
 def test_measured_shot_of_6_1_2():
     after = np.array([-0.0605, 0.1049, 0.9978])  # of equal balls, the first at 1 m/s
     assert np.isclose(after.sum(), 1.042, atol=5e-4)
@@ -338,6 +383,18 @@ def test_equation_6_61():
     bound = np.linalg.norm(np.eye(2) + block.E, 2) * np.linalg.norm(qn)
     assert np.linalg.norm(p) <= heavier * bound
     assert np.linalg.norm(p) > 1.0 * bound
+
+
+def test_equation_6_61_i():
+    """lambda_min(M) > lambda_max(K) lets an impact gain energy; Mbar is what (6.60) bounds it by."""
+    block = Block()
+    plus, minus, inverse = 1.995 * np.eye(2), 0.005 * np.eye(2), np.linalg.inv(block.G)
+    # E = .995 I
+    slide = block.t.T @ block.H * block.slip @ np.linalg.inv(block.G_mu) @ plus
+    K, M_bar = slide.T @ slide, minus.T @ inverse @ plus
+    least = [np.linalg.eigvalsh(x + x.T)[0] / 2 for x in (inverse, M_bar)]
+    assert least[1] < np.linalg.eigvalsh(K)[-1] < least[0]
+    assert np.linalg.eigvalsh(2 * K - M_bar - M_bar.T)[-1] > 0  # a gain, at qt- = 0
 
 
 def test_proposition_6_6_2():

@@ -67,6 +67,43 @@ def test_missing_values_labels_and_foreign_line_ends(tmp_path):
     assert data.shots == ("first", "2")
 
 
+def test_comments_are_not_read(tmp_path):
+    text = "comment,pre_1[m/s],comment_camera,post_1[m/s]\nfirst,1,left of it,0.5\n,2,,1\n"
+    data = ji.read_experiments(written(tmp_path, text))
+    np.testing.assert_array_equal([data.pre, data.post], [[[1], [2]], [[0.5], [1]]])
+    with pytest.raises(ValueError, match="must have 4 values"):
+        ji.read_experiments(written(tmp_path, text + "a,1,2\n"))
+
+
+def test_data_sets_are_joined():
+    plain = ji.Experiments([1.0, 0.0], [0.1, np.nan], sigma=0.01, shots=["a"], lost_freedom=1)
+    read = ji.Experiments([[2.0, 0.0]] * 2, [[0.2, 1.8]] * 2, resolution=0.1, sigma_pre=0.02)
+    both = plain + read
+    assert both.shots == ("a", "1", "2")
+    np.testing.assert_array_equal(both.pre, [[1, 0], [2, 0], [2, 0]])
+    step = 0.1 / np.sqrt(12)
+    np.testing.assert_allclose(both.sigma, [[0.01, np.nan], [step, step], [step, step]])
+    np.testing.assert_array_equal(both.sigma_pre, [[0, 0], [0.02, 0.02], [0.02, 0.02]])
+    assert both.lost == (1, 0, 0)
+    assert both.resolution is None
+    np.testing.assert_array_equal((read + read).resolution, [[0.1, 0.1]] * 4)
+    np.testing.assert_allclose((read + read).sigma, [[step, step]] * 4)
+    assert (read + read).shots == ("1/1", "1/2", "2/1", "2/2")
+    placed = ji.Experiments([1.0, 0.0], [0.1, 0.9], 0.01, scenes=[ji.chain([1.0, 1.0])])
+    assert len(ji.Experiments.join([placed, placed, placed]).scenes) == 3
+    turning = ji.Experiments([1.0, 0.0], [0.1, 0.9], 0.01, units=["m/s", "rad/s"])
+    for other, message in (
+        (ji.Experiments([1.0, 0.0], [0.1, 0.9]), "a `sigma` .or `resolution`. in all or in none"),
+        (placed, "scenes of their own in all or in none"),
+        (turning, "the same units"),
+        (ji.Experiments([1.0], [0.1], 0.01), "as many bodies"),
+    ):
+        with pytest.raises(ValueError, match=f"`many` must have .*{message}"):
+            plain + other
+    with pytest.raises(ValueError, match="at least one data set"):
+        ji.Experiments.join([])
+
+
 def test_sigma_of_an_unmeasured_value_may_be_empty(tmp_path):
     header = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s],sigma_1[m/s],sigma_2[m/s]\n"
     data = ji.read_experiments(written(tmp_path, header + "1,0,0.1,,0.01,\n"))

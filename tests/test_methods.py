@@ -766,8 +766,36 @@ def test_dispersion_index_and_energy_ratio():
     for v, index in (([0, 0, 1.0], 0.0), ([-1 / 3, 2 / 3, 2 / 3], 2 / 3), ([1, -1, 1.0], 1.0)):
         assert float(ji.dispersion_index(BALLS, v)) == pytest.approx(index, abs=1e-14)
     heavy = ji.chain([4.0, 1.0])
+    assert float(ji.energy_dispersion(heavy, [1.0, 0.0])) == pytest.approx(1.0)
     assert float(ji.dispersion_index(heavy, [1.0, -2.0])) == pytest.approx(1.0)
     assert float(ji.energy_ratio(heavy, [1.0, 0.0], [0.5, 0.0])) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(
+    ("after", "kept", "spread"),
+    [
+        ((0.0, 0.0, 1.0), 1.0, 1.41421),  # A
+        ((-1 / 3, 2 / 3, 2 / 3), 1.0, 0.47140),  # B
+        ((0.0, 0.5, 0.5), 0.5, 0.70711),  # Moreau, e = 1/2
+        ((0.203125, 0.234375, 0.5625), 0.41260, 0.92055),  # binary, e = 1/2
+        ((-0.130261695064521, 0.150229569434774, 0.980032125629747), 1.0, 1.33036),  # LZB, eta 1
+        ((-0.070952353651437, 0.076403039071207, 0.994549314580230), 1.0, 1.39115),  # 1.5
+        ((-0.037880398123056, 0.039374137379719, 0.998506260743337), 1.0, 1.40788),  # 2
+        ((-0.010396841805953, 0.010506083831368, 0.999890757974585), 1.0, 1.41375),  # 3
+    ],
+)
+def test_energy_kept_and_its_dispersion(after, kept, spread):
+    """Of three equal balls, k2/k1 = 1; outcomes are closed forms, or held in test_values."""
+    assert float(ji.energy_ratio(BALLS, STRIKE, after)) == pytest.approx(kept, abs=6e-6)
+    assert float(ji.energy_dispersion(BALLS, after)) == pytest.approx(spread, abs=6e-6)
+
+
+def test_dispersion_falls_along_the_arc():
+    """From A to B, where Moreau's law has the least."""
+    arc = ji.theory.admissible_set(BALLS, STRIKE).conserving_arc(13)
+    spread = [float(ji.energy_dispersion(BALLS, v)) for v in arc]
+    assert (np.diff(spread) < 0).all()
+    np.testing.assert_allclose([spread[0], spread[-1]], [2**0.5, 2**0.5 / 3], rtol=1e-12)
 
 
 @pytest.mark.long_run

@@ -1,9 +1,11 @@
 """Pictures of every kind, on small records made by hand: nothing overlaps, every axis is labelled.
 
-Nothing is simulated here, so that the layout of all pictures costs seconds.
+Nothing is simulated here but some figures of the chapter (slow), so that the layout of all pictures
+costs seconds.
 """
 
 import dataclasses
+import functools
 import itertools
 
 import jax
@@ -22,6 +24,7 @@ from jimpact.methods.chart import Point, Reference, Timing, WorkPrecision
 from jimpact.methods.comparison import Comparison, Entry
 from jimpact.methods.stability import Confirmation, Slice, StabilityMap
 from jimpact.methods.validity import ValidityMap
+from jimpact.plot.chapter.figures import CAPTIONS
 from jimpact.plot.charts import _styles
 from jimpact.plot.style import SMALL, WIDTH
 
@@ -52,6 +55,15 @@ def comparison():
     return ji.plot.comparison(Comparison(BALLS, STRIKE, entries), AFTER, "three balls")
 
 
+def energy_plane():
+    rows = {"newton": AFTER, "moreau": [-1 / 3, 2 / 3, 2 / 3], "binary": [0.0, 0.0, 1.0]}
+    entries = {
+        name: dataclasses.replace(entry(ji.Newton(0.5), name != "newton"), outcome=outcome(v))
+        for name, v in rows.items()
+    }
+    return ji.plot.energy_plane(Comparison(BALLS, STRIKE, entries), "three balls")
+
+
 def rheologies():
     names = ("Hertz, bistiffness", "linear, bistiffness", "Kelvin-Voigt", "Hunt-Crossley")
     return ji.plot.rheologies(Comparison(BALLS, STRIKE, {x: entry(HERTZ) for x in names}), "forces")
@@ -62,7 +74,8 @@ def impact_history():
     rows = np.sin(np.pi * t) * np.array([1.0, 0.5])
     none = np.zeros((9, 0))
     return History(
-        *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, np.zeros((9, 3))),
+        *(37e-6 * t[:, 0], 900 * rows, rows, 0.5 * rows**2, rows, rows - 0.5, 0.6 * rows + 0.4 * t),
+        np.zeros((9, 3)),
         *(none, none, none, np.float64(37e-6), rows.max(axis=0), np.int32(0)),
     )
 
@@ -189,6 +202,7 @@ def valley(name):
 
 
 BLOCK = ji.Block(width=0.2, height=0.6)
+COMPUTED = ("5.5", "6.2", "6.3b", "6.6", "6.8b", "6.9")  # figures of impacts, which are compiled
 PICTURES = {
     "advice": advice,
     "comparison": comparison,
@@ -199,7 +213,9 @@ PICTURES = {
     "profiles": lambda: ji.plot.profiles([valley("restitution[1]"), valley("stiffness[2]")] * 2),
     "residuals": lambda: ji.plot.residuals(canned(50)),
     "forces": lambda: ji.plot.forces({"soft": impact_history(), "hard": impact_history()}),
+    "contact_loop": lambda: ji.plot.contact_loop(impact_history(), title="a loop"),
     "history": lambda: ji.plot.history(impact_history(), "three balls"),
+    "energy_plane": energy_plane,
     "rheologies": rheologies,
     "stability_map": lambda: ji.plot.stability_map(stability(), "where methods fail"),
     "stability_pairs": lambda: ji.plot.stability_pairs(stability(), "rk4"),
@@ -216,7 +232,8 @@ PICTURES = {
     "admissible_set of three contacts": lambda: outcomes([1.0, 1.0, 1.0], True),
     "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),
     "system, a block": lambda: ji.plot.system(BLOCK, BLOCK.touching(0.2), "a block"),
-}  # fmt: skip
+} | {f"chapter_figure {x}": functools.partial(ji.plot.chapter_figure, x) for x in CAPTIONS}  # fmt: skip
+SLOW = [f"chapter_figure {number}" for number in COMPUTED]
 
 
 def texts(figure):
@@ -242,7 +259,9 @@ def labelled(label):
     return has_unit or label in COUNTED or any(word in label for word in DIMENSIONLESS)
 
 
-@pytest.mark.parametrize("name", PICTURES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[pytest.mark.slow] if x in SLOW else []) for x in PICTURES]
+)
 def test_layout(name):
     figure = PICTURES[name]()
     FigureCanvasAgg(figure).draw()
@@ -293,6 +312,19 @@ def test_a_loop_encloses_the_energy_lost():
     assert x.max() == pytest.approx(deepest)
     assert force.max() == pytest.approx(3.0 * deepest**1.5)
     assert np.trapezoid(force, x) == pytest.approx((1 - 0.6**2) * 1.0, rel=1e-3)
+
+
+def test_laws_stand_at_their_energy_and_dispersion():
+    """A at (1, sqrt 2), B at (1, sqrt 2 / 3); what is allowed lies between 1/3 and 1."""
+    axes = energy_plane().axes[0]
+    allowed, newton, moreau, binary = axes.lines
+    np.testing.assert_allclose(np.ravel(moreau.get_data()), [1, 2**0.5 / 3])
+    np.testing.assert_allclose(np.ravel(binary.get_data()), [1, 2**0.5])
+    assert newton.get_mfc() == "none"
+    kept, spread = allowed.get_data()
+    assert 1 / 3 < kept.min() < 0.4
+    assert 0.9 < kept.max() < 1
+    assert spread.max() < 2**0.5
 
 
 def test_every_kind_of_picture_is_here():

@@ -83,6 +83,12 @@ def test_the_tip_depends_on_friction_alone(found, exponent, stiffness):
     )
 
 
+def test_critical_angles_in_degrees():
+    """arccos of (2 - a^2) / (4 + a^2), a^2 + 3 mu a = 2; from mu = 1 / sqrt(2) on arccos(1 / 3)."""
+    angles = np.degrees(ji.theory.critical_kinetic_angle([0.0, 0.1, 0.3, 0.8]))
+    np.testing.assert_allclose(angles, [90.0, 86.105, 79.421, 70.529], atol=5e-4)
+
+
 def test_it_is_half_rocking_at_the_tip_and_free_beside_it(found):
     names = np.array(OUTCOMES)[found[1.5].outcomes()]
     for j in range(3):

@@ -64,6 +64,15 @@ def test_constraints_reduce_and_distort():
     assert (np.diag(g) < 1).all()
 
 
+def test_kinetic_angles_of_tied_bodies():
+    """Pairs 1-2 and 3-4, 2 tied to 3: cos = (1/2) / (1 + 1/2); by the masses alone (6.66) pi/2."""
+    mass, pairs = [1.0] * 4, [[-1.0, 0], [1, 0], [0, -1], [0, 1]]
+    tied = ji.Scene(mass, pairs, constraints=[[0.0], [1], [-1], [0]])
+    assert float(ji.kinetic_angles(tied)[0, 1]) == pytest.approx(np.arccos(1 / 3), abs=1e-12)
+    free = ji.kinetic_angles(ji.Scene(mass, pairs))
+    assert float(free[0, 1]) == pytest.approx(np.pi / 2, abs=1e-12)
+
+
 @pytest.mark.parametrize(
     "name", ["newton", pytest.param("poisson", marks=pytest.mark.slow), "binary", "lzb"]
 )
@@ -111,12 +120,19 @@ def test_kinetic_angles_of_bodies():
     def angles(aspects, ratios):
         block = jax.vmap(lambda a: ji.kinetic_angles(ji.rocking_block(2.0, 2 * a, 3.0))[0, 1])
         dimer = jax.vmap(lambda r: ji.kinetic_angles(ji.dimer(2 * r, 2.0))[0, 1])
+        together = ji.kinetic_angles(ji.dimer(2.0, 0.0))[0, 1]
         cosine = jax.grad(lambda r: ji.normalized_delassus(ji.dimer(r, 1.0))[0, 1])
-        return block(aspects), dimer(ratios), jax.vmap(cosine)(jnp.array([0.2, 5 / 24, 0.22]))
+        return (
+            block(aspects),
+            dimer(ratios),
+            together,
+            jax.vmap(cosine)(jnp.array([0.2, 5 / 24, 0.22])),
+        )
 
-    block, dimer, slope = angles(np.array([*BLOCKS]), np.array([*DIMERS]))
+    block, dimer, together, slope = angles(np.array([*BLOCKS]), np.array([*DIMERS]))
     np.testing.assert_allclose(block, [*BLOCKS.values()], atol=1e-10)
     np.testing.assert_allclose(dimer, [*DIMERS.values()], atol=1e-10)
+    np.testing.assert_allclose(together, 1.53630673083321779, atol=1e-14)
     # least angle at R / L = 5/24: the slope vanishes and rises
     assert abs(float(slope[1])) < 1e-12
     assert float(slope[0]) < -1e-3 < 1e-3 < float(slope[2])

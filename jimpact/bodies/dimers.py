@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_values
+from jimpact._checks import check_values, is_traced
 from jimpact.bodies.base import (
     CIRCLE,
     Body,
@@ -29,7 +29,7 @@ class Dimer(OnGround):
 
     Args:
         radius: R >= 0 of the spheres [m].
-        length: L > 0 of the rod between their surfaces [m].
+        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch (R > 0).
         sphere_mass: of one sphere, > 0 [kg].
         rod_mass: of the thin rod, >= 0 [kg].
 
@@ -48,7 +48,9 @@ class Dimer(OnGround):
 
     def __init__(self, radius: Any, length: Any, sphere_mass: Any = 1.0, rod_mass: Any = 1.0):
         self.radius = positive("radius", radius, low_allowed=True)
-        self.length = positive("length", length)
+        self.length = positive("length", length, low_allowed=True)
+        if not is_traced(self.arm) and self.arm <= 0:
+            raise ValueError("Argument `length` must be > 0 where `radius` is 0, but has value 0.")
         self.sphere_mass = positive("sphere_mass", sphere_mass)
         self.rod_mass = positive("rod_mass", rod_mass, low_allowed=True)
 
@@ -98,7 +100,7 @@ class SpatialDimer(Body):
 
     Args:
         radius: R > 0 of the spheres [m].
-        length: L > 0 of the rod between their surfaces [m].
+        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch.
         sphere_mass: of one sphere, > 0 [kg].
         rod_mass: of the thin rod, >= 0 [kg].
 
@@ -212,7 +214,7 @@ def dimer(
 
     Args:
         radius: R >= 0 of the spheres [m].
-        length: L > 0 of the rod between their surfaces [m].
+        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch (R > 0).
         sphere_mass: of one sphere, > 0 [kg].
         rod_mass: of the thin rod, >= 0 [kg].
         angle: theta [rad]: > 0 lifts the right sphere, contact 1.
@@ -247,7 +249,7 @@ def dimer_3d(
 
     Args:
         radius: R > 0 of the spheres [m].
-        length: L > 0 of the rod between their surfaces [m].
+        length: L >= 0 of the rod between their surfaces [m]; 0: the spheres touch.
         sphere_mass: of one sphere, > 0 [kg].
         rod_mass: of the thin rod, >= 0 [kg].
         angle: pitch in (-pi/2, pi/2) [rad]: > 0 lifts sphere 1.

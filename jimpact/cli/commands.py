@@ -220,7 +220,8 @@ def _fit_and_yardsticks(study: Study, chosen: dict[str, Any], steps: Steps) -> d
         friction = getattr(study.law, "friction", None)
         shared = [name for name in ("restitution", "friction") if name in study.free]
         free: dict[str, Any] = dict.fromkeys(shared or ["restitution"], True)
-        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), free=free, bounds={}))
+        alone: dict[str, Any] = {"free": free, "bounds": {}, "priors": {}}
+        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), **alone))
     if all_free is not None:
         run(ALL_FREE, all_free)
     return fits
@@ -509,7 +510,23 @@ def _failure(motion: "ji.Motion") -> str:
     return ""
 
 
+# ----------------------------------------------------------------------------------------- figure
+
+
+def figure(command: options.FigureCommand, steps: Steps) -> CommandResult:
+    """A figure of the source chapter."""
+    from jimpact.plot.chapter.figures import CAPTIONS
+
+    assert command.number is not None  # `FigureCommand.light`
+    caption = CAPTIONS[command.number]
+    with waiting(f"drawing figure {command.number}", steps.patience):
+        picture = ji.plot.chapter_figure(command.number)
+    data = {"number": command.number, "caption": caption}
+    title, table = f"Figure {command.number}: {caption}", (list(data), [list(data.values())])
+    return CommandResult(title, data, picture, table, "")
+
+
 _COMMANDS: dict[str, Callable[[Any, Steps], CommandResult]] = {
     command.__name__: command
-    for command in (fit, compare, montecarlo, chart, stability, advise, simulate)
+    for command in (fit, compare, montecarlo, chart, stability, advise, simulate, figure)
 }

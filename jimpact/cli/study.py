@@ -47,6 +47,7 @@ class Study:
         law: with the study's values.
         free: names -> masks of the parameters that `run` fits.
         bounds: names -> (low, high).
+        priors: names -> (mean, standard deviation).
         experiments: the shots, None without `[data]`.
         parameters: the law's values as the file states them.
         options: of `fit`, by name.
@@ -62,6 +63,7 @@ class Study:
     experiments: Experiments | None
     parameters: dict[str, Any]
     options: dict[str, Any] = field(default_factory=dict)
+    priors: dict[str, Any] = field(default_factory=dict)
     monte_carlo: dict[str, Any] = field(default_factory=dict)
     measured: Measured | None = None
 
@@ -72,7 +74,8 @@ class Study:
     @property
     def problem(self) -> FitProblem:
         """The problem that `run` solves: of the shots, or of the observables."""
-        parameters: dict[str, Any] = {"free": self.free, "bounds": self.bounds}
+        names = ("free", "bounds", "priors")
+        parameters: dict[str, Any] = {name: getattr(self, name) for name in names}
         if self.measured is not None:
             value, sigma, observe = self.measured
             return FitProblem.from_observable(self.law, observe, value, sigma, **parameters)
@@ -96,7 +99,8 @@ def read_study(path: str | Path, law: str | None = None) -> Study:
     - `[law]`: name (`jimpact laws`), start values (a number for all contacts or a list with one
       each), options, module (a file or module that registers the law, see `register`). A
       `restitution_matrix` without its matrix starts from an admissible one.
-    - `[law.bounds]`: pairs, as `restitution = [0, 1]`.
+    - `[law.bounds]`: pairs, as `restitution = [0, 1]` or `"restitution[2]" = [0.5, 1]`.
+    - `[law.priors]`: means with standard deviations, as `restitution = [0.9, 0.02]`, see `fit`.
     - `[fit]`: free (a list of names, or a table of masks), method, loss, starts, seed, max_steps,
       profiles.
     - `[data]`: file (relative to the study, see `read_experiments`), momentum_corrected; of shots
@@ -152,6 +156,7 @@ def _build(checked: CheckedStudy) -> Study:
         experiments=None if data is None else _experiments(data, checked.path, body or scene),
         parameters=values,
         options=checked.fit_options,
+        priors=checked.law.priors,
         monte_carlo=_sampling(tables["monte_carlo"], law, scene) if "monte_carlo" in tables else {},
         measured=None if observed is None else observations(scene, observed),
     )

@@ -1,23 +1,14 @@
 """A fit as data for other programs: JSON, and tables of pandas and xarray where installed."""
 
-import importlib
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from jimpact._checks import needed
 from jimpact.files.records import as_data
 from jimpact.fits.report import verdict
 from jimpact.fits.result import FitResult
 from jimpact.status import STATUS
-
-
-def needed(module: str, how: str) -> ModuleType:
-    """The module, or an ImportError that says how to get it."""
-    try:
-        return importlib.import_module(module)
-    except ImportError as error:
-        raise ImportError(f"{module} must be installed for this, but is not: {how}.") from error
 
 
 def parameters_frame(fit: FitResult) -> Any:

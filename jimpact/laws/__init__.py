@@ -4,9 +4,11 @@ from importlib.resources import files
 
 from jimpact.laws.binary import Binary
 from jimpact.laws.compliant import Compliant, make_compliant
+from jimpact.laws.impulse_correlation import ImpulseCorrelation
 from jimpact.laws.kinematic import Moreau, Newton, RestitutionMatrix
 from jimpact.laws.lzb import LZB
 from jimpact.laws.poisson import Poisson
+from jimpact.laws.routh import Routh
 from jimpact.laws.velocity_dependent import VelocityDependent, make_velocity_dependent
 from jimpact.registry import EVERY_PROPERTY, REGISTRY, Row, register
 
@@ -36,7 +38,7 @@ register(
     right_when="one contact, or contacts with kinetic angle pi/2",
     fails_when="contacts at rest (no dispersion), kinetic angles above pi/2 (p < 0)",
     promises={"velocity_scaling", "mass_scaling"},
-    source="Brogliato, Nonsmooth Mechanics (2016), (6.41) with diagonal E",
+    source="Brogliato, Nonsmooth Mechanics (2016), (6.44) with diagonal E",
     bibtex=_BIBTEX["brogliato2016"],
     simplicity=1,
 )
@@ -96,6 +98,26 @@ register(
     make=make_compliant,
 )
 
+register(
+    "routh",
+    Routh,
+    summary="impulses grow in constant ratios, one energetic e for the work of all contacts",
+    right_when="contacts that all approach, alike in material",
+    fails_when="chains at rest (no dispersion), unequal e, contacts that separate beforehand",
+    promises={"impulse_sign", "energy", "velocity_scaling", "mass_scaling"},
+    source="Bowling and Rodriguez; Brogliato (2016), 6.4.3",
+    bibtex=_BIBTEX["routh1897"],
+)
+register(
+    "impulse_correlation",
+    ImpulseCorrelation,
+    summary="contacts beside a collision get a constant multiple of its impulse",
+    right_when="a scene and an approach for which the ratio was measured or fitted",
+    fails_when="another approach or stiffness: impulse ratios vary; both sides approach at once",
+    promises={"velocity_scaling", "mass_scaling", "energy", "impulse_sign"},
+    source="Ceanga and Hurmuzlu (2001); Brogliato (2016), 6.4.3",
+    bibtex=_BIBTEX["ceanga2001"],
+)
 register(
     "velocity_dependent",
     VelocityDependent,

@@ -12,16 +12,18 @@ from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_history import history_program
 from jimpact.law import Law, check_law
-from jimpact.scene import Scene, as_velocity, velocity_change
+from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 
 
 class History(eqx.Module):
     """Histories over impact time: rows are samples; SI units.
 
-    `time` (s,), `force`, `indentation`, `energy`, `impulse`, `gap_velocity` (s, m), `velocity`
-    (s, n); with friction `tangential_force`, `tangential_impulse` and `slip` (s, t), else t = 0;
-    `duration` (), `maximum_force` (m,) and `status` of the whole impact.
-    `indentation` is the effective one, `E = k x^(eta + 1) / (eta + 1)`, of the loading curve.
+    `time` (s,), `force`, `indentation`, `energy`, `impulse`, `gap_velocity`, `approach` (s, m),
+    `velocity` (s, n); with friction `tangential_force`, `tangential_impulse` and `slip` (s, t),
+    else t = 0; `duration` (), `maximum_force` (m,) and `status` of the whole impact.
+    `indentation` is the effective one, `E = k x^(eta + 1) / (eta + 1)`, of the loading curve: it
+    ends at 0. `approach` is the true one, `-int gamma dt`: where the force ends it is the residual
+    indentation, and force against it encloses the energy lost (`ji.plot.contact_loop`).
     """
 
     time: jax.Array
@@ -30,6 +32,7 @@ class History(eqx.Module):
     energy: jax.Array
     impulse: jax.Array
     gap_velocity: jax.Array
+    approach: jax.Array
     velocity: jax.Array
     tangential_force: jax.Array
     tangential_impulse: jax.Array
@@ -104,18 +107,34 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int) -> History:
     tangential = live(states.tangential_impulse * (units.velocity / root)[None])
     change = jax.vmap(lambda p, q: velocity_change(scene, p, q if t else None))
     slip = jnp.zeros(0, v.dtype) if contact.slip is None or not t else contact.slip
+    at = live(time[:, 0, 0] * units.time)
+    pressed = live(states.force * force[None])
+    rubbed = live(states.tangential_force * (units.velocity / root / units.time)[None])
+    rates = live(states.gap_velocity * (units.velocity * units.root)[None], gamma[None])
+    growth = jax.vmap(lambda dv: gap_velocity(scene, dv))(change(pressed, rubbed))
     return History(
-        time=live(time[:, 0, 0] * units.time),
-        force=live(states.force * force[None]),
+        time=at,
+        force=pressed,
         indentation=live(states.indentation * units.indentation[None]),
         energy=live(0.5 * units.velocity**2 * energy[..., 0]),
         impulse=impulse,
-        gap_velocity=live(states.gap_velocity * (units.velocity * units.root)[None], gamma[None]),
+        gap_velocity=rates,
+        approach=-_integral(at, rates, growth),
         velocity=v[None] + change(impulse, tangential),
-        tangential_force=live(states.tangential_force * (units.velocity / root / units.time)[None]),
+        tangential_force=rubbed,
         tangential_impulse=tangential,
         slip=live(states.slip * (units.velocity * root)[None], slip[None]),
         duration=live(time[-1, 0, 0] * units.time),
         maximum_force=live(maximum * force),
         status=live(code[0]).astype(jnp.int32),
     )
+
+
+def _integral(time: jax.Array, values: jax.Array, rates: jax.Array) -> jax.Array:
+    """Integrals (s, m) of `values` from the first time on; `rates`: their derivatives.
+
+    The trapezoidal rule with the correction of its ends: exact for cubics.
+    """
+    step = jnp.diff(time)[:, None]
+    pieces = step / 2 * (values[1:] + values[:-1]) + step**2 / 12 * (rates[:-1] - rates[1:])
+    return jnp.concatenate([jnp.zeros_like(values[:1]), jnp.cumsum(pieces, axis=0)])

@@ -112,7 +112,7 @@ class Newton(_WithCoefficient):
     Derivatives, forward and reverse: v+ is linear in gamma- as long as a contact approaches. With
     friction they are one-sided where a contact begins to stick or to slide.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), (6.41) with a diagonal E; (6.54)-(6.57).
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.44) with a diagonal E; (6.54)-(6.57).
 
     >>> import jimpact as ji
     >>> ji.impact(ji.Newton(0.5), ji.chain([1.0, 1.0]), [1.0, 0.0]).velocity.tolist()

@@ -45,12 +45,44 @@ def energy_ratio(scene: Scene, before: Any, after: Any) -> jax.Array:
     return kinetic_energy(scene, after) / kinetic_energy(scene, before)
 
 
+def energy_dispersion(scene: Scene, velocity: Any) -> jax.Array:
+    """C_KE, how unevenly the kinetic energy is spread: 0 equal shares, sqrt(n - 1) all in one.
+
+    Equation: `sd(T_i) / mean(T_i)`, the coefficient of variation of the shares
+    `T_i = v_i (M v)_i / 2` of the n coordinates. For equal balls with v- = (1, 0, 0) and no loss:
+    sqrt(2) at (0, 0, 1), sqrt(2)/3 at (-1/3, 2/3, 2/3). `dispersion_index` is the same quantity
+    the other way round, from 0 to 1: `1 - C_KE / sqrt(n - 1)`.
+    NaN at rest. Not differentiable at equal shares.
+
+    Args:
+        scene: n coordinates, m contacts.
+        velocity: (n,) [m/s].
+
+    Returns:
+        C_KE () in [0, sqrt(n - 1)], at most that where all shares are >= 0.
+
+    Raises:
+        ValueError: not one velocity per coordinate.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), 6.3.3.
+
+    >>> import jimpact as ji
+    >>> round(float(ji.energy_dispersion(ji.chain([1.0, 1.0, 1.0]), [-1 / 3, 2 / 3, 2 / 3])), 6)
+    0.471405
+    """
+    v = as_velocity(scene, velocity)
+    share = 0.5 * v * momentum(scene, v)
+    mean = jnp.mean(share)
+    square = jnp.mean((share - mean) ** 2)
+    deviation = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+    return deviation / mean
+
+
 def dispersion_index(scene: Scene, velocity: Any) -> jax.Array:
     """How evenly the kinetic energy is spread over the coordinates: 0 all in one, 1 equal shares.
 
-    Equation: `1 - c / sqrt(n - 1)` with c the coefficient of variation (standard deviation over
-    mean) of the shares `T_i = v_i (M v)_i / 2`, whose largest value is `sqrt(n - 1)`. For equal
-    balls with v- = (1, 0, 0) and no loss: 0 at (0, 0, 1), 2/3 at (-1/3, 2/3, 2/3).
+    Equation: `1 - C_KE / sqrt(n - 1)`: C_KE (`energy_dispersion`) is at most `sqrt(n - 1)`. For
+    equal balls with v- = (1, 0, 0) and no loss: 0 at (0, 0, 1), 2/3 at (-1/3, 2/3, 2/3).
     NaN at rest, and for one coordinate. Not differentiable at equal shares.
 
     Args:
@@ -67,12 +99,8 @@ def dispersion_index(scene: Scene, velocity: Any) -> jax.Array:
     >>> round(float(ji.dispersion_index(ji.chain([1.0, 1.0, 1.0]), [-1 / 3, 2 / 3, 2 / 3])), 6)
     0.666667
     """
-    v = as_velocity(scene, velocity)
-    share = 0.5 * v * momentum(scene, v)
-    mean = jnp.mean(share)
-    square = jnp.mean((share - mean) ** 2)
-    deviation = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
-    return 1 - deviation / mean / jnp.sqrt(jnp.asarray(scene.size - 1, v.dtype))
+    spread = energy_dispersion(scene, velocity)
+    return 1 - spread / jnp.sqrt(jnp.asarray(scene.size - 1, spread.dtype))
 
 
 @dataclass(frozen=True)

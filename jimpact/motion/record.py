@@ -30,8 +30,9 @@ MOTION_STATUS = (
     Status("not_finite", "the motion or its input is NaN or infinite", True),
     Status(
         "coarse_step",
-        "steps are too long: within 3 a contact is struck again, or in one bodies pass each other, "
-        "or a disc of a pile moves by more than the least radius",
+        "steps are too long: within 3 a contact is struck again, at more than a tenth of the "
+        "largest gap velocity, or in one bodies pass each other, or a disc of a pile moves by more "
+        "than the least radius",
         False,
     ),
     Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
@@ -41,7 +42,7 @@ MOTION_STATUS = (
         "contact forces with friction have several solutions: contacts stick or part (`events`)",
         False,
     ),
-    Status("backward", "t_end is before t_start", True),
+    Status("backward", "t_end is not after t_start", True),
     Status(
         "no_derivatives",
         "the motion is right, but its derivatives are NaN: it takes more steps than they keep "
@@ -209,7 +210,7 @@ class Motion(eqx.Module):
         }
         lines = [
             f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: {row.name}"
-            + (f" ({row.message})" if row.failure else ""),
+            + (f" ({row.message})" if row.name != "ok" else ""),
             f"  events: {', '.join(counts) or 'none'}",
             f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
             f" at {reached[-1] if len(reached) else np.nan:g} s",

@@ -61,11 +61,16 @@ FEW, PILE, ROUNDINGS = 1e-9, 1e-6, 32
 OFF = 1e-2  # misfit above which `unsolved_step` is reported; ten times more is no solution
 ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jammed piles only
 MEAN = 4  # iterations of the mean velocity in the forces; the error falls by h omega (spin) each
-# Share of the largest speed of any gap by which the rate of a gap changes where bodies pass each
-# other in a step: head-on it is 2 for the fastest. Ten times less would report corners that roll
-# over the ground, ten times more would hide what is slower than half of the fastest.
+# Share of the speed that the velocities could give a gap, by which its rate changes where bodies
+# pass each other in a step: head-on it is 2. Ten times less would report corners that roll over the
+# ground, ten times more would hide oblique passages.
 TURN = 0.1
-APART = 3  # steps: a contact that is struck again within them is reported as `coarse_step`
+# Steps: a contact that is struck again within them by an impact that is HARD, of more than this
+# share of the largest gap velocity so far, is reported as `coarse_step`. Each impact is early or
+# late by up to h / 2; one below that share adds less than that share to the error in q that the
+# fastest impact makes anyway. Ten times less reports stacks that come to rest, ten times more
+# hides rebounds whose order the step does not resolve.
+APART, HARD = 3, 0.1
 
 WHY = (
     "Argument `method` must not be 'time_stepping' where derivatives are taken: with the step the "
@@ -523,12 +528,12 @@ def _status(
         speeds = jnp.sum(trial.v.reshape(-1, 3)[:, :2] ** 2, axis=1)
         coarse = problem.h * jnp.sqrt(jnp.max(speeds)) > contacts.pairs.reach
     else:
-        struck_again = setup.strikes & (progress.steps_since_impact < APART)
-        # a gap that was to close grows: bodies passed each other between two evaluations of it
         relative = progress.state.v - setup.base_velocity
         rate = contacts.normals.T @ relative
-        fastest = jnp.max(jnp.abs(contacts.normals).T @ jnp.abs(relative))
-        turned = rate - progress.closing > TURN * fastest
+        struck_again = setup.strikes & (progress.steps_since_impact < APART)
+        struck_again &= rate < -HARD * setup.speed
+        # a gap that was to close grows: bodies passed each other between two evaluations of it
+        turned = rate - progress.closing > TURN * (jnp.abs(contacts.normals).T @ jnp.abs(relative))
         coarse = jnp.any(struck_again | ((progress.closing < 0) & (rate > 0) & turned))
     coarse = jnp.where(coarse, MOTION_CODE["coarse_step"], 0)
     unsolved = jnp.where(trial.solution.misfit > OFF, MOTION_CODE["unsolved_step"], 0)

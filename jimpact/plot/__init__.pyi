@@ -1,5 +1,6 @@
 """Public names of `ji.plot` and where they live."""
 
+from .chapter.figures import chapter_figure as chapter_figure
 from .charts import (
     advice as advice,
     stability_map as stability_map,
@@ -11,6 +12,8 @@ from .fits import contour as contour, fit as fit
 from .inference import correlation as correlation, profiles as profiles, residuals as residuals
 from .laws import (
     comparison as comparison,
+    contact_loop as contact_loop,
+    energy_plane as energy_plane,
     forces as forces,
     history as history,
     rheologies as rheologies,

@@ -15,7 +15,7 @@ from jimpact.contact import delassus_matrix
 from jimpact.files.records import readable_unit
 from jimpact.laws.forces import Force
 from jimpact.laws.histories import History
-from jimpact.methods.comparison import Comparison
+from jimpact.methods.comparison import Comparison, energy_dispersion, energy_ratio
 from jimpact.plot.style import (
     COLOURS,
     GREY,
@@ -25,15 +25,19 @@ from jimpact.plot.style import (
     heading,
     legend_below,
     legend_within,
+    mark,
     new_figure,
     side_by_side,
     wrapped,
+    write,
 )
 from jimpact.scene import gap_velocity
 from jimpact.solvers.tridiagonal import diagonal
+from jimpact.theory.admissible import admissible_set
 
 _SAMPLES = 120  # points of a force-indentation loop
 _UPRIGHT = 8  # names that stand side by side, at most
+_OUTCOMES = 4000  # dots of a set of outcomes; ten times more would only be one area
 
 
 def comparison(result: Comparison, measured: np.ndarray | None = None, title: str = "") -> Figure:
@@ -126,6 +130,52 @@ def _laws_axis(axes: Axes, names: list[str]) -> None:
     axes.set_xlabel("law")
 
 
+def energy_plane(result: Comparison, title: str = "") -> Figure:
+    """Every law in the plane of energy kept (K_ER = T+/T-) and of its dispersion (C_KE).
+
+    Dots are samples of the outcomes that mechanics allows; a law whose outcome fails the audit is
+    hollow.
+
+    Args:
+        result: what `ji.compare` returned.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: something else.
+
+    >>> import jimpact as ji
+    >>> result = ji.compare(ji.chain([1.0, 1.0]), [1.0, 0.0], {"Newton": ji.Newton(0.5)})
+    >>> ji.plot.energy_plane(result).axes[0].get_xlabel()
+    'energy ratio K_ER = T+/T-'
+    """
+    check_kind("result", result, Comparison)
+    figure = new_figure(5.4)
+    axes = figure.subplots()
+    allowed = admissible_set(result.scene, result.velocity).sample(0, _OUTCOMES)
+    axes.plot(
+        *_kept_and_spread(result, allowed), ".", color=COLOURS[4], alpha=0.3, ms=3, label="allowed"
+    )
+    for i, (name, entry) in enumerate(result.entries.items()):
+        at = _kept_and_spread(result, np.asarray(entry.outcome.velocity)[None])
+        mark(axes, np.ravel(at), name, i, bool(entry.audit.consistent))
+    axes.set_xlabel("energy ratio K_ER = T+/T-")
+    axes.set_ylabel("energy dispersion C_KE (0: equal shares)")
+    heading(figure, title)
+    finish(axes)
+    legend_below(figure, axes.get_legend_handles_labels()[0], 4)
+    return figure
+
+
+def _kept_and_spread(result: Comparison, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """K_ER and C_KE (k,) of velocities after (k, n)."""
+    v, scene = jnp.asarray(after), result.scene
+    kept = jax.vmap(lambda x: energy_ratio(scene, result.velocity, x))(v)
+    return np.asarray(kept), np.asarray(jax.vmap(lambda x: energy_dispersion(scene, x))(v))
+
+
 def rheologies(result: Comparison, title: str = "") -> Figure:
     """Force-indentation loops of contact 1 alone, and what each force makes of the scene.
 
@@ -204,6 +254,59 @@ def forces(histories: Mapping[str, History], contact: int = -1) -> Figure:
     return figure
 
 
+def contact_loop(result: History, contact: int = -1, title: str = "") -> Figure:
+    """Force of one contact against its true approach; between the ends it encloses the lost energy.
+
+    O begins, M1, M2, ... end compressions, R1, R2, ... are where a contact that expands is
+    compressed again, B is the end with the residual indentation.
+
+    Args:
+        result: what `ji.history` returned, of one impact.
+        contact: counted from 0; -1: the last one.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        ValueError: a batch of impacts. TypeError: something else.
+
+    >>> import jimpact as ji
+    >>> h = ji.history(ji.LZB(0.8), ji.chain([1.0], wall=True), [1.0])
+    >>> [text.get_text() for text in ji.plot.contact_loop(h).axes[0].texts]
+    ['O', 'M1', 'B']
+    """
+    _check_one(result)
+    force, rate = np.asarray(result.force[:, contact]), np.asarray(result.gap_velocity[:, contact])
+    touching = np.flatnonzero(force > 0)
+    until = slice(0, touching[-1] + 2 if len(touching) else 1)
+    unit, size = readable_unit("m", float(np.max(np.abs(result.approach[:, contact]))))
+    x, force = np.asarray(result.approach[until, contact]) / size, force[until]
+    figure = new_figure(4.4)
+    axes = figure.subplots()
+    axes.plot(x, force, color=COLOURS[0], lw=1.8)
+    axes.fill(x, force, color=COLOURS[4], alpha=0.2, lw=0)
+    turns = np.flatnonzero(np.diff(rate[until] > 0)) if len(touching) else np.zeros(0, int)
+    names = [f"{'MR'[i % 2]}{i // 2 + 1}" for i in range(len(turns))]
+    for name, i in zip(["O", *names, "B"], [0, *turns, len(x) - 1], strict=True):
+        above = (0, -10) if name[0] == "R" else (0, 10)
+        axes.plot(x[i], force[i], "o", color="black", ms=4)
+        write(axes, (x[i], force[i]), name, xytext=above, textcoords="offset points")
+    axes.margins(y=0.12)
+    axes.set_xlabel(f"approach of the bodies [{unit}]")
+    axes.set_ylabel("force [N]")
+    heading(figure, title)
+    finish(axes)
+    return figure
+
+
+def _check_one(result: History) -> None:
+    """Refuse what is no history, and batches of them."""
+    check_kind("result", result, History)
+    if np.ndim(result.status):
+        raise ValueError("Argument `result` must be of one impact, but is a batch: pick one of it.")
+
+
 def history(result: History, title: str = "") -> Figure:
     """One impact over its time: forces, gap velocities and stored energy of every contact.
 
@@ -222,9 +325,7 @@ def history(result: History, title: str = "") -> Figure:
     >>> [axes.get_ylabel() for axes in ji.plot.history(h).axes]
     ['force [N]', 'gap velocity [m/s]', 'stored energy [J]']
     """
-    check_kind("result", result, History)
-    if np.ndim(result.status):
-        raise ValueError("Argument `result` must be of one impact, but is a batch: pick one of it.")
+    _check_one(result)
     unit, size = readable_unit("s", float(result.duration))
     time, rows = np.asarray(result.time) / size, [result.force, result.gap_velocity, result.energy]
     figure = new_figure(6.8)
@@ -256,7 +357,14 @@ def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarr
         deepest = ((eta + 1) * mass * speed**2 / (2 * k)) ** (1 / (eta + 1))
         part = np.linspace(0, 1, _SAMPLES)
         residual = (1 - float(loop.restitution) ** 2) * deepest
-        loading, unloading = part * deepest, residual + part[::-1] * (deepest - residual)
+        plastic = 0.0
+        if force.bound is not None:
+            bound = float(force.bound)
+            elastic = min(deepest, (bound / k) ** (1 / eta))
+            plastic = (0.5 * mass * speed**2 - k * elastic ** (eta + 1) / (eta + 1)) / bound
+            deepest = elastic
+        loading = part * deepest
+        unloading = plastic + residual + part[::-1] * (deepest - residual)
         f = k * deepest**eta * part**eta
         return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
 

@@ -14,9 +14,11 @@ COLOURS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000"),
     *("#882255", "#999933", "#332288"),
 )
+MARKERS = "osD^vP*X"
 GREY = "#777777"
 HIGHLIGHT = "#FFF3C4"  # behind what a picture points out
 PLATE = "white"  # behind every picture: axes and words are dark, so that dark pages need a plate
+ON_LINES = {"fc": "white", "ec": "none", "pad": 1, "alpha": 0.8}  # behind a text on lines
 SPREAD = 0.6  # width that the bodies of one group take, of the distance between groups
 
 WIDTH = 7.2  # of every picture [in]: legible at half a page's width
@@ -78,6 +80,27 @@ def legend_below(figure: Figure, handles: Sequence[Any], columns: int, note: str
 def legend_within(axes: Axes, columns: int = 1) -> None:
     """The legend of one panel, where it hides little."""
     axes.legend(frameon=False, fontsize=SMALL, ncols=columns, handlelength=1.4, columnspacing=1.0)
+
+
+def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
+    """Outcome number i, hollow unless admissible; later ones smaller, so that equal ones show."""
+    colour = GREY if i < 0 else COLOURS[i % len(COLOURS)]
+    axes.plot(
+        *point,
+        "s" if i < 0 else MARKERS[i % len(MARKERS)],
+        color=colour,
+        mfc=colour if admissible else "none",
+        ms=max(10 - i, 4),
+        mew=1.6,
+        ls="none",
+        label=name if admissible else f"{name} (not admissible)",
+    )
+
+
+def write(axes: Axes, at: Any, text: str, **style: Any) -> None:
+    """A small text, centred at a point (2,)."""
+    centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
+    axes.annotate(text, (at[0], at[1]), **centred | style)
 
 
 def logarithmic(axes: Axes, which: str) -> None:

@@ -19,15 +19,16 @@ from jimpact.plot.style import (
     finish,
     heading,
     legend_below,
+    mark,
     new_figure,
     new_panels,
+    write,
 )
 from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
 from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
 
 _FILL = "#DCE9F3"
-_MARKERS = "osD^vP*X"
 _MOST_CONTACTS = (
     4  # beyond two contacts: projections onto pairs of the first ones up to this number
 )
@@ -99,13 +100,13 @@ def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.n
         _line(axes, frame, frame.before, away, f"no impulse at contact {closed[k] + 1}", ":")
     arc = frame(result.conserving_arc(200))
     axes.plot(*arc.T, color="black", lw=2.4, solid_capstyle="round")
-    _write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
+    write(axes, arc[len(arc) // 2] * 1.13, "$T^+ = T^-$", fontsize="medium")
     for name, end in (("A", arc[0]), ("B", arc[-1])):
-        _write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
+        write(axes, end * 1.09, name, fontsize="x-large", fontweight="bold")
     axes.plot(*frame.before, "o", color="black", ms=8, ls="none", label="before the impact")
-    _mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
+    mark(axes, frame(result.plastic), "plastic, least energy", -1, True)
     for i, (name, v) in enumerate(marked.items()):
-        _mark(axes, frame(v), name, i, bool(result.contains(v)))
+        mark(axes, frame(v), name, i, bool(result.contains(v)))
     axes.set_aspect("equal")
     axes.set_xlim(-1.22 * r, 1.22 * r)
     axes.set_ylim(-1.22 * r, 1.22 * r)
@@ -114,27 +115,6 @@ def _plane(result: AdmissibleSet, marked: Mapping[str, np.ndarray], closed: np.n
     axes.spines[["top", "right"]].set_visible(False)
     _legend(figure, axes, 3)
     return figure
-
-
-def _mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:
-    """Outcome number i, hollow unless admissible; later ones smaller, so that equal ones show."""
-    colour = GREY if i < 0 else COLOURS[i % len(COLOURS)]
-    axes.plot(
-        *point,
-        "s" if i < 0 else _MARKERS[i % len(_MARKERS)],
-        color=colour,
-        mfc=colour if admissible else "none",
-        ms=max(10 - i, 4),
-        mew=1.6,
-        ls="none",
-        label=name if admissible else f"{name} (not admissible)",
-    )
-
-
-def _write(axes: Axes, at: np.ndarray, text: str, **style: Any) -> None:
-    """A centred text."""
-    centred: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": SMALL}
-    axes.annotate(text, (at[0], at[1]), **centred | style)
 
 
 def _legend(figure: Figure, axes: Axes, columns: int) -> None:
@@ -189,7 +169,7 @@ def _line(
     angle = angle - 180 if angle > 90 else angle + 180 if angle < -90 else angle
     share, side = (0.45, "top") if style == "-" else (0.3, "bottom")
     turned: dict[str, Any] = {"rotation": angle, "rotation_mode": "anchor", "va": side}
-    _write(axes, start + share * length * direction, text, color=GREY, **turned)
+    write(axes, start + share * length * direction, text, color=GREY, **turned)
 
 
 def _projections(
@@ -211,7 +191,7 @@ def _projections(
         for k, (name, v) in enumerate(marked.items()):
             point = v @ unit
             height = _energy_ratio(result, v) if single else point[j]
-            _mark(axes, (point[i], height), name, k, bool(result.contains(v)))
+            mark(axes, (point[i], height), name, k, bool(result.contains(v)))
         axes.set_xlabel(_gap_label(contacts[i]), fontsize=SMALL)
         energy = "energy ratio $T^+ / T^-$"
         axes.set_ylabel(energy if single else _gap_label(contacts[j]), fontsize=SMALL)

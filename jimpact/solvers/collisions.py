@@ -4,6 +4,7 @@ Everything is in normalized quantities: `qn = gamma / sqrt(W_jj)`, `pbar = sqrt(
 unit diagonal. A collision at contact j adds `pbar_j += s_j` and `qn += G_j s_j`, with
 `s_j = -(1 + e_j) qn_j`, so that its own gap velocity becomes `-e_j qn_j`. With friction it adds a
 tangential impulse, too: each collision is one contact's Coulomb problem (`friction.py`).
+With correlation ratios the closed contacts beside it get impulses in a given ratio to its own.
 """
 
 from typing import NamedTuple
@@ -52,6 +53,8 @@ class Inputs(NamedTuple):
     root: jax.Array  # sqrt(W_jj), only compared
     gaps: jax.Array | None  # None: no free flight
     friction: CoulombFriction | None = None
+    # p_j of contacts beside the one that collides, over its p_i: (), (m,), or (m, m) in row i
+    ratio: jax.Array | None = None
 
 
 class Options(NamedTuple):
@@ -102,9 +105,10 @@ def solve(
     cycle: tuple[int, ...] | None,
     max_collisions: int,
     friction: CoulombFriction | None = None,
+    ratio: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array | None, SequenceEnd]:
     """Impulses p (m,), p_t (t,) [N s] and how it ended, differentiable in both modes."""
-    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)
+    inputs = to_inputs(delassus, gamma, restitution, gaps, friction)._replace(ratio=ratio)
     options = Options(cycle, max_collisions, isinstance(delassus, Tridiagonal))
     (p, tangential), end = both_modes(lambda problem, _: run(problem, options))(inputs)
     return *impulses_of(p, tangential, jnp.sqrt(diagonal(delassus))), end
@@ -148,7 +152,7 @@ def run(inputs: Inputs, options: Options) -> tuple[tuple[jax.Array, jax.Array | 
     """Normalized impulses and the end of the sequence."""
     g = coupling_matrix(inputs, options)
     start = begin(inputs)
-    pair = inputs.qn.shape[0] == 2 and inputs.friction is None
+    pair = inputs.qn.shape[0] == 2 and inputs.friction is None and inputs.ratio is None
     endless, limit = jnp.array(False), start.p
     if pair:
         first = choose(inputs, options, g, start).contact
@@ -267,7 +271,10 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) 
     choice = choose(inputs, options, g, jax.lax.stop_gradient(at))
     chosen = jnp.arange(at.qn.shape[0], dtype=jnp.int32) == choice.contact
     slip, tangential, code = at.slip, at.tangential, at.code
-    if inputs.friction is None:
+    if inputs.ratio is not None:
+        jump, status = _correlated(inputs, inputs.ratio, g, at, chosen)
+        after, code = at.qn + times(g, jump), jnp.maximum(code, status)
+    elif inputs.friction is None:
         jump = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
         after = jnp.where(chosen, -inputs.restitution * at.qn, at.qn + times(g, jump))
     else:
@@ -295,6 +302,40 @@ def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) 
         tangential=tangential,
         code=code,
     )
+
+
+def _correlated(
+    inputs: Inputs, ratio: jax.Array, g: Symmetric, at: CollisionState, chosen: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Impulses (m,) of a collision that contacts beside the `chosen` one share, and its status.
+
+    They grow as `pbar = s d`, d_j = 1 at the chosen contact. With a = G d contact j is compressed
+    while `qn_j + a_j s < 0`, and returns e_j^2 of the work of that. What is lost,
+    `L = sum (1 - e_j^2) d_j qn_j^2 / (2 a_j)`, is what kinetic energy loses:
+    `d.a s^2 / 2 + d.qn s + L = 0`, of which s is the larger root.
+    """
+    eps = float(jnp.finfo(at.qn.dtype).eps)
+    own = jnp.sum(jnp.where(chosen, inputs.root, 0.0))
+    if ratio.ndim == 2:
+        ratio = jnp.sum(jnp.where(chosen[:, None], ratio, 0.0), axis=0)
+    pressed = times(g, chosen.astype(at.qn.dtype)) < -COUPLED * eps
+    beside = pressed & (at.qn <= rest_of(inputs)) & ~chosen
+    d = jnp.where(chosen, 1.0, jnp.where(beside, ratio * inputs.root / own, 0.0))
+    a = times(g, d)
+    closing = (d > 0) & (at.qn < 0)
+    stays = closing & (a <= 0)  # it would be compressed for ever
+    stored = jnp.where(closing & ~stays, d * at.qn**2 / (2 * jnp.where(a > 0, a, 1.0)), 0.0)
+    curvature, slope = jnp.sum(d * a), -jnp.sum(d * at.qn)
+    square = slope**2 - 2 * curvature * jnp.sum((1 - inputs.restitution**2) * stored)
+    allowed = (square >= -SINGULAR * eps * slope**2) & ~jnp.any(stays) & (curvature > 0)
+    real = allowed & (square > 0)
+    root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
+    s = (slope + root) / jnp.where(curvature > 0, curvature, 1.0)
+    left = at.qn + s * a
+    allowed = allowed & ~jnp.any(((d > 0) | beside) & (left < -rest_of(inputs)))
+    alone = jnp.where(chosen, -(1 + inputs.restitution) * at.qn, 0.0)
+    jump = jnp.where(allowed & jnp.any(beside), s * d, alone)
+    return jump, jnp.where(allowed, CODE["ok"], CODE["infeasible"])
 
 
 def _with_friction(

@@ -21,6 +21,7 @@ import numpy as np
 
 from jimpact.loops import fori_loop, while_loop
 from jimpact.solvers.dense import SINGULAR, block_inverse, load_shares, times
+from jimpact.solvers.interior_points import within_cones
 from jimpact.solvers.lcp import gathered_rounding, solve_lcp
 from jimpact.status import CODE
 
@@ -462,15 +463,24 @@ class _Searched(NamedTuple):
 
 
 def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
-    """Modes, x (m, b) and status from Lemke's method (planar) or Gauss-Seidel sweeps.
+    """Modes, x (m, b) and status from Lemke's method (planar), interior points or sweeps.
 
-    Sweeps at finer and finer tolerances give modes, Newton's method finishes on them, until the
-    law is satisfied.
+    Gauss-Seidel sweeps, where they are needed, at finer and finer tolerances give modes, Newton's
+    method finishes on them, until the law is satisfied.
     """
     x, code = jnp.zeros_like(problem.rate), jnp.asarray(CODE["ok"])
-    started = problem.rate.shape[1] == 2 and problem.complementary
-    if started:
+    planar = problem.rate.shape[1] == 2
+    started = problem.complementary and (planar or problem.load is None)
+    if started and planar:
         x, code = _by_lemke(problem)
+    elif started:
+        x = within_cones(
+            problem.matrix,
+            problem.rate,
+            problem.friction,
+            lambda x: _misfit(problem, x[..., None])[0],
+            problem.tolerance,
+        )
     eps = float(jnp.finfo(x.dtype).eps)
 
     def refine(state: _Searched) -> _Searched:

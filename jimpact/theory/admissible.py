@@ -178,7 +178,7 @@ def admissible_set(scene: Scene, velocity: Any) -> AdmissibleSet:
 
     Host function, not differentiable.
 
-    Source: Brogliato, Nonsmooth Mechanics (2016), section 6.1.2, (6.5)-(6.8) and Fig. 6.3.
+    Source: Brogliato, Nonsmooth Mechanics (2016), 6.1.1.2-6.1.1.3, (6.5)-(6.8), Fig. 6.3.
 
     >>> import jimpact as ji
     >>> result = admissible_set(ji.chain([1.0, 1.0, 1.0]), [1.0, 0.0, 0.0])

@@ -35,7 +35,7 @@ def to_quasi_velocities(scene: Scene, velocity: Any) -> tuple[jax.Array, jax.Arr
     Raises:
         ValueError: redundant contacts; a velocity of another size.
 
-    Source: Brogliato (2016), (6.22).
+    Source: Brogliato (2016), (6.23).
 
     >>> import jimpact as ji
     >>> four = ji.chain([2.0, 2.0, 2.0, 2.0])

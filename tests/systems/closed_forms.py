@@ -9,7 +9,8 @@ from programs import State, chain
 
 ALL = (
     "newton", "moreau", "poisson", "matrix",
-    "binary", "binary-earliest", "binary-left", "lzb", "compliant",
+    "binary", "binary-earliest", "binary-left", "correlation", "routh", "lzb",
+    "compliant",
 )  # fmt: skip
 SEQUENTIAL = ("binary", "binary-earliest", "binary-left")
 TINY = 1e-30  # of a complex step
@@ -95,7 +96,9 @@ class BySpeed(System):
 
 
 class RightAngles(System):
-    """Kinetic angle pi/2: W is diagonal, each contact is alone and Routh's, gamma+ = -e gamma-."""
+    """Kinetic angle pi/2: W is diagonal, each contact is alone, gamma+ = -e gamma-."""
+
+    laws = tuple(law for law in ALL if law != "routh")  # which has one e for both
 
     def state(self):
         normals = np.array([[1.0, 0], [0, 1], [0, 0]])
@@ -108,7 +111,7 @@ class RightAngles(System):
 class HeadOn(System):
     """Balls (m, M, m) at (u, 0, -u), equal e: both contacts act at once, v+ = (-e u, 0, e u)."""
 
-    laws = ("newton", "moreau", "poisson", "matrix", "lzb", "compliant")
+    laws = ("newton", "moreau", "poisson", "matrix", "routh", "lzb", "compliant")
     by = ()
 
     def state(self):
@@ -121,7 +124,7 @@ class HeadOn(System):
 class Plastic(System):
     """e = 0, all contacts approach: the common velocity sum m v / sum m."""
 
-    laws = ("newton", "moreau", "poisson", "matrix", "lzb", "compliant", "binary")
+    laws = ("newton", "moreau", "poisson", "matrix", "routh", "lzb", "compliant", "binary")
     by = ("v",)
     status = None  # `ok`, or `plastic_limit` of the laws that come there in the limit
 
@@ -150,7 +153,7 @@ class Kinematic(System):
 class MoreauAtRest(System):
     """Equal balls, the others at rest: ((1 - 2 e) / 3, (1 + e) / 3, (1 + e) / 3)."""
 
-    laws = ("moreau",)
+    laws = ("moreau", "routh")
     by = ()
 
     def state(self):
@@ -158,6 +161,26 @@ class MoreauAtRest(System):
 
     def after(self, v, e, k, eta):
         return np.stack([(1 - 2 * e[0]), (1 + e[0]), (1 + e[0])]) / 3
+
+
+class Correlated(System):
+    """Equal balls, the others at rest, p2 = r p1: `A p1^2 / 2 - p1 + (1 - e^2) / (2 (2 - r)) = 0`.
+
+    A = 2 - 2 r + 2 r^2; contact 2 is never compressed where r > 1/2.
+    """
+
+    laws = ("correlation",)
+    by = ("e",)
+    ratio = 0.6  # of tests/programs.py
+
+    def state(self):
+        return chain([1.0, 1, 1], [1.0, 0, 0], e=0.8)
+
+    def after(self, v, e, k, eta):
+        r = self.ratio
+        a = 2 - 2 * r + 2 * r**2
+        p = (1 + np.sqrt(1 - a * (1 - e[0] ** 2) / (2 - r))) / a
+        return np.stack([1 - p, (1 - r) * p, r * p])
 
 
 class PoissonAtRest(System):
@@ -317,6 +340,7 @@ SYSTEMS = {
     "plastic": Plastic(),
     "kinematic": Kinematic(),
     "Moreau at rest": MoreauAtRest(),
+    "correlated": Correlated(),
     **{f"Poisson at rest, {e}": PoissonAtRest(*e) for e in ((0.4, 0.95), (0.5, 0.9))},
     **{
         f"Poisson at a wall, {e}": PoissonAtWall(*e)

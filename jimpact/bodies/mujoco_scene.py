@@ -1,0 +1,299 @@
+"""The contacts of a MuJoCo model (MJCF or URDF) as a scene; extra `mujoco`."""
+
+import copy
+import warnings
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_values, needed
+from jimpact.scene import Scene
+
+HOW = "pip install 'jimpact[mujoco]'"
+
+# Penetration over the smaller body's radius beyond which a warning is given. Steps of a simulation
+# leave a hundredth; ten times more would let a sphere sink in to its centre in silence.
+_DEEP = 0.1
+
+# Inverse mass in a direction, over the largest one, below which nothing can slide there: rounding
+# leaves 1e-32. Ten times more would still be 3e-9 of the sliding elsewhere.
+_IMMOBILE = 1e-18
+
+# Singular values over the largest one, below which a bilateral constraint repeats others. Ten times
+# more would still take closed linkages that are 1e-8 from a singular position for what they are.
+_REPEATED = 1e-9
+
+# Part of the velocity, in the metric of the mass, that constraints may take away before a warning.
+# MuJoCo's soft constraints leave 1e-4 to 1e-3; ten times more would hide a tenth of the speed.
+_DRIFT = 1e-2
+
+# Distance of bodies that touch but for rounding, over the model's extent: balls at 0, .1, .2, .3 m
+# have gaps of 1e-17 m. Ten times more closes gaps of 10 nm in a model of a metre.
+_TOUCHING = 1e-9
+
+_LEFT_OUT = (2, 3)  # `contact.exclude`: a contact of bodies that are one, or that cannot move
+
+
+class MujocoScene(NamedTuple):
+    """What `from_mujoco` returns: a scene with the coordinates of `data.qvel`, and its velocity.
+
+    Equation: `gamma = N^T v`, v as `data.qvel`; `v+` of an impact goes back by
+    `data.qvel[:] = out.velocity`.
+
+    Args:
+        scene: mass, normals, tangents, gaps and constraints.
+        velocity: v (n,), `data.qvel` [m/s, rad/s], that obeys the constraints of the scene.
+        friction: mu (m,), sliding friction of each contact; None where the scene has no tangents.
+        names: the two geoms of each contact, as in "floor, box"; its normal points from the
+            first one to the second one.
+
+    >>> import jimpact as ji
+    >>> world = ji.MujocoScene(ji.chain([1.0, 1.0]), [1.0, 0.0], None, ("left, right",))
+    >>> ji.impact(ji.Newton(1.0), world.scene, world.velocity).velocity.tolist()
+    [0.0, 1.0]
+    """
+
+    scene: Scene
+    velocity: jax.Array
+    friction: jax.Array | None
+    names: tuple[str, ...]
+
+
+def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
+    """The contacts of a MuJoCo model at the position of `data`, as a scene with its velocity.
+
+    Equation: `N = J^T n`, `H = J^T (t1, t2)`, with `J = J2 - J1` the Jacobian of the relative
+    velocity at the contact point, and MuJoCo's contact frame n, t1, t2; M is MuJoCo's inertia
+    matrix. MuJoCo finds the contacts: for `data.qpos` as it is, on a copy, so that `mj_forward`
+    need not have been called; a positive distance is a gap, a negative one is taken for 0, as is
+    what rounding leaves of bodies that touch. `solref` and `solimp` play no part: the impact law
+    decides. Equality constraints of the model are bilateral constraints of the scene; those that
+    repeat others are left out. Where each contact slides in one direction (a planar model) the
+    scene is planar, where none does it has no tangents. `data.qvel[:] = out.velocity` is the way
+    back.
+
+    Args:
+        model: `mujoco.MjModel` with n velocities, of any MJCF or URDF.
+        data: `mujoco.MjData` of this model; not changed.
+        margin: distance >= 0 [m] up to which bodies that do not touch are contacts with a gap,
+            beyond the `margin` of the model's geoms.
+
+    Returns:
+        `MujocoScene`: scene, velocity (n,) [m/s, rad/s], friction (m,), names of m contacts.
+
+    Raises:
+        ImportError: mujoco is missing; the extra is named.
+        TypeError: not a model and its data.
+        ValueError: data of another model, a negative margin, no contact, a deformable body.
+            Warnings name bodies that overlap, unequal, torsional or rolling friction that is left
+            out, a joint or tendon at its limit (not a contact of the scene), and a velocity that
+            breaks constraints.
+
+    Limits: contacts of flexible bodies, limits of joints, adhesion.
+
+    Source: Todorov, Erez & Tassa (2012), IROS, 5026-5033; MuJoCo documentation, Computation.
+
+    >>> import jimpact as ji, mujoco
+    >>> model = mujoco.MjModel.from_xml_string(
+    ...     "<mujoco><worldbody><geom name='floor' type='plane' size='1 1 1'/><body pos='0 0 .1'>"
+    ...     "<freejoint/><geom name='ball' size='.1' mass='2'/></body></worldbody></mujoco>"
+    ... )
+    >>> data = mujoco.MjData(model)
+    >>> data.qvel[2] = -1.0
+    >>> world = ji.from_mujoco(model, data)
+    >>> world.names
+    ('floor, ball',)
+    >>> out = ji.impact(ji.Newton(0.8), world.scene, world.velocity)
+    >>> round(float(out.velocity[2]), 12)
+    0.8
+    """
+    mujoco = needed("mujoco", HOW)
+    if not isinstance(model, mujoco.MjModel) or not isinstance(data, mujoco.MjData):
+        raise TypeError(
+            f"Arguments `model` and `data` must be a mujoco.MjModel and its MjData, but are of "
+            f"types {type(model).__name__} and {type(data).__name__}."
+        )
+    if data.qpos.shape != (model.nq,) or data.qvel.shape != (model.nv,):
+        raise ValueError(
+            f"Argument `data` must be of this model, with {model.nq} positions and {model.nv} "
+            f"velocities, but has {data.qpos.size} and {data.qvel.size}."
+        )
+    check_values("margin", as_float_array("margin", margin), low=0.0)
+    touching = _TOUCHING * model.stat.extent
+    model, data = copy.copy(model), copy.copy(data)
+    model.geom_margin += margin + touching
+    model.pair_margin += margin + touching
+    mujoco.mj_fwdPosition(model, data)
+    mass = _mass(mujoco, model, data)
+    root = np.linalg.cholesky(mass)
+    contacts, jacobians = _contacts(mujoco, model, data)
+    names = tuple(
+        f"{_geom_name(mujoco, model, c.geom[0])}, {_geom_name(mujoco, model, c.geom[1])}"
+        for c in contacts
+    )
+    _warn_of_overlap(model, contacts, names)
+    _warn_of_limits(mujoco, model, data)
+    constraints = _independent(root, _equalities(mujoco, model, data))
+    gaps = np.array([c.dist if c.dist > touching else 0.0 for c in contacts])
+    tangents = _tangents(root, jacobians[:, 1:])
+    friction = None if tangents is None else jnp.asarray(_friction(contacts, names))
+    diagonal = np.diag(mass)
+    scene = Scene(
+        mass=diagonal if np.array_equal(mass, np.diag(diagonal)) else mass,
+        normals=jacobians[:, 0].T,
+        tangents=tangents,
+        gaps=gaps if gaps.any() else None,
+        constraints=constraints if constraints.size else None,
+    )
+    velocity = jnp.asarray(_admissible(root, constraints, np.array(data.qvel)))
+    return MujocoScene(scene, velocity, friction, names)
+
+
+def _mass(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
+    """M (n, n); `mj_fullM` takes other arguments in each version of MuJoCo."""
+    columns = np.eye(model.nv)
+    mass = np.empty_like(columns)
+    for column, product in zip(columns, mass):
+        mujoco.mj_mulM(model, data, product, column)
+    return mass
+
+
+def _contacts(mujoco: ModuleType, model: Any, data: Any) -> tuple[list[Any], np.ndarray]:
+    """The contacts, and for each the velocities n, t1, t2 of its second body as seen from the first
+    one, by qvel: (m, 3, n)."""
+    contacts, jacobians = [], []
+    for contact in data.contact:
+        if contact.exclude in _LEFT_OUT:
+            continue
+        if min(contact.geom) < 0:
+            raise ValueError(
+                "Argument `data` must have contacts of rigid bodies only, but has one of a "
+                "flexible body (flex)."
+            )
+        first, second = (_point_jacobian(mujoco, model, data, contact, g) for g in contact.geom)
+        jacobian = contact.frame.reshape(3, 3) @ (second - first)
+        if jacobian[0].any():
+            contacts.append(contact)
+            jacobians.append(jacobian)
+    if not contacts:
+        raise ValueError(
+            "Argument `data` must have a contact that can move, but has none: no geoms touch at "
+            "data.qpos. Argument `margin` finds contacts before they close."
+        )
+    return contacts, np.stack(jacobians)
+
+
+def _point_jacobian(
+    mujoco: ModuleType, model: Any, data: Any, contact: Any, geom: int
+) -> np.ndarray:
+    """The velocity (3, n) of the point of a geom's body at the contact, by qvel."""
+    jacobian = np.zeros((3, model.nv))
+    body = int(model.geom_bodyid[geom])
+    mujoco.mj_jac(model, data, jacobian, None, contact.pos, body)
+    return jacobian
+
+
+def _tangents(root: np.ndarray, jacobians: np.ndarray) -> np.ndarray | None:
+    """Tangents (n, 2 m), or (n, m) where each contact slides along one line, or None.
+
+    `jacobians` (m, 2, n) are of t1, t2; `root` is the lower root of the mass matrix.
+    """
+    scaled = np.linalg.solve(root, np.swapaxes(jacobians, 1, 2))  # (m, n, 2)
+    mobility, directions = np.linalg.eigh(np.swapaxes(scaled, 1, 2) @ scaled)  # increasing
+    least = _IMMOBILE * mobility.max()
+    if not (mobility[:, 1] > least).any():
+        return None
+    if (mobility[:, 0] <= least).all():
+        jacobians = np.einsum("mi,min->mn", directions[:, :, 1], jacobians)
+    return jacobians.reshape(-1, jacobians.shape[-1]).T
+
+
+def _friction(contacts: list[Any], names: tuple[str, ...]) -> np.ndarray:
+    """mu (m,), with a warning for what sliding friction leaves out."""
+    for contact, name in zip(contacts, names):
+        first, second, *turning = contact.friction
+        if contact.dim > 1 and first != second:
+            warnings.warn(
+                f"Contact {name!r} has friction {first:g} and {second:g} in two directions; "
+                "the first one is taken for both.",
+                stacklevel=3,
+            )
+        if contact.dim > 3 and any(turning):
+            warnings.warn(
+                f"Contact {name!r} has torsional or rolling friction, which is left out.",
+                stacklevel=3,
+            )
+    return np.array([c.friction[0] if c.dim > 1 else 0.0 for c in contacts])
+
+
+def _equalities(mujoco: ModuleType, model: Any, data: Any) -> np.ndarray:
+    """The gradients (n, c) of the model's active equality constraints."""
+    rows = np.flatnonzero(data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)
+    gradients = np.zeros((model.nv, rows.size))
+    if not mujoco.mj_isSparse(model):
+        gradients[:] = data.efc_J.reshape(-1, model.nv)[rows].T
+        return gradients
+    for column, row in enumerate(rows):
+        entries = slice(data.efc_J_rowadr[row], data.efc_J_rowadr[row] + data.efc_J_rownnz[row])
+        gradients[data.efc_J_colind[entries], column] = data.efc_J[entries]
+    return gradients
+
+
+def _independent(root: np.ndarray, gradients: np.ndarray) -> np.ndarray:
+    """A basis h (n, b) of the columns, with `h^T M^-1 h` the identity."""
+    left, sizes, _ = np.linalg.svd(np.linalg.solve(root, gradients), full_matrices=False)
+    return root @ left[:, sizes > _REPEATED * sizes.max(initial=0.0)]
+
+
+def _admissible(root: np.ndarray, constraints: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """The velocity (n,) without its part that breaks the constraints."""
+    scaled = root.T @ velocity
+    basis = np.linalg.solve(root, constraints)
+    broken = basis @ (basis.T @ scaled)
+    if np.linalg.norm(broken) > _DRIFT * np.linalg.norm(scaled):
+        warnings.warn(
+            f"The velocity breaks equality constraints of the model; "
+            f"{broken @ broken / (scaled @ scaled):.1%} of the kinetic energy is left out.",
+            stacklevel=3,
+        )
+    return np.linalg.solve(root.T, scaled - broken)
+
+
+def _geom_name(mujoco: ModuleType, model: Any, geom: int) -> str:
+    """The name of a geom, or of its body with the geom's number."""
+    name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, geom)
+    if name:
+        return str(name)
+    body = int(model.geom_bodyid[geom])
+    body_name = mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_BODY, body) or f"body {body}"
+    return f"{body_name} (geom {geom})"
+
+
+def _warn_of_overlap(model: Any, contacts: list[Any], names: tuple[str, ...]) -> None:
+    """Warn of bodies that are deep in each other: their contact points are arbitrary."""
+    for contact, name in zip(contacts, names):
+        radii = [r for r in model.geom_rbound[contact.geom] if r > 0]  # a plane's is 0
+        if radii and -contact.dist > _DEEP * min(radii):
+            warnings.warn(
+                f"Contact {name!r} overlaps by {-contact.dist:.3g} m; its point and normal mean "
+                "little there.",
+                stacklevel=3,
+            )
+
+
+def _warn_of_limits(mujoco: ModuleType, model: Any, data: Any) -> None:
+    """Warn of joints and tendons at their limits, where an impact would push them further."""
+    kinds = (
+        (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, mujoco.mjtObj.mjOBJ_JOINT, "Joint"),
+        (mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON, mujoco.mjtObj.mjOBJ_TENDON, "Tendon"),
+    )
+    for kind, of, word in kinds:
+        for number in data.efc_id[data.efc_type == kind]:
+            name = mujoco.mj_id2name(model, of, int(number)) or int(number)
+            warnings.warn(
+                f"{word} {name!r} is at its limit, which is not a contact of the scene.",
+                stacklevel=3,
+            )

@@ -1,0 +1,138 @@
+"""Impulse correlation ratios: a contact beside a collision gets a constant share of its impulse."""
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_float_array, check_per_contact, check_values, is_traced
+from jimpact.contact import Contact, delassus_matrix
+from jimpact.law import Impulses, Law, Values, option, parameter
+from jimpact.scene import Scene
+from jimpact.solvers import collisions
+from jimpact.solvers.tridiagonal import as_matrix
+
+# Relative excess of a ratio over an end of its interval that is rounding. Ten times more would
+# still be far below what a measurement resolves.
+ROUNDING = 1e-9
+
+
+class ImpulseCorrelation(Law):
+    """Collisions one after another; the contacts beside one get a constant multiple of its impulse.
+
+    Equation: contact i, the fastest, collides; contacts j that it presses and that do not separate
+    have `dp_j = r_j dp_i` throughout. Contact j is compressed while `gamma_j < 0` and gives back
+    e_j^2 of the work of compression (energetic restitution): with `p = s d`, d_i = 1, d_j = r_j,
+    `a = W d`, the impulse ends at the larger root s of
+    `d.a s^2 / 2 + d.gamma s + sum (1 - e_j^2) d_j gamma_j^2 / (2 a_j) = 0`
+    (over contacts with gamma_j < 0). Then the next contact that approaches collides.
+
+    The ratio is one of this scene and this kind of approach: it is measured or fitted. It is
+    constant during the impact, where LZB's `dp_j / dp_i` begins at 0 and grows without bound.
+
+    Args:
+        restitution: energetic coefficient e in [0, 1], scalar or one per contact (m,).
+        ratio: impulse correlation ratio r_j >= 0 of contact j beside any other, scalar or (m,), or
+            a matrix (m, m): row i, column j of j beside i. Each must lie in
+            `correlation_interval`, where contact i presses contact j.
+        max_collisions: largest number of collisions before the law gives up.
+
+    Raises:
+        ValueError: by `impact`, a ratio outside `correlation_interval` (not inside jit).
+
+    Status: `infeasible` where a ratio leads outside of what mechanics allows (a contact is left
+    approaching, or more energy is lost than is there); `order_dependent`, `plastic_limit` and
+    `max_steps` as in `Binary`.
+
+    Derivatives, forward and reverse, at the order of collisions that occurs. At e = 0 beside a
+    contact at rest the slope in e is infinite, and 0 is returned.
+
+    Source: Ceanga and Hurmuzlu, J. Appl. Mech. 68 (2001) 575; Brogliato (2016), 6.4.3.
+
+    >>> import jimpact as ji
+    >>> ji.impact(ji.ImpulseCorrelation(0.9, ratio=1.0), ji.chain([1.0] * 3), [1.0, 0.0, 0.0])
+    Traceback (most recent call last):
+    ...
+    ValueError: Argument `ratio` must lie in [0.5, 0.948753] for contact 1 beside contact 0, ...
+    """
+
+    separable: ClassVar[bool] = True
+
+    restitution: Values = parameter(low=0.0, high=1.0)
+    ratio: Values = parameter(low=0.0, matrix=True)
+    max_collisions: int = option(10_000, low=1)
+
+    def check(self, scene: Scene, dtype: jnp.dtype) -> None:
+        """Raise a ValueError where a ratio is outside its interval for a pair of contacts."""
+        if is_traced((scene, self.restitution, self.ratio)):
+            return
+        m, closed = scene.contacts, np.asarray(scene.closed)
+        low, high = _interval(scene, self.restitution)
+        ratio = np.broadcast_to(np.asarray(self.ratio, float), (m, m))
+        for i, j in zip(*np.nonzero(~np.isnan(low) & closed[:, None] & closed[None, :])):
+            least, most = low[i, j] * (1 - ROUNDING), high[i, j] * (1 + ROUNDING)
+            if not least <= ratio[i, j] <= most:
+                raise ValueError(
+                    f"Argument `ratio` must lie in [{low[i, j]:.6g}, {high[i, j]:.6g}] for contact "
+                    f"{j} beside contact {i}, but has value {ratio[i, j]:.6g}."
+                )
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """Sum of the impulses of all collisions."""
+        p, _, end = collisions.solve(
+            contact.delassus,
+            contact.gap_velocity,
+            self.restitution,
+            None,
+            None,
+            self.max_collisions,
+            ratio=self.ratio,
+        )
+        return Impulses(p, None, end.code)
+
+
+def correlation_interval(scene: Scene, restitution: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Ratios `r_j = dp_j / dp_i` that mechanics allows a contact j at rest beside contact i.
+
+    Equation: `r_j >= -W_ij / W_jj`, or contact j would approach; and contact i ends apart only
+    where `W_ii + 2 W_ij r + W_jj r^2 <= (1 + e_i^2) (W_ii + W_ij r)`, with
+    `W_ii + W_ij r > 0`. For three equal balls that hit at e = 1: 1/2 to 1, the whole arc of
+    outcomes that conserve energy.
+
+    Args:
+        scene: m contacts.
+        restitution: energetic coefficient e in [0, 1], scalar or (m,).
+
+    Returns:
+        Least and largest ratios, each (m, m): row i, column j; NaN where contact i does not press
+        contact j (`W_ij >= 0`), which then gets no impulse. Least above largest: there is none.
+
+    Raises:
+        ValueError: restitution out of range or of a wrong size.
+
+    Host function, not differentiable.
+
+    Source: own derivation, from `ImpulseCorrelation` of two contacts.
+
+    >>> import jimpact as ji
+    >>> low, high = ji.correlation_interval(ji.chain([1.0, 1.0, 1.0]), 0.9)
+    >>> round(float(low[0, 1]), 6), round(float(high[0, 1]), 6)
+    (0.5, 0.948753)
+    """
+    e = as_float_array("restitution", restitution)
+    check_values("restitution", e, low=0.0, high=1.0)
+    check_per_contact("restitution", e, scene.contacts)
+    return _interval(scene, e)
+
+
+def _interval(scene: Scene, restitution: jax.Array) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends (m, m) on the host; the upper one is a root of the quadratic inequality."""
+    w = np.asarray(as_matrix(delassus_matrix(scene)), float)
+    own, other = np.diag(w)[:, None], np.diag(w)[None, :]
+    kept = np.broadcast_to(np.asarray(restitution, float) ** 2, (len(w),))[:, None]
+    presses = w < -collisions.COUPLED * np.finfo(float).eps * np.sqrt(own * other)
+    off = np.where(presses, w, np.nan)
+    linear = (1 - kept) * off  # other r^2 + linear r - kept own <= 0
+    high = (-linear + np.sqrt(linear**2 + 4 * other * kept * own)) / (2 * other)
+    return -off / other, high

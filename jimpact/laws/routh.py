@@ -1,0 +1,50 @@
+"""Routh's incremental impulses with one energetic coefficient for the whole impact."""
+
+import jax.numpy as jnp
+
+from jimpact.contact import Contact
+from jimpact.law import Impulses, Law, Values, parameter
+from jimpact.solvers.lcp import solve_lcp
+from jimpact.solvers.tridiagonal import as_matrix, is_regular
+
+
+class Routh(Law):
+    """Rigid contacts whose impulses grow in constant ratios; one e for the work of all of them.
+
+    Equation: `p = s p_c` with `0 <= gamma_c = gamma- + W p_c  _|_  p_c >= 0`. The net work
+    `-(2 s - s^2) p_c^T W p_c / 2` of all contacts is least at s = 1, the end of compression, and
+    the share e^2 of it is given back (energetic restitution): s = 1 + e. Of unequal e_j, e^2 is
+    the mean of e_j^2, weighted by what each contact takes up in compression, `-p_cj gamma_j- / 2`.
+
+    Of contacts that approach or rest it is Moreau's law with one e, and where one contact hits
+    others at rest that of Hurmuzlu and Marghitu: no dispersion. It agrees with `LZB` for one
+    contact, and for contacts with kinetic angle pi/2 and one e.
+
+    Args:
+        restitution: energetic coefficient e in [0, 1], scalar or one per contact (m,).
+
+    Status: `inadmissible_velocity` where a contact separates before the impact and is pressed in
+    it; `impulse_not_unique` for redundant contacts.
+
+    Derivatives are one-sided where a contact is about to take part.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), 6.4.3, on Bowling and Rodriguez; Routh (1897).
+    How the increments are shared is this library's reading of it.
+
+    >>> import jimpact as ji
+    >>> three_balls = ji.Contact([[2.0, -1.0], [-1.0, 2.0]], [-1.0, 0.0])
+    >>> ji.Routh(0.8).impulses(three_balls).normal.round(6).tolist()
+    [1.2, 0.6]
+    """
+
+    restitution: Values = parameter(low=0.0, high=1.0)
+
+    def impulses(self, contact: Contact) -> Impulses:
+        """The impulse of compression, 1 + e times."""
+        w, gamma, e = contact.delassus, contact.gap_velocity, self.restitution
+        compression = solve_lcp(as_matrix(w), gamma, regular=is_regular(w))
+        if e.ndim:
+            work = compression.z * jnp.maximum(-gamma, 0.0)
+            kept = jnp.sum(e**2 * work) / jnp.sum(work)
+            e = jnp.where(kept > 0, jnp.sqrt(jnp.where(kept > 0, kept, 1.0)), 0.0)
+        return Impulses((1 + e) * compression.z, None, compression.code)
