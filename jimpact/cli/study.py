@@ -21,7 +21,7 @@ from jimpact.files.study_file import (
     distribution,
     from_file,
 )
-from jimpact.fits.experiments import Experiments, joined, read_experiments
+from jimpact.fits.experiments import Experiments, read_experiments
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.observables import Measured, observations
@@ -235,7 +235,8 @@ def cube_impacts(
         """The shots of these tables."""
         names = (tables["data"]["file"], *(("cube_nearly_clean.csv",) if nearly_clean else ()))
         body = body_of("[scene]", tables["scene"], AT_KEYS)
-        return joined([_experiments({"file": name, "near_m": near}, file, body) for name in names])
+        parts = [_experiments({"file": name, "near_m": near}, file, body) for name in names]
+        return Experiments.join(parts) if nearly_clean else parts[0]
 
     shots = from_file(path, "[scene]", read)
     return shots if contacts is None else _with_contacts(shots, contacts)

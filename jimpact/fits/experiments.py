@@ -307,17 +307,6 @@ class Experiments(eqx.Module):
         return [function(_scene_of(self, scene, k)) for k in range(len(self.shots))]
 
 
-def joined(parts: Sequence[Experiments]) -> Experiments:
-    """The shots of all `parts`, which have errors before and after, and scenes of their own."""
-    rows: dict[str, Any] = {
-        name: np.concatenate([np.asarray(getattr(part, name)) for part in parts])
-        for name in ("pre", "post", "sigma", "sigma_pre")
-    }
-    scenes = [scene for part in parts for scene in part.scenes or ()]
-    shots = [label for part in parts for label in part.shots]
-    return Experiments(**rows, scenes=scenes, shots=shots, units=parts[0].units)
-
-
 def _scene_of(data: Experiments, scene: Scene | None, shot: int) -> Scene:
     """`Experiments.scene_of`. Calling a method would go through all arrays of `data`."""
     if data.scenes is not None:
