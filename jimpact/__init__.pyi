@@ -116,6 +116,12 @@ from .methods.comparison import (
 from .methods.rheologies import compare_rheologies as compare_rheologies
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
+from .methods.waves import (
+    Pulses as Pulses,
+    Trains as Trains,
+    colliding_trains as colliding_trains,
+    pulses as pulses,
+)
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .montecarlo.gaps import (
     crossover as crossover,
@@ -127,7 +133,11 @@ from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
 from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
-from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
+from .motion.record import (
+    Motion as Motion,
+    load_motion as load_motion,
+    raise_on_failed_motion as raise_on_failed_motion,
+)
 from .motion.simulate import simulate as simulate
 from .motion.system import (
     HarmonicBase as HarmonicBase,

@@ -83,7 +83,7 @@ def test_readme_runs():
     assert len(README.splitlines()) <= 120
 
 
-LONG_PAGES = ("embedding", "fitting", "fitting_reference", "motions", "speed_accuracy")
+LONG_PAGES = ("embedding", "fitting", "fitting_reference", "motions", "speed_accuracy", "waves")
 
 
 def code_of(path):

@@ -127,8 +127,8 @@ class PlanarBodies(Body):
             parts.append(_discs(places, np.array(self.pairs.discs)))
         for polygon, discs in self.pairs.rolling:
             parts.append(_disc_on_polygon(places, np.array(discs), polygon))
-        if self.pairs.sides:
-            parts.append(_facing_sides(places, self.pairs.sides))
+        if self.pairs.sides or self.pairs.polygons:
+            parts.append(_facing_sides(_all_sides(places, self.pairs)))
         return PlanarContacts(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
     def gap_function(self, q: jax.Array) -> jax.Array:
@@ -220,13 +220,15 @@ class _Pairs(NamedTuple):
 
     discs: tuple[tuple[int, int], ...]
     rolling: tuple[tuple[int, tuple[int, ...]], ...]  # a polygon and its discs
-    sides: tuple[tuple[Side, Side], ...]
+    sides: tuple[tuple[Side, Side], ...]  # of polygons in contact there only
+    polygons: tuple[tuple[int, int], ...]  # in contact anywhere
 
     @property
     def between(self) -> list[tuple[int, int]]:
         """Bodies of each contact."""
         discs = [*self.discs, *((i, polygon) for polygon, some in self.rolling for i in some)]
-        return discs + [(first[0], second[0]) for first, second in self.sides for _ in (0, 1)]
+        polygons = [(first[0], second[0]) for first, second in self.sides] + list(self.polygons)
+        return discs + [pair for pair in polygons for _ in (0, 1)]
 
 
 class _Places(NamedTuple):
@@ -288,15 +290,52 @@ def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> Planar
     return PlanarContacts(away - places.rim[discs], middle - away[:, None] * n, n)
 
 
-def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> PlanarContacts:
+class _Sides(NamedTuple):
+    """Sides in contact of pairs of polygons, each from its begin to its end (g, 2)."""
+
+    first: tuple[jax.Array, jax.Array]
+    second: tuple[jax.Array, jax.Array]
+    swapped: jax.Array  # (g,) whether the contact at the first side's end comes first
+
+
+def _all_sides(places: _Places, pairs: _Pairs) -> _Sides:
+    """Sides that were chosen at the beginning, then those that face each other now.
+
+    Where a body rolls over a corner, one of the sides gives way to its neighbour, which has the
+    corner at its other end. The contact there keeps its place among the two because they are
+    swapped where the numbers of both sides have an odd sum.
+    """
+    rows: list[Any] = [(_side(places, a), _side(places, b), False) for a, b in pairs.sides]
+    for i, j in pairs.polygons:
+        a, b = _facing_now(places.polygons[i], places.polygons[j])
+        sides = (_side_of(places.polygons[i], a), _side_of(places.polygons[j], b))
+        rows.append((*sides, (a + b) % 2 == 1))
+    first, second, swapped = zip(*rows)
+
+    def ends(sides: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+        return jnp.stack([begin for begin, _ in sides]), jnp.stack([end for _, end in sides])
+
+    return _Sides(ends(first), ends(second), jnp.stack([jnp.asarray(x) for x in swapped]))
+
+
+def _facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Sides () of two polygons that face each other: the line of one keeps them apart most.
+
+    The other polygon's nearest corner to this line is an end of its side that is most opposite.
+    """
+    n_a, n_b = (_outward(jnp.roll(x, -1, axis=0) - x) for x in (a, b))
+    beyond_a = jnp.min(jnp.sum((b[:, None] - a[None]) * n_a[None], axis=2), axis=0)
+    beyond_b = jnp.min(jnp.sum((a[:, None] - b[None]) * n_b[None], axis=2), axis=0)
+    side_a, side_b = jnp.argmax(beyond_a), jnp.argmax(beyond_b)
+    opposite = n_a @ n_b.T
+    by_b = jnp.max(beyond_b) > jnp.max(beyond_a) + _PARALLEL
+    side_a = jnp.where(by_b, jnp.argmin(opposite[:, side_b]), side_a)
+    return side_a, jnp.where(by_b, side_b, jnp.argmin(opposite[side_a]))
+
+
+def _facing_sides(sides: _Sides) -> PlanarContacts:
     """Two contacts a pair, at the begin and at the end of the first body's side."""
-
-    def ends(which: int) -> tuple[jax.Array, jax.Array]:
-        """Begins and ends (g, 2) of the sides of the first or second bodies."""
-        sides = [_side(places, pair[which]) for pair in pairs]
-        return jnp.stack([x for x, _ in sides]), jnp.stack([x for _, x in sides])
-
-    (a_begin, a_end), (b_begin, b_end) = ends(0), ends(1)
+    (a_begin, a_end), (b_begin, b_end) = sides.first, sides.second
     n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)
 
     def at_end(
@@ -319,13 +358,20 @@ def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> Plan
 
     both = (at_end(a_begin, a_end, b_end, b_begin), at_end(a_end, a_begin, b_begin, b_end))
     gap, point, n = (jnp.stack(parts, axis=1) for parts in zip(*both))
+    swapped = sides.swapped[:, None]
+    gap = jnp.where(swapped, gap[:, ::-1], gap)
+    point, n = (jnp.where(swapped[..., None], x[:, ::-1], x) for x in (point, n))
     return PlanarContacts(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
 
 
 def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
     """Its begin and its end (2,)."""
-    corners, begin = places.polygons[side[0]], side[1]
-    return corners[begin], corners[(begin + 1) % corners.shape[0]]
+    return _side_of(places.polygons[side[0]], side[1])
+
+
+def _side_of(corners: jax.Array, side: Any) -> tuple[jax.Array, jax.Array]:
+    """Begin and end (2,) of a side of a polygon with these corners (k, 2)."""
+    return corners[side], corners[(side + 1) % corners.shape[0]]
 
 
 def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
@@ -367,6 +413,7 @@ def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at:
     discs: list[tuple[int, int]] = []
     rolling: dict[int, list[int]] = {}
     sides: list[tuple[Side, Side]] = []
+    polygons: list[tuple[int, int]] = []
     for pair in pairs:
         i, j = (_body_of(x, bodies) for x in pair)
         if i == j:
@@ -377,10 +424,23 @@ def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at:
             rolling.setdefault(j, []).append(i)
         elif isinstance(bodies[j], Disc):
             rolling.setdefault(i, []).append(j)
+        elif at is None and not all(np.ndim(x) for x in pair):
+            for which in (i, j):
+                _check_even(which, _polygon(bodies, which))
+            polygons.append((i, j))
         else:
             sides.append(_sides_of(pair, i, j, bodies, at))
     grouped = tuple((polygon, tuple(some)) for polygon, some in rolling.items())
-    return _Pairs(tuple(discs), grouped, tuple(sides))
+    return _Pairs(tuple(discs), grouped, tuple(sides), tuple(polygons))
+
+
+def _check_even(which: int, body: Cornered) -> None:
+    """Raise for a polygon whose contacts would change places where its last side follows."""
+    if len(body.ring) % 2:
+        raise ValueError(
+            f"Argument `at` must be given, or sides in `pairs`, for polygon {which}, which has "
+            f"{len(body.ring)} sides: only an even number of sides is chosen anew as it moves."
+        )
 
 
 def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:
@@ -418,10 +478,10 @@ def _sides_of(
                     f"{side!r}."
                 )
         return (i, int(pair[0][1])), (j, int(pair[1][1]))
-    if at is None or is_traced((at, bodies)):
+    if is_traced((at, bodies)):
         raise ValueError(
-            f"Argument `at` must be given, a configuration that is not traced, for the polygons "
-            f"{i} and {j}: or give their sides."
+            f"Argument `at` must not be traced for the polygons {i} and {j}: leave it out, or give "
+            "their sides."
         )
     q = as_float_array("at", at)
     check_shape("at", q, (3 * len(bodies),), "x, y, theta of each body")

@@ -493,7 +493,12 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
         more[command.portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
     if command.gif is not None:
         more[command.gif] = partial(
-            ji.plot.animation, system, motion, title=title, progress=steps.patience
+            ji.plot.animation,
+            system,
+            motion,
+            title=title,
+            progress=steps.patience,
+            speed=command.speed,
         )
     heads = ["time [s]", *system.body.names, *system.body.velocity_names]
     table = heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist()

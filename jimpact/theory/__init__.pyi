@@ -38,3 +38,4 @@ from .rocking import (
     rocking_ratios as rocking_ratios,
     search_critical_angle as search_critical_angle,
 )
+from .waves import nesterenko_speed as nesterenko_speed, reinsch_chain as reinsch_chain
