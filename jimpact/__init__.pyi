@@ -131,6 +131,12 @@ from .montecarlo.gaps import (
 from .montecarlo.results import MonteCarlo as MonteCarlo
 from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
+from .motion.accelerations import (
+    ContactProblem as ContactProblem,
+    QuasiLagrange as QuasiLagrange,
+    contact_problem as contact_problem,
+    quasi_lagrange as quasi_lagrange,
+)
 from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.record import (

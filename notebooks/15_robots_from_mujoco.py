@@ -14,8 +14,8 @@
 # %% [markdown]
 # # Robots from MuJoCo: a biped lands on both feet
 #
-# *Course, part 15. Before: [a block on a shaken base](14_a_shaken_block.ipynb). Next: [measured
-# drops](16_measured_drops.ipynb).*
+# *Course, part 15. Before: [a block on a shaken base](14_a_shaken_block.ipynb). Next: [the
+# chapter](16_the_chapter.ipynb).*
 #
 # You will take the contacts of a robot from MuJoCo, compare laws for its landing, differentiate the
 # landing, and find the damping of a contact from the speed after a collision. The extra `mujoco` is
@@ -198,4 +198,4 @@ first, second = ji.mujoco_solref(0.62, timestep=0.002)
 print(f"solref = {first:.6g} {second:.6g}")
 
 # %% [markdown]
-# *Next: [measured drops](16_measured_drops.ipynb)*
+# *Next: [the chapter that the laws are from](16_the_chapter.ipynb).*

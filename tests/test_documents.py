@@ -250,7 +250,7 @@ def test_notebook_and_script_agree(path):
     assert not any(output.output_type == "error" for output in outputs)
 
 
-COMPILING = ("05", "06", "07", "11", "12", "13", "14")  # compiling takes most of their time
+COMPILING = ("05", "06", "07", "11", "12", "13", "14", "16")  # compiling takes most of their time
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@
 # %% [markdown]
 # # Measured drops: an ellipse and a square
 #
-# *Course, part 16. Before: [robots from MuJoCo](15_robots_from_mujoco.ipynb).*
+# *Course, part 17. Before: [the chapter](16_the_chapter.ipynb).*
 #
 # You will see in two sets of measured impacts whether *any* law of contact at a point can fit them,
 # fit a law to those that allow it, and predict whole drops that were not used in the fit. The data
