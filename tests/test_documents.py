@@ -83,7 +83,16 @@ def test_readme_runs():
     assert len(README.splitlines()) <= 120
 
 
-LONG_PAGES = ("embedding", "fitting", "fitting_reference", "motions", "speed_accuracy", "waves")
+LONG_PAGES = (
+    "embedding",
+    "fitting",
+    "fitting_reference",
+    "from_lmfit",
+    "gradient_descent",
+    "motions",
+    "speed_accuracy",
+    "waves",
+)
 
 
 def code_of(path):
