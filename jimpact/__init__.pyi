@@ -40,6 +40,11 @@ from .fits.many import (
     fit_many as fit_many,
     leave_one_out as leave_one_out,
 )
+from .fits.measured import (
+    ellipse_impacts as ellipse_impacts,
+    square_drops as square_drops,
+    square_impacts as square_impacts,
+)
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import Profile as Profile, profile as profile

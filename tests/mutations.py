@@ -198,6 +198,8 @@ MUTATIONS = [
     Mutation("inertia of a dimer about its axis halved", r"0\.8 \* body\.sphere_mass", "0.4 * body.sphere_mass", ("test_scenes.py::test_dimer_in_space",)),
     Mutation("pendulums without the square of their length", r"self\.masses \* self\.length\*\*2", "self.masses * self.length", (examples("bodies.pendulums"),)),
     Mutation("sign of the Coriolis terms", r"0\.5 \* (jax\.grad\(lambda x: v @ momentum\(x\)\)\(q\) - change)", r"-0.5 * \1", ("test_bodies.py::test_inertial_forces_keep_the_energy",)),
+    Mutation("lever arm of the ellipse on the wrong side", r"\(b\*\*2 - a\*\*2\)", "(a**2 - b**2)", ("test_experiments.py::test_measured_drops",), "fits/measured.py"),
+    Mutation("nearly clean impacts of the cube are left out", r"Experiments\.join\(parts\) if nearly_clean else parts\[0\]", "parts[0]", ("test_experiments.py::test_nearly_clean_impacts_of_the_cube",), "cli/study.py"),
     Mutation("closed contacts of a measured height counted from zero", r"gaps <= gaps\.min\(axis=1, keepdims=True\) \+ near", "gaps <= near", ("test_experiments.py::test_the_cube",)),
     # --- contacts and scenes
     Mutation("tangents of open contacts confused in space", r"rows = jnp\.repeat\(part, each\)", "rows = jnp.tile(part, each)", ("test_seams.py::test_open_contacts_in_space_have_no_slip",)),
