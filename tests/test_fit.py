@@ -346,6 +346,29 @@ def test_gradient_descent_agrees_with_levenberg_marquardt(method):
     assert found.method == (method if isinstance(method, str) else "optax")
 
 
+def test_descent_comes_back_from_beyond_the_domain():
+    """With plain optax on `impact`: e > 1 has a status, and derivatives that lead back."""
+
+    def loss(e):
+        out = ji.impact(ji.Newton(e), PAIR, SHOTS[0])
+        return (out.velocity[1] - out.velocity[0] - 0.99) ** 2, out.status
+
+    def step(carry, _):
+        e, state = carry
+        slope, status = jax.grad(loss, has_aux=True)(e)
+        with jax.numpy_dtype_promotion("standard"):  # which optax needs
+            update, state = adam.update(slope, state)
+        return (e + update, state), (e, status)
+
+    adam, start = optax.adam(0.05), jnp.asarray(0.6)
+    descend = jax.jit(lambda e: jax.lax.scan(step, (e, adam.init(e)), length=400))
+    (e, _), (path, status) = descend(start)
+    beyond = np.asarray(path) > 1
+    assert beyond.any()
+    np.testing.assert_array_equal(np.asarray(status) == CODE["out_of_range"], beyond)
+    np.testing.assert_allclose(e, 0.99, atol=1e-4)
+
+
 PRE_3 = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, -2.0], [1.0, 0.5, 0.0]])
 
 

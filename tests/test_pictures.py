@@ -228,6 +228,9 @@ PICTURES = {
     "phase_portrait": lambda: motion("phase_portrait"),
     "rocking_dispersion": lambda: ji.plot.rocking_dispersion(rocking(), "by LZB"),
     "rocking_outcomes": lambda: ji.plot.rocking_outcomes(rocking()),
+    "rocking_domains": lambda: ji.plot.rocking_domains(
+        [ji.theory.rocking_domain(a, s) for a in (1.0, 2.0) for s in (True, False)]
+    ),
     "admissible_set": lambda: outcomes([1.0, 1.0, 1.0], False),
     "admissible_set of three contacts": lambda: outcomes([1.0, 1.0, 1.0], True),
     "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),

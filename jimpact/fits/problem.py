@@ -406,6 +406,17 @@ class FitProblem:
         """(R, P) derivatives of `residual` at x (P,), by forward mode."""
         return jax.jacfwd(self.residual)(jnp.asarray(x, self.residuals.offset.dtype))
 
+    def project(self, x: Any) -> jax.Array:
+        """The allowed parameters (P,) nearest to x (P,): within bounds, as an admissible matrix.
+
+        Equation: minimize `sum ((z - x) / s)^2` over allowed z; s is the natural scale of each
+        parameter, and what is fitted in its logarithm is measured in that. For gradient descent
+        of your own (docs/gradient_descent.md). Not differentiable.
+        """
+        y = self._scaled(jax.lax.stop_gradient(jnp.asarray(x, self.residuals.offset.dtype)))
+        first = np.array(self.parameters.first)
+        return self.residuals.entries_at(self.residuals.region.nearest(y))[first]
+
     def log_density(self, x: Any) -> jax.Array:
         """Logarithm () of the probability density of the data at x (P,), normally distributed.
 

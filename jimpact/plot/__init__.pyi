@@ -25,5 +25,6 @@ from .systems import system as system
 from .theory import (
     admissible_set as admissible_set,
     rocking_dispersion as rocking_dispersion,
+    rocking_domains as rocking_domains,
     rocking_outcomes as rocking_outcomes,
 )
