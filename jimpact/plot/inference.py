@@ -193,7 +193,8 @@ def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None
     for name in names or ():
         check_choice("names", name, fit.names)
     known = np.isfinite(fit.standard_error) & (fit.standard_error > 0)
-    shown = [i for i in np.flatnonzero(known) if names is None or fit.names[i] in names][:MOST]
+    usable = np.flatnonzero(known).tolist()
+    shown = [i for i in usable if names is None or fit.names[i] in names][:MOST]
     if not shown:
         raise ValueError("Argument `fit` must have a standard error to show, but has none.")
     values = None if draws is None else _drawn(fit, draws)
