@@ -15,7 +15,7 @@ from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
 from .bodies.mujoco_scene import MujocoScene as MujocoScene, from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
-from .bodies.piles import Discs as Discs
+from .bodies.piles import Discs as Discs, Spheres as Spheres
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
 from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
 from .cli.study import Study as Study, cube_impacts as cube_impacts, read_study as read_study
@@ -39,6 +39,11 @@ from .fits.many import (
     bootstrap as bootstrap,
     fit_many as fit_many,
     leave_one_out as leave_one_out,
+)
+from .fits.measured import (
+    ellipse_impacts as ellipse_impacts,
+    square_drops as square_drops,
+    square_impacts as square_impacts,
 )
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem

@@ -14,7 +14,8 @@
 # %% [markdown]
 # # The chapter: its systems, its figures, its question
 #
-# *Course, part 16. Before: [robots from MuJoCo](15_robots_from_mujoco.ipynb).*
+# *Course, part 16. Before: [robots from MuJoCo](15_robots_from_mujoco.ipynb). Next:
+# [measured drops](17_measured_drops.ipynb).*
 #
 # You will walk through the chapter that the laws are from (B. Brogliato, *Nonsmooth Mechanics*,
 # 2016, chapter 6), run its systems and draw its figures. Its question: one coefficient of
@@ -121,5 +122,4 @@ print("v+       ", np.round(out.velocity, 6) + 0.0)
 # %% [markdown]
 # The figures are also commands: `jimpact figure` lists them, `jimpact figure 6.9` draws one.
 #
-# You have finished the course. [Your own CSV file](02_your_own_csv.ipynb) is the notebook to copy
-# for your own data.
+# *Next: [measured drops](17_measured_drops.ipynb).*

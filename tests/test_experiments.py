@@ -353,6 +353,38 @@ def test_the_cube():
         ji.cube_impacts(3)
 
 
+def test_nearly_clean_impacts_of_the_cube():
+    """Two corners: the clean impacts and 84 more, none twice."""
+    two = ji.cube_impacts(2, nearly_clean=True)
+    assert len(set(two.shots)) == len(two.shots) == 105
+    assert two.shots[:21] == ji.cube_impacts(2).shots
+
+
+def test_measured_drops():
+    """Geometry in closed form: an ellipse's contact is where its outline is lowest."""
+    ellipse, square = ji.ellipse_impacts(), ji.square_impacts()
+    turn = np.linspace(0, 2 * np.pi, 100_001)
+    angle = (
+        -1.514224
+    )  # of the first row of the source, whose lever arm is 1.110112 mm, height 34.96396
+    outline = np.stack([0.035 * np.cos(turn), 0.025 * np.sin(turn)])
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = np.array([[c, -s], [s, c]]) @ outline
+    scene = ellipse.scenes[0]
+    np.testing.assert_allclose(scene.normals[2, 0], x[y.argmin()], atol=2e-6)
+    np.testing.assert_allclose(scene.tangents[2, 0], -y.min(), atol=2e-6)
+    np.testing.assert_allclose(scene.normals[2, 0], 1.110112e-3, atol=2e-4)
+    assert ellipse.pre.shape == (1378, 3)
+    assert [int((square.contacts == m).sum()) for m in (1, 2)] == [250, 15]
+    numbers, time, q = ji.square_drops()
+    assert q.shape == (len(numbers), len(time), 3) == (100, 200, 3)
+    np.testing.assert_allclose(np.median(q[:, -1, 1]), 0.03, atol=2e-4)  # at rest, half of a side
+    fourth = q[list(numbers).index(6)]  # impact 6:12.6 lies between frames 12 and 13
+    low = np.asarray(ji.Block(0.06, 0.06).gap_function(fourth[13])).min()
+    assert "6:12.6" in square.shots
+    assert abs(low) < 4e-3
+
+
 def test_a_correction_leaves_the_errors_before_in_what_it_conserves():
     """Generalized least squares of the velocity difference alone: a pair, its momentum corrected."""
     m, sigma, before = np.array([1.0, 2.0]), np.array([0.02, 0.05]), np.array([0.05, 0.03])
