@@ -169,6 +169,9 @@ MUTATIONS = [
     Mutation("slow films are as long as fast ones", r"int\(\(at\[-1\] - at\[0\]\) / speed \* rate", "int((at[-1] - at[0]) * rate", ("test_reports.py::test_films_run_in_time",)),
     Mutation("pictures enlarge rounding", r"if high - low < _FLAT \* scale", "if False", ("test_reports.py::test_pictures_of_many_bodies_show_those_that_move_most",)),
     Mutation("pictures show the bodies that move least", r"reverse=True\)\[:_FEW\]", "reverse=False)[:_FEW]", ("test_reports.py::test_pictures_of_many_bodies_show_those_that_move_most",)),
+    Mutation("a contact changes its place where sides change", r"\(a \+ b\) % 2 == 1", "a < 0", ("test_bodies.py::test_a_contact_keeps_its_place_where_sides_change",)),
+    Mutation("sides that face each other least", r"jnp\.argmin\(opposite\[side_a\]\)", "jnp.argmax(opposite[side_a])", ("test_bodies.py::test_polygons_choose_their_sides",)),
+    Mutation("only the first polygon's sides keep apart", r"by_b = jnp\.max\(beyond_b\) > .*", "by_b = jnp.max(beyond_b) > jnp.inf", ("test_bodies.py::test_polygons_choose_their_sides",)),
     Mutation("bodies that pass each other are not reported", r"struck_again \| \(\(progress", "struck_again | (False & (progress", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
     # --- the command line

@@ -471,3 +471,40 @@ def test_steps_too_many_to_count_are_refused():
         ji.simulate(
             ji.ball_system(), ji.Moreau(0.5), [1.0], [0.0], 1.0, method="time_stepping", step=1e-300
         )
+
+
+def slid_off(**options):
+    """A block slides over the right end of a heavy table, 2 m wide, and falls to the ground."""
+    bodies = ji.PlanarBodies(
+        [ji.Block(2.0, 1.0, mass=1e6), ji.Block(0.4, 0.2)], planes=[0.0], pairs=[(1, 0)]
+    )
+    system = ji.System(bodies, potential=ji.gravity(bodies))
+    law, start = ji.Moreau(0.3, friction=0.2), [0.0, 0.5, 0.0, 0.7, 1.1, 0.0]
+    return ji.simulate(system, law, start, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], 2.0, **options)
+
+
+# Friction moves the middle of the normal forces forward by mu h / 2 = .02 m: the block topples as
+# soon as its own middle is that far from the edge at x = 1 m.
+TOPPLES = (1.5 - np.sqrt(1.5**2 - 2 * 0.2 * G * 0.28)) / (0.2 * G)
+
+
+@pytest.mark.slow
+def test_a_block_slides_off_a_table():
+    motion = slid_off(samples=201, method="time_stepping", step=1e-3)
+    ji.raise_on_failed_motion(motion)
+    time, (x, y, angle) = np.asarray(motion.time), np.asarray(motion.q)[:, 3:].T
+    slides = time < TOPPLES - 0.005
+    np.testing.assert_allclose(angle[slides], 0, atol=1e-6)
+    np.testing.assert_allclose(x[slides], (0.7 + 1.5 * time - 0.1 * G * time**2)[slides], atol=1e-6)
+    assert (angle[(time > TOPPLES + 0.05) & (time < TOPPLES + 0.3)] < -1e-3).all()
+    np.testing.assert_allclose([y[-1], angle[-1]], [0.1, 0.0], atol=1e-4)
+    assert x[-1] > 1.2
+    assert float(np.nanmin(motion.gaps)) > -1e-2  # Moreau and Jean: h times the approach
+
+
+@pytest.mark.release
+def test_a_block_topples_off_a_table_at_its_moment():
+    motion = ji.raise_on_failed_motion(slid_off(samples=41))
+    assert float(motion.event_times("detachment")[0]) == pytest.approx(TOPPLES, abs=1e-7)
+    np.testing.assert_allclose(motion.q[-1, 4:], [0.1, 0.0], atol=1e-9)
+    assert float(np.nanmin(motion.gaps)) > -1e-9

@@ -40,16 +40,18 @@ class PlanarBodies(Body):
     a disc and a polygon `f = dist(x_1, polygon) - r_1`. Two polygons have the two contacts of two
     sides that face each other: at each end of the first side, the distance of its corner from the
     second side, or, where it overhangs, that of the second side's end from the first side, or, in
-    between, that of the two corners. Normals are unit vectors n from the second body to the first,
-    tangents (n_y, -n_x); both as rates of q.
+    between, that of the two corners; the least of both is the distance of the polygons. Normals are
+    unit vectors n from the second body to the first, tangents (n_y, -n_x); both as rates of q.
 
     Contacts, in order: for each plane and body, its contact points; then the pairs of discs; discs
-    on polygons, polygon by polygon; polygons, two contacts a pair. `between` names their bodies.
+    on polygons, polygon by polygon; polygons, two contacts a pair, pairs with fixed sides first.
+    `between` names their bodies.
 
-    The gap functions hold (`valid`, [m]) while the centre of a disc is outside the other body, and
-    while two sides overlap or the line of one of them keeps them apart, turned by less than 90
-    degrees against each other, with no other corner of the first body beyond the second side: a
-    body that falls next to another or rolls on it to its next side leaves this range. Bodies that
+    Polygons choose their sides as they move, so that they may roll over their corners, slide off
+    each other and meet again anywhere. Where sides are fixed, by `at` or by their numbers, the gap
+    functions hold (`valid`, [m]) while both overlap or the line of one of them keeps them apart,
+    turned by less than 90 degrees against each other, with no other corner of the first body beyond
+    the second side. Those of discs hold while their centres are outside the other body. Bodies that
     are no pair do not feel each other.
 
     Args:
@@ -59,11 +61,12 @@ class PlanarBodies(Body):
             polygons may be given as ((i, side), (j, side)), sides counted counter-clockwise: of a
             `Block` 0 is the base, of a `Polygon` it begins at the first corner.
         at: q (3 b,) at which the sides of two polygons are chosen that face each other, and which
-            is the first body; not needed where sides are given.
+            is the first body, once and for all; None: as they move. Polygons with an odd number of
+            sides need it, or sides.
 
     Raises:
         ValueError: no bodies or contacts, planes that are not finite, pairs that do not exist or
-            without a gap function, two polygons without sides.
+            without a gap function, polygons with an odd number of sides without `at`.
 
     Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7 (distances, separating axes).
 
@@ -72,7 +75,7 @@ class PlanarBodies(Body):
     >>> slope.scene(slope.touching()).closed.tolist()
     [True, True, False, False]
     >>> q = [0.0, 0.5, 0.0, 0.3, 1.5, 0.0]
-    >>> stack = ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)], pairs=[(1, 0)], at=q)
+    >>> stack = ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
     >>> stack.scene(q).gaps[-2:].tolist()
     [0.0, 0.0]
     """
