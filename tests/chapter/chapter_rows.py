@@ -97,6 +97,13 @@ SECTIONS = {
         Figure("6.1"),
         Figure("6.2"),
         Row(
+            "(6.1), (6.2)",
+            "gradients of the gaps of two balls at a wall",
+            "wall.normals",
+            "two balls",
+            [-1, 0, 1, -1],
+        ),
+        Row(
             "6.1.1",
             "largest force at the wall, 2 beads [N]; one: 51.65",
             "ji.history(ji.LZB([0.96, 0.92], [6.9716e9, 9.858e9]), ji.column([2.05e-3] * 2),"
@@ -124,6 +131,10 @@ SECTIONS = {
             "ji.impact(ji.LZB(1.0, [1.0, 1.0]), ji.chain([0.25, 1.0, 0.25]),"
             " [1.0, 0.0, -1.0]).velocity",
             "(-1, 0, 1)", [-1, 0, 1], slow=True),
+        Row(
+            "(6.5)", "gradients of the gaps of three balls", "three.normals", "three balls",
+            [-1, 0, 1, -1, 0, 1],
+        ),
         Row("6.1.1.2", "momentum of balls in flight is no law of impact: what a wall takes",
             "ji.momentum(wall, ji.impact(ji.Newton(1.0), wall, [1.0, 1.0]).velocity).sum()",
             "not conserved", -2.0, slow=True),
@@ -175,6 +186,14 @@ SECTIONS = {
         Row("(6.14), (6.15)", "displacements at k2/k1 = 2.7, t = 2.1",
             "ji.theory.bilateral_motion(three, [1.0, 2.7], hit, 2.1)[0]",
             "(6.15)", [1.0564388537, 0.6202288629, 0.4233322834], slow=True),
+        Row(
+            "(6.16)",
+            "first roots t1 and t2 at k2/k1 = 2.7",
+            "ji.theory.separation_times(2.7)",
+            "2.66333 of the first row",
+            [2.7494001240, 2.6351145226],
+            "Delta - 1 + gamma in the first row",
+        ),
         Row("6.1.3", "limit k2/k1 to 0", "ji.impact(ji.LZB(1.0, [1.0, 1e-8], 1.0), three, hit)"
             ".velocity", "(0, 0, 1)", [0, 0, 1], allowed=1e-3, slow=True),
         Row("6.1.3", "limit k2/k1 to infinity",
@@ -209,12 +228,47 @@ SECTIONS = {
         Row("(6.31)-(6.34)", "the energy in quasi-velocities",
             "sum(ji.theory.kinetic_energy_split(ji.chain([2.0] * 4), [0.3, -0.2, 0.5, 0.7]))",
             "(6.34)", 0.87),
+        Row(
+            "(6.24)-(6.27)",
+            "quasi-normal forces of a resting block, kinetic angle pi/2, g = 10",
+            "ji.quasi_lagrange(ji.block_system(1.0, 2.0**0.5, acceleration=10.0, corners='base'),"
+            " [0.0, 0.5**0.5, 0.0], [0.0, 0.0, 0.0]).normal",
+            "(6.26)",
+            [50**0.5, 50**0.5],
+            slow=True,
+        ),
+        Row(
+            "(6.28)-(6.30)",
+            "forces of the contact LCP on a resting block of 1 kg",
+            "ji.contact_problem(ji.block_system(1.0, 2.0, acceleration=10.0, corners='base'),"
+            " [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]).forces()",
+            "(6.74)",
+            [5.0, 5.0],
+            slow=True,
+        ),
+        Row(
+            "(6.35)",
+            "kinetic angle of contacts 1-2 and 3-4 of equal balls where v2 = v3: of (1, 2, 1)",
+            "ji.kinetic_angles(ji.Scene([1.0] * 4, [[-1.0, 0], [1, 0], [0, -1], [0, 1]],"
+            " constraints=[[0.0], [1.0], [-1.0], [0.0]]))[0, 1]",
+            "Schur complement",
+            np.arccos(1 / 3),
+        ),
         Row("(6.36)-(6.40)", "power of a contact force of 3 N at a gap velocity of -1 m/s",
             "ji.theory.contact_power(two, [1.5, 0.5], [3.0]).total", "(6.36)", -3.0),
         Row("(6.44)-(6.46)", "a restitution matrix: energy change of m = (1, 2, 3)",
             "ji.impact(ji.RestitutionMatrix([[0.7, 0.1], [0.25, 0.6]]), uneven,"
             " ji.theory.from_quasi_velocities(uneven, [-1.0, -0.3], [0.0])).energy_change",
             "(6.46), (6.47), (6.48)", -0.2248546638, "(6.49) lacks (I + E)^-1", slow=True),
+        Row(
+            "Prop. 6.1",
+            "a matrix for LZB's outcome",
+            "ji.impact(ji.RestitutionMatrix([[0.14735539269, 0.0], [0.91814627551, 0.0]]), three,"
+            " hit).velocity",
+            "there is one",
+            [-0.0709523537, 0.0764030391, 0.9945493146],
+            slow=True,
+        ),
         Row("Prop. 6.2, 6.3", "is diag(.5, .5) admissible for three balls?",
             "ji.theory.audit_matrix(three, 0.5 * np.eye(2)).admissible", "yes", True),
         Row("Prop. 6.4, 6.5", "(I - E)^T G^-1 (I + E) of e = .5",
@@ -236,6 +290,13 @@ SECTIONS = {
         Row("(6.63)-(6.65)", "Fremond's inclusion",
             "ji.theory.restitution_inclusion([[1.0, 0.3], [0.3, 1.0]], [[2.0, 0.5], [0.5, 1.0]], [[0.6, 0.0], [0.0, 0.4]], [-1.0, 0.2]).velocity",
             "(6.65)", [0.3456066946, 0.6036820084], slow=True),
+        Row(
+            "6.2.7",
+            "e_theta of a block that rocks without sliding, l = 2 L: from Housner's",
+            "ji.theory.rocking_domain(2.0, sliding=False).rocking",
+            "domains in [228]",
+            [0.7, 1.0],
+        ),
         Row("(6.66)", "kinetic angle of m = (1, 2, 3) [rad]",
             "ji.kinetic_angles(uneven)[0, 1]", "(6.66)", 1.1071487178),
     ],
@@ -266,7 +327,7 @@ SECTIONS = {
             "[ji.kinetic_angles(ji.dimer(r, length))[0, 1] for r, length in"
             " ((1e-9, 1.0), (1.0, 0.0), (5.0, 24.0))]",
             "1.445, 1.536, between", [1.4454684956, 1.5363067308, 1.4242044517],
-            "not monotone: least at 5/24"),
+            "not monotone: least at 5/24", slow=True),
         Figure("6.8b"),
         Row("Fig. 6.8b", "critical kinetic angle, mu = 0, .1, .3, .8 [degrees]",
             "np.degrees(ji.theory.critical_kinetic_angle([0.0, 0.1, 0.3, 0.8]))",
@@ -287,6 +348,14 @@ SECTIONS = {
         Row("(6.76)-(6.79)", "Poisson: two balls at a wall, e = (1, 1)",
             "-ji.impact(ji.Poisson([1.0, 1.0]), wall, [1.0, 0.0]).velocity", "(1, 0)", [1, 0],
             "(6.79) mixes t_c and t_f", slow=True),
+        Row(
+            "6.4.2",
+            "re-entrant corner: one of the outcomes of a point that meets an edge, e = .5",
+            "ji.theory.reentrant_corner(ji.Scene([1.0, 1.0], [[1.0, 0.0], [0.0, 1.0]]),"
+            " [-1.0, -0.4], 0.5)[0].velocity",
+            "excluded by Moreau",
+            [-1.0, 0.2],
+        ),
         Row("6.4.1", "Poisson: (0, 0, 1) needs e > 1",
             "ji.impact(ji.Poisson([0.5, 2.0], allow_above_one=True), three, hit).velocity",
             "e > 1", [0, 0, 1], slow=True),
