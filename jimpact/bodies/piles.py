@@ -53,6 +53,8 @@ class Discs(Body):
 
     def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
         self.radii = positives("radii", radii)
+        if not len(self.radii):
+            raise ValueError("Argument `radii` must hold a disc, but is empty.")
         self.masses = positives("masses", masses, self.radii.shape[0])
         rows = as_float_array("walls", np.reshape(walls, (-1, 3)) if len(walls) == 0 else walls)
         if rows.ndim != 2 or rows.shape[1] != 3:
