@@ -220,7 +220,8 @@ def _fit_and_yardsticks(study: Study, chosen: dict[str, Any], steps: Steps) -> d
         friction = getattr(study.law, "friction", None)
         shared = [name for name in ("restitution", "friction") if name in study.free]
         free: dict[str, Any] = dict.fromkeys(shared or ["restitution"], True)
-        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), free=free, bounds={}))
+        alone: dict[str, Any] = {"free": free, "bounds": {}, "priors": {}}
+        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), **alone))
     if all_free is not None:
         run(ALL_FREE, all_free)
     return fits

@@ -45,8 +45,9 @@ def posterior(
         fit: a fit by least squares, or a problem.
         priors: by name of a parameter, or of a field for all its entries: `ji.Uniform(low, high)`,
             `ji.Normal(mean, std)` (truncated to the domain), or a numpyro distribution of a scalar.
-            Others are flat over the parameter's domain; of what is fitted in its logarithm (a
-            stiffness), flat in that; of an admissible matrix, flat over all that are.
+            They take the place of those of the fit. Others are flat over the parameter's domain;
+            of what is fitted in its logarithm (a stiffness), flat in that; of an admissible matrix,
+            flat over all that are.
         samples, warmup: of each chain.
         chains: side by side in one program.
         seed: of the sampler.
@@ -78,7 +79,8 @@ def posterior(
     start = fit.value if isinstance(fit, Fit) else problem.start
     for name, count in (("samples", samples), ("warmup", warmup), ("chains", chains)):
         as_whole(name, count, 1)
-    each = _priors(problem, dict(priors or {}), numpyro.distributions)
+    own = {problem.names[i]: Normal(mean, std) for i, mean, std in problem.priors}
+    each = _priors(problem, own | dict(priors or {}), numpyro.distributions)
 
     region = problem.residuals.region
     inner = None if isinstance(region, BoxRegion) else _Inner(problem, region)

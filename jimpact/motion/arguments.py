@@ -250,7 +250,17 @@ def force_of(law: Law, mu: jax.Array | None) -> Force:
         )
     if mu is not None:
         raise ValueError("Argument `friction` must be 0 for method='contact_forces'.")
+    check_unbounded("law", force)
     return force
+
+
+def check_unbounded(name: str, force: Force) -> None:
+    """Raise a TypeError for a force that yields: motions do not keep what it depends on."""
+    if force.bound is not None:
+        raise TypeError(
+            f"Argument `{name}` must have a force without bound in a motion: what yields is for "
+            f"`impact`, but the force is {force!r}."
+        )
 
 
 def substeps_of(step: Any, start: Any, end: Any, samples: int) -> jax.Array:

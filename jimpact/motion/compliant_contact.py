@@ -14,6 +14,7 @@ from jimpact.contact import delassus_matrix
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
 from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Force
+from jimpact.motion.arguments import check_unbounded
 from jimpact.motion.dynamics import base_velocity, kinematics, user_force
 from jimpact.motion.event_driven import why_stuck
 from jimpact.motion.flow import (
@@ -354,6 +355,7 @@ def turning_impact(
     check_shape("velocity", v, position.shape, "one per coordinate")
     check_values("velocity", v)
     check_kind("force", force, Force)
+    check_unbounded("force", force)
     system, force, position, v = in_common_dtype(System(gap_function, mass), force, position, v)
     check_rtol(rtol, position.dtype)
     scene = system.body.scene(position)  # and its checks

@@ -10,7 +10,12 @@ from .charts import (
 )
 from .films import animation as animation
 from .fits import contour as contour, fit as fit
-from .inference import correlation as correlation, profiles as profiles, residuals as residuals
+from .inference import (
+    corner as corner,
+    correlation as correlation,
+    profiles as profiles,
+    residuals as residuals,
+)
 from .laws import (
     comparison as comparison,
     contact_loop as contact_loop,
@@ -25,5 +30,6 @@ from .systems import system as system
 from .theory import (
     admissible_set as admissible_set,
     rocking_dispersion as rocking_dispersion,
+    rocking_domains as rocking_domains,
     rocking_outcomes as rocking_outcomes,
 )

@@ -32,6 +32,7 @@ from jimpact.progress import counting_bar
 
 ENDINGS = (".gif", ".mp4", ".html")
 _SHORTEST = 2.0  # [s] films of shorter motions are slow; ten times more slows most motions down
+# [1/s] of a film. Ten times more: files ten times as large, which most screens cannot show.
 _FRAMES_PER_SECOND = 25.0
 _GIF_CLOCK, _GIF_LEAST = 100.0, 2.0  # a GIF counts in 1/100 s; viewers do not show less than two
 # [s] Frames last a little longer, because whole milliseconds are cut off the rounded numbers of a
