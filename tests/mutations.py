@@ -244,6 +244,7 @@ MUTATIONS = [
     Mutation("rounding counts twice in joined data", r"resolution = changed\.pop\(\"resolution\", self\.resolution\)", "resolution = changed.get(\"resolution\", self.resolution)", ("test_experiments.py::test_data_sets_are_joined",)),
     Mutation("joined shots lose what a correction took", r"lost = \[k for data in many for k in data\.lost\]", "lost = 0", ("test_experiments.py::test_data_sets_are_joined",)),
     Mutation("matrices projected on a ray", r"return nearest\(self, y\)", "return self.retract(y)", ("test_matrix_fit.py::test_the_projection_is_the_nearest_admissible_matrix",)),
+    Mutation("regions of a corner plot as of one parameter", r"chdtri\(2, 1 - share\)", "chdtri(1, 1 - share)", ("test_pictures.py::test_regions_of_a_corner_plot_hold_what_they_say",)),
     Mutation("entries counted from 0", r"tuple\(int\(i\) - 1 for i in part", "tuple(int(i) - 0 for i in part", ("test_fit.py::test_entries_are_named_as_in_the_report",)),
     Mutation("bounds of an entry are those of the first", r"ends\[:, first \+ np\.array\(at\)\]", "ends[:, [first] * len(at)]", ("test_fit.py::test_entries_are_named_as_in_the_report",)),
     Mutation("Akaike's criterion without the noise", r"np\.log\(squares / values\) \+ 2 \* \(len\(self\.names\) \+ 1\)", "np.log(squares / values) + 2 * len(self.names)", ("test_fit.py::test_parameters_by_name_and_criteria",)),

@@ -10,7 +10,12 @@ from .charts import (
 )
 from .films import animation as animation
 from .fits import contour as contour, fit as fit
-from .inference import correlation as correlation, profiles as profiles, residuals as residuals
+from .inference import (
+    corner as corner,
+    correlation as correlation,
+    profiles as profiles,
+    residuals as residuals,
+)
 from .laws import (
     comparison as comparison,
     contact_loop as contact_loop,
