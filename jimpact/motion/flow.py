@@ -26,13 +26,12 @@ from jimpact.motion.persistent_contact import (
     BEGINS,
     Contacts,
     Modes,
-    by_contact,
+    cone_margins,
     constraint_impulse,
     contact_powers,
     contacts_at,
     forces,
     least_regularity,
-    length,
     regularity,
     rest_acceleration,
     slip_margins,
@@ -121,8 +120,7 @@ def watched(
     normal = jnp.where(modes.active, force.normal * w[:m] + slack, gap)
     if contacts.tangent is None or mu is None or force.tangential is None:
         return normal
-    sizes = by_contact(w[m:], m).mean(axis=1)
-    cone = (mu * force.normal - length(by_contact(force.tangential, m))) * sizes + slack
+    cone = cone_margins(contacts, mu, force) + slack
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
     lasts = jax.lax.cond(
