@@ -415,7 +415,7 @@ def choose_with_friction(
     asked = _ModeQuestion(contacts, mu, touching, released, sliding, begun, slack)
     now, direction_now, stuck = _expected(asked, before)
     no, one = jnp.asarray(False), jnp.ones_like(slack)
-    start = _ModeTrial(now, direction_now, direction_now, touching, one, no, no, no, jnp.asarray(0))
+    start = _ModeTrial(now, direction_now, touching, one, no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(
         lambda tried: ~tried.done & (tried.passes < _PASSES),
         lambda tried: _next_trial(asked, tried),
@@ -425,7 +425,6 @@ def choose_with_friction(
     choice = ModeChoice(end.modes, end.solved, end.regularity, several, parts)
     if not in_space(contacts):
         return choice
-    choice = choice._replace(modes=_as_shared(asked, end))
     lets_go = jnp.any(released[:m]) | jnp.any(released[m:] & before.stick)
     sticks = _all_stick(asked, stuck) & ~lets_go
     still = Modes(touching, touching & ~sliding, jnp.ones_like(now.sign))
@@ -452,8 +451,7 @@ class _ModeTrial(NamedTuple):
     """One try of `choose_with_friction`."""
 
     modes: Modes
-    slide: jax.Array  # (m, rows) directions of slip
-    known: jax.Array  # (m, rows) those that are fixed, 0 where they are solved for
+    known: jax.Array  # (m, rows) directions of slip that are fixed, 0 where they are solved for
     allowed: jax.Array  # (m,) contacts that may be pressed
     regularity: jax.Array
     several: jax.Array
@@ -522,8 +520,6 @@ def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
     if in_space(contacts):
         growth = jnp.sum(turns * slide, axis=1)
         slow = slip_begins(contacts, mu, solution.normal, growth) > 0
-        # what only reaches its rim, as others hold it, is not held across as well
-        slow = slow & (growth > slack)
         sign = jnp.where(slow & ~sliding & ~begun, float(BEGINS), 1.0)
     modes = Modes(active, active & ~slips, sign)
     # what was taken to slide from rest must do so
@@ -540,7 +536,6 @@ def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
     open_ones_part = jnp.all(~touching | tried.allowed | (rate[:m] >= -slack))
     return _ModeTrial(
         modes,
-        slide,
         jnp.where(given, 0.0, known),
         tried.allowed & ~(wedged & several),
         regular,
@@ -549,20 +544,6 @@ def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
         solved & open_ones_part & ~jnp.any(wedged | returns),
         tried.passes + 1,
     )
-
-
-def _as_shared(asked: _ModeQuestion, end: _ModeTrial) -> Modes:
-    """The modes, but for redundant contacts that would not bear their share of the forces.
-
-    Those that would pull are open; those that would leave their cones are at its rim, and others
-    hold them: they slide as soon as these do.
-    """
-    contacts, mu, modes = asked.contacts, asked.mu, end.modes
-    force = forces(contacts, mu, modes, end.slide)
-    pulls = force.normal * jnp.diagonal(contacts.delassus)[: len(mu)] < -asked.slack
-    yields = modes.stick & (cone_margins(contacts, mu, force) < -0.5 * asked.slack)
-    sign = jnp.where(yields, 1.0, modes.sign)
-    return Modes(modes.active & ~pulls, modes.stick & ~pulls & ~yields, sign)
 
 
 def _all_stick(asked: _ModeQuestion, force: Forces) -> jax.Array:
