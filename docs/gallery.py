@@ -115,6 +115,22 @@ def law_binary():
 
 
 @picture
+def law_routh():
+    """Routh's increments, e = 0.5: where ball 3 runs away (> 0), contact 2 is left approaching."""
+    return running(ji.Routh(0.5))
+
+
+@picture
+def law_impulse_correlation():
+    """Impulse correlation, e = 1: the ratio runs through all outcomes that conserve energy."""
+    return three_balls(
+        lambda ratio: ji.ImpulseCorrelation(1.0, ratio),
+        np.linspace(0.5, 1, 101),
+        "impulse correlation ratio of contact 2",
+    )
+
+
+@picture
 def law_restitution_matrix():
     """A matrix with e = 0.5 on its diagonal: the entry E21 shares out the velocity."""
     return three_balls(

@@ -15,7 +15,7 @@ from .bodies.discs import DiskBalls as DiskBalls, disk_balls as disk_balls
 from .bodies.mujoco_scene import MujocoScene as MujocoScene, from_mujoco as from_mujoco
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
-from .bodies.piles import Discs as Discs
+from .bodies.piles import Discs as Discs, Spheres as Spheres
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
 from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
 from .cli.study import Study as Study, cube_impacts as cube_impacts, read_study as read_study
@@ -33,12 +33,17 @@ from .contact import (
 from .fits.contours import Contour as Contour, contour as contour
 from .fits.designs import Design as Design, design as design
 from .fits.experiments import Experiments as Experiments, read_experiments as read_experiments
-from .fits.fitting import Fit as Fit, fit as fit
+from .fits.fitting import Fit as Fit, fit as fit, load_fit as load_fit
 from .fits.many import (
     Refits as Refits,
     bootstrap as bootstrap,
     fit_many as fit_many,
     leave_one_out as leave_one_out,
+)
+from .fits.measured import (
+    ellipse_impacts as ellipse_impacts,
+    square_drops as square_drops,
+    square_impacts as square_impacts,
 )
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
@@ -66,6 +71,7 @@ from .laws.calibration import (
 from .laws.compliant import Compliant as Compliant
 from .laws.forces import (
     Bistiffness as Bistiffness,
+    ElastoPlastic as ElastoPlastic,
     Force as Force,
     Hertz as Hertz,
     HuntCrossley as HuntCrossley,
@@ -110,6 +116,12 @@ from .methods.comparison import (
 from .methods.rheologies import compare_rheologies as compare_rheologies
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
+from .methods.waves import (
+    Pulses as Pulses,
+    Trains as Trains,
+    colliding_trains as colliding_trains,
+    pulses as pulses,
+)
 from .montecarlo.distributions import Normal as Normal, RandomLaw as RandomLaw, Uniform as Uniform
 from .montecarlo.gaps import (
     crossover as crossover,
@@ -119,9 +131,19 @@ from .montecarlo.gaps import (
 from .montecarlo.results import MonteCarlo as MonteCarlo
 from .montecarlo.running import monte_carlo as monte_carlo
 from .montecarlo.store import read_samples as read_samples
+from .motion.accelerations import (
+    ContactProblem as ContactProblem,
+    QuasiLagrange as QuasiLagrange,
+    contact_problem as contact_problem,
+    quasi_lagrange as quasi_lagrange,
+)
 from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
-from .motion.record import Motion as Motion, raise_on_failed_motion as raise_on_failed_motion
+from .motion.record import (
+    Motion as Motion,
+    load_motion as load_motion,
+    raise_on_failed_motion as raise_on_failed_motion,
+)
 from .motion.simulate import simulate as simulate
 from .motion.system import (
     HarmonicBase as HarmonicBase,

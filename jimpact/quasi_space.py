@@ -108,6 +108,8 @@ def _coordinates(shares: jax.Array, mass: jax.Array, count: int) -> jax.Array:
 
     Pivoted Cholesky factorization of the Gram matrix of the projected coordinate directions.
     """
+    if count == 0:
+        return jnp.zeros(0, jnp.int32)
     scale = 1 / jnp.sqrt(jnp.diagonal(mass))
     gram = jax.lax.stop_gradient(shares * scale[:, None] * scale[None, :])
 

@@ -139,7 +139,8 @@ figure
 # ## Two corners
 #
 # The same laws, without new parameters. Newton's law now prescribes the restitution of each corner,
-# also of one that the other corner lifts.
+# also of one that the other corner lifts. These few impacts (19) do not rank laws that differ by a
+# percent: the page `docs/cube.md` compares laws on 105 impacts on two corners, with intervals.
 
 # %%
 laws["Newton"] = [ji.Newton(law.restitution, law.friction) for law in laws["Moreau"]]

@@ -14,7 +14,8 @@
 # %% [markdown]
 # # Robots from MuJoCo: a biped lands on both feet
 #
-# *Course, part 15. Before: [a block on a shaken base](14_a_shaken_block.ipynb).*
+# *Course, part 15. Before: [a block on a shaken base](14_a_shaken_block.ipynb). Next: [the
+# chapter](16_the_chapter.ipynb).*
 #
 # You will take the contacts of a robot from MuJoCo, compare laws for its landing, differentiate the
 # landing, and find the damping of a contact from the speed after a collision. The extra `mujoco` is
@@ -197,5 +198,4 @@ first, second = ji.mujoco_solref(0.62, timestep=0.002)
 print(f"solref = {first:.6g} {second:.6g}")
 
 # %% [markdown]
-# You have finished the course. [Your own CSV file](02_your_own_csv.ipynb) is the notebook to copy
-# for your own data.
+# *Next: [the chapter that the laws are from](16_the_chapter.ipynb).*

@@ -215,6 +215,67 @@ def test_facing_sides_are_chosen_and_may_part():
         stack.scene(off)
 
 
+def segment_distance(point, begin, end):
+    share = np.clip((point - begin) @ (end - begin) / ((end - begin) @ (end - begin)), 0, 1)
+    return np.linalg.norm(point - begin - share * (end - begin))
+
+
+def polygon_distance(a, b):
+    """Of two disjoint polygons (k, 2), from all corners to all sides."""
+    return min(
+        segment_distance(point, *side)
+        for points, other in ((a, b), (b, a))
+        for point in points
+        for side in zip(other, np.roll(other, -1, axis=0))
+    )
+
+
+def separation(a, b):
+    """The largest distance of the corners of b beyond the line of a side of a."""
+    side = np.roll(a, -1, axis=0) - a
+    normals = np.stack([side[:, 1], -side[:, 0]], axis=1) / np.linalg.norm(side, axis=1)[:, None]
+    return max(min((b - x) @ n) for x, n in zip(a, normals))
+
+
+def test_polygons_choose_their_sides():
+    """Anywhere the least gap is the distance; where they overlap it is negative."""
+    angles = 0.2 + np.arange(6) * np.pi / 3
+    hexagon = ji.Polygon(np.stack([0.5 * np.cos(angles), 0.3 * np.sin(angles)], axis=1))
+    pair = ji.PlanarBodies([ji.Block(1.0, 0.4), hexagon], planes=())
+    rng = np.random.default_rng(0)
+    q = rng.uniform([0, 0, 0, -1, -1, 0], [0, 0, 6.3, 1, 1, 6.3], (300, 6))
+    apart = 0
+    for x, gaps in zip(q, np.asarray(jax.vmap(pair.gap_function)(jnp.asarray(q)))):
+        a, b = (curve[:-1] for curve in pair.outlines(x, 0.0))
+        between = max(separation(a, b), separation(b, a))
+        if between > 0:
+            apart += 1
+            assert min(gaps) == pytest.approx(polygon_distance(a, b), abs=1e-12)
+        else:
+            assert min(gaps) <= between + 1e-12
+    assert 100 < apart < 250
+    with pytest.raises(ValueError, match=r"`at` must be given, .* polygon 1, which has 3 sides"):
+        ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Polygon([[0, 0], [1, 0], [0, 1]])])
+
+
+def test_a_contact_keeps_its_place_where_sides_change():
+    """A block turns about the edge of a table; beyond 45 degrees its base faces the table's side."""
+    table = ji.PlanarBodies([ji.Block(0.4, 0.2), ji.Block(2.0, 1.0)], planes=())
+    for first in ((0, 1), (1, 0)):
+        bodies = [table.bodies[i] for i in first]
+        pair = ji.PlanarBodies(bodies, planes=())
+        places = []
+        for turn in (-0.1, -0.7, -0.9, -1.5):  # its base, 0.05 m left of the middle, is at the edge
+            c, s = np.cos(turn), np.sin(turn)
+            middle = np.array([1.0, 0.5]) - np.array([c * -0.05 - s * -0.1, s * -0.05 + c * -0.1])
+            q = np.stack([[*middle, turn], np.zeros(3)])[list(first)].ravel()
+            gaps = np.asarray(pair.gap_function(jnp.asarray(q)))
+            places.append(int(np.argmin(np.abs(gaps))))
+            assert gaps[places[-1]] == pytest.approx(0.0, abs=1e-15)
+            assert gaps[1 - places[-1]] > 0.01
+        assert len(set(places)) == 1
+
+
 # ------------------------------------------------------------------------------------- in space
 
 

@@ -126,6 +126,22 @@ def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path)
     np.testing.assert_array_equal(study.free["restitution"], [1, 1])
 
 
+def test_a_study_knows_priors_and_names_of_entries(tmp_path):
+    text = STUDY.replace("restitution = 0.9", "restitution = [0.9, 0.8]")
+    text = text.replace("[1.0, 1.0]", "[1.0, 1.0, 1.0]") + (
+        '\n[law.priors]\n"restitution[2]" = [0.85, 0.01]\n[law.bounds]\n"restitution[1]" = [0.5, 1]\n'
+    )
+    shots = SHOTS.replace(
+        "post_2[m/s]", "post_2[m/s],pre_3[m/s],post_3[m/s],sigma_1[m/s],sigma_2[m/s],sigma_3[m/s]"
+    )
+    shots = shots.replace("0.83", "0.83,0,0.1,1,1,1").replace("1.62", "1.62,0,0.2,1,1,1")
+    problem = ji.read_study(written(tmp_path, text, shots)).problem
+    assert problem.priors == ((1, 0.85, 0.01),)
+    np.testing.assert_array_equal(problem.domains, [[0.5, 1.0], [0.0, 1.0]])
+    with pytest.raises(ValueError, match=r"\[law.priors\].*frictoin"):
+        ji.read_study(written(tmp_path, text.replace('"restitution[2]"', '"frictoin[2]"'), shots))
+
+
 def test_fit_of_a_study(tmp_path, capsys):
     picture = tmp_path / "deep" / "a.svg"
     page = tmp_path / "fit.html"
@@ -401,6 +417,7 @@ BODIES = {
     "Corner": "angle_rad = 1.0",
     "PendulumCradle": "masses_kg = [1, 1]\nlength_m = 0.3\nradius_m = 0.01\ngaps_m = 0.01",
     "Discs": "masses_kg = 1\nradii_m = [0.1, 0.1]\nwalls = [[0, 1, 0]]",
+    "Spheres": "masses_kg = 1\nradii_m = [0.1, 0.1]\nwalls = [[0, 0, 1, 0]]",
     "DiskBalls": "disk_radius_m = 1\nball_radius_m = 0.1\ndisk_mass_kg = 1\nball_masses_kg = [1]",
 }
 

@@ -83,7 +83,16 @@ def test_readme_runs():
     assert len(README.splitlines()) <= 120
 
 
-LONG_PAGES = ("embedding", "fitting", "fitting_reference", "motions", "speed_accuracy")
+LONG_PAGES = (
+    "embedding",
+    "fitting",
+    "fitting_reference",
+    "from_lmfit",
+    "gradient_descent",
+    "motions",
+    "speed_accuracy",
+    "waves",
+)
 
 
 def code_of(path):
@@ -250,7 +259,7 @@ def test_notebook_and_script_agree(path):
     assert not any(output.output_type == "error" for output in outputs)
 
 
-COMPILING = ("05", "06", "07", "11", "12", "13", "14")  # compiling takes most of their time
+COMPILING = ("05", "06", "07", "11", "12", "13", "14", "16")  # compiling takes most of their time
 
 
 @pytest.mark.slow

@@ -67,6 +67,43 @@ def test_missing_values_labels_and_foreign_line_ends(tmp_path):
     assert data.shots == ("first", "2")
 
 
+def test_comments_are_not_read(tmp_path):
+    text = "comment,pre_1[m/s],comment_camera,post_1[m/s]\nfirst,1,left of it,0.5\n,2,,1\n"
+    data = ji.read_experiments(written(tmp_path, text))
+    np.testing.assert_array_equal([data.pre, data.post], [[[1], [2]], [[0.5], [1]]])
+    with pytest.raises(ValueError, match="must have 4 values"):
+        ji.read_experiments(written(tmp_path, text + "a,1,2\n"))
+
+
+def test_data_sets_are_joined():
+    plain = ji.Experiments([1.0, 0.0], [0.1, np.nan], sigma=0.01, shots=["a"], lost_freedom=1)
+    read = ji.Experiments([[2.0, 0.0]] * 2, [[0.2, 1.8]] * 2, resolution=0.1, sigma_pre=0.02)
+    both = plain + read
+    assert both.shots == ("a", "1", "2")
+    np.testing.assert_array_equal(both.pre, [[1, 0], [2, 0], [2, 0]])
+    step = 0.1 / np.sqrt(12)
+    np.testing.assert_allclose(both.sigma, [[0.01, np.nan], [step, step], [step, step]])
+    np.testing.assert_array_equal(both.sigma_pre, [[0, 0], [0.02, 0.02], [0.02, 0.02]])
+    assert both.lost == (1, 0, 0)
+    assert both.resolution is None
+    np.testing.assert_array_equal((read + read).resolution, [[0.1, 0.1]] * 4)
+    np.testing.assert_allclose((read + read).sigma, [[step, step]] * 4)
+    assert (read + read).shots == ("1/1", "1/2", "2/1", "2/2")
+    placed = ji.Experiments([1.0, 0.0], [0.1, 0.9], 0.01, scenes=[ji.chain([1.0, 1.0])])
+    assert len(ji.Experiments.join([placed, placed, placed]).scenes) == 3
+    turning = ji.Experiments([1.0, 0.0], [0.1, 0.9], 0.01, units=["m/s", "rad/s"])
+    for other, message in (
+        (ji.Experiments([1.0, 0.0], [0.1, 0.9]), "a `sigma` .or `resolution`. in all or in none"),
+        (placed, "scenes of their own in all or in none"),
+        (turning, "the same units"),
+        (ji.Experiments([1.0], [0.1], 0.01), "as many bodies"),
+    ):
+        with pytest.raises(ValueError, match=f"`many` must have .*{message}"):
+            plain + other
+    with pytest.raises(ValueError, match="at least one data set"):
+        ji.Experiments.join([])
+
+
 def test_sigma_of_an_unmeasured_value_may_be_empty(tmp_path):
     header = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s],sigma_1[m/s],sigma_2[m/s]\n"
     data = ji.read_experiments(written(tmp_path, header + "1,0,0.1,,0.01,\n"))
@@ -314,6 +351,38 @@ def test_the_cube():
         ValueError, match=r"`contacts` in \[data\] must be one of 1, 2, 4, but is 3"
     ):
         ji.cube_impacts(3)
+
+
+def test_nearly_clean_impacts_of_the_cube():
+    """Two corners: the clean impacts and 84 more, none twice."""
+    two = ji.cube_impacts(2, nearly_clean=True)
+    assert len(set(two.shots)) == len(two.shots) == 105
+    assert two.shots[:21] == ji.cube_impacts(2).shots
+
+
+def test_measured_drops():
+    """Geometry in closed form: an ellipse's contact is where its outline is lowest."""
+    ellipse, square = ji.ellipse_impacts(), ji.square_impacts()
+    turn = np.linspace(0, 2 * np.pi, 100_001)
+    angle = (
+        -1.514224
+    )  # of the first row of the source, whose lever arm is 1.110112 mm, height 34.96396
+    outline = np.stack([0.035 * np.cos(turn), 0.025 * np.sin(turn)])
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = np.array([[c, -s], [s, c]]) @ outline
+    scene = ellipse.scenes[0]
+    np.testing.assert_allclose(scene.normals[2, 0], x[y.argmin()], atol=2e-6)
+    np.testing.assert_allclose(scene.tangents[2, 0], -y.min(), atol=2e-6)
+    np.testing.assert_allclose(scene.normals[2, 0], 1.110112e-3, atol=2e-4)
+    assert ellipse.pre.shape == (1378, 3)
+    assert [int((square.contacts == m).sum()) for m in (1, 2)] == [250, 15]
+    numbers, time, q = ji.square_drops()
+    assert q.shape == (len(numbers), len(time), 3) == (100, 200, 3)
+    np.testing.assert_allclose(np.median(q[:, -1, 1]), 0.03, atol=2e-4)  # at rest, half of a side
+    fourth = q[list(numbers).index(6)]  # impact 6:12.6 lies between frames 12 and 13
+    low = np.asarray(ji.Block(0.06, 0.06).gap_function(fourth[13])).min()
+    assert "6:12.6" in square.shots
+    assert abs(low) < 4e-3
 
 
 def test_a_correction_leaves_the_errors_before_in_what_it_conserves():

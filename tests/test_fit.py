@@ -14,9 +14,12 @@ from scipy import stats
 
 import jimpact as ji
 from jimpact import Law
+from jimpact.files.records import with_error
 from jimpact.fits.multistart import quiet
 from jimpact.fits.parameters import bounds_of, free_parameters
 from jimpact.fits.profiles import _Scans
+from jimpact.fits.saved import write_fit
+from jimpact.fits.ties import tied
 
 DATA = files("jimpact") / "data"
 PAIR = ji.chain([1.0, 2.0])
@@ -293,7 +296,10 @@ def test_derivatives_that_are_no_numbers_are_left_out_or_refused():
     )
     with pytest.raises(ValueError, match=r"at restitution = 0.9 those of 1 measured values \(1\)"):
         ji.fit(problem)
-    with pytest.raises(ValueError, match="`bounds` must be left out where a FitProblem is given"):
+    with pytest.raises(
+        ValueError,
+        match="`bounds`, `priors` and `ties` must be left out where a FitProblem is given",
+    ):
         ji.fit(problem, bounds={"restitution": (0.5, 1.0)})
 
 
@@ -338,6 +344,29 @@ def test_gradient_descent_agrees_with_levenberg_marquardt(method):
     tolerance = 1e-3 if found.converged else 0.2
     assert np.all(np.abs(found.value - best.value) < tolerance * best.standard_error)
     assert found.method == (method if isinstance(method, str) else "optax")
+
+
+def test_descent_comes_back_from_beyond_the_domain():
+    """With plain optax on `impact`: e > 1 has a status, and derivatives that lead back."""
+
+    def loss(e):
+        out = ji.impact(ji.Newton(e), PAIR, SHOTS[0])
+        return (out.velocity[1] - out.velocity[0] - 0.99) ** 2, out.status
+
+    def step(carry, _):
+        e, state = carry
+        slope, status = jax.grad(loss, has_aux=True)(e)
+        with jax.numpy_dtype_promotion("standard"):  # which optax needs
+            update, state = adam.update(slope, state)
+        return (e + update, state), (e, status)
+
+    adam, start = optax.adam(0.05), jnp.asarray(0.6)
+    descend = jax.jit(lambda e: jax.lax.scan(step, (e, adam.init(e)), length=400))
+    (e, _), (path, status) = descend(start)
+    beyond = np.asarray(path) > 1
+    assert beyond.any()
+    np.testing.assert_array_equal(np.asarray(status) == CODE["out_of_range"], beyond)
+    np.testing.assert_allclose(e, 0.99, atol=1e-4)
 
 
 PRE_3 = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, -1.0], [0.0, 0.0, -2.0], [1.0, 0.5, 0.0]])
@@ -553,10 +582,187 @@ def test_further_shots_are_predicted_with_errors():
         np.testing.assert_allclose(out.velocity, at_0 + e * (at_1 - at_0), rtol=1e-9)
         np.testing.assert_allclose(out.standard_error, error * np.abs(at_1 - at_0), rtol=1e-6)
         assert (out.status == 0).all()
+    q = stats.norm.ppf(0.9)
+    half = q * np.sqrt((error * (at_1 - at_0)) ** 2 + 0.02**2)
+    band = found.predict(further, level=0.8)
+    np.testing.assert_allclose([band.velocity - band.low, band.high - band.velocity], [half] * 2)
+    own = found.predict(ji.Experiments(further, further, 0.1))
+    np.testing.assert_allclose(own.noise, 0.1)
+    unknown = ji.fit(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, post))
+    np.testing.assert_allclose(unknown.predict(further).noise, unknown.noise)
     unseen = replace(found, standard_error=np.array([np.inf]))
     assert np.isinf(unseen.predict(further).standard_error).all()
-    with pytest.raises(ValueError, match=r"`shots` must have shape \(K, 2\), .* \(1, 3\)"):
-        found.predict([[1.0, 0.0, 0.0]])
+    each = replace(found, law=ji.Newton([0.6]))
+    for fit, shots, scene, message in (
+        (found, [[1.0, 0.0, 0.0]], None, r"`shots` must have shape \(K, 2\), .* \(1, 3\)"),
+        (found, further, BALLS, r"`scene` must have 2 velocities as the fit, but has 3 and 2"),
+        (each, further, WALLED, r"2 velocities as the fit and 1 contacts, .*but has 2 and 2"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            fit.predict(shots, scene)
+
+
+@pytest.mark.parametrize("options", [{}, {"sigma_pre": 0.01}])
+def test_a_saved_fit_is_the_same_fit(tmp_path, options):
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    post[2, 1] = np.nan
+    data = ji.Experiments(SHOTS, post, 0.02, shots="abcd", **options)
+    found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": (0.6, 0.1)})
+    path = found.save(tmp_path / "fit.json")
+    again = ji.load_fit(path)
+    assert (str(again), again.to_dict()) == (str(found), found.to_dict())
+    for a, b in zip(*(jax.tree.leaves(x.problem.residuals) for x in (found, again))):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+    np.testing.assert_array_equal(again.problem.residual([0.7]), found.problem.residual([0.7]))
+    np.testing.assert_array_equal(again.predict(SHOTS).low, found.predict(SHOTS).low)
+    record = json.loads(path.read_text())
+    assert record["versions"]["jax"] == jax.__version__
+    law = record["result"]["law"]
+    for change, message in (
+        ({"format": 2, "versions": {"jimpact": "9.9"}}, r"format 1, but has format 2 \(written by jimpact 9.9; this"),
+        ({"result": record["result"] | {"law": law | {"class": "mine:Law"}}}, "law of your own must be imported"),
+        ({"result": record["result"] | {"law": law | {"class": "os:remove"}}}, "is no class of a law"),
+        ({"result": record["result"] | {"law": law | {"fields": {}}}}, "Newton has the fields"),
+    ):  # fmt: skip
+        path.write_text(json.dumps(record | change))
+        with pytest.raises(ValueError, match=message):
+            ji.load_fit(path)
+    for text, message in (("[1]", "has no `format`"), ("e = 0.9", "a saved fit .JSON., but")):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            ji.load_fit(path)
+
+
+def test_functions_cannot_be_saved(tmp_path):
+    observed = ji.FitProblem.from_observable(ji.Newton(0.9), lambda law: law.restitution, 0.5)
+    for problem, message in (
+        (observed, "must be to shots to be saved"),
+        (ji.FitProblem.from_shots(ji.Newton([0.5, 0.5]), BALLS, THREE, ties={"restitution[2]": two_thirds}), "must have no ties"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=message):
+            write_fit(Saved(problem), tmp_path / "fit.json")
+
+
+class Saved:
+    """What `write_fit` looks at first."""
+
+    def __init__(self, problem):
+        self.problem, self.experiments = problem, problem.experiments
+
+
+# --------------------------------------------------------------------- priors and ties
+
+
+def test_a_prior_weighs_like_one_more_measured_value():
+    """Newton's law is linear in e: mean, error, chi^2 and interval in closed form."""
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    data, mean, std = ji.Experiments(SHOTS, post, 0.02), 0.63, 0.01
+    e, error, rest = newton_in_closed_form(post, np.full_like(post, 50.0))
+    found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": ji.Normal(mean, std)})
+    variance = 1 / (error**-2 + std**-2)
+    best = variance * (e / error**2 + mean / std**2)
+    squares = rest + (best - e) ** 2 / error**2 + (best - mean) ** 2 / std**2
+    np.testing.assert_allclose(found.value, [best], rtol=1e-9)
+    np.testing.assert_allclose(found.standard_error, [np.sqrt(variance)], rtol=1e-9)
+    np.testing.assert_allclose([found.chi_squared, found.aic], [squares, squares + 2], rtol=1e-9)
+    assert found.degrees_of_freedom == 8 + 1 - 1
+    half = stats.norm.ppf(0.975) * np.sqrt(variance)
+    (profiled,) = ji.profile(found)
+    np.testing.assert_allclose(profiled.intervals, [(best - half, best + half)], rtol=1e-4)
+    problem = found.problem
+    np.testing.assert_allclose(problem.residual([0.5])[-1], (0.5 - mean) / std)
+    assert len(problem.residual([0.5])) == len(problem.jacobian([0.5])) == 9
+    without = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, data).log_density([0.5])
+    np.testing.assert_allclose(problem.log_density([0.5]), without)
+    assert found.verdict.endswith("assuming the prior 0.63 ± 0.01 of restitution.")
+    many = ji.bootstrap(found, samples=400)
+    np.testing.assert_allclose(many.value.std(ddof=1), np.sqrt(variance), rtol=0.15)
+
+
+def test_a_prior_that_the_data_contradict_is_named():
+    """Its distance from the data alone, over both errors: named beyond 2.58 of them."""
+    post = simulated(ji.Newton(0.6), PAIR, SHOTS, noise=0.02)
+    data, std = ji.Experiments(SHOTS, post, 0.02), 0.01
+    e, error, _ = newton_in_closed_form(post, np.full_like(post, 50.0))
+    for far, named in ((2.5, False), (2.65, True)):
+        mean = e + far * np.hypot(error, std)
+        found = ji.fit(ji.Newton(0.9), PAIR, data, priors={"restitution": (mean, std)})
+        assert (f"is {far:.2g} standard errors off" in reported(found)) is named
+        assert ("the prior of restitution contradicts the data" in found.verdict) is named
+
+
+def test_what_only_a_prior_knows_is_said_to_be_its():
+    law = ji.Newton([0.8, 0.6])
+    seen = ji.Experiments(PRE_3[:1], simulated(law, BALLS, PRE_3[:1]), 0.01)  # not contact 2
+    found = ji.fit(law, BALLS, seen, starts=1, priors={"restitution[2]": (0.7, 0.05)})
+    np.testing.assert_allclose(found["restitution[2]"][:2], [0.7, 0.05], rtol=1e-6)
+    assert (found.rank, found.from_prior.tolist()) == (2, [False, True])
+    assert "restitution[2] = 0.70 ± 0.05, which is its prior" in found.verdict
+    assert "prior alone 0.7 ± 0.05" in str(found)
+    plan = ji.design(found, ji.Experiments(PRE_3[2:3], PRE_3[2:3], 0.01))
+    alone = ji.design(
+        ji.fit(law, BALLS, seen, starts=1), ji.Experiments(PRE_3[2:3], PRE_3[2:3], 0.01)
+    )
+    together = 1 / (alone.standard_error[0, 1] ** -2 + 0.05**-2)
+    np.testing.assert_allclose(plan.standard_error[0, 1], np.sqrt(together), rtol=1e-4)
+
+
+def two_thirds(p):
+    return p["restitution[1]"] * 2 / 3
+
+
+def test_ties_follow_and_pass_their_errors_on():
+    """e2 = 2/3 e1 by a tie, and by linear regression: v+ of Newton's law is linear in both."""
+    post = simulated(ji.Newton([0.9, 0.6]), BALLS, PRE_3, noise=0.01)
+    corners = [simulated(ji.Newton(e), BALLS, PRE_3) for e in ([0.0, 0.0], [0.9, 0.6])]
+    x, y = (corners[1] - corners[0]).ravel() / 0.9, (post - corners[0]).ravel()
+    data, ties = ji.Experiments(PRE_3, post, 0.01), {"restitution[2]": two_thirds}
+    found = ji.fit(ji.Newton([0.5, 0.5]), BALLS, data, ties=ties, starts=1)
+    e, error = x @ y / (x @ x), 0.01 / np.sqrt(x @ x)
+    assert found.names == ("restitution[1]",)
+    np.testing.assert_allclose(found.law.restitution, [e, e * 2 / 3], rtol=1e-9)
+    np.testing.assert_allclose(found.tied["restitution[2]"], [e * 2 / 3, error * 2 / 3], rtol=1e-6)
+    np.testing.assert_allclose(found.standard_error, [error], rtol=1e-6)
+    assert f"restitution[2] = {with_error(e * 2 / 3, error * 2 / 3)} is tied" in str(found)
+    further = found.predict(2 * PRE_3)
+    slope = 2 * x.reshape(PRE_3.shape)
+    np.testing.assert_allclose(further.standard_error, error * np.abs(slope), atol=1e-9)
+
+
+def test_ties_reach_across_fields_in_any_order():
+    law = ji.LZB([0.5, 0.5, 0.5], [1.0, 1.0, 1.0])
+    ties = (
+        ("stiffness[3]", lambda p: p["stiffness[2]"] + p["restitution"][1]),
+        ("stiffness[2]", lambda p: 2 * p["stiffness[1]"]),
+        ("restitution[2]", lambda p: p["restitution[1]"] / 2),
+    )
+    for order in (ties, ties[::-1]):
+        np.testing.assert_array_equal(tied(law, order).stiffness, [1.0, 2.0, 2.25])
+    chosen, _ = free_parameters(law, ("restitution", "stiffness"), ties=ties)
+    assert chosen.names == ("restitution[1]", "restitution[3]")  # stiffness[1]: only ratios matter
+
+
+@pytest.mark.parametrize(
+    ("ties", "message"),
+    [
+        (
+            {"restitution[1]": lambda p: p["restitution[2]"], "restitution[2]": two_thirds},
+            r"circle, but restitution\[1\] needs restitution\[2\], which needs restitution\[1\]",
+        ),
+        ({"restitution[2]": lambda p: p["restitution"][0]}, "needs restitution.2."),
+        ({"restitution[2]": lambda p: 3.0}, r"`restitution\[2\]` in \[0, 1\], but its function gives \[3.0\]"),
+        ({"friction": lambda p: 0.1}, "parameters of Newton, one of restitution, but uses 'friction'"),
+        ({"restitution[2]": lambda p: p["mass"]}, "but uses 'mass'"),
+        ({"restitution[2]": 0.3}, "must map `restitution.2.` to a function"),
+        ({"restitution[2]": lambda p: p["restitution"]}, "needs restitution"),
+        ({"restitution[2]": lambda p: jnp.ones(2)}, r"one number for `restitution.2.`, but .* shape \(2,\)"),
+        ({"restitution": lambda p: jnp.ones(2), "restitution[2]": two_thirds}, "overlap"),
+        ({"restitution": lambda p: 0.5}, "leaves none free"),
+    ],
+)  # fmt: skip
+def test_bad_ties(ties, message):
+    with pytest.raises(ValueError, match=message):
+        ji.fit(ji.Newton([0.5, 0.5]), BALLS, THREE, ties=ties)
 
 
 def test_masks_groups_and_held_contacts():
@@ -1054,6 +1260,11 @@ PER_CONTACT = ji.LZB([0.9, 0.9], [1.0, 1.0])
         (ji.Newton(0.9), PAIR, TWO, {"bounds": {"restitution": 0.5}}, r"map `restitution` to \(low, high\)"),
         (ji.Newton(0.9), PAIR, TWO, {"bounds": {"stiffness": (1.0, 2.0)}}, r"name free parameters, restitution, but has 'stiffness'"),
         (PER_CONTACT, BALLS, THREE, {"bounds": {"stiffness": (0.0, 2.0)}}, r"must be > 0 for `stiffness`"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": (1.2, 0.1)}}, r"mean in \[0, 1\] for `restitution`, but has \(1.2, 0.1\)"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": (0.9, 0.0)}}, r"standard deviation > 0 for `restitution`"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": 0.9}}, r"map `restitution` to \(mean, standard deviation\)"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution[2]": (0.9, 0.1)}}, r"name free parameters, restitution, but has 'restitution.2.'"),
+        (ji.Newton(0.9), PAIR, TWO, {"priors": {"restitution": (0.9, 0.1)}}, r"`priors` must be left out where no `sigma`"),
         (ji.Newton(0.9), BALLS, TWO, {}, r"one velocity per body of the scene: it has 2 a shot, but the scene has 3"),
         (ji.Newton(0.9), None, TWO, {}, r"`scene` must be a Scene"),
         (ji.Newton([0.9, 0.9]), PAIR, TWO, {}, r"`restitution` must have shape \(1,\)"),

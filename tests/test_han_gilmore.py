@@ -27,7 +27,7 @@ def solve(a, b):
     return [r[-1] for r in rows]
 
 
-def exact_tree(masses, v):
+def exact_tree(masses, v, e=1):
     """All outcomes of a chain without walls, in exact arithmetic and without merging."""
     m = [Fraction(x) for x in masses]
     n = len(m)
@@ -55,7 +55,8 @@ def exact_tree(masses, v):
             for extra in itertools.combinations(may, k):
                 active = sorted([*must, *extra])
                 p = solve(
-                    [[w[i][j] for j in active] for i in active], [-2 * gamma[j] for j in active]
+                    [[w[i][j] for j in active] for i in active],
+                    [-(1 + e) * gamma[j] for j in active],
                 )
                 if p is None or min(p) <= 0:
                     continue
@@ -204,3 +205,74 @@ def test_bad_input():
     assert len(han_gilmore(balls, [1.0, 0.0, 0.0], max_depth=2)) == 2
     with pytest.raises(TypeError, match="host"):
         jax.jit(lambda v: han_gilmore(balls, v)[0].velocity)(jnp.ones(3))
+
+
+# ------------------------------------------------------------------------ losses and friction
+
+
+@pytest.mark.parametrize("masses", [(1, 1, 1), (2, 1, 3), (1, 2, 1)])
+def test_losses_in_exact_arithmetic(masses):
+    e = Fraction(1, 2)
+    exact = exact_tree(masses, (1, 0, 0), e)
+    found = han_gilmore(ji.chain(np.array(masses, float)), [1.0, 0, 0], 0.5)
+    assert as_set(found) == {tuple(np.round([float(x) for x in v], 8) + 0.0) for v in exact}
+    assert not any(outcome.endless for outcome in found)
+    energies = [
+        float(ji.kinetic_energy(ji.chain(np.array(masses, float)), o.velocity)) for o in found
+    ]
+    assert max(energies) < 0.5 * masses[0]
+
+
+def test_plastic_balls_collide_without_end_and_it_says_so():
+    """e = 0: both contacts at once end at 1/3 each; one after another there in the limit."""
+    (found,) = han_gilmore(ji.chain(jnp.ones(3)), [1.0, 0, 0], 0.0)
+    np.testing.assert_allclose(found.velocity, 1 / 3, atol=1e-9)
+    assert found.endless
+    (pair,) = han_gilmore(ji.chain(jnp.ones(2)), [1.0, 0], 0.0)
+    assert not pair.endless
+    (walls,) = han_gilmore(ji.chain([1.0], wall="both"), [1.0], 0.5)
+    assert walls.endless
+
+
+def test_friction_of_one_contact():
+    """A disc of radius 1 that falls on its rim: it slides if mu is less than half of that of sticking."""
+    inertia = 0.5
+    scene = ji.Scene([1.0, 1.0, inertia], [[0.0], [1], [0]], tangents=[[1.0], [0], [1]])
+    v = np.array([1.0, -1.0, 0.2])
+    slip, ease = 1.2, 1 + 1 / inertia
+    for mu, p_t in ((0.1, -0.1 * 1.5), (1.0, -slip / ease)):
+        (found,) = han_gilmore(scene, v, 0.5, mu)
+        np.testing.assert_allclose(found.velocity, [1 + p_t, 0.5, 0.2 + p_t / inertia], atol=1e-12)
+        np.testing.assert_allclose(found.tangential_impulse, [p_t], atol=1e-12)
+        assert ("slides forward" in found.rules[0]) == (mu == 0.1)
+        assert ("sticks" in found.rules[0]) == (mu == 1.0)
+
+
+def test_friction_of_a_block_on_two_corners():
+    """Impulses in Coulomb's cones, admissible ends; without friction the tree of no friction."""
+    block, v = ji.rocking_block(1.0, 2.0), [0.4, -1.0, 0.6]
+    without = han_gilmore(block, v, 0.6)
+    assert as_set(han_gilmore(block, v, 0.6, 0.0)) == as_set(without)
+    found = han_gilmore(block, v, 0.6, [0.3, 0.5])
+    assert found
+    start = float(ji.kinetic_energy(block, v))
+    for outcome in found:
+        assert (np.abs(outcome.tangential_impulse) <= [0.3, 0.5] * outcome.impulse + 1e-9).all()
+        assert (ji.gap_velocity(block, outcome.velocity) >= -1e-9).all()
+        assert float(ji.kinetic_energy(block, outcome.velocity)) < start
+        push = np.asarray(block.normals) @ outcome.impulse
+        push += np.asarray(block.tangents) @ outcome.tangential_impulse
+        np.testing.assert_allclose(v + push / np.asarray(block.mass), outcome.velocity, atol=1e-12)
+    assert np.abs(found[0].velocity - without[0].velocity).max() > 0.01
+
+
+def test_bad_coefficients():
+    balls = ji.chain(jnp.ones(3))
+    with pytest.raises(ValueError, match=r"`restitution` must lie in \[0, 1\]"):
+        han_gilmore(balls, [1.0, 0, 0], 1.2)
+    with pytest.raises(ValueError, match="`restitution` must be a scalar or have shape"):
+        han_gilmore(balls, [1.0, 0, 0], [0.5] * 3)
+    with pytest.raises(ValueError, match="`scene` must have one tangent a contact"):
+        han_gilmore(balls, [1.0, 0, 0], 0.5, 0.1)
+    with pytest.raises(ValueError, match="`friction`"):
+        han_gilmore(ji.rocking_block(1.0, 2.0), [0.0, -1, 0], 0.5, -0.1)

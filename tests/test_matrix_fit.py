@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from programs import as_matrix
 from scipy.optimize import minimize
@@ -205,6 +206,53 @@ def test_every_iterate_is_admissible(method):
     assert worst > -1e-13
     assert worst < 1e-9  # some were drawn back to the boundary
     np.testing.assert_allclose(found.law.matrix, fitted(data).law.matrix, atol=1e-5)
+
+
+# ------------------------------------------------------- gradient descent with plain optax
+
+# the unconstrained minimum of these data creates energy
+PUSHED = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)
+PROBLEM = ji.FitProblem.from_shots(RestitutionMatrix(START), CHAIN, PUSHED)
+OUTSIDE = np.array([0.2, 0.1, 1.2, 0.3])  # creates energy, too
+project = jax.jit(jax.vmap(PROBLEM.project))
+
+
+def test_the_projection_is_the_nearest_admissible_matrix():
+    """Of a convex set: it is seen from the point at no acute angle with any other member."""
+    rng, g_inverse = np.random.default_rng(0), inverse(CHAIN)
+    points = OUTSIDE + 0.5 * rng.normal(size=(64, 4))
+    nearest = np.asarray(project(points))
+    inside = [min(slacks(x.reshape(2, 2), g_inverse)) >= 0 for x in points]
+    assert 0 < sum(inside) < 32
+    np.testing.assert_allclose(nearest[inside], points[inside], atol=1e-12)
+    assert min(min(slacks(x.reshape(2, 2), g_inverse)) for x in nearest) > -1e-9
+    out, to_others = points - nearest, nearest[None] - nearest[:, None]
+    assert np.einsum("ki,kji->kj", out, to_others).max() < 1e-3
+
+
+@pytest.mark.slow
+def test_descent_with_projected_gradients_ends_at_the_best_matrix():
+    """From a matrix that creates energy; adam with the gradient itself slides away."""
+    best, rate, adam = fitted(PUSHED, start=START), 0.2, optax.adam(0.02)
+
+    def squares(x):
+        return jnp.sum(PROBLEM.residual(x) ** 2)
+
+    def step(carry, _):
+        x, state = carry
+        gradients = jax.vmap(jax.grad(squares))(x)
+        inward = (x - jax.vmap(PROBLEM.project)(x - rate * gradients)) / rate
+        with jax.numpy_dtype_promotion("standard"):  # which optax needs
+            update, state = adam.update(jnp.stack([gradients[0], inward[1]]), state)
+        moved = jnp.stack([x[0] + update[0], x[1] + update[1], x[2] - rate * gradients[2]])
+        return (jax.vmap(PROBLEM.project)(moved), state), None
+
+    start = jnp.asarray(np.tile(OUTSIDE, (3, 1)))
+    run = jax.jit(lambda x: jax.lax.scan(step, (x, adam.init(x[:2])), length=500)[0][0])
+    plain, projected, sgd = run(start)
+    for x in (projected, sgd):
+        np.testing.assert_allclose(x, best.value, atol=1e-5)
+    assert squares(plain) > 1.01 * best.starts[0].sum_of_squares
 
 
 # ----------------------------------------------------------------------------- bad input

@@ -434,8 +434,8 @@ class Apart(ji.Body):
 
 
 LINE = (1.0, -1.0)
-PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0)
-DISCS = ji.PlanarBodies([ji.Disc(0.1), ji.Disc(0.1)], planes=[])
+PLANE = (1.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of two; the third flies away much faster
+DISCS = ji.PlanarBodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
 
 
 @pytest.mark.parametrize(
@@ -449,17 +449,18 @@ DISCS = ji.PlanarBodies([ji.Disc(0.1), ji.Disc(0.1)], planes=[])
 def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, expected):
     """Steps of .01 s; the status does not depend on where in a step they meet."""
     way = jnp.array(way)
+    aside = jnp.zeros(len(way)).at[6:7].set(1.0)  # x of the third
 
     @jax.jit
     @jax.vmap
     def run(start):
         return ji.simulate(
-            ji.System(body), ji.Moreau(0.5), -start * way, speed * way, 0.1,
+            ji.System(body), ji.Moreau(0.5), 10 * aside - start * way, 1e4 * aside + speed * way, 0.1,
             samples=2, method="time_stepping", step=1e-2,
         )  # fmt: skip
 
     motion = run(0.12 + jnp.array([0.0, 0.1, 0.3, 0.7, 0.9, 1.3]) * 0.5 * speed / 50)
-    passed = motion.velocity[:, -1, -len(way) // 2] < 0
+    passed = motion.velocity[:, -1, int(np.argmin(way))] < 0
     reported = motion.status == MOTION_CODE["coarse_step"]
     assert (reported == passed).all()
     assert bool(passed.any()) == (expected == "coarse_step")
@@ -470,3 +471,40 @@ def test_steps_too_many_to_count_are_refused():
         ji.simulate(
             ji.ball_system(), ji.Moreau(0.5), [1.0], [0.0], 1.0, method="time_stepping", step=1e-300
         )
+
+
+def slid_off(**options):
+    """A block slides over the right end of a heavy table, 2 m wide, and falls to the ground."""
+    bodies = ji.PlanarBodies(
+        [ji.Block(2.0, 1.0, mass=1e6), ji.Block(0.4, 0.2)], planes=[0.0], pairs=[(1, 0)]
+    )
+    system = ji.System(bodies, potential=ji.gravity(bodies))
+    law, start = ji.Moreau(0.3, friction=0.2), [0.0, 0.5, 0.0, 0.7, 1.1, 0.0]
+    return ji.simulate(system, law, start, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], 2.0, **options)
+
+
+# Friction moves the middle of the normal forces forward by mu h / 2 = .02 m: the block topples as
+# soon as its own middle is that far from the edge at x = 1 m.
+TOPPLES = (1.5 - np.sqrt(1.5**2 - 2 * 0.2 * G * 0.28)) / (0.2 * G)
+
+
+@pytest.mark.slow
+def test_a_block_slides_off_a_table():
+    motion = slid_off(samples=201, method="time_stepping", step=1e-3)
+    ji.raise_on_failed_motion(motion)
+    time, (x, y, angle) = np.asarray(motion.time), np.asarray(motion.q)[:, 3:].T
+    slides = time < TOPPLES - 0.005
+    np.testing.assert_allclose(angle[slides], 0, atol=1e-6)
+    np.testing.assert_allclose(x[slides], (0.7 + 1.5 * time - 0.1 * G * time**2)[slides], atol=1e-6)
+    assert (angle[(time > TOPPLES + 0.05) & (time < TOPPLES + 0.3)] < -1e-3).all()
+    np.testing.assert_allclose([y[-1], angle[-1]], [0.1, 0.0], atol=1e-4)
+    assert x[-1] > 1.2
+    assert float(np.nanmin(motion.gaps)) > -1e-2  # Moreau and Jean: h times the approach
+
+
+@pytest.mark.release
+def test_a_block_topples_off_a_table_at_its_moment():
+    motion = ji.raise_on_failed_motion(slid_off(samples=41))
+    assert float(motion.event_times("detachment")[0]) == pytest.approx(TOPPLES, abs=1e-7)
+    np.testing.assert_allclose(motion.q[-1, 4:], [0.1, 0.0], atol=1e-9)
+    assert float(np.nanmin(motion.gaps)) > -1e-9

@@ -209,6 +209,7 @@ PICTURES = {
     "fit of a shot": lambda: ji.plot.fit(canned(1), {"the same": canned(1)}, "one shot"),
     "fit of many shots": lambda: ji.plot.fit(canned(50)),
     "contour": lambda: ji.plot.contour(region(), "two parameters"),
+    "corner": lambda: ji.plot.corner(correlated(), correlated_draws()),
     "correlation": lambda: ji.plot.correlation(canned(4)),
     "profiles": lambda: ji.plot.profiles([valley("restitution[1]"), valley("stiffness[2]")] * 2),
     "residuals": lambda: ji.plot.residuals(canned(50)),
@@ -228,6 +229,9 @@ PICTURES = {
     "phase_portrait": lambda: motion("phase_portrait"),
     "rocking_dispersion": lambda: ji.plot.rocking_dispersion(rocking(), "by LZB"),
     "rocking_outcomes": lambda: ji.plot.rocking_outcomes(rocking()),
+    "rocking_domains": lambda: ji.plot.rocking_domains(
+        [ji.theory.rocking_domain(a, s) for a in (1.0, 2.0) for s in (True, False)]
+    ),
     "admissible_set": lambda: outcomes([1.0, 1.0, 1.0], False),
     "admissible_set of three contacts": lambda: outcomes([1.0, 1.0, 1.0], True),
     "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),
@@ -301,6 +305,39 @@ def test_residuals_are_drawn_over_what_was_fitted():
     dots = measured.lines[-1]
     np.testing.assert_array_equal(dots.get_xdata(), fitted.predicted[here])
     np.testing.assert_allclose(dots.get_ydata(), (fitted.predicted + fitted.residual)[here])
+
+
+def correlated():
+    """Of two parameters, and one that the data do not determine."""
+    covariance = np.array([[4e-4, 3e-4, 0.0], [3e-4, 9e-4, 0.0], [0.0, 0.0, np.inf]])
+    names = ("restitution[1]", "restitution[2]", "stiffness[2]")
+    known = {"names": names, "value": np.array([0.8, 0.7, 1.0]), "covariance": covariance}
+    return dataclasses.replace(canned(4), standard_error=np.sqrt(np.diag(covariance)), **known)
+
+
+def correlated_draws():
+    fit, rng = correlated(), np.random.default_rng(0)
+    drawn = rng.multivariate_normal(fit.value[:2], fit.covariance[:2, :2], 200)
+    return np.column_stack([drawn, rng.normal(size=200)])
+
+
+def test_regions_of_a_corner_plot_hold_what_they_say():
+    """chi^2 of two degrees of freedom exceeds 2.279 with 32 and 5.991 with 5 %."""
+    fit = correlated()
+    one, pair, other = ji.plot.corner(fit, correlated_draws()).axes
+    assert (pair.get_xlabel(), pair.get_ylabel()) == fit.names[:2]
+    inverse = np.linalg.inv(fit.covariance[:2, :2])
+    for line, limit in zip(pair.lines[1:3], (2.279, 5.991), strict=True):
+        away = np.stack(line.get_data()) - fit.value[:2, None]
+        np.testing.assert_allclose(np.sum(away * (inverse @ away), axis=0), limit, rtol=1e-3)
+    for axes, error in ((one, 0.02), (other, 0.03)):
+        assert max(axes.lines[0].get_ydata()) == pytest.approx(1 / (error * np.sqrt(2 * np.pi)))
+    with pytest.raises(ValueError, match=r"`draws` must have shape \(N, 3\)"):
+        ji.plot.corner(fit, np.ones((5, 2)))
+    with pytest.raises(ValueError, match="`fit` must have a standard error"):
+        ji.plot.corner(fit, names=["stiffness[2]"])
+    with pytest.raises(ValueError, match="`names` must be one of"):
+        ji.plot.corner(fit, names=["friction"])
 
 
 def test_a_loop_encloses_the_energy_lost():

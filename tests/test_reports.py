@@ -1,13 +1,17 @@
 """Reports and pictures of canned results: no impact is computed."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.animation import FFMpegWriter
+from PIL import Image
 from programs import CODE
 
 import jimpact as ji
@@ -15,6 +19,7 @@ from jimpact.fits.fitting import Fit
 from jimpact.fits.result import FitMinimum
 from jimpact.fits.selection import LawFit, LawFits
 from jimpact.motion.record import KIND_CODE, no_events, with_row
+from jimpact.plot.films import positions
 
 
 def canned(shots, **change):
@@ -249,6 +254,66 @@ def rocked(base=None):
     return system, record
 
 
+def test_motions_are_saved_and_loaded(tmp_path):
+    _, found = rocked()
+    batch = jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found)
+    for motion in (found, batch):
+        loaded = ji.load_motion(motion.save(tmp_path / "dimer.npz"))
+        assert jax.tree.structure(loaded) == jax.tree.structure(motion)
+        for one, other in zip(jax.tree.leaves(loaded), jax.tree.leaves(motion)):
+            assert one.dtype == other.dtype
+            np.testing.assert_array_equal(one, other)
+
+
+def test_files_that_hold_no_motion_are_refused(tmp_path):
+    _, found = rocked()
+    path = found.save(tmp_path / "dimer.npz")
+    with np.load(path) as file:
+        arrays = dict(file)
+    assert (str(arrays["status"]), arrays["events.kind"][0]) == ("ok", "impact")  # not codes
+    for name, content, message in (
+        (
+            "later",
+            arrays | {"format": 2, "jimpact": "9.0"},
+            "has format 2, of jimpact 9.0; .* reads 1",
+        ),
+        ("other", {"x": np.ones(2)}, "holds something else"),
+    ):
+        np.savez(tmp_path / name, **content)
+        with pytest.raises(ValueError, match=message):
+            ji.load_motion(tmp_path / f"{name}.npz")
+    path.write_bytes(b"not a file of numbers")
+    with pytest.raises(ValueError, match="cannot be read"):
+        ji.load_motion(path)
+    with pytest.raises(ValueError, match=r"must end in \.npz, but is 'motion\.csv'"):
+        found.save("motion.csv")
+
+
+def test_a_motion_goes_on():
+    """From the last sample that was reached; works and events of both make one record."""
+    _, found = rocked()
+    late = replace(found.events, time=found.events.time.at[1].set(0.45), count=jnp.int32(2))
+    late = replace(late, kind=late.kind.at[1].set(KIND_CODE["impact"]))
+    # it ended after the sample at .4 s and an impact at .45 s, which comes again later
+    ended = replace(found, q=np.where(np.arange(6)[:, None] < 5, found.q, np.nan), events=late)
+    end = ended.end
+    assert end["t_start"] == 0.4
+    np.testing.assert_array_equal(end["q0"], found.q[4])
+    np.testing.assert_array_equal(end["v0"], found.velocity[4])
+    later = replace(
+        found, time=0.4 + found.time, events=replace(found.events, time=found.events.time + 0.4)
+    )
+    both = ended.then(later)
+    np.testing.assert_array_equal(both.time, [*found.time[:5], *(0.4 + found.time[1:])])
+    np.testing.assert_allclose(both.contact_work[:, 0, 0], [0] * 3 + [-0.5] * 4 + [-1.0] * 3)
+    np.testing.assert_allclose(both.event_times(), [0.25, 0.65])
+    assert (int(both.events.count), int(both.steps)) == (2, 18)
+    with pytest.raises(ValueError, match=r"`later` must begin at 0\.4 s, .* begins at 0 s"):
+        ended.then(found)
+    with pytest.raises(ValueError, match="pick one motion"):
+        jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found).then(later)
+
+
 def test_picture_of_a_motion(tmp_path):
     system, found = rocked(ji.HarmonicBase(0.01, 4.0, direction="vertical"))
     figure = ji.plot.motion(found, "dimer", system=system)
@@ -271,6 +336,96 @@ def test_picture_of_a_motion(tmp_path):
     assert {"q3", "q3'"} <= set(bare)
     film = ji.plot.animation(system, found, tmp_path / "dimer.gif")
     assert film.read_bytes().startswith(b"GIF89a")
+
+
+def many_discs(count=8):
+    """As if simulated: disc i rises by i, disc 1 only by rounding; contact i strikes i times."""
+    system = ji.System(ji.PlanarBodies([ji.Disc(0.1)] * count, planes=[0.0], pairs=[]))
+    time, number = np.linspace(0.0, 1.0, 5), np.arange(count)
+    q = np.zeros((5, count, 3))
+    q[:, :, 1] = 1.0 + number * time[:, None]
+    q[:, 0, 1] = 1.0 + 1e-16 * time
+    rows = np.arange(count)[:, None] < number  # (E, m)
+    events = no_events(count, jnp.asarray(q[0].ravel()), jnp.zeros(3 * count), count)
+    events = replace(events, kind=jnp.asarray(rows.any(axis=1) * KIND_CODE["impact"]))
+    events = replace(events, contacts=jnp.asarray(rows), time=jnp.linspace(0.1, 0.9, count))
+    zero = np.zeros(5)
+    velocity = np.zeros((5, count, 3))
+    return system, ji.Motion(
+        *(time, q.reshape(5, -1), velocity.reshape(5, -1), zero, 1 + zero, zero, zero),
+        *(np.full((5, 2, count), 1e-17), np.full((5, count), 0.1), events, jnp.int32(9)),
+        status=jnp.int32(0),
+    )
+
+
+def test_pictures_of_many_bodies_show_those_that_move_most():
+    system, found = many_discs()
+
+    def legend(axes):
+        words = [text.get_text() for text in axes.get_legend().get_texts()]
+        return axes.get_legend().get_title().get_text(), words
+
+    axes = {x.get_ylabel(): x for x in ji.plot.motion(found, system=system).axes}
+    assert legend(axes["coordinates [m]"]) == ("6 of 16", [f"y{i}" for i in range(3, 9)])
+    assert legend(axes["gaps [m]"]) == ("6 of 8", [f"contact {i}" for i in range(3, 9)])
+    assert len(axes["gaps [m]"].lines[0].get_xdata()) == 5 + 2  # contact 3, 2 events
+    assert [line.get_label() for line in axes["energy [J]"].lines[:3]] == [
+        *("T + V − min V", "T", "contacts took")
+    ]
+    assert len(axes["energy [J]"].lines) == 3  # friction took 1e-16 J
+    chosen = ji.plot.motion(found, system=system, bodies=[0])
+    one = {x.get_ylabel(): x for x in chosen.axes}
+    assert legend(one["coordinates [m]"]) == ("", ["x1", "y1"])
+    assert len(one["gaps [m]"].lines) - 7 == 1  # and an event line for each impact
+    flat = {x.get_ylabel(): x for x in ji.plot.motion(found, system=system, contacts=[0]).axes}
+    assert np.ptp(flat["gaps [m]"].get_ylim()) == pytest.approx(8.0)  # the largest coordinate
+    assert np.ptp(flat["coordinates [rad]"].get_ylim()) == pytest.approx(1.0)
+    with pytest.raises(ValueError, match=r"`bodies` must hold some of \[0, 1, .*\], but holds 8"):
+        ji.plot.motion(found, system=system, bodies=[8])
+    with pytest.raises(ValueError, match=r"`contacts` must hold numbers in \[0, 7\], but holds 8"):
+        ji.plot.motion(found, system=system, contacts=[8])
+
+
+def test_films_run_in_time(tmp_path):
+    """Frames are equally spaced in time, and files last as long as they say."""
+    system, found = rocked()
+    path = ji.plot.animation(
+        system, found, tmp_path / "dimer.gif", speed=0.25, frames_per_second=30
+    )
+    with Image.open(path) as film:
+        frames = [film.info["duration"] for k in range(film.n_frames) if film.seek(k) is None]
+    assert frames == [30] * 67  # 100 / 3 in a second, .5 s at a quarter of the speed
+    page = ji.plot.animation(system, found, tmp_path / "a.html", "<Dimer>", speed=0.5).read_text()
+    assert "<title>&lt;Dimer&gt;</title>" in page
+    assert not re.search("https?:", page)
+    data = json.loads(re.search("const film = (.*);\n", page)[1])
+    assert (len(data["frames"]), data["rate"]) == (26, 25.0)
+    assert data["frames"][25]["time"] == "0.50 s (speed 0.5)"
+    assert len(data["frames"][0]["curves"]) == len(data["colours"]) == 3  # rod and two spheres
+    rods = np.array([frame["curves"][0] for frame in data["frames"]])
+    # the rod turns by -2 rad/s, then by 3 rad/s: up to the impact at .25 s its slope falls
+    slope = np.arctan2(rods[:, 1] - rods[:, 3], rods[:, 2] - rods[:, 0])
+    assert abs(abs(slope[12] - slope[0]) - 0.48) < 0.3
+    with pytest.raises(ValueError, match=r"must end in \.gif or \.mp4 or \.html, but is 'a\.avi'"):
+        ji.plot.animation(system, found, "a.avi")
+    with pytest.raises(ValueError, match="`speed`"):
+        ji.plot.animation(system, found, tmp_path / "a.gif", speed=0.0)
+
+
+def test_films_in_mp4_need_ffmpeg(tmp_path, monkeypatch):
+    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
+    system, found = rocked()
+    with pytest.raises(RuntimeError, match="ffmpeg must be installed"):
+        ji.plot.animation(system, found, tmp_path / "dimer.mp4")
+
+
+def test_positions_between_states_follow_their_velocities():
+    """Two parabolas that meet at an event, where the velocity jumps from 1 to -1."""
+    at = np.array([0.0, 1.0, 1.0, 2.0])
+    q, slopes = np.array([[0.0], [0.5], [0.5], [0.0]]), np.array([[0.0], [1.0], [-1.0], [0.0]])
+    time = np.array([0.0, 0.5, 1.0, 1.5, 2.0])
+    expected = [0.0, 0.125, 0.5, 0.125, 0.0]
+    np.testing.assert_allclose(positions(at, q, slopes, time)[:, 0], expected, atol=1e-15)
 
 
 def test_phase_portrait_of_what_moves():

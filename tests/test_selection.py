@@ -89,6 +89,7 @@ def test_compliant_is_compared_where_gaps_matter():
     candidates, left_out = _candidates([free], None, dict(values), ())
     assert "compliant" not in candidates
     assert "close again (as at a wall)" in left_out["compliant"]
+    assert "moreau with one restitution" in left_out["routh"]
     for scenes, laws in (([wall], None), ([free], ["lzb", "compliant"])):
         candidates, left_out = _candidates(scenes, laws, dict(values), ())
         assert any(name.startswith("compliant") for name in candidates)

@@ -40,16 +40,18 @@ class PlanarBodies(Body):
     a disc and a polygon `f = dist(x_1, polygon) - r_1`. Two polygons have the two contacts of two
     sides that face each other: at each end of the first side, the distance of its corner from the
     second side, or, where it overhangs, that of the second side's end from the first side, or, in
-    between, that of the two corners. Normals are unit vectors n from the second body to the first,
-    tangents (n_y, -n_x); both as rates of q.
+    between, that of the two corners; the least of both is the distance of the polygons. Normals are
+    unit vectors n from the second body to the first, tangents (n_y, -n_x); both as rates of q.
 
     Contacts, in order: for each plane and body, its contact points; then the pairs of discs; discs
-    on polygons, polygon by polygon; polygons, two contacts a pair. `between` names their bodies.
+    on polygons, polygon by polygon; polygons, two contacts a pair, pairs with fixed sides first.
+    `between` names their bodies.
 
-    The gap functions hold (`valid`, [m]) while the centre of a disc is outside the other body, and
-    while two sides overlap or the line of one of them keeps them apart, turned by less than 90
-    degrees against each other, with no other corner of the first body beyond the second side: a
-    body that falls next to another or rolls on it to its next side leaves this range. Bodies that
+    Polygons choose their sides as they move, so that they may roll over their corners, slide off
+    each other and meet again anywhere. Where sides are fixed, by `at` or by their numbers, the gap
+    functions hold (`valid`, [m]) while both overlap or the line of one of them keeps them apart,
+    turned by less than 90 degrees against each other, with no other corner of the first body beyond
+    the second side. Those of discs hold while their centres are outside the other body. Bodies that
     are no pair do not feel each other.
 
     Args:
@@ -59,11 +61,12 @@ class PlanarBodies(Body):
             polygons may be given as ((i, side), (j, side)), sides counted counter-clockwise: of a
             `Block` 0 is the base, of a `Polygon` it begins at the first corner.
         at: q (3 b,) at which the sides of two polygons are chosen that face each other, and which
-            is the first body; not needed where sides are given.
+            is the first body, once and for all; None: as they move. Polygons with an odd number of
+            sides need it, or sides.
 
     Raises:
         ValueError: no bodies or contacts, planes that are not finite, pairs that do not exist or
-            without a gap function, two polygons without sides.
+            without a gap function, polygons with an odd number of sides without `at`.
 
     Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7 (distances, separating axes).
 
@@ -72,12 +75,12 @@ class PlanarBodies(Body):
     >>> slope.scene(slope.touching()).closed.tolist()
     [True, True, False, False]
     >>> q = [0.0, 0.5, 0.0, 0.3, 1.5, 0.0]
-    >>> stack = ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)], pairs=[(1, 0)], at=q)
+    >>> stack = ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Block(1.0, 1.0)])
     >>> stack.scene(q).gaps[-2:].tolist()
     [0.0, 0.0]
     """
 
-    range_in_words = "see `PlanarBodies`: no centre in another body, sides that face each other"
+    range_in_words = "see `PlanarBodies`: no centre in a body, fixed sides face each other"
 
     bodies: tuple[OnGround, ...]
     planes: jax.Array  # (k, 2) angle, offset
@@ -127,8 +130,8 @@ class PlanarBodies(Body):
             parts.append(_discs(places, np.array(self.pairs.discs)))
         for polygon, discs in self.pairs.rolling:
             parts.append(_disc_on_polygon(places, np.array(discs), polygon))
-        if self.pairs.sides:
-            parts.append(_facing_sides(places, self.pairs.sides))
+        if self.pairs.sides or self.pairs.polygons:
+            parts.append(_facing_sides(_all_sides(places, self.pairs)))
         return PlanarContacts(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
     def gap_function(self, q: jax.Array) -> jax.Array:
@@ -220,13 +223,15 @@ class _Pairs(NamedTuple):
 
     discs: tuple[tuple[int, int], ...]
     rolling: tuple[tuple[int, tuple[int, ...]], ...]  # a polygon and its discs
-    sides: tuple[tuple[Side, Side], ...]
+    sides: tuple[tuple[Side, Side], ...]  # of polygons in contact there only
+    polygons: tuple[tuple[int, int], ...]  # in contact anywhere
 
     @property
     def between(self) -> list[tuple[int, int]]:
         """Bodies of each contact."""
         discs = [*self.discs, *((i, polygon) for polygon, some in self.rolling for i in some)]
-        return discs + [(first[0], second[0]) for first, second in self.sides for _ in (0, 1)]
+        polygons = [(first[0], second[0]) for first, second in self.sides] + list(self.polygons)
+        return discs + [pair for pair in polygons for _ in (0, 1)]
 
 
 class _Places(NamedTuple):
@@ -288,15 +293,52 @@ def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> Planar
     return PlanarContacts(away - places.rim[discs], middle - away[:, None] * n, n)
 
 
-def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> PlanarContacts:
+class _Sides(NamedTuple):
+    """Sides in contact of pairs of polygons, each from its begin to its end (g, 2)."""
+
+    first: tuple[jax.Array, jax.Array]
+    second: tuple[jax.Array, jax.Array]
+    swapped: jax.Array  # (g,) whether the contact at the first side's end comes first
+
+
+def _all_sides(places: _Places, pairs: _Pairs) -> _Sides:
+    """Sides that were chosen at the beginning, then those that face each other now.
+
+    Where a body rolls over a corner, one of the sides gives way to its neighbour, which has the
+    corner at its other end. The contact there keeps its place among the two because they are
+    swapped where the numbers of both sides have an odd sum.
+    """
+    rows: list[Any] = [(_side(places, a), _side(places, b), False) for a, b in pairs.sides]
+    for i, j in pairs.polygons:
+        a, b = _facing_now(places.polygons[i], places.polygons[j])
+        sides = (_side_of(places.polygons[i], a), _side_of(places.polygons[j], b))
+        rows.append((*sides, (a + b) % 2 == 1))
+    first, second, swapped = zip(*rows)
+
+    def ends(sides: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+        return jnp.stack([begin for begin, _ in sides]), jnp.stack([end for _, end in sides])
+
+    return _Sides(ends(first), ends(second), jnp.stack([jnp.asarray(x) for x in swapped]))
+
+
+def _facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Sides () of two polygons that face each other: the line of one keeps them apart most.
+
+    The other polygon's nearest corner to this line is an end of its side that is most opposite.
+    """
+    n_a, n_b = (_outward(jnp.roll(x, -1, axis=0) - x) for x in (a, b))
+    beyond_a = jnp.min(jnp.sum((b[:, None] - a[None]) * n_a[None], axis=2), axis=0)
+    beyond_b = jnp.min(jnp.sum((a[:, None] - b[None]) * n_b[None], axis=2), axis=0)
+    side_a, side_b = jnp.argmax(beyond_a), jnp.argmax(beyond_b)
+    opposite = n_a @ n_b.T
+    by_b = jnp.max(beyond_b) > jnp.max(beyond_a) + _PARALLEL
+    side_a = jnp.where(by_b, jnp.argmin(opposite[:, side_b]), side_a)
+    return side_a, jnp.where(by_b, side_b, jnp.argmin(opposite[side_a]))
+
+
+def _facing_sides(sides: _Sides) -> PlanarContacts:
     """Two contacts a pair, at the begin and at the end of the first body's side."""
-
-    def ends(which: int) -> tuple[jax.Array, jax.Array]:
-        """Begins and ends (g, 2) of the sides of the first or second bodies."""
-        sides = [_side(places, pair[which]) for pair in pairs]
-        return jnp.stack([x for x, _ in sides]), jnp.stack([x for _, x in sides])
-
-    (a_begin, a_end), (b_begin, b_end) = ends(0), ends(1)
+    (a_begin, a_end), (b_begin, b_end) = sides.first, sides.second
     n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)
 
     def at_end(
@@ -319,13 +361,20 @@ def _facing_sides(places: _Places, pairs: tuple[tuple[Side, Side], ...]) -> Plan
 
     both = (at_end(a_begin, a_end, b_end, b_begin), at_end(a_end, a_begin, b_begin, b_end))
     gap, point, n = (jnp.stack(parts, axis=1) for parts in zip(*both))
+    swapped = sides.swapped[:, None]
+    gap = jnp.where(swapped, gap[:, ::-1], gap)
+    point, n = (jnp.where(swapped[..., None], x[:, ::-1], x) for x in (point, n))
     return PlanarContacts(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
 
 
 def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
     """Its begin and its end (2,)."""
-    corners, begin = places.polygons[side[0]], side[1]
-    return corners[begin], corners[(begin + 1) % corners.shape[0]]
+    return _side_of(places.polygons[side[0]], side[1])
+
+
+def _side_of(corners: jax.Array, side: Any) -> tuple[jax.Array, jax.Array]:
+    """Begin and end (2,) of a side of a polygon with these corners (k, 2)."""
+    return corners[side], corners[(side + 1) % corners.shape[0]]
 
 
 def _overlap(places: _Places, first: Side, second: Side) -> jax.Array:
@@ -367,6 +416,7 @@ def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at:
     discs: list[tuple[int, int]] = []
     rolling: dict[int, list[int]] = {}
     sides: list[tuple[Side, Side]] = []
+    polygons: list[tuple[int, int]] = []
     for pair in pairs:
         i, j = (_body_of(x, bodies) for x in pair)
         if i == j:
@@ -377,10 +427,23 @@ def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at:
             rolling.setdefault(j, []).append(i)
         elif isinstance(bodies[j], Disc):
             rolling.setdefault(i, []).append(j)
+        elif at is None and not all(np.ndim(x) for x in pair):
+            for which in (i, j):
+                _check_even(which, _polygon(bodies, which))
+            polygons.append((i, j))
         else:
             sides.append(_sides_of(pair, i, j, bodies, at))
     grouped = tuple((polygon, tuple(some)) for polygon, some in rolling.items())
-    return _Pairs(tuple(discs), grouped, tuple(sides))
+    return _Pairs(tuple(discs), grouped, tuple(sides), tuple(polygons))
+
+
+def _check_even(which: int, body: Cornered) -> None:
+    """Raise for a polygon whose contacts would change places where its last side follows."""
+    if len(body.ring) % 2:
+        raise ValueError(
+            f"Argument `at` must be given, or sides in `pairs`, for polygon {which}, which has "
+            f"{len(body.ring)} sides: only an even number of sides is chosen anew as it moves."
+        )
 
 
 def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:
@@ -418,10 +481,10 @@ def _sides_of(
                     f"{side!r}."
                 )
         return (i, int(pair[0][1])), (j, int(pair[1][1]))
-    if at is None or is_traced((at, bodies)):
+    if is_traced((at, bodies)):
         raise ValueError(
-            f"Argument `at` must be given, a configuration that is not traced, for the polygons "
-            f"{i} and {j}: or give their sides."
+            f"Argument `at` must not be traced for the polygons {i} and {j}: leave it out, or give "
+            "their sides."
         )
     q = as_float_array("at", at)
     check_shape("at", q, (3 * len(bodies),), "x, y, theta of each body")

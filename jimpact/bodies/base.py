@@ -45,13 +45,23 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
     return tuple(f"{word}{i + 1} [{unit}]" for i in range(count) for word, unit in parts)
 
 
+# Contacts of a pile that are computed at once; rows without contacts are left out in such blocks.
+# Ten times more: few contacts among many bodies take as long as all of them.
+BLOCK = 128
+
+
 class ActivePairs(NamedTuple):
-    """The closed contacts of many planar bodies, K rows; rows that are not used are 0."""
+    """The closed contacts of many bodies in the first of K rows, a multiple of `BLOCK`.
+
+    Rows that are not used are 0.
+    """
 
     number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
     closed: jax.Array  # (K,) whether the row is used
     bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
-    directions: jax.Array  # (K, 2, 2, 3): normal and tangent, of both bodies, in x, y, turn
+    # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
+    # and turn in a plane, x, y, z and three turns in space
+    directions: jax.Array
     overflows: jax.Array  # () whether more are closed than there are rows
     reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
 
@@ -162,7 +172,7 @@ class Body(eqx.Module):
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` [m] at q or `later`, for time stepping.
 
-        Of planar bodies, three velocities each, with a diagonal mass matrix.
+        Of bodies with three velocities each in a plane, six in space, and a diagonal mass matrix.
         """
         raise NotImplementedError(f"{type(self).__name__} has no `pair_count`, no `active_pairs`.")
 

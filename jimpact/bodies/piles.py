@@ -1,5 +1,6 @@
-"""Piles: many discs between walls, each contact between two of them or with a wall."""
+"""Piles: many discs or spheres between walls, each contact between two of them or with a wall."""
 
+import abc
 from typing import Any
 
 import equinox as eqx
@@ -7,32 +8,233 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, as_whole, check_values
+from jimpact._checks import as_float_array, as_whole, check_values, is_traced
 from jimpact.bodies.base import (
+    BLOCK,
+    CIRCLE,
     PLANAR,
     ActivePairs,
     Body,
     LinearPotential,
     numbered,
-    planar_directions,
-    planar_weight,
     positives,
     wheel,
 )
+from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
 
-# Contacts per disc that may be closed by default: equal discs have 3, and walls. Ten times more
-# takes ten times the time.
-ROOM = 4
+# Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
+# 6, and walls. Ten times more takes ten times the memory.
+ROOM = {2: 4, 3: 7}
 
 
-class Discs(Body):
+class _Pile(Body):
+    """Round bodies between flat walls: d places and the turns of each, d = 2 or 3.
+
+    A kind of pile gives `dimension`, `inertia_factor` and `tangents_of`.
+    """
+
+    masses: jax.Array
+    radii: jax.Array
+    walls: jax.Array
+    room: int = eqx.field(static=True)
+    crowd: int = eqx.field(static=True)  # see `near_pairs`; 0: every pair is looked at
+
+    dimension = 0  # d
+    inertia_factor = 0.0  # moment of inertia over m R^2
+
+    def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
+        d = self.dimension
+        self.radii = positives("radii", radii)
+        if not len(self.radii):
+            raise ValueError("Argument `radii` must hold one or more, but is empty.")
+        self.masses = positives("masses", masses, self.radii.shape[0])
+        empty = len(walls) == 0
+        rows = as_float_array("walls", np.reshape(walls, (-1, d + 1)) if empty else walls)
+        if rows.ndim != 2 or rows.shape[1] != d + 1:
+            raise ValueError(
+                f"Argument `walls` must have shape (w, {d + 1}), but has {rows.shape}."
+            )
+        check_values("walls", rows)
+        length = jnp.sqrt(jnp.sum(rows[:, :d] ** 2, axis=1))
+        check_values("walls", length, low=0.0, open_low=True)
+        scale = jnp.stack([length] * d + [jnp.ones_like(length)], axis=1)
+        self.walls = (rows / scale).astype(self.radii.dtype)
+        self.room = ROOM[d] * len(self.radii) if room is None else as_whole("room", room, 1)
+        self.crowd = self._crowd()
+
+    def _crowd(self) -> int:
+        """How many bodies a row of cells may hold; 0 where looking at every pair is less work."""
+        if is_traced(self.radii):
+            return 0
+        radii = np.asarray(self.radii)
+        crowd = crowd_of(float(radii.min()), float(radii.max()), self.dimension)
+        rows = (3 ** (self.dimension - 1) + 1) // 2
+        return crowd if 2 * rows * crowd < self.count else 0
+
+    @property
+    def count(self) -> int:
+        """Number of bodies."""
+        return self.radii.shape[0]
+
+    @property
+    def mass(self) -> jax.Array:
+        """M, its diagonal (n,)."""
+        turning = self.inertia_factor * self.masses * self.radii**2
+        d = self.dimension
+        return jnp.stack([self.masses] * d + [turning] * _turns(d), axis=1).reshape(-1)
+
+    def at(self, centres: Any) -> jax.Array:
+        """q (n,) with the bodies, not turned, at these centres (k, d) [m]."""
+        places = as_float_array("centres", centres)
+        if places.shape != (self.count, self.dimension):
+            raise ValueError(
+                f"Argument `centres` must have shape ({self.count}, {self.dimension}), but has "
+                f"{places.shape}."
+            )
+        return jnp.pad(places, ((0, 0), (0, _turns(self.dimension)))).reshape(-1)
+
+    def gravity(self, acceleration: Any) -> LinearPotential:
+        """`V = g sum m_i h_i`, h the last place: y in a plane, z in space."""
+        return LinearPotential(self.mass * self.base_directions[:, -1] * acceleration)
+
+    @property
+    def base_directions(self) -> jax.Array:
+        """The walls move along each axis (n, d)."""
+        d, dtype = self.dimension, self.radii.dtype
+        return jnp.tile(jnp.eye(d + _turns(d), d, dtype=dtype), (self.count, 1))
+
+    def _of_bodies(self, q: jax.Array) -> jax.Array:
+        """Coordinates or velocities (k, d + turns) of each body."""
+        return q.reshape(self.count, -1)
+
+    # ---- all contacts
+
+    def gap_function(self, q: jax.Array) -> jax.Array:
+        """Gaps of all pairs, then of each body with every wall."""
+        first, second = np.triu_indices(self.count, 1)
+        to_walls = self._wall_gaps(q).reshape(-1)
+        return jnp.concatenate([self._pair_gaps(q, first, second), to_walls])
+
+    def _pair_gaps(self, q: jax.Array, first: Any, second: Any) -> jax.Array:
+        """Gaps of these pairs (C,)."""
+        centres = self._of_bodies(q)[:, : self.dimension]
+        squares = jnp.sum((centres[first] - centres[second]) ** 2, axis=1)
+        return jnp.sqrt(squares) - self.radii[first] - self.radii[second]
+
+    def _wall_gaps(self, q: jax.Array) -> jax.Array:
+        """Gaps (k, w) of each body with every wall."""
+        d = self.dimension
+        centres = self._of_bodies(q)[:, :d]
+        return centres @ self.walls[:, :d].T - self.walls[None, :, d] - self.radii[:, None]
+
+    # ---- closed contacts only
+
+    @property
+    def pair_count(self) -> int:
+        """Every pair (i, j), in both orders, and every body with every wall."""
+        return self.count * (self.count + len(self.walls))
+
+    def _candidates(self, q: jax.Array, below: jax.Array) -> Candidates:
+        """Pairs of bodies, all those with gaps up to `below` among them."""
+        if self.crowd == 0:
+            return all_pairs(self.count)
+        distance = 2 * jnp.max(self.radii) + below
+        return near_pairs(self._of_bodies(q)[:, : self.dimension], distance, self.crowd)
+
+    def _closed(
+        self, q: jax.Array, later: jax.Array, below: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Bodies i and j of contacts (C,), which of them are closed, and whether some are missing.
+
+        A contact is closed whose gap is at most `below` at q or `later`; j counts walls after the
+        bodies.
+        """
+        now = self._candidates(q, below)
+        closed_now = now.used & (self._pair_gaps(q, now.first, now.second) <= below)
+        pairs, overflows = [(now.first, now.second)], now.overflows
+        if self.crowd == 0:
+            soon = self._pair_gaps(later, now.first, now.second) <= below
+            closed = [closed_now | soon]
+        else:
+            then = self._candidates(later, below)
+            first, second = then.first, then.second
+            soon = then.used & (self._pair_gaps(later, first, second) <= below)
+            closed = [closed_now, soon & (self._pair_gaps(q, first, second) > below)]
+            pairs.append((first, second))
+            overflows |= then.overflows
+        walls = len(self.walls)
+        body, wall = np.divmod(np.arange(self.count * walls, dtype=np.int32), max(walls, 1))
+        pairs.append((jnp.asarray(body), jnp.asarray(self.count + wall)))
+        to_walls = jnp.minimum(self._wall_gaps(q), self._wall_gaps(later)).reshape(-1)
+        i, j = (jnp.concatenate(each) for each in zip(*pairs))
+        return i, j, jnp.concatenate([*closed, to_walls <= below]), overflows
+
+    def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
+        """The contacts, at q, with gaps up to `below` at q or `later`."""
+        i, j, closed, overflows = self._closed(q, later, below)
+        rows = -(-self.room // BLOCK) * BLOCK
+        chosen = jnp.nonzero(closed, size=rows, fill_value=closed.size)[0]
+        used = chosen < closed.size
+        row = jnp.minimum(chosen, closed.size - 1)
+        i, j = jnp.where(used, i[row], 0), jnp.where(used, j[row], 0)
+        wall = j >= self.count
+        other = jnp.minimum(j, self.count - 1)
+        normal = self._normals(q, i, other, j - self.count)
+        arms = self.radii[i], jnp.where(wall, 0.0, self.radii[other])
+        directions = self._directions(normal, *arms)
+        return ActivePairs(
+            jnp.where(used, i * (self.count + len(self.walls)) + j, self.pair_count),
+            used,
+            jnp.stack([i, jnp.where(wall, self.count, other)], axis=1),
+            jnp.where(used[:, None, None, None], directions, 0.0),
+            overflows | (jnp.sum(closed) > self.room),
+            jnp.min(self.radii),
+        )
+
+    def _normals(self, q: jax.Array, i: Any, other: Any, wall: Any) -> jax.Array:
+        """Unit normals (K, d) towards body i, of a wall where its number is not negative."""
+        at, d = self._of_bodies(q)[:, : self.dimension], self.dimension
+        way = at[i] - at[other]
+        length = jnp.sqrt(jnp.sum(way**2, axis=1, keepdims=True))
+        normal = way / jnp.where(length > 0, length, 1.0)
+        if len(self.walls) == 0:
+            return normal
+        of_wall = self.walls[jnp.maximum(wall, 0), :d]
+        return jnp.where((wall >= 0)[:, None], of_wall, normal)
+
+    def _directions(self, normal: jax.Array, first: jax.Array, second: jax.Array) -> jax.Array:
+        """Normal and tangents (K, d, 2, d + turns) of both bodies with these arms (K,) [m].
+
+        Equation: along a direction t the bodies slide at
+        `(v_i - v_j) . t - (R_i omega_i + R_j omega_j) . (n x t)`; of the normal that is 0.
+        """
+        ways, turns = self.tangents_of(normal)
+        along = jnp.concatenate([normal[:, None], ways], axis=1)
+        around = jnp.pad(turns, ((0, 0), (1, 0), (0, 0)))
+        both = [
+            jnp.concatenate([sign * along, -arm[:, None, None] * around], axis=2)
+            for sign, arm in ((1.0, first), (-1.0, second))
+        ]
+        return jnp.stack(both, axis=2)
+
+    @abc.abstractmethod
+    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Tangents t (K, d - 1, d) of normals n (K, d), and `n x t` (K, d - 1, turns)."""
+
+
+def _turns(d: int) -> int:
+    """Number of turns of a body in a plane (1) or in space (3)."""
+    return d * (d - 1) // 2
+
+
+class Discs(_Pile):
     """Discs in a plane between straight walls; q = (x, y, turn) of each in turn.
 
     Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
     `(v_i - v_j) . t - R_i omega_i - R_j omega_j`, t = n turned by a quarter counter-clockwise.
     Inertia `m R^2 / 2`. As a `Scene` it has a contact for every pair, those of disc 1 first, and
     for each disc and wall, disc by disc. Motions of many discs are those of
-    `simulate(method="time_stepping")`, which looks at closed contacts only.
+    `simulate(method="time_stepping")`, which finds closed contacts by a grid and takes no others.
 
     Args:
         masses: > 0, scalar or (k,) [kg].
@@ -46,64 +248,13 @@ class Discs(Body):
     [0.3, 0.0, 0.0]
     """
 
-    masses: jax.Array
-    radii: jax.Array
-    walls: jax.Array
-    room: int = eqx.field(static=True)
-
-    def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
-        self.radii = positives("radii", radii)
-        self.masses = positives("masses", masses, self.radii.shape[0])
-        rows = as_float_array("walls", np.reshape(walls, (-1, 3)) if len(walls) == 0 else walls)
-        if rows.ndim != 2 or rows.shape[1] != 3:
-            raise ValueError(f"Argument `walls` must have shape (w, 3), but has {rows.shape}.")
-        check_values("walls", rows)
-        length = jnp.sqrt(jnp.sum(rows[:, :2] ** 2, axis=1))
-        check_values("walls", length, low=0.0, open_low=True)
-        scale = jnp.stack([length, length, jnp.ones_like(length)], axis=1)
-        self.walls = (rows / scale).astype(self.radii.dtype)
-        self.room = ROOM * len(self.radii) if room is None else as_whole("room", room, 1)
-
-    @property
-    def count(self) -> int:
-        """Number of discs."""
-        return self.radii.shape[0]
-
-    @property
-    def mass(self) -> jax.Array:
-        """M, its diagonal (n,)."""
-        turning = 0.5 * self.masses * self.radii**2
-        return jnp.stack([self.masses, self.masses, turning], axis=1).reshape(-1)
-
-    def at(self, centres: Any) -> jax.Array:
-        """q (n,) with the discs, not turned, at these centres (k, 2) [m]."""
-        places = as_float_array("centres", centres)
-        if places.shape != (self.count, 2):
-            raise ValueError(
-                f"Argument `centres` must have shape ({self.count}, 2), but has {places.shape}."
-            )
-        return jnp.pad(places, ((0, 0), (0, 1))).reshape(-1)
-
-    def gravity(self, acceleration: Any) -> LinearPotential:
-        """`V = g sum m_i y_i`."""
-        return planar_weight(self.mass, acceleration)
-
-    @property
-    def base_directions(self) -> jax.Array:
-        """The walls move in x and y (n, 2)."""
-        return planar_directions(self.mass)
-
-    # ---- all contacts
-
-    def gap_function(self, q: jax.Array) -> jax.Array:
-        """Gaps of all pairs, then of each disc with every wall."""
-        first, second, gaps = *self._pairs(), self._all_gaps(q)
-        return jnp.concatenate([gaps[first, second], gaps[:, self.count :].reshape(-1)])
+    dimension = 2
+    inertia_factor = 0.5
 
     def tangent_function(self, q: jax.Array) -> jax.Array:
         """Ways that the discs slide on each other and along the walls."""
         at = q.reshape(-1, 3)
-        first, second = self._pairs()
+        first, second = np.triu_indices(self.count, 1)
         way = at[first, :2] - at[second, :2]
         rolled = self.radii * at[:, 2]
         both = self.radii[first] + self.radii[second]
@@ -111,57 +262,10 @@ class Discs(Body):
         slid = at[:, :2] @ jnp.stack([-self.walls[:, 1], self.walls[:, 0]]) - rolled[:, None]
         return jnp.concatenate([around, slid.reshape(-1)])
 
-    def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
-        """First and second disc of every pair."""
-        return np.triu_indices(self.count, 1)
-
-    def _all_gaps(self, q: jax.Array) -> jax.Array:
-        """(k, k + w), of which pairs count once, above the diagonal; elsewhere inf."""
-        centres = q.reshape(-1, 3)[:, :2]
-        once = np.triu(np.ones((self.count, self.count), bool), 1)
-        squares = jnp.sum((centres[:, None] - centres[None]) ** 2, axis=2)
-        apart = jnp.sqrt(jnp.where(once, squares, 1.0)) - self.radii[:, None] - self.radii[None]
-        to_walls = centres @ self.walls[:, :2].T - self.walls[None, :, 2] - self.radii[:, None]
-        return jnp.concatenate([jnp.where(once, apart, jnp.inf), to_walls], axis=1)
-
-    # ---- closed contacts only
-
-    @property
-    def pair_count(self) -> int:
-        """Every pair (i, j), in both orders, and every disc with every wall."""
-        return self.count * (self.count + len(self.walls))
-
-    def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
-        """The contacts, at q, with gaps up to `below` at q or `later`."""
-        gaps = jnp.minimum(self._all_gaps(q), self._all_gaps(later))
-        none, columns = gaps.size, gaps.shape[1]
-        closed = gaps.reshape(-1) <= below
-        number = jnp.nonzero(closed, size=self.room, fill_value=none)[0]
-        used = number < none
-        i, j = jnp.where(used, number, 0) // columns, jnp.where(used, number, 0) % columns
-        wall = j >= self.count
-        at, radius = q.reshape(-1, 3), self.radii
-        other = jnp.minimum(j, self.count - 1)
-        way = at[i, :2] - at[other, :2]
-        length = jnp.sqrt(jnp.sum(way**2, axis=1, keepdims=True))
-        normal = way / jnp.where(length > 0, length, 1.0)
-        if len(self.walls):
-            row = self.walls[jnp.maximum(j - self.count, 0)]
-            normal = jnp.where(wall[:, None], row[:, :2], normal)
-        zero = jnp.zeros_like(normal[:, 0])
+    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The normal turned by a quarter, and 1."""
         x, y = normal.T
-        arms = -radius[i], -jnp.where(wall, 0.0, radius[other])
-        first = jnp.stack([jnp.stack([x, y, zero], 1), jnp.stack([-y, x, arms[0]], 1)], axis=1)
-        second = jnp.stack([jnp.stack([-x, -y, zero], 1), jnp.stack([y, -x, arms[1]], 1)], axis=1)
-        directions = jnp.stack([first, second], axis=2)
-        return ActivePairs(
-            number,
-            used,
-            jnp.stack([i, jnp.where(wall, self.count, other)], axis=1),
-            jnp.where(used[:, None, None, None], directions, 0.0),
-            jnp.sum(closed) > self.room,
-            jnp.min(radius),
-        )
+        return jnp.stack([-y, x], axis=1)[:, None], jnp.ones_like(x)[:, None, None]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -176,3 +280,80 @@ class Discs(Body):
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles, each with the radius that shows how far it has turned."""
         return [wheel(r, at) for r, at in zip(self.radii, q.reshape(-1, 3))]
+
+
+class Spheres(_Pile):
+    """Spheres in space between flat walls; q = (x, y, z) and three turns of each.
+
+    Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
+    `v_i - v_j - (R_i omega_i + R_j omega_j) x n` along two tangents. Inertia `2 m R^2 / 5`. A
+    sphere looks the same from all sides, so no orientation is kept: turns are the integrals of the
+    angular velocity omega (in the axes of space). As a `Scene` it has a contact for every pair,
+    those of sphere 1 first, and for each sphere and wall; `simulate(method="time_stepping")` finds
+    closed contacts by a grid and takes no others.
+
+    Args:
+        masses: > 0, scalar or (k,) [kg].
+        radii: > 0 (k,) [m].
+        walls: rows (n_x, n_y, n_z, d): the half space `n . x >= d` is free; n is made a unit
+            vector.
+        room: largest number of closed contacts at once in time stepping; None: 7 per sphere.
+
+    Source: Ericson, Real-Time Collision Detection (2005), ch. 7.1 (the grid).
+
+    >>> import jimpact as ji
+    >>> spheres = ji.Spheres(1.0, [0.1, 0.1], walls=[[0.0, 0.0, 1.0, 0.0]])
+    >>> q = spheres.at([[0.0, 0.0, 0.1], [0.0, 0.3, 0.5]])
+    >>> [round(float(f), 6) for f in spheres.gap_function(q)]
+    [0.3, 0.0, 0.4]
+    """
+
+    dimension = 3
+    inertia_factor = 0.4
+
+    def tangents(self, q: jax.Array) -> jax.Array:
+        """H_t (n, 2 m): two directions of sliding for each contact of the scene."""
+        k, walls = self.count, len(self.walls)
+        first, second = np.triu_indices(k, 1)
+        body, wall = np.divmod(np.arange(k * walls), max(walls, 1))
+        i, j = np.concatenate([first, body]), np.concatenate([second, k + wall])
+        other = np.minimum(j, k - 1)
+        arm = jnp.where(j < k, self.radii[other], 0.0)
+        normal = self._normals(q, i, other, jnp.asarray(j - k))
+        directions = self._directions(normal, self.radii[i], arm)[:, 1:]  # (m, 2, 2, 6)
+        row = np.arange(i.size)
+        all_bodies = jnp.zeros((i.size, 2, k, 6), q.dtype).at[row, :, i].add(directions[:, :, 0])
+        all_bodies = all_bodies.at[row, :, other].add(
+            jnp.where((j < k)[:, None, None], directions[:, :, 1], 0.0)
+        )
+        return all_bodies.reshape(2 * i.size, 6 * k).T
+
+    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Two unit vectors at right angles to each normal, and to each other.
+
+        Source: Duff et al., Building an orthonormal basis, revisited, JCGT 6 (2017).
+        """
+        x, y, z = normal.T
+        sign = jnp.where(z >= 0, 1.0, -1.0)
+        a = -1 / (sign + z)
+        b = x * y * a
+        t1 = jnp.stack([1 + sign * x**2 * a, sign * b, -sign * x], axis=1)
+        t2 = jnp.stack([b, sign + y**2 * a, -y], axis=1)
+        return jnp.stack([t1, t2], axis=1), jnp.stack([t2, -t1], axis=1)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Place and turns of each sphere."""
+        places = ("x [m]", "y [m]", "z [m]")
+        return numbered((*places, "turn x [rad]", "turn y [rad]", "turn z [rad]"), self.count)
+
+    @property
+    def floors(self) -> list[tuple[float, float]]:
+        """The walls that are seen edge-on from the side, along y."""
+        return [
+            (float(np.arctan2(-x, z)), float(d)) for x, y, z, d in np.asarray(self.walls) if y == 0
+        ]
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Circles, seen from the side, along y."""
+        return [r * CIRCLE + at[[0, 2]] for r, at in zip(self.radii, q.reshape(-1, 6))]

@@ -220,7 +220,8 @@ def _fit_and_yardsticks(study: Study, chosen: dict[str, Any], steps: Steps) -> d
         friction = getattr(study.law, "friction", None)
         shared = [name for name in ("restitution", "friction") if name in study.free]
         free: dict[str, Any] = dict.fromkeys(shared or ["restitution"], True)
-        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), free=free, bounds={}))
+        alone: dict[str, Any] = {"free": free, "bounds": {}, "priors": {}}
+        run(YARDSTICK, replace(study, law=ji.Newton(0.5, friction), **alone))
     if all_free is not None:
         run(ALL_FREE, all_free)
     return fits
@@ -492,7 +493,12 @@ def simulate(command: options.SimulateCommand, steps: Steps) -> CommandResult:
         more[command.portrait] = ji.plot.phase_portrait(motion, which, title, system=system)
     if command.gif is not None:
         more[command.gif] = partial(
-            ji.plot.animation, system, motion, title=title, progress=steps.patience
+            ji.plot.animation,
+            system,
+            motion,
+            title=title,
+            progress=steps.patience,
+            speed=command.speed,
         )
     heads = ["time [s]", *system.body.names, *system.body.velocity_names]
     table = heads, np.column_stack([motion.time, motion.q, motion.velocity]).tolist()

@@ -289,7 +289,9 @@ class SimulateCommand(DrawingCommand):
     samples: Count = None
     """Instants in the record; default: the study's, or 201."""
     gif: File = None
-    """Animation (.gif), one frame a sample."""
+    """Animation (.gif) in real time, short motions slower."""
+    speed: Annotated[float | None, _option("S", float)] = None
+    """Seconds of the motion in a second of the animation."""
     portrait: File = None
     """Phase portrait (.png, .pdf, .svg)."""
     coordinate: Count = None
@@ -302,6 +304,8 @@ class SimulateCommand(DrawingCommand):
             checked_file("--portrait", self.portrait, PICTURES)
         if self.gif is not None:
             checked_file("--gif", self.gif, (".gif",))
+        if self.speed is not None and not self.speed > 0:
+            raise ValueError(f"--speed must be positive, but is {self.speed:g}.")
         if self.portrait == self.picture():
             raise ValueError(
                 f"--portrait and --out must be two files, but are both '{self.portrait}'."

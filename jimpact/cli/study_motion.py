@@ -42,6 +42,7 @@ class MotionStudy:
         measured: times, positions and their errors of `[data]`, else None.
         free: names -> masks of the parameters that `fit` fits.
         bounds: names -> (low, high).
+        priors: names -> (mean, standard deviation).
         options: of `fit_motion`, by name.
     """
 
@@ -52,6 +53,7 @@ class MotionStudy:
     measured: Positions | None = None
     free: dict[str, Any] = field(default_factory=dict)
     bounds: dict[str, Any] = field(default_factory=dict)
+    priors: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
 
     def fit(self, **options: Any) -> Fit:
@@ -70,9 +72,8 @@ class MotionStudy:
         if "max_steps" in arguments:
             raise ValueError("`max_steps` in [motion] must be left out where a motion is fitted.")
         arguments |= self.options | without_none(options)
-        return fit_motion(
-            self.system, self.law, q, free=self.free, sigma=sigma, bounds=self.bounds, **arguments
-        )
+        arguments |= {"free": self.free, "bounds": self.bounds, "priors": self.priors}
+        return fit_motion(self.system, self.law, q, sigma=sigma, **arguments)
 
     def run(self, **options: Any) -> Motion:
         """`simulate` with the study's arguments, or with options that are passed and not None."""
@@ -132,6 +133,7 @@ def _build(checked: CheckedStudy) -> MotionStudy:
         measured=read_positions(checked.data_file) if "data" in tables else None,
         free=free or dict.fromkeys(default_free(law)[:1], True),
         bounds=checked.law.bounds,
+        priors=checked.law.priors,
         options=checked.fit_options,
     )
 

@@ -18,7 +18,8 @@ MODES (rows)   phase (m), how often each contact has closed (m); with friction t
 A contact is OPEN, in COMPRESSION or in EXPANSION. Without gaps the geometry is frozen: an open
 contact closes as soon as gamma < 0. With gaps (`gapped`) it keeps track of x = -gap and closes when
 that returns to 0. A `viscous` force replaces the power law; it never pulls, so that a contact
-may be SLACK: x > 0, and no force.
+may be SLACK: x > 0, and no force. With a `limit` of x the force is bounded: the contact YIELDS at
+x = limit until it expands, and what it takes up meanwhile is lost.
 """
 
 import dataclasses
@@ -33,7 +34,7 @@ from jimpact.events.stepper import Flow, any_of, total
 from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
 from jimpact.solvers.tridiagonal import tridiagonal_product
 
-OPEN, COMPRESSION, EXPANSION, SLACK = 0, 1, 2, 3
+OPEN, COMPRESSION, EXPANSION, SLACK, YIELD = 0, 1, 2, 3, 4
 
 # The first two are in tolerances of velocity. Margins closer to 0 than SNAP are 0; ten times more
 # would move events by a tenth of the tolerance. An approach or a load below NEGLIGIBLE does nothing
@@ -207,6 +208,7 @@ class ContactFlow(Flow):
     tolerance: jax.Array  # (1, B)
     taking_part: jax.Array  # (1, B) contacts that are not open for good
     viscous: Viscous | None = None
+    limit: jax.Array | None = None  # (m, B) indentation at which the force stays
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
     closed_form: bool = True  # an impact may end by the energy of contacts that work alone
@@ -291,6 +293,8 @@ class ContactFlow(Flow):
         ratio = jnp.where(s > 0, least / jnp.where(s > 0, s, 1.0), 1.0)
         moves = jnp.ones_like(phase, bool) if self.gapped else phase != OPEN
         loaded = (phase == COMPRESSION) | (phase == EXPANSION)
+        if self.limit is not None:
+            moves, loaded = moves & (phase != YIELD), loaded | (phase == YIELD)
         closing = jnp.where(moves, -ratio * self.omega, 0.0)
         stiffness = (per_row(self.exponent, self.omega) + 1) / 2 * self.omega
         return Frozen(least, ratio, closing, jnp.where(loaded, stiffness, 0.0), s)
@@ -324,6 +328,9 @@ class ContactFlow(Flow):
         phase = modes[: self.contacts]
         by_x = jnp.where(phase == EXPANSION, x, 1.0)
         by_g = jnp.where(phase == COMPRESSION, -g, g)
+        if self.limit is not None:
+            by_x = jnp.where(phase == COMPRESSION, self.limit - x, by_x)
+            by_g = jnp.where(phase == YIELD, -g, by_g)
         if not self.gapped:
             return jnp.concatenate(
                 [by_x, by_g + jnp.where(phase == OPEN, NEGLIGIBLE * self.tolerance, 0.0)]
@@ -361,6 +368,10 @@ class ContactFlow(Flow):
             idle = power(x, plus_one(self.exponent)) <= (NEGLIGIBLE * self.tolerance) ** 2
             turned = by_g & (phase == COMPRESSION)
             after = jnp.where(turned, jnp.where(idle, OPEN, EXPANSION), phase)
+            if self.limit is not None:
+                yields = by_x & (phase == COMPRESSION) & ~turned
+                after, x = jnp.where(yields, YIELD, after), jnp.where(yields, self.limit, x)
+                after = jnp.where(by_g & (phase == YIELD), EXPANSION, after)
             after = jnp.where(by_g & (phase == EXPANSION), COMPRESSION, after)
             after = jnp.where(opened, OPEN, jnp.where(closed, COMPRESSION, after))
             g = jnp.where(opened, self.restitution * g, g)
@@ -388,7 +399,7 @@ class ContactFlow(Flow):
         if not self.gapped:
             return None
         phase = modes[: self.contacts]
-        return ~any_of((phase == COMPRESSION) | (phase == EXPANSION))
+        return ~any_of((phase == COMPRESSION) | (phase == EXPANSION) | (phase == YIELD))
 
     # ---- results
 

@@ -81,6 +81,7 @@ class Problem(NamedTuple):
     step: jax.Array  # (1,) of the impulse form: the tolerance itself, whatever the stiffnesses
     viscous: Viscous | None = None
     sides: "Sides | None" = None
+    limit: jax.Array | None = None  # indentation at which the force stays
 
 
 class Sides(NamedTuple):
@@ -201,7 +202,8 @@ def flow_of(
         viscous=viscous,
         exponent_static=None if problem.exponent is not None else exponent,
         gapped=problem.gap is not None,
-        closed_form=viscous is None,
+        closed_form=viscous is None and problem.limit is None,
+        limit=problem.limit,
     )
     x = first_indentation(problem, exponent)
     if problem.sides is None:

@@ -35,9 +35,10 @@ _OF_MOTIONS = {"t": {"s": 1.0, "ms": 0.001}, **dict.fromkeys(("q", "sigma_q"), _
 # more would pass steps that visibly differ.
 UNEVEN_STEPS = 1e-3
 _HEADER = re.compile(r"(t|[a-z_]+(?=_))(?:_([1-9][0-9]*))?\s*(?:\[([^]]*)\])?")
+_COMMENT = re.compile(r"comment(_.*)?")  # a column that is not read
 _ALLOWED = (
     "`shot`, `pre_1[unit]`, `post_1[unit]`, `sigma_1[unit]`, and so on for bodies 2, 3, ... "
-    "(further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`)"
+    "(further kinds: `sigma_pre`, `resolution`, `mass`, `gap`, `q`; `comment` is not read)"
 )
 _HOW = "columns are separated by commas, numbers have a decimal point"
 _ALLOWED_OF_MOTIONS = "`t[s]`, `q_1[unit]`, `sigma_q_1[unit]`, and so on for coordinates 2, 3, ..."
@@ -110,16 +111,17 @@ def _read(
     if not rows:
         raise ValueError(f"{path}: the file is empty; its first line must name the columns.")
     where, headers = rows[0]
-    columns = [_column(where, i, header, kinds, allowed) for i, header in enumerate(headers)]
+    read = [i for i, header in enumerate(headers) if not _COMMENT.fullmatch(header)]
+    columns = [_column(where, i, headers[i], kinds, allowed) for i in read]
     if len(rows) == 1:
         raise ValueError(f"{path}: the file has no {what}s; each line below the header is one.")
     for line, row in rows[1:]:
-        if len(row) != len(columns):
+        if len(row) != len(headers):
             raise ValueError(
-                f"{line}: a {what} must have {len(columns)} values, one per column, "
+                f"{line}: a {what} must have {len(headers)} values, one per column, "
                 f"but has {len(row)} ({_HOW})."
             )
-    return where, columns, rows[1:]
+    return where, columns, [(line, [row[i] for i in read]) for line, row in rows[1:]]
 
 
 class CsvColumn(NamedTuple):

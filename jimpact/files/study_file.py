@@ -111,11 +111,12 @@ def declared_laws() -> dict[str, dict[str, Any]]:
 
 
 class LawTable(NamedTuple):
-    """The table [law] of a study: the law's name, its arguments, bounds of its parameters."""
+    """The table [law] of a study: the law's name, its arguments, what `fit` knows of them."""
 
     name: str
     arguments: dict[str, Any]
     bounds: dict[str, Any]
+    priors: dict[str, Any]
 
 
 class CheckedStudy(NamedTuple):
@@ -308,32 +309,43 @@ def check_law(
     laws = declared_laws()
     study_law = str(table["name"]).lower()
     name = (other_law or study_law).lower()
-    bounds = table.get("bounds", {})
-    arguments = {k: x for k, x in table.items() if k not in ("name", "module", "bounds")}
+    others = ("name", "module", "bounds", "priors")
+    known = {key: table.get(key, {}) for key in ("bounds", "priors")}
+    arguments = {k: x for k, x in table.items() if k not in others}
     for key in (study_law, name):
         if key not in laws:
             if "module" in table and not modules:
-                return LawTable(name, arguments, bounds), free
+                return LawTable(name, arguments, **known), free
             raise ValueError(
                 f"the law must be one of {', '.join(laws)}, but is {key!r}.{suggestion(key, laws)}"
             )
-    check_keys("[law]", table, (*laws[study_law]["arguments"], "name", "module", "bounds"))
-    check_keys("[law.bounds]", bounds, tuple(laws[study_law]["parameters"]))
+    check_keys("[law]", table, (*laws[study_law]["arguments"], *others))
+    for key, pairs in known.items():
+        fields = {_field(k): x for k, x in pairs.items()} if isinstance(pairs, dict) else pairs
+        check_keys(f"[law.{key}]", fields, tuple(laws[study_law]["parameters"]))
     declared = laws[name]
     arguments = {k: x for k, x in arguments.items() if k in declared["arguments"]}
-    bounds = {k: x for k, x in bounds.items() if k in declared["parameters"]}
+    known = {
+        key: {k: x for k, x in pairs.items() if _field(k) in declared["parameters"]}
+        for key, pairs in known.items()
+    }
     _check_ranges(arguments, declared)
     if other_law is not None:
-        free = {k: mask for k, mask in free.items() if k in declared["parameters"]}
+        free = {k: mask for k, mask in free.items() if _field(k) in declared["parameters"]}
     elif name in names()["laws"]:  # parts of a user's law may have parameters of their own
         for parameter in free:
-            if parameter not in declared["free"]:
+            if _field(parameter) not in declared["free"]:
                 raise ValueError(
                     f"`free` in [fit] must name parameters of {name}, "
                     f"{', '.join(declared['free'])}, but has {parameter!r}."
                     f"{suggestion(parameter, declared['free'])}"
                 )
-    return LawTable(name, arguments, bounds), free
+    return LawTable(name, arguments, **known), free
+
+
+def _field(name: str) -> str:
+    """The field of `restitution[2]`, or of a name without brackets."""
+    return name.partition("[")[0]
 
 
 def _check_ranges(arguments: Mapping[str, Any], declared: Mapping[str, Any]) -> None:

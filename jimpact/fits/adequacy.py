@@ -15,6 +15,7 @@ from jimpact.fits.multistart import Minimum, SearchResult
 from jimpact.fits.problem import UNUSABLE, FitProblem, Shots
 from jimpact.status import STATUS
 
+NO_SHOT = -1  # the place of a shot where a value belongs to none: a prior
 LEVEL = 0.01  # of each test: how often it flags data that the law itself made
 _LEAST = 3  # degrees of freedom of the noise too few to test against
 _RANGE = 1e-6  # singular values below this share count as 0 (derivatives are good to 1e-7)
@@ -29,7 +30,10 @@ ABSURD = 1e3
 
 
 class Weighted(NamedTuple):
-    """Residuals (R,) of the measured values in units of sigma, derivatives (R, P), shots (R,)."""
+    """Residuals (R,) of the measured values in units of sigma, derivatives (R, P), shots (R,).
+
+    Those of the priors come last, their shot is `NO_SHOT`.
+    """
 
     residual: np.ndarray
     jacobian: np.ndarray
@@ -52,10 +56,11 @@ def unusable(problem: FitProblem, solution: SearchResult) -> np.ndarray:
 def weighted(problem: FitProblem, solution: SearchResult) -> Weighted:
     """Residuals and derivatives as the tests need them."""
     here = ~np.isnan(problem.measured)
+    residual, slope = problem.prior_errors(solution.value)
     return Weighted(
-        problem.independent(problem.measured - solution.predicted)[here],
-        problem.size * solution.jacobian[here.ravel()],
-        problem.shot_of_value,
+        np.append(problem.independent(problem.measured - solution.predicted)[here], residual),
+        np.vstack([problem.size * solution.jacobian[here.ravel()], slope * solution.scale]),
+        np.append(problem.shot_of_value, np.full(len(residual), NO_SHOT)),
     )
 
 
@@ -81,7 +86,7 @@ def adequacy(problem: FitProblem, solution: SearchResult, rank: int, robust: boo
             )
     elif problem.experiments is not None:
         lines += _beyond_noise(problem, data, freedom) or _pattern(problem, data, freedom)
-    found = [Finding(line) for line in lines]
+    found = [Finding(line) for line in lines] + _contradicted_priors(problem, data)
     if problem.experiments is not None:
         found += _suspicious(problem, data, freedom, robust)
     return found
@@ -210,11 +215,37 @@ def _range(matrix: np.ndarray, size: float | None = None) -> np.ndarray:
     return u[:, singular > _RANGE * (singular[0] if size is None else size)]
 
 
+def _shots_of(data: Weighted) -> np.ndarray:
+    """The shots that have residuals."""
+    return np.unique(data.shot[data.shot != NO_SHOT])
+
+
+def _contradicted_priors(problem: FitProblem, data: Weighted) -> list[Finding]:
+    """Priors that the data, fitted without them, would not expect: each against N(0, 1)."""
+    known = _range(data.jacobian)
+    found = []
+    for row, prior in zip(np.flatnonzero(data.shot == NO_SHOT), problem.priors):
+        left = 1 - float(known[row] @ known[row])  # variance of the residual; 0: the prior decides
+        if left <= _RANGE:
+            continue
+        far = float(abs(data.residual[row]) / np.sqrt(left))
+        if chdtrc(1, far**2) < LEVEL / len(problem.priors):
+            name = problem.names[prior.parameter]
+            found.append(
+                Finding(
+                    f"The data contradict the prior {name} = {prior.mean:g} ± {prior.std:g}: what "
+                    f"they say without it is {far:.2g} standard errors off.",
+                    f"the prior of {name} contradicts the data",
+                )
+            )
+    return found
+
+
 def _suspicious(problem: FitProblem, data: Weighted, freedom: int, robust: bool) -> list[Finding]:
     """Shots that the others, fitted without them, would not expect."""
     assert problem.experiments is not None
     labels = problem.experiments.shots
-    shots = np.unique(data.shot)
+    shots = _shots_of(data)
     find = _beyond_median if robust else _beyond_others
     suspects = [
         (squares, labels[k])
@@ -245,7 +276,7 @@ def _beyond_others(problem: FitProblem, data: Weighted, freedom: int) -> _Chance
     known, reading = _range(data.jacobian), _reading_variance(problem)
     total = float(data.residual @ data.residual)
     found: _Chances = []
-    for k in np.unique(data.shot):
+    for k in _shots_of(data):
         rows = data.shot == k
         r, q, n = data.residual[rows], known[rows], int(rows.sum())
         rest = freedom - n
@@ -270,7 +301,7 @@ def _beyond_median(problem: FitProblem, data: Weighted, freedom: int) -> _Chance
     if problem.sigma is not None:
         noise = max(noise, 1.0)
     found: _Chances = []
-    for k in np.unique(data.shot):
+    for k in _shots_of(data):
         r = data.residual[data.shot == k]
         squares = float(r @ r)
         chance = 0.0 if noise == 0 else float(fdtrc(len(r), rest, squares / len(r) / noise))

@@ -82,17 +82,18 @@ def design(
     if target is not None:
         check_choice("target", target, fit.names)
     own = fit.problem.scene if scene is None else scene
-    problem = FitProblem.from_shots(fit.law, own, candidates, fit.problem.parameters.labels)
+    labels, ties = fit.problem.parameters.labels, dict(fit.problem.ties)
+    problem = FitProblem.from_shots(fit.law, own, candidates, labels, ties=ties)
+    scale = np.where(fit.problem.log, fit.value, fit.problem.scale)
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
+    from_priors = fit.problem.prior_errors(fit.value)[1] * scale / fit.noise
+    known = known + from_priors.T @ from_priors
     noise = fit.noise
     if fit.experiments.sigma is not None:  # which weigh candidates of other units as `fit` does
         natural_error = fit.experiments.natural_errors(fit.problem.scene)
         noise *= float(np.nanmedian(np.asarray(fit.problem.sigma) / natural_error))
     each = _information(problem, fit, 1.0 if candidates.sigma is not None else noise)
     known = known + _RIDGE * np.trace(known + each.sum(axis=0)) * np.eye(len(known))
-    first = fit.problem.parameters.first
-    r = fit.problem.residuals
-    scale = np.where(np.asarray(r.log)[first], fit.value, np.asarray(r.scale, float)[first])
     chosen: list[int] = []
     errors = []
     for _ in range(count):
@@ -105,8 +106,8 @@ def design(
         chosen.append(int(np.argmax(merit)))
         known = after[chosen[-1]]
         errors.append(scale * np.sqrt(np.diag(np.linalg.inv(known))))
-    labels = tuple(candidates.shots[k] for k in chosen)
-    return Design(labels, np.array(chosen), fit.names, np.array(errors))
+    shots = tuple(candidates.shots[k] for k in chosen)
+    return Design(shots, np.array(chosen), fit.names, np.array(errors))
 
 
 def _information(problem: FitProblem, fit: Fit, noise: float) -> np.ndarray:

@@ -217,6 +217,56 @@ class Experiments(eqx.Module):
             fields["scenes"] = [self.scenes[k] for k in rows]
         return self._with(**fields)
 
+    def __add__(self, other: "Experiments") -> "Experiments":
+        """These shots and others, see `join`."""
+        return Experiments.join([self, other])
+
+    @staticmethod
+    def join(many: Sequence["Experiments"]) -> "Experiments":
+        """All shots of several data sets in one; `a + b` joins two.
+
+        Args:
+            many: sets of the same bodies. All or none of them have a `sigma`, and scenes of their
+                own. v- without a `sigma_pre` count as exact where others have one. Labels that
+                several sets have get the number of their set: 2/1 is shot 1 of the second.
+
+        Raises:
+            ValueError: no sets; other numbers of bodies, units, sigma or scenes in some.
+
+        >>> import jimpact as ji
+        >>> first, second = (ji.Experiments([v, 0.0], [0.1 * v, 0.9 * v]) for v in (1.0, 2.0))
+        >>> (first + second).shots, (first + second).pre.tolist()
+        (('1/1', '2/1'), [[1.0, 0.0], [2.0, 0.0]])
+        """
+        many = list(many)
+        if not many:
+            raise ValueError("Argument `many` must hold at least one data set, but is empty.")
+        for name, same in (
+            ("as many bodies and the same units", [data.units for data in many]),
+            ("a `sigma` (or `resolution`) in all or in none", [d.sigma is None for d in many]),
+            ("scenes of their own in all or in none", [d.scenes is None for d in many]),
+        ):
+            if len(set(same)) > 1:
+                raise ValueError(f"Argument `many` must have {name}.")
+        labels = [label for data in many for label in data.shots]
+        if len(set(labels)) < len(labels):
+            labels = [f"{i}/{label}" for i, data in enumerate(many, 1) for label in data.shots]
+        first, names = many[0], ("pre", "post", "sigma", "resolution")
+        parts = {name: [getattr(data, name) for data in many] for name in names}
+        if any(data.sigma_pre is not None for data in many):
+            exact = [jnp.zeros_like(data.pre) for data in many]
+            parts["sigma_pre"] = [
+                e if d.sigma_pre is None else d.sigma_pre for d, e in zip(many, exact)
+            ]
+        fields: dict[str, Any] = {
+            name: None if any(x is None for x in each) else np.concatenate(each)
+            for name, each in parts.items()
+        }
+        if first.scenes is not None:
+            fields["scenes"] = [scene for data in many for scene in data.scenes or ()]
+        lost = [k for data in many for k in data.lost]
+        return first._with(**fields, shots=labels, lost_freedom=lost)
+
     @property
     def contacts(self) -> np.ndarray:
         """Number of contacts of every shot (K,) whose scenes are its own."""
@@ -393,11 +443,12 @@ def read_experiments(
 
     Columns: `pre_1[m/s]`, `post_1[m/s]` and so on for every body, optional `sigma_1[m/s]`, ...
     (standard errors of `post`), `sigma_pre_1[m/s]` (of `pre`), `resolution_1[m/s]` (steps of the
-    readings, see `Experiments`) and `shot` (a label). Units: m/s, cm/s, mm/s, km/h, in/s, ft/s,
-    converted to m/s; rad/s, deg/s, converted to rad/s. An empty `post` cell is a value that was
-    not measured; so is NaN, with a warning. Scenes that differ from shot to shot: `mass_1[kg]`
-    (kg, g) of every body and `gap_1[m]` (m, cm, mm, um) of every contact of a chain; `q_1[m]`,
-    `q_2[rad]`, ... (lengths, rad, deg, 1) are the configuration of a body.
+    readings, see `Experiments`) and `shot` (a label); `comment` and `comment_...` are not read.
+    Units: m/s, cm/s, mm/s, km/h, in/s, ft/s, converted to m/s; rad/s, deg/s, converted to rad/s. An
+    empty `post` cell is a value that was not measured; so is NaN, with a warning. Scenes that
+    differ from shot to shot: `mass_1[kg]` (kg, g) of every body and `gap_1[m]` (m, cm, mm, um) of
+    every contact of a chain; `q_1[m]`, `q_2[rad]`, ... (lengths, rad, deg, 1) are the configuration
+    of a body.
 
     Args:
         path: of the file.

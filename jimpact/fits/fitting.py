@@ -15,13 +15,14 @@ from jimpact.fits.intervals import Profile
 from jimpact.fits.least_squares import Method, check_method, default_steps
 from jimpact.fits.multistart import Minimum, SearchResult, ends, search, settled
 from jimpact.fits.page import write_page
-from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw, with_entries
-from jimpact.fits.prediction import Predicted, jacobian_of, predicted
+from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
+from jimpact.fits.prediction import Predicted, jacobian_of, predicted, tied_values
 from jimpact.fits.problem import FitProblem
 from jimpact.fits.profiles import needs_profiles, profile, quick_profiles
 from jimpact.fits.report import report, verdict
 from jimpact.fits.result import FitMinimum, FitResult
 from jimpact.fits.robust import LOSSES, RobustSolution, robust_solution
+from jimpact.fits.saved import read_fit, write_fit
 from jimpact.fits.tables import as_dict, dataset, parameters_frame
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.fits.verdicts import fit_warnings
@@ -49,24 +50,48 @@ class Fit(FitResult[AnyLaw]):
         """
         return verdict(self)
 
-    def predict(self, shots: Any, scene: Scene | None = None) -> Predicted:
+    @property
+    def tied(self) -> dict[str, tuple[float, float]]:
+        """What is tied to parameters, by name: values with their standard errors."""
+        return tied_values(self)
+
+    def predict(self, shots: Any, scene: Scene | None = None, level: float = 0.95) -> Predicted:
         """Velocities after further shots, with the errors that the parameters leave in them.
 
-        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; the error of
-        a measurement, `noise`, comes on top of it (in squares).
+        Equation: `sqrt(J C J^T)`, J derivatives in the parameters, C their covariance; a
+        measurement, with its own standard error s, lies within `q sqrt(J C J^T + s^2)`, q the
+        quantile as in `intervals`.
 
         Args:
             shots: v- (K, n) [m/s], or `Experiments`, of which v- and scenes count.
             scene: of all shots; None: that of the fit, or those of the shots.
+            level: of the band.
 
         Returns:
             `velocity` (K, n) [m/s], `standard_error` (K, n): inf where it depends on what the data
-            do not determine, NaN where the errors are unknown; `status` (K,).
+            do not determine, NaN where the errors are unknown; `status` (K,); `noise` (K, n) of a
+            measurement: the `sigma` of the shots if they have one, else as in the fit; `low` and
+            `high` (K, n), the band of a measurement.
 
         Raises:
-            ValueError: a fit of something else than shots; velocities that do not fit the scene.
+            ValueError: a fit of something else than shots; velocities that do not fit the scene, a
+                scene that does not fit the law; a level outside (0, 1).
         """
-        return predicted(self, shots, scene)
+        return predicted(self, shots, scene, level)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the fit to a file (JSON) that `ji.load_fit` reads: problem, result, versions.
+
+        Args:
+            path: the file; an existing file is replaced.
+
+        Returns:
+            The path.
+
+        Raises:
+            ValueError: a fit of something else than shots, or with ties: functions cannot be saved.
+        """
+        return write_fit(self, Path(path))
 
     def report(self, path: str | Path, profiles: bool = True) -> Path:
         """Write one self-contained page (HTML): everything of `print(fit)`, and the pictures.
@@ -96,6 +121,34 @@ class Fit(FitResult[AnyLaw]):
         return report(self)
 
 
+def load_fit(path: str | Path) -> Fit[Any]:
+    """The fit that `Fit.save` has written, with all that one can do with a fit.
+
+    The classes of laws and scenes are imported by name, so read only files that you trust.
+
+    Args:
+        path: the file.
+
+    Returns:
+        `Fit`.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: no saved fit, one of another format, a law that cannot be imported.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import jimpact as ji
+    >>> data = ji.Experiments([[1.0, 0.0], [2.0, 0.0]], [[0.3, 0.7], [0.6, 1.4]], sigma=0.02)
+    >>> result = ji.fit(ji.Newton(0.9), ji.chain([1.0, 1.0]), data)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     again = ji.load_fit(result.save(Path(folder) / "fit.json"))
+    >>> again.verdict == result.verdict
+    True
+    """
+    return Fit(**read_fit(Path(path)))
+
+
 def fit(
     law: AnyLaw | FitProblem,
     scene: Scene | None = None,
@@ -103,6 +156,8 @@ def fit(
     free: Any = DEFAULT_FREE,
     *,
     bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    ties: Mapping[str, Any] | None = None,
     method: Method = "levenberg-marquardt",
     loss: str = "squares",
     starts: int = 8,
@@ -113,7 +168,8 @@ def fit(
 ) -> Fit[AnyLaw]:
     """Fit parameters of a law to measured velocities by weighted least squares.
 
-    Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured values.
+    Equation: minimize `sum ((v+(law) - v+ measured) / sigma)^2` over the measured values, and, with
+    priors, `+ sum ((x - mean) / std)^2`.
 
     Args:
         law: the law to fit; its parameters are the start values. All contacts share one value of
@@ -122,7 +178,7 @@ def fit(
             stiffness is fixed by default, and naming it in `free` is an error.
             The (m, m) matrix of a `RestitutionMatrix` stays admissible in all its scenes for every
             approach velocity, at every evaluation and with every method; the start must be so.
-            Or a `FitProblem`, which holds the next three arguments and `bounds`.
+            Or a `FitProblem`, which holds the next three arguments, `bounds`, `priors`, `ties`.
         scene: the scene of all shots; ignored if each shot has its own scene.
         experiments: measured shots.
         free: names of fields or entries ('restitution[2]'), or {field: True, or a boolean mask over
@@ -130,6 +186,13 @@ def fit(
             fixed.
         bounds: {field or entry: (low, high)}; default [0, 1] for restitution, > 0 for
             stiffness, ...
+        priors: {parameter or field: (mean, standard deviation), or `ji.Normal`}: what is known of a
+            parameter besides the data; each counts as one more measured value. The data need a
+            `sigma` (or `resolution`), which priors weigh against.
+        ties: {field or entry: function}: what is not fitted but follows from other values, as in
+            {"stiffness[2]": lambda p: 2 * p["restitution"]}; `p` has all fields and entries of the
+            law by name. `Fit.tied` has the values with their errors. Functions must be
+            differentiable by JAX; each compiles a program of its own.
         method: 'levenberg-marquardt'; or gradient descent: 'adam', 'sgd', 'lbfgs' or an optax
             transformation.
         loss: 'squares'; or one that outliers move little: 'huber' (beyond 1.345 sigma the absolute
@@ -155,8 +218,9 @@ def fit(
     data.
 
     Raises:
-        ValueError: unknown field, no free parameter, masks or bounds that do not fit, bodies of
-            scene and experiments that differ in number, derivatives that are not finite.
+        ValueError: unknown field, no free parameter, masks or bounds that do not fit, priors
+            outside bounds or without sigma, ties in a circle or outside a domain, bodies of scene
+            and experiments that differ in number, derivatives that are not finite.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -170,14 +234,14 @@ def fit(
         as_whole(name, count, least)
     check_choice("loss", loss, ("squares", *LOSSES))
     if isinstance(law, FitProblem):
-        if not (scene is experiments is bounds is None and free is DEFAULT_FREE):
+        if not (scene is experiments is bounds is priors is ties is None and free is DEFAULT_FREE):
             raise ValueError(
-                "Arguments `scene`, `experiments`, `free` and `bounds` must be left out where a "
-                "FitProblem is given, which holds its own."
+                "Arguments `scene`, `experiments`, `free`, `bounds`, `priors` and `ties` must be "
+                "left out where a FitProblem is given, which holds its own."
             )
         problem = law
     else:
-        problem = FitProblem.from_shots(law, scene, experiments, free, bounds)  # type: ignore[arg-type]
+        problem = FitProblem.from_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
     solution = search(problem, method, starts, seed, steps, progress)
     while (lost := unusable(problem, solution)).any() and not lost.all():
         problem = _without(problem, lost)
@@ -269,7 +333,7 @@ def as_fit(
     residual = np.asarray(problem.measured, float) - solution.predicted
     findings = fit_warnings(problem, solution, errors, robust is not None)
     return Fit(
-        law=with_entries(problem.law, problem.residuals.fields, solution.entries),
+        law=problem.residuals.law_of(solution.entries),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
         value=solution.value,
@@ -311,8 +375,10 @@ def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Sear
     solution, weighed = robust.solution, problem.weighed(robust.factor).residuals
     size = problem.size
     back = float(weighed.size) / size / robust.factor.reshape(-1, 1)
-    residual = problem.independent(problem.measured - solution.predicted) / size
-    squares, jacobian = float(np.sum(residual**2)), back * solution.jacobian
+    residual = problem.independent(problem.measured - solution.predicted)
+    from_priors, _ = problem.prior_errors(solution.value)
+    squares = float(np.sum(residual**2) + np.sum(from_priors**2)) / size**2
+    jacobian = back * solution.jacobian
     minimum = Minimum(squares, solution.value, 1, jacobian)
     return solution._replace(jacobian=jacobian, minima=[minimum])
 
@@ -329,10 +395,12 @@ def _uncertainty(
         noise = 1.0
     elif noise is None and reproduced(problem, minimum):
         noise = np.nan
+    scale = np.where(solution.log, minimum.value, solution.scale)
+    _, of_priors = problem.prior_errors(minimum.value)
     return uncertainty(
         names=problem.names,
-        jacobian=size * minimum.jacobian,
-        scale=np.where(solution.log, minimum.value, solution.scale),
+        jacobian=np.vstack([size * minimum.jacobian, of_priors * scale]),
+        scale=scale,
         log=solution.log,
         sum_of_squares=size**2 * minimum.squares,
         values=problem.values,

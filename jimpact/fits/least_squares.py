@@ -46,6 +46,9 @@ class Region(Protocol):
     def retract(self, y: jax.Array) -> jax.Array:
         """y itself, or a point of the region near it."""
 
+    def nearest(self, y: jax.Array) -> jax.Array:
+        """The point of the region nearest to y."""
+
     def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
         """The gradient without what would push y out of the region."""
 
@@ -64,6 +67,10 @@ class BoxRegion(eqx.Module):
     def retract(self, y: jax.Array) -> jax.Array:
         """The nearest point of the box."""
         return jnp.clip(y, self.low, self.high)
+
+    def nearest(self, y: jax.Array) -> jax.Array:
+        """The same."""
+        return self.retract(y)
 
     def free_gradient(self, y: jax.Array, gradient: jax.Array) -> jax.Array:
         """The gradient without variables that sit on a bound and are pushed against it."""
@@ -179,6 +186,19 @@ def advance(
         return SolverState(y, r, jac, aux, least, gain, trial, memory, state.steps + 1, done)
 
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < last), one, state)
+
+
+def nearest(region: Region, y: jax.Array) -> jax.Array:
+    """The point of a region nearest to y: least squares of the distance."""
+    identity, method = jnp.eye(y.shape[0], dtype=y.dtype), "levenberg-marquardt"
+    steps = DEFAULT_STEPS[method]
+
+    def distance(at: jax.Array) -> tuple[jax.Array, jax.Array, tuple[()]]:
+        """From y, and its Jacobian."""
+        return at - y, identity, ()
+
+    state = begin(region.retract(y), (y, identity, ()), method, steps)
+    return advance(distance, region, method, steps, state, steps).y
 
 
 def _cost(evaluate: Evaluate, y: jax.Array) -> jax.Array:

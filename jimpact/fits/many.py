@@ -40,6 +40,8 @@ def fit_many(
     free: Any = DEFAULT_FREE,
     *,
     bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    ties: Mapping[str, Any] | None = None,
     starts: int = 1,
     seed: int = 0,
     max_steps: int = DEFAULT_STEPS[_METHOD],
@@ -56,6 +58,8 @@ def fit_many(
         many: the data sets.
         free: as of `fit`.
         bounds: as of `fit`.
+        priors: as of `fit`; of each data set.
+        ties: as of `fit`.
         starts: of each data set.
         seed: of the random starts.
         max_steps: iterations per start.
@@ -74,7 +78,8 @@ def fit_many(
     [0.4, 0.8]
     """
     as_whole("starts", starts, 1)
-    problems = [FitProblem.from_shots(law, scene, data, free, bounds) for data in many]
+    choice = (free, bounds, priors, ties)
+    problems = [FitProblem.from_shots(law, scene, data, *choice) for data in many]
     filled = [filled_up(problem.residuals) for problem in problems]
     groups: dict[str, list[int]] = {}
     for k, residuals in enumerate(filled):
@@ -168,8 +173,23 @@ def bootstrap(
     measured = np.zeros((samples, *residuals.measured.shape), residuals.measured.dtype)
     rows = (slice(None), slice(len(fit.predicted))) if shape else slice(None)
     measured[rows] = np.nan_to_num(fit.predicted + np.moveaxis(errors, -1, 0))
-    many = eqx.tree_at(lambda r: r.measured, repeated(residuals, samples), measured)
+    many = eqx.tree_at(
+        lambda r: (r.measured, r.prior_mean),
+        repeated(residuals, samples),
+        (measured, _drawn_priors(fit, samples, seed)),
+    )
     return _refits(fit, [fit.problem] * samples, many, progress)
+
+
+def _drawn_priors(fit: Fit, samples: int, seed: int) -> np.ndarray:
+    """Means (B, Q) of the priors as if they had been measured anew, around what was fitted."""
+    r, problem = fit.problem.residuals, fit.problem
+    means = np.tile(np.asarray(r.prior_mean), (samples, 1))
+    z = np.random.default_rng((seed, 1)).normal(size=(samples, len(problem.priors)))
+    for prior, drawn in zip(problem.priors, z.T):
+        at = problem.parameters.first[prior.parameter]
+        means[:, at] = fit.value[prior.parameter] + fit.noise * prior.std * drawn
+    return means
 
 
 def leave_one_out(fit: Fit, *, progress: float | None = None) -> Refits:

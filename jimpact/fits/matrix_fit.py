@@ -16,6 +16,7 @@ import numpy as np
 
 from jimpact.compiling import quick_jit
 from jimpact.contact import decoupled, delassus_matrix, kinetic_norm
+from jimpact.fits.least_squares import nearest
 from jimpact.law import Law
 from jimpact.laws.kinematic import RestitutionMatrix
 from jimpact.scene import Scene
@@ -121,6 +122,10 @@ class AdmissibleMatrices(eqx.Module):
         short = 1 - _SHORT * jnp.finfo(y.dtype).eps
         inside = self.center + short * share * (y - self.center)
         return jnp.where(share < 1, inside, y)
+
+    def nearest(self, y: jax.Array) -> jax.Array:
+        """The admissible point nearest to y."""
+        return nearest(self, y)
 
     def share(self, y: jax.Array) -> jax.Array:
         """How much of the way from the center to y is admissible, at most 1."""

@@ -1,11 +1,9 @@
 """A fit as one self-contained page: text, tables and pictures in a single HTML file."""
 
-import platform
 from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from html import escape
-from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,10 +11,10 @@ from typing import TYPE_CHECKING
 import equinox as eqx
 import numpy as np
 
-import jimpact
 from jimpact.fits.profiles import profile
 from jimpact.fits.report import parameter_rows, report_blocks, shot_rows, verdict
 from jimpact.fits.result import FitResult
+from jimpact.fits.saved import versions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,7 +32,6 @@ img { max-width: 100%; }
 """.strip()
 _PARAMETERS = ("parameter", "value", "standard error")
 _SHOTS = ("shot", "velocity", "before", "measured", "fitted", "residual", "unit", "status")
-_PACKAGES = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 
 
 def write_page(fit: FitResult, path: Path, profiles: bool) -> Path:
@@ -129,11 +126,5 @@ def _made_by(fit: FitResult) -> list[list[str]]:
         ["law", eqx.tree_pformat(fit.law, short_arrays=False)],
         ["solver", f"{fit.method}, loss {fit.loss}, {fit.start_count} starts, seed {fit.seed}"],
         ["precision", fit.problem.precision],
-        ["jimpact", jimpact.__version__],
     ]
-    for name in _PACKAGES:
-        try:
-            rows.append([name, version(name)])
-        except PackageNotFoundError:  # installed in a way that leaves no record
-            continue
-    return [*rows, ["Python", f"{platform.python_version()}, {platform.system()}"]]
+    return rows + [list(row) for row in versions().items()]

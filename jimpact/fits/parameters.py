@@ -1,13 +1,13 @@
 """Which entries of a law are free, their names, bounds and natural scales."""
 
 import dataclasses
-import re
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact.fits.ties import Ties, entry_of, places, tied_places
 from jimpact.law import Law, free_parameters_of, parameters_of, with_parameter
 
 AnyLaw = TypeVar("AnyLaw", bound=Law)  # what goes in as LZB comes out as LZB
@@ -17,8 +17,6 @@ OF_SPEED = ("speed_exponent", "yield_speed")  # a law has them only if requested
 # What is fitted in its logarithm, a stiffness, may without bounds move this far from its start:
 # beyond, the softer contact has no further influence that a measurement could see.
 LOG_RANGE = 1e4
-
-_ENTRY = re.compile(r"(\w+)\[([1-9]\d*(?:[,=][1-9]\d*)*)\]")  # a name with entries, from 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,8 +70,10 @@ def with_entries(law: AnyLaw, fields: tuple[str, ...], values: Any) -> AnyLaw:
     return law
 
 
-def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parameters, list[str]]:
-    """The parameters that `free` names, and notes on what was fixed instead.
+def free_parameters(
+    law: Law, free: Any, absolute: bool = False, ties: Ties = ()
+) -> tuple[Parameters, list[str]]:
+    """The parameters that `free` names, but for what is tied, and notes on what was fixed instead.
 
     `absolute`: forces or times were measured, which show a common factor of all stiffnesses.
     """
@@ -85,7 +85,7 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
             fixed = "stiffness"
     choices = dict(free) if isinstance(free, Mapping) else dict.fromkeys(_as_names(free), True)
     for name, choice in choices.items():
-        field, entry = _split(name)
+        field, entry = entry_of(name)
         if field not in known:
             raise ValueError(_unknown_field(law, name, list(known)))
         shape = np.shape(value_of(law, field))
@@ -93,7 +93,7 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
             labels[field] = _as_labels(field, choice, shape)
         else:
             label = labels.setdefault(field, np.zeros(shape, int))
-            at = _places("free", name, entry, shape)
+            at = places("free", name, entry, shape)
             label.flat[at] = (label.max() + 1) * _as_flag(name, choice)
     ratios = not absolute and _only_ratios(law, labels)
     if ratios and "stiffness" in labels and labels["stiffness"].all():
@@ -112,6 +112,10 @@ def free_parameters(law: Law, free: Any, absolute: bool = False) -> tuple[Parame
         notes = [
             f"{fixed} is fixed at its start: with equal exponents only stiffness ratios matter."
         ]
+    for name, at in tied_places(law, ties).items():
+        field, _ = entry_of(name)
+        if field in labels:
+            labels[field].flat[at] = 0
     names, groups, start = [], [], 0
     for field, label in labels.items():
         for value in dict.fromkeys(label[label > 0].tolist()):
@@ -131,31 +135,6 @@ def _name(field: str, members: np.ndarray, size: int) -> str:
     if len(members) == size and (size > 1 or members.shape[1] == 0):
         return field
     return f"{field}[{'='.join(','.join(str(i + 1) for i in index) for index in members)}]"
-
-
-def _split(name: str) -> tuple[str, str | None]:
-    """The field of a name as in `Parameters.names`, and what is in its brackets.
-
-    >>> from jimpact.fits.parameters import _split
-    >>> _split("restitution"), _split("restitution[1=3]")
-    (('restitution', None), ('restitution', '1=3'))
-    """
-    found = _ENTRY.fullmatch(name)
-    return (found[1], found[2]) if found else (name, None)
-
-
-def _places(argument: str, name: str, entry: str, shape: tuple[int, ...]) -> list[int]:
-    """Where in the flattened field the entries of a name are, counted from 0."""
-    members = [tuple(int(i) - 1 for i in part.split(",")) for part in entry.split("=")]
-    for index in members:
-        inside = len(index) == len(shape) and all(0 <= i < n for i, n in zip(index, shape))
-        if not inside:
-            kind = f"of shape {shape}" if shape else "one value for all contacts"
-            raise ValueError(
-                f"Argument `{argument}` must name entries that the field has, counted from 1, but "
-                f"has {name!r} of a field that is {kind}."
-            )
-    return [int(np.ravel_multi_index(index, shape)) for index in members]
 
 
 def _as_flag(name: str, choice: Any) -> bool:
@@ -232,7 +211,7 @@ def bounds_of(
     chosen = dict(bounds or {})
     known = {parameters.field_of(i) for i in range(len(parameters.names))}
     for field in chosen:
-        if _split(field)[0] not in known:
+        if entry_of(field)[0] not in known:
             raise ValueError(
                 f"Argument `bounds` must name free parameters, {', '.join(sorted(known))}, "
                 f"but has {field!r}."
@@ -251,9 +230,9 @@ def bounds_of(
             searched = np.maximum(values[inside], domain.searched_high)
             ends[1, inside] = np.minimum(ends[1, inside], searched)
     for name, pair in chosen.items():
-        field, entry = _split(name)
+        field, entry = entry_of(name)
         if entry is not None:
-            at = _places("bounds", name, entry, np.shape(value_of(law, field)))
+            at = places("bounds", name, entry, np.shape(value_of(law, field)))
             first = parameters.entry_fields.index(field)
             ends[:, first + np.array(at)] = np.array(_bound_pair(field, pair, law))[:, at]
     low = np.array([ends[0, list(group)].max() for group in parameters.groups])
@@ -265,6 +244,56 @@ def bounds_of(
                 f"but is [{a:g}, {b:g}]."
             )
     return low, high
+
+
+class Prior(NamedTuple):
+    """What is known of a parameter (by its number) besides the data: normally distributed."""
+
+    parameter: int
+    mean: float
+    std: float
+
+
+def priors_of(
+    parameters: Parameters, limits: tuple[np.ndarray, np.ndarray], priors: Mapping[str, Any] | None
+) -> tuple[Prior, ...]:
+    """The user's priors, by name of a parameter or of a field for all that belong to it."""
+    chosen = dict(priors or {})
+    fields = [parameters.field_of(i) for i in range(len(parameters.names))]
+    for name in chosen:
+        if name not in (*parameters.names, *fields):
+            raise ValueError(
+                "Argument `priors` must name free parameters, "
+                f"{', '.join(parameters.names)}, but has {name!r}."
+            )
+    found = []
+    for i, (name, field, low, high) in enumerate(zip(parameters.names, fields, *limits)):
+        pair = chosen.get(name, chosen.get(field))
+        if pair is not None:
+            found.append(Prior(i, *_mean_and_std(name, pair, low, high)))
+    return tuple(found)
+
+
+def _mean_and_std(name: str, pair: Any, low: float, high: float) -> tuple[float, float]:
+    """The two numbers of a prior: (mean, std), or of a `ji.Normal`."""
+    ends = (pair.mean, pair.std) if hasattr(pair, "std") and hasattr(pair, "mean") else pair
+    try:
+        mean, std = (float(end) for end in ends)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"Argument `priors` must map `{name}` to (mean, standard deviation) or a ji.Normal, "
+            f"but has {pair!r}."
+        ) from None
+    if not (0 < std < np.inf):
+        raise ValueError(
+            f"Argument `priors` must have a standard deviation > 0 for `{name}`, but has {pair!r}."
+        )
+    if not low <= mean <= high:
+        raise ValueError(
+            f"Argument `priors` must have its mean in [{low:g}, {high:g}] for `{name}`, but has "
+            f"{pair!r}."
+        )
+    return mean, std
 
 
 def _bound_pair(field: str, pair: Any, law: Law) -> tuple[np.ndarray, np.ndarray]:

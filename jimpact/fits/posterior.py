@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_whole, needed
+from jimpact.compiling import known_options
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.problem import FitProblem
@@ -45,8 +46,9 @@ def posterior(
         fit: a fit by least squares, or a problem.
         priors: by name of a parameter, or of a field for all its entries: `ji.Uniform(low, high)`,
             `ji.Normal(mean, std)` (truncated to the domain), or a numpyro distribution of a scalar.
-            Others are flat over the parameter's domain; of what is fitted in its logarithm (a
-            stiffness), flat in that; of an admissible matrix, flat over all that are.
+            They take the place of those of the fit. Others are flat over the parameter's domain;
+            of what is fitted in its logarithm (a stiffness), flat in that; of an admissible matrix,
+            flat over all that are.
         samples, warmup: of each chain.
         chains: side by side in one program.
         seed: of the sampler.
@@ -78,7 +80,8 @@ def posterior(
     start = fit.value if isinstance(fit, Fit) else problem.start
     for name, count in (("samples", samples), ("warmup", warmup), ("chains", chains)):
         as_whole(name, count, 1)
-    each = _priors(problem, dict(priors or {}), numpyro.distributions)
+    own = {problem.names[i]: Normal(mean, std) for i, mean, std in problem.priors}
+    each = _priors(problem, own | dict(priors or {}), numpyro.distributions)
 
     region = problem.residuals.region
     inner = None if isinstance(region, BoxRegion) else _Inner(problem, region)
@@ -107,20 +110,36 @@ def posterior(
         dense_mass=len(each) > 1,
         init_strategy=numpyro.infer.init_to_value(values=first),
     )
+    shown = sys.stderr.isatty() if progress is None else progress is not False
     sampler = numpyro.infer.MCMC(
         kernel,
         num_warmup=warmup,
         num_samples=samples,
         num_chains=chains,
         chain_method="vectorized",
-        progress_bar=sys.stderr.isatty() if progress is None else progress is not False,
+        progress_bar=shown,
     )
-    sampler.run(jax.random.PRNGKey(seed))
-    draws = arviz.from_numpyro(sampler, log_likelihood=False)
+
+    values, said = _drawn(sampler, seed, shown)
+    draws = arviz.from_dict(posterior=values, sample_stats=said)
     if inner is not None:
         del draws.posterior[_FREE]
     _warn(draws, arviz)
     return draws
+
+
+def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
+    """Draws by name, and what numpyro's `sampler` says of them; each (chains, samples)."""
+
+    def drawn(key: jax.Array) -> tuple[Any, Any]:
+        """Both of them."""
+        sampler.run(key)
+        return sampler.get_samples(True), sampler.get_extra_fields(True)
+
+    # as one program, compiled quickly, it takes half of the time; a progress bar needs several
+    run = drawn if shown else jax.jit(drawn, compiler_options=known_options())
+    values, said = jax.tree.map(np.asarray, run(jax.random.PRNGKey(seed)))
+    return values, said
 
 
 class _Inner:

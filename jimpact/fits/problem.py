@@ -23,11 +23,14 @@ from jimpact.fits.matrix_fit import matrix_region
 from jimpact.fits.parameters import (
     DEFAULT_FREE,
     Parameters,
+    Prior,
     bounds_of,
     entries,
     free_parameters,
+    priors_of,
     with_entries,
 )
+from jimpact.fits.ties import Ties, checked_ties, entry_of, tied
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.scene import Scene, dense_mass, stackable
@@ -94,7 +97,8 @@ class Residuals(eqx.Module):
 
     Solvers work on y (Q,), of which the first P count, the rest is 0. The entries of the law's
     fields in scaled form are `offset + mix y`; an entry is `scale` times that, or its exponential
-    where `log` is set.
+    where `log` is set. Entries that are tied follow from these. A prior weighs the value of the
+    entry that stands for its parameter.
     """
 
     law: Law
@@ -110,18 +114,32 @@ class Residuals(eqx.Module):
     weight: jax.Array  # 0 where not measured; makes |r|^2 a mean square relative to `unit`
     size: jax.Array  # () size r is (prediction - measured) / sigma, with sigma = 1 where unknown
     unit: jax.Array  # () the largest measured value
+    prior_mean: jax.Array  # (Q,) of entries
+    prior_weight: jax.Array  # (Q,) 1 / standard deviation, 0 where there is no prior
     fields: tuple[str, ...] = eqx.field(static=True)
     mixing: jax.Array | None = None  # (K, n, n): makes correlated errors of a shot independent
+    ties: Ties = eqx.field(static=True, default=())
+
+    def entries_at(self, y: jax.Array) -> jax.Array:
+        """The entries (Q,) of scaled parameters y, before those that are tied follow."""
+        scaled = self.offset + self.mix @ y
+        exponential = jnp.exp(jnp.where(self.log, scaled, 0.0))
+        return jnp.where(self.log, exponential, scaled * self.scale)
+
+    def law_of(self, values: Any) -> Law:
+        """The law of entries (Q,)."""
+        return tied(with_entries(self.law, self.fields, values), self.ties)
 
     def law_at(self, y: jax.Array) -> Law:
         """The law of scaled parameters y."""
-        scaled = self.offset + self.mix @ y
-        exponential = jnp.exp(jnp.where(self.log, scaled, 0.0))
-        values = jnp.where(self.log, exponential, scaled * self.scale)
-        return with_entries(self.law, self.fields, values)
+        return self.law_of(self.entries_at(y))
+
+    def prior_residual(self, y: jax.Array) -> jax.Array:
+        """Weighted distances (Q,) from the priors."""
+        return (self.entries_at(y) - self.prior_mean) * self.prior_weight / self.size
 
     def residual(self, y: jax.Array) -> tuple[jax.Array, Prediction]:
-        """Weighted residual (R,), and what the law makes visible."""
+        """Weighted residual (R,) of what was measured, and what the law makes visible."""
         prediction = self.observe(self.law_at(y))
         bad = jnp.broadcast_to(prediction.bad, self.measured.shape)
         harmless = jnp.where(bad, self.measured, prediction.value)
@@ -136,11 +154,15 @@ class Residuals(eqx.Module):
         return (self.mixing @ weighted[..., None])[..., 0]
 
     def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
-        """Weighted residual (R,), its Jacobian (R, Q), and (predicted values, status)."""
+        """Weighted residual (R + Q,), its Jacobian (R + Q, Q), and (predicted values, status).
+
+        The last Q are those of the priors.
+        """
 
         def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
             """The residual, and all that is not differentiated."""
-            residual, prediction = self.residual(y)
+            data, prediction = self.residual(y)
+            residual = jnp.concatenate([data, self.prior_residual(y)])
             return residual, (residual, prediction.value, prediction.status)
 
         jacobian, (residual, *aux) = jax.jacfwd(outcome, has_aux=True)(y)
@@ -156,7 +178,7 @@ class FitProblem:
     minimizes its sum of squares. `residual`, `jacobian`, `log_density` and `to_law` are pure
     functions of x for jit, vmap and grad, and so for any solver or sampler; `start` (P,), `domains`
     (P, 2) and `names` say where to begin, how far x may go, and what it means. `fit(problem)` does
-    all that `fit` does.
+    all that `fit` does. Each of the `priors` adds a value to the residual, `(x_i - mean) / std`.
 
     Errors S of v- are passed on: with `J = dv+/dv-` of the law, those of a shot have the covariance
     `C = diag(sigma^2) + J S J^T`, and its residual is multiplied by the inverse of the Cholesky
@@ -165,8 +187,8 @@ class FitProblem:
 
     Make one with `from_shots` or `from_observable`. It holds what was `measured` (NaN where no
     value was), `sigma`, `experiments` and `scene` or None, how many independent `values`
-    were measured; in words, `notes` on what was fixed instead of fitted, and shots `left_out`; and
-    for the solvers `residuals` and `parameters`.
+    were measured or are priors; in words, `notes` on what was fixed instead of fitted, and shots
+    `left_out`; and for the solvers `residuals` and `parameters`.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -183,10 +205,11 @@ class FitProblem:
     domains: np.ndarray
     measured: np.ndarray  # NaN where not
     sigma: np.ndarray | None
-    values: int  # independent measured values
+    values: int  # independent measured values, and priors
     experiments: Experiments | None = None
     scene: Scene | None = None
     left_out: tuple[str, ...] = ()  # which shots, in words
+    priors: tuple[Prior, ...] = ()
 
     @classmethod
     def from_shots(
@@ -196,6 +219,8 @@ class FitProblem:
         experiments: Experiments,
         free: Any = DEFAULT_FREE,
         bounds: Mapping[str, Any] | None = None,
+        priors: Mapping[str, Any] | None = None,
+        ties: Mapping[str, Any] | None = None,
     ) -> "FitProblem":
         """The problem of measured shots; errors as of `fit`.
 
@@ -205,6 +230,8 @@ class FitProblem:
             experiments: measured shots.
             free: as in `fit`.
             bounds: as in `fit`.
+            priors: as in `fit`.
+            ties: as in `fit`.
         """
         check_kind("law", law, Law)
         check_kind("experiments", experiments, Experiments)
@@ -226,9 +253,8 @@ class FitProblem:
         observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
         errors = experiments.natural_errors(scene) if sigma is None else sigma
-        problem = _build(
-            law, observe, post, sigma, errors, free, bounds, dtype, unit, energy, alike
-        )
+        choice = _choice(law, observe, free, bounds, priors, ties)
+        problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
         values = problem.values - experiments.lost_freedom
         problem = replace(problem, values=values, experiments=experiments, scene=scene)
         return problem if experiments.sigma_pre is None else problem.with_errors_before(law)
@@ -274,6 +300,8 @@ class FitProblem:
         sigma: Any = None,
         free: Any = DEFAULT_FREE,
         bounds: Mapping[str, Any] | None = None,
+        priors: Mapping[str, Any] | None = None,
+        ties: Mapping[str, Any] | None = None,
     ) -> "FitProblem":
         """The problem of a user's own observable, or residual.
 
@@ -285,6 +313,8 @@ class FitProblem:
             sigma: standard errors, scalar or of the same shape; None: one common, unknown.
             free: as in `fit`.
             bounds: as in `fit`.
+            priors: as in `fit`.
+            ties: as in `fit`.
 
         Raises:
             ValueError: no measured value, sigma <= 0, an observable of another shape, and as `fit`.
@@ -311,7 +341,8 @@ class FitProblem:
         unit = np.nanmax(np.abs(post)) or 1.0
         dtype = _dtype(law, observable, post)
         errors = np.ones(()) if sigma is None else sigma
-        problem = _build(law, observable, post, sigma, errors, free, bounds, dtype, unit, 1.0, [])
+        choice = _choice(law, observable, free, bounds, priors, ties)
+        problem = _build(choice, observable, post, sigma, errors, dtype, unit, 1.0, [])
         shape = eqx.filter_eval_shape(observable, law).value.shape
         if shape != post.shape:
             raise ValueError(
@@ -355,21 +386,46 @@ class FitProblem:
         return self.residuals.law_at(self._scaled(x))
 
     def residual(self, x: Any) -> jax.Array:
-        """(R,) `(observed - measured) / sigma` at x (P,); a large number where the law fails."""
+        """(R,) `(observed - measured) / sigma` at x (P,), then those of the priors.
+
+        Where the law fails, a large number.
+        """
+        return jnp.concatenate([self._of_data(x), self._of_priors(x)])
+
+    def _of_data(self, x: Any) -> jax.Array:
+        """The residual of what was measured."""
         residual, _ = self.residuals.residual(self._scaled(x))
         return self.residuals.size * residual[np.flatnonzero(~np.isnan(self.measured))]
+
+    def _of_priors(self, x: Any) -> jax.Array:
+        """The residual of the priors."""
+        first = np.array([self.parameters.first[p.parameter] for p in self.priors], int)
+        return self.residuals.size * self.residuals.prior_residual(self._scaled(x))[first]
 
     def jacobian(self, x: Any) -> jax.Array:
         """(R, P) derivatives of `residual` at x (P,), by forward mode."""
         return jax.jacfwd(self.residual)(jnp.asarray(x, self.residuals.offset.dtype))
 
+    def project(self, x: Any) -> jax.Array:
+        """The allowed parameters (P,) nearest to x (P,): within bounds, as an admissible matrix.
+
+        Equation: minimize `sum ((z - x) / s)^2` over allowed z; s is the natural scale of each
+        parameter, and what is fitted in its logarithm is measured in that. For gradient descent
+        of your own (docs/gradient_descent.md). Not differentiable.
+        """
+        y = self._scaled(jax.lax.stop_gradient(jnp.asarray(x, self.residuals.offset.dtype)))
+        first = np.array(self.parameters.first)
+        return self.residuals.entries_at(self.residuals.region.nearest(y))[first]
+
     def log_density(self, x: Any) -> jax.Array:
         """Logarithm () of the probability density of the data at x (P,), normally distributed.
+
+        That of the priors is not in it.
 
         Equation: `-|r|^2 / 2 - sum log(sigma sqrt(2 pi))`; where sigma is unknown, it is integrated
         over `d sigma / sigma`: `-R log |r|`, up to a constant.
         """
-        squares = jnp.sum(self.residual(x) ** 2)
+        squares = jnp.sum(self._of_data(x) ** 2)
         if self.sigma is None:
             return -0.5 * self.values * jnp.log(squares)
         sigma = np.broadcast_to(self.sigma, self.measured.shape)[~np.isnan(self.measured)]
@@ -384,6 +440,17 @@ class FitProblem:
         """(R,) the shot (or row, from 0) of every measured value."""
         here = ~np.isnan(self.measured)
         return np.nonzero(here)[0] if here.ndim else np.zeros(1, int)
+
+    def prior_errors(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Of each prior: its mean less x (P,), and the derivatives of x (., P), over its std."""
+        means, stds = (np.array([p[k] for p in self.priors], float) for k in (1, 2))
+        which = np.array([p.parameter for p in self.priors], int)
+        return (means - x[which]) / stds, np.eye(len(self.names))[which] / stds[:, None]
+
+    @property
+    def ties(self) -> Ties:
+        """What follows from parameters by the user's functions."""
+        return self.residuals.ties
 
     @property
     def weight(self) -> np.ndarray:
@@ -498,23 +565,52 @@ def _in(dtype: np.dtype, tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x, dtype) if eqx.is_inexact_array(x) else x, tree)
 
 
-def _build(
+class _Choice(NamedTuple):
+    """What is fitted of a law: parameters, their limits and priors, and what follows from them."""
+
+    law: Law  # with the values at the start
+    parameters: Parameters
+    notes: list[str]
+    limits: tuple[np.ndarray, np.ndarray]
+    priors: tuple[Prior, ...]
+    ties: Ties
+
+
+def _choice(
     law: Law,
+    observe: Observable,
+    free: Any,
+    bounds: Mapping[str, Any] | None,
+    priors: Mapping[str, Any] | None,
+    ties: Mapping[str, Any] | None,
+) -> _Choice:
+    """The user's choices, checked."""
+    functions = checked_ties(law, ties)
+    law = tied(law, functions)
+    absolute = getattr(observe, "absolute", False)
+    parameters, notes = free_parameters(law, free, absolute, functions)
+    limits = bounds_of(parameters, law, bounds)
+    return _Choice(law, parameters, notes, limits, priors_of(parameters, limits, priors), functions)
+
+
+def _build(
+    choice: _Choice,
     observe: Observable,
     measured: np.ndarray,
     sigma: np.ndarray | None,
     errors: np.ndarray,
-    free: Any,
-    bounds: Mapping[str, Any] | None,
     dtype: np.dtype,
     unit: float,
     energy: float,
     scenes: list[Scene],
 ) -> FitProblem:
     """Arrays, weights and natural scales of a fit."""
-    absolute = getattr(observe, "absolute", False)
-    parameters, notes = free_parameters(law, free, absolute)
-    limits = bounds_of(parameters, law, bounds)
+    law, parameters, notes, limits, priors, ties = choice
+    if priors and sigma is None:
+        raise ValueError(
+            "Argument `priors` must be left out where no `sigma` (or `resolution`) of the measured "
+            "values is known: priors and data weigh against each other by their errors."
+        )
     law = _in(dtype, law)
     here = ~np.isnan(measured)
     weight = np.where(here, 1 / np.where(here, errors, 1.0), 0.0)
@@ -527,10 +623,16 @@ def _build(
     ends = np.zeros((2, len(values)))
     first, count = parameters.first, len(parameters.names)
     ends[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
+    prior_mean, prior_weight = np.zeros((2, len(values)))
+    for prior in priors:
+        prior_mean[first[prior.parameter]] = prior.mean
+        prior_weight[first[prior.parameter]] = 1 / prior.std
     arrays = {"mix": mix, "offset": offset, "scale": scale, "low": ends[0], "high": ends[1]}
     arrays |= {"measured": np.nan_to_num(measured), "weight": weight / size}
-    arrays |= {"size": size, "unit": unit}
+    arrays |= {"size": size, "unit": unit, "prior_mean": prior_mean, "prior_weight": prior_weight}
     region = matrix_region(law, scenes, scale * offset, scale[:, None] * mix, ends)
+    if region is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
+        raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
     host: dict[str, Any] = {name: np.asarray(array, dtype) for name, array in arrays.items()}
     residuals = Residuals(
         law=law,
@@ -538,10 +640,20 @@ def _build(
         log=log,  # type: ignore[arg-type]
         observe=observe,
         fields=parameters.fields,
+        ties=ties,
         **host,
     )
-    count, domains = int(here.sum()), np.stack(limits, axis=1)
-    return FitProblem(residuals, parameters, tuple(notes), domains, measured, sigma, count)
+    domains, values_known = np.stack(limits, axis=1), int(here.sum()) + len(priors)
+    return FitProblem(
+        residuals,
+        parameters,
+        tuple(notes),
+        domains,
+        measured,
+        sigma,
+        values_known,
+        priors=priors,
+    )
 
 
 def _scales(
@@ -609,7 +721,7 @@ def begin_all(problems: Residuals, starts: Any, method: Method, max_steps: int) 
 
     def one(problem: Residuals, y: jax.Array) -> SolverState:
         """The state of one problem."""
-        size, shape = problem.measured.size, problem.measured.shape
+        size, shape = problem.measured.size + y.shape[0], problem.measured.shape
         statuses = shape[0] if isinstance(problem.observe, Shots) else 1
         aux = (jnp.zeros(shape, y.dtype), jnp.zeros(statuses, jnp.int32))
         first = (jnp.zeros(size, y.dtype), jnp.zeros((size, y.shape[0]), y.dtype), aux)

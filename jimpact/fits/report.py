@@ -6,6 +6,7 @@ from jimpact.files.records import with_error
 from jimpact.fits.findings import joined_words
 from jimpact.fits.intervals import in_words
 from jimpact.fits.parameters import value_of
+from jimpact.fits.prediction import tied_values
 from jimpact.fits.result import FitResult
 from jimpact.fits.scatter import SURE, shown_scatter
 from jimpact.status import STATUS
@@ -68,7 +69,11 @@ def _values_in_words(fit: FitResult) -> str:
         worst = determined[int(np.argmax(np.nan_to_num(fit.standard_error[determined])))]
         least_certain = _with_error(fit, int(worst))
         parts = [f"{len(determined)} parameters are fitted, the least certain {least_certain}"]
-    assumed = _assumptions(fit)
+    assumed = _assumptions(fit) + [
+        f"the {prior} of {name}"
+        for i, name in enumerate(fit.names)
+        if (prior := _prior(fit, i)) and not fit.from_prior[i]
+    ]
     if parts and assumed:
         parts[-1] += f", assuming {joined_words(assumed)}"
     if others:
@@ -135,6 +140,8 @@ def _with_error(fit: FitResult, i: int) -> str:
     if np.isnan(error):
         return f"{name} = {value:.5g}, its error unknown"
     text = f"{value:g}" if fit.at_bound[i] else with_error(value, error)
+    if fit.from_prior[i]:
+        return f"{name} = {text}, which is its prior"
     if fit.profiles:
         words = fit.profiles[i].words
         if words.startswith("at ") or " or " in words:
@@ -169,11 +176,20 @@ def parameter_rows(fit: FitResult) -> list[list[str]]:
         if np.isfinite(error) or fit.profiles:
             interval = in_words(pieces, (fit.bounds[0][i], fit.bounds[1][i]))
         note = "at its bound" if fit.at_bound[i] else ""
-        note = note if seen[i] else UNSEEN
+        note = ", ".join(filter(None, [note if seen[i] else UNSEEN, _prior(fit, i)]))
         rows.append(
             [fit.names[i], marked(fit.value[i], seen[i], ".6g"), error_text, interval, note]
         )
     return rows
+
+
+def _prior(fit: FitResult, i: int) -> str:
+    """The prior of a parameter, and whether it alone determines the value; '' without one."""
+    for prior in fit.problem.priors:
+        if prior.parameter == i:
+            alone = " alone" if fit.from_prior[i] else ""
+            return f"prior{alone} {prior.mean:g} ± {prior.std:g}"
+    return ""
 
 
 def marked(value: float, seen: bool, digits: str) -> str:
@@ -195,6 +211,7 @@ def _parameters(fit: FitResult) -> list[str]:
         f"{name:{width}s} {value:>12s} {error:>12s}   {'   '.join(rest)}".rstrip()
         for name, value, error, *rest in [head, *parameter_rows(fit)]
     ]
+    lines += [f"{name} = {with_error(*pair)} is tied" for name, pair in tied_values(fit).items()]
     if fit.linearization_misleads:
         lines.append(
             "These intervals take the sum of squares for a parabola, which may mislead here: "

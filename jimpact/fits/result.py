@@ -16,6 +16,10 @@ from jimpact.fits.problem import FitProblem
 # Relative standard error of a stiffness beyond which its linearized interval is not believed.
 HARDLY_SEEN = 0.2
 
+# Share of a prior's standard deviation from which on a standard error is the prior's: the data have
+# then less than a tenth of the information. Ten times as much would call priors of half of it so.
+PRIOR_ALONE = 0.95
+
 
 @dataclass(frozen=True, eq=False)
 class FitMinimum:
@@ -121,6 +125,31 @@ class FitResult(Generic[AnyLaw]):
         return seen
 
     @property
+    def from_prior(self) -> np.ndarray:
+        """(P,) which parameters are known from their priors alone: the data add hardly anything."""
+        alone = np.zeros(len(self.names), bool)
+        for i, _, std in self.problem.priors:
+            alone[i] = self.standard_error[i] > PRIOR_ALONE * self.noise * std
+        return alone
+
+    def errors_of(self, slope: np.ndarray) -> np.ndarray:
+        """Standard errors of what has these derivatives (..., P) in the parameters.
+
+        Equation: `sqrt(J C J^T)`; inf where it depends on what the data do not determine.
+        """
+        seen = self.determined
+        known = slope[..., seen]
+        covariance = self.covariance[np.ix_(seen, seen)]
+        variance = np.einsum("...p,pq,...q->...", known, covariance, known)
+        blind = (np.abs(slope[..., ~seen]) > 0).any(axis=-1)
+        return np.where(blind, np.inf, np.sqrt(variance))
+
+    @property
+    def contradicts_priors(self) -> bool:
+        """Whether a test finds the data at odds with a prior."""
+        return any(line.startswith("The data contradict the prior") for line in self.warnings)
+
+    @property
     def experiments(self) -> Experiments | None:
         """The shots; None where something else was fitted."""
         return self.problem.experiments
@@ -145,7 +174,8 @@ class FitResult(Generic[AnyLaw]):
 
     @property
     def chi_squared(self) -> float:
-        """The sum of squared residuals in units of sigma; NaN where sigma is unknown."""
+        """The sum of squared residuals in units of sigma, those of priors included; NaN where sigma
+        is unknown."""
         return np.nan if self.problem.sigma is None else self.starts[0].sum_of_squares
 
     @property

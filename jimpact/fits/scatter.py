@@ -7,6 +7,7 @@ from scipy.special import chdtrc, stdtr
 
 from jimpact._checks import check_choice
 from jimpact.files.records import with_error
+from jimpact.fits.adequacy import NO_SHOT
 from jimpact.fits.result import FitResult
 
 LEAST_SHOTS = 4  # of which the scatter of one number can be estimated
@@ -106,7 +107,7 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
 
     which = _which(fit, name)
     residual, jacobian, shot = _weighted(fit)
-    shots = np.unique(shot)
+    shots = np.unique(shot[shot != NO_SHOT])
     if len(shots) < LEAST_SHOTS:
         raise ValueError(
             f"Argument `fit` must be of at least {LEAST_SHOTS} shots, but has {len(shots)}."
@@ -145,7 +146,7 @@ def shown_scatter(fit: FitResult) -> Scatter | None:
     stretched = fit.problem.sigma is not None and fit.noise > 1 and fit.loss == "squares"
     if not stretched or fit.experiments is None or not np.isfinite(fit.standard_error).all():
         return None
-    if fit.shot_count < SHOWN_FROM:
+    if fit.shot_count < SHOWN_FROM or fit.contradicts_priors:
         return None
     try:
         result = scatter(fit)
@@ -169,10 +170,12 @@ def _which(fit: FitResult, name: str | None) -> int:
 
 
 def _weighted(fit: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals (R,) in units of sigma, their derivatives (R, P), shots (R,)."""
+    """Residuals (R,) in units of sigma, their derivatives (R, P), shots (R,); then the priors'."""
     problem, here = fit.problem, ~np.isnan(fit.problem.measured)
     residual, jacobian = problem.independent(fit.residual), problem.independent(fit.jacobian)
-    return residual[here], jacobian[here], problem.shot_of_value
+    more, slope = problem.prior_errors(fit.value)
+    shot = np.append(problem.shot_of_value, np.full(len(more), NO_SHOT))
+    return np.append(residual[here], more), np.vstack([jacobian[here], slope]), shot
 
 
 class _Model:

@@ -331,6 +331,11 @@ def _candidates(
             "differs from lzb only where contacts have gaps, or open and close again (as at a "
             "wall): name it in `laws` to fit it, too"
         )
+    if laws is None and "routh" in built:
+        left_out["routh"] = (
+            "is moreau with one restitution, unless contacts separate beforehand: name it in "
+            "`laws` to fit it, too"
+        )
     if "base" not in values:
         left_out.pop("velocity_dependent", None)  # an option of the others, see `speed`
     built = {name: law for name, law in built.items() if name not in left_out}

@@ -122,9 +122,9 @@ def _not_finite(problem: FitProblem, solution: SearchResult) -> list[str]:
     lost = np.flatnonzero(np.isfinite(problem.measured) & ~np.isfinite(solution.predicted))
     if not len(lost):
         return []
-    which = listed([str(i + 1) for i in lost])
+    which, values = listed([str(i + 1) for i in lost]), problem.values - len(problem.priors)
     return [
-        f"The fitted law fails in {len(lost)} of {problem.values} values ({which}): they are not "
+        f"The fitted law fails in {len(lost)} of {values} values ({which}): they are not "
         "finite there and count as large errors."
     ]
 

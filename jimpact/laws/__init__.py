@@ -58,7 +58,7 @@ register(
     Poisson,
     summary="every contact returns e times the impulse of its compression",
     right_when="contacts that reach their largest compression together",
-    fails_when="dispersion in chains (would need e > 1), unequal e (may gain energy)",
+    fails_when="dispersion in chains: it would need e > 1, which may gain energy",
     promises=EVERY_PROPERTY - {"energy"},
     source="Pfeiffer and Glocker (1996); Brogliato (2016), (6.76)-(6.79)",
     bibtex=_BIBTEX["pfeiffer1996"],

@@ -79,7 +79,7 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
     0.9
     """
     e = as_float_array("restitution", restitution)
-    if force.bistiffness is not None:
+    if force.bistiffness is not None and force.bound is None:
         return with_parameter(force.bistiffness, "restitution", e)
     check_values("restitution", e, low=LEAST, high=1.0)
     m, v = as_float_array("mass", mass), as_float_array("speed", speed)

@@ -34,8 +34,9 @@ class Compliant(Law):
     Args:
         force: a contact force: `PowerLaw(k, eta)`, `Hertz(k)`, `LinearSpring(k)`,
             `Bistiffness(k, eta, e)`, `KelvinVoigt(k, c)`, `HuntCrossley(k, d, eta)`,
-            `KuwabaraKono(k, A)`, `UserForce(function, parameters)`; stiffness k [N / m^eta],
-            exponent eta, restitution e, damping c [N s/m], d [s/m], dissipative time A [s].
+            `KuwabaraKono(k, A)`, `ElastoPlastic(k, F_y, eta)`, `UserForce(function, parameters)`;
+            stiffness k [N / m^eta], exponent eta, restitution e, damping c [N s/m], d [s/m],
+            dissipative time A [s], yield force F_y [N].
         friction: Coulomb's mu >= 0, scalar or (m,), for a scene with tangents; None: none.
         initial_energy: U_0j >= 0, scalar or (m,) [J]: precompression of closed contacts; not with
             a viscous force.
@@ -79,8 +80,14 @@ class Compliant(Law):
                 "Argument `force` must be a contact force such as Hertz(k), "
                 f"but has value {self.force!r}."
             )
-        if self.force.bistiffness is None:  # the energy of others is not a function of x alone
+        bounded = self.force.bound is not None
+        if self.force.bistiffness is None or bounded:  # energy is not a function of x alone
             check_values("initial_energy", self.initial_energy, low=0.0, high=0.0)
+        if bounded and (self.friction is not None or self.method == "implicit"):
+            raise ValueError(
+                "Argument `force` must not yield with friction or method 'implicit', but has value "
+                f"{self.force!r}."
+            )
 
     @property
     def contact_force(self) -> Force:
@@ -127,6 +134,9 @@ class Compliant(Law):
             speed = units.velocity * units.root
             viscous = Viscous(force, units.indentation, speed, units.momentum / units.time)
         problem = problem._replace(viscous=viscous)
+        if bistiffness is not None and force.bound is not None:
+            depth = (force.bound / k) ** (1 / jnp.asarray(exponent, k.dtype))
+            problem = problem._replace(limit=depth / units.indentation)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
         return Dynamics(problem, units, exponent, contact.chain, self.max_steps, method)

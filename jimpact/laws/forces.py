@@ -27,8 +27,8 @@ class Force(Declared):
 
     A force of your own with declared parameters inherits it; `UserForce` takes a function. What
     else it can do it declares: `slackens`, the force may end before the indentation does;
-    `bistiffness`, for forces that are one; `damping_scale` and a parameter `damping`, for
-    `calibrate`; `pair_restitution`, where it is known in closed form.
+    `bistiffness`, for forces that are one, and the `bound` of one that yields; `damping_scale` and
+    a parameter `damping`, for `calibrate`; `pair_restitution`, where it is known in closed form.
 
     >>> import jax.numpy as jnp
     >>> import jimpact as ji
@@ -54,6 +54,11 @@ class Force(Declared):
     @property
     def bistiffness(self) -> "Bistiffness | None":
         """The same force as a `Bistiffness`, which stores energy and has a history; else None."""
+        return None
+
+    @property
+    def bound(self) -> jax.Array | None:
+        """Force [N] beyond which indentation is plastic; None: it has no such bound."""
         return None
 
     def damping_scale(self, mass: jax.Array, speed: jax.Array) -> jax.Array | None:
@@ -125,6 +130,60 @@ class Bistiffness(Force):
         positive = x > 0
         power = jnp.where(positive, x, 1.0) ** jnp.asarray(self.exponent, x.dtype)
         return self.stiffness * jnp.where(positive, power, 0.0)
+
+
+class ElastoPlastic(Force):
+    """Elastic contact that yields: `F = k x^eta` up to a force that it never exceeds.
+
+    Equation: `F = k x_e^eta` of the elastic indentation, `x_e' = -gamma`, but `x_e' = 0` while
+    `F = F_y` and the contact is compressed. Unloading is elastic, along another branch, to the
+    residual indentation x - x_e, where the surface remains. A pair is elastic up to a speed v_y;
+    above it `e = v_y / v`, as it returns at most the elastic energy at F_y,
+    `m v_y^2 / 2 = F_y^((eta + 1) / eta) / ((eta + 1) k^(1 / eta))`.
+
+    A `Bistiffness`, in comparison, loses its share at any speed, and its force has no bound.
+
+    Args:
+        stiffness: k > 0 [N / m^eta].
+        yield_force: F_y > 0 [N].
+        exponent: eta >= 1; a float (or a tuple) is static, an array is differentiable.
+
+    `Compliant` takes it without friction, and not by method 'implicit'; motions do not take it.
+
+    Source: elastic, ideally plastic contact; Brogliato, Nonsmooth Mechanics (2016), 6.3.1, on what
+    a bistiffness leaves out.
+
+    >>> import jimpact as ji
+    >>> force = ji.ElastoPlastic(8.0, yield_force=2.0, exponent=1.0)  # F_y^2 / (2 k) = 1/4 J
+    >>> [round(float(ji.measured_restitution(force, mass=2.0, speed=v)), 6) for v in (0.4, 1.0)]
+    [1.0, 0.5]
+    """
+
+    stiffness: Values = parameter(low=0.0, open_low=True, log=True)
+    yield_force: Values = parameter(low=0.0, open_low=True, log=True)
+    exponent: StaticOrValues = parameter(
+        low=1.0, static_numbers=True, searched_high=LARGEST_EXPONENT, default=1.5
+    )
+
+    @property
+    def bistiffness(self) -> Bistiffness:
+        """Its elastic part."""
+        return Bistiffness(self.stiffness, self.exponent)
+
+    @property
+    def bound(self) -> jax.Array:
+        """The yield force."""
+        return self.yield_force
+
+    def pair_restitution(self, mass: jax.Array, speed: jax.Array) -> jax.Array:
+        """min(1, v_y / v)."""
+        eta = jnp.asarray(self.exponent, mass.dtype)
+        energy = self.yield_force ** ((eta + 1) / eta) / (eta + 1) / self.stiffness ** (1 / eta)
+        return jnp.minimum(1.0, jnp.sqrt(2 * energy / mass) / speed)
+
+    def force(self, x: jax.Array, rate: jax.Array) -> jax.Array:
+        """Of a first loading."""
+        return jnp.minimum(self.bistiffness.force(x, rate), self.yield_force)
 
 
 def PowerLaw(stiffness: Any, exponent: Any = 1.5) -> Bistiffness:

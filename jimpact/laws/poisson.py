@@ -31,7 +31,10 @@ class Poisson(Law):
 
     Status: `impulse_not_unique` for redundant contacts; `several_outcomes` where, besides, their e
     differ: v+ then depends on how they share p_c (the least one is taken); `energy_gain` where
-    unequal or large e create energy. With friction as in `Moreau`.
+    e above 1 creates energy. With friction as in `Moreau`.
+
+    Without friction it loses at least `(1 - e_max^2) p_c^T W p_c / 2`, whatever the e_j up to 1:
+    of all s >= 0 the law takes that of least energy, and `s = (e_max - e_j) p_c` is one of them.
 
     Derivatives are one-sided where a contact is about to take part in either stage.
 

@@ -107,7 +107,7 @@ def gap_scale(scene: Scene, law: Law, velocity: Any) -> GapScale:
     check_law(law, scene, v.dtype)
     speed = jnp.maximum(jnp.max(-gap_velocity(scene, v)), 0.0)
     work = 2 / diagonal(delassus_matrix(scene)) * speed**2
-    if force.bistiffness is not None:
+    if force.bistiffness is not None and force.bound is None:
         eta = jnp.asarray(force.bistiffness.exponent, work.dtype)
         delta = (work / force.bistiffness.stiffness) ** (1 / (eta + 1))
     else:

@@ -14,6 +14,7 @@ from jimpact.contact import delassus_matrix
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
 from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Force
+from jimpact.motion.arguments import check_unbounded
 from jimpact.motion.dynamics import base_velocity, kinematics, user_force
 from jimpact.motion.event_driven import why_stuck
 from jimpact.motion.flow import (
@@ -26,6 +27,7 @@ from jimpact.motion.flow import (
     check_rtol,
     first_flight,
     longest_step,
+    nan_derivatives,
     no_samples,
     one_pass,
     packed,
@@ -206,7 +208,10 @@ def compliant_motion(
         return on & ~run.apart if until_apart else on
 
     end = jax.lax.while_loop(going, lambda run: _one_pass(problem, run), start)
-    samples = sampled_states(end.samples, state, end.flight.sample)
+    table = end.samples
+    reached = jnp.arange(table.shape[0], dtype=jnp.int32) < end.flight.sample
+    table = table + nan_derivatives((system, force, q0, v0, times), reached).astype(table.dtype)
+    samples = sampled_states(table, state, end.flight.sample)
     course = Course(samples, end.events, end.flight.steps, end.status)
     return course, end.flight.state, end.apart
 
@@ -350,6 +355,7 @@ def turning_impact(
     check_shape("velocity", v, position.shape, "one per coordinate")
     check_values("velocity", v)
     check_kind("force", force, Force)
+    check_unbounded("force", force)
     system, force, position, v = in_common_dtype(System(gap_function, mass), force, position, v)
     check_rtol(rtol, position.dtype)
     scene = system.body.scene(position)  # and its checks

@@ -33,6 +33,8 @@ from jimpact.motion.flow import (
     encoded,
     first_flight,
     flow_of,
+    nan_derivatives,
+    nan_unless,
     no_samples,
     one_pass,
     out_of_range,
@@ -455,7 +457,7 @@ def _events(table: MotionTable, count: jax.Array, problem: MotionProblem) -> Eve
     """The record of events; NaN or 0 in rows that are not used."""
     used = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
-    rows = jnp.where(used[:, None], table.events[:-1], jnp.nan)
+    rows = nan_unless(used, table.events[:-1])
     n, m = problem.v0.size, problem.contacts
     sizes = np.cumsum([1, problem.q0.size, n, n, m, problem.sides, 2 * m])
     time, q, before, after, impulse, side, energy, passed = jnp.split(rows, sizes, axis=1)
@@ -540,10 +542,12 @@ def _again(
     states, numbers = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
 
     def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
-        """The values in the first rows with a flag."""
+        """The values in the first rows with a flag; derivatives of further ones are NaN."""
         so_far, wanted = jnp.cumsum(flags, dtype=jnp.int32), jnp.arange(count, dtype=jnp.int32)
         row = jnp.minimum(jnp.searchsorted(so_far, wanted + 1), size - 1)
-        return jnp.where((wanted < so_far[-1])[:, None], values.reshape(size, -1)[row], 0.0)
+        known = wanted < so_far[-1]
+        values = jnp.where(known[:, None], values.reshape(size, -1)[row], 0.0)
+        return values + nan_derivatives(problem, known).astype(values.dtype)
 
     samples = at(sampled, states, times.shape[0])
     first = packed(start)[:, 0][None]

@@ -47,6 +47,8 @@ def fit_motion(
     *,
     sigma: Any = None,
     bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    ties: Mapping[str, Any] | None = None,
     observe: Observe | None = None,
     loss: str = "squares",
     starts: int = 1,
@@ -73,7 +75,7 @@ def fit_motion(
         t_end: [s].
         free: names of the law's parameters, or a mapping to masks over contacts, as in `fit`.
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
-        bounds: field -> (low, high).
+        bounds, priors, ties: as in `fit`.
         observe: Motion -> array; None: the positions. E.g. `lambda m: m.events.time[:10]`.
         loss, starts, seed, max_steps, profiles, progress: as in `fit`.
         options: of `simulate`; `samples` follows from `measured` where `observe` is None.
@@ -102,7 +104,9 @@ def fit_motion(
     observable = MotionObservable(
         system, {"q0": q0, "v0": v0, "t_end": t_end} | options, observe or _positions
     )
-    problem = FitProblem.from_observable(law, observable, measured, sigma, free, bounds)
+    problem = FitProblem.from_observable(
+        law, observable, measured, sigma, free, bounds, priors, ties
+    )
     return fit(
         problem,
         loss=loss,

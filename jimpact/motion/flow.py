@@ -345,10 +345,38 @@ def no_samples(start: State, targets: jax.Array) -> jax.Array:
     return jnp.zeros((targets.shape[0] + 1, len(row)), row.dtype).at[0].set(row)
 
 
+def nan_unless(known: jax.Array, rows: jax.Array) -> jax.Array:
+    """Rows (r, w), NaN where not `known` (r,); other than those of `where`, derivatives pass."""
+    return rows + jnp.where(known, 0.0, jnp.nan).astype(rows.dtype)[:, None]
+
+
+def nan_derivatives(inputs: Any, known: jax.Array) -> jax.Array:
+    """Rows (r, 1): 0 where `known` (r,); elsewhere all derivatives by all inputs are NaN.
+
+    A motion that has ended does not determine what would come later. In reverse mode what nobody
+    differentiates (a cotangent of 0) leaves the gradient as it is.
+    """
+    unknown, total = ~known, jnp.zeros(())
+    for x in jax.tree.leaves(inputs):
+        if eqx.is_inexact_array(x):
+            # the sine has derivatives of all orders
+            wave = jnp.sin(jnp.where(jnp.isfinite(x), x, 0.0) + 1)
+            total = total + jnp.sum(_nan_unless_zero(wave, jnp.any(unknown))).astype(total.dtype)
+    each = _nan_unless_zero(jnp.broadcast_to(total, known.shape), unknown)
+    return jnp.where(known, 0.0, each)[:, None]
+
+
+def _nan_unless_zero(x: jax.Array, chosen: jax.Array) -> jax.Array:
+    """x, but NaN where `chosen` unless it is 0: products, so that this holds transposed as well."""
+    huge = jnp.where(chosen, jnp.finfo(x.dtype).max, 1.0).astype(x.dtype)
+    times_infinity = jnp.where(chosen, 0.0, 1.0).astype(x.dtype) * (huge * (huge * x))
+    return huge * (huge * times_infinity)
+
+
 def sampled_states(samples: jax.Array, start: State, reached: jax.Array) -> State:
     """States of a table, NaN where they were not reached."""
     is_reached = jnp.arange(samples.shape[0] - 1, dtype=reached.dtype) < reached
-    rows = jnp.where(is_reached[:, None], samples[:-1], jnp.nan)
+    rows = nan_unless(is_reached, samples[:-1])
     return jax.vmap(lambda row: unpacked(start, row[:, None]))(rows)
 
 
@@ -460,7 +488,7 @@ def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any
     penetrates = jnp.any(gaps(system, at.q, at.t) < -closed_below)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
     status = jnp.where(out_of_range(system, at), MOTION_CODE["out_of_range"], status)
-    status = jnp.where(end < at.t, MOTION_CODE["backward"], status)
+    status = jnp.where(end <= at.t, MOTION_CODE["backward"], status)
     finite = jnp.all(jnp.isfinite(at.q)) & jnp.all(jnp.isfinite(at.v)) & jnp.isfinite(end)
     return jnp.where(finite, status, MOTION_CODE["not_finite"]).astype(jnp.int32)
 

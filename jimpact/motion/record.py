@@ -1,7 +1,10 @@
 """The record of a motion: samples, events, energy ledger, status."""
 
 import dataclasses
+import zipfile
 from functools import partial
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -30,8 +33,9 @@ MOTION_STATUS = (
     Status("not_finite", "the motion or its input is NaN or infinite", True),
     Status(
         "coarse_step",
-        "steps are too long: within 3 a contact is struck again, or in one bodies pass each other, "
-        "or a disc of a pile moves by more than the least radius",
+        "steps are too long: within 3 a contact is struck again, at more than a tenth of the "
+        "largest gap velocity, or in one bodies pass each other, or a disc of a pile moves by more "
+        "than the least radius",
         False,
     ),
     Status("unsolved_step", "impulses of a step are off by > 1 % of its velocities", False),
@@ -41,7 +45,7 @@ MOTION_STATUS = (
         "contact forces with friction have several solutions: contacts stick or part (`events`)",
         False,
     ),
-    Status("backward", "t_end is before t_start", True),
+    Status("backward", "t_end is not after t_start", True),
     Status(
         "no_derivatives",
         "the motion is right, but its derivatives are NaN: it takes more steps than they keep "
@@ -53,8 +57,16 @@ MOTION_CODE = {row.name: code for code, row in enumerate(MOTION_STATUS)}
 
 EVENT_KINDS = ("none", "impact", "accumulation", "contact", "detachment", "friction", "paroxysm")
 _ROUNDING = 1e-12  # of the largest work: what is smaller is not printed
+FORMAT = 1  # version of the files of motions
 
 KIND_CODE = {name: code for code, name in enumerate(EVENT_KINDS)}
+
+# Codes are saved as their names, so that files outlive the order of these rows.
+_NAMES = {
+    "status": tuple(row.name for row in MOTION_STATUS),
+    "events.kind": EVENT_KINDS,
+    "events.status": tuple(row.name for row in STATUS),
+}
 
 
 class Events(eqx.Module):
@@ -182,6 +194,58 @@ class Motion(eqx.Module):
             raise ValueError(f"Argument `kind` must be one of {EVENT_KINDS}, but is {kind!r}.")
         return np.asarray(self.events.time)[np.asarray(self.events.kind) == KIND_CODE[kind]]
 
+    @property
+    def end(self) -> dict[str, Any]:
+        """`q0`, `v0`, `t_start` at the last sample that was reached, on the host, of one motion.
+
+        `simulate(system, law, **motion.end, t_end=...)` goes on from there.
+        """
+        last = self._reached() - 1
+        return {"q0": self.q[last], "v0": self.velocity[last], "t_start": float(self.time[last])}
+
+    def _reached(self) -> int:
+        """How many samples were reached."""
+        if np.ndim(self.status):
+            raise ValueError("A batch of motions has no common end: pick one motion of it.")
+        return int(np.isfinite(np.asarray(self.q)).all(axis=-1).sum())
+
+    def then(self, later: "Motion") -> "Motion":
+        """This motion and a `later` one, which goes on from its `end`, as one record.
+
+        Works add up, so that the ledger holds from the start of this motion on.
+        """
+        last, begin = self.end["t_start"], float(later.time[0])
+        if begin != last:
+            raise ValueError(
+                f"Argument `later` must begin at {last:g} s, where this motion ends, but begins at "
+                f"{begin:g} s."
+            )
+        count = self._reached()
+        samples = {}
+        for name in _SAMPLED:
+            first, second = getattr(self, name)[:count], getattr(later, name)[1:]
+            added = first[-1] if name.endswith("_work") else 0.0
+            samples[name] = jnp.concatenate([first, second + added])
+        # what came after the last sample comes again
+        known = np.asarray(self.events.kind > 0) & (np.asarray(self.events.time) <= last)
+        events = jax.tree.map(lambda x: np.asarray(x)[known] if np.ndim(x) else x, self.events)
+        events = dataclasses.replace(events, count=jnp.int32(known.sum()))
+        table = joined([events, later.events], known.sum() + later.events.time.shape[0])
+        return dataclasses.replace(later, **samples, events=table, steps=self.steps + later.steps)
+
+    def save(self, path: str | Path) -> Path:
+        """Write everything to `path`, which ends in .npz; `ji.load_motion` reads it."""
+        path = Path(path)
+        if path.suffix != ".npz":
+            raise ValueError(f"Argument `path` must end in .npz, but is '{path}'.")
+        arrays = {name: np.asarray(x) for name, x in _arrays(self).items()}
+        arrays |= {"format": np.asarray(FORMAT), "jimpact": np.asarray(version("jimpact"))}
+        for name, words in _NAMES.items():
+            arrays[name] = np.asarray(words)[arrays[name]]
+        with path.open("wb") as file:
+            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        return path
+
     def to_dict(self) -> dict[str, Any]:
         """Everything, ready for JSON (NaN: None)."""
         n = int(self.events.count)
@@ -209,7 +273,7 @@ class Motion(eqx.Module):
         }
         lines = [
             f"Motion from {float(self.time[0]):g} s to {float(self.time[-1]):g} s: {row.name}"
-            + (f" ({row.message})" if row.failure else ""),
+            + (f" ({row.message})" if row.name != "ok" else ""),
             f"  events: {', '.join(counts) or 'none'}",
             f"  energy T + V: {float(self.energy[0]):.6g} J to {float(self.energy[last]):.6g} J"
             f" at {reached[-1] if len(reached) else np.nan:g} s",
@@ -217,6 +281,62 @@ class Motion(eqx.Module):
             f"  ledger closes to {np.nanmax(np.abs(np.asarray(self.ledger_residual))):.1e} J",
         ]
         return "\n".join(lines)
+
+
+_WHOLE = ("events", "steps", "status")  # fields that do not belong to samples
+_SAMPLED = tuple(name for name in Motion.__dataclass_fields__ if name not in _WHOLE)
+
+
+def _arrays(motion: Motion) -> dict[str, jax.Array]:
+    """All fields by name, those of events as `events.name`."""
+    rows = {f"events.{name}": x for name, x in vars(motion.events).items()}
+    return {name: x for name, x in vars(motion).items() if name != "events"} | rows
+
+
+def load_motion(path: str | Path) -> Motion:
+    """A motion, or a batch, from the file that `Motion.save` wrote.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        The same `Motion`, to the last digit. System and law are not in the file.
+
+    Raises:
+        FileNotFoundError: no such file. ValueError: not a file of a motion, one of a later
+            version, or double precision while JAX is in single precision.
+
+    >>> import pathlib, tempfile, jimpact as ji
+    >>> ball, law = ji.ball_system(), ji.Newton(0.5)
+    >>> motion = ji.simulate(ball, law, [1.0], [0.0], 1.0, samples=21)
+    >>> path = motion.save(pathlib.Path(tempfile.mkdtemp()) / "ball.npz")
+    >>> loaded = ji.load_motion(path)
+    >>> later = ji.simulate(ball, law, **loaded.end, t_end=2.0, samples=21)
+    >>> both = loaded.then(later)
+    >>> len(both.time), [round(float(t), 4) for t in both.event_times()[:3]]
+    (41, [0.4516, 0.9032, 1.129])
+    """
+    wrong = f"Argument `path` must be a file of `Motion.save`, but '{path}' "
+    try:
+        with np.load(Path(path), allow_pickle=False) as file:
+            arrays = dict(file)
+    except (ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise ValueError(f"{wrong}cannot be read: {error}") from error
+    found = arrays.pop("format", None)
+    if found is None or not {"time", "status", "events.kind"} <= set(arrays):
+        raise ValueError(f"{wrong}holds something else.")
+    written = arrays.pop("jimpact")
+    if int(found) != FORMAT:
+        raise ValueError(
+            f"{wrong}has format {int(found)}, of jimpact {written}; this version reads {FORMAT}."
+        )
+    for name, words in _NAMES.items():
+        arrays[name] = np.vectorize(words.index, otypes=[np.int32])(arrays[name])
+    if jnp.asarray(arrays["q"]).dtype != arrays["q"].dtype:
+        raise ValueError(f"{wrong}is in {arrays['q'].dtype}: enable jax_enable_x64.")
+    values = {name: jnp.asarray(x) for name, x in arrays.items()}
+    rows = {name: values.pop(f"events.{name}") for name in Events.__dataclass_fields__}
+    return Motion(events=Events(**rows), **values)
 
 
 def _work_report(works: dict[str, Any]) -> str:

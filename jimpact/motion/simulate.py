@@ -300,10 +300,12 @@ def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
     reached = jnp.isfinite(at.t)
 
     def sampled(function: Callable[..., jax.Array], *args: jax.Array) -> jax.Array:
-        """A function of the samples; one that is NaN does not reach the derivatives of others."""
+        """A function of the samples; a NaN does not reach the derivatives of other samples."""
         rows = (jnp.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, x[:1]) for x in args)
         values = jax.vmap(function)(*rows)
-        return jnp.where(reached.reshape(-1, *[1] * (values.ndim - 1)), values, jnp.nan)
+        each = (-1, *[1] * (values.ndim - 1))
+        # times that were not reached are NaN, and so are their derivatives
+        return jnp.where(reached.reshape(each), values, at.t.reshape(each))
 
     return Motion(
         time=times,

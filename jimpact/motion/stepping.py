@@ -21,12 +21,13 @@ DERIVATIVES of such a step do not converge: with h the time of an impact is cons
 derivative is not. They are refused.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jimpact.bodies.base import ActivePairs
+from jimpact.bodies.base import BLOCK, ActivePairs
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
 from jimpact.motion.dynamics import (
@@ -61,16 +62,26 @@ FEW, PILE, ROUNDINGS = 1e-9, 1e-6, 32
 OFF = 1e-2  # misfit above which `unsolved_step` is reported; ten times more is no solution
 ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jammed piles only
 MEAN = 4  # iterations of the mean velocity in the forces; the error falls by h omega (spin) each
-# Share of the largest speed of any gap by which the rate of a gap changes where bodies pass each
-# other in a step: head-on it is 2 for the fastest. Ten times less would report corners that roll
-# over the ground, ten times more would hide what is slower than half of the fastest.
+# Share of the speed that the velocities could give a gap, by which its rate changes where bodies
+# pass each other in a step: head-on it is 2. Ten times less would report corners that roll over the
+# ground, ten times more would hide oblique passages.
 TURN = 0.1
-APART = 3  # steps: a contact that is struck again within them is reported as `coarse_step`
+# Steps: a contact that is struck again within them by an impact that is HARD, of more than this
+# share of the largest gap velocity so far, is reported as `coarse_step`. Each impact is early or
+# late by up to h / 2; one below that share adds less than that share to the error in q that the
+# fastest impact makes anyway. Ten times less reports stacks that come to rest, ten times more
+# hides rebounds whose order the step does not resolve.
+APART, HARD = 3, 0.1
 
 WHY = (
     "Argument `method` must not be 'time_stepping' where derivatives are taken: with the step the "
     "times of impacts are fixed, so that derivatives do not converge. method='events' has them."
 )
+
+
+def block(x: jax.Array, row: jax.Array) -> jax.Array:
+    """The rows of x (K, ...) from this one that are computed at once."""
+    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
 
 
 class _AllContacts(NamedTuple):
@@ -109,11 +120,11 @@ class _AllContacts(NamedTuple):
         m, b = self.matrix.shape[:2]
         return jnp.diagonal(self.matrix.reshape(m * b, m * b)).reshape(m, b)
 
-    def warm_start(self, last_impulses: jax.Array) -> jax.Array:
+    def warm_start(self, last: Any) -> jax.Array:
         """Impulses (m, b) of the last step."""
-        return jnp.where(self.closed[:, None], last_impulses, 0.0)
+        return jnp.where(self.closed[:, None], last, 0.0)
 
-    def update_memory(self, last_impulses: jax.Array, x: jax.Array) -> jax.Array:
+    def kept(self, x: jax.Array) -> jax.Array:
         """Impulses x (m, b) in the form in which the next step reads them."""
         return x
 
@@ -122,21 +133,39 @@ class _AllContacts(NamedTuple):
         return values
 
 
+class _PileImpulses(NamedTuple):
+    """Impulses of the closed contacts of a pile, by increasing numbers of the contacts."""
+
+    number: jax.Array  # (m,)
+    impulse: jax.Array  # (m, b)
+
+
 class _ActiveContacts(NamedTuple):
     """The closed contacts of a pile in one step; methods as those of `_AllContacts`."""
 
     pairs: ActivePairs
-    inverse: jax.Array  # 1 / M (k + 1, 3), 0 for walls
+    inverse: jax.Array  # 1 / M (k + 1, velocities of a body), 0 for walls
 
     @property
     def closed(self) -> jax.Array:
         """(m,)."""
         return self.pairs.closed
 
+    def _over_blocks(self, one: Callable[[jax.Array, Any], Any], start: Any) -> Any:
+        """`start` carried by `one(first_row, carry)` through the blocks of rows that are used."""
+        blocks = (jnp.sum(self.closed) + BLOCK - 1) // BLOCK
+        return jax.lax.fori_loop(0, blocks, lambda i, carry: one(i * BLOCK, carry), start)
+
     def rates(self, v: jax.Array) -> jax.Array:
         """Gap velocities and slips (m, b) of v (n,)."""
-        bodies = jnp.pad(v.reshape(-1, 3), ((0, 1), (0, 0)))[self.pairs.bodies]
-        return jnp.sum(self.pairs.directions * bodies[:, None], axis=(2, 3))
+        of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
+
+        def one(row: jax.Array, rates: jax.Array) -> jax.Array:
+            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
+            values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
+            return jax.lax.dynamic_update_slice_in_dim(rates, values, row, 0)
+
+        return self._over_blocks(one, jnp.zeros(self.pairs.directions.shape[:2], v.dtype))
 
     def fastest(self, v: jax.Array) -> jax.Array:
         """Gap velocity () that the speeds of v could give."""
@@ -148,8 +177,13 @@ class _ActiveContacts(NamedTuple):
 
     def generalized_impulse(self, x: jax.Array) -> jax.Array:
         """Generalized impulse (n,) of impulses x (m, b)."""
-        each = jnp.sum(self.pairs.directions * x[:, :, None, None], axis=1)
-        return jnp.zeros_like(self.inverse).at[self.pairs.bodies].add(each)[:-1].reshape(-1)
+
+        def one(row: jax.Array, impulses: jax.Array) -> jax.Array:
+            bodies, directions = (block(y, row) for y in (self.pairs.bodies, self.pairs.directions))
+            each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
+            return impulses.at[bodies].add(each)
+
+        return self._over_blocks(one, jnp.zeros_like(self.inverse))[:-1].reshape(-1)
 
     def product(self, x: jax.Array) -> jax.Array:
         """Rates (m, b) that impulses x (m, b) give."""
@@ -160,13 +194,17 @@ class _ActiveContacts(NamedTuple):
         """Of the Delassus matrix (m, b)."""
         return jnp.sum(self.pairs.directions**2 * self.inverse[self.pairs.bodies][:, None], (2, 3))
 
-    def warm_start(self, last_impulses: jax.Array) -> jax.Array:
-        """Impulses (m, b) of the last step."""
-        return last_impulses.at[self.pairs.number].get(mode="fill", fill_value=0.0)
+    def warm_start(self, last: Any) -> jax.Array:
+        """Impulses (m, b) of the last step, 0 where the contact was open."""
+        row = jnp.searchsorted(last.number, self.pairs.number)
+        row = jnp.minimum(row, last.number.size - 1)
+        same = self.closed & (last.number[row] == self.pairs.number)
+        return jnp.where(same[:, None], last.impulse[row], 0.0)
 
-    def update_memory(self, last_impulses: jax.Array, x: jax.Array) -> jax.Array:
-        """Impulses x (m, b) as (pairs, b), the form in which the next step reads them."""
-        return jnp.zeros_like(last_impulses).at[self.pairs.number].set(x, mode="drop")
+    def kept(self, x: jax.Array) -> _PileImpulses:
+        """Impulses x (m, b) in the form in which the next step reads them."""
+        order = jnp.argsort(self.pairs.number)
+        return _PileImpulses(self.pairs.number[order], x[order])
 
     def recorded(self, values: jax.Array) -> jax.Array:
         """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
@@ -189,7 +227,7 @@ class _Progress(NamedTuple):
 
     state: State
     speed: jax.Array  # () largest gap velocity that velocities could give so far
-    last_impulses: jax.Array  # of the last step
+    last_impulses: jax.Array | _PileImpulses  # of the last step
     residual_velocity: jax.Array  # gap velocity () that these leave unsolved
     inverse_step_size: jax.Array  # of the solver, see `solve_many`
     steps_since_impact: jax.Array  # (m,) of each contact
@@ -264,12 +302,9 @@ def time_stepping(
     zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
     m = recorded_gaps(system, q0, times[0]).shape[0]
 
-    def rates_at(q: jax.Array) -> jax.Array:
-        t = times[0]
-        return _contacts(system, q, t, q, t, closed_below, mu is not None).rates(v0)
-
-    contacts, b = jax.eval_shape(rates_at, q0).shape
-    pair_count = system.body.pair_count
+    first = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
+    at_rest = jnp.zeros_like(first.rates(v0))
+    contacts, b = at_rest.shape
     rest = jnp.zeros((2, m), dtype)
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
     rows = 1 if is_pile(system) else max_events
@@ -282,7 +317,7 @@ def time_stepping(
     start = _Progress(
         state=begin,
         speed=zero,
-        last_impulses=jnp.zeros((contacts if pair_count is None else pair_count, b), dtype),
+        last_impulses=first.kept(at_rest),
         residual_velocity=zero,
         inverse_step_size=jnp.ones((), dtype),
         steps_since_impact=jnp.full(contacts, substeps * len(times)),
@@ -327,7 +362,8 @@ def _contacts(
     if is_pile(system):
         pairs = system.body.active_pairs(at, end, closed_below)
         pairs = pairs if friction else pairs._replace(directions=pairs.directions[:, :1])
-        return _ActiveContacts(pairs, jnp.pad(1 / mass.reshape(-1, 3), ((0, 1), (0, 0))))
+        of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
+        return _ActiveContacts(pairs, jnp.pad(of_bodies, ((0, 1), (0, 0))))
     normal = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
     gap, normals = normal.value, normal.gradient
     n, m = normals.shape
@@ -354,7 +390,7 @@ def _one_step(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Prog
     return _Progress(
         state=state,
         speed=setup.speed,
-        last_impulses=contacts.update_memory(progress.last_impulses, solution.impulse),
+        last_impulses=contacts.kept(solution.impulse),
         residual_velocity=solution.residual_velocity,
         inverse_step_size=solution.inverse_step_size,
         steps_since_impact=jnp.where(setup.strikes, 1, progress.steps_since_impact + 1),
@@ -520,15 +556,17 @@ def _status(
         positive_definite = definite(setup.mass) | ~jnp.all(jnp.isfinite(setup.mass))
         status = jnp.where(positive_definite, status, MOTION_CODE["singular_mass"])
     if isinstance(contacts, _ActiveContacts):
-        speeds = jnp.sum(trial.v.reshape(-1, 3)[:, :2] ** 2, axis=1)
+        velocities = trial.v.reshape(-1, contacts.inverse.shape[1])
+        places = (velocities.shape[1] + 1) // 2  # 2 of 3 in a plane, 3 of 6 in space
+        speeds = jnp.sum(velocities[:, :places] ** 2, axis=1)
         coarse = problem.h * jnp.sqrt(jnp.max(speeds)) > contacts.pairs.reach
     else:
-        struck_again = setup.strikes & (progress.steps_since_impact < APART)
-        # a gap that was to close grows: bodies passed each other between two evaluations of it
         relative = progress.state.v - setup.base_velocity
         rate = contacts.normals.T @ relative
-        fastest = jnp.max(jnp.abs(contacts.normals).T @ jnp.abs(relative))
-        turned = rate - progress.closing > TURN * fastest
+        struck_again = setup.strikes & (progress.steps_since_impact < APART)
+        struck_again &= rate < -HARD * setup.speed
+        # a gap that was to close grows: bodies passed each other between two evaluations of it
+        turned = rate - progress.closing > TURN * (jnp.abs(contacts.normals).T @ jnp.abs(relative))
         coarse = jnp.any(struck_again | ((progress.closing < 0) & (rate > 0) & turned))
     coarse = jnp.where(coarse, MOTION_CODE["coarse_step"], 0)
     unsolved = jnp.where(trial.solution.misfit > OFF, MOTION_CODE["unsolved_step"], 0)

@@ -8,8 +8,14 @@ from .charts import (
     validity_map as validity_map,
     work_precision as work_precision,
 )
+from .films import animation as animation
 from .fits import contour as contour, fit as fit
-from .inference import correlation as correlation, profiles as profiles, residuals as residuals
+from .inference import (
+    corner as corner,
+    correlation as correlation,
+    profiles as profiles,
+    residuals as residuals,
+)
 from .laws import (
     comparison as comparison,
     contact_loop as contact_loop,
@@ -19,10 +25,11 @@ from .laws import (
     rheologies as rheologies,
 )
 from .montecarlo import monte_carlo as monte_carlo
-from .motions import animation as animation, motion as motion, phase_portrait as phase_portrait
+from .motions import motion as motion, phase_portrait as phase_portrait
 from .systems import system as system
 from .theory import (
     admissible_set as admissible_set,
     rocking_dispersion as rocking_dispersion,
+    rocking_domains as rocking_domains,
     rocking_outcomes as rocking_outcomes,
 )

@@ -1,19 +1,24 @@
 """Pictures of the uncertainty of a fit: profiles, correlations, residuals."""
 
+from collections.abc import Sequence
 from textwrap import fill
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.special import ndtri
+from scipy.special import chdtri, ndtri
 
-from jimpact._checks import check_kind
+from jimpact._checks import check_choice, check_kind
 from jimpact.fits.profiles import Profile
 from jimpact.fits.result import FitResult
 from jimpact.plot.style import COLOURS, GREY, SMALL, finish, new_figure, new_panels
 
 _TITLE = 45  # letters of a line of a panel's title
 _TOP = 3.0  # of a profile's axis, over the limit: only what is below matters
+MOST = 6  # parameters of a corner plot: more panels could not be read
+_WIDE = 3.5  # standard errors to each side in a corner plot
+_SHARES = (0.68, 0.95)  # of the regions in it
 _TWO_SIDED = 1.96  # standard errors: 95 % of normal noise lies within
 
 
@@ -157,3 +162,96 @@ def _over(fit: FitResult) -> tuple[np.ndarray, str]:
     if data is None:
         return np.asarray(fit.predicted), "fitted"
     return data.approach_speed(scene)[:, None], "fastest approach [m/s]"
+
+
+def corner(fit: FitResult, draws: Any = None, names: Sequence[str] | None = None) -> Figure:
+    """Every parameter, and every pair of them: intervals and regions of the fit, or of draws.
+
+    Lines are the normal density of each parameter and the ellipses in which two of them lie with
+    68 and 95 %, from values and covariance; draws are histograms and points.
+
+    Args:
+        fit: with standard errors; what the data do not determine is left out.
+        draws: of the parameters: `ji.bootstrap(fit)`, `ji.posterior(fit)`, or an array (N, P).
+        names: of the parameters to show, at most `MOST`; None: the first ones.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: no fit.
+        ValueError: unknown names; no standard error is known; draws of other parameters.
+
+    >>> import jimpact as ji
+    >>> after = [[0.1, 0.2, 0.7], [-0.6, -0.3, -0.1]]
+    >>> data = ji.Experiments([[1.0, 0, 0], [0, 0, -1.0]], after, sigma=0.02)
+    >>> result = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data, starts=1)
+    >>> len(ji.plot.corner(result).axes)
+    3
+    """
+    check_kind("fit", fit, FitResult)
+    for name in names or ():
+        check_choice("names", name, fit.names)
+    known = np.isfinite(fit.standard_error) & (fit.standard_error > 0)
+    usable = np.flatnonzero(known).tolist()
+    shown = [i for i in usable if names is None or fit.names[i] in names][:MOST]
+    if not shown:
+        raise ValueError("Argument `fit` must have a standard error to show, but has none.")
+    values = None if draws is None else _drawn(fit, draws)
+    count = len(shown)
+    figure = new_figure(float(np.clip(1.6 * count + 0.8, 3.0, 7.2)))
+    grid = figure.subplots(count, count, squeeze=False, sharex="col")
+    for row, i in enumerate(shown):
+        for column, j in enumerate(shown):
+            axes = grid[row, column]
+            if column > row:
+                axes.remove()
+                continue
+            if column == row:
+                _one(axes, fit, i, values)
+            else:
+                _pair(axes, fit, j, i, values)
+            if row == count - 1:
+                axes.set_xlabel(fit.names[j])
+            if column == 0:
+                axes.set_ylabel(fit.names[i] if row else "density")
+            finish(axes)
+    return figure
+
+
+def _drawn(fit: FitResult, draws: Any) -> np.ndarray:
+    """Draws (N, P) of the parameters of a fit."""
+    if hasattr(draws, "posterior"):
+        columns = [np.ravel(draws.posterior[name]) for name in fit.names]
+        return np.stack(columns, axis=1)
+    values = np.asarray(getattr(draws, "value", draws), float)
+    if values.ndim != 2 or values.shape[1] != len(fit.names):
+        raise ValueError(
+            f"Argument `draws` must have shape (N, {len(fit.names)}), parameters of the fit, but "
+            f"has shape {values.shape}."
+        )
+    return values
+
+
+def _one(axes: Axes, fit: FitResult, i: int, values: np.ndarray | None) -> None:
+    """The density of one parameter."""
+    x = fit.value[i] + fit.standard_error[i] * np.linspace(-_WIDE, _WIDE, 121)
+    z = (x - fit.value[i]) / fit.standard_error[i]
+    density = np.exp(-0.5 * z**2) / (fit.standard_error[i] * np.sqrt(2 * np.pi))
+    if values is not None:
+        axes.hist(values[:, i], bins="auto", density=True, color=COLOURS[4], alpha=0.5)
+    axes.plot(x, density, color=COLOURS[0], lw=1.2)
+    axes.set_yticks([])
+
+
+def _pair(axes: Axes, fit: FitResult, i: int, j: int, values: np.ndarray | None) -> None:
+    """The region of two parameters."""
+    if values is not None:
+        axes.plot(values[:, i], values[:, j], ".", ms=2, color=COLOURS[4], alpha=0.5)
+    factor = np.linalg.cholesky(fit.covariance[np.ix_([i, j], [i, j])])
+    angle = np.linspace(0, 2 * np.pi, 181)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    for share in _SHARES:
+        edge = np.sqrt(chdtri(2, 1 - share)) * factor @ circle
+        axes.plot(fit.value[i] + edge[0], fit.value[j] + edge[1], color=COLOURS[0], lw=1.2)
+    axes.plot(fit.value[i], fit.value[j], "+", color="black", ms=7)

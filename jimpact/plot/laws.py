@@ -357,7 +357,14 @@ def _loop(force: Force, mass: float, speed: float) -> tuple[np.ndarray, np.ndarr
         deepest = ((eta + 1) * mass * speed**2 / (2 * k)) ** (1 / (eta + 1))
         part = np.linspace(0, 1, _SAMPLES)
         residual = (1 - float(loop.restitution) ** 2) * deepest
-        loading, unloading = part * deepest, residual + part[::-1] * (deepest - residual)
+        plastic = 0.0
+        if force.bound is not None:
+            bound = float(force.bound)
+            elastic = min(deepest, (bound / k) ** (1 / eta))
+            plastic = (0.5 * mass * speed**2 - k * elastic ** (eta + 1) / (eta + 1)) / bound
+            deepest = elastic
+        loading = part * deepest
+        unloading = plastic + residual + part[::-1] * (deepest - residual)
         f = k * deepest**eta * part**eta
         return np.concatenate([loading, unloading]), np.concatenate([f, f[::-1]])
 

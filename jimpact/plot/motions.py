@@ -1,32 +1,31 @@
-"""Pictures of motions: coordinates over time, phase portraits, animations."""
+"""Pictures of motions: coordinates over time, phase portraits."""
 
+import re
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jimpact._checks import check_kind
-from jimpact.bodies.base import Body, projected, rate_of, split_name
-from jimpact.motion.dynamics import kinetic, potential, seen_from_base
+from jimpact.bodies.base import Body, rate_of, split_name
+from jimpact.motion.dynamics import kinetic, potential
 from jimpact.motion.record import Motion
 from jimpact.motion.system import System
 from jimpact.plot.style import COLOURS, GREY, finish, heading, legend_within, new_figure
-from jimpact.progress import counting_bar
 
-_FRAMES_PER_SECOND = 25  # of animations
-_POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
+POINT = 0.02  # radius in which a point mass is drawn, of the range of its coordinates
 _MARKED = ("accumulation", "detachment", "friction")  # events with a line style of their kind
 _MANY = 60  # up to this number of impacts each is marked by a line
-_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
-_BASE_POINTS = 1000  # at which a base is drawn
-_LEGEND = 6  # coordinates that get an entry in the legend
+_BASEPOINTS = 1000  # at which a base is drawn
+_FEW = 6  # curves that one panel shows by default, each with its entry in the legend
+# Share of the scale of its unit below which what a panel shows is rounding. Ten times more would
+# flatten motions that a thousandth of a hair's width is a lot for.
+_FLAT = 1e-9
 
 
 def one_motion(motion: Motion) -> None:
@@ -37,13 +36,20 @@ def one_motion(motion: Motion) -> None:
 
 
 def motion(
-    motion: Motion, title: str = "", names: Sequence[str] = (), system: System | None = None
+    motion: Motion,
+    title: str = "",
+    names: Sequence[str] = (),
+    system: System | None = None,
+    *,
+    bodies: Sequence[int] | None = None,
+    contacts: Sequence[int] | None = None,
 ) -> Figure:
     """Coordinates, velocities and gaps against time, events, and where the energy goes.
 
     Each unit has axes of its own. Curves go through the states before and after every event, so
-    that a jump stands upright at its time. Gaps far above all of contacts that closed are left out,
-    and the potential energy counts from its least value.
+    that a jump stands upright at its time. Of more than six curves a panel shows the six that move
+    most, of more than six contacts those with the most events; its legend says of how many. The
+    potential energy counts from its least value. What moves by rounding only is a flat line.
 
     Args:
         motion: one motion (of a batch: `jax.tree.map(lambda x: x[i], motion)`).
@@ -51,12 +57,16 @@ def motion(
         names: of the coordinates, with their units as in "x [m]"; default: those of the body.
         system: that moved: its body names the coordinates, and its base is shown; without it and
             without names they are q1, q2, ...
+        bodies: the ones to show, counted from 0, of a system whose coordinates are numbered by
+            body (x1, y1, ...).
+        contacts: the ones whose gaps to show, counted from 0; None: those of `bodies`, if the
+            system says which these are (`PlanarBodies.between`).
 
     Returns:
         A matplotlib figure: `.savefig(path)` writes it.
 
     Raises:
-        ValueError: a batch of motions, or names of another number.
+        ValueError: a batch of motions, or names of another number; no such body or contact.
 
     >>> import jimpact as ji
     >>> ball = ji.ball_system()
@@ -66,34 +76,87 @@ def motion(
     """
     one_motion(motion)
     labels, rates = _labels(motion, names, system)
-    course = _course(motion)
-    columns = [_by_unit(labels), _by_unit(rates)]
+    course = course_of(motion)
+    columns = [_by_unit(labels, bodies), _by_unit(rates, bodies)]
     rows = max(map(len, columns)) + 1
     figure = new_figure(2.5 * rows)
     panels = figure.subplots(rows, 2, sharex=True, squeeze=False)
+    scales = _scales(labels, motion)
     for j, (units, values) in enumerate(zip(columns, (course.q, course.v), strict=True)):
         for axes, (unit, which) in zip(panels[:, j], units.items(), strict=False):
+            count = len(which) if bodies is None else 0
+            if count > _FEW:
+                which = _largest(which, [_range(values[:, i]) for i, _ in which])
             for c, (i, word) in enumerate(which):
-                label = word if c < _LEGEND else None
-                axes.plot(course.time, values[:, i], color=COLOURS[c % len(COLOURS)], label=label)
+                axes.plot(course.time, values[:, i], color=COLOURS[c % len(COLOURS)], label=word)
             if j == 0 and unit == "m" and system is not None:
                 _moving_base(axes, system, motion)
             what = which[0][1] if len(which) == 1 else ("coordinates", "velocities")[j]
             axes.set_ylabel(f"{what} [{unit}]" if unit else what)
+            _finish(axes, scales.get(unit, 1.0), f"{_FEW} of {count}" if count > _FEW else "")
         for axes in panels[len(units) : -1, j]:
             axes.remove()
-    _gaps(panels[-1, 0], motion)
+    left_out = _gaps(panels[-1, 0], motion, _shown_contacts(motion, system, bodies, contacts))
+    _finish(panels[-1, 0], scales["m"], left_out)
     _ledger(panels[-1, 1], motion, course, system)
+    _finish(panels[-1, 1], float(np.nanmax(np.abs(motion.energy), initial=0.0)) or 1.0)
     heading(figure, title)
     for axes in figure.axes:
         if axes is not panels[-1, 1]:
             _event_lines(axes, motion)
-        finish(axes, grid="y")
-        if len(axes.get_legend_handles_labels()[0]) > 1:
-            legend_within(axes, 2)
     for axes in panels[-1]:
         axes.set_xlabel("time [s]")
     return figure
+
+
+def _finish(axes: Axes, scale: float, note: str = "") -> None:
+    """Frame, legend with a note, and limits that do not enlarge rounding, of panels of a motion."""
+    finish(axes, grid="y")
+    low, high = axes.dataLim.intervaly
+    if high - low < _FLAT * scale:
+        middle = (low + high) / 2
+        axes.set_ylim(middle - scale / 2, middle + scale / 2)
+    if len(axes.get_legend_handles_labels()[0]) > 1:
+        legend_within(axes, 2, note)
+
+
+def _scales(labels: list[str], motion: Motion) -> dict[str, float]:
+    """Sizes of the values of each unit; of rates what would change these over the motion."""
+    scales = {"rad": 1.0, "m": float(np.nanmax(np.abs(motion.gaps), initial=0.0))}
+    for label, values in zip(labels, np.asarray(motion.q).T, strict=True):
+        unit = split_name(label)[1]
+        if unit != "rad":
+            largest = float(np.nanmax(np.abs(values), initial=0.0))
+            scales[unit] = max(scales.get(unit, 0.0), largest)
+    scales = {unit: size or 1.0 for unit, size in scales.items()}
+    duration = _range(np.asarray(motion.time)) or 1.0
+    return scales | {f"{unit}/s": size / duration for unit, size in scales.items()}
+
+
+def _largest(entries: list[Any], sizes: Sequence[Any]) -> list[Any]:
+    """The few entries with the largest sizes, in their order."""
+    best = sorted(range(len(entries)), key=lambda i: sizes[i], reverse=True)[:_FEW]
+    return [entries[i] for i in sorted(best)]
+
+
+def _shown_contacts(
+    motion: Motion,
+    system: System | None,
+    bodies: Sequence[int] | None,
+    contacts: Sequence[int] | None,
+) -> list[int] | None:
+    """The contacts that were chosen; None: all."""
+    count = motion.gaps.shape[1]
+    if contacts is not None:
+        for contact in contacts:
+            if not 0 <= contact < count:
+                allowed = f"numbers in [0, {count - 1}]"
+                raise ValueError(f"Argument `contacts` must hold {allowed}, but holds {contact}.")
+        return list(contacts)
+    between = getattr(system.body, "between", None) if system is not None else None
+    if bodies is None or between is None:
+        return None
+    return [j for j, pair in enumerate(between) if set(pair) & set(bodies)]
 
 
 def _labels(
@@ -112,12 +175,19 @@ def _labels(
     return labels, [*velocities] or [f"v{i + 1}" for i in range(rates)]
 
 
-def _by_unit(names: list[str]) -> dict[str, list[tuple[int, str]]]:
-    """Index and word of the names by their unit."""
+def _by_unit(names: list[str], bodies: Sequence[int] | None) -> dict[str, list[tuple[int, str]]]:
+    """Index and word of the names of these bodies by their unit; None: of all."""
     by_unit: dict[str, list[tuple[int, str]]] = {}
+    numbers = [re.search(r"\d*(?='?$)", split_name(name)[0]) for name in names]
+    owners = [int(found[0]) - 1 if found and found[0] else None for found in numbers]
+    for body in bodies or ():
+        if body not in owners:
+            known = sorted({x for x in owners if x is not None})
+            raise ValueError(f"Argument `bodies` must hold some of {known}, but holds {body!r}.")
     for i, name in enumerate(names):
-        word, unit = split_name(name)
-        by_unit.setdefault(unit, []).append((i, word))
+        if bodies is None or owners[i] in bodies:
+            word, unit = split_name(name)
+            by_unit.setdefault(unit, []).append((i, word))
     return by_unit
 
 
@@ -130,7 +200,7 @@ class _Course(NamedTuple):
     after: np.ndarray  # (S,) whether it is the state after an event
 
 
-def _course(motion: Motion) -> _Course:
+def course_of(motion: Motion) -> _Course:
     """The samples and events of a motion in the order of time."""
     events, rows = motion.events, np.asarray(motion.events.kind) > 0
     at, place = np.asarray(events.time)[rows], np.asarray(events.q)[rows]
@@ -145,7 +215,7 @@ def _course(motion: Motion) -> _Course:
     return _Course(time[order], q[order], v[order], state[order] == 2)
 
 
-def _base_path(system: System, time: np.ndarray) -> np.ndarray:
+def base_path(system: System, time: np.ndarray) -> np.ndarray:
     """Displacement of the base (S, d) along the directions of the body, where it has them."""
     assert system.base is not None
     path = np.asarray(jax.vmap(lambda t: jnp.atleast_1d(system.base(t)))(jnp.asarray(time)))  # type: ignore[misc]
@@ -163,31 +233,40 @@ def _moving_base(axes: Axes, system: System, motion: Motion) -> None:
     reached = np.asarray(motion.time)[np.isfinite(np.asarray(motion.energy))]
     if not len(reached):
         return
-    time = np.linspace(reached[0], reached[-1], _BASE_POINTS)
-    path = _base_path(system, time)
+    time = np.linspace(reached[0], reached[-1], _BASEPOINTS)
+    path = base_path(system, time)
     words = ("",) if path.shape[1] == 1 else (" x", " y", " z")
     for values, word, style in zip(path.T, words, ("--", ":", "-."), strict=False):
         if np.ptp(values) > 0:
             axes.plot(time, values, style, color="black", lw=0.8, label=f"base{word}")
 
 
-def _gaps(axes: Axes, motion: Motion) -> None:
-    """Gaps, 0 at the events of their contacts; not those far above all of contacts that closed."""
+def _gaps(axes: Axes, motion: Motion, shown: list[int] | None) -> str:
+    """Gaps, 0 at the events of their contacts; a note on how many are left out.
+
+    Unless contacts are chosen these are not those far above all of contacts that closed, and the
+    few with the most events, or the least gaps.
+    """
     values, events = np.asarray(motion.gaps), motion.events
     single = events.contacts.shape[-1] == values.shape[1]
     closed = np.zeros((len(events.time), values.shape[1]), bool)
     if single:
         closed = (np.asarray(events.kind) > 0)[:, None] & np.asarray(events.contacts)
-    ever = closed.any(axis=0)
-    far = np.nanmax(values[:, ever], initial=-np.inf) if ever.any() else np.inf
-    for j in np.flatnonzero(np.nanmin(values, axis=0, initial=np.inf) <= far):
+    note = ""
+    if shown is None:
+        ever, least = closed.any(axis=0), np.nanmin(values, axis=0, initial=np.inf)
+        far = np.nanmax(values[:, ever], initial=-np.inf) if ever.any() else np.inf
+        near = list(np.flatnonzero(least <= far))
+        shown = _largest(near, [(closed[:, j].sum(), -least[j]) for j in near])
+        note = f"{_FEW} of {values.shape[1]}" if len(near) > _FEW else ""
+    for c, j in enumerate(shown):
         rows = closed[:, j]
         time = np.concatenate([motion.time, np.asarray(events.time)[rows]])
         order = np.argsort(time, kind="stable")
         gap = np.concatenate([values[:, j], np.zeros(rows.sum())])[order]
-        label = f"contact {j + 1}" if j < _LEGEND else None
-        axes.plot(time[order], gap, color=COLOURS[j % len(COLOURS)], label=label)
+        axes.plot(time[order], gap, color=COLOURS[c % len(COLOURS)], label=f"contact {j + 1}")
     axes.set_ylabel("gaps [m]" if single else "least gap [m]")
+    return note
 
 
 def _event_lines(axes: Axes, motion: Motion) -> None:
@@ -224,8 +303,9 @@ def _ledger(axes: Axes, motion: Motion, course: _Course, system: System | None) 
         ("the base gave", motion.base_work),
         ("forces gave", motion.force_work),
     )
+    rounding = _FLAT * float(np.nanmax(np.abs(motion.energy), initial=0.0))
     for (label, value), colour in zip(others, COLOURS[1:], strict=False):
-        if np.nanmax(np.abs(np.asarray(value)), initial=0.0) > 0:
+        if np.nanmax(np.abs(np.asarray(value)), initial=0.0) > rounding:
             axes.plot(time, value, "--", color=colour, label=label)
     axes.set_ylabel("energy [J]")
 
@@ -261,7 +341,7 @@ def phase_portrait(
     """
     one_motion(motion)
     labels, rates = _labels(motion, names, system)
-    course = _course(motion)
+    course = course_of(motion)
     # coordinate -> its velocity
     pairs = {i: i for i in range(len(labels))}
     if len(labels) != len(rates):
@@ -296,126 +376,33 @@ def _range(values: np.ndarray) -> float:
     return float(np.ptp(finite)) if len(finite) else 0.0
 
 
-def animation(
-    system: System,
-    motion: Motion,
-    path: str | Path,
-    title: str = "",
-    progress: float | None = None,
-) -> Path:
-    """The motion as an animated GIF, one frame a sample (those that were reached).
-
-    Bodies in space are shown in parallel projection, with their shadows. What moves with the base
-    moves in the picture.
-
-    Args:
-        system: that moved.
-        motion: one motion.
-        path: the file, ending in .gif.
-        title: of the picture; the time stands below it.
-        progress: a bar on stderr; None: on a terminal, where it takes long.
-
-    Returns:
-        The path of the file that was written.
-
-    Raises:
-        ValueError: another ending, a batch, no sample; TypeError: a body without outlines.
-
-    >>> import tempfile, pathlib, jimpact as ji
-    >>> ball = ji.ball_system()
-    >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
-    >>> place = pathlib.Path(tempfile.mkdtemp())
-    >>> ji.plot.animation(ball, motion, place / "ball.gif").name
-    'ball.gif'
-    """
-    one_motion(motion)
-    path = Path(path)
-    if path.suffix != ".gif":
-        raise ValueError(f"Argument `path` must end in .gif, but is '{path}'.")
-    q = np.asarray(motion.q)
-    reached = np.isfinite(q).all(axis=1)
-    q, time = q[reached], np.asarray(motion.time)[reached]
-    if not len(q):
-        raise ValueError("Argument `motion` must have a sample that was reached, but has none.")
-    ground = _grounds(system, time)
-    curves = _curves(system, q, time, ground)
-    figure = Figure(figsize=(4.8, 4.8), dpi=80)
-    axes = figure.add_axes(_PLACE)
-    floors = [_plane(angle, offset) for angle, offset in system.body.floors]
-    _limits(axes, curves, ground, floors)
-    lines = [
-        axes.plot([], [], color=COLOURS[i // 2 % len(COLOURS)])[0] for i in range(len(curves[0]))
-    ]
-    drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in floors]
-    view = np.array([axes.get_xlim(), axes.get_ylim()])
-
-    def draw(k: int) -> list[Any]:
-        """Frame k."""
-        for line, points in zip(lines, curves[k], strict=True):
-            line.set_data(points[:, 0], points[:, 1])
-        for line, (n, offset) in zip(drawn, floors, strict=True):
-            line.set_data(*_stretch(n, offset, view, ground[k]))
-        axes.set_title(f"{title}\n{time[k]:.2f} s" if title else f"{time[k]:.2f} s", loc="left")
-        return [*lines, *drawn]
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    film = FuncAnimation(figure, draw, frames=len(q))
-    with counting_bar(len(q), "frames", progress) as advance:
-        writer = PillowWriter(fps=_FRAMES_PER_SECOND)
-        film.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
-    return path
-
-
 def draw_body(axes: Axes, body: Body, q: np.ndarray) -> None:
     """A body at q, with what it stands on."""
-    curves = [body.outlines(q, _POINT * (np.ptp(q) or 1.0))]
-    floors, ground = [_plane(*floor) for floor in body.floors], np.zeros((1, 2))
-    _limits(axes, curves, ground, floors)
+    curves = [body.outlines(q, POINT * (np.ptp(q) or 1.0))]
+    floors, ground = [plane_of(*floor) for floor in body.floors], np.zeros((1, 2))
+    set_limits(axes, curves, ground, floors)
     for i, points in enumerate(curves[0]):
         axes.plot(*points.T, color=COLOURS[i // 2 % len(COLOURS)])
     view = np.array([axes.get_xlim(), axes.get_ylim()])
     for n, offset in floors:
-        axes.plot(*_stretch(n, offset, view, ground[0]), color=GREY, lw=2)
+        axes.plot(*stretch_of(n, offset, view, ground[0]), color=GREY, lw=2)
     axes.set_xlim(view[0])
     axes.set_ylim(view[1])
 
 
-def _stretch(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
+def stretch_of(n: np.ndarray, offset: float, view: np.ndarray, ground: np.ndarray) -> np.ndarray:
     """A piece (2, 2) of a plane that reaches across the view."""
     middle, reach = view.mean(axis=1), np.ptp(view[0])
     foot = middle - (n @ (middle - ground) - offset) * n
     return foot[:, None] + reach * np.array([-1, 1]) * np.array([n[1], -n[0]])[:, None]
 
 
-def _curves(
-    system: System, q: np.ndarray, time: np.ndarray, ground: np.ndarray
-) -> list[list[np.ndarray]]:
-    """Outlines of the body, of every sample, where they are in space."""
-    point = _POINT * (np.ptp(q) or 1.0)
-    if system.base is not None:
-        q = np.asarray(jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time)))
-    return [
-        [curve + moved for curve in system.body.outlines(x, point)]
-        for x, moved in zip(q, ground, strict=True)
-    ]
-
-
-def _grounds(system: System, time: np.ndarray) -> np.ndarray:
-    """Displacement of the base in the picture (S, 2)."""
-    if system.base is None:
-        return np.zeros((len(time), 2))
-    path = _base_path(system, time)
-    if path.shape[1] == 3:
-        return projected(path)
-    return np.insert(path, 0, 0.0, axis=1) if path.shape[1] == 1 else path
-
-
-def _plane(angle: Any, offset: Any) -> tuple[np.ndarray, float]:
+def plane_of(angle: Any, offset: Any) -> tuple[np.ndarray, float]:
     """Normal (2,) and offset of a plane."""
     return np.array([-np.sin(angle), np.cos(angle)]), float(offset)
 
 
-def _limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[Any]) -> None:
+def set_limits(axes: Axes, curves: list[Any], ground: np.ndarray, floors: list[Any]) -> None:
     """Equal limits that hold all curves and a point of each plane."""
     points = np.concatenate([curve for frame in curves for curve in frame])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2

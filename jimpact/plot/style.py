@@ -77,9 +77,17 @@ def legend_below(figure: Figure, handles: Sequence[Any], columns: int, note: str
     )
 
 
-def legend_within(axes: Axes, columns: int = 1) -> None:
-    """The legend of one panel, where it hides little."""
-    axes.legend(frameon=False, fontsize=SMALL, ncols=columns, handlelength=1.4, columnspacing=1.0)
+def legend_within(axes: Axes, columns: int = 1, note: str = "") -> None:
+    """The legend of one panel, where it hides little, below a note."""
+    axes.legend(
+        frameon=False,
+        fontsize=SMALL,
+        ncols=columns,
+        handlelength=1.4,
+        columnspacing=1.0,
+        title=note or None,
+        title_fontsize=SMALL,
+    )
 
 
 def mark(axes: Axes, point: Any, name: str, i: int, admissible: bool) -> None:

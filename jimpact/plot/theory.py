@@ -1,6 +1,6 @@
 """Pictures of admissible sets and of rocking blocks."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
@@ -26,6 +26,7 @@ from jimpact.plot.style import (
 )
 from jimpact.scene import dense_mass
 from jimpact.theory.admissible import AdmissibleSet
+from jimpact.theory.block_domains import RockingDomain
 from jimpact.theory.rocking import OUTCOMES, STAYS, RockingDispersion, critical_kinetic_angle
 
 _FILL = "#DCE9F3"
@@ -278,6 +279,48 @@ def rocking_outcomes(
     _angle_axes(result, panels, "restitution e")
     handles = [Patch(color=_OUTCOME_COLOURS[i], label=OUTCOMES[i]) for i in np.unique(codes)]
     legend_below(figure, handles, 5)
+    return figure
+
+
+def rocking_domains(domains: Sequence[RockingDomain], title: str = "") -> Figure:
+    """Admissible restitution matrices of blocks, a panel each: own entry against cross entry.
+
+    Args:
+        domains: what `ji.theory.rocking_domain` returned, for one or several blocks.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        ValueError: no domain.
+
+    >>> import jimpact as ji
+    >>> len(ji.plot.rocking_domains([ji.theory.rocking_domain(2.0)]).axes)
+    1
+    """
+    if not len(domains):
+        raise ValueError("Argument `domains` must hold at least one domain, but is empty.")
+    figure, panels = new_panels(len(domains), 3.2, 0.6, sharex=True, sharey=True)
+    for axes, domain in zip(panels, domains):
+        axes.fill(*domain.corners.T, color=_FILL, lw=0, label="free: both corners leave")
+        axes.plot([0, 0], domain.rocking, color=COLOURS[0], lw=4, label="rocking")
+        if domain.half_rocking is not None:
+            axes.plot(domain.half_rocking, [0, 0], color=COLOURS[1], lw=4, label="half-rocking")
+        way = "sliding" if domain.sliding else "sticking"
+        axes.set_title(f"height / width {domain.aspect:g}, {way}", loc="left", fontsize="medium")
+        axes.set_aspect("equal")
+        axes.set_xlim(-0.05, 1.1)
+        axes.set_ylim(-0.05, 1.1)
+    finish(*panels)
+    for axes in panels[::COLUMNS]:
+        axes.set_ylabel("restitution, other corner")
+    for axes in panels[-COLUMNS:]:
+        axes.set_xlabel("restitution, corner that hits")
+        axes.tick_params(labelbottom=True)
+    handles = {k: h for axes in panels for h, k in zip(*axes.get_legend_handles_labels())}
+    legend_below(figure, list(handles.values()), 3)
+    heading(figure, title or "Admissible restitution matrices of a block")
     return figure
 
 

@@ -1,6 +1,11 @@
 """Public names of `ji.theory` and where they live."""
 
 from .admissible import AdmissibleSet as AdmissibleSet, admissible_set as admissible_set
+from .block_domains import RockingDomain as RockingDomain, rocking_domain as rocking_domain
+from .corners import (
+    CornerOutcome as CornerOutcome,
+    reentrant_corner as reentrant_corner,
+)
 from .friction import (
     FrictionBounds as FrictionBounds,
     InclusionOutcome as InclusionOutcome,
@@ -10,7 +15,12 @@ from .friction import (
     friction_impulses as friction_impulses,
     restitution_inclusion as restitution_inclusion,
 )
-from .linear_chain import bilateral_motion as bilateral_motion, newby_ratio as newby_ratio
+from .linear_chain import (
+    SeparationTimes as SeparationTimes,
+    bilateral_motion as bilateral_motion,
+    newby_ratio as newby_ratio,
+    separation_times as separation_times,
+)
 from .quasi_velocities import (
     ContactPower as ContactPower,
     contact_power as contact_power,
@@ -18,6 +28,10 @@ from .quasi_velocities import (
     kinetic_energy_split as kinetic_energy_split,
     quasi_basis as quasi_basis,
     to_quasi_velocities as to_quasi_velocities,
+)
+from .restitution_coefficients import (
+    CoefficientAudit as CoefficientAudit,
+    audit_coefficients as audit_coefficients,
 )
 from .restitution_matrices import (
     Copositivity as Copositivity,
@@ -38,3 +52,4 @@ from .rocking import (
     rocking_ratios as rocking_ratios,
     search_critical_angle as search_critical_angle,
 )
+from .waves import nesterenko_speed as nesterenko_speed, reinsch_chain as reinsch_chain

@@ -1,12 +1,13 @@
-"""Han and Gilmore's exhaustive tree: every elastic outcome that their three rules allow."""
+"""Han and Gilmore's exhaustive tree: every outcome that their three rules allow."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from jimpact._checks import as_whole, check_values, is_traced
+from jimpact._checks import as_whole, check_per_contact, check_values, is_traced
 from jimpact.scene import Scene, as_velocity, dense_mass
 
 # Relative to the largest normalized approach velocity at the start: smaller gap velocities and
@@ -14,28 +15,63 @@ from jimpact.scene import Scene, as_velocity, dense_mass
 # branches that differ in the eighth digit.
 ZERO = 1e-9
 SINGULAR = 1e-14  # singular values of G_SS below this are zero: redundant contacts
+# An approach left at the end, relative as ZERO, that is no rounding: the sequence of impacts has no
+# end. Ten times more would begin to hide sequences whose approaches fall a hundredfold at once.
+ROUNDING = 1e-12
 
 
 @dataclasses.dataclass(frozen=True)
 class HanGilmoreOutcome:
-    """v+ (n,) [m/s], total impulse p (m,) [N s], and the outcome of rule (iii) at each impact."""
+    """v+ (n,) [m/s], impulses p (m,) and p_t (t,) [N s], the outcome of rule (iii) at each impact.
+
+    `endless`: a sequence of impacts without end leads there, cut off at 1e-9 of the approach.
+    """
 
     velocity: np.ndarray
     impulse: np.ndarray
     rules: tuple[str, ...]
+    tangential_impulse: np.ndarray
+    endless: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
 class _Node:
-    """Normalized gap velocities and impulses (m,) so far, and the rules applied."""
+    """Normalized gap and slip velocities (m + t,), impulses (m + t,) so far, and the rules."""
 
-    qn: np.ndarray
+    state: np.ndarray
     p: np.ndarray
     rules: tuple[str, ...]
 
 
+@dataclasses.dataclass(frozen=True)
+class _Problem:
+    """Normalized W of normals and tangents (m + t, m + t), e, mu and whether closed (m,)."""
+
+    matrix: np.ndarray
+    restitution: np.ndarray
+    friction: np.ndarray | None
+    closed: np.ndarray
+
+    @property
+    def contacts(self) -> int:
+        """m."""
+        return len(self.closed)
+
+    @property
+    def coupled(self) -> np.ndarray:
+        """Whether (m, m) contacts act on each other."""
+        m, each = self.contacts, len(self.matrix) // self.contacts
+        blocks = np.abs(self.matrix).reshape(each, m, each, m)
+        coupled: np.ndarray = blocks.max(axis=(0, 2)) > SINGULAR
+        return coupled
+
+    def ends(self, node: _Node) -> bool:
+        """Whether no closed contact approaches."""
+        return bool(np.all(node.state[: self.contacts][self.closed] >= -ZERO))
+
+
 class _VisitedStates:
-    """Gap velocities visited so far, sorted into cells by a generic weighted sum."""
+    """Velocities visited so far, sorted into cells by a generic weighted sum."""
 
     def __init__(self, first: np.ndarray):
         """With one state."""
@@ -54,27 +90,38 @@ class _VisitedStates:
         return True
 
 
-def han_gilmore(scene: Scene, velocity: Any, *, max_depth: int = 100) -> list[HanGilmoreOutcome]:
-    """All elastic outcomes of an impact by the rules of Han and Gilmore; a host function.
+def han_gilmore(
+    scene: Scene,
+    velocity: Any,
+    restitution: Any = 1.0,
+    friction: Any = None,
+    *,
+    max_depth: int = 100,
+) -> list[HanGilmoreOutcome]:
+    """All outcomes of an impact by the rules of Han and Gilmore; a host function.
 
     Equation: at each impact of a branch, S is the set of contacts with p_j > 0; there
-    `gamma_S+ = -gamma_S`, `p_S = -2 W_SS^-1 gamma_S`. Rules: (i) energy is conserved; (ii) a
-    branch ends where `gamma+ >= 0`, else another impact follows; (iii) `p_j > 0` where
-    `gamma_j < 0`, `p_j = 0` where `gamma_j > 0`, both are tried where `gamma_j = 0` (to 1e-9 of
-    the largest approach).
+    `gamma_S+ = -e gamma_S`, without friction `p_S = -W_SS^-1 (1 + e) gamma_S`. Rules: (i) energy
+    is conserved, where e = 1; (ii) a branch ends where `gamma+ >= 0`, else another impact follows;
+    (iii) `p_j > 0` where `gamma_j < 0`, `p_j = 0` where `gamma_j > 0`, both are tried where
+    `gamma_j = 0` (to 1e-9 of the largest approach). With friction each contact of S also sticks,
+    `u+ = 0` and `|p_t| <= mu p`, or slides to either side, `p_t = -mu p sgn(u+)`: all are tried.
 
     Args:
-        scene: its open contacts (gap > 0) take no part.
+        scene: its open contacts (gap > 0) take no part; planar tangents where there is friction.
         velocity: v- (n,) [m/s].
+        restitution: kinematic coefficient e in [0, 1], scalar or (m,).
+        friction: Coulomb's mu >= 0, scalar or (m,); None: no friction.
         max_depth: longest branch, in impacts. The tree grows exponentially with the contacts at
             rest: one of eight equal balls hits the others, 1894 outcomes, a second.
 
     Returns:
         The distinct outcomes in float64, the shortest branches first (`velocity`, `impulse`,
-        `rules`: one text an impact, contacts counted from 0; the branch of fewest impacts where
-        several lead to the same v+). Empty where the rules contradict each other (an approaching
-        contact would have to pull) or bounce between the same velocities for ever. For redundant
-        contacts the impulse is the one of least norm.
+        `tangential_impulse`, `rules`: one text an impact, contacts counted from 0; the branch of
+        fewest impacts where several lead to the same v+). `endless` where one of these branches
+        has no end: its approaches decay, as with e = 0, and it is cut off at 1e-9. Empty where the
+        rules contradict each other (an approaching contact would have to pull) or bounce between
+        the same velocities for ever. For redundant contacts the impulse is the one of least norm.
 
     Raises:
         ValueError, TypeError: bad input, traced values.
@@ -90,47 +137,72 @@ def han_gilmore(scene: Scene, velocity: Any, *, max_depth: int = 100) -> list[Ha
     [0. 0. 1.] 2
     """
     v = _checked(scene, velocity, max_depth)
-    closed, normals, mobility = _on_host(scene)
-    w = normals.T @ mobility
-    root = np.sqrt(np.diag(w))
-    g, qn = w / np.outer(root, root), normals.T @ v / root
-    size = float(np.max(-qn[closed], initial=0.0))
+    problem, rows, mobility, root = _problem(scene, restitution, friction)
+    m, state = problem.contacts, rows.T @ v / root
+    size = float(np.max(-state[:m][problem.closed], initial=0.0))
     if size == 0.0:
-        return [HanGilmoreOutcome(v, np.zeros_like(qn), ())]
-    outcomes: list[HanGilmoreOutcome] = []
-    frontier = [_Node(qn / size, np.zeros_like(qn), ())]
-    visited = _VisitedStates(qn / size)
+        return [HanGilmoreOutcome(v, np.zeros(m), (), np.zeros(len(state) - m))]
+    found: list[_Node] = []
+    endless: list[bool] = []
+    frontier = [_Node(state / size, np.zeros_like(state), ())]
+    visited = _VisitedStates(state / size)
     while frontier:
         following: list[_Node] = []
         for node in frontier:
-            for child in _impacts(g, node, closed):
-                if not visited.add(child.qn):
-                    continue
-                if np.all(child.qn[closed] >= -ZERO):
-                    p = child.p * size / root
-                    outcomes.append(HanGilmoreOutcome(v + mobility @ p, p, child.rules))
-                else:
+            for child in _impacts(problem, node):
+                new, ended = visited.add(child.state), problem.ends(child)
+                if new and not ended:
                     following.append(child)
+                elif new:
+                    found.append(child)
+                    endless.append(False)
+                if ended and np.any(child.state[:m][problem.closed] < -ROUNDING):
+                    for k, other in enumerate(found):
+                        endless[k] |= bool(np.abs(other.state - child.state).max() <= 2 * ZERO)
         if following and len(following[0].rules) >= max_depth:
             raise RuntimeError(
                 f"A branch of the tree has more than `max_depth` = {max_depth} impacts "
-                f"({len(outcomes)} outcomes found so far)."
+                f"({len(found)} outcomes found so far)."
             )
         frontier = following
+    outcomes = []
+    for node, without_end in zip(found, endless):
+        p = node.p * size / root
+        outcomes.append(HanGilmoreOutcome(v + mobility @ p, p[:m], node.rules, p[m:], without_end))
     return outcomes
 
 
-def _on_host(scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Closed contacts, N, and M^-1 N under the bilateral constraints, in double precision always.
+def _problem(
+    scene: Scene, restitution: Any, friction: Any
+) -> tuple[_Problem, np.ndarray, np.ndarray, np.ndarray]:
+    """The problem, normals and tangents (n, m + t), M^-1 times these, and sqrt(W_jj) (m + t,).
 
-    Whether a contact is at rest decides the tree: single precision would not do.
+    In double precision always: whether a contact is at rest decides the tree.
     """
-    normals, inverse = np.asarray(scene.normals, float), np.linalg.inv(dense_mass(scene))
+    m = scene.contacts
+    check_per_contact("restitution", restitution, m)
+    check_values("restitution", restitution, low=0.0, high=1.0)
+    rows, mu = np.asarray(scene.normals, float), None
+    if friction is not None:
+        check_per_contact("friction", friction, m)
+        check_values("friction", friction, low=0.0)
+        if scene.tangents is None or scene.tangents.shape[1] != m:
+            raise ValueError(
+                "Argument `scene` must have one tangent a contact (planar) where there is friction."
+            )
+        rows = np.concatenate([rows, np.asarray(scene.tangents, float)], axis=1)
+        mu = np.broadcast_to(np.asarray(friction, float), (m,))
+    inverse = np.linalg.inv(dense_mass(scene))
     if scene.constraints is not None:
         h = np.asarray(scene.constraints, float)
         inverse_h = inverse @ h
         inverse = inverse - inverse_h @ np.linalg.solve(h.T @ inverse_h, inverse_h.T)
-    return np.asarray(scene.closed), normals, inverse @ normals
+    mobility = inverse @ rows
+    w = rows.T @ mobility
+    root = np.tile(np.sqrt(np.diag(w)[:m]), len(w) // m)
+    e = np.broadcast_to(np.asarray(restitution, float), (m,))
+    problem = _Problem(w / np.outer(root, root), e, mu, np.asarray(scene.closed))
+    return problem, rows, mobility, root
 
 
 def _checked(scene: Scene, velocity: Any, max_depth: int) -> np.ndarray:
@@ -143,30 +215,60 @@ def _checked(scene: Scene, velocity: Any, max_depth: int) -> np.ndarray:
     return np.asarray(velocity, float)
 
 
-def _impacts(g: np.ndarray, node: _Node, closed: np.ndarray) -> Iterator[_Node]:
+def _impacts(problem: _Problem, node: _Node) -> Iterator[_Node]:
     """Nodes that one impact leads to: one for every allowed set of contacts with p > 0."""
-    approaching = closed & (node.qn < -ZERO)
-    resting = closed & (np.abs(node.qn) <= ZERO)
-    for active in _active_sets(g, approaching, resting):
-        block, target = g[np.ix_(active, active)], -2 * node.qn[active]
-        p_active = np.linalg.lstsq(block, target, rcond=SINGULAR)[0]
-        if np.abs(block @ p_active - target).max() > ZERO or np.any(p_active <= ZERO):
-            continue
-        p = np.zeros_like(node.qn)
-        p[active] = p_active
-        qn = np.where(active, -node.qn, node.qn + g @ p)
-        rules = (*node.rules, _rule(closed, active, approaching, resting))
-        yield _Node(qn, node.p + p, rules)
+    qn, closed = node.state[: problem.contacts], problem.closed
+    approaching = closed & (qn < -ZERO)
+    resting = closed & (np.abs(qn) <= ZERO)
+    for active in _active_sets(problem.coupled, approaching, resting):
+        at = np.flatnonzero(active)
+        # to which side each contact slides; 0: it sticks
+        sides = (0, 1, -1) if problem.friction is not None else (0,)
+        for slides in itertools.product(sides, repeat=len(at)):
+            child = _impact(problem, node, at, np.array(slides))
+            if child is None:
+                continue
+            rule = _rule(closed, active, approaching, resting)
+            if problem.friction is not None:
+                ways = {0: "sticks", 1: "slides forward", -1: "slides backward"}
+                rule += "".join(f"; {j} {ways[side]}" for j, side in zip(at, slides))
+            yield dataclasses.replace(child, rules=(*node.rules, rule))
+
+
+def _impact(problem: _Problem, node: _Node, at: np.ndarray, slides: np.ndarray) -> _Node | None:
+    """The node after an impact of contacts `at` that slide so; None where it contradicts itself."""
+    m, count, mu = problem.contacts, len(at), problem.friction
+    rows = at if mu is None else np.concatenate([at, m + at])
+    block = problem.matrix[np.ix_(rows, rows)].copy()
+    target = -node.state[rows]
+    target[:count] *= 1 + problem.restitution[at]
+    if mu is not None:
+        for k in np.flatnonzero(slides):  # p_t + mu p sgn(u+) = 0
+            block[count + k], target[count + k] = 0.0, 0.0
+            block[count + k, [k, count + k]] = mu[at[k]] * slides[k], 1.0
+    solved = np.linalg.lstsq(block, target, rcond=SINGULAR)[0]
+    pushes, sides = solved[:count], solved[count:]
+    if np.abs(block @ solved - target).max() > ZERO or np.any(pushes <= ZERO):
+        return None
+    p = np.zeros_like(node.p)
+    p[rows] = solved
+    state = node.state + problem.matrix @ p
+    state[at] = -problem.restitution[at] * node.state[at]
+    if mu is not None:
+        if np.any((slides == 0) & (np.abs(sides) > mu[at] * pushes + ZERO)):
+            return None
+        if np.any(slides * state[m + at] < -ZERO):
+            return None
+    return _Node(state, node.p + p, ())
 
 
 def _active_sets(
-    g: np.ndarray, approaching: np.ndarray, resting: np.ndarray
+    coupled: np.ndarray, approaching: np.ndarray, resting: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """The approaching contacts with all sets of resting ones that they reach through G.
+    """The approaching contacts with all sets of resting ones that they reach.
 
     A resting contact that no approaching one pushes through others has p_j = 0: no new set.
     """
-    coupled = np.abs(g) > SINGULAR
     sets, known = [approaching], {approaching.tobytes()}
     for active in sets:
         yield active

@@ -1,13 +1,20 @@
 """Bilateral linear chains: the closed form that unilateral springs follow until one opens."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import brentq
 
 from jimpact._checks import as_float_array, as_whole, check_per_contact, check_shape, check_values
 from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
+
+# Largest stiffness ratio, and one over the least, whose first opening is searched. Ten times more:
+# three times as many periods of the stiff contact to look through, for an outcome at its limit.
+_STIFFEST = 1e8
+# Step [rad] of the stiff contact in that search. Ten times more: two zeros in a step are missed.
+_GRID = 0.05
 
 
 def bilateral_motion(
@@ -84,3 +91,65 @@ def newby_ratio(n: int) -> float:
     n = as_whole("n", n, 2)
     root = float(np.sqrt(9 * n**8 - 12 * n**6 - 42 * n**4 - 12 * n**2 + 9))
     return (3 * n**4 - 2 * n**2 + 3 + root) / (8 * n**2)
+
+
+class SeparationTimes(NamedTuple):
+    """When the `first` and the `second` spring of three balls lose their load [sqrt(m / k1)]."""
+
+    first: float
+    second: float
+
+
+def separation_times(stiffness_ratio: float) -> SeparationTimes:
+    """When the two linear contacts of three equal balls would first open, the last two at rest.
+
+    Equation: first zeros t > 0 of
+    `(Delta - 1 + g) sin(w1 t) / w1 + (Delta + 1 - g) sin(w2 t) / w2` (contact 1) and of
+    `sin(w1 t) / w1 - sin(w2 t) / w2` (contact 2), with `g = k2 / k1`,
+    `Delta = sqrt(g^2 - g + 1)`, `w1^2 = 1 + g - Delta`, `w2^2 = 1 + g + Delta`. The earlier one is
+    that of the impact: contact 1 up to `newby_ratio(2)`, contact 2 beyond; the other one would
+    follow only if springs pulled.
+
+    Args:
+        stiffness_ratio: g from 1e-8 to 1e8, or 0.
+
+    Returns:
+        `SeparationTimes` in units of `sqrt(m / k1)`; at g = 0 contact 2 is never loaded: infinite.
+
+    Raises:
+        ValueError: a ratio out of range.
+
+    Host function, not differentiable.
+
+    Source: Brogliato, Nonsmooth Mechanics (2016), (6.16) with the sign of `docs/equations.md`.
+
+    >>> import jimpact as ji
+    >>> [round(t, 6) for t in ji.theory.separation_times(1.0)]
+    [2.554813, 3.382085]
+    """
+    check_values("stiffness_ratio", stiffness_ratio, low=0.0, high=_STIFFEST)
+    g = float(stiffness_ratio)
+    if 0 < g < 1 / _STIFFEST:
+        raise ValueError(
+            f"Argument `stiffness_ratio` must be 0 or at least {1 / _STIFFEST:g}, "
+            f"but has value {g:g}."
+        )
+    if g == 0:
+        return SeparationTimes(float(np.pi / np.sqrt(2)), float(np.inf))
+    root = float(np.sqrt(g * g - g + 1))
+    high = float(np.sqrt(1 + g + root))
+    low = float(np.sqrt(3 * g)) / high  # their product; 1 + g - root would cancel
+
+    def zero(slow: float, fast: float) -> float:
+        """First zero of `slow sin(w1 t) / w1 + fast sin(w2 t) / w2`."""
+
+        def squeeze(t: Any) -> Any:
+            """The indentation, but for a factor."""
+            return slow * np.sin(low * t) / low + fast * np.sin(high * t) / high
+
+        times = np.arange(1, int(2 * np.pi * high / low / _GRID) + 2) * _GRID / high
+        after = int(np.argmax(squeeze(times) <= 0))
+        return float(brentq(squeeze, times[after - 1], times[after], xtol=1e-15, rtol=1e-15))
+
+    rising, falling = g + (g * g - g) / (root + 1), 1 + (1 - g) / (root + g)  # nothing cancels
+    return SeparationTimes(zero(rising, falling), zero(1.0, -1.0))

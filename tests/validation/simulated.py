@@ -44,6 +44,8 @@ class Row:
     spoiled: Callable[[np.ndarray], np.ndarray] = lambda post: post
     swapped: bool = False
     loss: str = "squares"
+    prior: float = 0.0  # standard deviation of what is known of the first parameter; 0: nothing
+    off: float = 0.0  # how many of these that knowledge is wrong by
     ends: bool = False  # every other shot comes from the other end
     expected: str = ""  # the warning that should come
 
@@ -96,6 +98,7 @@ HONEST = (
         "Newton, 10 repeats read to .01",
         N(0.8), N(0.9), UNEQUAL, 10, noise=0.004, repeated=True, spoiled=lambda v: v.round(2),
     ),
+    Row("Newton, e1, e2, prior of e1", N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 6, sigma=True, prior=0.01),
     Row("Newton, 12 shots, huber", N(0.8), N(0.9), PAIR, 12, loss="huber"),
     Row("LZB, e = .9", L(0.9), L(0.8), BALLS),
     Row("LZB, e = .995, sigma", L(0.995), L(0.8), BALLS, sigma=True),
@@ -118,6 +121,11 @@ SPOILED = (
     Row(
         "one shot of 24 misread by .3 m/s",
         N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 24, spoiled=misread, expected="Suspicious",
+    ),
+    Row(
+        "a prior of e1 that is wrong by 5 of its standard deviations",
+        N([0.8, 0.6]), N([0.9, 0.9]), UNEQUAL, 6, sigma=True, prior=0.01, off=5.0,
+        expected="The data contradict the prior",
     ),
     Row(
         "three shots of 12 misread by .25 to .5 m/s, huber",
@@ -149,6 +157,7 @@ SPOILED = (
 ALARMS = (
     "Lack of fit",
     "Suspicious",
+    "The data contradict the prior",
     "The data violate conservation of momentum",
     "The data gain energy",
     "No contact approaches",
@@ -210,8 +219,22 @@ def covered(row, fits):
     return linear.mean(axis=0), np.mean(inside, axis=1)
 
 
+def with_priors(row, count):
+    """Fits with a prior each, whose mean is the true value with an error, perhaps a wrong one."""
+    rng, fits = np.random.default_rng(zlib.crc32(row.what.encode()) + 1), []
+    for data in row.data(count):
+        start = ji.FitProblem.from_shots(row.law, row.scene, data, row.free)
+        mean = truth_of(row, start.names[:1])[0] + row.prior * (rng.normal() + row.off)
+        known = {start.names[0]: (mean, row.prior)}
+        options = {"starts": 1, "profiles": False, "progress": False}
+        fits.append(ji.fit(row.law, row.scene, data, row.free, priors=known, **options))
+    return fits
+
+
 def fitted(row, count):
     """Fits of so many data sets."""
+    if row.prior:
+        return with_priors(row, count)
     if row.loss != "squares":
         options = {"loss": row.loss, "starts": 1, "profiles": False}
         return [ji.fit(row.law, row.scene, data, row.free, **options) for data in row.data(count)]

@@ -2,6 +2,8 @@
 
 import re
 
+import cube
+import numpy as np
 import page
 import pytest
 import simulated
@@ -55,6 +57,32 @@ def exponent(text):
 def test_page_has_nothing_else():
     assert re.findall(r"^## (.*)$", TEXT, re.M) == [case.title for case in CASES]
     assert TEXT.startswith(page.HEAD)
+
+
+def test_tosses_of_the_cube_stay_together():
+    toss = cube.tosses(["41:3", "7:1", "370:5", "41:9", "8:2"])  # 370 is 41, turned
+    assert toss.tolist() == [41, 7, 41, 41, 8]
+    group = cube.groups(toss)
+    assert group[0] == group[2] == group[3]
+    assert len(set(group)) == 3
+    draws = cube.resampled(toss)
+    assert all(np.sum(draw == 0) == np.sum(draw == 2) == np.sum(draw == 3) for draw in draws)
+
+
+def test_differences_of_the_cube_are_paired():
+    """One law that is .5 % worse in every impact is so in every draw, however they scatter."""
+    error, toss = 5 * np.random.default_rng(0).random(40), np.arange(40) // 2
+    draws = cube.resampled(toss)
+    np.testing.assert_allclose(cube.difference(error, error + 0.5, draws), 0.5, atol=1e-12)
+    median, low, high = cube.median_and_interval(error, draws)
+    assert low < median == np.median(error) < high
+
+
+def test_the_page_of_the_cube_has_its_rows():
+    text = cube.PAGE.read_text(encoding="utf-8")
+    for name in ("Newton", "Moreau", "MuJoCo", "LZB", "Compliant, e falls"):
+        assert f"| {name} |" in text
+    assert cube.HEAD.format(one=377, two=105, tosses=308, folds=cube.FOLDS) in text
 
 
 @pytest.mark.slow

@@ -42,6 +42,7 @@ from jimpact.theory.rocking import critical_kinetic_angle, rocking_dispersion
 _A, _B = np.array([0.0, 0.0, 1.0]), np.array([-1 / 3, 2 / 3, 2 / 3])  # ends of the arc AB
 _GRID = 31  # values of e1 and of e2 whose outcomes fill a region; ten times more looks the same
 _RATIOS = np.geomspace(1e-2, 1e2, 41)  # k2/k1 of the curves of LZB in figure 5.5
+_RATIO = 0.8  # impulse correlation ratio of figure 6.3b: from 0.5, where B is, to 1, where A is
 _PALE = "#C5DCEE"  # behind lines
 _FAILS = np.array([row.failure for row in STATUS])
 
@@ -141,7 +142,8 @@ def sphere() -> Figure:
     balls, before = chain([1.0, 1.0, 1.0]), np.array([1.0, 0.0, 0.0])
     arc = admissible_set(balls, before).conserving_arc(60)
     axes.plot(*arc.T, color="black", lw=3)
-    laws, _ = registered_laws({"restitution": 1.0, "stiffness": [1.0, 1.0]})
+    values = {"restitution": 1.0, "stiffness": [1.0, 1.0], "matrix": np.eye(2), "ratio": _RATIO}
+    laws, _ = registered_laws(values)
     for i, (name, law) in enumerate(laws.items()):
         mark(axes, np.asarray(impact(law, balls, before).velocity), name, i, True)
     for i, set_label in enumerate((axes.set_xlabel, axes.set_ylabel, axes.set_zlabel)):
@@ -151,11 +153,11 @@ def sphere() -> Figure:
         getattr(axes, f"set_{axis}ticks")((-1, 0, 1))
     axes.set_box_aspect((1, 1, 1))
     axes.view_init(20, 62)
-    for name, at in (("A", 1.12 * _A), ("B", 1.15 * _B)):
+    for name, at in (("A", 1.12 * _A), ("B", 1.3 * _B)):
         x, y, _ = proj_transform(*at, axes.get_proj())
         write(axes, (x, y), name, fontsize="x-large", fontweight="bold")
     handles = axes.get_legend_handles_labels()[0]
-    legend_below(figure, handles, 5)
+    legend_below(figure, handles, 4)
     return figure
 
 

@@ -1,0 +1,97 @@
+"""Measured drops that come with the package: an ellipse and a square on a table."""
+
+from importlib.resources import files
+
+import numpy as np
+
+from jimpact.bodies.blocks import Block
+from jimpact.files.shots_file import read_shots
+from jimpact.fits.experiments import Experiments, read_experiments
+from jimpact.scene import Scene
+
+_DATA = files("jimpact") / "data"
+ELLIPSE_AXES = 0.035, 0.025  # m, half of each, of the measured ellipse
+ELLIPSE_MASS = 0.0364  # kg
+SQUARE_SIDE = 0.06  # m, of the measured square
+# m, m, rad: the units of the stored poses, about the noise of a pose. Ten times more and the
+# rounding is what a fit sees.
+POSE_UNITS = 2e-5, 2e-5, 5e-4
+
+
+def ellipse_impacts() -> Experiments:
+    """1378 measured impacts of a flat ellipse (semi-axes 35 and 25 mm) on a table, in the plane.
+
+    Velocities are those of the centre (m/s) and the angular velocity (rad/s), each shot in the
+    scene of its angle: `gamma = y' + c theta'`, slip `x' + h theta'`, h the height of the centre
+    above the lowest point, c how far that lies to the right. The inertia is a guess:
+    m (a^2 + b^2) / 4 of the semi-axes a, b.
+
+    Returns:
+        `Experiments` of 1378 shots of 3 velocities, with scenes, without sigma.
+
+    No law of contact at a point fits them: an impulse of any size and direction at the lowest point
+    leaves 18 % of the velocity jump (median, energy norm).
+
+    Source: Fazeli et al., as kept in DAIRLab/ImpactModeling, see `planar_NOTICE.txt` in `data`.
+
+    >>> import jimpact as ji
+    >>> shots = ji.ellipse_impacts()
+    >>> shots.pre.shape, shots.units[2], shots.scenes[0].contacts
+    ((1378, 3), 'rad/s', 1)
+    """
+    values, units, labels = read_shots(str(_DATA / "ellipse_impacts.csv"))
+    a, b = ELLIPSE_AXES
+    sine, cosine = np.sin(values["q"][:, 2]), np.cos(values["q"][:, 2])
+    height = np.hypot(a * sine, b * cosine)
+    arm = (b**2 - a**2) * sine * cosine / height
+    mass = ELLIPSE_MASS * np.array([1.0, 1.0, (a**2 + b**2) / 4])
+    scenes = [
+        Scene(mass, [[0.0], [1.0], [x]], tangents=[[1.0], [0.0], [h]]) for x, h in zip(arm, height)
+    ]
+    return Experiments(values["pre"], values["post"], scenes=scenes, shots=labels, units=units)
+
+
+def square_impacts(near: float = 2e-3) -> Experiments:
+    """265 measured impacts of a square (side 60 mm) on a table, on a corner or an edge.
+
+    Velocities are those of the centre (m/s) and the angular velocity (rad/s), with standard errors
+    before and after, each shot in the scene of its pose. A label is "drop:frame", in frames of
+    4 ms. The mass is 1 kg: impacts with the table do not depend on it.
+
+    Args:
+        near: corners up to so far above the lowest one touch, too [m].
+
+    Returns:
+        `Experiments` of 265 shots of 3 velocities, with sigma and scenes.
+
+    Source: Fazeli et al., as kept in DAIRLab/ImpactModeling, see `planar_NOTICE.txt` in `data`.
+
+    >>> import jimpact as ji
+    >>> shots = ji.square_impacts()
+    >>> [int((shots.contacts == m).sum()) for m in (1, 2)]
+    [250, 15]
+    """
+    body = Block(SQUARE_SIDE, SQUARE_SIDE)
+    return read_experiments(str(_DATA / "square_impacts.csv"), body, near)
+
+
+def square_drops() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """100 measured drops of the square of `square_impacts`, seen from the side at 250 Hz.
+
+    It lands on corners and edges, tumbles, rocks and comes to rest.
+
+    Returns:
+        Numbers of the drops (100,); times (200,) [s]; poses (100, 200, 3): x, y [m] of the centre
+        above the table y = 0, and the angle of the sides [rad].
+
+    Source: Fazeli et al., as kept in DAIRLab/ImpactModeling, see `planar_NOTICE.txt` in `data`.
+
+    >>> import jimpact as ji
+    >>> drops, time, q = ji.square_drops()
+    >>> q.shape, round(float(time[1]), 3)
+    ((100, 200, 3), 0.004)
+    """
+    with np.load(str(_DATA / "square_drops.npz")) as stored:
+        steps, drops = stored["steps"], stored["drop"]
+    q = np.cumsum(steps, axis=1, dtype=np.int32) * np.array(POSE_UNITS)
+    return drops, np.arange(q.shape[1]) / 250.0, q

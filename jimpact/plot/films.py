@@ -1,0 +1,307 @@
+"""Motions as films in real time: GIF, MP4, or a page that plays them."""
+
+import json
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
+from matplotlib.figure import Figure
+
+from jimpact._checks import check_values
+from jimpact.bodies.base import projected
+from jimpact.motion.dynamics import seen_from_base
+from jimpact.motion.record import Motion
+from jimpact.motion.system import System
+from jimpact.plot.motions import (
+    POINT,
+    base_path,
+    course_of,
+    one_motion,
+    plane_of,
+    set_limits,
+    stretch_of,
+)
+from jimpact.plot.style import COLOURS, GREY
+from jimpact.progress import counting_bar
+
+ENDINGS = (".gif", ".mp4", ".html")
+_SHORTEST = 2.0  # [s] films of shorter motions are slow; ten times more slows most motions down
+# [1/s] of a film. Ten times more: files ten times as large, which most screens cannot show.
+_FRAMES_PER_SECOND = 25.0
+_GIF_CLOCK, _GIF_LEAST = 100.0, 2.0  # a GIF counts in 1/100 s; viewers do not show less than two
+# [s] Frames last a little longer, because whole milliseconds are cut off the rounded numbers of a
+# GIF; a thousand times more would slow films down.
+_CUT_OFF = 1e-6
+_PLACE = (0.12, 0.08, 0.84, 0.8)  # of the axes in a film, for all frames
+_GRID = 2000  # points along a side of the page's picture, on which curves are drawn
+_RATES = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)  # at which the page can play, of the film's speed
+
+
+def animation(
+    system: System,
+    motion: Motion,
+    path: str | Path,
+    title: str = "",
+    progress: float | None = None,
+    *,
+    speed: float | None = None,
+    frames_per_second: float = _FRAMES_PER_SECOND,
+) -> Path:
+    """The motion as a film: an animated GIF, an MP4, or a page (.html) that plays it.
+
+    Frames are equally spaced in time, whatever the samples are: between the states of the record,
+    those at events included, positions follow cubics with the velocities of the record. Bodies in
+    space are shown in parallel projection, with their shadows. What moves with the base moves in
+    the picture. The page needs nothing else and no network; it has a slider and a speed.
+
+    Args:
+        system: that moved.
+        motion: one motion.
+        path: the file, ending in .gif, .mp4 (needs ffmpeg) or .html.
+        title: of the picture; the time stands below it.
+        progress: a bar on stderr; None: on a terminal, where it takes long.
+        speed: of the film, not in [m/s]: seconds of the motion that a second of it shows; 1: real
+            time, 0.1: slow motion. None: 1, and less for motions of less than two seconds.
+        frames_per_second: of the film; a GIF has the nearest rate of 100 / k.
+
+    Returns:
+        The path of the file that was written.
+
+    Raises:
+        ValueError: another ending, a batch, no sample, a speed or rate that is not positive;
+        TypeError: a body without outlines; RuntimeError: an MP4 without ffmpeg.
+
+    >>> import tempfile, pathlib, jimpact as ji
+    >>> ball = ji.ball_system()
+    >>> motion = ji.simulate(ball, ji.Newton(0.5), [1.0], [0.0], 1.0, samples=21)
+    >>> place = pathlib.Path(tempfile.mkdtemp())
+    >>> ji.plot.animation(ball, motion, place / "ball.gif", speed=0.5, frames_per_second=10).name
+    'ball.gif'
+    """
+    one_motion(motion)
+    path = Path(path)
+    if path.suffix not in ENDINGS:
+        raise ValueError(f"Argument `path` must end in {' or '.join(ENDINGS)}, but is '{path}'.")
+    check_values("speed", speed, low=0.0, open_low=True)
+    check_values("frames_per_second", frames_per_second, low=0.0, open_low=True)
+    if path.suffix == ".mp4" and not FFMpegWriter.isAvailable():
+        raise RuntimeError(
+            "Argument `path` ends in .mp4, for which the program ffmpeg must be installed: install "
+            "it, or give a path that ends in .gif or .html."
+        )
+    if path.suffix == ".gif":
+        frames_per_second = _GIF_CLOCK / max(round(_GIF_CLOCK / frames_per_second), _GIF_LEAST)
+    film = _film(system, motion, title, speed, frames_per_second)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with counting_bar(len(film.time), "frames", progress) as advance:
+        if path.suffix == ".html":
+            path.write_text(_page(film), encoding="utf-8")
+            advance(len(film.time))
+        else:
+            _save(film, path, advance)
+    return path
+
+
+class _Film(NamedTuple):
+    """What all kinds of films show."""
+
+    title: str
+    time: np.ndarray  # (K,) of frames [s]
+    speed: float
+    rate: float  # frames in a second
+    curves: list[list[np.ndarray]]  # of each frame
+    floors: list[tuple[np.ndarray, float]]  # normal, offset
+    ground: np.ndarray  # (K, 2) displacement of the base
+
+    def caption(self, k: int) -> str:
+        """The time of a frame, to the digits in which frames differ."""
+        digits = max(2, int(np.ceil(-np.log10(self.speed / self.rate))))
+        slow = "" if self.speed == 1 else f" (speed {self.speed:g})"
+        return f"{self.time[k]:.{digits}f} s{slow}"
+
+
+def readable_speed(duration: float) -> float:
+    """1, or the largest of .5, .2, .1, .. at which a motion of this duration [s] takes long enough.
+
+    >>> from jimpact.plot.films import readable_speed
+    >>> [readable_speed(x) for x in (8.0, 1.0, 0.03, 0.0)]
+    [1.0, 0.5, 0.01, 1.0]
+    """
+    wanted = duration / _SHORTEST
+    if not 0 < wanted < 1:
+        return 1.0
+    power = float(10.0 ** np.floor(np.log10(wanted) + 1e-9))
+    return float(max(x for x in (1.0, 2.0, 5.0) if x * power <= wanted * (1 + 1e-9))) * power
+
+
+def _film(system: System, motion: Motion, title: str, speed: float | None, rate: float) -> _Film:
+    """The frames of a motion."""
+    course = course_of(motion)
+    known = np.isfinite(course.q).all(axis=1) & np.isfinite(course.v).all(axis=1)
+    at, q, v = course.time[known], course.q[known], course.v[known]
+    if not len(at):
+        raise ValueError("Argument `motion` must have a sample that was reached, but has none.")
+    speed = readable_speed(at[-1] - at[0]) if speed is None else float(speed)
+    count = int((at[-1] - at[0]) / speed * rate + 1e-9) + 1
+    time = at[0] + np.arange(count) * speed / rate
+    slopes = np.asarray(jax.vmap(system.body.rates)(jnp.asarray(q), jnp.asarray(v)))
+    places = positions(at, q, slopes, time)
+    ground = _grounds(system, time)
+    floors = [plane_of(angle, offset) for angle, offset in system.body.floors]
+    return _Film(title, time, speed, rate, _curves(system, places, time, ground), floors, ground)
+
+
+def positions(at: np.ndarray, q: np.ndarray, slopes: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """q (K, n) at `time` (K,), by cubics between the states at `at` (S,), which may repeat.
+
+    >>> import numpy as np
+    >>> from jimpact.plot.films import positions
+    >>> at, q, slopes = np.array([0.0, 1.0]), np.array([[0.0], [1.0]]), np.array([[0.0], [2.0]])
+    >>> positions(at, q, slopes, np.array([0.5]))  # t^2
+    array([[0.25]])
+    """
+    if len(at) == 1:
+        return np.repeat(q, len(time), axis=0)
+    k = np.clip(np.searchsorted(at, time, side="right") - 1, 0, len(at) - 2)
+    h = (at[k + 1] - at[k])[:, None]
+    s = (time - at[k])[:, None] / np.where(h > 0, h, 1.0)
+    begin, end = (1 + 2 * s) * (1 - s) ** 2, s**2 * (3 - 2 * s)
+    turns = s * (1 - s) ** 2 * h * slopes[k] - s**2 * (1 - s) * h * slopes[k + 1]
+    return begin * q[k] + end * q[k + 1] + turns
+
+
+def _curves(
+    system: System, q: np.ndarray, time: np.ndarray, ground: np.ndarray
+) -> list[list[np.ndarray]]:
+    """Outlines of the body, of every frame, where they are in space."""
+    point = POINT * (np.ptp(q) or 1.0)
+    if system.base is not None:
+        q = np.asarray(jax.vmap(partial(seen_from_base, system))(jnp.asarray(q), jnp.asarray(time)))
+    return [
+        [curve + moved for curve in system.body.outlines(x, point)]
+        for x, moved in zip(q, ground, strict=True)
+    ]
+
+
+def _grounds(system: System, time: np.ndarray) -> np.ndarray:
+    """Displacement of the base in the picture (K, 2)."""
+    if system.base is None:
+        return np.zeros((len(time), 2))
+    path = base_path(system, time)
+    if path.shape[1] == 3:
+        return projected(path)
+    return np.insert(path, 0, 0.0, axis=1) if path.shape[1] == 1 else path
+
+
+def _colour(i: int) -> str:
+    """Of curve i."""
+    return COLOURS[i // 2 % len(COLOURS)]
+
+
+def _save(film: _Film, path: Path, advance: Callable[[int], None]) -> None:
+    """Frame by frame, by matplotlib."""
+    figure = Figure(figsize=(4.8, 4.8), dpi=80)
+    axes = figure.add_axes(_PLACE)
+    set_limits(axes, film.curves, film.ground, film.floors)
+    lines = [axes.plot([], [], color=_colour(i))[0] for i in range(len(film.curves[0]))]
+    drawn = [axes.plot([], [], color=GREY, lw=2)[0] for _ in film.floors]
+    view = np.array([axes.get_xlim(), axes.get_ylim()])
+
+    def draw(k: int) -> list[Any]:
+        """Frame k."""
+        for line, points in zip(lines, film.curves[k], strict=True):
+            line.set_data(points[:, 0], points[:, 1])
+        for line, (n, offset) in zip(drawn, film.floors, strict=True):
+            line.set_data(*stretch_of(n, offset, view, film.ground[k]))
+        axes.set_title(f"{film.title}\n{film.caption(k)}".lstrip(), loc="left")
+        return [*lines, *drawn]
+
+    frames = FuncAnimation(figure, draw, frames=len(film.time))
+    kind: Any = PillowWriter if path.suffix == ".gif" else FFMpegWriter  # both take fractions
+    writer = kind(fps=1 / (1 / film.rate + _CUT_OFF))
+    frames.save(path, writer=writer, progress_callback=lambda i, n: advance(1))
+
+
+def _page(film: _Film) -> str:
+    """HTML that draws the curves on a canvas, with everything in it."""
+    axes = Figure().subplots()
+    set_limits(axes, film.curves, film.ground, film.floors)
+    view = np.array([axes.get_xlim(), axes.get_ylim()])
+    low, width = view[:, 0], np.ptp(view[0])
+
+    def on_grid(points: np.ndarray) -> list[int]:
+        """x, y, x, y, .. from the upper left corner."""
+        share = (points - low) / width
+        at = np.stack([share[:, 0], 1 - share[:, 1]], axis=1)
+        return [int(x) for x in np.round(_GRID * at).ravel()]
+
+    def frame(k: int) -> dict[str, Any]:
+        floors = [stretch_of(n, d, view, film.ground[k]).T for n, d in film.floors]
+        curves = [on_grid(points) for points in film.curves[k]]
+        return {"time": film.caption(k), "floors": list(map(on_grid, floors)), "curves": curves}
+
+    content = {
+        "grid": _GRID,
+        "rate": film.rate,
+        "grey": GREY,
+        "colours": [_colour(i) for i in range(len(film.curves[0]))],
+        "frames": [frame(k) for k in range(len(film.time))],
+    }
+    rates = "".join(
+        f'<option value="{x:g}"{" selected" * (x == 1)}>{x:g} x</option>' for x in _RATES
+    )
+    title = escape(film.title or "Motion")
+    data = json.dumps(content, separators=(",", ":"))
+    return _PAGE.replace("TITLE", title).replace("RATES", rates).replace("DATA", data)
+
+
+_PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>TITLE</title><style>
+body { font: 16px/1.5 system-ui, sans-serif; margin: 1rem auto; max-width: 40rem; padding: 0 1rem; }
+canvas { width: 100%; aspect-ratio: 1; border: 1px solid #ddd; background: white; }
+.controls { display: flex; gap: .6rem; align-items: center; } input { flex: 1; }
+</style></head><body>
+<h1 style="font-size: 1.2rem">TITLE</h1>
+<canvas id="view" width="1200" height="1200"></canvas>
+<p class="controls"><button id="play">Pause</button>
+<input id="place" type="range" min="0" value="0" aria-label="frame">
+<select id="speed" aria-label="speed">RATES</select><span id="time"></span></p>
+<script>
+"use strict";
+const film = DATA;
+const [view, play, place, speed, time] =
+  ["view", "play", "place", "speed", "time"].map(name => document.getElementById(name));
+const pen = view.getContext("2d"), scale = view.width / film.grid;
+let at = 0, last = null, plays = true;
+place.max = film.frames.length - 1;
+function stroke(points, colour, width) {
+  pen.beginPath();
+  for (let i = 0; i < points.length; i += 2) pen.lineTo(points[i] * scale, points[i + 1] * scale);
+  pen.strokeStyle = colour; pen.lineWidth = width; pen.stroke();
+}
+function draw() {
+  const frame = film.frames[Math.floor(at)];
+  pen.clearRect(0, 0, view.width, view.height);
+  frame.floors.forEach(points => stroke(points, film.grey, 5));
+  frame.curves.forEach((points, i) => stroke(points, film.colours[i], 3));
+  place.value = Math.floor(at); time.textContent = frame.time;
+}
+function tick(now) {
+  if (plays && last !== null) {
+    at = (at + (now - last) / 1000 * film.rate * speed.value) % film.frames.length;
+    draw();
+  }
+  last = now; requestAnimationFrame(tick);
+}
+function toggle(on) { plays = on; play.textContent = on ? "Pause" : "Play"; }
+play.onclick = () => toggle(!plays);
+place.oninput = () => { toggle(false); at = +place.value; draw(); };
+draw(); requestAnimationFrame(tick);
+</script></body></html>
+"""
