@@ -172,6 +172,7 @@ MUTATIONS = [
     Mutation("a contact changes its place where sides change", r"\(a \+ b\) % 2 == 1", "a < 0", ("test_bodies.py::test_a_contact_keeps_its_place_where_sides_change",)),
     Mutation("sides that face each other least", r"jnp\.argmin\(opposite\[side_a\]\)", "jnp.argmax(opposite[side_a])", ("test_bodies.py::test_polygons_choose_their_sides",)),
     Mutation("only the first polygon's sides keep apart", r"by_b = jnp\.max\(beyond_b\) > .*", "by_b = jnp.max(beyond_b) > jnp.inf", ("test_bodies.py::test_polygons_choose_their_sides",)),
+    Mutation("the mass is blamed for a start of the wrong length", r"check_shape\(\"q0\", q, mass\.shape\[:1\]", 'check_shape("q0", q, q.shape', ("test_errors.py::test_bad_motions",)),
     Mutation("bodies that pass each other are not reported", r"struck_again \| \(\(progress", "struck_again | (False & (progress", ("test_motion_stepped.py::test_bodies_that_pass_each_other_in_a_step_are_reported",), "stepping.py"),
     Mutation("rebound of the last contact without e", r"rebound = self\.restitution \* jnp\.sqrt", "rebound = jnp.sqrt", FLOW),
     # --- the command line

@@ -80,7 +80,7 @@ class PlanarBodies(Body):
     [0.0, 0.0]
     """
 
-    range_in_words = "see `PlanarBodies`: no centre in another body, sides that face each other"
+    range_in_words = "see `PlanarBodies`: no centre in a body, fixed sides face each other"
 
     bodies: tuple[OnGround, ...]
     planes: jax.Array  # (k, 2) angle, offset

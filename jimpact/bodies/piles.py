@@ -45,6 +45,8 @@ class _Pile(Body):
     def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
         d = self.dimension
         self.radii = positives("radii", radii)
+        if not len(self.radii):
+            raise ValueError("Argument `radii` must hold one or more, but is empty.")
         self.masses = positives("masses", masses, self.radii.shape[0])
         empty = len(walls) == 0
         rows = as_float_array("walls", np.reshape(walls, (-1, d + 1)) if empty else walls)

@@ -39,11 +39,15 @@ def check_motion(
     """Raise a ValueError for a bad start, end or system; the gaps at the start (m,)."""
     if q.ndim != 1:
         raise ValueError(f"Argument `q0` must have shape (n,), but has shape {q.shape}.")
-    coordinates = system.body.coordinates
+    coordinates, mass = system.body.coordinates, system.body.mass
+    if coordinates is not None:
+        check_shape("q0", q, (coordinates,), "the coordinates of the body")
+    elif not callable(mass):
+        check_shape("q0", q, mass.shape[:1], "the coordinates of the body, as many as its mass has")
     if coordinates is None:
         check_shape("v0", v, q.shape, "one velocity per coordinate of `q0`")
-    else:
-        check_shape("q0", q, (coordinates,), "the coordinates of the body")
+    elif not callable(mass):
+        check_shape("v0", v, mass.shape[:1], "the velocities of the body, as many as its mass has")
     for name, value in (("q0", q), ("v0", v), ("t_start", start), ("t_end", end)):
         check_values(name, value)
     check_shape("t_start", start, (), "a time")
