@@ -8,6 +8,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.bodies.base import STANDARD_GRAVITY as G
+from jimpact.motion.flow import Scales, Settings, State, flow_of, packed
 from jimpact.motion.persistent_contact import (
     Modes,
     by_contact,
@@ -15,6 +16,7 @@ from jimpact.motion.persistent_contact import (
     contacts_at,
     direction,
     forces,
+    no_modes,
 )
 from jimpact.motion.record import EVENT_KINDS, MOTION_STATUS
 
@@ -264,14 +266,86 @@ def test_forces_of_a_brick_that_slides_flat_have_derivatives():
     np.testing.assert_allclose(slope, jnp.stack(central, axis=1), atol=1e-6)
 
 
-def test_a_brick_that_could_stay_at_rest_does():
-    """At mu = 1, where complementarity alone finds other modes as well."""
-    contacts = contacts_at(SYSTEM, BRICK.touching(), jnp.zeros(6), jnp.zeros(()), True)
-    touch, mu = contacts.normal.value < 1e-9, jnp.ones(8)
-    before = Modes(touch & False, touch & False, jnp.zeros(8))
-    none = jnp.zeros(16, bool)
-    choice = jax.jit(choose_with_friction)(
-        contacts, mu, before, touch, none, none[:8], jnp.asarray(1e-10)
-    )
-    assert bool(choice.consistent)
-    assert (choice.modes.stick == touch).all()
+# Sizes, q, v and mu of boxes that roll over an edge whose two corners are about to slide: one of
+# them has reached the rim of its cone, and the other one has within rounding.
+ON_EDGES = [
+    (
+        [0.07809755793583939, 0.0995614154251711, 0.04932142472106374],
+        np.array(
+            [
+                "-0.11155535057578453",
+                "0.2615123932481366",
+                "0.04025697760088688",
+                "-0.5161330672427202",
+                "-0.48369330762500556",
+                "-0.49041992456242733",
+                "0.5090537679357517",
+            ],
+            float,
+        ),
+        [0.002324799753831211, -0.1683246003861265, -0.09465079697595051, 0, 4.181651580221588, 0],
+        0.3743545456893319,
+        (4, 6),
+    ),
+    (
+        [0.2971247691744712, 0.052487248534103394, 0.07495634060739399],
+        np.array(
+            [
+                "0.2882633685518917",
+                "-0.39584816102194825",
+                "0.03664376285367738",
+                "-0.37417063164120323",
+                "-0.5170416772154367",
+                "0.6236682660517031",
+                "0.45133373058030274",
+            ],
+            float,
+        ),
+        [0.4553341726448634, -0.08587402003439662, -0.34643104767191496, -12.64502100061415, 0, 0],
+        0.6518950229443833,
+        (5, 1),
+    ),
+]
+
+
+def chosen(sizes, q, v, mu, before, touch, released):
+    """The choice for a box of 1 kg."""
+    box = ji.Box(sizes)
+    system = ji.System(box, potential=ji.gravity(box))
+    contacts = contacts_at(system, q, v, jnp.zeros_like(mu), True)
+    slack, slides = jnp.asarray(5e-10), jnp.zeros(8, bool)
+    return choose_with_friction(contacts, mu * jnp.ones(8), before, touch, released, slides, slack)
+
+
+def test_who_sticks_and_who_slides():
+    """A brick that could stay at rest does, at mu = 1; corners on an edge break loose together."""
+    rows = [(BRICK.sizes, BRICK.touching(), np.zeros(6), 1.0, (0, 2, 4, 6)), *ON_EDGES]
+    touch, released = np.zeros((3, 8), bool), np.zeros((3, 16), bool)
+    for i, row in enumerate(rows):
+        touch[i, list(row[4])] = True
+        released[i, 8 + row[4][0]] = i > 0
+    before = Modes(touch & released.any(axis=1)[:, None], touch, np.zeros((3, 8)))
+    given = [np.array([np.asarray(row[k], float) for row in rows]) for k in range(4)]
+    choice = jax.jit(jax.vmap(chosen))(*given, before, touch, released)
+    assert choice.consistent.all()
+    assert (choice.modes.active == touch).all()
+    assert (choice.modes.stick == touch & [[True], [False], [False]]).all()
+
+
+def test_a_contact_that_lies_below_the_surface_may_leave_it():
+    """Margins of gaps begin at 0 there: one that began below would end each step."""
+    below, still, one = jnp.array([0, 0, -1e-10]), jnp.zeros(()), jnp.ones(())
+    q = jnp.concatenate([BRICK.touching()[:3] + below, BRICK.touching()[3:]])
+    rest = jnp.zeros((2, 8))
+    state = State(q, jnp.zeros(6), still, still, still, rest, rest[:0])
+    settings = Settings(1e-10, 1e-12, 1e-9 * one, 1e-14 * one, 9, False, False, one, 1e-6 * one)
+    modes, times = no_modes(8, q.dtype), jnp.linspace(0, 1, 2)
+
+    @jax.jit
+    def margins(state):
+        flow = flow_of(SYSTEM, None, settings, modes, Scales(one, one, one), times, state)
+        return flow.margins(modes, None, packed(state))[:8, 0]
+
+    low = np.asarray(BRICK.gap_function(BRICK.touching())) < 1e-9
+    assert (margins(state)[low] == 0).all()
+    assert (margins(state)[~low] > 1).all()

@@ -392,6 +392,15 @@ def test_priors_are_declared_like_domains(found):
     assert top == pytest.approx(1 / (0.1 * np.sqrt(2 * np.pi) * inside), rel=1e-6)
     beta = kinds.Beta(2.0, 2.0)
     assert _priors(problem, {"restitution": beta}, kinds)["restitution"] is beta
+    data = ji.Experiments([1.0, 0.0], [-0.2, 0.6], 0.01)
+    given = {"restitution": (0.8, 0.05)}
+    known = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, data, priors=given)
+    own = _priors(known, {}, kinds)["restitution"]  # of the fit, unless others are given
+    assert float(own.log_prob(0.8) - own.log_prob(0.85)) == pytest.approx(0.5)
+    assert (
+        type(_priors(known, {"restitution": ji.Uniform(0.2, 0.4)}, kinds)["restitution"])
+        is kinds.Uniform
+    )
     lzb = ji.FitProblem.from_shots(
         ji.LZB(0.9, [1.0, 2.0]),
         ji.chain([1.0, 1.0, 1.0]),

@@ -80,8 +80,7 @@ def posterior(
     start = fit.value if isinstance(fit, Fit) else problem.start
     for name, count in (("samples", samples), ("warmup", warmup), ("chains", chains)):
         as_whole(name, count, 1)
-    own = {problem.names[i]: Normal(mean, std) for i, mean, std in problem.priors}
-    each = _priors(problem, own | dict(priors or {}), numpyro.distributions)
+    each = _priors(problem, dict(priors or {}), numpyro.distributions)
 
     region = problem.residuals.region
     inner = None if isinstance(region, BoxRegion) else _Inner(problem, region)
@@ -184,11 +183,12 @@ def _inside(start: np.ndarray, domains: np.ndarray) -> np.ndarray:
 
 
 def _priors(problem: FitProblem, chosen_priors: dict[str, Any], kinds: Any) -> dict[str, Any]:
-    """A distribution of numpyro a parameter."""
+    """A distribution of numpyro a parameter: chosen, or of the fit, or flat."""
     parameters, priors = problem.parameters, {}
+    own = {i: Normal(mean, std) for i, mean, std in problem.priors}
     for i, name in enumerate(problem.names):
         field = parameters.field_of(i)
-        chosen = chosen_priors.get(name, chosen_priors.get(field))
+        chosen = chosen_priors.get(name, chosen_priors.get(field, own.get(i)))
         log = bool(parameters.log[parameters.first[i]])
         low, high = (float(end) for end in problem.domains[i])
         priors[name] = _prior(name, chosen, low, high, log, kinds)

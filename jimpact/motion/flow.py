@@ -26,13 +26,12 @@ from jimpact.motion.persistent_contact import (
     BEGINS,
     Contacts,
     Modes,
-    by_contact,
+    cone_margins,
     constraint_impulse,
     contact_powers,
     contacts_at,
     forces,
     least_regularity,
-    length,
     regularity,
     rest_acceleration,
     slip_margins,
@@ -106,21 +105,22 @@ def watched(
     mu: jax.Array | None,
     modes: Modes,
     scales: Scales,
+    below: jax.Array,
     slip: jax.Array | None = None,
 ) -> jax.Array:
     """What must stay positive (k,): gaps or normal forces, then friction.
 
-    `slip`: as in `forces`.
+    `below`: (m,) gaps <= 0 that steps begin with. `slip`: as in `forces`.
     """
     m = modes.active.shape[0]
     force = forces(contacts, mu, modes, slip)
     w = jnp.diagonal(contacts.delassus)
     slack = rest_acceleration(w.dtype) * scales.acceleration
-    normal = jnp.where(modes.active, force.normal * w[:m] + slack, contacts.normal.value)
+    gap = contacts.normal.value - below
+    normal = jnp.where(modes.active, force.normal * w[:m] + slack, gap)
     if contacts.tangent is None or mu is None or force.tangential is None:
         return normal
-    sizes = by_contact(w[m:], m).mean(axis=1)
-    cone = (mu * force.normal - length(by_contact(force.tangential, m))) * sizes + slack
+    cone = cone_margins(contacts, mu, force) + slack
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
     lasts = jax.lax.cond(
@@ -209,6 +209,7 @@ class MechanicalFlow(MotionFlow):
 
     mu: jax.Array | None
     scales: Scales
+    below: jax.Array  # (m,) gaps that the step begins with, 0 where they are positive
     axes: SlipAxes | None
 
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
@@ -272,7 +273,8 @@ class MechanicalFlow(MotionFlow):
         """What must stay positive."""
         at = unpacked(self.like, y)
         contacts = self._contacts(at)
-        margins = watched(contacts, self.mu, const, self.scales, self._slip(const, contacts))
+        slip = self._slip(const, contacts)
+        margins = watched(contacts, self.mu, const, self.scales, self.below, slip)
         return self.from_margins(margins, at)
 
     def projected(self, const: Modes, at: State) -> State:
@@ -565,10 +567,12 @@ def flow_of(
     margins = jnp.concatenate([normal, side]) if settings.friction else normal
     rounded, longest = roundings(settings, margins, targets), longest_step(system, targets)
     blank = jnp.zeros((1, 1), state.q.dtype)
+    # where contacts that were held not quite closed are closed, redundant ones come to lie below
+    below = jax.lax.stop_gradient(jnp.minimum(gaps(system, state.q, state.t), 0.0))
     axes = None
     if mu is not None and settings.spatial:
         contacts = contacts_at(system, state.q, state.v, state.t, True)
         axes = slip_axes(contacts, mu, modes, scales.speed)
     return MechanicalFlow(
-        system, rounded, state.t, settings.rtol, blank, state, longest, mu, scales, axes
+        system, rounded, state.t, settings.rtol, blank, state, longest, mu, scales, below, axes
     )

@@ -176,6 +176,14 @@ def friction_acceleration(contacts: Contacts, mu: jax.Array, normal: jax.Array) 
     return mu * normal * by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
 
 
+def cone_margins(contacts: Contacts, mu: jax.Array, force: Forces) -> jax.Array:
+    """What the forces leave of the friction cones (m,) [m/s^2], 0 at the rim."""
+    assert force.tangential is not None
+    m = len(mu)
+    sizes = by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
+    return (mu * force.normal - length(by_contact(force.tangential, m))) * sizes
+
+
 def slip_begins(
     contacts: Contacts, mu: jax.Array, normal: jax.Array, growth: jax.Array
 ) -> jax.Array:
@@ -403,109 +411,40 @@ def choose_with_friction(
     contacts, mu = jax.lax.stop_gradient((contacts, mu))
     assert contacts.tangent is not None
     m = touching.shape[0]
-    spatial, moves = in_space(contacts), direction(by_contact(contacts.tangent.rate, m))
-    slid = before.active & ~before.stick
-    broken = released[m:] & before.stick & ~sliding
-    ended = jnp.any(released[m:] & slid)
-    begun = jnp.any(slid & (before.sign == BEGINS))  # then nothing begins: it slides or sticks
-    # where sticking breaks at one contact of a body, those that began to slide before go on
-    goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
-    starts = broken | goes_on if spatial else broken  # in space directions are not remembered
-    now = Modes(touching, ~sliding & (starts | ~goes_on), jnp.where(goes_on, before.sign, 0.0))
-    slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
-    # sliding begins against the last force of sticking
-    stays = Modes(touching, touching & ~sliding, jnp.ones_like(now.sign))
-    tries = jax.tree.map(
-        lambda *x: jnp.stack(x), now._replace(active=touching & ~released[:m]), stays
-    )
-    both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), tries)
-    held, without_slip = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
-    assert held.tangential is not None
-    against = by_contact(held.tangential, m)
-    against = -direction(against) if spatial else jnp.where(against > 0, -1.0, 1.0)
-    begin = jnp.where(starts[:, None], against, slides)
-    k = len(contacts.approach)
-    eye, diagonal = jnp.eye(k, dtype=begin.dtype), jnp.diagonal(contacts.delassus)[:m]
-    least = 2 * least_regularity(begin.dtype)  # twice: flights end at once it
-
-    def choose(tried: _ModeTrial) -> _ModeTrial:
-        """Modes by a complementarity problem, and what the next try must change."""
-        known = tried.known
-        rows = jnp.concatenate([tried.allowed, jnp.repeat(tried.allowed, begin.shape[1])])
-        w = jnp.where(rows[:, None] & rows[None], contacts.delassus, eye)
-        free = jnp.where(rows, contacts.approach, 0.0)
-        solution = solve(
-            w, free[:m], free[m:], mu * jnp.ones(m, begin.dtype), complementary=True,
-            sliding=known.reshape(-1),
-        )  # fmt: skip
-        rate = contacts.approach + contacts.delassus @ jnp.concatenate(
-            [solution.normal, solution.tangential]
-        )
-        turns, is_known = by_contact(rate[m:], m), length(known) > 0
-        active = tried.allowed & (rate[:m] <= slack)
-        active = active & (~released[:m] | (solution.normal * diagonal > slack))
-        slips = is_known | (length(turns) > slack)
-        slide = jnp.where(is_known[:, None], known, direction(turns))
-        sign = slide[:, 0]
-        if spatial:
-            growth = jnp.sum(turns * slide, axis=1)
-            slow = slip_begins(contacts, mu, solution.normal, growth) > 0
-            sign = jnp.where(slow & ~sliding & ~begun, float(BEGINS), 1.0)
-        modes = Modes(active, active & ~slips, sign)
-        # what was taken to slide from rest must do so
-        returns = active & is_known & ~sliding & (jnp.sum(known * turns, axis=1) < -slack)
-        several = solution.status == CODE["several_outcomes"]
-        solved = solution.status <= CODE["several_outcomes"]
-        given = jnp.where(solved, returns, ~sliding)[:, None]
-        # what would go on sliding though it cannot parts, where that is a solution, too
-        pressed = jnp.where(solved, active, tried.allowed)
-        pressing = modes._replace(active=pressed, stick=pressed & ~slips)
-        regular = regularity(contacts, mu, pressing, slide)
-        wedged = active & slips & (regular <= least)
-        leaves = wedged & several
-        open_ones_part = jnp.all(~touching | tried.allowed | (rate[:m] >= -slack))
-        solved = solved & open_ones_part & ~jnp.any(wedged)
-        done = solved & ~jnp.any(returns)
-        several = several | tried.several
-        return _ModeTrial(
-            modes, jnp.where(given, 0.0, known), tried.allowed & ~leaves, regular, several, solved,
-            done, tried.passes + 1,
-        )  # fmt: skip
-
+    begun = jnp.any(before.active & ~before.stick & (before.sign == BEGINS))
+    asked = _ModeQuestion(contacts, mu, touching, released, sliding, begun, slack)
+    now, direction_now, stuck = _expected(asked, before)
     no, one = jnp.asarray(False), jnp.ones_like(slack)
-    start = _ModeTrial(now, begin, touching, one, no, no, no, jnp.asarray(0))
-    end = jax.lax.while_loop(lambda t: ~t.done & (t.passes < _PASSES), choose, start)
+    start = _ModeTrial(now, direction_now, touching, one, no, no, no, jnp.asarray(0))
+    end = jax.lax.while_loop(
+        lambda tried: ~tried.done & (tried.passes < _PASSES),
+        lambda tried: _next_trial(asked, tried),
+        start,
+    )
     parts, several = touching & ~end.allowed, end.several & end.solved
     choice = ModeChoice(end.modes, end.solved, end.regularity, several, parts)
-    if not spatial:
+    if not in_space(contacts):
         return choice
     lets_go = jnp.any(released[:m]) | jnp.any(released[m:] & before.stick)
-    sticks = _all_stick(contacts, without_slip, mu, touching & ~sliding, touching, slack)
-    sticks = sticks & ~lets_go
+    sticks = _all_stick(asked, stuck) & ~lets_go
+    still = Modes(touching, touching & ~sliding, jnp.ones_like(now.sign))
     return jax.tree.map(
         lambda a, b: jnp.where(sticks, a, b),
-        ModeChoice(stays, ~no, one, several, no & touching),
+        ModeChoice(still, ~no, one, several, no & touching),
         choice,
     )
 
 
-def _all_stick(
-    contacts: Contacts,
-    force: Forces,
-    mu: jax.Array,
-    stick: jax.Array,
-    touching: jax.Array,
-    slack: jax.Array,
-) -> jax.Array:
-    """Whether () these forces press all that is touching, and hold all that shall `stick`.
+class _ModeQuestion(NamedTuple):
+    """What `choose_with_friction` is asked, without derivatives."""
 
-    Half of the slack is for slip that has fallen back to 0: flights end beyond all of it.
-    """
-    assert force.tangential is not None
-    m = len(mu)
-    sizes = by_contact(jnp.diagonal(contacts.delassus)[m:], m).mean(axis=1)
-    cone = (mu * force.normal - length(by_contact(force.tangential, m))) * sizes
-    return jnp.all(~touching | (force.normal > 0)) & jnp.all(~stick | (cone > -0.5 * slack))
+    contacts: Contacts
+    mu: jax.Array
+    touching: jax.Array  # (m,)
+    released: jax.Array  # (2 m,)
+    sliding: jax.Array  # (m,)
+    begun: jax.Array  # () slip that only began before: now it slides or sticks, nothing begins
+    slack: jax.Array
 
 
 class _ModeTrial(NamedTuple):
@@ -519,6 +458,102 @@ class _ModeTrial(NamedTuple):
     solved: jax.Array
     done: jax.Array
     passes: jax.Array
+
+
+def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array, Forces]:
+    """Modes as they were but for what has let go, directions (m, rows) of slip where it is known.
+
+    And the forces if all sticks that does not slide yet.
+    """
+    contacts, mu, touching, released, sliding, _, slack = asked
+    assert contacts.tangent is not None
+    m, spatial = len(mu), in_space(contacts)
+    slid = before.active & ~before.stick
+    broken = released[m:] & before.stick & ~sliding
+    ended = jnp.any(released[m:] & slid)
+    # where sticking breaks at one contact of a body, those that began to slide before go on
+    goes_on = slid & jnp.any(released[m:] & before.stick) & ~ended & ~sliding
+    starts = broken | goes_on if spatial else broken  # in space directions are not remembered
+    now = Modes(touching, ~sliding & (starts | ~goes_on), jnp.where(goes_on, before.sign, 0.0))
+    moves = direction(by_contact(contacts.tangent.rate, m))
+    slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
+    # sliding begins against the last force of sticking
+    still = Modes(touching, touching & ~sliding, jnp.ones_like(now.sign))
+    tries = jax.tree.map(
+        lambda *x: jnp.stack(x), now._replace(active=touching & ~released[:m]), still
+    )
+    both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), tries)
+    held, stuck = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+    assert held.tangential is not None
+    against = by_contact(held.tangential, m)
+    against = -direction(against) if spatial else jnp.where(against > 0, -1.0, 1.0)
+    if spatial:  # redundant contacts that share equally break loose together
+        at_rim = (
+            before.active & before.stick & ~sliding & (cone_margins(contacts, mu, stuck) <= slack)
+        )
+        starts = starts | (at_rim & jnp.any(broken))
+    return now, jnp.where(starts[:, None], against, slides), stuck
+
+
+def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
+    """Modes by a complementarity problem, and what the next try must change."""
+    contacts, mu, touching, released, sliding, begun, slack = asked
+    m, known = len(mu), tried.known
+    dtype, diagonal = known.dtype, jnp.diagonal(contacts.delassus)[:m]
+    rows = jnp.concatenate([tried.allowed, jnp.repeat(tried.allowed, known.shape[1])])
+    eye = jnp.eye(len(rows), dtype=dtype)
+    w = jnp.where(rows[:, None] & rows[None], contacts.delassus, eye)
+    free = jnp.where(rows, contacts.approach, 0.0)
+    solution = solve(
+        w, free[:m], free[m:], mu * jnp.ones(m, dtype), complementary=True,
+        sliding=known.reshape(-1),
+    )  # fmt: skip
+    rate = contacts.approach + contacts.delassus @ jnp.concatenate(
+        [solution.normal, solution.tangential]
+    )
+    turns, is_known = by_contact(rate[m:], m), length(known) > 0
+    active = tried.allowed & (rate[:m] <= slack)
+    active = active & (~released[:m] | (solution.normal * diagonal > slack))
+    slips = is_known | (length(turns) > slack)
+    slide = jnp.where(is_known[:, None], known, direction(turns))
+    sign = slide[:, 0]
+    if in_space(contacts):
+        growth = jnp.sum(turns * slide, axis=1)
+        slow = slip_begins(contacts, mu, solution.normal, growth) > 0
+        sign = jnp.where(slow & ~sliding & ~begun, float(BEGINS), 1.0)
+    modes = Modes(active, active & ~slips, sign)
+    # what was taken to slide from rest must do so
+    returns = active & is_known & ~sliding & (jnp.sum(known * turns, axis=1) < -slack)
+    several = solution.status == CODE["several_outcomes"]
+    solved = solution.status <= CODE["several_outcomes"]
+    given = jnp.where(solved, returns, ~sliding)[:, None]
+    # what would go on sliding though it cannot parts, where that is a solution, too
+    pressed = jnp.where(solved, active, tried.allowed)
+    pressing = modes._replace(active=pressed, stick=pressed & ~slips)
+    regular = regularity(contacts, mu, pressing, slide)
+    # twice: flights end at once it
+    wedged = active & slips & (regular <= 2 * least_regularity(dtype))
+    open_ones_part = jnp.all(~touching | tried.allowed | (rate[:m] >= -slack))
+    return _ModeTrial(
+        modes,
+        jnp.where(given, 0.0, known),
+        tried.allowed & ~(wedged & several),
+        regular,
+        several | tried.several,
+        solved & open_ones_part & ~jnp.any(wedged),
+        solved & open_ones_part & ~jnp.any(wedged | returns),
+        tried.passes + 1,
+    )
+
+
+def _all_stick(asked: _ModeQuestion, force: Forces) -> jax.Array:
+    """Whether () these forces press all that is touching, and hold all that does not slide.
+
+    Half of the slack is for slip that has fallen back to 0: flights end beyond all of it.
+    """
+    touching, stick = asked.touching, asked.touching & ~asked.sliding
+    holds = ~stick | (cone_margins(asked.contacts, asked.mu, force) > -0.5 * asked.slack)
+    return jnp.all(~touching | (force.normal > 0)) & jnp.all(holds)
 
 
 def pressed_together(
