@@ -135,7 +135,7 @@ def _drawn(sampler: Any, seed: int, shown: bool) -> tuple[Any, Any]:
         sampler.run(key)
         return sampler.get_samples(True), sampler.get_extra_fields(True)
 
-    # as one program it compiles in half of the time (16 s for 29); a progress bar needs several
+    # as one program a short run takes half of the time (16 for 29 s); a progress bar needs several
     run = drawn if shown else jax.jit(drawn, compiler_options=known_options())
     values, said = jax.tree.map(np.asarray, run(jax.random.PRNGKey(seed)))
     return values, said
