@@ -56,6 +56,61 @@ def find_defects(
     experiments: Experiments, scene: Scene | None, stored_energy: float
 ) -> list[Finding]:
     """The same, and what a quoted value has to say of each."""
+    measured = _balances(experiments, scene, stored_energy)
+    momentum = {
+        k: ratio
+        for each in measured.momenta.values()
+        for k, ratio in _beyond_noise(each, DEFECT_LEVEL / len(measured.momenta)).items()
+    }
+    energy = _beyond_noise(measured.energies, DEFECT_LEVEL, gains=True)
+    resting = [experiments.shots[k] for k in measured.resting]
+    total, found = len(experiments.shots), []
+    if momentum:
+        found.append(
+            Finding(
+                "The data violate conservation of momentum (1 = conserved): "
+                f"{_listed(experiments, momentum)}; "
+                f"no law can reproduce that part{_floor(experiments, scene)}.",
+                f"the data violate conservation of momentum in {share(len(momentum), total)}",
+            )
+        )
+    if energy:
+        found.append(
+            Finding(
+                f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.",
+                f"kinetic energy grows in {share(len(energy), total)}",
+            )
+        )
+    if resting:
+        found.append(
+            Finding(
+                f"No contact approaches in {len(resting)} of {total} shots "
+                f"({listed(resting)}): are pre and post swapped, or is a sign wrong?",
+                f"no contact approaches in {share(len(resting), total)}",
+            )
+        )
+    if experiments.sigma is None and _are_copies(experiments):
+        found.append(
+            Finding(
+                f"All {total} shots are equal to the last digit, but for a factor: they carry no "
+                "more information than one of them, and none on the noise; without `sigma` or "
+                "`resolution` the errors are meaningless.",
+                f"the {total} shots are copies of one",
+            )
+        )
+    return found
+
+
+class _Balances(NamedTuple):
+    """Balances of all shots, with the number of the shot."""
+
+    momenta: dict[int, list[tuple[int, "_Defect"]]]  # by the momentum that is conserved
+    energies: list[tuple[int, "_Defect"]]
+    resting: list[int]  # shots in which no contact approaches
+
+
+def _balances(experiments: Experiments, scene: Scene | None, stored_energy: float) -> _Balances:
+    """Momentum and energy of each shot before and after."""
     momenta: dict[int, list[tuple[int, _Defect]]] = {}
     energies, resting = [], []
     energy_ratios = experiments.energy_ratio(scene)
@@ -83,48 +138,7 @@ def find_defects(
         gain = t_plus - t_minus - stored_energy
         slope = np.append(mass @ post, -mass @ pre)[both]
         energies.append((k, _Defect(gain, t_minus, t_minus, slope, sigma, energy_ratios[k])))
-    momentum = {
-        k: ratio
-        for each in momenta.values()
-        for k, ratio in _beyond_noise(each, DEFECT_LEVEL / len(momenta)).items()
-    }
-    energy = _beyond_noise(energies, DEFECT_LEVEL, gains=True)
-    total, found = len(experiments.shots), []
-    if momentum:
-        found.append(
-            Finding(
-                "The data violate conservation of momentum (1 = conserved): "
-                f"{_listed(experiments, momentum)}; "
-                f"no law can reproduce that part{_floor(experiments, scene)}.",
-                f"the data violate conservation of momentum in {share(len(momentum), total)}",
-            )
-        )
-    if energy:
-        found.append(
-            Finding(
-                f"The data gain energy (1 = conserved): {_listed(experiments, energy)}.",
-                f"kinetic energy grows in {share(len(energy), total)}",
-            )
-        )
-    if resting:
-        labels = [experiments.shots[k] for k in resting]
-        found.append(
-            Finding(
-                f"No contact approaches in {len(labels)} of {total} shots "
-                f"({listed(labels)}): are pre and post swapped, or is a sign wrong?",
-                f"no contact approaches in {share(len(labels), total)}",
-            )
-        )
-    if experiments.sigma is None and _are_copies(experiments):
-        found.append(
-            Finding(
-                f"All {total} shots are equal to the last digit, but for a factor: they carry no "
-                "more information than one of them, and none on the noise; without `sigma` or "
-                "`resolution` the errors are meaningless.",
-                f"the {total} shots are copies of one",
-            )
-        )
-    return found
+    return _Balances(momenta, energies, resting)
 
 
 def _are_copies(experiments: Experiments) -> bool:

@@ -22,9 +22,8 @@ import numpy as np
 
 from jimpact.loops import while_loop
 
-MOST = (
-    60  # iterations of an attempt; 10 to 30 are usual. Ten times more: what diverges takes longer
-)
+# Iterations of an attempt; 10 to 30 are usual. Ten times more: what diverges takes longer.
+MOST = 60
 # Of the two attempts: a contact counts as sliding whose |h s|^2 is above this multiple of a . b.
 # Ten times more: slower where contacts slide; ten times less: contacts that nearly stick turn
 # their slip in each iteration, and 2 % of nearly flat boxes have no solution at the first attempt.
