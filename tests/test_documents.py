@@ -90,6 +90,7 @@ LONG_PAGES = (
     "from_lmfit",
     "gradient_descent",
     "motions",
+    "mujoco",
     "speed_accuracy",
     "waves",
 )

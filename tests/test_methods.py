@@ -527,6 +527,7 @@ def test_tolerance_from_both_sides():
     assert "binary comes closest and is off by" in below.reason
 
 
+@pytest.mark.slow
 def test_special_scenes():
     """Plastic contacts, no approach, a law that breaks a property."""
     result = quick(BALLS, STRIKE, restitution=0.0)

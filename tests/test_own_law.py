@@ -109,6 +109,7 @@ def test_a_law_without_friction_on_a_scene_with_tangents():
     assert contact.whole_delassus.shape == (4, 4)
 
 
+@pytest.mark.slow
 def test_it_has_a_history_and_a_gap_scale():
     """What a law or a force declares counts, not its class."""
     law, same = Elastic(0.5), ji.LZB(1.0, 1.0)
@@ -235,6 +236,7 @@ def test_lists_of_traced_numbers():
     assert float(dense(3.0)) == 2.0
 
 
+@pytest.mark.slow
 def test_advise_tries_it():
     """With a place in the order of the laws it is a candidate, and chosen where it suffices."""
 
