@@ -64,7 +64,8 @@ ITERATIONS = 1000  # of the solver, per step; ten times more costs time in jamme
 MEAN = 4  # iterations of the mean velocity in the forces; the error falls by h omega (spin) each
 # Share of the speed that the velocities could give a gap, by which its rate changes where bodies
 # pass each other in a step: head-on it is 2. Ten times less would report corners that roll over the
-# ground, ten times more would hide oblique passages.
+# ground, ten times more would hide oblique passages. What the free acceleration of SLOW steps
+# explains is no passage.
 TURN = 0.1
 # Steps: a contact that is struck again within them by an impact that is HARD, of more than this
 # share of the largest gap velocity so far, is reported as `coarse_step`. Each impact is early or
@@ -248,6 +249,7 @@ class _Setup(NamedTuple):
     contacts: _AllContacts | _ActiveContacts
     speed: jax.Array  # as in `_Progress`
     noise: jax.Array  # () gap velocities below it are rounding
+    slow: jax.Array  # (m,) those that the free acceleration makes in a step, and rounding
     tolerance: float  # of the solver
     strikes: jax.Array  # (m,) whether there is an impact
     law_velocity: jax.Array  # (n,) velocity to which the law is applied
@@ -453,6 +455,7 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Setup:
         contacts=contacts,
         speed=speed,
         noise=noise,
+        slow=slow,
         tolerance=tolerance,
         strikes=strikes,
         law_velocity=law_velocity,
@@ -566,7 +569,8 @@ def _status(
         struck_again = setup.strikes & (progress.steps_since_impact < APART)
         struck_again &= rate < -HARD * setup.speed
         # a gap that was to close grows: bodies passed each other between two evaluations of it
-        turned = rate - progress.closing > TURN * (jnp.abs(contacts.normals).T @ jnp.abs(relative))
+        speeds = jnp.abs(contacts.normals).T @ jnp.abs(relative)
+        turned = rate - progress.closing > TURN * speeds + setup.slow
         coarse = jnp.any(struck_again | ((progress.closing < 0) & (rate > 0) & turned))
     coarse = jnp.where(coarse, MOTION_CODE["coarse_step"], 0)
     unsolved = jnp.where(trial.solution.misfit > OFF, MOTION_CODE["unsolved_step"], 0)
