@@ -284,6 +284,48 @@ def stability(path):
     subprocess.run(["jimpact", "stability", "--out", str(path)], check=True)
 
 
+@picture
+def force_chains():
+    """Impulses in a packing of 290 discs, some of which are smaller, that another disc strikes."""
+    rows, radius = 17, 0.5
+    at = [(i + j % 2 / 2, j * np.sqrt(0.75)) for j in range(rows) for i in range(rows)]
+    small = np.random.default_rng(1).random(len(at)) < 0.2
+    at = np.array([*at, (rows // 2, rows * np.sqrt(0.75))]) + np.array([0, radius])
+    at[-1, 0] += (rows % 2) / 2
+    radii = np.append(np.where(small, 0.9 * radius, radius), radius)
+    discs = ji.Discs(1.0, radii, walls=[[0.0, 1.0, 0.0]])
+    q = discs.at(at)
+    packing = discs.touching(q)
+    velocity = np.zeros(packing.size)
+    velocity[-2] = -1.0
+    law = ji.LZB(0.9, method="implicit")
+    out = ji.raise_on_failure(ji.impact(law, packing, velocity))
+    title = (
+        f"{discs.count} discs, {packing.contacts} contacts: impulses of an impact from above (LZB)"
+    )
+    return ji.plot.force_chains(discs, q, packing, out.impulse, title)
+
+
+@picture
+def drops():
+    """Drops of a square: median error of the predicted angle after a hit, from two flights."""
+    with np.load(Path(__file__).parents[1] / "tests" / "data" / "drops.npz") as stored:
+        curves = {name: stored[name] for name in stored.files}
+    figure = new_figure(3.0)
+    for axes, kind in zip(
+        figure.subplots(1, 2, sharey=True), ("first flight", "flight after an impact")
+    ):
+        for colour, name in zip(COLOURS, ("jimpact", "MuJoCo")):
+            error = curves[f"{kind}, {name}"]
+            axes.plot(4 * np.arange(len(error)), error, color=colour, lw=2, label=name)
+        axes.set_title(f"from the {kind}")
+        axes.set_xlabel("time after the hit [ms]")
+        finish(axes)
+    figure.axes[0].set_ylabel("error of the angle [deg]")
+    legend_below(figure, figure.axes[0].get_legend_handles_labels()[0], 2)
+    return figure
+
+
 def main(names: list[str]) -> None:
     """Draw these, or all."""
     jax.config.update("jax_enable_x64", True)

@@ -5,6 +5,7 @@ so the default tests check the texts, too.
 """
 
 import ast
+import functools
 import inspect
 import io
 import re
@@ -227,6 +228,7 @@ def unit_of(comment: str) -> str:
     return ""
 
 
+@functools.cache
 def constants() -> dict[str, list[tuple[str, str, str]]]:
     """Constants of all modules, by path in the package."""
     package = ROOT / "jimpact"

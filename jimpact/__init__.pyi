@@ -18,6 +18,7 @@ from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle 
 from .bodies.piles import Discs as Discs, Spheres as Spheres
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
 from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
+from .bodies.spatial_bodies import SpatialBodies as SpatialBodies
 from .cli.study import Study as Study, cube_impacts as cube_impacts, read_study as read_study
 from .cli.study_motion import (
     MotionStudy as MotionStudy,
@@ -48,7 +49,12 @@ from .fits.measured import (
 from .fits.posterior import posterior as posterior
 from .fits.problem import FitProblem as FitProblem
 from .fits.profiles import Profile as Profile, profile as profile
-from .fits.scatter import Scatter as Scatter, scatter as scatter
+from .fits.scatter import (
+    JointScatter as JointScatter,
+    Scatter as Scatter,
+    joint_scatter as joint_scatter,
+    scatter as scatter,
+)
 from .fits.selection import (
     LawFits as LawFits,
     NestedTest as NestedTest,
@@ -114,6 +120,7 @@ from .methods.comparison import (
     energy_ratio as energy_ratio,
 )
 from .methods.rheologies import compare_rheologies as compare_rheologies
+from .methods.scene_advice import simplest_scene as simplest_scene
 from .methods.stability import stability_map as stability_map
 from .methods.validity import validity_map as validity_map
 from .methods.waves import (

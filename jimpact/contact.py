@@ -14,8 +14,17 @@ import numpy as np
 
 from jimpact._checks import as_float_array, is_traced
 from jimpact.scene import Scene, gap_velocity, solve_mass, without_constraints
+from jimpact.solvers.sparse import Sparse
 from jimpact.solvers.tangential import TangentialBlock
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, as_matrix, diagonal, scaled
+from jimpact.solvers.tridiagonal import (
+    Structure,
+    Symmetric,
+    Tridiagonal,
+    as_matrix,
+    diagonal,
+    scaled,
+    structure_of,
+)
 
 # A gap velocity counts as 0 below this many times eps |N|^T |v-|, because v- results from a few
 # rounded sums and products. Ten times more would hide true, slow approaches in fast common motion;
@@ -47,7 +56,7 @@ class Contact(eqx.Module):
     result, so that gradients stay finite.
 
     Args:
-        delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain).
+        delassus: W (m, m) [1/kg], or a `Tridiagonal` (a chain) or `Sparse` (a packing).
         gap_velocity: gamma- (m,) [m/s], < 0 on approach.
         closed: (m,) contacts without a gap; None: all.
         gaps: (m,) [m]; None: 0.
@@ -87,8 +96,8 @@ class Contact(eqx.Module):
         noise: Any = None,
         tangential_block: Any = None,
     ):
-        chain = isinstance(delassus, Tridiagonal)
-        self.delassus = delassus if chain else as_float_array("delassus", delassus)
+        own_form = isinstance(delassus, (Tridiagonal, Sparse))
+        self.delassus = delassus if own_form else as_float_array("delassus", delassus)
         self.gap_velocity = as_float_array("gap_velocity", gap_velocity)
         zero = jnp.zeros_like(self.gap_velocity)
         self.closed = zero == 0 if closed is None else jnp.asarray(closed, bool)
@@ -126,9 +135,9 @@ class Contact(eqx.Module):
         return None if self.tangential_block is None else self.tangential_block.slip
 
     @property
-    def chain(self) -> bool:
-        """Whether W is stored as that of a chain."""
-        return isinstance(self.delassus, Tridiagonal)
+    def structure(self) -> Structure:
+        """Which entries of W are stored."""
+        return structure_of(self.delassus)
 
     @property
     def normalized_delassus(self) -> Symmetric:
@@ -209,10 +218,7 @@ class Contact(eqx.Module):
     def rounding(self, normal: jax.Array, tangential: jax.Array | None) -> jax.Array:
         """Rounding (m,) of gamma+ after normal and tangential impulses: terms of W p may cancel."""
         w = self.delassus
-        if isinstance(w, Tridiagonal):
-            size = Tridiagonal(w.diagonal, jnp.abs(w.off_diagonal)) @ jnp.abs(normal)
-        else:
-            size = jnp.abs(w) @ jnp.abs(normal)
+        size: jax.Array = abs(w) @ jnp.abs(normal)  # type: ignore[operator]
         if self.cross is not None and tangential is not None:
             size = size + jnp.abs(self.cross) @ jnp.abs(tangential)
         eps = float(jnp.finfo(size.dtype).eps)
@@ -275,7 +281,9 @@ def rounded_gap_velocity(scene: Scene, velocity: jax.Array) -> tuple[jax.Array, 
     The derivative of gamma- remains that of N^T v- where its value is set to 0.
     """
     gamma, speed = gap_velocity(scene, velocity), jax.lax.stop_gradient(jnp.abs(velocity))
-    if scene.walls is None:
+    if scene.pairs is not None:
+        size = jax.tree.map(jnp.abs, scene.pairs).rates(speed)
+    elif scene.walls is None:
         size = jnp.abs(scene.normals).T @ speed
     else:
         left, right = scene.walls
@@ -300,6 +308,8 @@ def delassus_matrix(scene: Scene) -> Symmetric:
     >>> ji.delassus_matrix(ji.chain([1.0, 2.0, 2.0])).diagonal.tolist()
     [1.5, 1.0]
     """
+    if scene.pairs is not None:
+        return scene.pairs.delassus(scene.mass)
     if scene.walls is None:
         return scene.normals.T @ solve_mass(scene, scene.normals)
     left, right = scene.walls
@@ -311,6 +321,8 @@ def delassus_matrix(scene: Scene) -> Symmetric:
 
 def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
     """W whose rows and columns of open contacts hold their diagonal only."""
+    if isinstance(delassus, Sparse):
+        return delassus.within(closed)
     if isinstance(delassus, Tridiagonal):
         off = jnp.where(closed[:-1] & closed[1:], delassus.off_diagonal, 0.0)
         return Tridiagonal(delassus.diagonal, off, delassus.regular)
@@ -320,7 +332,7 @@ def decoupled(delassus: Symmetric, closed: jax.Array) -> Symmetric:
 
 def kinetic_norm(scene: Scene) -> jax.Array:
     """`|grad f_j|` in the metric of M^-1 (m,), the square roots of the free W_jj."""
-    if scene.walls is not None:
+    if scene.walls is not None or scene.pairs is not None:
         return jnp.sqrt(diagonal(delassus_matrix(scene)))
     moved = solve_mass(without_constraints(scene), scene.normals)
     return jnp.sqrt(jnp.sum(scene.normals * moved, axis=0))
@@ -402,7 +414,7 @@ def coupled_groups(scene: Scene) -> Groups | None:
     contacts of a group move a common coordinate, or coordinates joined by an entry of a dense M or
     by bilateral constraints. Open contacts are in no group (with traced gaps all contacts count as
     closed). The result is None where all contacts form one group, where the zeros are not known on
-    the host, and for a chain, whose tridiagonal W costs only O(m).
+    the host, and for a chain or packing, whose W has only O(m) entries.
 
     >>> import jimpact as ji
     >>> from jimpact.contact import coupled_groups
@@ -411,7 +423,7 @@ def coupled_groups(scene: Scene) -> Groups | None:
     [[[0], [1]]]
     """
     m, tangents = scene.contacts, scene.tangents
-    if scene.walls is not None or m == 1:
+    if scene.walls is not None or scene.pairs is not None or m == 1:
         return None
     if is_traced((scene.normals, tangents, scene.constraints)):
         return None

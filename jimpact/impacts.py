@@ -104,7 +104,7 @@ def impact(
     check_kind("scene", scene, Scene)
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
-    _check_constrained(scene, v)
+    check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
     for name, speed in (("noise", noise), ("approach", approach)):
@@ -121,7 +121,7 @@ def impact(
     pads = few and groups is None and separable and law.pads_scenes
     if pads and not is_traced((law, scene, v, offsets)) and is_top_level_call():
         return _impact_of_padded_scene(law, scene, v, offsets)
-    return _impact(law, scene, v, groups, offsets, _Traced.of(law, scene, v, offsets))
+    return _impact(law, scene, v, groups, offsets, Traced.of(law, scene, v, offsets))
 
 
 class _Offsets(NamedTuple):
@@ -136,7 +136,10 @@ class _Offsets(NamedTuple):
         return contact if self.approach is None else contact.approaching(self.approach)
 
 
-class _Traced(NamedTuple):
+NO_OFFSETS = _Offsets(None, None)
+
+
+class Traced(NamedTuple):
     """Which arguments the host could not check, because they are traced."""
 
     law: bool = False
@@ -145,12 +148,30 @@ class _Traced(NamedTuple):
     offsets: bool = False
 
     @classmethod
-    def of(cls, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> "_Traced":
+    def of(cls, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets = NO_OFFSETS) -> "Traced":
         """Those of an impact."""
         constrained = scene.constraints is not None and is_traced((scene.constraints, v))
         return cls(is_traced(law), is_traced(scene), constrained, is_traced(offsets))
 
-    def code(self, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> jax.Array:
+    def status(
+        self,
+        arguments: tuple[Law, Scene, jax.Array, _Offsets],
+        code: jax.Array,
+        size: jax.Array,
+        finite: jax.Array,
+    ) -> jax.Array:
+        """Status () of an impact with these `arguments`: `code`, or why it has no outcome.
+
+        `size` () is the root of its energy [sqrt(J)]; `finite` (): whether its results are.
+        """
+        code = jnp.where(finite, code, CODE["not_finite"])
+        code = jnp.where(_has_scale(size, arguments[2]), code, CODE["out_of_range"])
+        if any(self):
+            refused = self._refusal(*arguments)
+            code = jnp.where(refused > CODE["ok"], refused, code)
+        return code.astype(jnp.int32)
+
+    def _refusal(self, law: Law, scene: Scene, v: jax.Array, offsets: _Offsets) -> jax.Array:
         """`not_finite` or `out_of_range` where an argument is not allowed, else `ok`."""
         inputs = [x for x, traced in zip((law, scene, None, offsets), self) if traced]
         numbers = [x for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x)]
@@ -174,7 +195,7 @@ def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, offsets: _Offs
     velocity: Any = np.zeros(padded.scene.size, v.dtype)
     velocity[padded.coordinates] = v
     on_host = restrict_law(jax.tree.map(np.asarray, law), padded.copied)
-    out = _impact(on_host, padded.scene, velocity, None, offsets, _Traced())
+    out = _impact(on_host, padded.scene, velocity, None, offsets, Traced())
     return dataclasses.replace(
         out,
         velocity=jnp.asarray(np.asarray(out.velocity)[padded.coordinates]),
@@ -182,7 +203,7 @@ def _impact_of_padded_scene(law: Law, scene: Scene, v: jax.Array, offsets: _Offs
     )
 
 
-def _check_constrained(scene: Scene, velocity: jax.Array) -> None:
+def check_constrained(scene: Scene, velocity: jax.Array) -> None:
     """A velocity that breaks a bilateral constraint is an error."""
     if scene.constraints is None or is_traced((scene.constraints, velocity)):
         return
@@ -209,7 +230,7 @@ def _impact(
     v: jax.Array,
     groups: Groups | None,
     offsets: _Offsets,
-    traced: _Traced,
+    traced: Traced,
 ) -> Impact:
     """The outcome from the law's impulses: velocities, energy and status."""
     if groups is None:
@@ -228,13 +249,8 @@ def _impact(
     code = jnp.where(change > total + outcome.noise, CODE["energy_gain"], CODE["ok"])
     code = jnp.where(happens, jnp.maximum(code, outcome.status), CODE["ok"])
     finite = jnp.all(jnp.isfinite(v_plus)) & jnp.all(jnp.isfinite(p)) & jnp.isfinite(change)
-    code = jnp.where(finite, code, CODE["not_finite"])
-    beyond = happens & ~_has_scale(outcome.size, v)
-    code = jnp.where(beyond, CODE["out_of_range"], code)
-    if any(traced):
-        refused = traced.code(law, scene, v, offsets)
-        code = jnp.where(refused > CODE["ok"], refused, code)
-    code = code.astype(jnp.int32)
+    size = jnp.where(happens, outcome.size, 1.0)
+    code = traced.status((law, scene, v, offsets), code, size, finite)
     return Impact(v_plus, p, tangential, change, total, code)
 
 

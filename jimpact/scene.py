@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.solvers.sparse import Neighbours, Sparse
 
 # Asymmetry of M, relative to its largest entry, that rounding causes in float32. Ten times more
 # would accept a mass matrix with a wrong fourth digit.
@@ -44,6 +45,50 @@ WALLS = {
     "left": (True, False),
     "both": (True, True),
 }
+
+
+class PairNormals(eqx.Module):
+    """Normals of contacts between two bodies of d velocities each: `directions` (m, 2, d).
+
+    The other entries of `grad f` are 0 and not stored. Body -1 is none: it has the direction 0.
+    """
+
+    directions: jax.Array
+    neighbours: Neighbours = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        """Number n of velocity coordinates."""
+        return self.neighbours.count * self.directions.shape[2]
+
+    def _at_bodies(self, v: jax.Array) -> jax.Array:
+        """Velocities (m, 2, d) of the bodies of each contact."""
+        return v.reshape(self.neighbours.count, -1)[self.neighbours.bodies]
+
+    def rates(self, v: jax.Array) -> jax.Array:
+        """`N^T v` (m,)."""
+        return jnp.sum(self.directions * self._at_bodies(v), axis=(1, 2))
+
+    def push(self, p: jax.Array) -> jax.Array:
+        """`N p` (n,)."""
+        d = self.directions.shape[2]
+        forces = (self.directions * p[:, None, None]).reshape(-1, d)
+        bodies = self.neighbours.bodies.reshape(-1)
+        return (
+            jnp.zeros((self.neighbours.count, d), forces.dtype).at[bodies].add(forces).reshape(-1)
+        )
+
+    def delassus(self, mass: jax.Array) -> Sparse:
+        """W for masses (n,)."""
+        moved = self.directions / self._at_bodies(mass)
+        table, shared = self.neighbours.of_contacts, self.neighbours.shared
+        other = jnp.einsum("msd,mktd->mkst", moved, self.directions[table])
+        entries = jnp.sum(jnp.where(shared, other, 0.0), axis=(2, 3))
+        return Sparse(jnp.sum(moved * self.directions, axis=(1, 2)), entries, self.neighbours)
+
+    def dense(self) -> jax.Array:
+        """N (n, m)."""
+        return jax.vmap(self.push)(jnp.eye(len(self.directions), dtype=self.directions.dtype)).T
 
 
 class Scene(eqx.Module):
@@ -75,7 +120,7 @@ class Scene(eqx.Module):
     tangents: jax.Array | None
     gaps: jax.Array | None
     constraints: jax.Array | None
-    _normals: jax.Array | None
+    _normals: jax.Array | PairNormals | None
     walls: tuple[bool, bool] | None = eqx.field(static=True)  # of a chain (left, right)
 
     def __init__(
@@ -106,11 +151,18 @@ class Scene(eqx.Module):
         """Number m of contacts."""
         if self.walls is not None:
             return self.size - 1 + sum(self.walls)
-        return self.normals.shape[1]
+        return len(self.pairs.directions) if self.pairs else self.normals.shape[1]
+
+    @property
+    def pairs(self) -> PairNormals | None:
+        """Its normals, where only those of two bodies each are stored (`sparse_scene`)."""
+        return self._normals if isinstance(self._normals, PairNormals) else None
 
     @property
     def normals(self) -> jax.Array:
-        """`grad f`, shape (n, m); a chain builds it on demand."""
+        """`grad f`, shape (n, m); a chain and a packing build it on demand."""
+        if isinstance(self._normals, PairNormals):
+            return self._normals.dense()
         if self._normals is not None:
             return self._normals
         assert self.walls is not None
@@ -327,6 +379,8 @@ def gap_velocity(scene: Scene, velocity: Any) -> jax.Array:
     [-1.0, 0.5]
     """
     v = as_velocity(scene, velocity)
+    if scene.pairs is not None:
+        return scene.pairs.rates(v)
     if scene.walls is None:
         return scene.normals.T @ v
     left, right = scene.walls
@@ -418,6 +472,8 @@ def velocity_change(scene: Scene, impulse: Any, tangential: Any = None) -> jax.A
     if tangential is not None and scene.tangents is not None:
         tangential = as_float_array("tangential", tangential)
         check_shape("tangential", tangential, scene.tangents.shape[1:], "one per tangent")
+    if scene.pairs is not None:
+        return solve_mass(scene, scene.pairs.push(impulse))
     if scene.walls is None:
         push = scene.normals @ impulse
         if scene.tangents is not None and tangential is not None:
@@ -436,6 +492,15 @@ def without_constraints(scene: Scene) -> Scene:
 def chain_scene(masses: jax.Array, walls: tuple[bool, bool], gaps: jax.Array | None) -> Scene:
     """A chain: its normals stay implicit, its Delassus matrix tridiagonal (see `ji.chain`)."""
     return _unchecked(mass=masses, walls=walls, gaps=gaps)
+
+
+def sparse_scene(mass: jax.Array, directions: jax.Array, bodies: Any, count: int) -> Scene:
+    """A packing: m frictionless contacts between two of `count` bodies each.
+
+    `mass` (n,), `directions` (m, 2, n / count) of `bodies` (m, 2), where -1 is none (a wall): its
+    direction is 0. Only these entries of the normals are stored, and its Delassus matrix is sparse.
+    """
+    return _unchecked(mass=mass, _normals=PairNormals(directions, Neighbours(bodies, count)))
 
 
 def _unchecked(**fields: Any) -> Scene:
@@ -559,7 +624,9 @@ def is_allowed(scene: Scene) -> jax.Array:
     NaN is not looked for; a dense M that is not positive definite gives energies without a value.
     """
     allowed = [jnp.all(scene.mass > 0) if scene.mass.ndim == 1 else _is_symmetric(scene.mass)]
-    if scene.walls is None:
+    if scene.pairs is not None:
+        allowed.append(jnp.all(jnp.any(scene.pairs.directions != 0, axis=(1, 2))))
+    elif scene.walls is None:
         allowed.append(jnp.all(_has_body(scene.normals)))
     if scene.gaps is not None:
         allowed.append(jnp.all(scene.gaps >= 0))

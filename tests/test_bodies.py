@@ -237,25 +237,87 @@ def separation(a, b):
     return max(min((b - x) @ n) for x, n in zip(a, normals))
 
 
-def test_polygons_choose_their_sides():
-    """Anywhere the least gap is the distance; where they overlap it is negative."""
+@pytest.fixture(scope="module")
+def polygons():
+    """A block, a hexagon, a triangle, a pentagon, and gaps (k, 6) of three pairs of them."""
     angles = 0.2 + np.arange(6) * np.pi / 3
-    hexagon = ji.Polygon(np.stack([0.5 * np.cos(angles), 0.3 * np.sin(angles)], axis=1))
-    pair = ji.PlanarBodies([ji.Block(1.0, 0.4), hexagon], planes=())
+    around = 0.3 + np.arange(5) * 2 * np.pi / 5
+    shapes = [
+        ji.Block(1.0, 0.4),
+        ji.Polygon(np.stack([0.5 * np.cos(angles), 0.3 * np.sin(angles)], axis=1)),
+        ji.Polygon([[0, 0], [1.0, 0.1], [0.2, 0.8]]),
+        ji.Polygon(np.stack([0.5 * np.cos(around), 0.4 * np.sin(around)], axis=1)),
+    ]
+    bodies = ji.PlanarBodies(shapes, planes=(), pairs=[(0, 1), (2, 3), (2, 0)])
+
+    def seen(q):
+        return bodies.gap_function(q), bodies.valid(q)
+
+    return bodies, jax.jit(jax.vmap(seen))
+
+
+def test_polygons_choose_their_sides(polygons):
+    """Anywhere the least gap is the distance; where they overlap it is negative."""
+    bodies, seen = polygons
     rng = np.random.default_rng(0)
-    q = rng.uniform([0, 0, 0, -1, -1, 0], [0, 0, 6.3, 1, 1, 6.3], (300, 6))
+    low, high = [-0.5, -0.5, 0], [0.5, 0.5, 6.3]
+    q = rng.uniform(4 * low, 4 * high, (300, 12))
     apart = 0
-    for x, gaps in zip(q, np.asarray(jax.vmap(pair.gap_function)(jnp.asarray(q)))):
-        a, b = (curve[:-1] for curve in pair.outlines(x, 0.0))
-        between = max(separation(a, b), separation(b, a))
-        if between > 0:
-            apart += 1
-            assert min(gaps) == pytest.approx(polygon_distance(a, b), abs=1e-12)
-        else:
-            assert min(gaps) <= between + 1e-12
-    assert 100 < apart < 250
-    with pytest.raises(ValueError, match=r"`at` must be given, .* polygon 1, which has 3 sides"):
-        ji.PlanarBodies([ji.Block(1.0, 1.0), ji.Polygon([[0, 0], [1, 0], [0, 1]])])
+    for x, gaps in zip(q, np.asarray(seen(jnp.asarray(q))[0]).reshape(-1, 3, 2)):
+        curves = [curve[:-1] for curve in bodies.outlines(x, 0.0)]
+        for (i, j), pair in zip(((0, 1), (2, 3), (2, 0)), gaps):
+            a, b = curves[i], curves[j]
+            between = max(separation(a, b), separation(b, a))
+            if between > 0:
+                apart += 1
+                assert min(pair) == pytest.approx(polygon_distance(a, b), abs=1e-12)
+            else:
+                assert min(pair) <= between + 1e-12
+    assert 50 < apart < 850
+
+
+def corner_on_side(bodies, below, above, path):
+    """q (k, 12) with a corner of one polygon in the middle of a side of another.
+
+    `path`: the direction of the side's normal, and the angle of the polygon `above`. How often the
+    corner has changed.
+    """
+    ring = bodies.bodies[below].ring
+    begin, end = np.asarray(bodies.bodies[below].corners)[list(ring[:2])]
+    slope = np.arctan2(*(end - begin)[::-1]) - np.pi / 2  # of its normal, in its own axes
+    rows, corners = [], []
+    for way, angle in path:
+        own = turned(np.asarray(bodies.bodies[above].corners), angle)
+        corners.append(int(np.argmin(own @ [np.cos(way), np.sin(way)])))
+        q = 100.0 + 10 * np.arange(12.0)  # the others are far away
+        q[3 * above : 3 * above + 3] = *-own[corners[-1]], angle
+        middle = turned((begin + end) / 2, way - slope)
+        q[3 * below : 3 * below + 3] = *-middle, way - slope
+        rows.append(q)
+    return np.array(rows), np.append(0, np.cumsum(np.diff(corners) != 0))
+
+
+def test_contacts_of_odd_polygons_keep_their_places(polygons):
+    """Rolling through full turns: contacts change places only where the next corner touches."""
+    bodies, seen = polygons
+    s = np.linspace(0.0, 1.0, 300)[:, None]
+    for below, above, column, begin, end in (
+        (2, 3, 2, [0.1, 0.2], [14.0, -9.0]),  # both odd: any way around each other
+        (3, 2, 2, [0.1, 0.2], [-14.0, 9.0]),
+        (2, 0, 4, [2.1, 0.2], [2 * np.pi + 1.9, -15.0]),  # at most once around the triangle
+        (0, 2, 4, [2.1 - np.pi, 0.2], [np.pi + 1.9, -14.0]),
+    ):
+        q, count = corner_on_side(bodies, below, above, begin + s * (np.array(end) - begin))
+        gaps, margin = (np.asarray(x) for x in seen(jnp.asarray(q)))
+        pair = np.abs(gaps[:, column : column + 2])
+        np.testing.assert_allclose(pair.min(axis=1), 0.0, atol=1e-14)
+        clear = pair.max(axis=1) > 1e-6
+        assert clear.sum() > 290
+        assert len(set(((np.argmin(pair, axis=1) + count) % 2)[clear])) == 1
+        assert count[-1] > 6
+        assert (margin > 0).all()
+    at_cut, _ = corner_on_side(bodies, 2, 0, [[2.0, 0.2]])
+    assert seen(jnp.asarray(np.repeat(at_cut, 300, axis=0)))[1][0] < 0
 
 
 def test_a_contact_keeps_its_place_where_sides_change():

@@ -98,6 +98,7 @@ def call(capsys, *arguments):
 # ------------------------------------------------------------------------------------ fit
 
 
+@pytest.mark.slow
 def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
     """The bundled three balls: one e; corrected; all free; the other laws; a picture."""
     command = [sys.executable, "-m", "jimpact.cli", "fit", "--json"]
@@ -138,6 +139,9 @@ def test_a_study_knows_priors_and_names_of_entries(tmp_path):
     problem = ji.read_study(written(tmp_path, text, shots)).problem
     assert problem.priors == ((1, 0.85, 0.01),)
     np.testing.assert_array_equal(problem.domains, [[0.5, 1.0], [0.0, 1.0]])
+    of_scene = text.replace('"restitution[2]" =', '"mass[2]" = [1.0, 0.1]\n"restitution[2]" =')
+    of_scene = of_scene.replace('free = ["restitution"]', 'free = ["restitution", "mass[2]"]')
+    assert "mass[2]" in ji.read_study(written(tmp_path, of_scene, shots)).problem.names
     with pytest.raises(ValueError, match=r"\[law.priors\].*frictoin"):
         ji.read_study(written(tmp_path, text.replace('"restitution[2]"', '"frictoin[2]"'), shots))
 
@@ -412,6 +416,10 @@ BODIES = {
     "PlanarBodies": "planes = [0.1]\n[[system.bodies]]\nkind = 'disc'\nradius_m = 0.1",
     "Box": "sizes_m = [0.2, 0.1, 0.3]\nrounding_m = 0.01",
     "Sphere": "radius_m = 0.1\nnormal = [0.1, 0, 1]",
+    "SpatialBodies": (
+        "places = [[0, 0, 0, 1, 0, 0, 0]]\n[[system.bodies]]\nkind = 'sphere'\nradius_m = 0.1\n"
+        "[[system.fixed]]\nkind = 'box'\nsizes_m = [0.1, 1, 1]"
+    ),
     "SpatialDimer": "radius_m = 0.1\nlength_m = 1",
     "Column": "masses_kg = [1, 2]\nradii_m = 0.1",
     "Corner": "angle_rad = 1.0",

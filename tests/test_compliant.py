@@ -368,6 +368,21 @@ def test_history_of_one_ball_on_a_linear_spring():
     np.testing.assert_allclose(history.approach[:, 0], x, atol=1e-7)
 
 
+def test_the_status_of_a_history_is_that_of_the_impact():
+    """Bad parameters, unknown velocities and energies without a number, inside jit."""
+
+    @jax.jit
+    @jax.vmap
+    def traced(e, v):
+        law = ji.LZB(e, 2.0, exponent=1.0)
+        return ji.history(law, ji.chain([1.0], wall=True), v[None], samples=2).status
+
+    e = np.array([1.0, np.nan, 1.5, 1.0, 1.0])
+    found = traced(e, np.array([1.0, 1.0, 1.0, np.nan, 1e-200]))
+    wanted = ["ok", "not_finite", "out_of_range", "not_finite", "out_of_range"]
+    assert names(found) == wanted
+
+
 def test_a_contact_that_is_compressed_twice():
     """Figure 6.6: two balls at a wall; approach and force at its turns, by another integration."""
     law, scene = ji.LZB([0.9, 0.8], [1.0, 2**0.5], 1.5), ji.chain([1.0, 1.0], wall=True)

@@ -111,7 +111,6 @@ SCENES = [
         lambda: ji.PlanarBodies([ji.Disc(1.0), ji.Dimer(0.1, 1.0)], pairs=[(0, 1)]),
         r"body 1 is a Dimer",
     ),
-    (lambda: ji.PlanarBodies([ji.Polygon(TRIANGLE)] * 2), r"`at` must be given"),
     (lambda: ji.PlanarBodies([ji.Block(1, 1)] * 2, at=[0.0] * 3), r"`at` must have shape \(6,\)"),
     (
         lambda: ji.PlanarBodies([ji.Block(1, 1)] * 2, pairs=[((0, 4), (1, 0))]),
@@ -152,6 +151,7 @@ SCENES = [
 MANY = ji.Scene(np.ones(402), np.eye(402)[:, ::2], tangents=np.eye(402)[:, 1::2])
 WELDED = ji.Scene([1.0] * 3, [[-1.0], [1.0], [0.0]], constraints=[[0.0], [-1.0], [1.0]])
 CALLS = [
+    (lambda: ji.history(ji.LZB(0.5), WELDED, [1.0, 0.0, 0.5]), "satisfy the bilateral constraints"),
     (lambda: ji.impact(ji.LZB(0.9), BALLS, [1.0, 0.0]), r"`velocity` must have shape \(3,\)"),
     (lambda: ji.impact(ji.LZB(0.9), BALLS, [1.0, 0, np.nan]), r"`velocity`.*nan at index 2"),
     (lambda: ji.impact(ji.LZB([0.9] * 3), BALLS, V), r"`restitution` must have shape \(2,\)"),

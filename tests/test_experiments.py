@@ -447,6 +447,7 @@ def test_a_report_counts_what_was_not_measured():
     assert "2 shots of 2 bodies (3 of 4 velocities measured)" in str(fit)
 
 
+@pytest.mark.slow
 def test_a_fit_passes_errors_on_by_the_law_it_finds():
     """Generalized least squares with the covariance of the minimum itself; the start's is another."""
     m1, m2, before = 1.0, 2.0, np.array([0.05, 0.02])

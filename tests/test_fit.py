@@ -10,15 +10,17 @@ import numpy as np
 import optax
 import pytest
 from programs import CODE, as_matrix
-from scipy import stats
+from scipy import optimize, stats
 
 import jimpact as ji
 from jimpact import Law
 from jimpact.files.records import with_error
 from jimpact.fits.multistart import quiet
 from jimpact.fits.parameters import bounds_of, free_parameters
+from jimpact.fits.prediction import placed_fit
 from jimpact.fits.profiles import _Scans
 from jimpact.fits.saved import write_fit
+from jimpact.fits.scene_parameters import LawInScene
 from jimpact.fits.ties import tied
 
 DATA = files("jimpact") / "data"
@@ -244,10 +246,21 @@ def test_copies_of_a_shot_are_reported():
     assert np.isnan([*scaled.standard_error, scaled.noise]).all()  # reproduced to the last digit
     reserved = "its error unknown; but the 6 shots are copies of one"
     assert scaled.verdict == f"restitution = 0.8, {reserved}."
-    post[1] += [0.01, -0.005]
+    post[1:4] += [[0.01, -0.005], [0.02, 0.0], [0.0, 0.01]]
     spread = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(pre, post))
     assert "shots are equal" not in reported(spread)
     assert np.isfinite(spread.standard_error).all()
+
+
+def test_readings_that_repeat_hide_the_noise():
+    """Seven times the same reading, and one of twice the speed, both rounded to 1 cm/s."""
+    speed = np.array([[1.0]] * 7 + [[2.0]])
+    post = np.array([[0.10, 0.90]] * 7 + [[0.21, 1.79]])
+    data = ji.Experiments(speed * [1.0, 0.0], post)
+    repeated = ji.fit(ji.Newton(0.5), ji.chain([1.0, 1.0]), data)
+    assert "Lack of fit" not in reported(repeated)
+    assert "7 of 8 shots are equal to the last digit" in reported(repeated)
+    assert repeated.verdict.endswith("; but 7 of 8 shots are copies of one.")
 
 
 class Steep(ji.Newton):
@@ -709,6 +722,67 @@ def test_what_only_a_prior_knows_is_said_to_be_its():
 
 def two_thirds(p):
     return p["restitution[1]"] * 2 / 3
+
+
+def test_a_mass_with_a_prior_is_fitted_with_the_law():
+    """Against scipy on the closed form `v1 = (1 - e m) v / (1 + m)`, `v2 = (1 + e) v / (1 + m)`."""
+    heavier, speed, prior, sigma = 2.05, SHOTS[:, 0] - SHOTS[:, 1], (2.0, 0.05), 0.02
+    post = simulated(ji.Newton(0.6), ji.chain([1.0, heavier]), SHOTS, noise=sigma)
+    data = ji.Experiments(SHOTS, post, sigma)
+
+    def residual(x):
+        e, m = x
+        after = SHOTS[:, 1:] + np.array([1 - e * m, 1 + e]) * speed[:, None] / (1 + m)
+        return np.append((after - post) / sigma, (m - prior[0]) / prior[1])
+
+    best = optimize.least_squares(residual, [0.7, 2.0], jac="3-point", xtol=1e-12)
+    error = np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac)))
+    choice = {"free": ("restitution", "mass[2]"), "priors": {"mass[2]": prior}}
+    found = ji.fit(ji.Newton(0.9), PAIR, data, **choice)
+    np.testing.assert_allclose(found.value, best.x, rtol=1e-6)
+    np.testing.assert_allclose(found.standard_error, error, rtol=1e-5)
+    np.testing.assert_allclose(found.chi_squared, 2 * best.cost, rtol=1e-8)
+    np.testing.assert_allclose(found.scene.mass, [1.0, found.value[1]])
+    assert type(found.law) is type(found.problem.to_law(found.value)) is ji.Newton
+    law, scene = placed_fit(found, None)  # by which further shots are predicted
+    np.testing.assert_allclose(law.in_scene(scene).mass, found.scene.mass)
+    with pytest.raises(ValueError, match="`scene` must be left out"):
+        found.predict(SHOTS, BALLS)
+
+
+def test_parts_of_a_scene_move_it():
+    """A tilt of pi / 2 makes the tangent the normal; gaps and masses take the place of the old."""
+    wall = ji.Scene([1.0, 2.0, 0.5], [[0.0], [1.0], [0.2]], [[1.0], [0.0], [0.5]], gaps=[0.1])
+    parts = LawInScene(ji.Newton(0.5), mass=[3.0, 4.0, 5.0], gaps=[0.2], tilt=[np.pi / 2])
+    moved = parts.in_scene(wall)
+    np.testing.assert_allclose(moved.normals, wall.tangents, atol=1e-15)
+    np.testing.assert_allclose(moved.tangents, -wall.normals, atol=1e-15)
+    np.testing.assert_array_equal([*moved.gaps, *moved.mass], [0.2, 3.0, 4.0, 5.0])
+
+
+@pytest.mark.parametrize(("free", "priors", "message"), [
+    ("mass", {}, "`priors` must have .* for `mass.1.`"),
+    ("mass[2]", {"mass[2]": (3.0, 0.01)}, "`priors` must have a mean for `mass.2.` within 10"),
+    ("mass[3]", {"mass[3]": (3.0, 0.01)}, "must name entries that the field has"),
+    ("gaps", {"gaps": (0.0, 0.01)}, "`gaps` only where `scene` has gaps"),
+    ("tilt", {"tilt": (0.0, 0.01)}, "`tilt` only where `scene` has one tangent"),
+])  # fmt: skip
+def test_bad_parts_of_a_scene(free, priors, message):
+    data = ji.Experiments(SHOTS, SHOTS[:, ::-1], 0.01)
+    with pytest.raises(ValueError, match=message):
+        ji.fit(ji.Newton(0.5), PAIR, data, ("restitution", free), priors=priors)
+
+
+def test_parts_of_scenes_belong_to_one_scene_and_one_kind_of_law():
+    one, own = ji.Experiments(SHOTS, SHOTS, 0.01), ji.Experiments(SHOTS, SHOTS, 0.01, [PAIR] * 4)
+    dense = ji.Scene(np.diag([1.0, 2.0]), PAIR.normals)
+    for law, scene, data, message in (
+        (ji.Newton(0.5), None, own, "only where all shots have one `scene`"),
+        (ji.Newton(0.5), dense, one, "`mass` only where that of `scene` is"),
+        (ji.RestitutionMatrix([[0.5]]), PAIR, one, "must not name `mass` with a RestitutionMatrix"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ji.fit(law, scene, data, ("mass",), priors={"mass": (1.0, 0.1)})
 
 
 def test_ties_follow_and_pass_their_errors_on():

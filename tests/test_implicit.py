@@ -1,5 +1,6 @@
 """Method 'implicit': impacts by steps without events, of `LZB` and `Compliant`."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -208,6 +209,7 @@ def test_auto_leaves_several_contacts_in_space_to_it():
     assert method_for("auto", contact_of(balls, jnp.zeros(9)), None) == "time"
 
 
+@pytest.mark.slow
 def test_random_boxes_end():
     """Boxes nearly flat on four corners, mu up to 1.5, e from 0 to 1: every impact ends, lossy."""
     draw = random_boxes("nearly flat", 16)
@@ -237,12 +239,23 @@ def test_impulses_of_a_step():
     load, zero = jnp.ones((2, 1)), jnp.zeros((2, 1))
     velocity = jnp.array([[-3.0], [-3.0], [0.4], [3.0]])
     problem = StepProblem(Dense(k), velocity, load, zero, 0.5 * load, lengths)
-    q = solve(problem, jnp.zeros((4, 1)), jnp.full((1, 1), 1e-12))
+    q, left = solve(problem, jnp.zeros((4, 1)), jnp.full((1, 1), 1e-12))
     np.testing.assert_allclose(q[:, 0], [1.0, 1.0, -0.2, -0.5], atol=1e-12)
+    assert left[0, 0] <= 1e-12
     # gamma = -.5 + f: with a = 3 the force that is left solves f = 1 - 3 (f - .5)
     problem = problem._replace(velocity=velocity.at[0].set(-0.5), unloading=3 * load)
-    q = solve(problem, jnp.zeros((4, 1)), jnp.full((1, 1), 1e-12))
+    q, _ = solve(problem, jnp.zeros((4, 1)), jnp.full((1, 1), 1e-12))
     np.testing.assert_allclose(q[:2, 0], [0.625, 1.0], atol=1e-12)
+
+
+def test_an_impact_in_a_batch_is_what_it_is_alone():
+    """Its sweeps end where it is right, not where the slowest of the batch is."""
+    k = jnp.stack([jnp.eye(4).at[2, 3].set(c).at[3, 2].set(c) for c in (0.5, 0.999)], axis=-1)
+    velocity, one = jnp.array([[0.0], [0.0], [1.0], [0.9985]]) * jnp.ones((1, 2)), jnp.ones((2, 2))
+    problem = StepProblem(Dense(k), velocity, one, 0 * one, 2 * one, descent_lengths(k, 2))
+    alone = jax.tree.map(lambda x: x[..., :1], problem)
+    both, single = (solve(p, 0 * p.velocity, 1e-5 + 0 * p.load[:1])[0] for p in (problem, alone))
+    np.testing.assert_allclose(both[:, 0], single[:, 0], rtol=1e-12)
 
 
 def test_redundant_contacts_keep_descent_lengths_safe():
@@ -252,6 +265,20 @@ def test_redundant_contacts_keep_descent_lengths_safe():
     k = factor.T @ factor
     d = np.asarray(descent_lengths(jnp.asarray(k)[..., None], 4))[:, 0]
     assert np.linalg.eigvalsh(np.diag(1 / d) - k).min() > -1e-12
+    d = np.asarray(descent_lengths(jnp.asarray(k)[..., None], 4, friction_only=True))[:, 0]
+    assert np.linalg.eigvalsh((np.diag(1 / d) - k)[4:, 4:]).min() > -1e-12
+    # one contact in the plane: its tangential row alone
+    coupled = jnp.array([[1.0, 0.8], [0.8, 2.0]])[..., None]
+    alone = descent_lengths(coupled, 1, friction_only=True)
+    assert float(alone[1, 0]) == pytest.approx(0.5)
+
+
+def test_friction_is_guessed_as_a_part_of_the_load():
+    """Under half of the load half of the friction; none where the contact has just closed."""
+    rate = jnp.array([[2.0], [0.0], [0.6], [0.0]])
+    load = jnp.array([[1.0], [3.0]])
+    guess = steps_of_two(1.0, gapped=False).guess(rate, load)
+    np.testing.assert_allclose(guess[:, 0], [1.0, 3.0, 0.3, 0.0])
 
 
 def steps_of_two(restitution, gapped):
@@ -267,6 +294,37 @@ def steps_of_two(restitution, gapped):
         exponent_static=1.5,
         gapped=gapped,
     )
+
+
+def test_what_the_sweeps_of_a_step_leave_is_part_of_its_error():
+    """Contacts whose friction nearly cancels: both stick, slowly; slip that is left is an error."""
+    k = jnp.eye(4).at[2, 3].set(0.999).at[3, 2].set(0.999)[..., None]
+    flow = dataclasses.replace(
+        steps_of_two(0.5, gapped=False),
+        coupling=Dense(k),
+        friction=jnp.ones((2, 1)),
+        descent=descent_lengths(k, 2),
+    )
+    loaded, velocity = jnp.ones((2, 1)), jnp.array([[0.0], [0.0], [1e-4], [-1e-4]])
+    after, error = flow.substep(flow.start(loaded, velocity), jnp.full((1, 1), 0.3), smooth=False)
+    slip = np.abs(after.velocity[2:]).max()  # it takes impulses of .1, and the discs have .3
+    assert slip > 2 * float(flow.tolerance[0, 0])
+    assert error > 0.8 * slip
+
+
+def test_a_force_that_acts_until_its_contact_turns_is_not_forgotten():
+    """Forces F that stay, e = 0: gamma_0' is 1.5 F until gamma_0 = 0, then .5 F; a step has .5 F."""
+    k, n = jnp.array([[1.0, 0.5], [0.5, 1.0]])[..., None], jnp.ones((2, 1))
+    flow = steps_of_two(0.0, gapped=False)
+    flow = dataclasses.replace(
+        flow, coupling=Dense(k), omega=1e-3 * n, tolerance=1e-4 * flow.tolerance
+    )
+    h, force = 0.1, 1.25e-3 * 100**1.5
+    start = flow.start(100 * n, jnp.array([[-0.05], [-5.0]]))
+    after, error = flow.substep(start, jnp.full((1, 1), h), smooth=False)
+    wrong = 0.5 * force * (h - 0.05 / (1.5 * force)) - float(after.velocity[0, 0])
+    assert wrong == pytest.approx(1 / 30, rel=1e-3)
+    assert wrong < error < 4 * wrong
 
 
 def test_a_wait_ends_where_the_gap_closes():

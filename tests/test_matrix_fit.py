@@ -144,6 +144,7 @@ def test_a_sparsity_pattern_is_kept():
     assert not any("edge" in line for line in found.warnings)  # held zeros are no edge
 
 
+@pytest.mark.slow
 def test_the_admissible_least_squares_solution_is_found():
     """Noisy data that gain energy: the constrained minimum, against scipy."""
     data = shots(np.array([[0.1, 0.2], [0.95, 0.1]]), noise=0.1, seed=4)

@@ -622,6 +622,79 @@ def test_contacts_that_close_again():
     assert "contacts open and close again" in advice.reason
 
 
+# ---------------------------------------------------------------------------- the simplest scene
+
+
+class EachAlone(ji.Law):
+    """Every contact as if it were alone, elastic, and sticking where it has friction: it compiles quickly."""
+
+    friction: jax.Array | None = ji.parameter(low=0, default=None)
+
+    def impulses(self, contact):
+        w = contact.normal_delassus
+        p = jnp.maximum(-2 * contact.gap_velocity, 0.0) / jnp.diagonal(w)
+        if self.friction is None:
+            return p, None, jnp.int32(0)
+        return p, -contact.slip / jnp.diagonal(contact.tangential), jnp.int32(0)
+
+
+def rolling_balls():
+    """Three balls on a floor; (x, y, z) and two turns of each. Tangents are those of a point below."""
+    m, r = 2.0, 0.1
+    one = np.diag([m, m, m, 0.4 * m * r**2, 0.4 * m * r**2])
+    tangents = np.array([[1.0, 0.0], [0.0, 1.0], [0.0, 0.0], [0.0, r], [-r, 0.0]])
+    normal = np.array([[0.0], [0.0], [1.0], [0.0], [0.0]])
+    return ji.Scene(*(np.kron(np.eye(3), x) for x in (one, normal, tangents)))
+
+
+def test_contacts_that_an_impact_needs():
+    """Ball 1 falls and slides, ball 2 falls at half the speed, ball 3 rises."""
+    scene, v = rolling_balls(), np.zeros(15)
+    v[[0, 1, 2, 7, 12]] = 0.006, 0.008, -1.0, -0.5, 0.5
+    law = EachAlone(jnp.ones(()))
+    advice = ji.simplest_scene(law, scene, v, names="abc")
+    assert advice.law.friction is None  # slip is small
+    assert advice.scene.tangents is None
+    assert advice.kept == (0, 1)
+    np.testing.assert_array_equal(np.isinf(advice.scene.gaps), [False, False, True])
+    expected = [2 / np.sqrt(1.5001), 1 / np.sqrt(1.5001), 0]
+    np.testing.assert_allclose(advice.errors, expected, atol=1e-12)
+    np.testing.assert_allclose(advice.changes, [2, 1, 0], atol=1e-12)
+    assert [b.approaches for b in advice.blocks] == [True, True, False]
+    assert advice.reason(2) == "left out: nothing approaches"
+    assert "2 of 3 contacts suffice" in str(advice)
+    assert "3 c" in str(advice)
+    second = ji.simplest_scene(law, scene, v, watched=[7])
+    np.testing.assert_allclose(second.errors, [0, 1 / np.sqrt(1.5001), 0], atol=1e-12)
+    assert second.to_dict()["kept"] == [2]
+    assert second.reason(0) == "left out: no effect"
+
+
+def test_friction_that_an_impact_needs():
+    """A ball rolls on after 2/7 of its slip, which is oblique to both tangents."""
+    v = np.zeros(15)
+    v[[0, 1, 2]] = 0.6, 0.8, -1.0
+    advice = ji.simplest_scene(EachAlone(jnp.ones(())), rolling_balls(), v)
+    assert advice.friction["one direction"] == pytest.approx(0, abs=1e-9)
+    # v- has m (s^2 + 1) / 2, and the impulse 2 m s / 7 does half the work 2/7 m s^2
+    assert advice.friction["none"] == pytest.approx(np.sqrt(2 / 7 / 2))
+    np.testing.assert_allclose(np.abs(advice.scene.tangents[:5, 0]), [0.6, 0.8, 0, 0.08, 0.06])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tolerance": 1.5}, "tolerance"),
+        ({"watched": [3]}, "`watched` must be indices of coordinates from 0 to 2"),
+        ({"names": ["a"]}, "names"),
+        ({"runs": 0}, "runs"),
+    ],
+)
+def test_simplest_scene_refuses(options, message):
+    with pytest.raises(ValueError, match=message):
+        ji.simplest_scene(**({"law": EachAlone(), "scene": BALLS, "velocity": STRIKE} | options))
+
+
 @pytest.mark.release
 def test_several_ratios():
     """Five unknown ratios: which of them matters."""
@@ -658,6 +731,7 @@ def test_advice_refuses(options, error, message):
         ji.advise(**({"scene": BALLS, "velocity": STRIKE} | options))
 
 
+@pytest.mark.slow
 def test_advice_in_words_and_picture(unknown):
     data = json.loads(json.dumps(unknown.to_dict()))
     assert data["laws"]["lzb"]["worst"] == unknown.candidates["lzb"].worst

@@ -217,6 +217,10 @@ def test_errors_name_the_argument(monkeypatch):
         ji.from_mujoco("robot.xml", data)
     with pytest.raises(ValueError, match="margin"):
         ji.from_mujoco(model, data, margin=-1.0)
+    data.qpos[0] = np.nan
+    with pytest.raises(ValueError, match=r"`data\.qpos`.* must be finite"):
+        ji.from_mujoco(model, data)
+    data.qpos[0] = 0.0
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(ImportError, match=r"pip install 'jimpact\[mujoco\]'"):
         ji.from_mujoco(model, data)

@@ -236,8 +236,26 @@ PICTURES = {
     "admissible_set of three contacts": lambda: outcomes([1.0, 1.0, 1.0], True),
     "system, a chain": lambda: ji.plot.system(ji.chain([1.0, 4.0, 0.1], "right", [0, 1, 0]), STRIKE),
     "system, a block": lambda: ji.plot.system(BLOCK, BLOCK.touching(0.2), "a block"),
+    "force_chains": lambda: force_chains(),
 } | {f"chapter_figure {x}": functools.partial(ji.plot.chapter_figure, x) for x in CAPTIONS}  # fmt: skip
 SLOW = [f"chapter_figure {number}" for number in COMPUTED]
+
+
+def force_chains():
+    """A disc on two others on a floor, whose left contact carries twice as much."""
+    discs = ji.Discs(1.0, [1.0] * 3, walls=[[0.0, 1.0, 0.0]])
+    q = discs.at([[0.0, 1.0], [2.0, 1.0], [1.0, 1.0 + np.sqrt(3)]])
+    impulse = [0.0, 2.0, 1.0, np.sqrt(3), np.sqrt(0.75)]  # 1-2, 1-3, 2-3, the floor
+    return ji.plot.force_chains(discs, q, discs.touching(q), impulse, "three discs")
+
+
+def test_force_chains_are_as_thick_as_impulses():
+    (lines,) = force_chains().axes[0].collections
+    thickness = np.asarray(lines.get_linewidths()) / lines.get_linewidths()[-1]
+    np.testing.assert_allclose(thickness, np.array([np.sqrt(0.75), 1, np.sqrt(3), 2]) / 2)
+    ends = np.array([sorted(line.round(6).tolist()) for line in lines.get_segments()])
+    np.testing.assert_allclose(ends[0], [[2.0, 0.0], [2.0, 1.0]])  # a disc on the floor
+    np.testing.assert_allclose(ends[-1], [[0.0, 1.0], [1.0, 1 + np.sqrt(3)]], atol=1e-5)
 
 
 def texts(figure):

@@ -204,3 +204,78 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
     assert speed.max() < 2e-2  # a last sphere may roll
     assert np.diff(np.asarray(motion.energy)).max() < 1e-8 * motion.energy[0]
     assert -1e-3 < float(np.min(motion.gaps)) < 0
+
+
+# ------------------------------------------------------------------------ impacts on packings
+
+
+@pytest.fixture(scope="module")
+def struck():
+    """Ball 1 strikes balls 2 and 3, which touch each other, on a table; ball 4 falls onto it.
+
+    Four more make it too many contacts for the program that small scenes share.
+    """
+    h = np.sqrt(3)
+    places = [[0, 0, 1.0], [h, 1.0, 1.0], [h, -1.0, 1.0], *([9.0 * i, 0, 1.0] for i in range(1, 6))]
+    spheres = ji.Spheres([1.0, 1.0, 1.0, 2.0] + 4 * [1.0], [1.0] * 8, walls=[[0.0, 0.0, 2.0, 0.0]])
+    v = np.zeros(48)
+    v[[0, 20]] = 1.0, -3.0
+    return spheres, spheres.at(places), v
+
+
+def test_a_packing_has_the_contacts_of_its_body(struck):
+    spheres, q, _ = struck
+    scene, places, columns = spheres.touching(q), np.asarray(q).reshape(8, 6)[:, :3], []
+    for i, j in [(0, 1), (0, 2), (1, 2)]:
+        column = np.zeros((8, 6))
+        column[i, :3] = (places[i] - places[j]) / 2
+        column[j, :3] = -column[i, :3]
+        columns.append(column.ravel())
+    normals = np.array([*columns, *np.eye(48)[2::6]]).T  # and the table
+    assert scene.contacts == 11
+    assert scene.tangents is None
+    np.testing.assert_allclose(scene.normals, normals, atol=1e-15)
+    w = normals.T @ (normals / np.asarray(spheres.mass)[:, None])
+    sparse = ji.delassus_matrix(scene)
+    np.testing.assert_allclose(sparse.as_matrix(), w, atol=1e-15)
+    x = np.arange(11.0)
+    np.testing.assert_allclose(sparse @ x, w @ x, atol=1e-14)
+    np.testing.assert_allclose(ji.gap_velocity(scene, q), normals.T @ q, atol=1e-13)
+    np.testing.assert_allclose(ji.velocity_change(scene, x), normals @ x / spheres.mass, atol=1e-14)
+
+
+def test_a_packing_is_struck(struck):
+    """p (2 + cos 60) = (1 + e) cos 30, and contact 2, 3 opens. v+ is linear in v-: so its derivative."""
+    spheres, q, v = struck
+    scene, e = spheres.touching(q), 0.5
+    after, rate = jax.jvp(lambda v: ji.impact(ji.Moreau(e), scene, v).velocity, (v,), (v,))
+    p = (1 + e) * np.sqrt(0.75) / 2.5
+    expected = np.zeros(48)
+    expected[0] = 1 - 2 * p * np.sqrt(0.75)
+    expected[[6, 12]] = p * np.sqrt(0.75)
+    expected[[7, 13]] = p / 2, -p / 2
+    expected[20] = 3 * e
+    np.testing.assert_allclose(after, expected, atol=1e-12)
+    np.testing.assert_allclose(rate, expected, atol=1e-12)
+
+
+def test_bad_packings_are_named(struck):
+    spheres, q, _ = struck
+    with pytest.raises(ValueError, match="`q` must hold bodies that touch"):
+        spheres.touching(10 * q)
+    with pytest.raises(ValueError, match="below"):
+        spheres.touching(q, below=-1.0)
+    with pytest.raises(ValueError, match="`q` must have shape"):
+        spheres.touching(q[1:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["time", "implicit"])
+def test_dynamics_of_a_packing_are_those_of_the_dense_scene(struck, method):
+    spheres, q, v = struck
+    scene = spheres.touching(q)
+    law = ji.LZB([0.9, 0.9, 0.5] + 8 * [0.7], 1e4, rtol=1e-7, method=method)
+    dense = ji.impact(law, ji.Scene(scene.mass, scene.normals), v)
+    sparse = ji.impact(law, scene, v)
+    np.testing.assert_allclose(sparse.velocity, dense.velocity, atol=1e-6)
+    assert sparse.velocity[20] == pytest.approx(2.1, abs=1e-5)

@@ -33,6 +33,7 @@ def test_frozen_geometry_is_the_stiff_limit(force, power):
     np.testing.assert_allclose(energy, 0.5 * (0.25 + 1 / 6), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_block_on_one_corner():
     """Landing on the right corner, the left one 1e-3 up: it turns before the left one lands."""
     angle = -1e-3

@@ -12,8 +12,12 @@ from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.bodies.base import (
     PLANAR,
     Body,
+    ContactPoints,
     LinearPotential,
     OnGround,
+    dot,
+    lengths,
+    moving,
     number,
     numbered,
     planar_directions,
@@ -21,15 +25,14 @@ from jimpact.bodies.base import (
 )
 from jimpact.bodies.polygons import Cornered, Disc
 
+# [rad] Direction between two polygons, of which one has an odd number of sides, at which their two
+# contacts change places, see `_all_sides`: none of the usual slopes.
+_CUT = 2.0
+# 1 - cos of the angle to that direction, within which they must not touch: .8 degrees. Ten times
+# less, and steps of a motion may pass over it.
+_NEAR_CUT = 1e-4
+_TOUCHING = 1e-6  # [m] gap from which they may pass it; ten times more would do
 _PARALLEL = 1e-9  # [m] more than rounding: between parallel sides it does not decide
-
-
-class PlanarContacts(NamedTuple):
-    """Of the m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
-
-    gap: jax.Array  # (m,)
-    point: jax.Array  # (m, 2)
-    normal: jax.Array  # (m, 2)
 
 
 class PlanarBodies(Body):
@@ -48,11 +51,12 @@ class PlanarBodies(Body):
     `between` names their bodies.
 
     Polygons choose their sides as they move, so that they may roll over their corners, slide off
-    each other and meet again anywhere. Where sides are fixed, by `at` or by their numbers, the gap
-    functions hold (`valid`, [m]) while both overlap or the line of one of them keeps them apart,
-    turned by less than 90 degrees against each other, with no other corner of the first body beyond
-    the second side. Those of discs hold while their centres are outside the other body. Bodies that
-    are no pair do not feel each other.
+    each other and meet again anywhere. Of two in touch, one with an odd number of sides, one with
+    an even number, the normal from the first to the second must not pass 2 rad (`valid`). Where
+    sides are fixed, by `at` or by their numbers, the gap functions hold (`valid`, [m]) while both
+    overlap or the line of one of them keeps them apart, turned by less than 90 degrees against each
+    other, with no other corner of the first body beyond the second side. Those of discs hold while
+    their centres are outside the other body. Bodies that are no pair do not feel each other.
 
     Args:
         bodies: `Polygon`, `Block`, `Disc`; `Dimer` on planes only.
@@ -61,12 +65,11 @@ class PlanarBodies(Body):
             polygons may be given as ((i, side), (j, side)), sides counted counter-clockwise: of a
             `Block` 0 is the base, of a `Polygon` it begins at the first corner.
         at: q (3 b,) at which the sides of two polygons are chosen that face each other, and which
-            is the first body, once and for all; None: as they move. Polygons with an odd number of
-            sides need it, or sides.
+            is the first body, once and for all; None: as they move.
 
     Raises:
         ValueError: no bodies or contacts, planes that are not finite, pairs that do not exist or
-            without a gap function, polygons with an odd number of sides without `at`.
+            without a gap function.
 
     Source: Ericson, Real-Time Collision Detection (2005), ch. 5 and 7 (distances, separating axes).
 
@@ -97,7 +100,10 @@ class PlanarBodies(Body):
         self.bodies = tuple(bodies)
         for body in self.bodies:
             if not isinstance(body, OnGround):
-                raise TypeError(f"Argument `bodies` must hold planar bodies, but holds {body!r}.")
+                raise TypeError(
+                    "Argument `bodies` must hold planar bodies, but holds a "
+                    f"{type(body).__name__}; boxes and spheres go into `SpatialBodies`."
+                )
         rows = [_plane(plane) for plane in planes]
         self.planes = jnp.stack(rows) if rows else jnp.zeros((0, 2))
         counts = [body.points.shape[0] for body in self.bodies]
@@ -121,7 +127,7 @@ class PlanarBodies(Body):
         """`V = g sum m_i y_i`."""
         return planar_weight(self.mass, acceleration)
 
-    def contacts(self, q: jax.Array) -> PlanarContacts:
+    def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps, points and normals at q (3 b,); `between` says of which bodies."""
         places, parts = self._places(q), []
         if self.planes.shape[0]:
@@ -132,37 +138,43 @@ class PlanarBodies(Body):
             parts.append(_disc_on_polygon(places, np.array(discs), polygon))
         if self.pairs.sides or self.pairs.polygons:
             parts.append(_facing_sides(_all_sides(places, self.pairs)))
-        return PlanarContacts(*(jnp.concatenate(rows) for rows in zip(*parts)))
+        return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Gaps f(q) (m,) [m]."""
         return self.contacts(q).gap
 
+    def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Gaps (m,) and N (n, m)."""
+        contacts = self.contacts(q)
+        return contacts.gap, self._along(q, contacts.point, contacts.normal)
+
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (3 b, m): how fast body 1 slides along body 2, to the right of the normal."""
-        contacts, middle = self.contacts(q), q.reshape(-1, 3)[:, :2]
-        tangent = jnp.stack([contacts.normal[:, 1], -contacts.normal[:, 0]], axis=1)
-        first, second = np.array(self.between).T
-        columns = np.arange(len(first))
-        out = jnp.zeros((len(self.bodies), 3, len(first)), q.dtype)
-        for body, sign in ((first, 1.0), (second, -1.0)):
-            moves = body >= 0  # planes do not
-            lever = contacts.point - middle[body]
-            turn = lever[:, :1] * tangent[:, 1:] - lever[:, 1:] * tangent[:, :1]
-            rows = sign * jnp.concatenate([tangent, turn], axis=1)[moves]
-            out = out.at[body[moves], :, columns[moves]].add(rows)
-        return out.reshape(-1, len(first))
+        contacts = self.contacts(q)
+        right = jnp.stack([contacts.normal[:, 1], -contacts.normal[:, 0]], axis=1)
+        return self._along(q, contacts.point, right)
+
+    def _along(self, q: jax.Array, point: jax.Array, way: jax.Array) -> jax.Array:
+        """(3 b, m): speeds along directions (m, 2) of body 1 from body 2 at points (m, 2)."""
+        lever = point[:, None] - q.reshape(-1, 3)[None, :, :2]
+        turn = lever[..., 0] * way[:, 1:] - lever[..., 1] * way[:, :1]
+        still = jnp.broadcast_to(way[:, None], lever.shape)
+        rows = jnp.concatenate([still, turn[..., None]], axis=2)
+        moves = moving(self.between, len(self.bodies))[..., None]
+        return (jnp.asarray(moves, q.dtype) * rows).reshape(len(moves), -1).T
 
     def valid(self, q: jax.Array) -> jax.Array:
         """The least of the margins () [m], see the class."""
         places, margins = self._places(q), [super().valid(q)[None]]
         if self.pairs.discs:
             i, j = np.array(self.pairs.discs).T
-            margins.append(_length(places.middle[i] - places.middle[j])[0])
+            margins.append(lengths(places.middle[i] - places.middle[j])[0])
         for polygon, discs in self.pairs.rolling:
             contacts = _disc_on_polygon(places, np.array(discs), polygon)
             margins.append(contacts.gap + places.rim[np.array(discs)])
         margins += [_overlap(places, *pair)[None] for pair in self.pairs.sides]
+        margins += [_off_cut(places, *pair)[None] for pair in self.pairs.polygons]
         return jnp.min(jnp.concatenate(margins))
 
     def touching(
@@ -203,16 +215,16 @@ class PlanarBodies(Body):
             for b, body in enumerate(self.bodies)
             if isinstance(body, Cornered)
         }
-        return _Places(owner, points, points[np.cumsum(counts) - counts], rim, polygons)
+        return _Places(at[:, 2], owner, points, points[np.cumsum(counts) - counts], rim, polygons)
 
-    def _on_planes(self, places: "_Places") -> PlanarContacts:
+    def _on_planes(self, places: "_Places") -> ContactPoints:
         """Contacts of all points with all planes."""
         a, offset = self.planes.T
         n = jnp.stack([-jnp.sin(a), jnp.cos(a)], axis=1)[:, None]
         height = jnp.sum(n * places.points[None], axis=2) - offset[:, None]
         point = places.points[None] - height[..., None] * n
         gap, normal = height - places.rim[places.owner][None], jnp.broadcast_to(n, point.shape)
-        return PlanarContacts(gap.reshape(-1), point.reshape(-1, 2), normal.reshape(-1, 2))
+        return ContactPoints(gap.reshape(-1), point.reshape(-1, 2), normal.reshape(-1, 2))
 
 
 Side = tuple[int, int]  # of which body, and which
@@ -237,6 +249,7 @@ class _Pairs(NamedTuple):
 class _Places(NamedTuple):
     """Bodies where they are."""
 
+    angle: jax.Array  # (b,)
     owner: np.ndarray  # (p,) body of each contact point
     points: jax.Array  # (p, 2)
     middle: jax.Array  # (b, 2) first contact point: the middle of a disc
@@ -251,32 +264,20 @@ def _placed(points: jax.Array, at: jax.Array) -> jax.Array:
     return at[:, :2] + jnp.stack([c * x - s * y, s * x + c * y], axis=1)
 
 
-def _length(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Lengths (g,) and unit vectors (g, 2); one of length 0 has no direction."""
-    square = jnp.sum(vectors**2, axis=1)
-    length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
-    return jnp.where(square > 0, length, 0.0), vectors / length[:, None]
-
-
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Scalar products (..)."""
-    return jnp.sum(a * b, axis=-1)
-
-
 def _outward(side: jax.Array) -> jax.Array:
     """Unit normals (.., 2) of counter-clockwise sides (.., 2)."""
-    return jnp.stack([side[..., 1], -side[..., 0]], axis=-1) / jnp.sqrt(_dot(side, side))[..., None]
+    return jnp.stack([side[..., 1], -side[..., 0]], axis=-1) / jnp.sqrt(dot(side, side))[..., None]
 
 
-def _discs(places: _Places, pairs: np.ndarray) -> PlanarContacts:
+def _discs(places: _Places, pairs: np.ndarray) -> ContactPoints:
     """One contact for each pair (g, 2) of discs."""
     i, j = pairs.T
-    length, n = _length(places.middle[i] - places.middle[j])
+    length, n = lengths(places.middle[i] - places.middle[j])
     gap = length - places.rim[i] - places.rim[j]
-    return PlanarContacts(gap, places.middle[j] + (places.rim[j] + 0.5 * gap)[:, None] * n, n)
+    return ContactPoints(gap, places.middle[j] + (places.rim[j] + 0.5 * gap)[:, None] * n, n)
 
 
-def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> PlanarContacts:
+def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> ContactPoints:
     """Distances of discs from a polygon: from a side, or, beyond its ends, from a corner."""
     begin, middle = places.polygons[polygon], places.middle[discs]
     side = jnp.roll(begin, -1, axis=0) - begin
@@ -284,13 +285,13 @@ def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> Planar
     heights = jnp.sum((middle[:, None] - begin[None]) * normals[None], axis=2)
     nearest = jnp.argmax(heights, axis=1)  # outside, its side or one of its ends is the nearest
     a, tangent, n = begin[nearest], side[nearest], normals[nearest]
-    share = _dot(middle - a, tangent) / _dot(tangent, tangent)
+    share = dot(middle - a, tangent) / dot(tangent, tangent)
     beyond = (share < 0) | (share > 1)
     corner = a + jnp.where(share > 1, 1.0, 0.0)[:, None] * tangent
-    length, toward = _length(middle - corner)
+    length, toward = lengths(middle - corner)
     n = jnp.where(beyond[:, None], toward, n)
     away = jnp.where(beyond, length, jnp.max(heights, axis=1))
-    return PlanarContacts(away - places.rim[discs], middle - away[:, None] * n, n)
+    return ContactPoints(away - places.rim[discs], middle - away[:, None] * n, n)
 
 
 class _Sides(NamedTuple):
@@ -306,13 +307,19 @@ def _all_sides(places: _Places, pairs: _Pairs) -> _Sides:
 
     Where a body rolls over a corner, one of the sides gives way to its neighbour, which has the
     corner at its other end. The contact there keeps its place among the two because they are
-    swapped where the numbers of both sides have an odd sum.
+    swapped where the numbers of both sides have an odd sum. An odd number of sides counts on
+    through full turns, of the body and of the direction between the bodies; the latter begin anew
+    at `_CUT`.
     """
     rows: list[Any] = [(_side(places, a), _side(places, b), False) for a, b in pairs.sides]
-    for i, j in pairs.polygons:
-        a, b = _facing_now(places.polygons[i], places.polygons[j])
-        sides = (_side_of(places.polygons[i], a), _side_of(places.polygons[j], b))
-        rows.append((*sides, (a + b) % 2 == 1))
+    for pair in pairs.polygons:
+        *sides, n = _facing_now(*(places.polygons[i] for i in pair))
+        number = sides[0] + sides[1]
+        for i, side, way in zip(pair, sides, (n, -n)):
+            if len(places.polygons[i]) % 2:
+                number += _full_turns(places.polygons[i], side, places.angle[i], n, way)
+        both = (_side_of(places.polygons[i], side) for i, side in zip(pair, sides))
+        rows.append((*both, number % 2 == 1))
     first, second, swapped = zip(*rows)
 
     def ends(sides: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
@@ -321,10 +328,38 @@ def _all_sides(places: _Places, pairs: _Pairs) -> _Sides:
     return _Sides(ends(first), ends(second), jnp.stack([jnp.asarray(x) for x in swapped]))
 
 
-def _facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sides () of two polygons that face each other: the line of one keeps them apart most.
+def _full_turns(
+    corners: jax.Array, side: jax.Array, angle: jax.Array, n: jax.Array, way: jax.Array
+) -> jax.Array:
+    """How many full turns () a body at this angle has made against the direction to the other.
 
-    The other polygon's nearest corner to this line is an end of its side that is most opposite.
+    `way` is that direction, n or -n; its angle goes on by the one of n, from `_CUT` to there again.
+    """
+    own = _outward(jnp.roll(corners, -1, axis=0) - corners)
+    own = jnp.arctan2(own[:, 1], own[:, 0])
+    turned = jnp.arctan2(n[1], n[0])
+    turned = _CUT + (turned - _CUT) % (2 * np.pi) + jnp.where(way @ n > 0, 0.0, np.pi)
+    first = (own[0] - angle) % (2 * np.pi)
+    facing = angle + first + (own[side] - own[0]) % (2 * np.pi)
+    return jnp.round((turned - facing) / (2 * np.pi)).astype(side.dtype)
+
+
+def _off_cut(places: _Places, i: int, j: int) -> jax.Array:
+    """Margin () within which the two contacts of polygons i and j keep their places."""
+    a, b = places.polygons[i], places.polygons[j]
+    if (len(a) + len(b)) % 2 == 0:
+        return jnp.ones((), a.dtype)
+    _, _, n = _facing_now(a, b)
+    apart = jnp.min(b @ n) - jnp.max(a @ n)
+    off = 1 - n @ jnp.array([np.cos(_CUT), np.sin(_CUT)], n.dtype) - _NEAR_CUT
+    return jnp.maximum(off, apart - _TOUCHING)
+
+
+def _facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Sides () of two polygons that face each other, and the normal (2,) from a to b.
+
+    The line of one side keeps the polygons apart most. The other polygon's nearest corner to this
+    line is an end of its side that is most opposite.
     """
     n_a, n_b = (_outward(jnp.roll(x, -1, axis=0) - x) for x in (a, b))
     beyond_a = jnp.min(jnp.sum((b[:, None] - a[None]) * n_a[None], axis=2), axis=0)
@@ -333,38 +368,37 @@ def _facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     opposite = n_a @ n_b.T
     by_b = jnp.max(beyond_b) > jnp.max(beyond_a) + _PARALLEL
     side_a = jnp.where(by_b, jnp.argmin(opposite[:, side_b]), side_a)
-    return side_a, jnp.where(by_b, side_b, jnp.argmin(opposite[side_a]))
+    side_b = jnp.where(by_b, side_b, jnp.argmin(opposite[side_a]))
+    return side_a, side_b, jnp.where(by_b, -n_b[side_b], n_a[side_a])
 
 
-def _facing_sides(sides: _Sides) -> PlanarContacts:
+def _facing_sides(sides: _Sides) -> ContactPoints:
     """Two contacts a pair, at the begin and at the end of the first body's side."""
     (a_begin, a_end), (b_begin, b_end) = sides.first, sides.second
     n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)
 
-    def at_end(
-        a: jax.Array, other_a: jax.Array, b: jax.Array, other_b: jax.Array
-    ) -> PlanarContacts:
+    def at_end(a: jax.Array, other_a: jax.Array, b: jax.Array, other_b: jax.Array) -> ContactPoints:
         """Contacts at the ends a (g, 2) of first sides, which face the ends b of second ones."""
         side = other_a - a
-        share = _dot(side, b - a) / _dot(side, side)
-        over = _dot(b - other_b, a - b) > 0  # a overhangs: b is under the side, or beyond it
-        past = _dot(other_b - b, a - other_b) > 0  # the sides do not overlap
+        share = dot(side, b - a) / dot(side, side)
+        over = dot(b - other_b, a - b) > 0  # a overhangs: b is under the side, or beyond it
+        past = dot(other_b - b, a - other_b) > 0  # the sides do not overlap
         by_side = over & (share >= 0) & (share <= 1)
         by_end = past | (over & ~by_side)
         end = jnp.where((over & (share > 1))[:, None], other_a, a)
         b = jnp.where(past[:, None], other_b, b)
-        apart, toward = _length(end - b)
-        gap = jnp.where(by_end, apart, jnp.where(by_side, _dot(n_a, b - a), _dot(n_b, a - b)))
+        apart, toward = lengths(end - b)
+        gap = jnp.where(by_end, apart, jnp.where(by_side, dot(n_a, b - a), dot(n_b, a - b)))
         n = jnp.where(by_end[:, None], toward, jnp.where(by_side[:, None], -n_a, n_b))
         point = jnp.where(by_end[:, None], 0.5 * (end + b), jnp.where(by_side[:, None], b, a))
-        return PlanarContacts(gap, point, n)
+        return ContactPoints(gap, point, n)
 
     both = (at_end(a_begin, a_end, b_end, b_begin), at_end(a_end, a_begin, b_begin, b_end))
     gap, point, n = (jnp.stack(parts, axis=1) for parts in zip(*both))
     swapped = sides.swapped[:, None]
     gap = jnp.where(swapped, gap[:, ::-1], gap)
     point, n = (jnp.where(swapped[..., None], x[:, ::-1], x) for x in (point, n))
-    return PlanarContacts(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
+    return ContactPoints(gap.reshape(-1), point.reshape(-1, 2), n.reshape(-1, 2))
 
 
 def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
@@ -428,22 +462,11 @@ def _sorted_pairs(bodies: tuple[OnGround, ...], pairs: Sequence[Any] | None, at:
         elif isinstance(bodies[j], Disc):
             rolling.setdefault(i, []).append(j)
         elif at is None and not all(np.ndim(x) for x in pair):
-            for which in (i, j):
-                _check_even(which, _polygon(bodies, which))
             polygons.append((i, j))
         else:
             sides.append(_sides_of(pair, i, j, bodies, at))
     grouped = tuple((polygon, tuple(some)) for polygon, some in rolling.items())
     return _Pairs(tuple(discs), grouped, tuple(sides), tuple(polygons))
-
-
-def _check_even(which: int, body: Cornered) -> None:
-    """Raise for a polygon whose contacts would change places where its last side follows."""
-    if len(body.ring) % 2:
-        raise ValueError(
-            f"Argument `at` must be given, or sides in `pairs`, for polygon {which}, which has "
-            f"{len(body.ring)} sides: only an even number of sides is chosen anew as it moves."
-        )
 
 
 def _body_of(entry: Any, bodies: tuple[OnGround, ...]) -> int:

@@ -66,6 +66,14 @@ class ActivePairs(NamedTuple):
     reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
 
 
+class ContactPoints(NamedTuple):
+    """Of m contacts: gap [m], where it is [m], and the unit normal from body 2 to body 1."""
+
+    gap: jax.Array  # (m,)
+    point: jax.Array  # (m, 2 or 3)
+    normal: jax.Array  # (m, 2 or 3)
+
+
 class Body(eqx.Module):
     """One or several bodies with contacts, as functions of their configuration q.
 
@@ -121,9 +129,14 @@ class Body(eqx.Module):
         """Displacements (m,) [m] along the contact planes at q; their rates are sliding speeds."""
         return None
 
+    def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array] | None:
+        """f (m,) and N (n, m) at q, where N has a formula; None: N is found by differentiation."""
+        return None
+
     def normals(self, q: jax.Array) -> jax.Array:
         """N (n, m) at q: gap velocities are `N^T v`."""
-        return self._gradient(self.gap_function, q)
+        both = self.gaps_and_normals(q)
+        return self._gradient(self.gap_function, q) if both is None else both[1]
 
     def tangents(self, q: jax.Array) -> jax.Array | None:
         """H_t (n, m) at q, in space (n, 2 m), contact-major: `v_t = H_t^T v`; None: no friction."""
@@ -514,6 +527,24 @@ def wheel(radius: Any, q: np.ndarray, middle: Any = (0.0, 0.0)) -> np.ndarray:
     """A circle about `middle`, with the radius that shows how far it has turned."""
     spoke = np.concatenate([[[0.0, 0.0]], CIRCLE])
     return turned(float(radius) * spoke + np.asarray(middle), q)
+
+
+def moving(between: Sequence[tuple[int, int]], count: int) -> np.ndarray:
+    """(m, count) of contacts and moving bodies: 1 for the first body, -1 for the second, else 0."""
+    first, second = (np.array(side)[:, None] == np.arange(count) for side in zip(*between))
+    return first.astype(float) - second.astype(float)
+
+
+def lengths(vectors: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Lengths (g,) and unit vectors of vectors (g, d); one of length 0 has no direction."""
+    square = jnp.sum(vectors**2, axis=1)
+    length = jnp.sqrt(jnp.where(square > 0, square, 1.0))
+    return jnp.where(square > 0, length, 0.0), vectors / length[:, None]
+
+
+def dot(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Scalar products (..)."""
+    return jnp.sum(a * b, axis=-1)
 
 
 def inertia_of(inertia: Any, homogeneous: Any, centre: Any) -> Any:

@@ -122,6 +122,8 @@ def from_mujoco(model: Any, data: Any, margin: float = 0.0) -> MujocoScene:
             f"velocities, but has {data.qpos.size} and {data.qvel.size}."
         )
     check_values("margin", as_float_array("margin", margin), low=0.0)
+    check_values("data.qpos", data.qpos)
+    check_values("data.qvel", data.qvel)
     touching = _TOUCHING * model.stat.extent
     model, data = copy.copy(model), copy.copy(data)
     model.geom_margin += margin + touching

@@ -7,8 +7,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial import cKDTree
 
-from jimpact._checks import as_float_array, as_whole, check_values, is_traced
+from jimpact._checks import (
+    as_float_array,
+    as_whole,
+    check_concrete,
+    check_shape,
+    check_values,
+    is_traced,
+)
 from jimpact.bodies.base import (
     BLOCK,
     CIRCLE,
@@ -21,10 +29,16 @@ from jimpact.bodies.base import (
     wheel,
 )
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
+from jimpact.scene import Scene, sparse_scene
 
 # Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
 # 6, and walls. Ten times more takes ten times the memory.
 ROOM = {2: 4, 3: 7}
+
+
+# Gap over the least radius up to which bodies touch but for rounding. Ten times more closes gaps of
+# 10 nm of bodies of a metre.
+_TOUCHING = 1e-9
 
 
 class _Pile(Body):
@@ -127,7 +141,63 @@ class _Pile(Body):
         centres = self._of_bodies(q)[:, :d]
         return centres @ self.walls[:, :d].T - self.walls[None, :, d] - self.radii[:, None]
 
+    def _at_walls(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bodies i and walls j of every contact with a wall; j counts walls after the bodies."""
+        walls = len(self.walls)
+        body, wall = np.divmod(np.arange(self.count * walls, dtype=np.int32), max(walls, 1))
+        return body, self.count + wall
+
     # ---- closed contacts only
+
+    def touching(self, q: Any, below: Any = None) -> Scene:
+        """The contacts at q that are closed, as a scene without friction of any number of bodies.
+
+        Only normals of two bodies each are stored, and W has few entries in a row: an impact of
+        `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
+        pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
+
+        Args:
+            q: (n,), see `at`; not traced.
+            below: gap >= 0 [m] up to which contacts count as closed; None: 1e-9 of the least
+                radius.
+
+        Returns:
+            `Scene` of n velocities; contacts of bodies i < j first, then those with walls.
+
+        Raises:
+            ValueError: nothing touches, a bad `below`, two bodies in one place.
+        """
+        q = as_float_array("q", q)
+        check_concrete("q", q)
+        check_shape("q", q, self.mass.shape, "one number per velocity")
+        least = float(np.min(np.asarray(self.radii)))
+        below = _TOUCHING * least if below is None else below
+        check_values("below", below, low=0.0)
+        places, radii = np.asarray(self._of_bodies(q))[:, : self.dimension], np.asarray(self.radii)
+        pairs = cKDTree(places).query_pairs(2 * radii.max() + below, output_type="ndarray")
+        i, j = pairs[np.lexsort(pairs.T[::-1])].T
+        away = places[i] - places[j]
+        distance = np.linalg.norm(away, axis=1)
+        if (distance == 0).any():
+            raise ValueError("Argument `q` must hold bodies with different centres.")
+        meet = distance - radii[i] - radii[j] <= below
+        body, wall = np.nonzero(np.asarray(self._wall_gaps(q)) <= below)
+        normals = np.concatenate(
+            [(away / distance[:, None])[meet], np.asarray(self.walls)[wall, : self.dimension]]
+        )
+        bodies = np.concatenate(
+            [np.stack([i, j], axis=1)[meet], np.stack([body, np.full_like(body, -1)], axis=1)]
+        )
+        if not len(bodies):
+            raise ValueError(
+                f"Argument `q` must hold bodies that touch, but no gap is up to {below:g}."
+            )
+        second = np.where(bodies[:, 1:] < 0, 0.0, -normals)
+        both = np.pad(
+            np.stack([normals, second], axis=1), ((0, 0), (0, 0), (0, _turns(self.dimension)))
+        )
+        directions = jnp.asarray(both.astype(q.dtype))
+        return sparse_scene(self.mass, directions, bodies, self.count)
 
     @property
     def pair_count(self) -> int:
@@ -151,7 +221,8 @@ class _Pile(Body):
         """
         now = self._candidates(q, below)
         closed_now = now.used & (self._pair_gaps(q, now.first, now.second) <= below)
-        pairs, overflows = [(now.first, now.second)], now.overflows
+        pairs: list[tuple[Any, Any]] = [(now.first, now.second)]
+        overflows = now.overflows
         if self.crowd == 0:
             soon = self._pair_gaps(later, now.first, now.second) <= below
             closed = [closed_now | soon]
@@ -162,9 +233,7 @@ class _Pile(Body):
             closed = [closed_now, soon & (self._pair_gaps(q, first, second) > below)]
             pairs.append((first, second))
             overflows |= then.overflows
-        walls = len(self.walls)
-        body, wall = np.divmod(np.arange(self.count * walls, dtype=np.int32), max(walls, 1))
-        pairs.append((jnp.asarray(body), jnp.asarray(self.count + wall)))
+        pairs.append(self._at_walls())
         to_walls = jnp.minimum(self._wall_gaps(q), self._wall_gaps(later)).reshape(-1)
         i, j = (jnp.concatenate(each) for each in zip(*pairs))
         return i, j, jnp.concatenate([*closed, to_walls <= below]), overflows
@@ -313,10 +382,9 @@ class Spheres(_Pile):
 
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (n, 2 m): two directions of sliding for each contact of the scene."""
-        k, walls = self.count, len(self.walls)
-        first, second = np.triu_indices(k, 1)
-        body, wall = np.divmod(np.arange(k * walls), max(walls, 1))
-        i, j = np.concatenate([first, body]), np.concatenate([second, k + wall])
+        k = self.count
+        pairs = np.triu_indices(k, 1), self._at_walls()
+        i, j = (np.concatenate(each) for each in zip(*pairs))
         other = np.minimum(j, k - 1)
         arm = jnp.where(j < k, self.radii[other], 0.0)
         normal = self._normals(q, i, other, jnp.asarray(j - k))

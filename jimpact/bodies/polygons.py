@@ -34,9 +34,7 @@ class Cornered(OnGround):
 
     def inner_radius(self) -> jax.Array:
         """Distance of the centre of mass from the nearest side [m]."""
-        c = self.corners[jnp.array(self.ring)]
-        side = jnp.roll(c, -1, axis=0) - c
-        return jnp.min(_cross(c, side) / jnp.sqrt(jnp.sum(side**2, axis=1)))
+        return _distance_to_sides(self.corners, jnp.array(self.ring))
 
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """The polygon."""
@@ -85,7 +83,7 @@ class Polygon(Cornered):
         check_values("corners", c)
         self.ring = _ring(c)
         self.total_mass = positive("mass", mass)
-        middle, about_middle = _moments(c[jnp.array(self.ring)])
+        middle, about_middle = _moments(c, jnp.array(self.ring))
         inertia = inertia_of(inertia, self.total_mass * about_middle, centre)
         if centre is not None:
             middle = as_float_array("centre", centre)
@@ -186,8 +184,18 @@ def _ring(corners: jax.Array) -> tuple[int, ...]:
     return tuple(range(k)) if around > 0 else tuple(reversed(range(k)))
 
 
-def _moments(ring: jax.Array) -> tuple[jax.Array, jax.Array]:
+@jax.jit  # operation by operation JAX would compile thirty programs
+def _distance_to_sides(corners: jax.Array, order: jax.Array) -> jax.Array:
+    """Of the origin from the nearest side of a polygon."""
+    c = corners[order]
+    side = jnp.roll(c, -1, axis=0) - c
+    return jnp.min(_cross(c, side) / jnp.sqrt(jnp.sum(side**2, axis=1)))
+
+
+@jax.jit
+def _moments(corners: jax.Array, order: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Centroid (2,), and moment of inertia about it over the mass, of a homogeneous polygon."""
+    ring = corners[order]
     start = ring - ring[:1]  # about a corner: far from the origin, areas would cancel
     end = jnp.roll(start, -1, axis=0)
     twice = _cross(start, end)

@@ -247,7 +247,8 @@ def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) 
 
     `kind` is the name of a body's class (`Block`, `Box`, `PlanarBodies`, ..., in any case); the
     other keys are the arguments of that class, with their units behind them: `width_m`, `mass_kg`,
-    `inertia_kg_m2`, `angle_rad`. Bodies of `PlanarBodies` are tables of this kind themselves.
+    `inertia_kg_m2`, `angle_rad`. Bodies of `PlanarBodies` and `SpatialBodies` are tables of this
+    kind themselves.
     `others` are keys of the table that mean something else.
 
     >>> from jimpact.cli.study import body_of
@@ -256,9 +257,9 @@ def body_of(where: str, table: Mapping[str, Any], others: tuple[str, ...] = ()) 
     """
     kind, keys = body_keys(where, table, others)
     arguments = {name: table[key] for key, name in keys.items() if key in table}
-    if "bodies" in arguments:
-        within = f"{where.removesuffix(']')}.bodies]"
-        arguments["bodies"] = [body_of(within, x) for x in arguments["bodies"]]
+    for several in {"bodies", "fixed"} & set(arguments):
+        within = f"{where.removesuffix(']')}.{several}]"
+        arguments[several] = [body_of(within, x) for x in arguments[several]]
     return getattr(ji, kind)(**arguments)
 
 

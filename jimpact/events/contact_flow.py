@@ -32,6 +32,7 @@ import jax.numpy as jnp
 
 from jimpact.events.stepper import Flow, any_of, total
 from jimpact.solvers.dense import COLUMNS_WRITTEN_OUT, times, unit
+from jimpact.solvers.sparse import Neighbours, neighbour_sum
 from jimpact.solvers.tridiagonal import tridiagonal_product
 
 OPEN, COMPRESSION, EXPANSION, SLACK, YIELD = 0, 1, 2, 3, 4
@@ -162,6 +163,30 @@ class Dense(NamedTuple):
         return Dense(jnp.minimum(self._off_diagonal(), 0.0) + unit(self.matrix))
 
 
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Packing:
+    """The coupling of a packing: entries of G off its unit diagonal, (m, K, B), at neighbours."""
+
+    entries: jax.Array
+    neighbours: Neighbours = dataclasses.field(metadata={"static": True})
+
+    def times(self, f: jax.Array) -> jax.Array:
+        """`G f` (m, B)."""
+        return f + neighbour_sum(self.entries, f, self.neighbours)
+
+    def magnitude(self) -> "Packing":
+        """|G|, entry by entry."""
+        return dataclasses.replace(self, entries=jnp.abs(self.entries))
+
+    def pull(self) -> "Packing":
+        """min(G, 0) with its unit diagonal."""
+        return dataclasses.replace(self, entries=jnp.minimum(self.entries, 0.0))
+
+
+Coupling = Chain | Dense | Packing
+
+
 class Frozen(NamedTuple):
     """What of the field does not change while the modes last."""
 
@@ -201,7 +226,7 @@ def as_pytree(flow: type[T]) -> type[T]:
 class ContactFlow(Flow):
     """Contacts without friction."""
 
-    coupling: Chain | Dense
+    coupling: Coupling
     omega: jax.Array  # (m, B)
     restitution: jax.Array  # (m, B)
     exponent_array: jax.Array | None  # (m, B)

@@ -21,21 +21,25 @@ from jimpact.events.batches import in_columns, with_tangents_in_columns
 from jimpact.events.contact_flow import (
     Chain,
     ContactFlow,
+    Coupling,
     Dense,
     Exponent,
+    Packing,
     Viscous,
     per_row,
 )
 from jimpact.events.friction_flow import FrictionFlow
 from jimpact.events.implicit_steps import ImplicitSteps
-from jimpact.events.plastic_limit import remainder, to_the_end
+from jimpact.events.plastic_limit import final_impulses, to_the_end
 from jimpact.events.reverse_mode import reversible_run
 from jimpact.events.slip import SlipFlow
 from jimpact.events.tangents import Dual, is_dual, pushforward, value_of
 from jimpact.solvers.dense import unit
 from jimpact.solvers.sensitivity import without_derivatives
+from jimpact.solvers.sparse import Neighbours
+from jimpact.solvers.step_impulses import descent_lengths
 from jimpact.solvers.tangential import TangentialBlock
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.solvers.tridiagonal import Structure, Symmetric, diagonal, off_diagonal, scaled
 from jimpact.status import CODE
 
 # Tolerance of a run with derivatives, as a multiple of that of values: derivatives are one or two
@@ -69,7 +73,7 @@ DENSE_CHAIN = 4  # contacts up to which a dense product is faster than shifts by
 class Problem(NamedTuple):
     """What the dimensionless outcome depends on, arrays (m,) but `off_diagonal`."""
 
-    off_diagonal: jax.Array  # of G: (m - 1,) of a chain, or the upper triangle
+    off_diagonal: jax.Array  # of G, see `off_diagonal`
     omega: jax.Array
     restitution: jax.Array
     exponent: jax.Array | None
@@ -125,7 +129,8 @@ def dimensionless(
     qn = gamma / root
     approach = jnp.where(gamma < 0, qn, 0.0)
     q = jax.lax.stop_gradient(jnp.sqrt(jnp.max(approach**2 + 2 * stored)))
-    x_ref = ((eta + 1) * q**2 / (2 * stiffness)) ** (1 / (eta + 1))
+    # q^2 / k may be too small or too large for a number where x_ref is not
+    x_ref = (jnp.sqrt((eta + 1) / 2) * q / jnp.sqrt(stiffness)) ** (2 / (eta + 1))
     t_ref = x_ref / (q * root)
     time = jax.lax.stop_gradient(jnp.min(t_ref))
     # the tolerance applies to velocities: where W_jj is large, impulses must be finer
@@ -134,14 +139,13 @@ def dimensionless(
     omega = time / t_ref
     closeness = jax.lax.stop_gradient(jnp.minimum(1.0, WIDE_SPREAD * jnp.min(omega)))
     g = scaled(delassus, 1 / root)
-    off_diagonal = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
     ones = jnp.ones_like(gamma)
     # errors of many contacts add up
     count = jnp.full((), m, dtype) if closed is None else jnp.sum(closed, dtype=dtype)
     count = jnp.maximum(count, 1)
     step = jax.lax.stop_gradient(rtol * jnp.minimum(1.0, 2 / count) / jnp.max(weight))
     problem = Problem(
-        off_diagonal=off_diagonal,
+        off_diagonal=off_diagonal(g),
         omega=omega,
         restitution=restitution * ones,
         exponent=exponent * ones if isinstance(exponent, jax.Array) else None,
@@ -162,19 +166,22 @@ def sides_of(contact: Contact, friction: jax.Array, units: ImpactUnits) -> Sides
     return Sides(block, friction * jnp.ones_like(units.root))
 
 
-def normal_coupling(problem: Problem, chain: bool) -> jax.Array:
+def normal_coupling(problem: Problem, structure: Structure) -> jax.Array:
     """G (m, m, B) from the entries that a problem holds."""
     m, (_, *batch) = problem.omega.shape[0], problem.omega.shape
+    chain = structure == "chain"
     i, j = (jnp.arange(m - 1), jnp.arange(1, m)) if chain else jnp.triu_indices(m, 1)
     upper = jnp.zeros((m, m, *batch), problem.omega.dtype).at[i, j].set(problem.off_diagonal)
     return unit(upper) + upper + jnp.swapaxes(upper, 0, 1)
 
 
-def coupling_of(problem: Problem, chain: bool) -> Chain | Dense:
+def coupling_of(problem: Problem, structure: Structure) -> Coupling:
     """G in the form in which it is multiplied."""
-    if chain and problem.omega.shape[0] > DENSE_CHAIN:
+    if isinstance(structure, Neighbours):
+        return Packing(problem.off_diagonal, structure)
+    if structure == "chain" and problem.omega.shape[0] > DENSE_CHAIN:
         return Chain(problem.off_diagonal)
-    return Dense(normal_coupling(problem, chain))
+    return Dense(normal_coupling(problem, structure))
 
 
 def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
@@ -188,12 +195,12 @@ def first_indentation(problem: Problem, exponent: Exponent | None) -> jax.Array:
 
 
 def flow_of(
-    problem: Problem, exponent: Exponent | None, chain: bool, tighten: float = 1.0
+    problem: Problem, exponent: Exponent | None, structure: Structure, tighten: float = 1.0
 ) -> tuple[ContactFlow, jax.Array, jax.Array]:
     """The flow of a problem in columns (.., B), and its first modes and state."""
     m, viscous = problem.omega.shape[0], problem.viscous
     parts: dict[str, Any] = dict(
-        coupling=coupling_of(problem, chain),
+        coupling=coupling_of(problem, structure),
         omega=problem.omega,
         restitution=problem.restitution,
         exponent_array=problem.exponent,
@@ -222,7 +229,7 @@ class ImpulseProgram:
 
     tree: Any
     exponent: float | tuple[float, ...] | None
-    chain: bool
+    structure: Structure
     most: int
     sides: int = 0  # tangential rows
     whole: bool = False
@@ -232,7 +239,7 @@ class ImpulseProgram:
 
     def flow(self, problem: Problem, tighten: float) -> tuple[ContactFlow, jax.Array, jax.Array]:
         """The flow of a problem, its first modes and state."""
-        flow, modes, y = flow_of(problem, self.exponent, self.chain, tighten)
+        flow, modes, y = flow_of(problem, self.exponent, self.structure, tighten)
         return dataclasses.replace(flow, closed_form=flow.closed_form and not self.whole), modes, y
 
     def shapes(self, *leaves: Any) -> tuple[jax.ShapeDtypeStruct, ...]:
@@ -277,19 +284,14 @@ class ImpulseProgram:
         else:
             end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
             state = end.carry.y
-        dp: Any = end.impulse
+        rows = 3 * gamma.shape[0]
+        p = value_of(state)[rows - len(gamma) : rows] + end.impulse
         if self.smooth or duals:
             last = flow, problem.gamma, state
-            dp = pushforward(lambda f, g, y: remainder(f, g, y, end.carries), *last)
-            dp = Dual(end.impulse, dp.tangents) if is_dual(dp) else dp
-        rows = 3 * gamma.shape[0]
-
-        def parts(state: jax.Array, dp: jax.Array) -> tuple[jax.Array, ...]:
-            """Normal impulses, tangential ones and time of the last state."""
-            p = state[rows - len(gamma) : rows] + dp
-            return p, state[rows + self.sides : -1][: self.sides], state[-1:]
-
-        p, *rest = pushforward(parts, state, dp)
+            plastic = pushforward(lambda f, g, y: final_impulses(f, g, y, end.carries), *last)
+            p = Dual(p, plastic.tangents) if is_dual(plastic) else plastic
+        sides = slice(rows + self.sides, rows + 2 * self.sides)
+        rest = pushforward(lambda y: (y[sides], y[-1:]), state)
         if self.smooth:
             return p, *rest
         p = end.with_kept(p) if self.finely and not duals else p
@@ -315,13 +317,16 @@ class ImplicitProgram(ImpulseProgram):
 
     def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
         """The contacts of a problem, and their state before the impact."""
-        coupling, m = coupling_of(problem, self.chain), problem.omega.shape[0]
+        coupling, m = coupling_of(problem, self.structure), problem.omega.shape[0]
         friction, velocity = jnp.zeros_like(problem.omega), problem.gamma
+        sliding = None
         if problem.sides is not None:
             (across, tangent, slip), friction = problem.sides
-            back, normal = jnp.swapaxes(across, 0, 1), normal_coupling(problem, self.chain)
+            back, normal = jnp.swapaxes(across, 0, 1), normal_coupling(problem, self.structure)
             rows = [jnp.concatenate(x, axis=1) for x in ((normal, across), (back, tangent))]
             coupling = Dense(jnp.concatenate(rows))
+            still = jax.lax.stop_gradient(coupling.matrix)
+            sliding = descent_lengths(still, m, friction_only=True)
             velocity = jnp.concatenate([velocity, slip])
         flow = ImplicitSteps(
             coupling=coupling,
@@ -330,6 +335,7 @@ class ImplicitProgram(ImpulseProgram):
             exponent_array=problem.exponent,
             friction=friction,
             descent=jax.lax.stop_gradient(implicit_steps.descent_of(coupling, m)),
+            sliding=sliding,
             tolerance=problem.tolerance * (IMPLICIT_TIGHTENING if self.finely else 1.0),
             viscous=problem.viscous,
             exponent_static=None if problem.exponent is not None else self.exponent,
@@ -398,7 +404,7 @@ class Dynamics(NamedTuple):
     problem: Problem
     units: ImpactUnits
     exponent: Exponent
-    chain: bool
+    structure: Structure
     max_steps: int
     method: str = "time"
 
@@ -421,7 +427,7 @@ class Dynamics(NamedTuple):
         """From `columns` to impulses; `whole`: no closed form ends it."""
         kind = ImplicitProgram if self.method == "implicit" else ImpulseProgram
         tree = self.columns()[1]
-        parts = tree, self.static_exponent, self.chain, self.max_steps, self.tangents
+        parts = tree, self.static_exponent, self.structure, self.max_steps, self.tangents
         return kind(*parts, whole=whole)
 
 
@@ -436,7 +442,7 @@ def solve(
     units, problem = dynamics.units, dynamics.problem
     if dynamics.method == "impulse":
         exponent, most = dynamics.static_exponent, dynamics.max_steps
-        p, code = impulse_form.solve(problem, exponent, dynamics.chain, most)
+        p, code = impulse_form.solve(problem, exponent, dynamics.structure, most)
         return p * units.momentum, None, code
     leaves, _ = dynamics.columns()
     if condition_check is not None:

@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact.events.contact_flow import (
-    Chain,
+    Coupling,
     Dense,
     Exponent,
     Viscous,
@@ -101,13 +101,14 @@ class Middle(NamedTuple):
 class ImplicitSteps:
     """Contacts with or without friction, arrays with the batch last; n = m + t rows."""
 
-    coupling: Chain | Dense  # K (n, n, B): G and the tangential block
+    coupling: Coupling  # K (n, n, B): G and the tangential block
     omega: jax.Array  # (m, B)
     restitution: jax.Array  # (m, B)
     exponent_array: jax.Array | None  # (m, B)
     friction: jax.Array  # (m, B)
     descent: jax.Array  # (n, B), see `descent_lengths`
     tolerance: jax.Array  # (1, B)
+    sliding: jax.Array | None = None  # (n, B), the same where no normal impulse is unknown
     viscous: Viscous | None = None
     exponent_static: float | tuple[float, ...] | None = None
     gapped: bool = False
@@ -197,12 +198,17 @@ class ImplicitSteps:
         self, velocity: jax.Array, load: jax.Array, unloading: jax.Array, friction: jax.Array
     ) -> StepProblem:
         """The convex problem of a stage."""
-        return StepProblem(self.coupling, velocity, load, unloading, friction, self.descent)
+        descent = self.descent
+        if self.sliding is not None:
+            unloads = jnp.any(unloading > 0, axis=0, keepdims=True)
+            descent = jnp.where(unloads, descent, self.sliding)
+        return StepProblem(self.coupling, velocity, load, unloading, friction, descent)
 
     def substep(
         self, s: ImplicitState, h: jax.Array, smooth: bool
     ) -> tuple[ImplicitState, jax.Array]:
-        """The state after h (1, B), and what it loses (1, B) by opening within the step."""
+        """The state after h (1, B), and its errors (1, B) that halves may not show: what it loses
+        by opening within the step, what its impulses leave, and what they drop too early."""
         m = self.contacts
         x, gamma = s.indentation, s.velocity[:m]
         stiff = jax.lax.stop_gradient(self.unloading(x, h)) > STIFF
@@ -210,7 +216,7 @@ class ImplicitSteps:
         load = h * self.force_of(half, gamma)
         unloading = jnp.where(stiff, self.unloading(half, h), 0.0)
         impulses = self.frictional_impulses if len(s.velocity) > m else self.normal_impulses
-        impulse, rate, load = impulses(s, h, Middle(half, load, unloading), smooth)
+        impulse, rate, load, left = impulses(s, h, Middle(half, load, unloading), smooth)
         velocity = s.velocity + self.coupling.times(impulse)
         normal, after = impulse[:m], velocity[:m]
 
@@ -226,19 +232,21 @@ class ImplicitSteps:
         opened = cut & (normal <= 0) & (after > 0)
         x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
         loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
+        loss = loss + left + self.dropped(load, opened, gamma, after)
         return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
 
     def frictional_impulses(
         self, s: ImplicitState, h: jax.Array, middle: Middle, smooth: bool
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Impulses (n, B) of both stages, those in unit time of the last one, and the load."""
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+        """Impulses (n, B) of both stages, those in unit time of the last one, the load, and the
+        error (1, B) of the velocities that the two solves leave."""
         m, solver = self.contacts, solve_smooth if smooth else solve
         inner, gamma = INNER * self.tolerance, s.velocity[:m]
         half, load, unloading = middle
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
-        first = solver(stage, h * s.rate, inner)
+        first, left = solver(stage, self.guess(s.rate, load), inner)
         if self.viscous is not None:  # the force at the velocity in the middle of the step
             load = h * self.force_of(half, gamma + self.coupling.times(first)[:m] / 2)
         side = (1 - PART) * first[m:]
@@ -247,29 +255,40 @@ class ImplicitSteps:
         # second stage, in units in which both rows have the weight PART
         stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
         guess = jnp.concatenate([first[:m] / PART, first[m:]])
-        second = solver(stage, guess, inner)
+        second, left_then = solver(stage, guess, inner)
         normal = PART * second[:m]
         impulse = jnp.concatenate([normal, side + PART * second[m:]])
-        return impulse, jnp.concatenate([normal, second[m:]]) / h, load
+        left = (1 - PART) * left + PART * left_then
+        return impulse, jnp.concatenate([normal, second[m:]]) / h, load, left
+
+    def guess(self, rate: jax.Array, load: jax.Array) -> jax.Array:
+        """Impulses (n, B): this load, and the parts of it that friction had in the last step."""
+        m = self.contacts
+        rows = len(rate) // m - 1
+        pressed = rate[:m] > 0
+        carried = jnp.repeat(jnp.where(pressed, rate[:m], 1.0), rows, axis=0)
+        loads = jnp.repeat(jnp.where(pressed, load, 0.0), rows, axis=0)
+        return jnp.concatenate([load, rate[m:] / carried * loads])
 
     def normal_impulses(
         self, s: ImplicitState, h: jax.Array, middle: Middle, smooth: bool
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """As `frictional_impulses`, without friction: the load, where nothing expands too fast."""
         half, load, unloading = middle
+        none = jnp.zeros_like(self.tolerance)
         if self.viscous is not None:  # never stiff; the force at the velocity in the middle
             load = h * self.force_of(half, s.velocity + self.coupling.times(load) / 2)
-            return load, load / h, load
+            return load, load / h, load, none
 
-        def cut(load: jax.Array, unloading: jax.Array) -> jax.Array:
+        def cut(load: jax.Array, unloading: jax.Array) -> tuple[jax.Array, jax.Array]:
             """What fast expansions leave of the load."""
             problem = self.problem(s.velocity, load, unloading, self.friction)
             solver = solve_smooth if smooth else solve
             return solver(problem, h * s.rate, INNER * self.tolerance)
 
         some = jnp.any(unloading > 0)
-        normal = jax.lax.cond(some, cut, lambda load, _: load, load, unloading)
-        return normal, normal / h, load
+        normal, left = jax.lax.cond(some, cut, lambda load, _: (load, none), load, unloading)
+        return normal, normal / h, load, left
 
     def turned(
         self, x: jax.Array, half: jax.Array, before: jax.Array, after: jax.Array, h: jax.Array
@@ -309,6 +328,17 @@ class ImplicitSteps:
         faster = self.least * left / jnp.where(gamma > 0, gamma, 1.0)
         speed = jnp.where(gone, jnp.minimum(root, faster), 0.0)
         return jnp.max(speed, axis=0, keepdims=True)
+
+    def dropped(
+        self, load: jax.Array, opened: jax.Array, before: jax.Array, after: jax.Array
+    ) -> jax.Array:
+        """Impulse (1, B) until gamma is 0, where contacts have `opened` (m, B) from the beginning.
+
+        While they approach, their force still acts; others then push them open.
+        """
+        turns = opened & (before < 0)
+        part = -before / jnp.where(turns, after - before, 1.0)
+        return jnp.max(jnp.where(turns, part * load, 0.0), axis=0, keepdims=True)
 
     def unseen(self, s: ImplicitState, end: ImplicitState, h: jax.Array) -> jax.Array:
         """Part (1, B) of a force that sets in with a jump which a step may miss by its estimate."""
@@ -350,12 +380,13 @@ class ImplicitSteps:
         return new, (error + jnp.sum(losses, axis=0)) / allowed
 
 
-def descent_of(coupling: Chain | Dense, contacts: int) -> jax.Array:
+def descent_of(coupling: Coupling, contacts: int) -> jax.Array:
     """Lengths (n, B) of descent of a coupling; see `descent_lengths`."""
     if isinstance(coupling, Dense):
         return descent_lengths(coupling.matrix, contacts)
-    ones = jnp.ones_like(coupling.off_diagonal[:1])
-    row_sums = coupling.magnitude().times(jnp.broadcast_to(ones, (contacts, *ones.shape[1:])))
+    batch = jax.tree.leaves(coupling)[0].shape[-1]
+    ones = jnp.ones((contacts, batch), jax.tree.leaves(coupling)[0].dtype)
+    row_sums = coupling.magnitude().times(ones)
     return ones / jnp.max(row_sums, axis=0, keepdims=True) * jnp.ones_like(row_sums)
 
 
@@ -389,6 +420,16 @@ def next_length(length: jax.Array, error: jax.Array) -> jax.Array:
     return jnp.where(error < jnp.inf, factor, SHRINK) * length
 
 
+def attempt(
+    flow: ImplicitSteps, state: ImplicitState, length: jax.Array, live: jax.Array
+) -> tuple[ImplicitState, jax.Array, jax.Array]:
+    """State, next length and acceptance (1, B) after one step tried in `live` (1, B) runs."""
+    new, error = flow.step(flow.coasted(state), length)
+    accepted = live & (error <= 1)
+    state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, state)
+    return state, jnp.where(live, next_length(length, error), length), accepted
+
+
 def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool) -> ImplicitRun:
     """From the start to the end of the impact; `keeps` the plan of the steps."""
     lanes = jnp.zeros(flow.tolerance.shape, jnp.int32)
@@ -401,13 +442,10 @@ def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool
         """Which impacts (1, B) are not over."""
         return ~run.over(flow, most)
 
-    def attempt(flow: ImplicitSteps, run: ImplicitRun) -> ImplicitRun:
+    def attempt_all(flow: ImplicitSteps, run: ImplicitRun) -> ImplicitRun:
         """One step tried in all impacts that go on."""
         live = goes_on(flow, run)
-        new, error = flow.step(flow.coasted(run.state), run.length)
-        accepted = live & (error <= 1)
-        state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, run.state)
-        length = jnp.where(live, next_length(run.length, error), run.length)
+        state, length, accepted = attempt(flow, run.state, run.length, live)
         plan = run.plan
         if plan is not None:
             at = plan.used[0], 0, np.arange(lanes.shape[1])
@@ -417,7 +455,7 @@ def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool
         return ImplicitRun(state, length, run.passes + live.astype(jnp.int32), plan)
 
     # a plan is long, and is not moved between slots
-    return (side_by_side if keeps else run_queue)(goes_on, attempt, flow, run)
+    return (side_by_side if keeps else run_queue)(goes_on, attempt_all, flow, run)
 
 
 def repeat(flow: ImplicitSteps, start: ImplicitState, plan: Plan) -> ImplicitState:

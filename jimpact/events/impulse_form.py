@@ -14,7 +14,8 @@ import jax.numpy as jnp
 
 from jimpact.events.contact_flow import Exponent, power
 from jimpact.solvers.sensitivity import both_modes
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal
+from jimpact.solvers.sparse import Neighbours, Sparse
+from jimpact.solvers.tridiagonal import Structure, Symmetric, Tridiagonal
 from jimpact.status import CODE
 
 # Part of the largest energy below which that of a contact is rounding, and the contact unloaded.
@@ -111,11 +112,13 @@ def walk(flow: Rule, dp: jax.Array, max_steps: int, gamma: jax.Array, energy: ja
     )
 
 
-def rule_of(problem: Any, exponent: Any, chain: bool) -> Rule:
+def rule_of(problem: Any, exponent: Any, structure: Structure) -> Rule:
     """The rule of a dimensionless problem (see `impact_dynamics.py`)."""
     m, eta = problem.gamma.shape[0], exponent if problem.exponent is None else problem.exponent
     coupling: Symmetric = Tridiagonal(jnp.ones_like(problem.gamma), problem.off_diagonal)
-    if not chain:
+    if isinstance(structure, Neighbours):
+        coupling = Sparse(jnp.ones_like(problem.gamma), problem.off_diagonal, structure)
+    elif structure is None:
         upper = (
             jnp.zeros((m, m), problem.gamma.dtype)
             .at[jnp.triu_indices(m, 1)]
@@ -125,13 +128,15 @@ def rule_of(problem: Any, exponent: Any, chain: bool) -> Rule:
     return Rule(coupling, problem.omega, problem.restitution, eta)
 
 
-def solve(problem: Any, exponent: Any, chain: bool, max_steps: int) -> tuple[jax.Array, jax.Array]:
+def solve(
+    problem: Any, exponent: Any, structure: Structure, max_steps: int
+) -> tuple[jax.Array, jax.Array]:
     """Dimensionless impulses and status; the step in impulse is the problem's `step`."""
 
     def run(problem: Any, differentiated: bool) -> tuple[jax.Array, jax.Array]:
         """Impulses and status, as `both_modes` takes them."""
         step = jax.lax.stop_gradient(problem.step[0])
-        rule = rule_of(problem, exponent, chain)
+        rule = rule_of(problem, exponent, structure)
         end = walk(rule, step, max_steps, problem.gamma, 0.5 * problem.energy)
         return end.p, jnp.where(at_work(end), CODE["max_steps"], CODE["ok"])
 

@@ -26,8 +26,8 @@ from jimpact.events.implicit_steps import (
     FIRST,
     ImplicitState,
     ImplicitSteps,
+    attempt,
     descent_of,
-    next_length,
 )
 from jimpact.events.stepper import any_of
 
@@ -93,20 +93,17 @@ def comes_to_rest(
         close = (own > COMPARED * visible) & (dp - s.impulse < MARGIN * own)
         return ~any_of(jnp.where(block, close, s.impulse > flow.tolerance))
 
-    def attempt(look: _Look) -> _Look:
+    def coarse_step(look: _Look) -> _Look:
         """One step tried, with errors that are a part of what is left."""
         live = goes_on(look)
         coarse = dataclasses.replace(steps, tolerance=COARSE * size(look.state))
-        new, error = coarse.step(look.state, look.length)
-        accepted = live & (error <= 1)
-        state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, look.state)
-        length = jnp.where(live, next_length(look.length, error), look.length)
+        state, length, _ = attempt(coarse, look.state, look.length, live)
         clear = look.clear & is_clear(state)
         return _Look(state, length, look.passes + live.astype(jnp.int32), clear)
 
     start = steps.start(x, flow.scales(modes) * g)
     none = jnp.zeros(visible.shape, jnp.int32)
     first = _Look(start, FIRST * jnp.ones_like(visible), none, is_clear(start))
-    end = jax.lax.while_loop(lambda look: jnp.any(goes_on(look)), attempt, first)
+    end = jax.lax.while_loop(lambda look: jnp.any(goes_on(look)), coarse_step, first)
     rests = ~any_of(block & (jnp.abs(end.state.velocity) > visible)) & any_of(block)
     return asked & end.clear & (size(end.state) <= LEFT * visible) & rests

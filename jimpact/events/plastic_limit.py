@@ -230,16 +230,23 @@ def plastic_impulses(
     return jax.lax.fori_loop(0, CHOICES, choose, (start, jnp.zeros_like(now)))
 
 
-def remainder(
+def final_impulses(
     flow: ContactFlow, gamma: jax.Array, state: jax.Array, carries: jax.Array
 ) -> jax.Array:
-    """The impulses of the contacts that carry at the end, as a smooth function of the rest."""
+    """p (m, B) after the last `state`; that of contacts at rest follows from `gamma+ = 0`.
+
+    Their closings do not matter for it: derivatives of earlier impulses grow with each closing, and
+    their rounding would remain where they cancel.
+    """
+    m, p = flow.contacts, flow.rows(state)[2]
 
     def some() -> jax.Array:
         """Impulses where a contact carries."""
-        return impulse_of_rest(flow, carries, gamma + flow.change(state))
+        others = state.at[2 * m : 3 * m].set(jnp.where(carries, 0.0, p))
+        of_rest = impulse_of_rest(flow, carries, gamma + flow.change(others))
+        return jnp.where(carries, of_rest, p)
 
-    return jax.lax.cond(jnp.any(carries), some, lambda: jnp.zeros_like(gamma))
+    return jax.lax.cond(jnp.any(carries), some, lambda: p)
 
 
 def impulse_of_rest(flow: ContactFlow, carries: jax.Array, after: jax.Array) -> jax.Array:

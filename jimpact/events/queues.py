@@ -10,7 +10,7 @@ import jax.numpy as jnp
 # that are free before they are filled with waiting impacts. Ten times more slots: more of them idle
 # while the last impacts end; ten times fewer: each operation has too few numbers to work on. Ten
 # times more free slots: all wait for the slowest impact again.
-SLOTS, FREE = 128, 8
+SLOTS, FREE = 64, 4
 
 Carry = TypeVar("Carry")
 

@@ -18,6 +18,7 @@ from jimpact._checks import as_whole, check_choice, check_values, suggestion
 from jimpact.files.shots_file import read_positions, read_shots
 
 STUDY = "study.toml"  # in a folder that `jimpact new` has made
+OF_A_SCENE = ("mass", "gaps", "tilt")  # parts of a scene that a fit may have as parameters
 
 
 class TableKeys(NamedTuple):
@@ -289,11 +290,11 @@ def body_keys(
     keys = {f"{name}_{_UNITS[name]}" if name in _UNITS else name: name for name in arguments}
     required = tuple(key for key, name in keys.items() if arguments[name])
     check_keys(where, table, ("kind", *keys, *others), required)
-    if "bodies" in table and "bodies" in keys:
-        within = f"{where.removesuffix(']')}.bodies]"
-        if not isinstance(table["bodies"], list):
+    for several in {"bodies", "fixed"} & keys.keys() & table.keys():
+        within = f"{where.removesuffix(']')}.{several}]"
+        if not isinstance(table[several], list):
             raise ValueError(f"[{within}] must be tables, each headed by [{within}].")
-        for part in table["bodies"]:
+        for part in table[several]:
             body_keys(within, part)
     return kind, keys
 
@@ -322,19 +323,19 @@ def check_law(
     check_keys("[law]", table, (*laws[study_law]["arguments"], *others))
     for key, pairs in known.items():
         fields = {_field(k): x for k, x in pairs.items()} if isinstance(pairs, dict) else pairs
-        check_keys(f"[law.{key}]", fields, tuple(laws[study_law]["parameters"]))
+        check_keys(f"[law.{key}]", fields, (*laws[study_law]["parameters"], *OF_A_SCENE))
     declared = laws[name]
+    fitted = (*declared["parameters"], *OF_A_SCENE)
     arguments = {k: x for k, x in arguments.items() if k in declared["arguments"]}
     known = {
-        key: {k: x for k, x in pairs.items() if _field(k) in declared["parameters"]}
-        for key, pairs in known.items()
+        key: {k: x for k, x in pairs.items() if _field(k) in fitted} for key, pairs in known.items()
     }
     _check_ranges(arguments, declared)
     if other_law is not None:
-        free = {k: mask for k, mask in free.items() if _field(k) in declared["parameters"]}
+        free = {k: mask for k, mask in free.items() if _field(k) in fitted}
     elif name in names()["laws"]:  # parts of a user's law may have parameters of their own
         for parameter in free:
-            if _field(parameter) not in declared["free"]:
+            if _field(parameter) not in (*declared["free"], *OF_A_SCENE):
                 raise ValueError(
                     f"`free` in [fit] must name parameters of {name}, "
                     f"{', '.join(declared['free'])}, but has {parameter!r}."

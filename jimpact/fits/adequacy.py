@@ -144,6 +144,8 @@ def _noise(problem: FitProblem, data: Weighted) -> tuple[float, int]:
         whole = np.array([block for block in blocks if len(block) == bodies])
         if len(whole) == 0:
             continue
+        if (whole == whole[0]).all():  # readings that repeat to the last digit: noise is hidden
+            whole = whole[:1]
         mean, basis = whole.mean(axis=0), conserved[shots[0]]
         squares += float(np.sum((whole - mean) ** 2))
         squares += len(whole) * float(np.sum((basis.T @ mean) ** 2))

@@ -89,13 +89,15 @@ def find_defects(
                 f"no contact approaches in {share(len(resting), total)}",
             )
         )
-    if experiments.sigma is None and _are_copies(experiments):
+    copies = _copies(experiments)
+    if experiments.sigma is None and 2 * copies > total > 1:
+        which = f"All {total}" if copies == total else f"{copies} of {total}"
         found.append(
             Finding(
-                f"All {total} shots are equal to the last digit, but for a factor: they carry no "
+                f"{which} shots are equal to the last digit, but for a factor: they carry no "
                 "more information than one of them, and none on the noise; without `sigma` or "
                 "`resolution` the errors are meaningless.",
-                f"the {total} shots are copies of one",
+                f"{'the' if copies == total else f'{copies} of'} {total} shots are copies of one",
             )
         )
     return found
@@ -141,14 +143,15 @@ def _balances(experiments: Experiments, scene: Scene | None, stored_energy: floa
     return _Balances(momenta, energies, resting)
 
 
-def _are_copies(experiments: Experiments) -> bool:
-    """Whether all shots of a scene are one, several times or scaled."""
+def _copies(experiments: Experiments) -> int:
+    """How many shots of a scene are one, several times or scaled; fewer if at most half are."""
+    if experiments.scenes is not None:
+        return 1
     rows = np.hstack([np.asarray(experiments.pre, float), np.asarray(experiments.post, float)])
-    if len(rows) < 2 or experiments.scenes is not None:
-        return False
     size = np.sqrt(np.nansum(rows**2, axis=1, keepdims=True))
-    unit = rows / np.where(size > 0, size, 1.0)
-    return bool(np.allclose(unit, unit[:1], rtol=0, atol=COPIED, equal_nan=True))
+    unit = np.nan_to_num(rows / np.where(size > 0, size, 1.0), nan=np.inf)
+    # what more than half have in common is the median
+    return int(np.isclose(unit, np.median(unit, axis=0), rtol=0, atol=COPIED).all(axis=1).sum())
 
 
 class _Defect(NamedTuple):

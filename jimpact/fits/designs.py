@@ -11,6 +11,7 @@ from jimpact.fits.experiments import Experiments
 from jimpact.fits.fitting import Fit
 from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.multistart import quiet, repeated, run
+from jimpact.fits.prediction import placed_fit
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.scene import Scene
 
@@ -81,9 +82,9 @@ def design(
         raise ValueError("Argument `fit` must be to shots, with a known noise.")
     if target is not None:
         check_choice("target", target, fit.names)
-    own = fit.problem.scene if scene is None else scene
+    law, own = placed_fit(fit, scene)
     labels, ties = fit.problem.parameters.labels, dict(fit.problem.ties)
-    problem = FitProblem.from_shots(fit.law, own, candidates, labels, ties=ties)
+    problem = FitProblem.from_shots(law, own, candidates, labels, ties=ties)
     scale = np.where(fit.problem.log, fit.value, fit.problem.scale)
     known = _information(fit.problem, fit, fit.noise).sum(axis=0)
     from_priors = fit.problem.prior_errors(fit.value)[1] * scale / fit.noise

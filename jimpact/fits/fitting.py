@@ -23,6 +23,7 @@ from jimpact.fits.report import report, verdict
 from jimpact.fits.result import FitMinimum, FitResult
 from jimpact.fits.robust import LOSSES, RobustSolution, robust_solution
 from jimpact.fits.saved import read_fit, write_fit
+from jimpact.fits.scene_parameters import plain_law
 from jimpact.fits.tables import as_dict, dataset, parameters_frame
 from jimpact.fits.uncertainty import RANK_TOLERANCE, Uncertainty, uncertainty
 from jimpact.fits.verdicts import fit_warnings
@@ -183,12 +184,15 @@ def fit(
         experiments: measured shots.
         free: names of fields or entries ('restitution[2]'), or {field: True, or a boolean mask over
             contacts, or numbers of groups}: contacts with equal numbers share one value, 0 is
-            fixed.
+            fixed. Also parts of the scene that all shots share, each with a prior: 'mass[2]' [kg],
+            'gaps[1]' [m], 'tilt[1]' [rad], by which the normal of a planar contact turns towards
+            its tangent; `Fit.scene` has them. Momentum and energy are judged with them.
         bounds: {field or entry: (low, high)}; default [0, 1] for restitution, > 0 for
             stiffness, ...
         priors: {parameter or field: (mean, standard deviation), or `ji.Normal`}: what is known of a
             parameter besides the data; each counts as one more measured value. The data need a
-            `sigma` (or `resolution`), which priors weigh against.
+            `sigma` (or `resolution`), which priors weigh against. Parts of a scene are searched
+            within ten standard deviations.
         ties: {field or entry: function}: what is not fitted but follows from other values, as in
             {"stiffness[2]": lambda p: 2 * p["restitution"]}; `p` has all fields and entries of the
             law by name. `Fit.tied` has the values with their errors. Functions must be
@@ -219,8 +223,9 @@ def fit(
 
     Raises:
         ValueError: unknown field, no free parameter, masks or bounds that do not fit, priors
-            outside bounds or without sigma, ties in a circle or outside a domain, bodies of scene
-            and experiments that differ in number, derivatives that are not finite.
+            outside bounds or without sigma, parts of a scene without a prior, ties in a circle or
+            outside a domain, bodies of scene and experiments that differ in number, derivatives
+            that are not finite.
 
     >>> import jimpact as ji
     >>> data = ji.Experiments(pre=[[1.0, 0.0], [2.0, 0.0]], post=[[0.3, 0.7], [0.6, 1.4]])
@@ -318,22 +323,13 @@ def as_fit(
     """The fit at the end of a search: errors, rank and warnings."""
     if robust is not None:
         solution = _without_robust_factors(problem, robust)
-    best, size = solution.minima[0], problem.size
-    errors = _uncertainty(problem, solution, best)
-    if robust is not None:
-        freedom = errors.degrees_of_freedom
-        noise = np.nan if problem.sigma is None else 1.0
-        if freedom > 0:
-            noise = robust.noise / np.sqrt(freedom)
-        errors = _uncertainty(problem, solution, best, noise)
-    elif problem.sigma is not None:
-        times = stretch(problem, weighted(problem, solution), errors.rank)
-        if times > 1:
-            errors = _uncertainty(problem, solution, best, times)
+    size = problem.size
+    judged = replace(problem, scene=problem.to_scene(solution.value))
+    errors = _errors(problem, judged, solution, robust)
     residual = np.asarray(problem.measured, float) - solution.predicted
-    findings = fit_warnings(problem, solution, errors, robust is not None)
+    findings = fit_warnings(judged, solution, errors, robust is not None)
     return Fit(
-        law=problem.residuals.law_of(solution.entries),
+        law=plain_law(problem.residuals.law_of(solution.entries)),
         method=method if isinstance(method, str) else "optax",
         names=problem.names,
         value=solution.value,
@@ -381,6 +377,25 @@ def _without_robust_factors(problem: FitProblem, robust: RobustSolution) -> Sear
     jacobian = back * solution.jacobian
     minimum = Minimum(squares, solution.value, 1, jacobian)
     return solution._replace(jacobian=jacobian, minima=[minimum])
+
+
+def _errors(
+    problem: FitProblem, judged: FitProblem, solution: SearchResult, robust: RobustSolution | None
+) -> Uncertainty:
+    """Errors of the parameters; with known errors of the data wider where the law does not fit."""
+    best = solution.minima[0]
+    errors = _uncertainty(problem, solution, best)
+    if robust is not None:
+        freedom = errors.degrees_of_freedom
+        noise = np.nan if problem.sigma is None else 1.0
+        if freedom > 0:
+            noise = robust.noise / np.sqrt(freedom)
+        return _uncertainty(problem, solution, best, noise)
+    if problem.sigma is not None:
+        times = stretch(judged, weighted(problem, solution), errors.rank)
+        if times > 1:
+            return _uncertainty(problem, solution, best, times)
+    return errors
 
 
 def _uncertainty(

@@ -14,8 +14,9 @@ from jimpact.fits.multistart import SearchResult, ends, quiet, repeated, run
 from jimpact.fits.parameters import value_of
 from jimpact.fits.problem import FitProblem, filled_up
 from jimpact.fits.result import FitResult
+from jimpact.fits.scene_parameters import LawInScene
 from jimpact.fits.ties import entry_of, tied_names, tied_places
-from jimpact.law import parameters_of
+from jimpact.law import Law, parameters_of
 from jimpact.scene import Scene
 
 
@@ -48,11 +49,11 @@ def predicted(fit: FitResult, shots: Any, scene: Scene | None, level: float) -> 
             f"fit, but has shape {np.shape(data)}."
         )
     data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
-    own = fit.problem.scene if scene is None else scene
+    law, own = placed_fit(fit, scene)
     largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)
     _check_scene(fit, largest, len(units))
     ties = dict(fit.problem.ties)
-    problem = FitProblem.from_shots(fit.law, own, data, fit.problem.parameters.labels, ties=ties)
+    problem = FitProblem.from_shots(law, own, data, fit.problem.parameters.labels, ties=ties)
     y = problem.point(problem.start)
     box: Any = BoxRegion(*np.broadcast_to(y.astype(problem.residuals.offset.dtype), (2, len(y))))
     held = eqx.tree_at(
@@ -66,6 +67,21 @@ def predicted(fit: FitResult, shots: Any, scene: Scene | None, level: float) -> 
     value, noise = solution.predicted, _noise_of(fit, shots)
     half = quantile * np.hypot(error, noise)
     return Predicted(value, error, np.asarray(solution.status), noise, value - half, value + half)
+
+
+def placed_fit(fit: FitResult, scene: Scene | None) -> tuple[Law, Scene | None]:
+    """The law of a fit, with the parts of the scene that were fitted, and the scene of new shots.
+
+    Raises:
+        ValueError: another scene than that of which parts were fitted.
+    """
+    law = fit.law_in_scene
+    if isinstance(law, LawInScene) and scene is not None:
+        raise ValueError(
+            "Argument `scene` must be left out where parts of the scene were fitted: they hold for "
+            "that of the fit only."
+        )
+    return law, fit.problem.scene if scene is None else scene
 
 
 def _check_scene(fit: FitResult, scene: Any, size: int) -> None:
@@ -110,7 +126,7 @@ def tied_values(fit: FitResult) -> dict[str, tuple[float, float]]:
 
     def values(x: jax.Array) -> jax.Array:
         """The tied entries of parameters x."""
-        law = problem.to_law(x)
+        law = problem.law_in_scene(x)
         parts = [jnp.ravel(value_of(law, entry_of(name)[0])) for name, _ in ties]
         places = tied_places(law, ties).values()
         return jnp.concatenate([part[np.array(at)] for part, at in zip(parts, places)])
@@ -120,4 +136,4 @@ def tied_values(fit: FitResult) -> dict[str, tuple[float, float]]:
     x = jnp.asarray(fit.value, problem.precision)
     errors = fit.errors_of(np.asarray(jax.jacfwd(values)(x), float))
     pairs = zip(np.asarray(values(x), float).tolist(), errors.tolist())
-    return dict(zip(tied_names(fit.law, ties), pairs))
+    return dict(zip(tied_names(problem.law, ties), pairs))

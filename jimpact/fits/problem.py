@@ -17,6 +17,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_concrete, check_kind, check_values
 from jimpact.compiling import quick_jit
+from jimpact.files.study_file import OF_A_SCENE
 from jimpact.fits.experiments import Experiments, kept_by_corrections
 from jimpact.fits.least_squares import BoxRegion, Method, Region, SolverState, advance, begin
 from jimpact.fits.matrix_fit import matrix_region
@@ -29,6 +30,13 @@ from jimpact.fits.parameters import (
     free_parameters,
     priors_of,
     with_entries,
+)
+from jimpact.fits.scene_parameters import (
+    REACH,
+    LawInScene,
+    placed,
+    plain_law,
+    with_parts_of_scene,
 )
 from jimpact.fits.ties import Ties, checked_ties, entry_of, tied
 from jimpact.impacts import impact
@@ -67,7 +75,8 @@ class Shots(eqx.Module):
 
     def __call__(self, law: Law) -> Prediction:
         """Velocities after every shot, and the status of its impact."""
-        out = jax.vmap(impact, in_axes=(None, 0, 0))(law, self.scenes, self.pre)
+        law, scenes = placed(law, self.scenes)
+        out = jax.vmap(impact, in_axes=(None, 0, 0))(law, scenes, self.pre)
         bad = meaningless(out.status)
         return Prediction(out.velocity[:, : self.bodies], bad[:, None], out.status)
 
@@ -239,6 +248,7 @@ class FitProblem:
         check_concrete("scene", scene)
         scenes = experiments.each(scene, lambda s: s)
         same = experiments.scenes is None
+        fixed, law = law, with_parts_of_scene(law, scene, not same, free)
         alike, extra = stackable(scenes[:1] if same else scenes)
         dtype = _dtype(law, alike, experiments.pre)
         pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
@@ -254,6 +264,8 @@ class FitProblem:
         sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
         errors = experiments.natural_errors(scene) if sigma is None else sigma
         choice = _choice(law, observe, free, bounds, priors, ties)
+        if law is not fixed:
+            choice = choice._replace(limits=_limits_of_scene(choice))
         problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
         values = problem.values - experiments.lost_freedom
         problem = replace(problem, values=values, experiments=experiments, scene=scene)
@@ -353,7 +365,7 @@ class FitProblem:
 
     @property
     def law(self) -> Law:
-        """The law with its start values."""
+        """The law with its start values, and with the parts of the scene that are fitted."""
         return self.residuals.law
 
     @property
@@ -383,6 +395,17 @@ class FitProblem:
 
     def to_law(self, x: Any) -> Law:
         """The law with parameters x (P,)."""
+        return plain_law(self.law_in_scene(x))
+
+    def to_scene(self, x: Any) -> Scene | None:
+        """The scene with parameters x (P,); None where each shot has its own."""
+        law = self.law_in_scene(x)
+        if self.scene is None or not isinstance(law, LawInScene):
+            return self.scene
+        return law.in_scene(self.scene)
+
+    def law_in_scene(self, x: Any) -> Law:
+        """The law with parameters x (P,), and with the parts of the scene that are fitted."""
         return self.residuals.law_at(self._scaled(x))
 
     def residual(self, x: Any) -> jax.Array:
@@ -593,6 +616,33 @@ def _choice(
     return _Choice(law, parameters, notes, limits, priors_of(parameters, limits, priors), functions)
 
 
+def _limits_of_scene(choice: _Choice) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of all parameters, those of the scene no farther away than their priors allow.
+
+    Raises:
+        ValueError: a part of the scene without a prior, or far from it at the start.
+    """
+    parameters, priors = choice.parameters, {prior.parameter: prior for prior in choice.priors}
+    low, high = (end.copy() for end in choice.limits)
+    start = entries(choice.law, parameters.fields)[parameters.first]
+    for i, name in enumerate(parameters.names):
+        if parameters.field_of(i) not in OF_A_SCENE:
+            continue
+        if i not in priors:
+            raise ValueError(
+                f"Argument `priors` must have (mean, standard deviation) for `{name}`, a part of "
+                "the scene that is fitted with the law."
+            )
+        _, mean, std = priors[i]
+        low[i], high[i] = max(low[i], mean - REACH * std), min(high[i], mean + REACH * std)
+        if not low[i] <= start[i] <= high[i]:
+            raise ValueError(
+                f"Argument `priors` must have a mean for `{name}` within {REACH:g} standard "
+                f"deviations of its value in the scene, {start[i]:g}, but has {mean:g} ± {std:g}."
+            )
+    return low, high
+
+
 def _build(
     choice: _Choice,
     observe: Observable,
@@ -617,19 +667,18 @@ def _build(
     size = unit * np.linalg.norm(weight)
     values = entries(law, parameters.fields)
     scale, log = _scales(parameters, values, energy)
+    for prior in priors:
+        if parameters.field_of(prior.parameter) in OF_A_SCENE:  # a gap is far smaller than 1 m
+            scale[list(parameters.groups[prior.parameter])] = prior.std
     offset, mix = to_scaled(values, scale, log), np.zeros((len(values), len(values)))
     for i, group in enumerate(parameters.groups):
         mix[list(group), i], offset[list(group)] = 1.0, 0.0
     ends = np.zeros((2, len(values)))
     first, count = parameters.first, len(parameters.names)
     ends[:, :count] = [to_scaled(end, scale[first], log[first]) for end in limits]
-    prior_mean, prior_weight = np.zeros((2, len(values)))
-    for prior in priors:
-        prior_mean[first[prior.parameter]] = prior.mean
-        prior_weight[first[prior.parameter]] = 1 / prior.std
-    arrays = {"mix": mix, "offset": offset, "scale": scale, "low": ends[0], "high": ends[1]}
+    arrays = _prior_arrays(priors, first, len(values)) | {"size": size, "unit": unit}
+    arrays |= {"mix": mix, "offset": offset, "scale": scale, "low": ends[0], "high": ends[1]}
     arrays |= {"measured": np.nan_to_num(measured), "weight": weight / size}
-    arrays |= {"size": size, "unit": unit, "prior_mean": prior_mean, "prior_weight": prior_weight}
     region = matrix_region(law, scenes, scale * offset, scale[:, None] * mix, ends)
     if region is not None and any(entry_of(name)[0] == "matrix" for name, _ in ties):
         raise ValueError("Argument `ties` must not tie a `matrix` that has to stay admissible.")
@@ -654,6 +703,14 @@ def _build(
         values_known,
         priors=priors,
     )
+
+
+def _prior_arrays(priors: tuple[Prior, ...], first: Any, count: int) -> dict[str, np.ndarray]:
+    """Mean and 1 / std (count,) of the priors, each at its parameter's first entry."""
+    mean, weight = np.zeros((2, count))
+    for prior in priors:
+        mean[first[prior.parameter]], weight[first[prior.parameter]] = prior.mean, 1 / prior.std
+    return {"prior_mean": mean, "prior_weight": weight}
 
 
 def _scales(
@@ -701,12 +758,13 @@ def filled_up(residuals: Residuals) -> Residuals:
 @quick_jit
 def _slopes_before(law: Law, shots: Shots) -> jax.Array:
     """Compiled `dv+/dv-` of every shot."""
+    law, scenes = placed(law, shots.scenes)
 
     def after(v: jax.Array, scene: Scene) -> jax.Array:
         """v+ of v-."""
         return impact(law, scene, v).velocity
 
-    return jax.vmap(jax.jacfwd(after))(shots.pre, shots.scenes)
+    return jax.vmap(jax.jacfwd(after))(shots.pre, scenes)
 
 
 def slopes_before(law: Law, shots: Any) -> np.ndarray:

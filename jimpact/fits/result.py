@@ -12,6 +12,9 @@ from jimpact.fits.intervals import Profile, check_level, joined
 from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.parameters import AnyLaw
 from jimpact.fits.problem import FitProblem
+from jimpact.fits.scene_parameters import LawInScene
+from jimpact.law import Law
+from jimpact.scene import Scene
 
 # Relative standard error of a stiffness beyond which its linearized interval is not believed.
 HARDLY_SEEN = 0.2
@@ -115,6 +118,17 @@ class FitResult(Generic[AnyLaw]):
     seed: int = 0
     profiles: tuple[Profile, ...] = ()
     reservations: tuple[str, ...] = ()
+
+    @property
+    def scene(self) -> Scene | None:
+        """The scene of all shots, with what was fitted of it; None: the shots have their own."""
+        return self.problem.to_scene(self.value)
+
+    @property
+    def law_in_scene(self) -> Law:
+        """The law, and with it the parts of the scene that were fitted."""
+        fitted = isinstance(self.problem.law, LawInScene)
+        return self.problem.law_in_scene(self.value) if fitted else self.law
 
     @property
     def determined(self) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Does a parameter differ from shot to shot: a random effect, estimated next to the fit."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,12 @@ SHOWN_FROM = 8  # number of shots from which a report includes it
 SURE = 0.01  # p-value below which scatter counts as detected
 _SMALLEST = 1e-4  # scatter looked for, in standard errors of one shot
 _LARGEST = 1e4  # likewise, the upper end of the search
+_SLOPES = (-1.0, 0.0, 1.0)  # slopes of angles from which correlations are searched
+_STEEP = 50.0  # largest slope of a correlation's angle: correlations of +-0.9998
+_LIMIT = 3.8415  # chi^2 with one degree of freedom, 95 %
+# Of the logarithm of a standard deviation where its interval ends. With ten times more the ends
+# would be off by a percent.
+_END = 1e-3
 _NO_CHANCE = 1e-15  # smaller p-values are rounding, and printed as "below"
 
 
@@ -103,30 +110,17 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
     >>> bool(0.035 < result.value < 0.065), result.chance < 1e-6
     (True, True)
     """
-    from scipy.optimize import minimize_scalar  # late: slow to import
-
     which = _which(fit, name)
-    residual, jacobian, shot = _weighted(fit)
-    shots = np.unique(shot[shot != NO_SHOT])
-    if len(shots) < LEAST_SHOTS:
-        raise ValueError(
-            f"Argument `fit` must be of at least {LEAST_SHOTS} shots, but has {len(shots)}."
-        )
-    known = fit.problem.sigma is not None
-    model = _Model(residual, jacobian, shot, shots, which, fit.problem.values, known)
-    typical = 1 / np.sqrt(np.mean(model.seen))  # error of one shot
-    ends = np.log([_SMALLEST * typical, _LARGEST * typical])
-    best = minimize_scalar(
-        lambda log: model.deviance(float(np.exp(log))), bounds=tuple(ends), method="bounded"
-    )
-    least, none = float(best.fun), model.deviance(0.0)
+    model = _Model(fit, [which])
+    log = _alone(model, 0)
+    least, none = model.deviance(np.exp([[log]])), model.deviance(np.zeros((1, 1)))
     gain = max(none - least, 0.0)
-    ratio = float(np.exp(best.x)) if gain > 0 else 0.0  # over the noise
-    change, covariance, squares, freedom = model.solve(ratio)
-    noise = 1.0 if known else float(np.sqrt(squares / freedom)) if freedom > 0 else np.nan
-    change_of_each = model.projected / np.where(model.seen > 0, model.seen, np.nan)
+    ratio = float(np.exp(log)) if gain > 0 else 0.0  # over the noise
+    change, covariance, squares, freedom = model.solve(np.array([[ratio]]))
+    noise, seen = model.noise(squares, freedom), model.seen[:, 0, 0]
+    change_of_each = model.projected[:, 0] / np.where(seen > 0, seen, np.nan)
     with np.errstate(divide="ignore"):
-        each_error = noise / np.sqrt(model.seen)
+        each_error = noise / np.sqrt(seen)
     return Scatter(
         name=fit.names[which],
         value=ratio * noise,
@@ -139,6 +133,154 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
         each=fit.value[which] + change_of_each,
         each_error=each_error,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class JointScatter:
+    """Scatter of several parameters `names` (q) between shots, and the fit with it.
+
+    `value` (q,) their standard deviations, `interval` (q, 2) of these at 95 %, `correlation`
+    (q, q); `mean` and `standard_error` (P,) of all parameters of the fit; `chance` is the p-value
+    of no scatter at all, at most.
+    """
+
+    names: tuple[str, ...]
+    value: np.ndarray
+    interval: np.ndarray
+    correlation: np.ndarray
+    mean: np.ndarray
+    standard_error: np.ndarray
+    chance: float
+
+    def __str__(self) -> str:
+        lines = [
+            f"{name} scatters by {value:.2g} ({low:.2g} to {high:.2g}, 95 %) from shot to shot."
+            for name, value, (low, high) in zip(self.names, self.value, self.interval)
+        ]
+        pairs = zip(*np.triu_indices(len(self.names), 1))
+        lines += [
+            f"Correlation of {self.names[i]} and {self.names[j]}: {self.correlation[i, j]:.2f}."
+            for i, j in pairs
+        ]
+        return "\n".join(lines)
+
+
+def joint_scatter(fit: FitResult, names: Sequence[str], correlated: bool = True) -> JointScatter:
+    """Several parameters that each shot draws anew: their standard deviations and correlations.
+
+    Equation: `r_k = J_k (x - x_fit) + Z_k b_k + noise`, `b_k ~ N(0, D)`, Z_k the columns of the
+    parameters in J_k; D maximizes the restricted likelihood, linearized at the fit. The interval of
+    a standard deviation is where that likelihood, with the best of all others in D, is at most
+    1.92 below its maximum in the logarithm. The p-value, of chi^2 with as many degrees of freedom
+    as D has numbers, is an upper bound: at 0 the true one is smaller.
+
+    Args:
+        fit: of at least 4 shots.
+        names: of at least two parameters that the data see.
+        correlated: whether they may correlate.
+
+    Returns:
+        `JointScatter`; `print` says it in words.
+
+    Raises:
+        ValueError: too few shots or names, an unknown name, or one that the data cannot see.
+
+    Source: Pinheiro and Bates, Mixed-Effects Models in S and S-PLUS (2000), chapter 2.
+
+    >>> import numpy as np
+    >>> import jimpact as ji
+    >>> a, b = np.array([0.65, 0.7, 0.75, 0.6]), np.array([0.62, 0.6, 0.58, 0.57])
+    >>> post = np.stack([-2 * a - b, a - b, a + 2 * b], axis=1) / 3
+    >>> data = ji.Experiments(np.tile([1.0, 0.0, -1.0], (4, 1)), post, 0.002)
+    >>> result = ji.fit(ji.Newton([0.9, 0.9]), ji.chain([1.0, 1.0, 1.0]), data, starts=1)
+    >>> print(ji.joint_scatter(result, result.names, correlated=False))
+    restitution[1] scatters by 0.064 (0.034 to 0.19, 95 %) from shot to shot.
+    restitution[2] scatters by 0.022 (0.011 to 0.065, 95 %) from shot to shot.
+    Correlation of restitution[1] and restitution[2]: 0.00.
+    """
+    if len(set(names)) < 2:
+        raise ValueError(f"Argument `names` must have at least two parameters, but is {names!r}.")
+    model, count = _Model(fit, [_which(fit, name) for name in names]), len(names)
+    free = count + (count * (count - 1) // 2 if correlated else 0)
+    best, least = _best(model, free)
+    root = _root(model, best)
+    change, covariance, squares, freedom = model.solve(root)
+    noise, spread = model.noise(squares, freedom), root @ root.T
+    ratio = np.sqrt(np.diag(spread))
+    gain = max(model.deviance(np.zeros_like(root)) - least, 0.0)
+    ends = np.array([_ends(model, best, least, i) for i in range(count)])
+    return JointScatter(
+        names=tuple(names),
+        value=noise * ratio,
+        interval=noise * ends,
+        correlation=spread / np.outer(ratio, ratio),
+        mean=fit.value + change,
+        standard_error=noise * np.sqrt(np.diag(covariance)),
+        chance=float(chdtrc(free, gain)),
+    )
+
+
+def _root(model: "_Model", x: np.ndarray) -> np.ndarray:
+    """L (q, q) of x: logarithms of q standard deviations, then the correlations' angles."""
+    q = len(model.typical)
+    rows = np.eye(q)
+    rows[np.tril_indices(q, -1)] = x[q:] if len(x) > q else 0.0
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(np.exp(x[:q])[:, None] * rows)
+
+
+def _best(model: "_Model", free: int) -> tuple[np.ndarray, float]:
+    """The best x (free,) and its deviance, from each scatter alone and several correlations."""
+    alone = [_alone(model, i) for i in range(len(model.typical))]
+    starts = [np.append(alone, np.full(free - len(alone), slope)) for slope in _SLOPES]
+    return min((_least(model, start) for start in starts), key=lambda found: found[1])
+
+
+def _alone(model: "_Model", i: int) -> float:
+    """Logarithm of the best scatter, over the noise, of the i-th parameter alone."""
+    from scipy.optimize import minimize_scalar  # late: slow to import
+
+    only = np.zeros((len(model.typical),) * 2)
+    only[i, i] = 1.0
+    ends = np.log(model.typical[i]) + np.log([_SMALLEST, _LARGEST])
+    found = minimize_scalar(
+        lambda log: model.deviance(np.exp(log) * only), bounds=tuple(ends), method="bounded"
+    )
+    return float(found.x)
+
+
+def _least(
+    model: "_Model", start: np.ndarray, fixed: tuple[int, float] | None = None
+) -> tuple[np.ndarray, float]:
+    """The best x near a start and its deviance; `fixed`: an entry that has this value."""
+    from scipy.optimize import minimize  # late: slow to import
+
+    more, reach = len(start) - len(model.typical), np.log([_SMALLEST, _LARGEST])
+    bounds = [*(np.log(model.typical)[:, None] + reach), *[(-_STEEP, _STEEP)] * more]
+    if fixed is not None:
+        i, value = fixed
+        bounds[i], start = (value, value), np.where(np.arange(len(start)) == i, value, start)
+    found = minimize(
+        lambda x: model.deviance(_root(model, x)), start, method="L-BFGS-B", bounds=bounds
+    )
+    return found.x, float(found.fun)
+
+
+def _ends(model: "_Model", best: np.ndarray, least: float, i: int) -> tuple[float, float]:
+    """Where the deviance of the i-th standard deviation, over the noise, passes its limit."""
+    from scipy.optimize import brentq  # late: slow to import
+
+    def above(log: float) -> float:
+        """The deviance with this logarithm, over the limit."""
+        return _least(model, best, (i, log))[1] - least - _LIMIT
+
+    ends = []
+    for edge, none in ((_SMALLEST, 0.0), (_LARGEST, np.inf)):
+        far = float(np.log(edge * model.typical[i]))
+        ends.append(
+            none if above(far) <= 0 else float(np.exp(brentq(above, best[i], far, xtol=_END)))
+        )
+    return ends[0], ends[1]
 
 
 def shown_scatter(fit: FitResult) -> Scatter | None:
@@ -179,43 +321,53 @@ def _weighted(fit: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 class _Model:
-    """Shots with noise 1 and an effect of standard deviation t along j_k."""
+    """Shots with noise 1 and effects of covariance L L^T along the columns of Z_k (., q)."""
 
-    def __init__(
-        self,
-        residual: np.ndarray,
-        jacobian: np.ndarray,
-        shot: np.ndarray,
-        shots: np.ndarray,
-        which: int,
-        values: int,
-        known: bool,
-    ):
-        column = jacobian[:, which]
-        member = shot[None, :] == shots[:, None]
+    def __init__(self, fit: FitResult, which: list[int]):
+        residual, jacobian, shot = _weighted(fit)
+        shots = np.unique(shot[shot != NO_SHOT])
+        if len(shots) < LEAST_SHOTS:
+            raise ValueError(
+                f"Argument `fit` must be of at least {LEAST_SHOTS} shots, but has {len(shots)}."
+            )
+        columns, member = jacobian[:, which], (shot[None, :] == shots[:, None]).astype(float)
         self.residual, self.jacobian = residual, jacobian
-        self.seen = member @ column**2  # |j_k|^2
-        self.projected = member @ (column * residual)  # j_k . r_k
-        self.crossed = member @ (column[:, None] * jacobian)  # j_k . J_k
-        self.values, self.known = values, known
+        self.seen = np.einsum("kr,rp,rq->kpq", member, columns, columns)  # Z_k^T Z_k
+        self.projected = np.einsum("kr,rp,r->kp", member, columns, residual)  # Z_k^T r_k
+        self.crossed = np.einsum("kr,rp,rq->kpq", member, columns, jacobian)  # Z_k^T J_k
+        self.values, self.known = fit.problem.values, fit.problem.sigma is not None
+        # scatter is searched around the error that one shot has
+        self.typical = 1 / np.sqrt(np.mean(np.diagonal(self.seen, axis1=1, axis2=2), axis=0))
 
-    def solve(self, t: float) -> tuple[np.ndarray, np.ndarray, float, int]:
-        """Change of the parameters, covariance, sum of squares, degrees of freedom."""
-        less = t**2 / (1 + t**2 * self.seen)
+    def solve(self, root: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, int]:
+        """Change of the parameters, covariance, sum of squares, degrees of freedom; `root` is L."""
+        less = root @ np.linalg.inv(self._inner(root)) @ root.T
         information = self.jacobian.T @ self.jacobian
-        information = information - self.crossed.T @ (less[:, None] * self.crossed)
-        right = self.jacobian.T @ self.residual - self.crossed.T @ (less * self.projected)
+        information = information - np.einsum("kpi,kpq,kqj", self.crossed, less, self.crossed)
+        right = self.jacobian.T @ self.residual
+        right = right - np.einsum("kpi,kpq,kq", self.crossed, less, self.projected)
         covariance = np.linalg.pinv(information, hermitian=True)
         change = covariance @ right
-        squares = self.residual @ self.residual - less @ self.projected**2 - right @ change
+        squares = self.residual @ self.residual - right @ change
+        squares -= np.einsum("kp,kpq,kq", self.projected, less, self.projected)
         rank = np.linalg.matrix_rank(information, hermitian=True)
         return change, covariance, float(squares), int(self.values - rank)
 
-    def deviance(self, t: float) -> float:
+    def _inner(self, root: np.ndarray) -> np.ndarray:
+        """`1 + L^T Z_k^T Z_k L` (K, q, q)."""
+        return np.eye(len(root)) + root.T @ self.seen @ root
+
+    def deviance(self, root: np.ndarray) -> float:
         """-2 log of the restricted likelihood, up to a constant."""
-        _, covariance, squares, freedom = self.solve(t)
-        spread = float(np.sum(np.log1p(t**2 * self.seen)))
+        _, covariance, squares, freedom = self.solve(root)
+        spread = float(np.sum(np.linalg.slogdet(self._inner(root))[1]))
         information = -np.linalg.slogdet(covariance)[1]
         if self.known:
             return spread + information + squares
         return spread + information + freedom * float(np.log(max(squares, np.finfo(float).tiny)))
+
+    def noise(self, squares: float, freedom: int) -> float:
+        """Of one value, in units of sigma."""
+        if self.known:
+            return 1.0
+        return float(np.sqrt(squares / freedom)) if freedom > 0 else np.nan

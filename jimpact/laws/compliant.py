@@ -139,7 +139,7 @@ class Compliant(Law):
             problem = problem._replace(limit=depth / units.indentation)
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, exponent, contact.chain, self.max_steps, method)
+        return Dynamics(problem, units, exponent, contact.structure, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses over the whole encounter, gaps included."""

@@ -11,6 +11,7 @@ from jimpact.compiling import quick_jit
 from jimpact.events.batches import in_columns
 from jimpact.events.contact_flow import ContactStates
 from jimpact.events.impact_history import history_program
+from jimpact.impacts import NO_OFFSETS, Traced, check_constrained
 from jimpact.law import Law, check_law
 from jimpact.scene import Scene, as_velocity, gap_velocity, velocity_change
 
@@ -80,13 +81,14 @@ def history(law: Law, scene: Scene, velocity: Any, samples: int = 200) -> Histor
     as_whole("samples", samples, 2)
     v = as_velocity(scene, velocity)
     check_values("velocity", v)
+    check_constrained(scene, v)
     law, scene, v = in_common_dtype(law, scene, v)
     check_law(law, scene, v.dtype)
-    return _history(law, scene, v, samples)
+    return _history(law, scene, v, samples, Traced.of(law, scene, v))
 
 
 @quick_jit
-def _history(law: Law, scene: Scene, v: jax.Array, samples: int) -> History:
+def _history(law: Law, scene: Scene, v: jax.Array, samples: int, traced: Traced) -> History:
     """The samples of the dimensionless flow, in SI units."""
     contact = law.contact(scene, v)
     happens, gamma = contact.happens, contact.gap_velocity
@@ -112,6 +114,8 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int) -> History:
     rubbed = live(states.tangential_force * (units.velocity / root / units.time)[None])
     rates = live(states.gap_velocity * (units.velocity * units.root)[None], gamma[None])
     growth = jax.vmap(lambda dv: gap_velocity(scene, dv))(change(pressed, rubbed))
+    size = jnp.where(happens, contact.size, 1.0)
+    finite = jnp.all(jnp.isfinite(impulse)) & jnp.all(jnp.isfinite(at))
     return History(
         time=at,
         force=pressed,
@@ -126,7 +130,7 @@ def _history(law: Law, scene: Scene, v: jax.Array, samples: int) -> History:
         slip=live(states.slip * (units.velocity * root)[None], slip[None]),
         duration=live(time[-1, 0, 0] * units.time),
         maximum_force=live(maximum * force),
-        status=live(code[0]).astype(jnp.int32),
+        status=traced.status((law, scene, v, NO_OFFSETS), live(code[0]), size, finite),
     )
 
 

@@ -59,7 +59,7 @@ class Kinematic(Law):
             return frictional_impulses(contact, required, mu, e_t, complementary=self.complementary)
         w = contact.delassus
         if self.complementary:
-            solution = solve_lcp(as_matrix(w), required, regular=is_regular(w))
+            solution = solve_lcp(w, required)
             return Impulses(solution.z, None, solution.code)
         return prescribed_impulses(contact, required)
 

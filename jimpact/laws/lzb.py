@@ -263,7 +263,7 @@ class LZB(Law):
         )
         if self.friction is not None:
             problem = problem._replace(sides=sides_of(contact, self.friction, units))
-        return Dynamics(problem, units, self.exponent, contact.chain, self.max_steps, method)
+        return Dynamics(problem, units, self.exponent, contact.structure, self.max_steps, method)
 
     def impulses(self, contact: Contact) -> Impulses:
         """Impulses at the end of the impact dynamics."""

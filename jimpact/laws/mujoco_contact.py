@@ -89,8 +89,7 @@ def mujoco_restitution(
     0.41, from 0.01 to 0.81
     """
     _check(timestep, solimp, speed)
-    stiffness, damping = _stiffness_and_damping(solref, timestep, _clipped(solimp)[1])
-    e = _restitution(stiffness, damping, timestep, solimp, speed)
+    e = _restitution(solref, timestep, solimp, speed)
     return MujocoRestitution(float(e.mean()), float(e.min()), float(e.max()))
 
 
@@ -133,13 +132,12 @@ def mujoco_solref(
     _check(timestep, solimp, speed)
     duration = _STEPS_A_CONTACT * timestep if duration is None else duration
     check_values("duration", duration, low=0.0, open_low=True)
-    largest = _clipped(solimp)[1]
     stiffness = (np.pi / duration) ** 2
 
     def excess(damping: float) -> float:
         """The mean coefficient with this damping over what it should be."""
-        of_contact = stiffness / largest**2, damping / largest
-        return float(_restitution(*of_contact, timestep, solimp, speed).mean()) - restitution
+        e = _restitution((-stiffness, -damping), timestep, solimp, speed)
+        return float(e.mean()) - restitution
 
     ends = 0.0, 1.0 / timestep  # beyond, a step reverses the velocity
     if excess(ends[0]) <= 0.0:
@@ -188,7 +186,7 @@ def _clipped(solimp: tuple[float, ...]) -> tuple[float, float, float, float, flo
 
 def _impedance(depth: np.ndarray, solimp: tuple[float, ...]) -> np.ndarray:
     """d by the depth of penetration: a smooth step from dmin to dmax over the width."""
-    least, most, width, middle, power = _clipped(solimp)
+    least, most, width, middle, power = solimp
     if least == most or width == 0:
         return np.full_like(depth, (least + most) / 2)
     x = np.minimum(depth / width, 1.0)
@@ -198,9 +196,11 @@ def _impedance(depth: np.ndarray, solimp: tuple[float, ...]) -> np.ndarray:
 
 
 def _restitution(
-    stiffness: float, damping: float, timestep: float, solimp: tuple[float, ...], speed: float
+    solref: tuple[float, float], timestep: float, solimp: tuple[float, ...], speed: float
 ) -> np.ndarray:
     """e for each instant within a step at which the contact may begin."""
+    solimp = _clipped(solimp)
+    stiffness, damping = _stiffness_and_damping(solref, timestep, largest=solimp[1])
     v = np.full(_PHASES, -speed)
     r = -speed * timestep * (np.arange(_PHASES) + 0.5) / _PHASES
     in_contact = np.ones(_PHASES, bool)

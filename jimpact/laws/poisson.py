@@ -73,13 +73,13 @@ class Poisson(Law):
         mu, e_t = self.friction, self.tangential_restitution
         if mu is not None and e_t is not None:
             return self._with_friction(contact, mu, e_t)
-        w, regular = as_matrix(contact.delassus), is_regular(contact.delassus)
-        compression = solve_lcp(w, contact.gap_velocity, regular=regular)
+        w = contact.delassus
+        compression = solve_lcp(w, contact.gap_velocity)
         returned = self.restitution * compression.z
-        supplement = solve_lcp(w, compression.w + w @ returned, regular=regular)
+        supplement = solve_lcp(w, compression.w + w @ returned)
         code = jnp.maximum(compression.code, supplement.code)
-        if self.restitution.ndim == 1 and not regular:
-            shared = _depends_on_sharing(w, self.restitution, compression.z > 0)
+        if self.restitution.ndim == 1 and not is_regular(w):
+            shared = _depends_on_sharing(as_matrix(w), self.restitution, compression.z > 0)
             code = jnp.maximum(code, jnp.where(shared, CODE["several_outcomes"], CODE["ok"]))
         return Impulses(compression.z + returned + supplement.z, None, code)
 

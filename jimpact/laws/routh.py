@@ -5,7 +5,6 @@ import jax.numpy as jnp
 from jimpact.contact import Contact
 from jimpact.law import Impulses, Law, Values, parameter
 from jimpact.solvers.lcp import solve_lcp
-from jimpact.solvers.tridiagonal import as_matrix, is_regular
 
 
 class Routh(Law):
@@ -42,7 +41,7 @@ class Routh(Law):
     def impulses(self, contact: Contact) -> Impulses:
         """The impulse of compression, 1 + e times."""
         w, gamma, e = contact.delassus, contact.gap_velocity, self.restitution
-        compression = solve_lcp(as_matrix(w), gamma, regular=is_regular(w))
+        compression = solve_lcp(w, gamma)
         if e.ndim:
             work = compression.z * jnp.maximum(-gamma, 0.0)
             kept = jnp.sum(e**2 * work) / jnp.sum(work)

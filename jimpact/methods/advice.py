@@ -319,7 +319,7 @@ def situation_of(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> S
     if far.any():
         assert scene.gaps is not None
         scene = with_gaps(scene, jnp.where(jnp.asarray(far), jnp.inf, scene.gaps))
-    blocks = _blocks(scene, gamma, np.flatnonzero(~far), law.friction is not None)
+    blocks = blocks_of(scene, gamma, np.flatnonzero(~far), law.friction is not None)
     acting = np.zeros(len(gamma), bool)
     gapped = np.zeros(len(gamma), bool)
     for block in blocks:
@@ -351,7 +351,7 @@ def _can_close(scene: Scene, velocity: np.ndarray, law: LZB, known: bool) -> np.
     return np.asarray(scene.gaps) <= fastest * duration
 
 
-def _blocks(
+def blocks_of(
     scene: Scene, gamma: np.ndarray, contacts: np.ndarray, friction: bool
 ) -> tuple[ContactBlock, ...]:
     """These contacts in blocks that feel each other."""
@@ -362,9 +362,9 @@ def _blocks(
     blocks = []
     for first in np.unique(label):
         members = np.flatnonzero(label == first)
-        pairs = [(i, j) for i, j in itertools.combinations(members, 2) if touch[i, j]]
-        angles = [float(angle[contacts[i], contacts[j]]) for i, j in pairs]
-        ends = (min(angles), max(angles)) if angles else None
+        inside = np.ix_(contacts[members], contacts[members])
+        angles = angle[inside][np.triu(touch[np.ix_(members, members)], 1)]
+        ends = (float(angles.min()), float(angles.max())) if angles.size else None
         joined = contacts[members]
         blocks.append(ContactBlock(tuple(joined.tolist()), bool((gamma[joined] < 0).any()), ends))
     return tuple(blocks)

@@ -60,27 +60,43 @@ def kinematics(
     """Value, rate, drift and gradient of the gaps, or of what slides (its value is 0)."""
     body, zero, one = system.body, jnp.zeros_like(t), jnp.ones_like(t)
 
-    def gap(u: jax.Array, s: jax.Array) -> jax.Array:
-        """Gaps (m,) after the displacement u (n,) and the time s."""
-        return gaps(system, body.nearby(q, u), t + s)
+    def place(s: jax.Array) -> jax.Array:
+        """The configuration, seen from the base, after the time s."""
+        return seen_from_base(system, body.nearby(q, s * v), t + s)
 
-    def slips(s: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Slip (k,) and tangents (n, k) after the time s."""
-        h = body.tangents(seen_from_base(system, body.nearby(q, s * v), t + s))
+    def along(s: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        """Velocities (k,) along the directions (n, k) after the time s; values, directions."""
+        found = (None, body.tangents(place(s))) if of_tangents else body.gaps_and_normals(place(s))
+        assert found is not None
+        value, h = found
         assert h is not None
         carried = base_velocity(system, t + s)
-        return h.T @ (v if carried is None else v - carried), h
+        rate = h.T @ (v if carried is None else v - carried)
+        return rate, (jnp.zeros_like(rate) if value is None else value, h)
 
-    if of_tangents:
-        (rate, h), (drift, _) = jax.jvp(slips, (zero,), (one,))
-        return Kinematics(jnp.zeros_like(rate), rate, drift, h)
+    if of_tangents or _has_formula(system, q):
+        rate, drift, (value, h) = jax.jvp(along, (zero,), (one,), has_aux=True)
+        return Kinematics(value, rate, drift, h)
 
     def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Gaps and gap velocities (m,) after the time s."""
-        return jax.jvp(lambda s: gap(s * v, s), (s,), (jnp.ones_like(s),))
+        return jax.jvp(lambda s: jnp.atleast_1d(body.gap_function(place(s))), (s,), (one,))
 
     (value, rate), (_, drift) = jax.jvp(rates, (zero,), (one,))
-    return Kinematics(value, rate, drift, jax.jacfwd(gap)(0 * v, zero).T)
+    return Kinematics(value, rate, drift, normals_at(system, q, t))
+
+
+def _has_formula(system: System, q: jax.Array) -> bool:
+    """Whether the body's normals need no differentiation."""
+    return jax.eval_shape(system.body.gaps_and_normals, q) is not None
+
+
+def normals_at(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
+    """N (n, m); by forward differentiation, as gap functions may have loops."""
+    if _has_formula(system, q):
+        return system.body.normals(seen_from_base(system, q, t))
+    still = jnp.zeros(mass_at(system, q).shape[:1], q.dtype)
+    return jax.jacfwd(lambda u: gaps(system, system.body.nearby(q, u), t))(still).T
 
 
 def mass_at(system: System, q: jax.Array) -> jax.Array:

@@ -9,6 +9,7 @@ differentiates it in both modes and any order. Its blocks of rows are checkpoint
 without a step are skipped.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -524,31 +525,13 @@ def _again(
         state = jax.lax.cond(any_lane(row.accepted), step, lambda y, *_: y, state, row, sample)
         return state, (packed(state)[:, 0], numbers)
 
-    def block(y: Any, xs: Any) -> tuple[Any, Any]:
-        """A block of rows between two checkpoints."""
-
-        def walk(y: Any) -> tuple[Any, Any]:
-            return jax.lax.scan(jax.checkpoint(one), y, xs)
-
-        def stay(y: Any) -> tuple[Any, Any]:
-            nothing = jnp.zeros((BLOCK, len(packed(start)) + width), start.q.dtype)
-            return y, (nothing[:, width:], nothing[:, :width])
-
-        some = xs[0].event.happens | xs[0].accepted
-        return jax.lax.cond(any_lane(jnp.any(some)), walk, stay, y)
-
-    xs = PlanRow(rows.event._replace(happens=happens), accepted, rows.aim), reached
-    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), xs)
-    states, numbers = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
-
     def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
         """The values in the first rows with a flag; derivatives of further ones are NaN."""
-        so_far, wanted = jnp.cumsum(flags, dtype=jnp.int32), jnp.arange(count, dtype=jnp.int32)
-        row = jnp.minimum(jnp.searchsorted(so_far, wanted + 1), size - 1)
-        known = wanted < so_far[-1]
-        values = jnp.where(known[:, None], values.reshape(size, -1)[row], 0.0)
+        values, known = _first_rows(flags, values, count)
         return values + nan_derivatives(problem, known).astype(values.dtype)
 
+    todo = PlanRow(rows.event._replace(happens=happens), accepted, rows.aim)
+    states, numbers = _in_blocks(one, start, todo, reached, (len(packed(start)), width))
     samples = at(sampled, states, times.shape[0])
     first = packed(start)[:, 0][None]
     # all derivatives are NaN if rows ran out
@@ -557,3 +540,38 @@ def _again(
     unknown = jnp.where(plan.lost, jnp.nan, 0.0) * jnp.sum(jnp.stack(finite))
     events = at(written, numbers, max_events + 1)
     return jnp.concatenate([first, samples]) + unknown, events + unknown
+
+
+def _in_blocks(
+    one: Callable[[State, Any], tuple[State, Any]],
+    start: State,
+    rows: PlanRow,
+    reached: jax.Array,
+    sizes: tuple[int, int],
+) -> tuple[jax.Array, jax.Array]:
+    """The two arrays, of these sizes, that `one` gives for each row of the plan.
+
+    Between two blocks of rows lies a checkpoint; a block in which nothing happens is left out.
+    """
+
+    def block(state: State, xs: Any) -> tuple[State, Any]:
+        def walk(state: State) -> tuple[State, Any]:
+            return jax.lax.scan(jax.checkpoint(one), state, xs)
+
+        def stay(state: State) -> tuple[State, Any]:
+            return state, tuple(jnp.zeros((BLOCK, size), start.q.dtype) for size in sizes)
+
+        some = xs[0].event.happens | xs[0].accepted
+        return jax.lax.cond(any_lane(jnp.any(some)), walk, stay, state)
+
+    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), (rows, reached))
+    values = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
+    return jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), values)
+
+
+def _first_rows(flags: jax.Array, values: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
+    """Values (count, k) of the first rows with a flag, else 0; and which of them there are."""
+    so_far, wanted = jnp.cumsum(flags, dtype=jnp.int32), jnp.arange(count, dtype=jnp.int32)
+    row = jnp.minimum(jnp.searchsorted(so_far, wanted + 1), len(flags) - 1)
+    known = wanted < so_far[-1]
+    return jnp.where(known[:, None], values[row], 0.0), known

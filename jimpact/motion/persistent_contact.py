@@ -410,10 +410,9 @@ def choose_with_friction(
     """
     contacts, mu = jax.lax.stop_gradient((contacts, mu))
     assert contacts.tangent is not None
-    m = touching.shape[0]
     begun = jnp.any(before.active & ~before.stick & (before.sign == BEGINS))
     asked = _ModeQuestion(contacts, mu, touching, released, sliding, begun, slack)
-    now, direction_now, stuck = _expected(asked, before)
+    now, direction_now = _expected(asked, before)
     no, one = jnp.asarray(False), jnp.ones_like(slack)
     start = _ModeTrial(now, direction_now, touching, one, no, no, no, jnp.asarray(0))
     end = jax.lax.while_loop(
@@ -422,17 +421,7 @@ def choose_with_friction(
         start,
     )
     parts, several = touching & ~end.allowed, end.several & end.solved
-    choice = ModeChoice(end.modes, end.solved, end.regularity, several, parts)
-    if not in_space(contacts):
-        return choice
-    lets_go = jnp.any(released[:m]) | jnp.any(released[m:] & before.stick)
-    sticks = _all_stick(asked, stuck) & ~lets_go
-    still = Modes(touching, touching & ~sliding, jnp.ones_like(now.sign))
-    return jax.tree.map(
-        lambda a, b: jnp.where(sticks, a, b),
-        ModeChoice(still, ~no, one, several, no & touching),
-        choice,
-    )
+    return ModeChoice(end.modes, end.solved, end.regularity, several, parts)
 
 
 class _ModeQuestion(NamedTuple):
@@ -445,6 +434,12 @@ class _ModeQuestion(NamedTuple):
     sliding: jax.Array  # (m,)
     begun: jax.Array  # () slip that only began before: now it slides or sticks, nothing begins
     slack: jax.Array
+
+    @property
+    def still(self) -> Modes:
+        """What touches and does not slide sticks."""
+        ones = jnp.ones(len(self.mu), self.mu.dtype)
+        return Modes(self.touching, self.touching & ~self.sliding, ones)
 
 
 class _ModeTrial(NamedTuple):
@@ -460,11 +455,8 @@ class _ModeTrial(NamedTuple):
     passes: jax.Array
 
 
-def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array, Forces]:
-    """Modes as they were but for what has let go, directions (m, rows) of slip where it is known.
-
-    And the forces if all sticks that does not slide yet.
-    """
+def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array]:
+    """Modes as they were but for what has let go; directions (m, rows) of slip that is known."""
     contacts, mu, touching, released, sliding, _, slack = asked
     assert contacts.tangent is not None
     m, spatial = len(mu), in_space(contacts)
@@ -478,10 +470,8 @@ def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array, Fo
     moves = direction(by_contact(contacts.tangent.rate, m))
     slides = jnp.where(sliding[:, None], moves, 0.0 if spatial else now.sign[:, None])
     # sliding begins against the last force of sticking
-    still = Modes(touching, touching & ~sliding, jnp.ones_like(now.sign))
-    tries = jax.tree.map(
-        lambda *x: jnp.stack(x), now._replace(active=touching & ~released[:m]), still
-    )
+    held_on = now._replace(active=touching & ~released[:m])
+    tries = jax.tree.map(lambda *x: jnp.stack(x), held_on, asked.still)
     both = jax.lax.map(lambda modes: forces(contacts, mu, modes, slides), tries)
     held, stuck = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
     assert held.tangential is not None
@@ -492,7 +482,7 @@ def _expected(asked: _ModeQuestion, before: Modes) -> tuple[Modes, jax.Array, Fo
             before.active & before.stick & ~sliding & (cone_margins(contacts, mu, stuck) <= slack)
         )
         starts = starts | (at_rim & jnp.any(broken))
-    return now, jnp.where(starts[:, None], against, slides), stuck
+    return now, jnp.where(starts[:, None], against, slides)
 
 
 def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
@@ -544,16 +534,6 @@ def _next_trial(asked: _ModeQuestion, tried: _ModeTrial) -> _ModeTrial:
         solved & open_ones_part & ~jnp.any(wedged | returns),
         tried.passes + 1,
     )
-
-
-def _all_stick(asked: _ModeQuestion, force: Forces) -> jax.Array:
-    """Whether () these forces press all that is touching, and hold all that does not slide.
-
-    Half of the slack is for slip that has fallen back to 0: flights end beyond all of it.
-    """
-    touching, stick = asked.touching, asked.touching & ~asked.sliding
-    holds = ~stick | (cone_margins(asked.contacts, asked.mu, force) > -0.5 * asked.slack)
-    return jnp.all(~touching | (force.normal > 0)) & jnp.all(holds)
 
 
 def pressed_together(

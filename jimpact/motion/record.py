@@ -321,7 +321,7 @@ def load_motion(path: str | Path) -> Motion:
         with np.load(Path(path), allow_pickle=False) as file:
             arrays = dict(file)
     except (ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{wrong}cannot be read: {error}") from error
+        raise ValueError(f"{wrong}cannot be read.") from error
     found = arrays.pop("format", None)
     if found is None or not {"time", "status", "events.kind"} <= set(arrays):
         raise ValueError(f"{wrong}holds something else.")

@@ -35,8 +35,8 @@ from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
     gaps,
-    kinematics,
     mass_at,
+    normals_at,
     seen_from_base,
     solve_mass,
     user_force,
@@ -366,8 +366,7 @@ def _contacts(
         pairs = pairs if friction else pairs._replace(directions=pairs.directions[:, :1])
         of_bodies = 1 / mass.reshape(-1, pairs.directions.shape[-1])
         return _ActiveContacts(pairs, jnp.pad(of_bodies, ((0, 1), (0, 0))))
-    normal = kinematics(system, q, jnp.zeros(mass.shape[:1], q.dtype), t)
-    gap, normals = normal.value, normal.gradient
+    gap, normals = gaps(system, q, t), normals_at(system, q, t)
     n, m = normals.shape
     directions = (normals + 0 * gap[None])[:, :, None]  # NaN where the gap is
     if friction:
@@ -435,7 +434,7 @@ def _set_up(problem: _StepProblem, progress: _Progress, t: jax.Array) -> _Setup:
     law_velocity = state.v if joint else state.v + 0.5 * h * free
     impulse, law_status = jnp.zeros_like(before), jnp.int32(CODE["ok"])
     if not joint:
-        scene = scene_at(system, q, state.v, middle, contacts.closed)
+        scene = scene_at(system, q, middle, contacts.closed)
         relative = law_velocity - base_velocity
         impulse, law_status = jax.lax.cond(
             jnp.any(strikes),

@@ -9,9 +9,9 @@ from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.motion.dynamics import (
     carried_along,
-    kinematics,
     kinetic,
     mass_at,
+    normals_at,
     not_rounding,
     seen_from_base,
 )
@@ -71,12 +71,11 @@ def no_jump(state: State, m: int, sides: int) -> Jump:
     return Jump(state.v, none, side, jnp.zeros((2, m), none.dtype), zero, jnp.int32(CODE["ok"]))
 
 
-def scene_at(system: System, q: jax.Array, v: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
+def scene_at(system: System, q: jax.Array, t: jax.Array, closed: jax.Array) -> Scene:
     """The scene that a law sees: normals and tangents at q; open contacts are out of reach."""
-    normal = kinematics(system, q, v, t)
     tangents = system.body.tangents(seen_from_base(system, q, t))
     away = jnp.where(closed, 0.0, jnp.inf).astype(q.dtype)
-    return Scene(mass_at(system, q), normal.gradient, tangents, away)
+    return Scene(mass_at(system, q), normals_at(system, q, t), tangents, away)
 
 
 def impact_jump(
@@ -93,7 +92,7 @@ def impact_jump(
     Gap velocities up to `noise` are rounding, on the scale of the motion; `approach`: see `impact`.
     """
     m = closed.shape[0]
-    scene = scene_at(system, state.q, state.v, t, closed)
+    scene = scene_at(system, state.q, t, closed)
     carried = carried_along(system, state.v, t)
     relative = state.v - carried
     out = impact(law, scene, relative, noise, approach)

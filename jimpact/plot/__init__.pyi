@@ -26,7 +26,7 @@ from .laws import (
 )
 from .montecarlo import monte_carlo as monte_carlo
 from .motions import motion as motion, phase_portrait as phase_portrait
-from .systems import system as system
+from .systems import force_chains as force_chains, system as system
 from .theory import (
     admissible_set as admissible_set,
     rocking_dispersion as rocking_dispersion,

@@ -1,13 +1,16 @@
-"""Picture of a system before anything happens: a row of bodies, or a body at a configuration."""
+"""Pictures of a system before anything happens, and of the forces in a packing."""
 
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from jimpact._checks import check_kind, check_shape
 from jimpact.bodies.base import Body
+from jimpact.bodies.piles import Discs, Spheres
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
 from jimpact.plot.style import COLOURS, GREY, SMALL, finish, heading, new_figure
@@ -16,6 +19,8 @@ from jimpact.scene import Scene, as_velocity
 _GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
 _LEAST = 0.35  # radius of a small body, likewise
 _ARROW = 2.2  # length of the fastest velocity, likewise
+_THICKEST = 8.0  # line of the largest impulse [points]; ten times more hides the bodies
+_FAINT = 1e-3  # impulses over the largest one that are not drawn; ten times more breaks chains
 
 
 def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
@@ -53,6 +58,71 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
         axes.set_xlabel("x [m]")
         axes.set_ylabel("height [m]")
         finish(axes)
+    heading(figure, title)
+    return figure
+
+
+def force_chains(
+    pile: Discs | Spheres, q: Any, scene: Scene, impulse: Any, title: str = ""
+) -> Figure:
+    """The impulses in a packing as lines between the centres, as thick as they are large.
+
+    Spheres are seen from the side, along y; lines in front cover those behind.
+
+    Args:
+        pile: its bodies.
+        q: where they are (n,), as for `pile.touching(q)`.
+        scene: `pile.touching(q)`.
+        impulse: p (m,) [N s] of an impact on this scene.
+        title: above the picture.
+
+    Returns:
+        A matplotlib figure: `.savefig(path)` writes it.
+
+    Raises:
+        TypeError: another body, or a scene that `touching` did not make. ValueError: not one
+            impulse per contact.
+
+    >>> import jimpact as ji
+    >>> balls = ji.Spheres(1.0, [0.1, 0.1])
+    >>> q = balls.at([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3]])
+    >>> figure = ji.plot.force_chains(balls, q, balls.touching(q), [1.0])
+    >>> len(figure.axes[0].collections)
+    1
+    """
+    if not isinstance(pile, (Discs, Spheres)):
+        raise TypeError(
+            f"Argument `pile` must be Discs or Spheres, but is a {type(pile).__name__}."
+        )
+    check_kind("scene", scene, Scene)
+    if scene.pairs is None or scene.size != pile.mass.shape[0]:
+        raise TypeError("Argument `scene` must be `pile.touching(q)`.")
+    p = np.asarray(impulse, float)
+    check_shape("impulse", p, (scene.contacts,), "one per contact")
+    d = pile.dimension
+    axis = [0, d - 1]  # seen from the side
+    centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
+    first, second = scene.pairs.neighbours.bodies.T
+    towards = np.asarray(scene.pairs.directions)[:, 0, :d]
+    on_wall = centres[first] - np.asarray(pile.radii)[first, None] * towards
+    ends = np.where((second < 0)[:, None], on_wall, centres[second])
+    size = np.abs(p) / (np.abs(p).max() or 1.0)
+    drawn = np.flatnonzero(size > _FAINT)
+    drawn = drawn[np.argsort(size[drawn])]
+    figure = new_figure(5.0)
+    axes = figure.subplots()
+    for centre, radius in zip(centres[:, axis], np.asarray(pile.radii)):
+        axes.add_patch(Circle(tuple(centre), radius, fc="none", ec=GREY, lw=0.4, alpha=0.5))
+    lines = np.stack([centres[first], ends], axis=1)[drawn][:, :, axis]
+    widths = _THICKEST * size[drawn]
+    axes.add_collection(
+        LineCollection(list(lines), linewidths=widths, colors=COLOURS[0], alpha=0.8)
+    )
+    axes.set_aspect("equal")
+    axes.autoscale_view()
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("height [m]")
+    finish(axes)
     heading(figure, title)
     return figure
 

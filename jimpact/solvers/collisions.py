@@ -16,7 +16,14 @@ from jimpact.loops import while_loop
 from jimpact.solvers.friction import solve as solve_friction
 from jimpact.solvers.sensitivity import both_modes
 from jimpact.solvers.tangential import TangentialBlock, per_tangent
-from jimpact.solvers.tridiagonal import Symmetric, Tridiagonal, diagonal, scaled
+from jimpact.solvers.tridiagonal import (
+    Symmetric,
+    Tridiagonal,
+    as_matrix,
+    diagonal,
+    off_diagonal,
+    scaled,
+)
 from jimpact.status import CODE
 
 # eps, relative to the largest normalized approach velocity at the start: slower approaches are
@@ -133,8 +140,7 @@ def to_inputs(
     """The normalized problem. Gaps and `sqrt(W_jj)` only order the collisions: no derivatives."""
     root = jnp.sqrt(diagonal(delassus))
     g = scaled(delassus, 1 / root)
-    m = gamma.shape[0]
-    coupling = g.off_diagonal if isinstance(g, Tridiagonal) else g[jnp.triu_indices(m, 1)]
+    coupling = off_diagonal(g if isinstance(g, Tridiagonal) else as_matrix(g))
     fixed = jax.lax.stop_gradient
     if friction is not None:
         friction = friction._replace(block=friction.block.scaled(root))
@@ -261,9 +267,9 @@ def first_to_close(
 
 def times(g: Symmetric, vector: jax.Array) -> jax.Array:
     """`G vector` without the reduced precision that accelerators use in products."""
-    if isinstance(g, Tridiagonal):
-        return g @ vector
-    return jnp.sum(g * vector[None, :], axis=1)
+    if isinstance(g, jax.Array):
+        return jnp.sum(g * vector[None, :], axis=1)
+    return g @ vector
 
 
 def collide(inputs: Inputs, options: Options, g: Symmetric, at: CollisionState) -> CollisionState:

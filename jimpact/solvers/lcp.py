@@ -12,6 +12,9 @@ import jax.numpy as jnp
 
 from jimpact.loops import while_loop
 from jimpact.solvers.dense import null_projector
+from jimpact.solvers.many_contacts import solve_many
+from jimpact.solvers.sparse import Sparse, conjugate_gradients
+from jimpact.solvers.tridiagonal import Symmetric, as_matrix, is_regular
 from jimpact.status import CODE
 
 # The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Entries below this times
@@ -19,6 +22,11 @@ from jimpact.status import CODE
 _ROUNDING = 64.0
 _POWER = 2 / 3  # of eps: see `gathered_rounding`
 _PIVOTS = 10  # pivots allowed per unknown; 1 or 2 are usual
+
+# A sparse problem is solved by descent until it moves less than this many roundings, relative to
+# the largest q. Ten times more: velocities lose a digit.
+_DESCENT_ROUNDINGS = 256
+_DESCENTS = 100_000  # steps of descent at most; packings of 3000 spheres take some thousand
 
 
 class LCP(NamedTuple):
@@ -38,17 +46,19 @@ class _Tableau(NamedTuple):
 
 
 def solve_lcp(
-    matrix: jax.Array, q: jax.Array, *, symmetric: bool = True, regular: bool = False
+    matrix: Symmetric, q: jax.Array, *, symmetric: bool = True, regular: bool | None = None
 ) -> LCP:
     """Solve `0 <= z _|_ A z + q >= 0`.
 
     Args:
-        matrix: A (m, m): symmetric positive semidefinite, or not symmetric (`symmetric=False`) and
-            such that Lemke's method applies (positive semidefinite, copositive plus, P).
+        matrix: A (m, m): symmetric positive semidefinite, stored in any way, or not symmetric
+            (`symmetric=False`) and such that Lemke's method applies (positive semidefinite,
+            copositive plus, P).
         q: (m,).
         symmetric: w is then unique; where z is not, the z of least norm (in the scaling that
             makes the diagonal 1) is returned, with the code `impulse_not_unique`.
-        regular: A is known to be regular, which saves the search for its null space.
+        regular: A is known to be regular, which saves the search for its null space; None: as its
+            structure says.
 
     Source: Lemke (1965); Cottle, Pang and Stone, The Linear Complementarity Problem (2009), 4.4.
 
@@ -58,6 +68,10 @@ def solve_lcp(
     >>> [round(float(z), 6) for z in solution.z]
     [0.5, 0.0]
     """
+    if isinstance(matrix, Sparse):
+        return _solve_sparse(matrix, q)
+    regular = is_regular(matrix) if regular is None else regular
+    matrix = as_matrix(matrix)
     diagonal = jax.lax.stop_gradient(jnp.diagonal(matrix))
     scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(jnp.where(diagonal > 0, diagonal, 1.0)), 1.0)
     a, b = matrix * scale[:, None] * scale[None, :], q * scale
@@ -72,6 +86,40 @@ def solve_lcp(
     z = jnp.where(z < 0, 0.0, z)  # only rounding is negative
     w = jnp.where(support, 0.0, a @ z + b)
     return LCP(z * scale * size, w / scale * size, code)
+
+
+def _solve_sparse(matrix: Sparse, q: jax.Array) -> LCP:
+    """As `solve_lcp` by products `A z` only, for A symmetric positive semidefinite.
+
+    Which of several z is returned is left to the descent. Values are those of the descent, and
+    derivatives those of the linear system on its support: where A is singular there, they are
+    right for `A z`, and NaN where not even that has any.
+    """
+    still, rate = jax.lax.stop_gradient((matrix, q))
+    tolerance = _DESCENT_ROUNDINGS * float(jnp.finfo(q.dtype).eps)
+    columns = still.diagonal[:, None], rate[:, None]
+    found = solve_many(
+        lambda z: (still @ z[:, 0])[:, None],
+        *columns,
+        friction=jnp.zeros_like(rate),
+        start=jnp.zeros_like(columns[1]),
+        inverse_step_size=jnp.ones_like(rate[0]),
+        tolerance=tolerance,
+        most=_DESCENTS,
+    )
+    z = jax.lax.stop_gradient(found.impulse[:, 0])
+    support = z > 0
+    scale = 1 / jnp.sqrt(still.diagonal)
+    a = matrix.scaled(scale).within(support)
+    solved = scale * conjugate_gradients(lambda x: a @ x, jnp.where(support, -q * scale, 0.0))
+    z = z + (solved - jax.lax.stop_gradient(solved))
+    # a vector that A makes nothing of, if there is one, has a part in nearly all others
+    other = jnp.where(support, jnp.cos(jnp.arange(1.0, len(q) + 1, dtype=q.dtype) ** 2), 0.0)
+    still_a = jax.lax.stop_gradient(a)
+    singular = jnp.any(jnp.isnan(conjugate_gradients(lambda x: still_a @ x, other)))
+    code = jnp.where(singular, CODE["impulse_not_unique"], CODE["ok"])
+    code = jnp.where(found.misfit > tolerance, CODE["max_steps"], code)
+    return LCP(z, jnp.where(support, 0.0, matrix @ z + q), code)
 
 
 def gathered_rounding(unknowns: int, dtype: Any) -> float:

@@ -9,8 +9,9 @@ A step looks for impulses q = (f, y), normal (m) and tangential (t), at which th
 with the force F_j that the indentation at the beginning of the step gives, and the part a_j gamma_j
 of it that a fast unloading takes away within the step (0: none). With F_j and the radii known this
 is a convex problem; accelerated projected gradients with restarts solve it from the impulses of the
-step before. Which contacts stick, which slip and where to, and who carries what where contacts are
-redundant, comes out of the minimum: no modes, nothing to be compiled for each contact.
+step before, scaled to the new load. Which contacts stick, which slip and where to, and who carries
+what where contacts are redundant, comes out of the minimum: no modes, nothing to be compiled for
+each contact.
 """
 
 from typing import Any, NamedTuple
@@ -21,9 +22,10 @@ import jax.numpy as jnp
 from jimpact.solvers.dense import regularized_once
 from jimpact.solvers.friction import in_disc
 
-# Sweeps of one solve at most; 5 to 15 are usual. What is left then is an error of the step, which
-# its estimate sees. Ten times more: batches take three times as long, for the same errors.
-SWEEPS = 30
+# Sweeps of one solve at most; 1 to 10 are usual. What is left then is an error of the step, which
+# becomes shorter. Ten times more: batches, which wait for their slowest solve, take four times as
+# long, for the same errors.
+SWEEPS = 15
 # Added to the diagonal of the tangent equations, which are singular where contacts stick
 # redundantly. Velocities do not depend on it. Ten times more: derivatives err by ten times the
 # rounding that it amplifies.
@@ -59,11 +61,12 @@ class StepProblem(NamedTuple):
         return impulses - self.projected(impulses, self.velocities(impulses))
 
 
-def descent_lengths(coupling: jax.Array, contacts: int) -> jax.Array:
+def descent_lengths(coupling: jax.Array, contacts: int, friction_only: bool = False) -> jax.Array:
     """Lengths d (n, B) with which descent converges: diag(1/d) - K is positive semidefinite.
 
     Rows are scaled to a diagonal of at most 1, both tangents of a contact alike; the largest
-    eigenvalue is then at most the Frobenius norm, and the largest sum of a row.
+    eigenvalue is then at most the largest sum of a row, and the fourth root of the Frobenius norm
+    of the fourth power. `friction_only`: normal impulses are known, so their rows do not count.
     """
     n = len(coupling)
     size = coupling[jnp.arange(n), jnp.arange(n)]
@@ -74,14 +77,24 @@ def descent_lengths(coupling: jax.Array, contacts: int) -> jax.Array:
         size = jnp.concatenate([size[:contacts], largest])
     size = jnp.where(size > 0, size, 1.0)
     root = jnp.sqrt(size)
-    scaled = jnp.abs(coupling) / (root[:, None] * root[None])
-    row_sum = jnp.max(jnp.sum(scaled, axis=1), axis=0, keepdims=True)
-    norm = jnp.sqrt(jnp.sum(scaled**2, axis=(0, 1)))[None]
-    return 1 / (size * jnp.minimum(row_sum, norm))
+    scaled = coupling / (root[:, None] * root[None])
+    if friction_only:
+        scaled = scaled.at[:contacts].set(0.0).at[:, :contacts].set(0.0)
+    row_sum = jnp.max(jnp.sum(jnp.abs(scaled), axis=1), axis=0, keepdims=True)
+    square = jnp.einsum("ij...,jk...->ik...", scaled, scaled)
+    fourth = jnp.einsum("ij...,jk...->ik...", square, square)
+    norm = jnp.sum(fourth**2, axis=(0, 1))[None] ** (1 / 8)
+    longest = size * jnp.minimum(row_sum, norm)
+    return 1 / jnp.where(longest > 0, longest, 1.0)
 
 
-def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.Array:
-    """Impulses (n, B) that leave velocities right to `tolerance` (1, B), from a guess."""
+def solve(
+    problem: StepProblem, start: jax.Array, tolerance: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Impulses (n, B) that leave velocities right to `tolerance` (1, B), from a guess.
+
+    And by how much (1, B) the last sweep still changed velocities.
+    """
 
     class Sweep(NamedTuple):
         """Impulses, the point that the next sweep starts from, momentum, error, sweeps done."""
@@ -105,19 +118,34 @@ def solve(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.A
         momentum = jnp.where(uphill, 1.0, (1 + jnp.sqrt(1 + 4 * s.momentum**2)) / 2)
         weight = jnp.where(uphill, 0.0, (s.momentum - 1) / momentum)
         ahead = new + weight * (new - s.impulses)
-        return Sweep(new, ahead, momentum, change, s.done + 1)
+        right = s.error <= tolerance
+
+        def kept(before: jax.Array, now: jax.Array) -> jax.Array:
+            """What lanes that are right keep."""
+            return jnp.where(right, before, now)
+
+        return Sweep(
+            kept(s.impulses, new),
+            kept(s.ahead, ahead),
+            kept(s.momentum, momentum),
+            kept(s.error, change),
+            s.done + 1,
+        )
 
     one = jnp.ones_like(tolerance)
     first = Sweep(start, start, one, one * jnp.inf, jnp.asarray(0))
-    return jax.lax.while_loop(going, sweep, first).impulses
+    end = jax.lax.while_loop(going, sweep, first)
+    return end.impulses, end.error
 
 
-def solve_smooth(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -> jax.Array:
+def solve_smooth(
+    problem: StepProblem, start: jax.Array, tolerance: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """As `solve`, as a smooth function of the problem: derivatives solve the tangent equations."""
     still = jax.lax.stop_gradient((problem, start, tolerance))
 
-    def iterate(_residual: Any, _start: jax.Array) -> jax.Array:
-        """The impulses."""
+    def iterate(_residual: Any, _start: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The impulses, and what is left."""
         return solve(*still)
 
     def tangent_solve(linear: Any, right: jax.Array) -> jax.Array:
@@ -128,4 +156,4 @@ def solve_smooth(problem: StepProblem, start: jax.Array, tolerance: jax.Array) -
         ridge = jnp.full_like(right, RIDGE)
         return regularized_once(matrix, ridge, right)
 
-    return jax.lax.custom_root(problem.residual, still[1], iterate, tangent_solve)
+    return jax.lax.custom_root(problem.residual, still[1], iterate, tangent_solve, has_aux=True)

@@ -1,8 +1,12 @@
 """A symmetric tridiagonal matrix stored as its two diagonals (the Delassus matrix of a chain)."""
 
+from typing import Literal
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+
+from jimpact.solvers.sparse import Neighbours, Sparse
 
 Triple = tuple[jax.Array, jax.Array, jax.Array]
 
@@ -56,6 +60,10 @@ class Tridiagonal(eqx.Module):
         rows = pivot, right, after
         return jax.lax.scan(substitute, none, rows, reverse=True)[1].reshape(vector.shape)
 
+    def __abs__(self) -> "Tridiagonal":
+        """|A|, entry by entry."""
+        return Tridiagonal(jnp.abs(self.diagonal), jnp.abs(self.off_diagonal), self.regular)
+
     def as_matrix(self) -> jax.Array:
         """The dense (m, m) matrix."""
         m = self.diagonal.shape[0]
@@ -71,17 +79,36 @@ class Tridiagonal(eqx.Module):
         return Tridiagonal(self.diagonal * scale**2, off, self.regular)
 
 
-Symmetric = jax.Array | Tridiagonal
+Symmetric = jax.Array | Tridiagonal | Sparse
+
+# Which entries off the diagonal are stored: all (None), those of a chain, or those of neighbours.
+Structure = Literal["chain"] | Neighbours | None
+
+
+def structure_of(matrix: Symmetric) -> Structure:
+    """The structure in which a matrix is stored."""
+    if isinstance(matrix, Sparse):
+        return matrix.neighbours
+    return "chain" if isinstance(matrix, Tridiagonal) else None
+
+
+def off_diagonal(matrix: Symmetric) -> jax.Array:
+    """Entries off the diagonal: (m, K) of neighbours, (m - 1,) of a chain, the upper triangle."""
+    if isinstance(matrix, Sparse):
+        return matrix.entries
+    if isinstance(matrix, Tridiagonal):
+        return matrix.off_diagonal
+    return matrix[jnp.triu_indices(len(matrix), 1)]
 
 
 def as_matrix(matrix: Symmetric) -> jax.Array:
-    """Dense form of a `Tridiagonal` or an array."""
-    return matrix.as_matrix() if isinstance(matrix, Tridiagonal) else matrix
+    """Dense form of a matrix."""
+    return matrix.as_matrix() if isinstance(matrix, (Tridiagonal, Sparse)) else matrix
 
 
 def diagonal(matrix: Symmetric) -> jax.Array:
-    """Diagonal of a `Tridiagonal` or an array."""
-    return matrix.diagonal if isinstance(matrix, Tridiagonal) else jnp.diagonal(matrix)
+    """Diagonal of a matrix."""
+    return matrix.diagonal if isinstance(matrix, (Tridiagonal, Sparse)) else jnp.diagonal(matrix)
 
 
 def is_regular(matrix: Symmetric) -> bool:
@@ -91,6 +118,6 @@ def is_regular(matrix: Symmetric) -> bool:
 
 def scaled(matrix: Symmetric, scale: jax.Array) -> Symmetric:
     """`diag(scale) A diag(scale)` in the form `matrix` has."""
-    if isinstance(matrix, Tridiagonal):
+    if isinstance(matrix, (Tridiagonal, Sparse)):
         return matrix.scaled(scale)
     return matrix * scale[:, None] * scale[None, :]

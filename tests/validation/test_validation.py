@@ -3,6 +3,7 @@
 import re
 
 import cube
+import drops
 import numpy as np
 import page
 import pytest
@@ -78,11 +79,95 @@ def test_differences_of_the_cube_are_paired():
     assert low < median == np.median(error) < high
 
 
+@pytest.mark.parametrize("nu", [4.0, 1e6])
+def test_scatter_of_the_cube_is_found_with_its_tails(nu):
+    """Simulated impacts with a known scatter, normal and with tails: regions hold what they say."""
+    rng, many = np.random.default_rng(0), 300
+    slopes, noise = rng.normal(size=(many, 6, 2)), np.full((many, 6), 0.01)
+    residual = np.einsum("kij,kj->ki", slopes, rng.normal(size=(many, 2)) * [0.04, 0.02])
+    residual += 1.5 * noise * rng.normal(size=(many, 6))
+    residual *= np.sqrt(nu / rng.chisquare(nu, many))[:, None]
+    sizes, inside = cube.scatter_of(residual, slopes, noise, np.arange(many))
+    np.testing.assert_allclose(sizes[:3], [0.04, 0.02, 1.5], rtol=0.15)
+    assert 2.5 < sizes[3] < 6 if nu == 4 else sizes[3] > 30
+    for chance, share in inside.items():
+        assert abs(share / 100 - chance) < 4 * np.sqrt(chance * (1 - chance) / many)
+
+
 def test_the_page_of_the_cube_has_its_rows():
     text = cube.PAGE.read_text(encoding="utf-8")
-    for name in ("Newton", "Moreau", "MuJoCo", "LZB", "Compliant, e falls"):
+    for name in (
+        "Newton",
+        "Moreau",
+        "MuJoCo",
+        "MuJoCo, seven numbers",
+        "LZB",
+        "Compliant, e falls",
+    ):
         assert f"| {name} |" in text
     assert cube.HEAD.format(one=377, two=105, tosses=308, folds=cube.FOLDS) in text
+
+
+def swung(rate, times):
+    """Poses of a square that turns about its left lower corner, from flat, by small steps."""
+    fine = 400  # steps of a frame; ten times more changes the angle by 1e-7
+    q, v, found = np.array([0.5, 0.5, 0.0]) * drops.SIDE, rate, []
+    for _ in range(times):
+        found.append(q.copy())
+        for _ in range(fine):
+            v += drops.accelerations(q)[2] * drops.FRAME / fine
+            q[2] += v * drops.FRAME / fine
+        q[:2] = np.array([np.cos(q[2] + np.pi / 4), np.sin(q[2] + np.pi / 4)])
+        q[:2] *= drops.SIDE / 2**0.5
+    return np.array(found)
+
+
+def test_rocking_is_found_in_a_drop():
+    """It turns about the left corner, hits with the right one, turns back with .4 of its rate."""
+    rise = swung(5.0, 40)
+    top = int(rise[:, 2].argmax())
+    assert top > 6
+    back = swung(2.0, 12)  # the way down is the way up, backwards
+    found = drops.rocking(np.concatenate([rise[top:0:-1], back])[None])
+    assert len(found.drop) == 1
+    np.testing.assert_allclose(found.before, -5.0, rtol=0.03)
+    np.testing.assert_allclose(found.after, 2.0, rtol=0.05)
+    np.testing.assert_allclose(found.rebound, 0.4, atol=0.03)
+    np.testing.assert_allclose(found.left, 0.0, atol=0.03)
+
+
+def test_measured_rocking_turns_back():
+    """Of the bundled drops; LZB says -.37 at mu = .3, Housner +.25."""
+    found = drops.rocking(drops.drops())
+    assert len(found.drop) == 68
+    np.testing.assert_allclose(np.median(found.after / found.before), -0.394, atol=2e-3)
+    np.testing.assert_allclose(np.median(found.rebound), 0.395, atol=2e-3)
+
+
+def test_flights_of_a_drop_and_their_arcs():
+    """A parabola and a spin are found as they are; contacts between flights end them."""
+    t = drops.FRAME * np.arange(12)
+    arc = np.stack([0.1 + 0.5 * t, 0.1 - t - drops.GRAVITY / 2 * t**2, 1 - 6.0 * t], axis=1)
+    at = drops.state(arc, 10)
+    tenth = 10 * drops.FRAME
+    np.testing.assert_allclose(at[0], arc[10], atol=1e-12)
+    np.testing.assert_allclose(at[1], [0.5, -1 - drops.GRAVITY * tenth, -6.0], atol=1e-9)
+    rests = np.tile([0.0, drops.SIDE / 2, 0.0], (5, 1))
+    assert (
+        drops.flights(np.concatenate([rests, rests + np.array([0, 0.1, 0]), rests])) == []
+    )  # too short
+    long = np.tile([0.0, 0.1, 0.0], (9, 1))
+    assert drops.flights(np.concatenate([rests, long, rests, long])) == [
+        (5, 14)
+    ]  # the last goes on
+
+
+def test_the_page_of_the_drops_has_its_rows():
+    text = drops.PAGE.read_text(encoding="utf-8")
+    for name in ("jimpact", "MuJoCo", "first flight", "flight after an impact", "an edge"):
+        assert f"| {name}" in text
+    with np.load(drops.NUMBERS) as stored:
+        assert {"first flight, jimpact", "first flight, MuJoCo"} <= set(stored.files)
 
 
 @pytest.mark.slow

@@ -110,7 +110,7 @@ class ScaledImpact(NamedTuple):
     @property
     def flow(self) -> Rule:
         """G, omega, e and eta of the contacts."""
-        return rule_of(self.inputs, self.dynamics.static_exponent, self.dynamics.chain)
+        return rule_of(self.inputs, self.dynamics.static_exponent, self.dynamics.structure)
 
 
 def problem(

@@ -1,0 +1,360 @@
+"""The simplest scene that suffices for an impact: contacts and friction that may be left out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jimpact._checks import as_whole, check_kind, check_shape, check_values
+from jimpact.contact import delassus_matrix
+from jimpact.files.records import fields_as_data, listed, number, table
+from jimpact.impacts import impact
+from jimpact.law import Law, check_law
+from jimpact.methods.advice import blocks_of
+from jimpact.methods.advice_report import ContactBlock, share
+from jimpact.scene import Scene, as_velocity, dense_mass, gap_velocity, with_gaps
+from jimpact.solvers.tridiagonal import diagonal
+from jimpact.status import STATUS
+
+# Impacts computed together, and the entries of their Delassus matrices. Ten times more take ten
+# times the memory, a gigabyte, and are not faster.
+LANES, ENTRIES = 64, 2**24
+PRINTED = 12  # contacts in the printed table; ten times more fill three pages
+
+
+@dataclass(frozen=True)
+class SceneAdvice:
+    """The result of `simplest_scene`; `ji.impact(result.law, result.scene, velocity)` applies it.
+
+    Errors are changes of v+ in the energy norm over that of v-. NaN: the law fails without this
+    contact, or `runs` did not suffice.
+
+    Attributes:
+        law: the law, without friction where that suffices.
+        scene: the scene in which contacts are left out (they have an infinite gap), with one
+            tangent for each contact, or none, where that suffices.
+        kept: contacts (from 0) that are not left out.
+        error: of v+ with this law and scene.
+        tolerance: as passed.
+        friction: the error of each way to treat friction: 'none', 'one direction'.
+        names: of the contacts (m,).
+        impulses: p (m,) [N s] with all contacts.
+        errors: of leaving out each contact by itself (m,).
+        changes: the largest change of a velocity by that (m,) [m/s, rad/s].
+        blocks: groups of coupled contacts with their kinetic angles.
+    """
+
+    law: Law
+    scene: Scene
+    kept: tuple[int, ...]
+    error: float
+    tolerance: float
+    friction: dict[str, float]
+    names: tuple[str, ...]
+    impulses: np.ndarray
+    errors: np.ndarray
+    changes: np.ndarray
+    blocks: tuple[ContactBlock, ...]
+
+    def reason(self, contact: int) -> str:
+        """Why this contact (from 0) is kept or left out."""
+        if contact in self.kept:
+            return "kept"
+        if self.errors[contact] > 0:
+            return "left out: small"
+        block = next((b for b in self.blocks if contact in b.contacts), None)
+        if block is None:
+            return "left out: open"
+        if not block.approaches:
+            return "left out: nothing approaches"
+        return "left out: no effect" if self.impulses[contact] else "left out: no impulse"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers of all contacts, as a JSON file can hold them; contacts counted from 1."""
+        kept = {"kept": [j + 1 for j in self.kept]}
+        return fields_as_data(self, "law", "scene", "blocks", "kept") | kept
+
+    def __str__(self) -> str:
+        """Half a page."""
+        m = len(self.names)
+        lines = [
+            f"{len(self.kept)} of {m} contacts suffice within {share(self.tolerance)}; "
+            f"the error of v+ is {share(self.error)}"
+        ]
+        lines += [f"friction, {name}: error {share(x)}" for name, x in self.friction.items()]
+        for block in self.blocks[:PRINTED]:
+            ends = block.angles
+            angles = f"; kinetic angles {ends[0]:.0f} to {ends[1]:.0f} degrees" if ends else ""
+            some = listed([str(j + 1) for j in block.contacts])
+            state = "impact" if block.approaches else "nothing approaches"
+            lines.append(f"group of contacts {some}: {state}{angles}")
+        order = np.argsort(-np.nan_to_num(self.errors, nan=np.inf), kind="stable")[:PRINTED]
+        rows = [
+            [
+                f"{j + 1} {self.names[j]}".strip(),
+                number(self.impulses[j], ".3g"),
+                share(self.errors[j]),
+                number(self.changes[j], ".2g"),
+                self.reason(int(j)),
+            ]
+            for j in order
+        ]
+        heads = ["contact", "impulse [N s]", "error without", "change of v+", "advice"]
+        lines += ["", *table(heads, rows, left=["advice"])]
+        return "\n".join([*lines, *([f"and {m - PRINTED} more"] if m > PRINTED else [])])
+
+
+def simplest_scene(
+    law: Law,
+    scene: Scene,
+    velocity: Any,
+    tolerance: float = 1e-2,
+    *,
+    names: Any = None,
+    watched: Any = None,
+    runs: int = 256,
+) -> SceneAdvice:
+    """Which contacts, and which friction, an impact needs for v+ within `tolerance`.
+
+    Equation: error `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the change of v+ by what is left out.
+    A contact without impulse can be left out exactly: nothing approaches in its group of coupled
+    contacts, or no load reaches it. Each of the others is left out by itself, then those of the
+    least errors together, as many as `tolerance` allows. Before that, friction is left out, or
+    given one direction at each contact, that of its impulse (planar), where that suffices.
+
+    Args:
+        law: as for `impact`.
+        scene: n coordinates, m contacts, for example of `from_mujoco`.
+        velocity: v- (n,) [m/s, rad/s].
+        tolerance: of the error, in (0, 1).
+        names: of the contacts (m,), for the table, as `from_mujoco` gives them.
+        watched: indices of the coordinates whose velocities count; None: all. A contact that a wave
+            reaches too late to change them has the error 0.
+        runs: largest number of contacts left out one by one, those of the largest
+            `p_j sqrt(W_jj)`, and of impacts with several left out.
+
+    Returns:
+        `SceneAdvice`: law, scene, errors; `print` gives a table.
+
+    Raises:
+        ValueError: shapes or ranges.
+        RuntimeError: the law fails on the whole scene.
+
+    >>> import jimpact as ji
+    >>> advice = ji.simplest_scene(ji.Moreau(1.0), ji.chain([1.0, 1.0, 1e-6]), [1.0, 0.0, 0.0])
+    >>> advice.kept, round(float(advice.errors[1]), 4)
+    ((0,), 0.001)
+    """
+    check_kind("law", law, Law)
+    check_kind("scene", scene, Scene)
+    v = as_velocity(scene, velocity)
+    check_values("velocity", v)
+    check_law(law, scene, v.dtype)
+    check_shape("tolerance", tolerance, (), "one number")
+    check_values("tolerance", tolerance, low=0.0, high=1.0, open_low=True)
+    as_whole("runs", runs, 1)
+    labels = ("",) * scene.contacts if names is None else tuple(map(str, names))
+    check_shape("names", np.empty(len(labels)), (scene.contacts,), "one per contact")
+    norm = _Norm.of(scene, np.asarray(v), watched)
+    whole = _Simpler(law, scene).run(v, [()])
+    if STATUS[int(whole.status[0])].failure:
+        raise RuntimeError(
+            f"The law fails on the whole scene: {STATUS[int(whole.status[0])].message}."
+        )
+    friction, trial = _frictions(_Simpler(law, scene), v, whole, norm, tolerance)
+    working, errors, changes = _alone(trial, v, norm, runs)
+    kept, error = _together(trial, v, whole, norm, working, errors, tolerance, runs)
+    taking = scene.closed
+    if law.uses_gaps and scene.gaps is not None:
+        taking = jnp.isfinite(scene.gaps)
+    couples = getattr(trial.law, "friction", None) is not None
+    gamma = np.asarray(gap_velocity(scene, v))
+    return SceneAdvice(
+        law=trial.law,
+        scene=trial.without(np.setdiff1d(np.arange(scene.contacts), kept)),
+        kept=tuple(kept.tolist()),
+        error=error,
+        tolerance=float(tolerance),
+        friction=friction,
+        names=labels,
+        impulses=whole.impulse[0],
+        errors=errors,
+        changes=changes,
+        blocks=blocks_of(trial.scene, gamma, np.flatnonzero(np.asarray(taking)), couples),
+    )
+
+
+class _Outcomes(NamedTuple):
+    """v+ (r, n), p (r, m), p_t (r, t) and status (r,) of impacts."""
+
+    velocity: Any
+    impulse: Any
+    tangential: Any
+    status: Any
+
+
+class _Norm(NamedTuple):
+    """Energy norm of changes of the watched velocities, over that of v-."""
+
+    mass: np.ndarray
+    before: float
+    watched: np.ndarray
+
+    @classmethod
+    def of(cls, scene: Scene, velocity: np.ndarray, watched: Any) -> "_Norm":
+        """For a scene at v- (n,)."""
+        count = scene.size
+        index = np.arange(count) if watched is None else np.atleast_1d(np.asarray(watched))
+        whole = index.ndim == 1 and index.size > 0 and np.issubdtype(index.dtype, np.integer)
+        if not whole or index.min() < 0 or index.max() >= count:
+            raise ValueError(
+                f"Argument `watched` must be indices of coordinates from 0 to {count - 1}, but has "
+                f"value {watched!r}."
+            )
+        mass = dense_mass(scene)
+        before = float(np.sqrt(velocity @ mass @ velocity)) or 1.0
+        return cls(mass[np.ix_(index, index)], before, index)
+
+    def of_changes(self, change: np.ndarray) -> np.ndarray:
+        """Errors (r,) of changes of v+ (r, n)."""
+        dv = change[:, self.watched]
+        return np.sqrt(np.sum((dv @ self.mass) * dv, axis=1)) / self.before
+
+
+class _Simpler(NamedTuple):
+    """A law on a scene of which contacts are left out."""
+
+    law: Law
+    scene: Scene
+
+    @property
+    def lanes(self) -> int:
+        """Impacts computed together."""
+        m = self.scene.contacts
+        return max(1, min(LANES, m + 1, ENTRIES // m**2))
+
+    def without(self, left_out: Any) -> Scene:
+        """The scene whose contacts of these indices have an infinite gap."""
+        gaps = self.gaps([left_out])[0]
+        return with_gaps(self.scene, jnp.asarray(gaps)) if len(left_out) else self.scene
+
+    def gaps(self, left_out: Sequence[Any]) -> np.ndarray:
+        """Gaps (r, m) where row i leaves these contacts out."""
+        scene = self.scene
+        own = np.zeros(scene.contacts) if scene.gaps is None else np.asarray(scene.gaps)
+        gaps = np.tile(own.astype(scene.mass.dtype), (len(left_out), 1))
+        for row, index in zip(gaps, left_out):
+            row[list(index)] = np.inf
+        return gaps
+
+    def run(self, velocity: jax.Array, left_out: Sequence[Any]) -> _Outcomes:
+        """An impact for each set of contacts to leave out, some at a time."""
+        rows, parts = self.gaps(left_out), []
+        for first in range(0, len(rows), self.lanes):
+            part = np.minimum(np.arange(first, first + self.lanes), len(rows) - 1)
+            out = _batch(self.law, self.scene, velocity, jnp.asarray(rows[part]))
+            parts.append(jax.device_get(out))
+        return _Outcomes(*(np.concatenate(x)[: len(rows)] for x in zip(*parts)))
+
+    def changes(
+        self, velocity: jax.Array, left_out: Sequence[Any], reference: np.ndarray
+    ) -> np.ndarray:
+        """Changes (r, n) of v+ from the reference (n,); NaN where the law fails."""
+        out = self.run(velocity, left_out)
+        failed = np.array([STATUS[int(code)].failure for code in out.status])
+        return np.where(failed[:, None], np.nan, out.velocity - reference)
+
+
+@eqx.filter_jit
+def _batch(law: Law, scene: Scene, velocity: jax.Array, gaps: jax.Array) -> _Outcomes:
+    """The impact with each row of gaps (r, m)."""
+
+    def one(gaps: jax.Array) -> _Outcomes:
+        """One impact."""
+        out = impact(law, with_gaps(scene, gaps), velocity)
+        return _Outcomes(out.velocity, out.impulse, out.tangential_impulse, out.status)
+
+    return jax.vmap(one)(gaps)
+
+
+def _frictions(
+    trial: _Simpler, v: jax.Array, whole: _Outcomes, norm: _Norm, tolerance: float
+) -> tuple[dict[str, float], _Simpler]:
+    """The error of each simpler friction, and the simplest that is within tolerance."""
+    law, scene = trial
+    if getattr(law, "friction", None) is None or scene.tangents is None:
+        return {}, trial
+    simpler: Any = replace(law, friction=None)  # type: ignore[call-arg]
+    ways = {"none": _Simpler(simpler, _with_tangents(scene, None))}
+    if scene.tangents.shape[1] == 2 * scene.contacts:
+        ways["one direction"] = _Simpler(law, _with_tangents(scene, _along(scene, whole)))
+    errors, chosen = {}, None
+    for name, way in ways.items():
+        errors[name] = float(norm.of_changes(way.changes(v, [()], whole.velocity[0]))[0])
+        if chosen is None and errors[name] <= tolerance:
+            chosen = way
+    return errors, chosen or trial
+
+
+def _with_tangents(scene: Scene, tangents: jax.Array | None) -> Scene:
+    """The scene with other tangents."""
+    return eqx.tree_at(lambda tree: tree.tangents, scene, tangents)
+
+
+def _along(scene: Scene, whole: _Outcomes) -> jax.Array:
+    """One tangent (n, m) of each contact, along its tangential impulse."""
+    m = scene.contacts
+    impulse = whole.tangential[0].reshape(m, 2)
+    size = np.linalg.norm(impulse, axis=1, keepdims=True)
+    way = np.where(size > 0, impulse / np.where(size > 0, size, 1.0), [[1.0, 0.0]])
+    tangents = np.asarray(scene.tangents).reshape(-1, m, 2)
+    return jnp.asarray(np.sum(tangents * way[None], axis=2).astype(tangents.dtype))
+
+
+def _alone(
+    trial: _Simpler, v: jax.Array, norm: _Norm, runs: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Contacts with an impulse, and of each contact (m,) the error and change of v+ without it.
+
+    Without impulse a contact leaves no trace in v+, whatever the law.
+    """
+    whole = trial.run(v, [()])
+    p = np.abs(whole.impulse[0])
+    working = np.flatnonzero(p)
+    weight = p * np.sqrt(np.asarray(diagonal(delassus_matrix(trial.scene))))
+    largest = working[np.argsort(-weight[working], kind="stable")][:runs]
+    errors, changes = np.zeros(len(p)), np.zeros(len(p))
+    errors[working] = changes[working] = np.nan
+    if len(largest):
+        change = trial.changes(v, [(j,) for j in largest], whole.velocity[0])
+        errors[largest] = norm.of_changes(change)
+        changes[largest] = np.abs(change[:, norm.watched]).max(axis=1)
+    return working, errors, changes
+
+
+def _together(
+    trial: _Simpler,
+    v: jax.Array,
+    whole: _Outcomes,
+    norm: _Norm,
+    working: np.ndarray,
+    errors: np.ndarray,
+    tolerance: float,
+    runs: int,
+) -> tuple[np.ndarray, float]:
+    """The fewest contacts that suffice, those of the largest errors, and the error of v+.
+
+    Contacts whose error is not known come first: they have less impulse.
+    """
+    order = working[np.argsort(np.nan_to_num(errors[working], nan=-1.0), kind="stable")]
+    silent = np.flatnonzero(~np.isin(np.arange(len(errors)), working))
+    counts = np.unique(np.linspace(0, max(len(order) - 1, 0), min(runs, len(order) + 1), dtype=int))
+    left_out = [[*silent, *order[:count]] for count in counts]
+    error = norm.of_changes(trial.changes(v, left_out, whole.velocity[0]))
+    suffice = np.flatnonzero(error <= tolerance)
+    best = int(suffice[-1]) if len(suffice) else 0
+    return np.sort(order[counts[best] :]), float(error[best])
