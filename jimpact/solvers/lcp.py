@@ -18,8 +18,9 @@ from jimpact.solvers.tridiagonal import Symmetric, as_matrix, is_regular
 from jimpact.status import CODE
 
 # The matrix is scaled to a diagonal of 1 and q to a largest entry of 1. Entries below this times
-# eps m are rounding: no pivot, a tie of two ratios. Ten times more: small pivots are missed.
-_ROUNDING = 64.0
+# eps m are rounding, and no pivots. Ten times more: small pivots of very light bodies are missed;
+# ten times less: pivots at the level of rounding spoil one in a thousand degenerate problems.
+_ROUNDING = 640.0
 _POWER = 2 / 3  # of eps: see `gathered_rounding`
 _PIVOTS = 10  # pivots allowed per unknown; 1 or 2 are usual
 
@@ -78,8 +79,11 @@ def solve_lcp(
     largest = jax.lax.stop_gradient(jnp.abs(b).max())
     size = jnp.where(largest > 0, largest, 1.0)
     b = b / size
-    support, code = _support(*jax.lax.stop_gradient((a, b)))
+    still = jax.lax.stop_gradient((a, b))
+    support, code = _support(*still)
     z = _solve_on(support, a, -b)
+    wrong = _wrong(*still, support, jax.lax.stop_gradient(z))
+    code = jnp.where((code == CODE["ok"]) & wrong, CODE["max_steps"], code)
     if symmetric and not regular:
         z, singular = _least_norm(a, b, z)
         code = jnp.where(singular, jnp.maximum(code, CODE["impulse_not_unique"]), code)
@@ -157,10 +161,24 @@ def _least_norm(a: jax.Array, b: jax.Array, z: jax.Array) -> tuple[jax.Array, ja
     return jnp.where(singular, rest + projector @ y, z), singular
 
 
+def _rounding(unknowns: int, dtype: Any) -> float:
+    """Rounding in a tableau of Lemke's method."""
+    return _ROUNDING * float(jnp.finfo(dtype).eps) * unknowns
+
+
+def _wrong(a: jax.Array, b: jax.Array, support: jax.Array, z: jax.Array) -> jax.Array:
+    """Whether z or w has a wrong sign, or z is so large that the rounding of A z hides q."""
+    size, gathered = jnp.max(jnp.abs(z)), gathered_rounding(len(b), b.dtype)
+    noise = _rounding(len(b), b.dtype) * size  # of A z, where the largest q is 1
+    w = jnp.where(support, 0.0, a @ z + b)
+    signs = (z >= -gathered * jnp.maximum(1.0, size)) & (w >= -gathered - noise)
+    return ~(jnp.all(signs) & (noise < 1))  # True where z is NaN
+
+
 def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Lemke's method: which z are basic at the end, status code."""
+    """Lemke's method: which z are basic at the end, and the status code."""
     m, dtype = b.shape[0], b.dtype
-    tolerance = _ROUNDING * float(jnp.finfo(dtype).eps) * m
+    tolerance = _rounding(m, dtype)
     ones = jnp.ones((m, 1), dtype)
     rows = jnp.concatenate([jnp.eye(m, dtype=dtype), -a, -ones, b[:, None]], axis=1)
     artificial = 2 * m
@@ -179,7 +197,7 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
 
     def one(state: _Tableau) -> _Tableau:
         """One pivot, unless a ray shows that there is no solution."""
-        row, ray = _leaving(state, artificial, tolerance)
+        row, ray = _leaving(state, tolerance)
         moved = _pivot(state, row)
         chosen = jax.tree.map(lambda new, old: jnp.where(ray, old, new), moved, state)
         return chosen._replace(ray=ray)
@@ -189,22 +207,21 @@ def _support(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     support = needed & jnp.any(end.basis[:, None] == (m + number)[None, :], axis=0)
     left = jnp.max(jnp.where(end.basis == artificial, end.rows[:, -1], 0.0))
     stuck = needed & (left > gathered_rounding(len(b), b.dtype))
-    code = jnp.where(stuck, jnp.where(end.ray, CODE["infeasible"], CODE["max_steps"]), CODE["ok"])
-    return support, code
+    reason = jnp.where(end.ray, CODE["infeasible"], CODE["max_steps"])
+    return support, jnp.where(stuck, reason, CODE["ok"])
 
 
-def _leaving(state: _Tableau, artificial: int, tolerance: float) -> tuple[jax.Array, jax.Array]:
-    """Row of the least ratio, in a tie that of the artificial variable; whether there is none.
+def _leaving(state: _Tableau, tolerance: float) -> tuple[jax.Array, jax.Array]:
+    """Row of the least ratio, and whether there is none.
 
-    An order among further ties (lexicographic) changed none of over 80 000 degenerate problems; a
-    cycle would end as `max_steps`.
+    No order among ties (lexicographic, say) changed any of over 80 000 degenerate problems; a cycle
+    would end as `max_steps`.
     """
     m = state.basis.shape[0]
     column = state.rows @ (jnp.arange(2 * m + 2) == state.entering).astype(state.rows.dtype)
     candidates = column > tolerance
     ratio = jnp.where(candidates, state.rows[:, -1] / jnp.where(candidates, column, 1.0), jnp.inf)
-    own = candidates & (state.basis == artificial) & (ratio <= jnp.min(ratio) + tolerance)
-    return jnp.argmin(jnp.where(own, -jnp.inf, ratio)), ~jnp.any(candidates)
+    return jnp.argmin(ratio), ~jnp.any(candidates)
 
 
 def _pivot(state: _Tableau, row: jax.Array) -> _Tableau:
