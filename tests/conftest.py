@@ -27,8 +27,8 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 matplotlib.use("Agg")
 
 # Every compiled program maps memory, and Linux lets a process have 65 530 maps: beyond, the
-# compiler aborts. A process that holds half of them forgets its programs.
-MANY_MAPS = 30_000
+# compiler aborts. A process that holds three quarters of them forgets its programs.
+MANY_MAPS = 50_000
 
 # Processes side by side share the programs that took longer than this to compile.
 WORTH_SHARING = "0.2"  # seconds
