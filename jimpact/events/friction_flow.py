@@ -10,6 +10,10 @@ cone. The normal forces follow from the indentations, so that lambda exists and 
 whatever mu is: there is no Painleve paradox. Where K_tt is singular (both corners of a block lying
 flat) lambda is shared among the contacts that stick in proportion to mu F: they then break loose
 together.
+
+A single contact is not integrated. Against its normal impulse p gap velocity and slip are straight
+lines, with one kink where slip stops, and the work of the force is a sum of parabolas
+(`_unloaded`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897, with energetic restitution).
 """
 
 import dataclasses
@@ -29,6 +33,8 @@ from jimpact.events.contact_flow import (
     ContactStates,
     Frozen,
     as_pytree,
+    plus_one,
+    power,
 )
 from jimpact.events.stepper import any_of
 from jimpact.solvers.dense import load_shares, regularized_once, times
@@ -246,7 +252,7 @@ class FrictionFlow(ContactFlow):
         side = y[-1 - self.normal_tangent.shape[1] : -1]
         return super().change(y) + times(self.normal_tangent, side)
 
-    # ---- the end: a contact with friction is never alone, and no multiple of another state
+    # ---- the end: a contact with friction is no multiple of another state
 
     @property
     def looks_ahead(self) -> bool:
@@ -257,13 +263,106 @@ class FrictionFlow(ContactFlow):
         """Never: the states of an impact with friction are not self-similar."""
         return None
 
+    @property
+    def alone(self) -> bool:
+        """Whether there is one planar contact, which a closed form takes to its end."""
+        return self.closed_form and self.normal_tangent.shape[:2] == (1, 1)
+
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Whether no contact is loaded or approaches."""
+        """Whether no contact is loaded or approaches, or it is a single one."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
-        return ~any_of(works)
+        return jnp.ones_like(works) if self.alone else ~any_of(works)
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Indentations set to 0; no closed form ends an impact with friction."""
+        """Indentations set to 0, after the impulses of a single contact."""
         m = self.contacts
-        x = jnp.zeros_like(y[:m])
-        return modes, jnp.concatenate([x, y[m:]])
+        x, _, p = self.rows(y)
+        if self.alone:
+            return modes, self._after_one(modes, y)
+        return modes, jnp.concatenate([jnp.zeros_like(x), y[m:]])
+
+    def _after_one(self, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """The state (n, B) after a single contact."""
+        works, gamma, _ = self.at_work(modes, y, LEFT * self.tolerance)
+        (x, _, p), u, slip = self.rows(y), self.slip(y), modes[2:]
+        across, own, mu = self.normal_tangent[0], self.tangent[0], self.friction
+        drag = -slip.astype(u.dtype) * mu
+        movable = own > 0
+        hold = jnp.where(movable, -across / jnp.where(movable, own, 1.0), 0.0)
+        # or slip begins anew, to the other side
+        hold = jnp.sign(hold) * jnp.minimum(jnp.abs(hold), mu)
+        rate = across + own * drag
+        stops = (slip != 0) & (u * rate < 0)
+        length = jnp.where(stops, -u / jnp.where(stops, rate, 1.0), jnp.inf)
+        length = jnp.where(slip == 0, 0.0, length)
+        twice = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
+        start = SingleContact(jnp.where(works, gamma, -1.0), twice, jnp.zeros_like(p))
+        sliding = _unloaded(start, 1 + across * drag, length, self.restitution)
+        first = sliding.impulse
+        end = _unloaded(sliding, 1 + across * hold, jnp.inf, self.restitution)
+        side = drag * first + hold * (end.impulse - first)
+        side = jnp.where(works, side, 0.0)
+        dp = jnp.where(works, end.impulse, 0.0)
+        gamma = jnp.where(works, end.gap_velocity, gamma)
+        rows = [jnp.zeros_like(x), gamma, p + dp, u + across * dp + own * side, y[4:5] + side]
+        return jnp.concatenate([*rows, y[5:]])
+
+
+class SingleContact(NamedTuple):
+    """A contact at a normal impulse that it has carried, (1, B) each."""
+
+    gap_velocity: jax.Array
+    energy: jax.Array  # twice what is stored; 0: it is unloaded
+    impulse: jax.Array
+
+
+def _unloaded(s: SingleContact, slope: jax.Array, length: Any, e: jax.Array) -> SingleContact:
+    """The contact after this `length` of impulse, or unloaded; gamma changes at the rate `slope`.
+
+    It may expand, be compressed, and expand again.
+    """
+    begun = s.impulse
+    for expands in (True, False, True):
+        left = length - (s.impulse - begun)
+        s = _expanded(s, slope, left, e) if expands else _compressed(s, slope, left)
+    return s
+
+
+def _compressed(s: SingleContact, slope: jax.Array, left: jax.Array) -> SingleContact:
+    """Until it turns, at most for the impulse that is `left`; nothing where it expands."""
+    approaches = (s.gap_velocity < 0) | ((s.gap_velocity == 0) & (slope < 0))
+    turns = approaches & (slope > 0)
+    most = jnp.where(turns, -s.gap_velocity / jnp.where(turns, slope, 1.0), jnp.inf)
+    ends = turns & (most <= left)
+    dp = jnp.where(approaches, jnp.where(ends, most, left), 0.0)
+    gamma = jnp.where(ends, 0.0, s.gap_velocity + slope * dp)
+    return SingleContact(gamma, s.energy - (s.gap_velocity + gamma) * dp, s.impulse + dp)
+
+
+def _expanded(s: SingleContact, slope: jax.Array, left: jax.Array, e: jax.Array) -> SingleContact:
+    """Until it is unloaded or turns back, at most for the impulse that is `left`.
+
+    Energy falls with gamma^2: unloaded it has gamma^2 + e^2 slope energy.
+    """
+    gamma, energy = s.gap_velocity, s.energy
+    expands = (energy > 0) & (gamma >= 0) & (left > 0) & ((gamma > 0) | (slope > 0))
+    rising, some = expands & (gamma == 0), jnp.where(expands, energy, 1.0)
+    # from gamma = 0 gamma is a multiple of e: regular at e = 0
+    up = jnp.where(rising, slope, 1.0)
+    square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * some, 1.0)
+    back = square <= 0
+    end = jnp.where(rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square)))
+    safe = jnp.where(back | ~expands | rising, 1.0, gamma + end)
+    whole = jnp.where(rising, e * jnp.sqrt(some / up), e**2 * some / safe)
+    turned = -gamma / jnp.where(back, slope, -1.0)
+    most = jnp.where(back, turned, whole)
+    reached = most <= left
+    dp = jnp.where(expands, jnp.where(reached, most, left), 0.0)
+    unloaded = expands & reached & ~back
+    after = jnp.where(unloaded, end, jnp.where(reached & back, 0.0, gamma + slope * dp))
+    part = (gamma + after) * dp / jnp.where(unloaded | ~expands, 1.0, e**2)
+    return SingleContact(
+        jnp.where(expands, after, gamma),
+        jnp.where(unloaded, 0.0, energy - jnp.where(expands, part, 0.0)),
+        s.impulse + dp,
+    )
