@@ -13,7 +13,7 @@ together.
 
 A single contact is not integrated. Against its normal impulse p gap velocity and slip are straight
 lines, with one kink where slip stops, and the work of the force is a sum of parabolas
-(`_unloaded`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897, with energetic restitution).
+(`_next_piece`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897, with energetic restitution).
 """
 
 import dataclasses
@@ -43,6 +43,9 @@ from jimpact.solvers.friction import distribute
 # part of the unit of time. At the first touch forces are 0 and cannot decide which contacts
 # stick: those of a moment later do. Ten times more would decide by later forces.
 MOMENT = 1e-6
+# Pieces of a single contact's impact: it expands, is compressed, sticks, turns. Ten times more would
+# change nothing.
+PIECES = 4
 # of the tolerance: the impact is over where no contact has more energy, loaded ones included. Ten
 # times more is the energy of one tolerance of velocity, which would be lost.
 LEFT = 0.1
@@ -296,73 +299,60 @@ class FrictionFlow(ContactFlow):
         length = jnp.where(stops, -u / jnp.where(stops, rate, 1.0), jnp.inf)
         length = jnp.where(slip == 0, 0.0, length)
         twice = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
-        start = SingleContact(jnp.where(works, gamma, -1.0), twice, jnp.zeros_like(p))
-        sliding = _unloaded(start, 1 + across * drag, length, self.restitution)
-        first = sliding.impulse
-        end = _unloaded(sliding, 1 + across * hold, jnp.inf, self.restitution)
-        side = drag * first + hold * (end.impulse - first)
+        slopes = 1 + across * drag, 1 + across * hold
+        start = SingleContact(jnp.where(works, gamma, -1.0), twice, length, 0 * p, 0 * p)
+        end = jax.lax.fori_loop(
+            0, PIECES, lambda _, s: _next_piece(s, slopes, self.restitution), start
+        )
+        side = drag * end.sliding + hold * end.holding
         side = jnp.where(works, side, 0.0)
-        dp = jnp.where(works, end.impulse, 0.0)
+        dp = jnp.where(works, end.sliding + end.holding, 0.0)
         gamma = jnp.where(works, end.gap_velocity, gamma)
         rows = [jnp.zeros_like(x), gamma, p + dp, u + across * dp + own * side, y[4:5] + side]
         return jnp.concatenate([*rows, y[5:]])
 
 
 class SingleContact(NamedTuple):
-    """A contact at a normal impulse that it has carried, (1, B) each."""
+    """A contact on its way, and the impulses that it has carried, (1, B) each."""
 
     gap_velocity: jax.Array
     energy: jax.Array  # twice what is stored; 0: it is unloaded
-    impulse: jax.Array
+    left: jax.Array  # impulse until slip stops
+    sliding: jax.Array  # impulse until then
+    holding: jax.Array  # impulse since then
 
 
-def _unloaded(s: SingleContact, slope: jax.Array, length: Any, e: jax.Array) -> SingleContact:
-    """The contact after this `length` of impulse, or unloaded; gamma changes at the rate `slope`.
+def _next_piece(
+    s: SingleContact, slopes: tuple[jax.Array, jax.Array], e: jax.Array
+) -> SingleContact:
+    """The contact after its slip stops, it turns, or is unloaded; as it is where it is unloaded.
 
-    It may expand, be compressed, and expand again.
+    gamma grows with the impulse at the rates `slopes`, until slip stops and from then on. While it
+    is compressed, energy grows as -gamma^2 / slope; while it expands, it falls e^-2 times as fast.
     """
-    begun = s.impulse
-    for expands in (True, False, True):
-        left = length - (s.impulse - begun)
-        s = _expanded(s, slope, left, e) if expands else _compressed(s, slope, left)
-    return s
-
-
-def _compressed(s: SingleContact, slope: jax.Array, left: jax.Array) -> SingleContact:
-    """Until it turns, at most for the impulse that is `left`; nothing where it expands."""
-    approaches = (s.gap_velocity < 0) | ((s.gap_velocity == 0) & (slope < 0))
-    turns = approaches & (slope > 0)
-    most = jnp.where(turns, -s.gap_velocity / jnp.where(turns, slope, 1.0), jnp.inf)
-    ends = turns & (most <= left)
-    dp = jnp.where(approaches, jnp.where(ends, most, left), 0.0)
-    gamma = jnp.where(ends, 0.0, s.gap_velocity + slope * dp)
-    return SingleContact(gamma, s.energy - (s.gap_velocity + gamma) * dp, s.impulse + dp)
-
-
-def _expanded(s: SingleContact, slope: jax.Array, left: jax.Array, e: jax.Array) -> SingleContact:
-    """Until it is unloaded or turns back, at most for the impulse that is `left`.
-
-    Energy falls with gamma^2: unloaded it has gamma^2 + e^2 slope energy.
-    """
-    gamma, energy = s.gap_velocity, s.energy
-    expands = (energy > 0) & (gamma >= 0) & (left > 0) & ((gamma > 0) | (slope > 0))
-    rising, some = expands & (gamma == 0), jnp.where(expands, energy, 1.0)
-    # from gamma = 0 gamma is a multiple of e: regular at e = 0
-    up = jnp.where(rising, slope, 1.0)
-    square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * some, 1.0)
-    back = square <= 0
+    gamma, energy, slides = s.gap_velocity, s.energy, s.left > 0
+    slope, most = jnp.where(slides, *slopes), jnp.where(slides, s.left, jnp.inf)
+    closes = (gamma < 0) | ((gamma == 0) & (slope < 0))
+    expands = ~closes & (energy > 0) & ((gamma > 0) | (slope > 0))
+    turns, rising = closes & (slope > 0), expands & (gamma == 0)
+    some, up = jnp.where(expands, energy, 1.0), jnp.where(turns | rising, slope, 1.0)
+    square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * energy, 1.0)
+    back = square <= 0  # gamma falls to 0 before the energy does
+    # from gamma = 0 the end is a multiple of e: regular at e = 0
     end = jnp.where(rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square)))
-    safe = jnp.where(back | ~expands | rising, 1.0, gamma + end)
-    whole = jnp.where(rising, e * jnp.sqrt(some / up), e**2 * some / safe)
-    turned = -gamma / jnp.where(back, slope, -1.0)
-    most = jnp.where(back, turned, whole)
-    reached = most <= left
-    dp = jnp.where(expands, jnp.where(reached, most, left), 0.0)
+    whole = e**2 * some / jnp.where(expands & ~rising & ~back, gamma + end, 1.0)
+    whole = jnp.where(rising, e * jnp.sqrt(some / up), whole)
+    length = jnp.where(back, -gamma / jnp.where(back, slope, 1.0), whole)
+    length = jnp.where(turns, -gamma / up, jnp.where(expands, length, jnp.inf))
+    reached = length <= most
+    dp = jnp.where(closes | expands, jnp.where(reached, length, most), 0.0)
     unloaded = expands & reached & ~back
-    after = jnp.where(unloaded, end, jnp.where(reached & back, 0.0, gamma + slope * dp))
-    part = (gamma + after) * dp / jnp.where(unloaded | ~expands, 1.0, e**2)
+    after = jnp.where(unloaded, end, jnp.where(reached & (turns | back), 0.0, gamma + slope * dp))
+    share = jnp.where(expands & ~unloaded, e**2, 1.0)
     return SingleContact(
-        jnp.where(expands, after, gamma),
-        jnp.where(unloaded, 0.0, energy - jnp.where(expands, part, 0.0)),
-        s.impulse + dp,
+        gap_velocity=after,
+        energy=jnp.where(unloaded, 0.0, energy - (gamma + after) * dp / share),
+        left=s.left - dp,
+        sliding=s.sliding + jnp.where(slides, dp, 0.0),
+        holding=s.holding + jnp.where(slides, 0.0, dp),
     )
