@@ -267,22 +267,22 @@ class FrictionFlow(ContactFlow):
         return None
 
     @property
-    def alone(self) -> bool:
-        """Whether there is one planar contact, which a closed form takes to its end."""
-        return self.closed_form and self.normal_tangent.shape[:2] == (1, 1)
+    def at_once(self) -> bool:
+        """Whether there is one contact, and it is planar."""
+        return super().at_once and self.normal_tangent.shape[1] == 1
 
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
-        """Whether no contact is loaded or approaches, or it is a single one."""
+        """Whether no contact is loaded or approaches."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
-        return jnp.ones_like(works) if self.alone else ~any_of(works)
+        return ~any_of(works)
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Indentations set to 0, after the impulses of a single contact."""
-        m = self.contacts
-        x, _, p = self.rows(y)
-        if self.alone:
+        if self.at_once:
             return modes, self._after_one(modes, y)
-        return modes, jnp.concatenate([jnp.zeros_like(x), y[m:]])
+        m = self.contacts
+        x = jnp.zeros_like(y[:m])
+        return modes, jnp.concatenate([x, y[m:]])
 
     def _after_one(self, modes: jax.Array, y: jax.Array) -> jax.Array:
         """The state (n, B) after a single contact."""
