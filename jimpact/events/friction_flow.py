@@ -13,7 +13,8 @@ together.
 
 A single contact is not integrated. Against its normal impulse p gap velocity and slip are straight
 lines, with one kink where slip stops, and the work of the force is a sum of parabolas
-(`_next_piece`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897, with energetic restitution).
+(`_next_piece`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897, here with energetic
+restitution).
 """
 
 import dataclasses
@@ -43,8 +44,8 @@ from jimpact.solvers.friction import distribute
 # part of the unit of time. At the first touch forces are 0 and cannot decide which contacts
 # stick: those of a moment later do. Ten times more would decide by later forces.
 MOMENT = 1e-6
-# Pieces of a single contact's impact: it expands, is compressed, sticks, turns. Ten times more would
-# change nothing.
+# Pieces of a single contact's impact, at most: it expands, is compressed, its slip stops, it turns.
+# Ten times more would change nothing.
 PIECES = 4
 # of the tolerance: the impact is over where no contact has more energy, loaded ones included. Ten
 # times more is the energy of one tolerance of velocity, which would be lost.
