@@ -120,6 +120,11 @@ MUTATIONS = [
     Mutation("fastest becomes first", r"level = rivals & \(speed \+ noise >= fastest\)", "level = rivals", ("test_binary.py::test_against_the_plain_reference[fastest]",)),
     # --- friction
     Mutation("friction along the slip", r"drag = -(\w+\.astype\(self\.friction\.dtype\))", r"drag = \1", ("test_friction.py::test_disk_in_closed_form[lzb]",)),
+    Mutation("slip that stopped is held by any force", r"jnp\.minimum\(jnp\.abs\(hold\), mu\)", "jnp.abs(hold)", ("test_friction.py::test_a_single_contact_in_closed_form",), "friction_flow.py"),
+    Mutation("a single contact never turns back while it expands", r"back = square <= 0 .*", "back = square < -jnp.inf", ("test_friction.py::test_a_single_contact_in_closed_form",), "friction_flow.py"),
+    Mutation("a single contact slips to its end", r"length = jnp\.where\(stops, -u / [^\n]*", "length = jnp.full_like(u, jnp.inf)", ("test_friction.py::test_a_single_contact_in_closed_form",), "friction_flow.py"),
+    Mutation("a single contact expands as it is compressed", r"share = jnp\.where\(expands & ~unloaded, e\*\*2, 1\.0\)", "share = 1.0", ("test_friction.py::test_a_single_contact_in_closed_form",), "friction_flow.py"),
+    Mutation("ratios of known scenes are read from traced ones", r"with jax\.ensure_compile_time_eval\(\):.*", "with jax.named_scope('check'):", ("test_other_laws.py::test_ratios_are_checked_inside_jit",), "impulse_correlation.py"),
     Mutation("friction of the other contact", r"(drag = [^\n]* \* self\.friction)\n", r"\1[::-1]\n", ("test_friction.py::test_lzb_in_the_plane",)),
     # --- impact
     Mutation("a law around another one has no capabilities", r"setattr\(around, name, _forwarded\(name\)\)", "setattr(around, name, getattr(around, name))", ("test_own_law.py",)),

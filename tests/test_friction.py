@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from friction_reference import regularized, routh, small_steps
+from friction_reference import blocks, regularized, routh, small_steps
 from programs import OPTIMIZED, failed, names
 
 import jimpact as ji
@@ -196,6 +196,51 @@ def test_rods_are_rouths():
     kinds = np.abs(expected[:, 1]) < mu * expected[:, 0] - 1e-6
     assert kinds.any()
     assert not kinds.all()
+
+
+def by_small_impulses(scene, v, mu, e, stored, dp=2e-5):
+    """(p, p_t) of one contact with energy `stored` beforehand, summed up, and the least gamma."""
+    wn, wnt, wt, g, u = (float(x.ravel()[0]) for x in blocks(scene, v))
+    p = side = 0.0
+    least = g
+    while stored > 0 or g < 0:
+        hold = min(max(-wnt / wt, -mu), mu)
+        ratio = hold if abs(u) <= mu * wt * dp else -mu * np.sign(u)
+        middle = g + (wn + wnt * ratio) * dp / 2
+        stored -= middle * dp / (1.0 if middle < 0 else e**2)
+        g, u = g + (wn + wnt * ratio) * dp, u + (wnt + wt * ratio) * dp
+        p, side, least = p + dp, side + ratio * dp, min(g, least)
+    return p, side, least
+
+
+def test_a_single_contact_in_closed_form():
+    """It is not integrated. Slopes in mu and e, one-sided at 0; it expands first and turns back."""
+    mass, normals, tangents = rod(0.8)
+
+    @jax.jit
+    @jax.vmap
+    def impulses_with_slopes(v, mu, e, stored):
+        def impulses(mu, e):
+            law = ji.LZB(e, friction=mu, initial_energy=stored)
+            out = ji.impact(law, ji.Scene(mass, normals, tangents=tangents), v)
+            return jnp.concatenate([out.impulse, out.tangential_impulse])
+
+        return impulses(mu, e), jnp.stack(jax.jacfwd(impulses, argnums=(0, 1))(mu, e))
+
+    v = [(0.5, -1, 0), (-0.3, -1, 0.2), (2, -1, 1)]
+    rows = [(v, mu, e, 0.0) for v in v for mu in (0.0, 0.1, 0.8, 5.0) for e in (0.0, 0.5, 0.9)]
+    loaded = [((u, 0.1, 0.0), mu, 0.7, 0.4) for u in (1.0, -1.0) for mu in (0.1, 1.0, 5.0)]
+    found, slopes = impulses_with_slopes(*map(np.array, zip(*rows, *loaded)))
+    scene, h = ji.Scene(mass, normals, tangents=tangents), 1e-6
+    for (v, mu, e, _), p, slope in zip(rows, found, slopes):
+        e = max(e, 1e-9)
+        expected = np.array(routh(scene, v, mu, e))
+        close(p, expected, atol=1e-8)
+        for dmu, de, one in ((h, 0, slope[0]), (0, h, slope[1])):
+            close(one, (np.array(routh(scene, v, mu + dmu, e + de)) - expected) / h, atol=1e-4)
+    *expected, least = np.array([by_small_impulses(scene, *row) for row in loaded]).T
+    close(found[-len(loaded) :], np.transpose(expected), atol=3e-4)
+    assert (least < 0).any()  # drawn back by friction, and compressed
 
 
 @pytest.mark.parametrize("rod", [RODS[16], RODS[54]], ids=["slips", "jams"])

@@ -88,6 +88,18 @@ def test_the_interval_ends_where_a_contact_stays_closed():
         ji.correlation_interval(ji.chain([1.0] * 3), 1.1)
 
 
+def test_ratios_are_checked_inside_jit():
+    """Law and scene are known there: too large a ratio is an error while it is traced."""
+    balls = ji.chain([1.0, 1.0, 1.0])
+
+    def shape(law):
+        return jax.eval_shape(lambda v: ji.impact(law, balls, v).velocity, np.ones(3)).shape
+
+    assert shape(ji.ImpulseCorrelation(0.9, 0.6)) == (3,)
+    with pytest.raises(ValueError, match="`ratio` must lie in"):
+        shape(ji.ImpulseCorrelation(0.9, 1.6))
+
+
 @pytest.mark.slow
 def test_a_matrix_of_ratios_is_that_of_each_contact_that_collides():
     """Ratios .6 of contact 2 beside 1 and .9 the other way: in jit, so that one program does both."""

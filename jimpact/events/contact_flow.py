@@ -442,6 +442,11 @@ class ContactFlow(Flow):
     # ---- the end
 
     @property
+    def at_once(self) -> bool:
+        """Whether `finish` alone is the impact: one contact, with a closed form."""
+        return self.closed_form and self.contacts == 1
+
+    @property
     def looks_ahead(self) -> bool:
         """Whether the chain is so long that a look ahead decides whether it comes to rest."""
         self_similar = not self.gapped and self.viscous is None

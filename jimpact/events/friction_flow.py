@@ -10,6 +10,11 @@ cone. The normal forces follow from the indentations, so that lambda exists and 
 whatever mu is: there is no Painleve paradox. Where K_tt is singular (both corners of a block lying
 flat) lambda is shared among the contacts that stick in proportion to mu F: they then break loose
 together.
+
+A single contact is not integrated. Against its normal impulse p gap velocity and slip are straight
+lines, with one kink where slip stops, and the work of the force is a sum of parabolas
+(`_next_piece`; E. J. Routh, Dynamics of a System of Rigid Bodies, 1897, here with energetic
+restitution).
 """
 
 import dataclasses
@@ -29,6 +34,8 @@ from jimpact.events.contact_flow import (
     ContactStates,
     Frozen,
     as_pytree,
+    plus_one,
+    power,
 )
 from jimpact.events.stepper import any_of
 from jimpact.solvers.dense import load_shares, regularized_once, times
@@ -37,6 +44,9 @@ from jimpact.solvers.friction import distribute
 # part of the unit of time. At the first touch forces are 0 and cannot decide which contacts
 # stick: those of a moment later do. Ten times more would decide by later forces.
 MOMENT = 1e-6
+# Pieces of a single contact's impact, at most: it expands, is compressed, its slip stops, it turns.
+# Ten times more would change nothing.
+PIECES = 4
 # of the tolerance: the impact is over where no contact has more energy, loaded ones included. Ten
 # times more is the energy of one tolerance of velocity, which would be lost.
 LEFT = 0.1
@@ -246,7 +256,7 @@ class FrictionFlow(ContactFlow):
         side = y[-1 - self.normal_tangent.shape[1] : -1]
         return super().change(y) + times(self.normal_tangent, side)
 
-    # ---- the end: a contact with friction is never alone, and no multiple of another state
+    # ---- the end: a contact with friction is no multiple of another state
 
     @property
     def looks_ahead(self) -> bool:
@@ -257,13 +267,93 @@ class FrictionFlow(ContactFlow):
         """Never: the states of an impact with friction are not self-similar."""
         return None
 
+    @property
+    def at_once(self) -> bool:
+        """Whether there is one contact, and it is planar."""
+        return super().at_once and self.normal_tangent.shape[1] == 1
+
     def over(self, modes: jax.Array, y: jax.Array, passes: jax.Array) -> jax.Array:
         """Whether no contact is loaded or approaches."""
         works, *_ = self.at_work(modes, y, LEFT * self.patience(passes))
         return ~any_of(works)
 
     def finish(self, modes: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Indentations set to 0; no closed form ends an impact with friction."""
+        """Indentations set to 0, after the impulses of a single contact."""
+        if self.at_once:
+            return modes, self._after_one(modes, y)
         m = self.contacts
         x = jnp.zeros_like(y[:m])
         return modes, jnp.concatenate([x, y[m:]])
+
+    def _after_one(self, modes: jax.Array, y: jax.Array) -> jax.Array:
+        """The state (n, B) after a single contact."""
+        works, gamma, _ = self.at_work(modes, y, LEFT * self.tolerance)
+        (x, _, p), u, slip = self.rows(y), self.slip(y), modes[2:]
+        across, own, mu = self.normal_tangent[0], self.tangent[0], self.friction
+        drag = -slip.astype(u.dtype) * mu
+        movable = own > 0
+        hold = jnp.where(movable, -across / jnp.where(movable, own, 1.0), 0.0)
+        # or slip begins anew, to the other side
+        hold = jnp.sign(hold) * jnp.minimum(jnp.abs(hold), mu)
+        rate = across + own * drag
+        stops = (slip != 0) & (u * rate < 0)
+        length = jnp.where(stops, -u / jnp.where(stops, rate, 1.0), jnp.inf)
+        length = jnp.where(slip == 0, 0.0, length)
+        twice = jnp.where(x > 0, power(x, plus_one(self.exponent)), 0.0)
+        slopes = 1 + across * drag, 1 + across * hold
+        start = SingleContact(jnp.where(works, gamma, -1.0), twice, length, 0 * p, 0 * p)
+        end = jax.lax.fori_loop(
+            0, PIECES, lambda _, s: _next_piece(s, slopes, self.restitution), start
+        )
+        side = drag * end.sliding + hold * end.holding
+        side = jnp.where(works, side, 0.0)
+        dp = jnp.where(works, end.sliding + end.holding, 0.0)
+        gamma = jnp.where(works, end.gap_velocity, gamma)
+        rows = [jnp.zeros_like(x), gamma, p + dp, u + across * dp + own * side, y[4:5] + side]
+        return jnp.concatenate([*rows, y[5:]])
+
+
+class SingleContact(NamedTuple):
+    """A contact on its way, and the impulses that it has carried, (1, B) each."""
+
+    gap_velocity: jax.Array
+    energy: jax.Array  # twice what is stored; 0: it is unloaded
+    left: jax.Array  # impulse until slip stops
+    sliding: jax.Array  # impulse until then
+    holding: jax.Array  # impulse since then
+
+
+def _next_piece(
+    s: SingleContact, slopes: tuple[jax.Array, jax.Array], e: jax.Array
+) -> SingleContact:
+    """The contact after its slip stops, it turns, or is unloaded; as it is where it is unloaded.
+
+    gamma grows with the impulse at the rates `slopes`, until slip stops and from then on. While it
+    is compressed, energy grows as -gamma^2 / slope; while it expands, it falls e^-2 times as fast.
+    """
+    gamma, energy, slides = s.gap_velocity, s.energy, s.left > 0
+    slope, most = jnp.where(slides, *slopes), jnp.where(slides, s.left, jnp.inf)
+    closes = (gamma < 0) | ((gamma == 0) & (slope < 0))
+    expands = ~closes & (energy > 0) & ((gamma > 0) | (slope > 0))
+    turns, rising = closes & (slope > 0), expands & (gamma == 0)
+    some, up = jnp.where(expands, energy, 1.0), jnp.where(turns | rising, slope, 1.0)
+    square = jnp.where(expands & ~rising, gamma**2 + e**2 * slope * energy, 1.0)
+    back = square <= 0  # gamma falls to 0 before the energy does
+    # from gamma = 0 the end is a multiple of e: regular at e = 0
+    end = jnp.where(rising, e * jnp.sqrt(up * some), jnp.sqrt(jnp.where(back, 1.0, square)))
+    whole = e**2 * some / jnp.where(expands & ~rising & ~back, gamma + end, 1.0)
+    whole = jnp.where(rising, e * jnp.sqrt(some / up), whole)
+    length = jnp.where(back, -gamma / jnp.where(back, slope, 1.0), whole)
+    length = jnp.where(turns, -gamma / up, jnp.where(expands, length, jnp.inf))
+    reached = length <= most
+    dp = jnp.where(closes | expands, jnp.where(reached, length, most), 0.0)
+    unloaded = expands & reached & ~back
+    after = jnp.where(unloaded, end, jnp.where(reached & (turns | back), 0.0, gamma + slope * dp))
+    share = jnp.where(expands & ~unloaded, e**2, 1.0)
+    return SingleContact(
+        gap_velocity=after,
+        energy=jnp.where(unloaded, 0.0, energy - (gamma + after) * dp / share),
+        left=s.left - dp,
+        sliding=s.sliding + jnp.where(slides, dp, 0.0),
+        holding=s.holding + jnp.where(slides, 0.0, dp),
+    )

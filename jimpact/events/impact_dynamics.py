@@ -276,7 +276,14 @@ class ImpulseProgram:
         flow, modes, y = pushforward(lambda problem: self.flow(problem, tighten), problem)
         gamma = value_of(problem.gamma)
         duals = any(map(is_dual, leaves))
+        rows = 3 * gamma.shape[0]
+        sides = slice(rows + self.sides, rows + 2 * self.sides)
         state: Any
+        if value_of(flow).at_once:
+            state = pushforward(lambda flow, y: flow.finish(modes, y)[1], flow, y)
+            results = pushforward(lambda y: (y[rows - 1 : rows], y[sides], y[-1:]), state)
+            none = jnp.full(gamma.shape, CODE["ok"], jnp.int32)
+            return results if self.smooth else (*results, none, none)
         if self.reverses:
             (state, _), (end, _) = reversible_run(flow, gamma, modes, y, self.most, 0)
             end = jax.lax.stop_gradient(end)
@@ -284,13 +291,11 @@ class ImpulseProgram:
         else:
             end = to_the_end(flow, gamma, modes, y, self.most, keeps=self.finely and not duals)
             state = end.carry.y
-        rows = 3 * gamma.shape[0]
         p = value_of(state)[rows - len(gamma) : rows] + end.impulse
         if self.smooth or duals:
             last = flow, problem.gamma, state
             plastic = pushforward(lambda f, g, y: final_impulses(f, g, y, end.carries), *last)
             p = Dual(p, plastic.tangents) if is_dual(plastic) else plastic
-        sides = slice(rows + self.sides, rows + 2 * self.sides)
         rest = pushforward(lambda y: (y[sides], y[-1:]), state)
         if self.smooth:
             return p, *rest

@@ -67,8 +67,10 @@ class ImpulseCorrelation(Law):
         """Raise a ValueError where a ratio is outside its interval for a pair of contacts."""
         if is_traced((scene, self.restitution, self.ratio)):
             return
-        m, closed = scene.contacts, np.asarray(scene.closed)
-        low, high = _interval(scene, self.restitution)
+        m = scene.contacts
+        with jax.ensure_compile_time_eval():  # inside jit too, where all of these are known
+            closed = np.asarray(scene.closed)
+            low, high = _interval(scene, self.restitution)
         ratio = np.broadcast_to(np.asarray(self.ratio, float), (m, m))
         for i, j in zip(*np.nonzero(~np.isnan(low) & closed[:, None] & closed[None, :])):
             least, most = low[i, j] * (1 - ROUNDING), high[i, j] * (1 + ROUNDING)
