@@ -340,6 +340,8 @@ MUTATIONS = [
     Mutation("no convex problem for fast expansions", r"some = jnp\.any\(unloading > 0\)", "some = jnp.any(unloading > jnp.inf)", ("test_implicit.py",)),
     Mutation("free flight ends late", r"x - wait \* self\.omega \* gamma", "x - 1.01 * wait * self.omega * gamma", ("test_implicit.py",)),
     Mutation("second derivatives of steps without events", r"without_derivatives\(primals\[0\], NotImplementedError\(NO_SECOND\)\)", "primals[0]", ("test_implicit.py",)),
+    Mutation("one change of the sweeps for two", r"both = aa \* bb - ab\*\*2 > ", "both = aa * bb - ab**2 > jnp.inf + ", ("test_implicit.py::test_sweeps_of_contacts_that_stick_end_soon",)),
+    Mutation("sweeps without extrapolation", r"- first \* change\.reached - second \* before\.reached", "", ("test_implicit.py::test_sweeps_of_contacts_that_stick_end_soon",)),
     Mutation("what sweeps leave is no error", r"loss \+ left\b", "loss + 0 * left", ("test_implicit.py::test_what_the_sweeps_of_a_step_leave_is_part_of_its_error",)),
     Mutation("sweeps beyond what is right", r"right = s\.error <= tolerance", "right = s.error < 0 * tolerance", ("test_implicit.py::test_an_impact_in_a_batch_is_what_it_is_alone",)),
     Mutation("a force that acts until its contact turns is dropped", r"turns = opened & \(before < 0\)", "turns = opened & (before < 0) & False", ("test_implicit.py::test_a_force_that_acts_until_its_contact_turns_is_not_forgotten",)),
