@@ -342,6 +342,8 @@ MUTATIONS = [
     Mutation("second derivatives of steps without events", r"without_derivatives\(primals\[0\], NotImplementedError\(NO_SECOND\)\)", "primals[0]", ("test_implicit.py",)),
     Mutation("one change of the sweeps for two", r"both = aa \* bb - ab\*\*2 > ", "both = aa * bb - ab**2 > jnp.inf + ", ("test_implicit.py::test_sweeps_of_contacts_that_stick_end_soon",)),
     Mutation("sweeps without extrapolation", r"- first \* change\.reached - second \* before\.reached", "", ("test_implicit.py::test_sweeps_of_contacts_that_stick_end_soon",)),
+    Mutation("a tolerance beyond the noise", r"PART_OF_NOISE \* s >= COARSE", "100 * s >= COARSE", ("test_implicit.py::test_a_fit_takes_the_tolerance_that_the_noise_allows",)),
+    Mutation("a tolerance for a method that errs by none", r"0 < law\.accuracy\(shapes\)", "0 <= law.accuracy(shapes)", ("test_implicit.py::test_a_fit_takes_the_tolerance_that_the_noise_allows",)),
     Mutation("what sweeps leave is no error", r"loss \+ left\b", "loss + 0 * left", ("test_implicit.py::test_what_the_sweeps_of_a_step_leave_is_part_of_its_error",)),
     Mutation("sweeps beyond what is right", r"right = s\.error <= tolerance", "right = s.error < 0 * tolerance", ("test_implicit.py::test_an_impact_in_a_batch_is_what_it_is_alone",)),
     Mutation("a force that acts until its contact turns is dropped", r"turns = opened & \(before < 0\)", "turns = opened & (before < 0) & False", ("test_implicit.py::test_a_force_that_acts_until_its_contact_turns_is_not_forgotten",)),

@@ -9,9 +9,9 @@ A step looks for impulses q = (f, y), normal (m) and tangential (t), at which th
 with the force F_j that the indentation at the beginning of the step gives, and the part a_j gamma_j
 of it that a fast unloading takes away within the step (0: none). With F_j and the radii known this
 is a convex problem; projected gradients, extrapolated by Anderson's method, solve it from the
-impulses of the step before, scaled to the new load. Which contacts stick, which slip and where to, and who carries
-what where contacts are redundant, comes out of the minimum: no modes, nothing to be compiled for
-each contact.
+impulses of the step before, scaled to the new load. Which contacts stick, which slip and where to,
+and who carries what where contacts are redundant, comes out of the minimum: no modes, nothing to be
+compiled for each contact.
 """
 
 from typing import Any, NamedTuple
