@@ -41,4 +41,4 @@ def tolerated(
         f"Velocities finer than {COARSE:g} of the fastest approach: the law is computed with `rtol`"
         f" = {COARSE:g}, a tenth of the noise or less; give it an `rtol` to change that."
     )
-    return dataclasses.replace(law, rtol=COARSE), (line,)
+    return dataclasses.replace(law, **{"rtol": COARSE}), (line,)
