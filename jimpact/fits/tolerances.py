@@ -10,11 +10,11 @@ from jimpact.fits.experiments import Experiments
 from jimpact.law import AnyLaw
 from jimpact.scene import Scene
 
-# Error of computed gap velocities, as a part of their noise. Ten times more: fits move by their
-# standard errors.
+# Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
+# itself, and the same in all shots.
 PART_OF_NOISE = 0.1
-# Tolerance for such data. One value: each compiles a program. Ten times more: derivatives, and with
-# them standard errors, err by some percent.
+# Tolerance for such data: one, since each compiles a program. Standard errors move by .1 % with it;
+# ten times more: derivatives lose another digit.
 COARSE = 1e-4
 
 
