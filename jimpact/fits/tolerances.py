@@ -13,8 +13,8 @@ from jimpact.scene import Scene
 # Error of computed gap velocities, as a part of their noise. Ten times more: as large as the noise
 # itself, and the same in all shots.
 PART_OF_NOISE = 0.1
-# Tolerance for such data: one, since each compiles a program. Standard errors move by .1 % with it;
-# ten times more: derivatives lose another digit.
+# Tolerance for such data: one, since each compiles a program. Standard errors move by .1 %; at one
+# ten times more derivatives lose another digit.
 COARSE = 1e-4
 
 
