@@ -23,8 +23,8 @@ from jimpact.solvers.dense import regularized_once
 from jimpact.solvers.friction import in_disc
 
 # Sweeps of one solve at most; 1 to 4 are usual. What is left then is an error of the step, which
-# becomes shorter. Batches wait for their slowest solve: already twice as many take half as long again
-# for boxes that are nearly flat, in as many steps.
+# becomes shorter. Batches wait for their slowest solve: twice as many already take half as long
+# again for boxes that are nearly flat, in as many steps.
 SWEEPS = 8
 # Added to the diagonal of the tangent equations, which are singular where contacts stick
 # redundantly. Velocities do not depend on it. Ten times more: derivatives err by ten times the
