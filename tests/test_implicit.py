@@ -100,13 +100,13 @@ def test_derivatives():
         jax.hessian(after)(0.5)
 
 
-def edge_problem():
+def edge_problem(sigma=0.01, name="edge", **options):
     """Restitution and friction of four impacts of a box on its edge, not yet at the fit."""
-    scene, velocity = pressed("edge")
+    scene, velocity = pressed(name)
     shots = np.outer([0.8, 1.0, 1.2, 1.4], velocity)
     after = np.outer([0.8, 1.0, 1.2, 1.4], EDGE)
-    data = ji.Experiments(shots, after, sigma=0.01)
-    law = ji.LZB(0.4, friction=0.25)
+    data = ji.Experiments(shots, after, sigma=sigma)
+    law = ji.LZB(0.4, friction=0.25, **options)
     return ji.FitProblem.from_shots(law, scene, data, ("restitution", "friction"))
 
 
@@ -119,6 +119,17 @@ def test_second_derivatives_of_a_fit_say_what_auto_is():
 
     with pytest.raises(NotImplementedError, match="or 'auto', which is 'implicit' for several"):
         jax.jit(jax.hessian(cost)).lower(jnp.asarray(problem.start))
+
+
+def test_a_fit_takes_the_tolerance_that_the_noise_allows():
+    """Coarse under the noise; the usual one where it is smaller, unknown, or no error is seen."""
+    problem = edge_problem()
+    assert problem.law.rtol == 1e-4
+    assert any("`rtol` = 0.0001" in note for note in problem.notes)
+    gaps = np.abs(pressed("edge")[0].normals.T @ problem.experiments.pre[-1]).max()
+    for others in ({"sigma": None}, {"sigma": 1e-4 * gaps}, {"name": "corner"}):
+        assert edge_problem(**others).law.rtol is None, others
+    assert edge_problem(rtol=1e-6).law.rtol == 1e-6
 
 
 @pytest.mark.release
@@ -135,6 +146,9 @@ def test_gradient_of_a_fit():
         np.testing.assert_allclose(jax.jit(mode(cost))(x), wanted, rtol=1e-4)
     found = ji.fit(problem, starts=1, profiles=False)
     np.testing.assert_allclose(found.value, 0.3, atol=1e-3)
+    fine = ji.fit(edge_problem(rtol=1e-5), starts=1, profiles=False)
+    assert np.abs(found.value - fine.value).max() < 0.01 * found.standard_error.min()
+    np.testing.assert_allclose(found.standard_error, fine.standard_error, rtol=0.02)
 
 
 @pytest.mark.slow
@@ -248,13 +262,26 @@ def test_impulses_of_a_step():
     np.testing.assert_allclose(q[:2, 0], [0.625, 1.0], atol=1e-12)
 
 
+def test_sweeps_of_contacts_that_stick_end_soon():
+    """Slip of two rates, 19 to 1: two changes tell both; K y = -u has the solution (-.1, 0)."""
+    k = jnp.eye(4).at[2, 3].set(0.9).at[3, 2].set(0.9)[..., None]
+    one, velocity = jnp.ones((2, 1)), jnp.array([[0.0], [0.0], [0.1], [0.09]])
+    problem = StepProblem(Dense(k), velocity, one, 0 * one, one, jnp.full((4, 1), 0.4))
+    q, left = solve(problem, 0 * velocity, jnp.full((1, 1), 1e-13))
+    np.testing.assert_allclose(q[:, 0], [1.0, 1.0, -0.1, 0.0], atol=1e-12)
+    assert left[0, 0] <= 1e-13
+
+
 def test_an_impact_in_a_batch_is_what_it_is_alone():
     """Its sweeps end where it is right, not where the slowest of the batch is."""
     k = jnp.stack([jnp.eye(4).at[2, 3].set(c).at[3, 2].set(c) for c in (0.5, 0.999)], axis=-1)
-    velocity, one = jnp.array([[0.0], [0.0], [1.0], [0.9985]]) * jnp.ones((1, 2)), jnp.ones((2, 2))
-    problem = StepProblem(Dense(k), velocity, one, 0 * one, 2 * one, descent_lengths(k, 2))
+    velocity, one = jnp.array([[0.0], [0.0], [1.0], [0.3]]) * jnp.ones((1, 2)), jnp.ones((2, 2))
+    problem = StepProblem(Dense(k), velocity, one, 0 * one, 2 * one, jnp.full((4, 2), 0.4))
     alone = jax.tree.map(lambda x: x[..., :1], problem)
-    both, single = (solve(p, 0 * p.velocity, 1e-5 + 0 * p.load[:1])[0] for p in (problem, alone))
+    (both, _), (single, left) = (
+        solve(p, 0 * p.velocity, 0.2 + 0 * p.load[:1]) for p in (problem, alone)
+    )
+    assert left[0, 0] > 1e-3  # it ends before it is exact
     np.testing.assert_allclose(both[:, 0], single[:, 0], rtol=1e-12)
 
 

@@ -39,6 +39,7 @@ from jimpact.fits.scene_parameters import (
     with_parts_of_scene,
 )
 from jimpact.fits.ties import Ties, checked_ties, entry_of, tied
+from jimpact.fits.tolerances import tolerated
 from jimpact.impacts import impact
 from jimpact.law import Law
 from jimpact.scene import Scene, dense_mass, stackable
@@ -246,6 +247,7 @@ class FitProblem:
         check_kind("experiments", experiments, Experiments)
         check_concrete("law", law)
         check_concrete("scene", scene)
+        law, of_tolerance = tolerated(law, scene, experiments)
         scenes = experiments.each(scene, lambda s: s)
         same = experiments.scenes is None
         fixed, law = law, with_parts_of_scene(law, scene, not same, free)
@@ -268,7 +270,8 @@ class FitProblem:
             choice = choice._replace(limits=_limits_of_scene(choice))
         problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
         values = problem.values - experiments.lost_freedom
-        problem = replace(problem, values=values, experiments=experiments, scene=scene)
+        notes = (*problem.notes, *of_tolerance)
+        problem = replace(problem, notes=notes, values=values, experiments=experiments, scene=scene)
         return problem if experiments.sigma_pre is None else problem.with_errors_before(law)
 
     def with_errors_before(self, law: Law) -> "FitProblem":

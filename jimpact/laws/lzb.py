@@ -162,7 +162,7 @@ class LZB(Law):
             None: none. While a contact slips, the tangential force is `lambda = -mu F u / |u|`;
             while it sticks, u is exactly 0 and `|lambda| <= mu F` (`docs/friction.md`).
         rtol: tolerance on v+ relative to max |v-|; default 1e-8 (float32: 1e-5), with method
-            'implicit' 1e-5 (float32: 1e-4).
+            'implicit' 1e-5 (float32: 1e-4), in fits 1e-4 where that is a tenth of the noise.
         max_steps: maximum attempted steps.
         method: 'time', event-aligned, order 8; 'implicit', steps that know no events, order 2 to
             3, compiled as soon for many contacts with friction as for one;

@@ -29,9 +29,10 @@ from jimpact.loops import fori_loop
 # Rows up to which one system is solved by the loop, not by LAPACK: in a batch that is three to six
 # times as fast. With ten times more the cubic cost of many contacts would not be blocked.
 _BY_LOOP = 4
-# Columns up to which products are written out: a reduction does not fuse with what follows it. Ten
+# Columns up to which products are written out: a reduction does not fuse with what follows it, and
+# is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
 # times more would make large programs of long chains.
-COLUMNS_WRITTEN_OUT = 8
+COLUMNS_WRITTEN_OUT = 12
 # With a unit diagonal a matrix of m rows counts as singular when it has an eigenvalue (singular
 # value) below this multiple of its rounding errors, eps m. Ten times more: nearly parallel contacts
 # are redundant.

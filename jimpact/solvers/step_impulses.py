@@ -8,10 +8,10 @@ A step looks for impulses q = (f, y), normal (m) and tangential (t), at which th
 
 with the force F_j that the indentation at the beginning of the step gives, and the part a_j gamma_j
 of it that a fast unloading takes away within the step (0: none). With F_j and the radii known this
-is a convex problem; accelerated projected gradients with restarts solve it from the impulses of the
-step before, scaled to the new load. Which contacts stick, which slip and where to, and who carries
-what where contacts are redundant, comes out of the minimum: no modes, nothing to be compiled for
-each contact.
+is a convex problem; projected gradients, extrapolated by Anderson's method, solve it from the
+impulses of the step before, scaled to the new load. Which contacts stick, which slip and where to,
+and who carries what where contacts are redundant, comes out of the minimum: no modes, nothing to be
+compiled for each contact.
 """
 
 from typing import Any, NamedTuple
@@ -22,10 +22,10 @@ import jax.numpy as jnp
 from jimpact.solvers.dense import regularized_once
 from jimpact.solvers.friction import in_disc
 
-# Sweeps of one solve at most; 1 to 10 are usual. What is left then is an error of the step, which
-# becomes shorter. Ten times more: batches, which wait for their slowest solve, take four times as
-# long, for the same errors.
-SWEEPS = 15
+# Sweeps of one solve at most; 1 to 4 are usual. What is left then is an error of the step, which
+# becomes shorter. Batches wait for their slowest solve: twice as many already take half as long
+# again for boxes that are nearly flat, in as many steps.
+SWEEPS = 8
 # Added to the diagonal of the tangent equations, which are singular where contacts stick
 # redundantly. Velocities do not depend on it. Ten times more: derivatives err by ten times the
 # rounding that it amplifies.
@@ -88,6 +88,34 @@ def descent_lengths(coupling: jax.Array, contacts: int, friction_only: bool = Fa
     return 1 / jnp.where(longest > 0, longest, 1.0)
 
 
+class Move(NamedTuple):
+    """The impulses (n, B) that a step of descent reaches, and its way to them."""
+
+    reached: jax.Array
+    way: jax.Array
+
+
+def extrapolated(now: Move, change: Move, before: Move, weight: jax.Array) -> jax.Array:
+    """Impulses (n, B) from which descent would have no way to go, by Anderson's method of depth 2.
+
+    `change`, `before`: by how much moves differed now and a sweep ago. The combination of ways that
+    is least, in a metric with the weights (n, B), is taken for that of the impulses, too.
+    """
+
+    def dot(a: jax.Array, b: jax.Array) -> jax.Array:
+        """Products (1, B)."""
+        return jnp.sum(weight * a * b, axis=0, keepdims=True)
+
+    aa, ab, bb = (dot(*x) for x in ((change.way,) * 2, (change.way, before.way), (before.way,) * 2))
+    both = aa * bb - ab**2 > float(jnp.finfo(weight.dtype).eps) * aa * bb
+    aa, bb = jnp.where(aa > 0, aa, 1.0), jnp.where(both, bb, 1.0)
+    ab = jnp.where(both, ab, 0.0)
+    a, b = dot(change.way, now.way), jnp.where(both, dot(before.way, now.way), 0.0)
+    determinant = aa * bb - ab**2
+    first, second = (a * bb - b * ab) / determinant, (b * aa - a * ab) / determinant
+    return now.reached - first * change.reached - second * before.reached
+
+
 def solve(
     problem: StepProblem, start: jax.Array, tolerance: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -97,43 +125,39 @@ def solve(
     """
 
     class Sweep(NamedTuple):
-        """Impulses, the point that the next sweep starts from, momentum, error, sweeps done."""
+        """The point that a sweep starts from, velocities there, the last move, its difference from
+        the one before it; impulses, their error, sweeps done."""
 
-        impulses: jax.Array
         ahead: jax.Array
-        momentum: jax.Array
+        velocities: jax.Array  # kept here, they are computed once: XLA fuses them into each use
+        last: Move
+        change: Move
+        impulses: jax.Array
         error: jax.Array
         done: jax.Array
+
+    weight = 1 / problem.descent
 
     def going(s: Sweep) -> jax.Array:
         """Whether a lane of the batch is not yet right."""
         return (s.done < SWEEPS) & jnp.any(s.error > tolerance)
 
     def sweep(s: Sweep) -> Sweep:
-        """One step of descent, and Nesterov's extrapolation unless it points uphill."""
-        new = problem.projected(s.ahead, problem.velocities(s.ahead))
-        moved = (s.ahead - new) / problem.descent
-        change = jnp.max(jnp.abs(moved), axis=0, keepdims=True)
-        uphill = jnp.sum(moved * (new - s.impulses), axis=0, keepdims=True) > 0
-        momentum = jnp.where(uphill, 1.0, (1 + jnp.sqrt(1 + 4 * s.momentum**2)) / 2)
-        weight = jnp.where(uphill, 0.0, (s.momentum - 1) / momentum)
-        ahead = new + weight * (new - s.impulses)
-        right = s.error <= tolerance
+        """One step of descent, and the extrapolation from it and the two before it."""
+        reached = problem.projected(s.ahead, s.velocities)
+        now = Move(reached, reached - s.ahead)
+        changes = jax.tree.map(lambda a, b: jnp.where(s.done > 0, a - b, 0.0), now, s.last)
+        ahead = extrapolated(now, changes, s.change, weight)
+        error = jnp.max(jnp.abs(weight * now.way), axis=0, keepdims=True)
+        right = s.error <= tolerance  # such lanes keep what they have
+        impulses = jnp.where(right, s.impulses, reached)
+        error = jnp.where(right, s.error, error)
+        velocities = problem.velocities(ahead)
+        return Sweep(ahead, velocities, now, changes, impulses, error, s.done + 1)
 
-        def kept(before: jax.Array, now: jax.Array) -> jax.Array:
-            """What lanes that are right keep."""
-            return jnp.where(right, before, now)
-
-        return Sweep(
-            kept(s.impulses, new),
-            kept(s.ahead, ahead),
-            kept(s.momentum, momentum),
-            kept(s.error, change),
-            s.done + 1,
-        )
-
-    one = jnp.ones_like(tolerance)
-    first = Sweep(start, start, one, one * jnp.inf, jnp.asarray(0))
+    none = Move(*[jnp.zeros_like(start)] * 2)
+    wrong = jnp.full_like(tolerance, jnp.inf)
+    first = Sweep(start, problem.velocities(start), none, none, start, wrong, jnp.asarray(0))
     end = jax.lax.while_loop(going, sweep, first)
     return end.impulses, end.error
 
