@@ -30,8 +30,9 @@ class Scatter:
     """Scatter `value` of the parameter `name` between shots, and the fit with it.
 
     `chance` is the p-value of no scatter; `mean` (P,) and `standard_error` (P,) of all parameters
-    `names`, `squares` and `degrees_of_freedom` of what is left; `each` (K,) the value
-    of every single shot and its error `each_error` (inf where a shot does not see it).
+    `names`, `squares` and `degrees_of_freedom` of what is left, `share` of the sum of squares that
+    the scatter accounts for; `each` (K,) the value of every single shot and its error `each_error`
+    (inf where a shot does not see it).
     """
 
     name: str
@@ -42,6 +43,7 @@ class Scatter:
     standard_error: np.ndarray
     squares: float
     degrees_of_freedom: int
+    share: float
     each: np.ndarray
     each_error: np.ndarray
 
@@ -130,6 +132,7 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
         standard_error=noise * np.sqrt(np.diag(covariance)),
         squares=squares,
         degrees_of_freedom=freedom,
+        share=1 - squares / model.solve(np.zeros((1, 1)))[2],
         each=fit.value[which] + change_of_each,
         each_error=each_error,
     )
