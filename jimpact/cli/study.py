@@ -26,7 +26,7 @@ from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.observables import Measured, observations
 from jimpact.fits.parameters import OF_SPEED, default_free
-from jimpact.fits.problem import FitProblem
+from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -69,7 +69,7 @@ class Study:
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options, or with those that are passed and not None."""
-        problem = self._problem(FitProblem.of_shots)  # `fit` passes on errors of v-
+        problem = self._problem(of_shots)  # `fit` passes on errors of v-
         return fit(problem, **(self.options | without_none(options)))
 
     @property

@@ -25,7 +25,7 @@ from jimpact.fits.multistart import (
     start_points,
 )
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
-from jimpact.fits.problem import FitProblem, Residuals, filled_up
+from jimpact.fits.problem import FitProblem, Residuals, filled_up, of_shots
 from jimpact.fits.result import check_squares
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
@@ -79,7 +79,7 @@ def fit_many(
     """
     as_whole("starts", starts, 1)
     choice = (free, bounds, priors, ties)
-    problems = [FitProblem.of_shots(law, scene, data, *choice) for data in many]
+    problems = [of_shots(law, scene, data, *choice) for data in many]
     filled = [filled_up(problem.residuals) for problem in problems]
     groups: dict[str, list[int]] = {}
     for k, residuals in enumerate(filled):

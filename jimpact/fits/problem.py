@@ -254,52 +254,15 @@ class FitProblem:
             priors: as in `fit`.
             ties: as in `fit`.
         """
-        problem = cls.of_shots(law, scene, experiments, free, bounds, priors, ties)
+        problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
         return problem.passing_errors_at(problem.point(problem.start))
 
-    @classmethod
-    def of_shots(
-        cls,
-        law: Law,
-        scene: Scene | None,
-        experiments: Experiments,
-        free: Any = DEFAULT_FREE,
-        bounds: Mapping[str, Any] | None = None,
-        priors: Mapping[str, Any] | None = None,
-        ties: Mapping[str, Any] | None = None,
-    ) -> "FitProblem":
-        """As `from_shots`, but errors of v- count as if v+ had them, too, until a law is found."""
-        check_kind("law", law, Law)
-        check_kind("experiments", experiments, Experiments)
-        check_concrete("law", law)
-        check_concrete("scene", scene)
-        scenes = experiments.each(scene, lambda s: s)
-        same = experiments.scenes is None
-        fixed, law = law, with_parts_of_scene(law, scene, not same, free)
-        alike, extra = stackable(scenes[:1] if same else scenes)
-        dtype = _dtype(law, alike, experiments.pre)
-        pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
-        unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
-        count, n = pre.shape
-        masses = experiments.each(scene, dense_mass)
-        energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
-        stacked = jax.tree.map(
-            lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
-        )
-        filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
-        observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
-        sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
-        errors = experiments.natural_errors(scene) if sigma is None else sigma
-        choice = _choice(law, observe, free, bounds, priors, ties)
-        if law is not fixed:
-            choice = choice._replace(limits=_limits_of_scene(choice))
-        problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
-        values = problem.values - experiments.lost_freedom
-        problem = replace(problem, values=values, experiments=experiments, scene=scene)
-        return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
-
     def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
-        """With the errors of v-, if any, passed on to v+ by `dv+/dv-` (K or more, n, n)."""
+        """With the errors of v-, if there are any, passed on to v+ by slopes.
+
+        Args:
+            slopes: `dv+/dv-` of the shots (K or more, n, n); None: nothing changes.
+        """
         data, r = self.experiments, self.residuals
         if slopes is None or data is None or data.sigma_pre is None:
             return self
@@ -601,6 +564,46 @@ class FitProblem:
         log = r.log[first]
         y = jnp.where(log, jnp.log(jnp.where(log, x, 1.0)), x / r.scale[first])
         return jnp.zeros_like(r.offset).at[: len(first)].set(y)
+
+
+def of_shots(
+    law: Law,
+    scene: Scene | None,
+    experiments: Experiments,
+    free: Any = DEFAULT_FREE,
+    bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    ties: Mapping[str, Any] | None = None,
+) -> FitProblem:
+    """`FitProblem.from_shots`, but errors of v- count as if v+ had them, until a law is found."""
+    check_kind("law", law, Law)
+    check_kind("experiments", experiments, Experiments)
+    check_concrete("law", law)
+    check_concrete("scene", scene)
+    scenes = experiments.each(scene, lambda s: s)
+    same = experiments.scenes is None
+    fixed, law = law, with_parts_of_scene(law, scene, not same, free)
+    alike, extra = stackable(scenes[:1] if same else scenes)
+    dtype = _dtype(law, alike, experiments.pre)
+    pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
+    unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
+    count, n = pre.shape
+    masses = experiments.each(scene, dense_mass)
+    energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
+    stacked = jax.tree.map(
+        lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
+    )
+    filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
+    observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
+    sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
+    errors = experiments.natural_errors(scene) if sigma is None else sigma
+    choice = _choice(law, observe, free, bounds, priors, ties)
+    if law is not fixed:
+        choice = choice._replace(limits=_limits_of_scene(choice))
+    problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
+    values = problem.values - experiments.lost_freedom
+    problem = replace(problem, values=values, experiments=experiments, scene=scene)
+    return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
 
 
 def _dtype(*trees: Any) -> np.dtype:
