@@ -30,9 +30,9 @@ class Scatter:
     """Scatter `value` of the parameter `name` between shots, and the fit with it.
 
     `chance` is the p-value of no scatter; `mean` (P,) and `standard_error` (P,) of all parameters
-    `names`, `squares` and `degrees_of_freedom` of what is left, `share` of the sum of squares that
-    the scatter accounts for; `each` (K,) the value of every single shot and its error `each_error`
-    (inf where a shot does not see it).
+    `names`, `squares` and `degrees_of_freedom` of what is left; `each` (K,) the value
+    of every single shot and its error `each_error` (inf where a shot does not see it); `share` of
+    the sum of squares that the scatter accounts for.
     """
 
     name: str
@@ -43,9 +43,9 @@ class Scatter:
     standard_error: np.ndarray
     squares: float
     degrees_of_freedom: int
-    share: float
     each: np.ndarray
     each_error: np.ndarray
+    share: float = np.nan
 
     def __str__(self) -> str:
         i = self.names.index(self.name)
