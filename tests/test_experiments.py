@@ -295,6 +295,7 @@ def test_a_body_where_each_shot_found_it(tmp_path):
     ("text", "message"),
     [
         ("pre_1[m/s],post_1[m/s],mass_1[m]\n1,1,1\n", r"the unit of column `mass_1\[m\]` must be one of kg, g"),
+        ("pre_1[m/s],post_1[m/s],mass_1[g]\n1,1,0\n", r"column `mass_1\[g\]`: a mass must be > 0, but is '0'"),
         ("pre_1[m/s],post_1[m/s],gap_1[mm]\n1,1,\n", r"column `gap_1\[mm\]`: this must be given"),
         ("pre_1[m/s],post_1[m/s],sigma_1[m/s],sigma_pre_1[m/s]\n1,1,1,-1\n", r"must be > 0, but is -1"),
         ("pre_1[m/s],post_1[m/s],sigma_pre_1[m/s]\n1,1,1\n", r"`sigma` must be given where `sigma_pre` is"),

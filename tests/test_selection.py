@@ -296,6 +296,13 @@ def test_scatter_between_shots():
     assert found.noise > 5  # the errors of the plain fit are stretched
     falling = ji.Experiments(PRE, after(0.8 * SPEED**-0.2, 0.002), sigma=0.002)
     assert "It depends on the speed" in str(ji.fit(ji.Newton(0.5), PAIR, falling))
+    moved = after(e, 0.002) + 0.1 * rng.normal(size=(12, 1))  # no e makes momentum
+    both = ji.fit(ji.Newton(0.5), PAIR, ji.Experiments(PRE, moved, sigma=0.002))
+    reported = ji.scatter(both)
+    share = 1 - reported.squares / both.starts[0].sum_of_squares
+    assert 0.1 < share < 0.9
+    assert not reported.explains
+    assert f"from shot to shot, which accounts for {100 * share:.2g} % of chi^2" in both.verdict
 
 
 def test_the_chance_of_scatter_is_half_that_of_chi_squared():

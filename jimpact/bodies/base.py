@@ -1,6 +1,7 @@
 """The description of a body: gaps, tangents and mass matrix as functions of its configuration."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact.compiling import quick_jit
 from jimpact.scene import Scene, check_mass
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
@@ -305,8 +307,16 @@ def _parts(body: Body, q: jax.Array) -> _Parts:
     return body.mass_matrix(q), normals, body.tangents(q), body.gap_function(q), margin
 
 
-_compiled_parts = eqx.filter_jit(_parts)
-_many_parts = eqx.filter_jit(jax.vmap(_parts, in_axes=(None, 0)))
+@quick_jit
+def _compiled_parts(body: Body, q: jax.Array) -> _Parts:
+    """The same, compiled."""
+    return _parts(body, q)
+
+
+@quick_jit
+def _many_parts(body: Body, q: jax.Array) -> _Parts:
+    """The same at many q (K, d), compiled."""
+    return jax.vmap(partial(_parts, body))(q)
 
 
 def check_range(name: str, body: Body, margin: Any, where: str = "") -> None:

@@ -2,7 +2,7 @@
 
 import importlib.util
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
@@ -26,7 +26,7 @@ from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.matrix_fit import admissible_start
 from jimpact.fits.observables import Measured, observations
 from jimpact.fits.parameters import OF_SPEED, default_free
-from jimpact.fits.problem import FitProblem
+from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.law import Law, free_parameters_of
 from jimpact.laws import REGISTRY
 from jimpact.laws.kinematic import RestitutionMatrix
@@ -69,11 +69,16 @@ class Study:
 
     def run(self, **options: Any) -> Fit:
         """`fit` with the study's options, or with those that are passed and not None."""
-        return fit(self.problem, **(self.options | without_none(options)))
+        problem = self._problem(of_shots)  # `fit` passes on errors of v-
+        return fit(problem, **(self.options | without_none(options)))
 
     @property
     def problem(self) -> FitProblem:
         """The problem that `run` solves: of the shots, or of the observables."""
+        return self._problem(FitProblem.from_shots)
+
+    def _problem(self, of_shots: Callable[..., FitProblem]) -> FitProblem:
+        """The same, that of shots made by this function."""
         names = ("free", "bounds", "priors")
         parameters: dict[str, Any] = {name: getattr(self, name) for name in names}
         if self.measured is not None:
@@ -81,7 +86,7 @@ class Study:
             return FitProblem.from_observable(self.law, observe, value, sigma, **parameters)
         if self.experiments is None:
             raise ValueError(NO_DATA)
-        return FitProblem.from_shots(self.law, self.scene, self.experiments, **parameters)
+        return of_shots(self.law, self.scene, self.experiments, **parameters)
 
 
 def read_study(path: str | Path, law: str | None = None) -> Study:

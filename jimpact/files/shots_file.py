@@ -246,6 +246,8 @@ def _number(where: str, column: CsvColumn, cell: str) -> float:
         ) from None
     if not np.isfinite(number):
         raise ValueError(f"{where}: the value must be finite, but is {cell!r}.")
+    if column.kind == "mass" and number <= 0:
+        raise ValueError(f"{where}: a mass must be > 0, but is {cell!r}.")
     return number * column.factor
 
 

@@ -17,7 +17,7 @@ from jimpact.fits.multistart import Minimum, SearchResult, ends, search, settled
 from jimpact.fits.page import write_page
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
 from jimpact.fits.prediction import Predicted, jacobian_of, predicted, tied_values
-from jimpact.fits.problem import FitProblem
+from jimpact.fits.problem import FitProblem, of_shots
 from jimpact.fits.profiles import needs_profiles, profile, quick_profiles
 from jimpact.fits.report import report, verdict
 from jimpact.fits.result import FitMinimum, FitResult
@@ -246,7 +246,7 @@ def fit(
             )
         problem = law
     else:
-        problem = FitProblem.from_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
+        problem = of_shots(law, scene, experiments, free, bounds, priors, ties)  # type: ignore[arg-type]
     solution = search(problem, method, starts, seed, steps, progress)
     while (lost := unusable(problem, solution)).any() and not lost.all():
         problem = _without(problem, lost)
@@ -254,7 +254,7 @@ def fit(
     _check_derivatives(problem, solution)
     if problem.residuals.mixing is not None:
         points = problem.point(np.array([minimum.value for minimum in solution.minima]))
-        (problem,), states = settled([problem], points, method, steps)
+        (problem,), states = settled([problem], points, method, steps, slopes=[solution.slopes])
         counts = np.array([minimum.starts for minimum in solution.minima])
         solution = ends(problem, states, counts, solution.lost)
     robust = None

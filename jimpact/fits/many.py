@@ -25,7 +25,7 @@ from jimpact.fits.multistart import (
     start_points,
 )
 from jimpact.fits.parameters import DEFAULT_FREE, AnyLaw
-from jimpact.fits.problem import FitProblem, Residuals, filled_up
+from jimpact.fits.problem import FitProblem, Residuals, filled_up, of_shots
 from jimpact.fits.result import check_squares
 from jimpact.progress import progress_bar
 from jimpact.scene import Scene
@@ -49,7 +49,7 @@ def fit_many(
 ) -> list[Fit[AnyLaw]]:
     """`fit` of one law to each of many data sets, side by side in one compiled program.
 
-    Data sets of up to 4, 16, 64, 128, ... shots share a program. Arguments and errors as of `fit`;
+    Data sets of up to 4, 8, 16, ... shots share a program. Arguments and errors as of `fit`;
     `starts` are those of each data set; around the best, and in scans, none are added.
 
     Args:
@@ -79,7 +79,7 @@ def fit_many(
     """
     as_whole("starts", starts, 1)
     choice = (free, bounds, priors, ties)
-    problems = [FitProblem.from_shots(law, scene, data, *choice) for data in many]
+    problems = [of_shots(law, scene, data, *choice) for data in many]
     filled = [filled_up(problem.residuals) for problem in problems]
     groups: dict[str, list[int]] = {}
     for k, residuals in enumerate(filled):
@@ -99,7 +99,14 @@ def fit_many(
             searches = _searches(group_problems, states)
             if stacked.mixing is not None:
                 best = np.array([search.y for search in searches])
-                group_problems, states = settled(group_problems, best, _METHOD, max_steps, show)
+                group_problems, states = settled(
+                    group_problems,
+                    best,
+                    _METHOD,
+                    max_steps,
+                    show,
+                    slopes=[search.slopes for search in searches],
+                )
                 searches = _searches(group_problems, states)
             for k, problem, search in zip(group, group_problems, searches):
                 if unusable(problem, search).any():  # what is left is another problem

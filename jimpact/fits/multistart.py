@@ -22,13 +22,15 @@ from jimpact.fits.problem import (
 )
 from jimpact.progress import Show, progress_bar
 
-LANES, DEAR_LANES = 8, 4  # starts that run together: of shots, and of what may take longer
+# Starts that run together. With more of them, those that are done wait for the slowest; with fewer,
+# the operations of a pass are too small to be worth their calls.
+LANES = 4
 PASSES = 4  # until starts that are done are replaced
 # A Levenberg-Marquardt start that gains less than this share in this number of passes sits on a
 # kink of the law (a change in the sequence of contacts), where steps zigzag: it is given up.
 SLOW, SLOW_PASSES = 1e-3, 12
-# One whose sum of squares is this far above the best must gain this share to go on.
-BEHIND, SLOW_BEHIND = 10.0, 0.1
+# One whose sum of squares is this far above the best must gain this share to go on, and sooner.
+BEHIND, SLOW_BEHIND, BEHIND_PASSES = 10.0, 0.1, 8
 
 # Random starts: a stiffness within this factor of the user's, a parameter without two bounds
 # within this many natural scales of the user's.
@@ -40,15 +42,15 @@ START_RESTITUTION = 0.3
 
 # The law is only piecewise smooth, so that the sum of squares has side minima close to a minimum.
 # Starts around the best find lower ones; they repeat while they gain.
-ROUNDS = 5
+ROUNDS, NEAR = 5, 8  # of so many starts
 NEAR_SPREAD = 2.0  # standard errors
 SETTLED, SETTLING = 1e-5, 10  # change (natural scales) and rounds, where errors of v- are passed on
 NEAR_RCOND = 1e-10  # directions that the data do not determine are not searched
 
 # Impacts map a stiffness ratio many to one: three balls of ratio 40 come apart as those of up to
 # nine other ratios do. So each such parameter is scanned: SCANNED values within SCAN_FACTOR of the
-# user's own, the others following for SCAN_PASSES; the FOLLOWED best valleys are followed.
-SCANNED, SCAN_FACTOR, SCAN_PASSES, FOLLOWED = 64, 300.0, 2, 16
+# user's own, the others following by a Gauss-Newton step; the FOLLOWED best valleys are followed.
+SCANNED, SCAN_FACTOR, FOLLOWED = 64, 300.0, 16
 DEEP = 0.5  # a valley is deeper than this share of the ridges on both sides
 WITHIN = 8  # points of the scan's cubics between two of its values
 FLAT = 1e-6  # singular values below this share: the data leave a valley, and no scan is made
@@ -82,6 +84,7 @@ class SearchResult(NamedTuple):
     jacobian: np.ndarray  # (R, P), of the scaled parameters
     predicted: np.ndarray  # shaped like what was measured
     status: np.ndarray
+    slopes: np.ndarray | None  # `dv+/dv-` of the shots, where errors of v- are passed on
     converged: bool
     at_bound: np.ndarray
     steps: int
@@ -107,7 +110,7 @@ def search(
             least = float(states.cost[best])
             if 2 * least <= EXACT[str(states.y.dtype)] or not _smooth(states, best):
                 break
-            points = _near(residuals, states, best, min(starts, LANES), rng)
+            points = _near(residuals, states, best, min(starts, NEAR), rng)
             more = run(
                 repeated(residuals, len(points)), points, method, max_steps, show, len(states.y)
             )
@@ -148,20 +151,21 @@ def settled(
     max_steps: int,
     show: Show = quiet,
     many: Residuals | None = None,
+    slopes: Sequence[np.ndarray | None] | None = None,
 ) -> tuple[list[FitProblem], SolverState]:
     """Minima next to points (S, Q), equally many of each problem, its best one first.
 
-    Errors of v- are propagated by the law of the best minimum, until both agree. `many`:
-    other residuals (S, ...) than the problems', whose weights alone are taken.
+    Errors of v- are passed on by the law of the best minimum, until both agree. `many`: other
+    residuals (S, ...) than the problems', whose weights alone are taken. `slopes`: `dv+/dv-` of
+    each problem at its best point; None: the problems pass errors on by them already.
     """
     each = len(points) // len(problems)
-    best = np.arange(0, len(points), each)
     if many is None:
         copies = [filled_up(problem.residuals) for problem in problems for _ in range(each)]
         many = jax.tree.map(lambda *x: np.stack([np.asarray(leaf) for leaf in x]), *copies)
     for _ in range(SETTLING):
-        if many.mixing is not None:
-            problems = [p.passing_errors_at(points[b]) for p, b in zip(problems, best)]
+        if slopes is not None:
+            problems = [p.with_errors_before(slope) for p, slope in zip(problems, slopes)]
             weights = [_weights(filled_up(p.residuals)) for p in problems]
             stacked = (np.repeat(np.stack(x), each, axis=0) for x in zip(*weights))
             many = eqx.tree_at(_weights, many, tuple(stacked))
@@ -171,7 +175,7 @@ def settled(
         if many.mixing is None or not moved.any():
             return problems, states
         cost = states.cost.reshape(-1, each)
-        best = np.arange(0, len(points), each) + np.nanargmin(cost, axis=1)
+        slopes = states.aux[-1][np.arange(0, len(points), each) + np.nanargmin(cost, axis=1)]
     return problems, eqx.tree_at(lambda s: s.gain, states, np.where(moved, np.inf, states.gain))
 
 
@@ -206,8 +210,7 @@ def run(
     counts `what`, with those of `earlier` runs of the same search.
     """
     few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
-    most = LANES if few and isinstance(problems.observe, Shots) else DEAR_LANES
-    lanes = most if few or len(points) > 1 else 1  # not a program for each number of points
+    lanes = LANES if few or len(points) > 1 else 1  # not a program for each number of points
     points = points.astype(problems.offset.dtype)
     limit: Any = max_steps
     if method == "levenberg-marquardt":
@@ -236,7 +239,7 @@ def run(
         if method == "levenberg-marquardt":
             behind = rivals & (states.cost > BEHIND * np.nanmin(states.cost))
             share = np.where(behind, SLOW_BEHIND, SLOW)
-            due = states.steps >= since + SLOW_PASSES
+            due = states.steps >= since + np.where(behind, BEHIND_PASSES, SLOW_PASSES)
             ended |= due & (before - states.cost <= share * before) & np.isfinite(before)
             before = np.where(due, states.cost, before)
             since = np.where(due, states.steps, since)
@@ -300,7 +303,7 @@ def ends(
     low, high = (np.asarray(end)[:count] for end in (r.low, r.high))
     # starts that did not converge have no minimum to report, unless they are the best there is
     ends = [[i for i in g if converged[i] or i == best] for g in groups]
-    predicted, status = states.aux
+    predicted, status, *slopes_before = states.aux
 
     def slopes(i: int) -> np.ndarray:
         """The Jacobian at an end, without what filled up."""
@@ -316,6 +319,7 @@ def ends(
         jacobian=slopes(best),
         predicted=np.asarray(predicted[best][:rows] if rows else predicted[best], float),
         status=status[best][:rows],
+        slopes=slopes_before[0][best] if slopes_before else None,
         converged=bool(converged[best]),
         at_bound=(y[best] <= low) | (y[best] >= high),
         steps=int(np.max(states.steps)),
@@ -388,8 +392,8 @@ def _valleys(
     """Points (., Q) in the valleys of scans through the best end.
 
     A parameter that is fitted in its logarithm, or that lacks one of two bounds, is fixed at many
-    values while the others follow. Between two values the residuals are taken for cubic, with the
-    slopes that the Jacobian gives: two turns between two of them are seen.
+    values while the others follow by a step each. Between two values the residuals are taken for
+    cubic, with the slopes that the Jacobian gives: two turns between two of them are seen.
     """
     best, count = int(np.nanargmin(states.cost)), len(problem.names)
     if not _smooth(states, best):
@@ -411,8 +415,7 @@ def _valleys(
             fixed[-1][1][i] = value
     if not fixed:
         return np.zeros((0, states.y.shape[1]))
-    passes = 1 if count == 1 else SCAN_PASSES
-    scan = run_fixed(residuals, fixed, passes, show)
+    scan = run_fixed(residuals, fixed, 1, show)
     valleys = []
     for k in range(0, len(fixed), SCANNED):
         rows = slice(k, k + SCANNED)
@@ -426,8 +429,10 @@ def _turns(
     i: int, count: int, scan: SolverState, best: np.ndarray
 ) -> list[tuple[float, np.ndarray]]:
     """Sums of squares in the valleys of a scan of the i-th parameter, and where; not the best."""
-    y, r = np.asarray(scan.y, float), np.asarray(scan.residual, float)
+    y = np.asarray(scan.trial, float)  # one step ahead, as the Jacobian predicts
     jacobian = np.asarray(scan.jacobian, float)[:, :, :count]
+    ahead = (y - np.asarray(scan.y, float))[:, :count]
+    r = np.asarray(scan.residual, float) + np.einsum("krp,kp->kr", jacobian, ahead)
     others = np.delete(jacobian, i, axis=2)
     slope = jacobian[:, :, i]
     follow = np.einsum("kor,kr->ko", np.linalg.pinv(others, rcond=FLAT), slope)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import check_kind
+from jimpact._checks import check_kind, check_values
 from jimpact.fits.experiments import Experiments
 from jimpact.fits.least_squares import BoxRegion
 from jimpact.fits.multistart import SearchResult, ends, quiet, repeated, run
@@ -48,6 +48,7 @@ def predicted(fit: FitResult, shots: Any, scene: Scene | None, level: float) -> 
             f"Argument `shots` must have shape (K, {len(units)}), velocities of the bodies of the "
             f"fit, but has shape {np.shape(data)}."
         )
+    check_values("shots", data)
     data = Experiments(data, np.zeros_like(np.asarray(data, float)), scenes=scenes, units=units)
     law, own = placed_fit(fit, scene)
     largest = own if scenes is None else max(scenes, key=lambda each: each.contacts)

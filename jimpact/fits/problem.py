@@ -54,8 +54,8 @@ PENALTY = 1e3  # times the largest measured value
 # tolerance of the impact.
 EXACT = {"float64": 1e-14, "float32": 1e-8}
 
-# Shots are filled up to 4, 16, 64 and then 128, 256, ... of them: a program serves all numbers in
-# between, and the copies that fill up cost far less than compiling another one.
+# Shots are filled up to 4, 8, 16, ... of them: a program serves all numbers in between, and the
+# copies that fill up cost far less than compiling another one.
 FEWEST, FEW = 4, 64
 
 
@@ -166,17 +166,29 @@ class Residuals(eqx.Module):
     def evaluate(self, y: jax.Array) -> tuple[jax.Array, jax.Array, Any]:
         """Weighted residual (R + Q,), its Jacobian (R + Q, Q), and (predicted values, status).
 
-        The last Q are those of the priors.
+        The last Q are those of the priors. Where errors of v- are passed on, `dv+/dv-` (K, n, n)
+        of the shots comes last: one program compiles an impact once.
         """
+        count, passed = y.shape[0], 0 if self.mixing is None else self.mixing.shape[-1]
 
-        def outcome(y: jax.Array) -> tuple[jax.Array, Any]:
-            """The residual, and all that is not differentiated."""
-            data, prediction = self.residual(y)
+        def outcome(y_and_shift: jax.Array) -> tuple[tuple[jax.Array, jax.Array], Any]:
+            """Residual and prediction of y and a change of v-, and all not differentiated."""
+            y, shift = y_and_shift[:count], y_and_shift[count:]
+            data, prediction = (self.shifted(shift) if passed else self).residual(y)
             residual = jnp.concatenate([data, self.prior_residual(y)])
-            return residual, (residual, prediction.value, prediction.status)
+            out = residual, prediction.value
+            return out, (*out, prediction.status)
 
-        jacobian, (residual, *aux) = jax.jacfwd(outcome, has_aux=True)(y)
-        return residual, jacobian, tuple(aux)
+        both = jnp.concatenate([y, jnp.zeros(passed, y.dtype)])
+        (jacobian, slopes), (residual, *aux) = jax.jacfwd(outcome, has_aux=True)(both)
+        if passed:
+            aux.append(slopes[..., count:])
+        return residual, jacobian[:, :count], tuple(aux)
+
+    def shifted(self, shift: jax.Array) -> "Residuals":
+        """With this change (n,) of the velocities before all shots."""
+        pre = self.observe.pre  # type: ignore[attr-defined]
+        return eqx.tree_at(lambda r: r.observe.pre, self, pre.at[:, : shift.shape[0]].add(shift))
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,44 +255,20 @@ class FitProblem:
             priors: as in `fit`.
             ties: as in `fit`.
         """
-        check_kind("law", law, Law)
-        check_kind("experiments", experiments, Experiments)
-        check_concrete("law", law)
-        check_concrete("scene", scene)
-        law, of_tolerance = tolerated(law, scene, experiments)
-        scenes = experiments.each(scene, lambda s: s)
-        same = experiments.scenes is None
-        fixed, law = law, with_parts_of_scene(law, scene, not same, free)
-        alike, extra = stackable(scenes[:1] if same else scenes)
-        dtype = _dtype(law, alike, experiments.pre)
-        pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
-        unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
-        count, n = pre.shape
-        masses = experiments.each(scene, dense_mass)
-        energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
-        stacked = jax.tree.map(
-            lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
-        )
-        filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
-        observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
-        sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
-        errors = experiments.natural_errors(scene) if sigma is None else sigma
-        choice = _choice(law, observe, free, bounds, priors, ties)
-        if law is not fixed:
-            choice = choice._replace(limits=_limits_of_scene(choice))
-        problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
-        values = problem.values - experiments.lost_freedom
-        notes = (*problem.notes, *of_tolerance)
-        problem = replace(problem, notes=notes, values=values, experiments=experiments, scene=scene)
-        return problem if experiments.sigma_pre is None else problem.with_errors_before(law)
+        problem = of_shots(law, scene, experiments, free, bounds, priors, ties)
+        return problem.passing_errors_at(problem.point(problem.start))
 
-    def with_errors_before(self, law: Law) -> "FitProblem":
-        """With the errors of v- passed on to v+ as this law does."""
+    def with_errors_before(self, slopes: np.ndarray | None) -> "FitProblem":
+        """With the errors of v-, if there are any, passed on to v+ by slopes.
+
+        Args:
+            slopes: `dv+/dv-` of the shots (K or more, n, n); None: nothing changes.
+        """
         data, r = self.experiments, self.residuals
-        assert data is not None
-        assert data.sigma_pre is not None
+        if slopes is None or data is None or data.sigma_pre is None:
+            return self
         count, n = self.measured.shape
-        slope = slopes_before(law, filled_up(r).observe)[:count]
+        slope = np.asarray(slopes[:count], float)
         slope = np.where(np.isfinite(slope).all(axis=(1, 2), keepdims=True), slope, np.eye(n))
         for k, kept in enumerate(kept_by_corrections(data, self.scene)):
             if kept is not None:  # a residual that conserves momentum shows that part of the errors
@@ -507,9 +495,8 @@ class FitProblem:
         """With errors of v-, if there are any, passed on as the law of y (Q,) does."""
         if self.residuals.mixing is None:
             return self
-        return self.with_errors_before(
-            self.residuals.law_at(jnp.asarray(y, self.residuals.offset.dtype))
-        )
+        law = self.residuals.law_at(jnp.asarray(y, self.residuals.offset.dtype))
+        return self.with_errors_before(slopes_before(law, filled_up(self.residuals).observe))
 
     def weighed(self, factor: np.ndarray) -> "FitProblem":
         """With factors on the independent errors.
@@ -578,6 +565,48 @@ class FitProblem:
         log = r.log[first]
         y = jnp.where(log, jnp.log(jnp.where(log, x, 1.0)), x / r.scale[first])
         return jnp.zeros_like(r.offset).at[: len(first)].set(y)
+
+
+def of_shots(
+    law: Law,
+    scene: Scene | None,
+    experiments: Experiments,
+    free: Any = DEFAULT_FREE,
+    bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    ties: Mapping[str, Any] | None = None,
+) -> FitProblem:
+    """`FitProblem.from_shots`, but errors of v- count as if v+ had them, until a law is found."""
+    check_kind("law", law, Law)
+    check_kind("experiments", experiments, Experiments)
+    check_concrete("law", law)
+    check_concrete("scene", scene)
+    law, of_tolerance = tolerated(law, scene, experiments)
+    scenes = experiments.each(scene, lambda s: s)
+    same = experiments.scenes is None
+    fixed, law = law, with_parts_of_scene(law, scene, not same, free)
+    alike, extra = stackable(scenes[:1] if same else scenes)
+    dtype = _dtype(law, alike, experiments.pre)
+    pre, post = np.asarray(experiments.pre), np.asarray(experiments.post)
+    unit = max(np.abs(pre).max(), np.nanmax(np.abs(post))) or 1.0
+    count, n = pre.shape
+    masses = experiments.each(scene, dense_mass)
+    energy = max(0.5 * v @ mass @ v for mass, v in zip(masses, pre)) or 1.0
+    stacked = jax.tree.map(
+        lambda *x: np.repeat(np.stack(x), count, axis=0) if same else np.stack(x), *alike
+    )
+    filled = np.pad(pre, ((0, 0), (0, extra)), constant_values=unit)
+    observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
+    sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
+    errors = experiments.natural_errors(scene) if sigma is None else sigma
+    choice = _choice(law, observe, free, bounds, priors, ties)
+    if law is not fixed:
+        choice = choice._replace(limits=_limits_of_scene(choice))
+    problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
+    values = problem.values - experiments.lost_freedom
+    notes = (*problem.notes, *of_tolerance)
+    problem = replace(problem, notes=notes, values=values, experiments=experiments, scene=scene)
+    return problem.with_errors_before(np.tile(np.eye(n), (count, 1, 1)))
 
 
 def _dtype(*trees: Any) -> np.dtype:
@@ -744,7 +773,7 @@ def filled_up(residuals: Residuals) -> Residuals:
     count = len(residuals.measured)
     goal = FEWEST
     while goal < count:
-        goal *= 4 if goal < FEW else 2
+        goal *= 2
 
     last = np.minimum(np.arange(goal), count - 1)
     parts = (residuals.observe, residuals.measured, residuals.weight, residuals.mixing)
@@ -784,7 +813,9 @@ def begin_all(problems: Residuals, starts: Any, method: Method, max_steps: int) 
         """The state of one problem."""
         size, shape = problem.measured.size + y.shape[0], problem.measured.shape
         statuses = shape[0] if isinstance(problem.observe, Shots) else 1
-        aux = (jnp.zeros(shape, y.dtype), jnp.zeros(statuses, jnp.int32))
+        aux: Any = (jnp.zeros(shape, y.dtype), jnp.zeros(statuses, jnp.int32))
+        if problem.mixing is not None:
+            aux += (jnp.zeros_like(problem.mixing),)
         first = (jnp.zeros(size, y.dtype), jnp.zeros((size, y.shape[0]), y.dtype), aux)
         return begin(problem.region.retract(y), first, method, max_steps)
 

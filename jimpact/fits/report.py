@@ -50,6 +50,7 @@ def verdict(fit: FitResult) -> str:
     sentence = _values_in_words(fit)
     if scatter is not None:
         sentence += f"; {scatter.name} scatters by {scatter.value:.2g} from shot to shot"
+        sentence += f", which accounts for {100 * scatter.share:.2g} % of chi^2"
     against = _objection(fit)
     if against:
         nearest = f"it comes nearest with {sentence}" if fit.determined.any() else sentence

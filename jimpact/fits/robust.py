@@ -47,7 +47,7 @@ def robust_solution(
     """
     here = ~np.isnan(problem.measured)
     for _ in range(ROUNDS):
-        problem = problem.passing_errors_at(solution.y)
+        problem = problem.with_errors_before(solution.slopes)
         error = problem.independent(problem.measured - solution.predicted)
         scale = 1.0
         if problem.sigma is None:

@@ -31,7 +31,8 @@ class Scatter:
 
     `chance` is the p-value of no scatter; `mean` (P,) and `standard_error` (P,) of all parameters
     `names`, `squares` and `degrees_of_freedom` of what is left; `each` (K,) the value
-    of every single shot and its error `each_error` (inf where a shot does not see it).
+    of every single shot and its error `each_error` (inf where a shot does not see it); `share` of
+    the sum of squares that the scatter accounts for.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Scatter:
     degrees_of_freedom: int
     each: np.ndarray
     each_error: np.ndarray
+    share: float = np.nan
 
     def __str__(self) -> str:
         i = self.names.index(self.name)
@@ -130,6 +132,7 @@ def scatter(fit: FitResult, name: str | None = None) -> Scatter:
         standard_error=noise * np.sqrt(np.diag(covariance)),
         squares=squares,
         degrees_of_freedom=freedom,
+        share=1 - squares / model.solve(np.zeros((1, 1)))[2],
         each=fit.value[which] + change_of_each,
         each_error=each_error,
     )
