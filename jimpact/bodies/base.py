@@ -50,6 +50,22 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
 BLOCK = 128
 
 
+def over_blocks(count: Any, one: Callable[[Any, Any], Any], start: Any) -> Any:
+    """`start` carried by `one(first_row, carry)` through the blocks that hold `count` () rows."""
+    blocks = (count + BLOCK - 1) // BLOCK
+    return jax.lax.fori_loop(jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start)
+
+
+def block(x: jax.Array, row: jax.Array) -> jax.Array:
+    """The rows of x (K, ...) from this one that are computed at once."""
+    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
+
+
+def with_block(x: jax.Array, values: jax.Array, row: jax.Array) -> jax.Array:
+    """x (K, ...) with these values from this row on."""
+    return jax.lax.dynamic_update_slice_in_dim(x, values.astype(x.dtype), row, 0)
+
+
 class ActivePairs(NamedTuple):
     """The closed contacts of many bodies in the first of K rows, a multiple of `BLOCK`.
 
@@ -58,6 +74,7 @@ class ActivePairs(NamedTuple):
 
     number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
     closed: jax.Array  # (K,) whether the row is used
+    count: jax.Array  # () how many are
     bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
     # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
     # and turn in a plane, x, y, z and three turns in space
@@ -181,6 +198,15 @@ class Body(eqx.Module):
     def pair_count(self) -> int | None:
         """How many contacts `active_pairs` chooses from; None: time stepping takes all contacts."""
         return None
+
+    @property
+    def overlap(self) -> Any:
+        """Penetration [m] with which a motion may start: what steps of a pile leave."""
+        return 0.0
+
+    def least_gap(self, q: jax.Array) -> jax.Array:
+        """The least gap () [m] of a body with `pair_count`."""
+        return jnp.min(self.gap_function(q))
 
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` [m] at q or `later`, for time stepping.

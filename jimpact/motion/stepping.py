@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jimpact.bodies.base import BLOCK, ActivePairs
+from jimpact.bodies.base import ActivePairs, block, over_blocks, with_block
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
 from jimpact.motion.dynamics import (
@@ -35,8 +35,10 @@ from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
     gaps,
+    is_pile,
     mass_at,
     normals_at,
+    recorded_gaps,
     seen_from_base,
     solve_mass,
     user_force,
@@ -78,11 +80,6 @@ WHY = (
     "Argument `method` must not be 'time_stepping' where derivatives are taken: with the step the "
     "times of impacts are fixed, so that derivatives do not converge. method='events' has them."
 )
-
-
-def block(x: jax.Array, row: jax.Array) -> jax.Array:
-    """The rows of x (K, ...) from this one that are computed at once."""
-    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
 
 
 class _AllContacts(NamedTuple):
@@ -152,11 +149,6 @@ class _ActiveContacts(NamedTuple):
         """(m,)."""
         return self.pairs.closed
 
-    def _over_blocks(self, one: Callable[[jax.Array, Any], Any], start: Any) -> Any:
-        """`start` carried by `one(first_row, carry)` through the blocks of rows that are used."""
-        blocks = (jnp.sum(self.closed) + BLOCK - 1) // BLOCK
-        return jax.lax.fori_loop(0, blocks, lambda i, carry: one(i * BLOCK, carry), start)
-
     def rates(self, v: jax.Array) -> jax.Array:
         """Gap velocities and slips (m, b) of v (n,)."""
         of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
@@ -164,9 +156,10 @@ class _ActiveContacts(NamedTuple):
         def one(row: jax.Array, rates: jax.Array) -> jax.Array:
             bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
             values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
-            return jax.lax.dynamic_update_slice_in_dim(rates, values, row, 0)
+            return with_block(rates, values, row)
 
-        return self._over_blocks(one, jnp.zeros(self.pairs.directions.shape[:2], v.dtype))
+        start = jnp.zeros(self.pairs.directions.shape[:2], v.dtype)
+        return over_blocks(self.pairs.count, one, start)
 
     def fastest(self, v: jax.Array) -> jax.Array:
         """Gap velocity () that the speeds of v could give."""
@@ -184,7 +177,8 @@ class _ActiveContacts(NamedTuple):
             each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
             return impulses.at[bodies].add(each)
 
-        return self._over_blocks(one, jnp.zeros_like(self.inverse))[:-1].reshape(-1)
+        start = jnp.zeros_like(self.inverse)
+        return over_blocks(self.pairs.count, one, start)[:-1].reshape(-1)
 
     def product(self, x: jax.Array) -> jax.Array:
         """Rates (m, b) that impulses x (m, b) give."""
@@ -193,7 +187,15 @@ class _ActiveContacts(NamedTuple):
     @property
     def diagonal(self) -> jax.Array:
         """Of the Delassus matrix (m, b)."""
-        return jnp.sum(self.pairs.directions**2 * self.inverse[self.pairs.bodies][:, None], (2, 3))
+
+
+        def one(row: jax.Array, diagonal: jax.Array) -> jax.Array:
+            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
+            squares = directions**2 * self.inverse[bodies][:, None]
+            return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
+
+        start = jnp.zeros(self.pairs.directions.shape[:2], self.inverse.dtype)
+        return over_blocks(self.pairs.count, one, start)
 
     def warm_start(self, last: Any) -> jax.Array:
         """Impulses (m, b) of the last step, 0 where the contact was open."""
@@ -204,8 +206,13 @@ class _ActiveContacts(NamedTuple):
 
     def kept(self, x: jax.Array) -> _PileImpulses:
         """Impulses x (m, b) in the form in which the next step reads them."""
-        order = jnp.argsort(self.pairs.number)
-        return _PileImpulses(self.pairs.number[order], x[order])
+
+        def in_order() -> _PileImpulses:
+            order = jnp.argsort(self.pairs.number)
+            return _PileImpulses(self.pairs.number[order], x[order])
+
+        as_it_is = _PileImpulses(self.pairs.number, x)
+        return jax.lax.cond(self.pairs.count > 0, in_order, lambda: as_it_is)
 
     def recorded(self, values: jax.Array) -> jax.Array:
         """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
@@ -269,17 +276,6 @@ class _Trial(NamedTuple):
     solution: Many
     adds_energy: jax.Array  # () whether the impulses add energy
     tries: jax.Array  # () iterations so far, this one included
-
-
-def is_pile(system: System) -> bool:
-    """Whether time stepping takes the closed contacts only."""
-    return system.body.pair_count is not None
-
-
-def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """Gaps (m,), of a pile the least one (1,)."""
-    f = gaps(system, q, t)
-    return jnp.min(f, keepdims=True) if is_pile(system) else f
 
 
 def time_stepping(
