@@ -151,6 +151,7 @@ from .motion.record import (
     load_motion as load_motion,
     raise_on_failed_motion as raise_on_failed_motion,
 )
+from .motion.pile_contacts import PileContacts as PileContacts, pile_contacts as pile_contacts
 from .motion.simulate import simulate as simulate
 from .motion.system import (
     HarmonicBase as HarmonicBase,

@@ -60,16 +60,16 @@ def test_a_crowd_holds_the_densest_packing():
 
 @pytest.fixture(scope="module")
 def packing():
-    """450 spheres without overlaps in a corner, and where they are a step later."""
+    """480 spheres without overlaps in a corner, and where they are a step later."""
     rng = np.random.default_rng(1)
     centres, radii = [], []
-    while len(radii) < 450:
-        c, r = 0.1 + 1.7 * rng.random(3), 0.05 * (1 + 0.2 * rng.random())
+    while len(radii) < 480:
+        c, r = 0.1 + 1.7 * rng.random(3), 0.05 * (1 + 0.1 * rng.random())
         if all(np.linalg.norm(c - x) > 0.98 * (r + s) for x, s in zip(centres, radii, strict=True)):
             centres.append(c)
             radii.append(r)
     walls = [[2.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 3.0, 4.0, 0.0]]
-    spheres = ji.Spheres(1.0 + rng.random(450), radii, walls=walls)
+    spheres = ji.Spheres(1.0 + rng.random(480), radii, walls=walls)
     q = spheres.at(centres)
     later = q + 0.02 * rng.standard_normal(q.shape)
     return spheres, q, later

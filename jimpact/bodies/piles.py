@@ -30,8 +30,7 @@ from jimpact.bodies.base import (
     with_block,
 )
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
-from jimpact.scene import PairNormals, Scene, sparse_scene
-from jimpact.solvers.sparse import Neighbours
+from jimpact.scene import Scene, sparse_scene
 
 # Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
 # 6, and walls. Ten times more takes ten times the memory.
@@ -161,19 +160,18 @@ class _Pile(Body):
 
     # ---- closed contacts only
 
-    def touching(self, q: Any, below: Any = None, *, friction: bool = False) -> Scene:
-        """The contacts at q that are closed, as a scene of any number of bodies.
+    def touching(self, q: Any, below: Any = None) -> Scene:
+        """The contacts at q that are closed, as a scene without friction of any number of bodies.
 
         Only normals of two bodies each are stored, and W has few entries in a row: an impact of
         `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
-        pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew. With
-        `friction` the scene has tangents, and its matrices are dense: for some hundred contacts.
+        pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
+        `packing_impact` has friction.
 
         Args:
             q: (n,), see `at`; not traced.
             below: gap >= 0 [m] up to which contacts count as closed; None: 1e-9 of the least
                 radius.
-            friction: whether contacts have tangents.
 
         Returns:
             `Scene` of n velocities; contacts of bodies i < j first, then those with walls.
@@ -205,13 +203,7 @@ class _Pile(Body):
         directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]  # walls do not move
         if not directions[:, 0].any(axis=(1, 2)).all():
             raise ValueError("Argument `q` must hold bodies with different centres.")
-        scene = sparse_scene(self.mass, jnp.asarray(directions[:, 0]), bodies, self.count)
-        if not friction:
-            return scene
-        m, axes = directions.shape[:2]
-        each = Neighbours(np.repeat(bodies, axes - 1, axis=0), self.count)
-        along = PairNormals(jnp.asarray(directions[:, 1:].reshape(m * (axes - 1), 2, -1)), each)
-        return Scene(self.mass, scene.normals, along.dense())
+        return sparse_scene(self.mass, jnp.asarray(directions[:, 0]), bodies, self.count)
 
     @property
     def overlap(self) -> jax.Array:

@@ -155,7 +155,7 @@ def simulate(
     rtol, atol = _tolerances(method, dtype, rtol, atol)
     mu = friction_of(system, law, friction, q)
     system = without_closures(system, q, v, start)
-    below, rounding = _closed_gaps(q, f, closed_below)
+    below, rounding = closed_gaps(q, f, closed_below)
     if method != "contact_forces":
         check_penetration("q0", f, jnp.maximum(below, system.body.overlap))
     share = jnp.asarray(slow, dtype)
@@ -193,7 +193,7 @@ def _tolerances(
     return rtol, atol
 
 
-def _closed_gaps(
+def closed_gaps(
     q: jax.Array, f: jax.Array, closed_below: float | None
 ) -> tuple[jax.Array, jax.Array]:
     """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""

@@ -297,33 +297,10 @@ def time_stepping(
     system, law, mu, q0, v0, times = without_derivatives(
         (system, law, mu, q0, v0, times), NotImplementedError(WHY)
     )
-    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
-    m = recorded_gaps(system, q0, times[0]).shape[0]
-
-    first = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
-    at_rest = jnp.zeros_like(first.rates(v0))
-    contacts, b = at_rest.shape
-    rest = jnp.zeros((2, m), dtype)
-    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
-    rows = 1 if is_pile(system) else max_events
-    events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
-    status = status_at_start(system, begin, times[-1], closed_below)
-    fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
-    status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
-    h = (times[1] - times[0]) / substeps.astype(dtype)
+    h = (times[1] - times[0]) / substeps.astype(q0.dtype)
     problem = _StepProblem(system, law, mu, h, closed_below, joint)
-    start = _Progress(
-        state=begin,
-        speed=zero,
-        last_impulses=first.kept(at_rest),
-        residual_velocity=zero,
-        inverse_step_size=jnp.ones((), dtype),
-        steps_since_impact=jnp.full(contacts, substeps * len(times)),
-        closing=_closing_at_start(problem, begin, contacts),
-        events=events,
-        status=status,
-        reported=jnp.int32(MOTION_CODE["ok"]),
-    )
+    start = _begin(problem, q0, v0, times, substeps, max_events)
+    dtype = q0.dtype
 
     def to_sample(progress: _Progress, t: jax.Array) -> tuple[_Progress, State]:
         """The motion up to the next sample, from t."""
@@ -339,10 +316,67 @@ def time_stepping(
         return progress, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
 
     end, later = jax.lax.scan(to_sample, start, times[:-1])
-    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, later)
+    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), start.state, later)
     steps = substeps * (times.shape[0] - 1)
     status = jnp.where(end.status == MOTION_CODE["ok"], end.reported, end.status)
     return Course(samples, end.events, steps, status)
+
+
+def step_of_pile(
+    system: System,
+    law: Law,
+    mu: jax.Array | None,
+    q: jax.Array,
+    v: jax.Array,
+    times: jax.Array,
+    closed_below: jax.Array,
+) -> tuple[ActivePairs, jax.Array, jax.Array, jax.Array]:
+    """The step of a pile between two `times`: contacts, impulses (K, b), v' (n,), status ()."""
+    problem = _StepProblem(system, law, mu, times[1] - times[0], closed_below, joint=True)
+    start = _begin(problem, q, v, times, jnp.int32(1), 1)
+    setup = _set_up(problem, start, times[0])
+    trial = _solve(problem, start, setup)
+    state, _ = _end_state(problem, start, setup, trial)
+    status, reported = _status(problem, start, setup, trial, state)
+    contacts = setup.contacts
+    assert isinstance(contacts, _ActiveContacts)
+    return contacts.pairs, trial.solution.impulse, trial.v, jnp.where(status > 0, status, reported)
+
+
+def _begin(
+    problem: _StepProblem,
+    q0: jax.Array,
+    v0: jax.Array,
+    times: jax.Array,
+    substeps: jax.Array,
+    max_events: int,
+) -> _Progress:
+    """A motion before its first step."""
+    system, law, mu, _, closed_below, _ = problem
+    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
+    m = recorded_gaps(system, q0, times[0]).shape[0]
+    first = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
+    at_rest = jnp.zeros_like(first.rates(v0))
+    contacts, b = at_rest.shape
+    rest = jnp.zeros((2, m), dtype)
+    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
+    rows = 1 if is_pile(system) else max_events
+    events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
+    status = status_at_start(system, begin, times[-1], closed_below)
+    fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
+    status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
+    return _Progress(
+        state=begin,
+        speed=zero,
+        last_impulses=first.kept(at_rest),
+        residual_velocity=zero,
+        inverse_step_size=jnp.ones((), dtype),
+        steps_since_impact=jnp.full(contacts, substeps * len(times)),
+        closing=_closing_at_start(problem, begin, contacts),
+        events=events,
+        status=status,
+        reported=jnp.int32(MOTION_CODE["ok"]),
+    )
 
 
 def _contacts(
