@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
-from jimpact.scene import Scene, check_mass
+from jimpact.scene import Scene, check_mass, sparse_scene
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too
@@ -74,13 +74,27 @@ class ActivePairs(NamedTuple):
 
     number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
     closed: jax.Array  # (K,) whether the row is used
-    count: jax.Array  # () how many are
+    filled: jax.Array  # () how many are
     bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
     # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
     # and turn in a plane, x, y, z and three turns in space
     directions: jax.Array
     overflows: jax.Array  # () whether more are closed than there are rows
     reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
+
+
+def listed_pairs(pairs: ActivePairs, mass: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, Scene]:
+    """On the host: rows (m,) in order, bodies (m, 2) with -1 for walls, directions, the scene.
+
+    Contacts of two bodies come first; `mass` (n,). Walls do not move: their directions are 0.
+    """
+    size = pairs.directions.shape[3]
+    bodies = np.where(pairs.bodies == len(mass) // size, -1, pairs.bodies)[: int(pairs.filled)]
+    order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
+    bodies, directions = bodies[order], np.array(pairs.directions)[order]
+    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]
+    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, len(mass) // size)
+    return order, bodies, directions, scene
 
 
 class ContactPoints(NamedTuple):

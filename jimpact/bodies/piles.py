@@ -23,6 +23,7 @@ from jimpact.bodies.base import (
     ActivePairs,
     Body,
     LinearPotential,
+    listed_pairs,
     numbered,
     over_blocks,
     positives,
@@ -30,7 +31,7 @@ from jimpact.bodies.base import (
     with_block,
 )
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
-from jimpact.scene import Scene, sparse_scene
+from jimpact.scene import Scene
 
 # Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
 # 6, and walls. Ten times more takes ten times the memory.
@@ -51,10 +52,10 @@ _OVERLAP = 0.1
 _TOUCHING = 1e-9
 
 
-class _Pile(Body):
-    """Round bodies between flat walls: d places and the turns of each, d = 2 or 3.
+class Pile(Body):
+    """Bodies between flat walls: d places and the turns of each, d = 2 or 3; here they are round.
 
-    A kind of pile gives `dimension`, `inertia_factor` and `tangents_of`.
+    A kind of pile gives `dimension` and `tangents_of`; if round, `inertia_factor`.
     """
 
     masses: jax.Array
@@ -67,11 +68,19 @@ class _Pile(Body):
     inertia_factor = 0.0  # moment of inertia over m R^2
 
     def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
-        d = self.dimension
         self.radii = positives("radii", radii)
         if not len(self.radii):
             raise ValueError("Argument `radii` must hold one or more, but is empty.")
         self.masses = positives("masses", masses, self.radii.shape[0])
+        self.walls = self._unit_walls(walls)
+        self.room = (
+            ROOM[self.dimension] * len(self.radii) if room is None else as_whole("room", room, 1)
+        )
+        self.crowd = self._crowd()
+
+    def _unit_walls(self, walls: Any) -> jax.Array:
+        """Rows (w, d + 1) with unit normals."""
+        d = self.dimension
         empty = len(walls) == 0
         rows = as_float_array("walls", np.reshape(walls, (-1, d + 1)) if empty else walls)
         if rows.ndim != 2 or rows.shape[1] != d + 1:
@@ -82,19 +91,21 @@ class _Pile(Body):
         length = jnp.sqrt(jnp.sum(rows[:, :d] ** 2, axis=1))
         check_values("walls", length, low=0.0, open_low=True)
         scale = jnp.stack([length] * d + [jnp.ones_like(length)], axis=1)
-        self.walls = (rows / scale).astype(self.radii.dtype)
-        self.room = ROOM[d] * len(self.radii) if room is None else as_whole("room", room, 1)
-        self.crowd = self._crowd()
+        return (rows / scale).astype(self.radii.dtype)
 
     def _crowd(self) -> int:
         """How many bodies a row of cells may hold; 0 where looking at every pair is less work."""
         if is_traced(self.radii):
             return 0
-        radii = np.asarray(self.radii)
-        least = float(radii.min())
-        crowd = crowd_of(least, float(radii.max()) + 0.5 * MARGIN * least, self.dimension)
+        least, largest = float(self._least), float(self.radii.max())
+        crowd = crowd_of(least, largest + 0.5 * MARGIN * least, self.dimension)
         rows = (3 ** (self.dimension - 1) + 1) // 2
         return crowd if 2 * rows * crowd < self.count else 0
+
+    @property
+    def _least(self) -> jax.Array:
+        """The least radius () of a disc or ball within a body."""
+        return jnp.min(self.radii)
 
     @property
     def count(self) -> int:
@@ -184,10 +195,10 @@ class _Pile(Body):
         check_concrete("q", q)
         check_shape("q", q, self.mass.shape, "one number per velocity")
         check_values("q", q)
-        below = _TOUCHING * float(jnp.min(self.radii)) if below is None else below
+        below = _TOUCHING * float(self._least) if below is None else below
         check_values("below", below, low=0.0)
         pairs = jax.device_get(_active_pairs(self, q, jnp.asarray(below, q.dtype)))
-        if not pairs.count:
+        if not pairs.filled:
             raise ValueError(
                 f"Argument `q` must hold bodies that touch, but no gap is up to {below:g}."
             )
@@ -196,19 +207,15 @@ class _Pile(Body):
                 f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
                 f"{type(self).__name__}), but holds more, or bodies that overlap."
             )
-        bodies = np.where(pairs.bodies == self.count, -1, pairs.bodies)
-        order = np.lexsort((pairs.number, bodies[:, 1] < 0))
-        order = order[pairs.closed[order]]
-        bodies, directions = bodies[order], pairs.directions[order]
-        directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]  # walls do not move
+        _, _, directions, scene = listed_pairs(pairs, self.mass)
         if not directions[:, 0].any(axis=(1, 2)).all():
             raise ValueError("Argument `q` must hold bodies with different centres.")
-        return sparse_scene(self.mass, jnp.asarray(directions[:, 0]), bodies, self.count)
+        return scene
 
     @property
     def overlap(self) -> jax.Array:
         """Penetration () [m] with which a motion may start."""
-        return _OVERLAP * jnp.min(self.radii)
+        return _OVERLAP * self._least
 
     @property
     def pair_count(self) -> int:
@@ -230,12 +237,24 @@ class _Pile(Body):
 
         if self.crowd == 0:
             return of_all()
-        margin = MARGIN * jnp.min(self.radii)
+        margin = MARGIN * self._least
+        least, overflows = self._least_of_near(q, margin)
+        least = jnp.minimum(least, jnp.min(self._wall_gaps(q), initial=jnp.inf))
+        found = (least <= margin) & ~overflows
+        return jax.lax.cond(found, lambda: least, of_all)
+
+    def _least_of_near(self, q: jax.Array, margin: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The least gap () of pairs with gaps up to `margin`; whether some are missing."""
         near = self._candidates(q, margin)
         gaps = jnp.where(near.used, self._pair_gaps(q, near.first, near.second), jnp.inf)
-        least = jnp.minimum(jnp.min(gaps), jnp.min(self._wall_gaps(q), initial=jnp.inf))
-        found = (least <= margin) & ~near.overflows
-        return jax.lax.cond(found, lambda: least, of_all)
+        return jnp.min(gaps, initial=jnp.inf), near.overflows
+
+    def _near(self, q: jax.Array, later: jax.Array, below: jax.Array) -> Candidates:
+        """Pairs of bodies, all those with gaps up to `below` at q or `later` among them."""
+        way = jnp.abs(self._of_bodies(later - q)[:, : self.dimension])
+        # each moves by half of its way from the middle; what moves farther is a `coarse_step`
+        farther = jnp.minimum(jnp.max(jnp.sum(way, axis=1)), MARGIN * self._least)
+        return self._candidates(0.5 * (q + later), below + farther)
 
     def _closed(
         self, q: jax.Array, later: jax.Array, below: jax.Array
@@ -244,10 +263,7 @@ class _Pile(Body):
 
         A contact is closed whose gap is at most `below` at q or `later`.
         """
-        way = jnp.abs(self._of_bodies(later - q)[:, : self.dimension])
-        # each moves by half of its way from the middle; what moves farther is a `coarse_step`
-        farther = jnp.minimum(jnp.max(jnp.sum(way, axis=1)), MARGIN * jnp.min(self.radii))
-        near = self._candidates(0.5 * (q + later), below + farther)
+        near = self._near(q, later, below)
         gaps = [self._pair_gaps(x, near.first, near.second) for x in (q, later)]
         closed = near.used & (jnp.minimum(*gaps) <= below)
         to_walls = jnp.minimum(self._wall_gaps(q), self._wall_gaps(later)).reshape(-1)
@@ -259,7 +275,7 @@ class _Pile(Body):
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` at q or `later`."""
         numbers, closed, overflows = self._closed(q, later, below)
-        rows, stride = -(-self.room // BLOCK) * BLOCK, self.count + len(self.walls)
+        rows = -(-self.room // BLOCK) * BLOCK
         so_far = jnp.cumsum(closed, dtype=jnp.int32)
         count = jnp.minimum(so_far[-1], rows)
         number = jnp.full(rows, self.pair_count, jnp.int32)
@@ -269,28 +285,33 @@ class _Pile(Body):
 
         def one(first: jax.Array, filled: Any) -> Any:
             """The next rows."""
-            row = first + np.arange(BLOCK, dtype=np.int32)
-            used = row < count
-            chosen = numbers[jnp.minimum(jnp.searchsorted(so_far, row + 1), closed.size - 1)]
-            i, j = jnp.where(used, chosen // stride, 0), jnp.where(used, chosen % stride, 0)
-            ways = jnp.where(used[:, None, None, None], self._along(q, i, j), 0.0)
+            used, chosen = chosen_rows(so_far, first, count)
+            chosen = jnp.where(used, numbers[chosen], 0)
+            i, j, ways = self._of_contacts(q, chosen)
             new = (
                 jnp.where(used, chosen, self.pair_count),
-                jnp.stack([i, jnp.minimum(j, self.count)], axis=1),
-                ways,
+                jnp.where(used[:, None], jnp.stack([i, j], axis=1), 0),
+                jnp.where(used[:, None, None, None], ways, 0.0),
             )
             return tuple(with_block(x, part, first) for x, part in zip(filled, new))
 
         number, bodies, directions = over_blocks(count, one, (number, bodies, directions))
         return ActivePairs(
             number,
-            np.arange(rows, dtype=np.int32) < count,
+            jnp.asarray(np.arange(rows, dtype=np.int32)) < count,
             count,
             bodies,
             directions,
             overflows | (so_far[-1] > self.room),
-            jnp.min(self.radii),
+            self._least,
         )
+
+    def _of_contacts(
+        self, q: jax.Array, number: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Bodies i and j (K,) of contacts of these numbers, j = `count` for walls; see `_along`."""
+        i, j = jnp.divmod(number, jnp.int32(self.count + len(self.walls)))
+        return i, jnp.minimum(j, self.count), self._along(q, i, j)
 
     def _along(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
         """Normal and tangents (K, d, 2, d + turns) of contacts of body i with body or wall j."""
@@ -324,13 +345,22 @@ class _Pile(Body):
         ]
         return jnp.stack(both, axis=2)
 
+    def _dense(self, directions: jax.Array, i: np.ndarray, j: np.ndarray) -> jax.Array:
+        """(n, m r): r directions (m, r, 2, ..) each of contacts of body i with body or wall j."""
+        (m, r), k, row = directions.shape[:2], self.count, np.arange(i.size)
+        still = (j >= k)[:, None, None]
+        every = jnp.zeros((m, r, k, directions.shape[3]), directions.dtype)
+        every = every.at[row, :, i].add(directions[:, :, 0])
+        other = jnp.where(still, 0.0, directions[:, :, 1])
+        return every.at[row, :, np.minimum(j, k - 1)].add(other).reshape(m * r, -1).T
+
     @abc.abstractmethod
     def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Tangents t (K, d - 1, d) of normals n (K, d), and `n x t` (K, d - 1, turns)."""
 
 
 @eqx.filter_jit
-def _active_pairs(pile: _Pile, q: jax.Array, below: jax.Array) -> ActivePairs:
+def _active_pairs(pile: Pile, q: jax.Array, below: jax.Array) -> ActivePairs:
     """The contacts that are closed at q."""
     return pile.active_pairs(q, q, below)
 
@@ -340,7 +370,40 @@ def _turns(d: int) -> int:
     return d * (d - 1) // 2
 
 
-class Discs(_Pile):
+def chosen_rows(
+    so_far: jax.Array, first: jax.Array, count: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Of the next block of `count` () rows: which are used, and where they are found (BLOCK,).
+
+    `so_far` (C,) is how many have been found up to each place.
+    """
+    row = first + np.arange(BLOCK, dtype=np.int32)
+    place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)
+    return row < count, place
+
+
+class InPlane(Pile):
+    """A pile in a plane."""
+
+    dimension = 2
+
+    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The normal turned by a quarter, and 1."""
+        x, y = normal.T
+        return jnp.stack([-y, x], axis=1)[:, None], jnp.ones_like(x)[:, None, None]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, angle of each body."""
+        return numbered(PLANAR, self.count)
+
+    @property
+    def floors(self) -> list[tuple[float, float]]:
+        """The walls."""
+        return [(float(np.arctan2(-x, y)), float(d)) for x, y, d in np.asarray(self.walls)]
+
+
+class Discs(InPlane):
     """Discs in a plane between straight walls; q = (x, y, turn) of each in turn.
 
     Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
@@ -361,7 +424,6 @@ class Discs(_Pile):
     [0.3, 0.0, 0.0]
     """
 
-    dimension = 2
     inertia_factor = 0.5
 
     def tangent_function(self, q: jax.Array) -> jax.Array:
@@ -375,27 +437,12 @@ class Discs(_Pile):
         slid = at[:, :2] @ jnp.stack([-self.walls[:, 1], self.walls[:, 0]]) - rolled[:, None]
         return jnp.concatenate([around, slid.reshape(-1)])
 
-    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The normal turned by a quarter, and 1."""
-        x, y = normal.T
-        return jnp.stack([-y, x], axis=1)[:, None], jnp.ones_like(x)[:, None, None]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """x, y, angle of each disc."""
-        return numbered(PLANAR, self.count)
-
-    @property
-    def floors(self) -> list[tuple[float, float]]:
-        """The walls."""
-        return [(float(np.arctan2(-x, y)), float(d)) for x, y, d in np.asarray(self.walls)]
-
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles, each with the radius that shows how far it has turned."""
         return [wheel(r, at) for r, at in zip(self.radii, q.reshape(-1, 3))]
 
 
-class Spheres(_Pile):
+class Spheres(Pile):
     """Spheres in space between flat walls; q = (x, y, z) and three turns of each.
 
     Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
@@ -429,14 +476,8 @@ class Spheres(_Pile):
         k = self.count
         pairs = np.triu_indices(k, 1), self._at_walls()
         i, j = (np.concatenate(each) for each in zip(*pairs))
-        other = np.minimum(j, k - 1)
-        directions = self._along(q, i, jnp.asarray(j))[:, 1:]  # (m, 2, 2, 6)
-        row = np.arange(i.size)
-        all_bodies = jnp.zeros((i.size, 2, k, 6), q.dtype).at[row, :, i].add(directions[:, :, 0])
-        all_bodies = all_bodies.at[row, :, other].add(
-            jnp.where((j < k)[:, None, None], directions[:, :, 1], 0.0)
-        )
-        return all_bodies.reshape(2 * i.size, 6 * k).T
+        directions = self._along(q, jnp.asarray(i), jnp.asarray(j))[:, 1:]  # (m, 2, 2, 6)
+        return self._dense(directions, i, j)
 
     def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Two unit vectors at right angles to each normal, and to each other.

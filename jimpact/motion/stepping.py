@@ -21,7 +21,6 @@ DERIVATIVES of such a step do not converge: with h the time of an impact is cons
 derivative is not. They are refused.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -159,7 +158,7 @@ class _ActiveContacts(NamedTuple):
             return with_block(rates, values, row)
 
         start = jnp.zeros(self.pairs.directions.shape[:2], v.dtype)
-        return over_blocks(self.pairs.count, one, start)
+        return over_blocks(self.pairs.filled, one, start)
 
     def fastest(self, v: jax.Array) -> jax.Array:
         """Gap velocity () that the speeds of v could give."""
@@ -178,7 +177,7 @@ class _ActiveContacts(NamedTuple):
             return impulses.at[bodies].add(each)
 
         start = jnp.zeros_like(self.inverse)
-        return over_blocks(self.pairs.count, one, start)[:-1].reshape(-1)
+        return over_blocks(self.pairs.filled, one, start)[:-1].reshape(-1)
 
     def product(self, x: jax.Array) -> jax.Array:
         """Rates (m, b) that impulses x (m, b) give."""
@@ -188,14 +187,13 @@ class _ActiveContacts(NamedTuple):
     def diagonal(self) -> jax.Array:
         """Of the Delassus matrix (m, b)."""
 
-
         def one(row: jax.Array, diagonal: jax.Array) -> jax.Array:
             bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
             squares = directions**2 * self.inverse[bodies][:, None]
             return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
 
         start = jnp.zeros(self.pairs.directions.shape[:2], self.inverse.dtype)
-        return over_blocks(self.pairs.count, one, start)
+        return over_blocks(self.pairs.filled, one, start)
 
     def warm_start(self, last: Any) -> jax.Array:
         """Impulses (m, b) of the last step, 0 where the contact was open."""
@@ -212,7 +210,7 @@ class _ActiveContacts(NamedTuple):
             return _PileImpulses(self.pairs.number[order], x[order])
 
         as_it_is = _PileImpulses(self.pairs.number, x)
-        return jax.lax.cond(self.pairs.count > 0, in_order, lambda: as_it_is)
+        return jax.lax.cond(self.pairs.filled > 0, in_order, lambda: as_it_is)
 
     def recorded(self, values: jax.Array) -> jax.Array:
         """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
@@ -355,8 +353,15 @@ def _begin(
     system, law, mu, _, closed_below, _ = problem
     zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
     m = recorded_gaps(system, q0, times[0]).shape[0]
-    first = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
-    at_rest = jnp.zeros_like(first.rates(v0))
+
+    def first() -> tuple[jax.Array, Any]:
+        """Rates of contacts, and their impulses as steps keep them."""
+        at = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
+        rates = at.rates(v0)
+        return rates, at.kept(rates)
+
+    shapes = jax.eval_shape(first)
+    at_rest, impulses = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     contacts, b = at_rest.shape
     rest = jnp.zeros((2, m), dtype)
     begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
@@ -368,7 +373,7 @@ def _begin(
     return _Progress(
         state=begin,
         speed=zero,
-        last_impulses=first.kept(at_rest),
+        last_impulses=impulses,
         residual_velocity=zero,
         inverse_step_size=jnp.ones((), dtype),
         steps_since_impact=jnp.full(contacts, substeps * len(times)),
