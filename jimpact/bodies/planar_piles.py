@@ -137,16 +137,13 @@ class PlanarPile(InPlane):
         flat = facing_sides(Sides(ends[0], ends[1], jnp.zeros(len(a), bool)))
         of_sides = [x.reshape(len(a), _SLOTS, *x.shape[1:]) for x in flat]
         first, second = self.rims[i] > 0, self.rims[j] > 0
-        away_i, n_i = (x[:, 0] for x in jax.vmap(from_polygon)(a[:, :1], b))
-        away_j, n_j = (x[:, 0] for x in jax.vmap(from_polygon)(b[:, :1], a))
-        length, n = lengths(a[:, 0] - b[:, 0])
-        both = first & second
-        away = jnp.where(both, length, jnp.where(first, away_i, away_j))
-        n = jnp.where(both[:, None], n, jnp.where(first[:, None], n_i, -n_j))
-        gap = away - self.rims[i] - self.rims[j]
-        on_polygon = jnp.where(
-            first[:, None], a[:, 0] - away[:, None] * n, b[:, 0] + away[:, None] * n
-        )
+        both, swap = first & second, first[:, None, None]
+        disc, polygon = jnp.where(swap, a[:, :1], b[:, :1]), jnp.where(swap, b, a)
+        away, n = (x[:, 0] for x in jax.vmap(from_polygon)(disc, polygon))
+        on_polygon = disc[:, 0] - away[:, None] * n
+        length, apart = lengths(a[:, 0] - b[:, 0])
+        n = jnp.where(both[:, None], apart, jnp.where(first[:, None], n, -n))
+        gap = jnp.where(both, length, away) - self.rims[i] - self.rims[j]
         between = b[:, 0] + (self.rims[j] + 0.5 * gap)[:, None] * n
         point = jnp.where(both[:, None], between, on_polygon)
         with_disc = first | second
@@ -241,7 +238,8 @@ class PlanarPile(InPlane):
         i, j, count, overflows = self._near_rows(q, later, below)
         gaps = self._gaps_of_rows([q, later], i, j, count)
         to_walls = jnp.minimum(self._wall_gaps(q), self._wall_gaps(later)).reshape(-1)
-        number = _SLOTS * (i * self._stride + j)[:, None] + np.arange(_SLOTS, dtype=np.int32)
+        slot = np.arange(_SLOTS, dtype=np.int32)[None]
+        number = _SLOTS * (i * self._stride + j)[:, None] + slot
         numbers = jnp.concatenate([number.reshape(-1), self._numbers_at_walls()])
         return numbers, jnp.concatenate([gaps.reshape(-1), to_walls]) <= below, overflows
 
