@@ -219,7 +219,7 @@ class Body(eqx.Module):
         return 0.0
 
     def least_gap(self, q: jax.Array) -> jax.Array:
-        """The least gap () [m] of a body with `pair_count`."""
+        """The least gap () [m] at q (n,), of a body with `pair_count`."""
         return jnp.min(self.gap_function(q))
 
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
