@@ -274,7 +274,7 @@ def test_a_mixed_pile_finds_its_contacts_by_the_grid():
 
 def test_bad_mixed_piles_are_named():
     with pytest.raises(
-        TypeError, match="`bodies` must hold polygons, blocks and discs, .* a Dimer"
+        TypeError, match=r"`bodies` must hold polygons, blocks and discs, .* a Dimer"
     ):
         ji.PlanarPile([ji.Dimer(0.1, 0.5)])
     with pytest.raises(ValueError, match="`bodies` must hold one or more"):
@@ -379,7 +379,7 @@ def test_a_step_of_a_packing_is_an_impact(struck):
     assert rough.impulse[falls] == pytest.approx(2 * 1.5 * 3, abs=1e-5)
     np.testing.assert_allclose(rough.tangential[falls], [-0.9, 0, 0], atol=1e-5)
     np.testing.assert_allclose(rough.velocity[[18, 20]], [9 - 0.45, 1.5], atol=1e-5)
-    with pytest.raises(ValueError, match="must be of a body with many contacts .* of Column"):
+    with pytest.raises(ValueError, match=r"must be of a body with many contacts .* of Column"):
         ji.pile_contacts(ji.ball_system(), ji.Moreau(0.5), [0.0], [-1.0], step=1e-3)
     with pytest.raises(ValueError, match="must lead to a contact within the step"):
         ji.pile_contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v, step=1e-9)
@@ -388,7 +388,7 @@ def test_a_step_of_a_packing_is_an_impact(struck):
 def test_bad_packings_are_named(struck):
     spheres, q, _ = struck
     row = ji.Spheres(1.0, [0.1] * 3, room=1)
-    with pytest.raises(ValueError, match="at most 1 contacts .* or bodies that overlap"):
+    with pytest.raises(ValueError, match=r"at most 1 contacts .* or bodies that overlap"):
         row.touching(row.at([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.4, 0.0, 0.0]]))
     with pytest.raises(ValueError, match="`q` must hold bodies that touch"):
         spheres.touching(10 * q)
