@@ -23,6 +23,7 @@ from jimpact.bodies.base import (
     ActivePairs,
     Body,
     LinearPotential,
+    check_penetration,
     listed_pairs,
     numbered,
     over_blocks,
@@ -188,8 +189,8 @@ class Pile(Body):
             `Scene` of n velocities; contacts of bodies i < j first, then those with walls.
 
         Raises:
-            ValueError: nothing touches, more than `room` do, a bad `below`, two bodies in one
-                place.
+            ValueError: nothing touches, more than `room` do, a bad `below`, bodies that overlap by
+                more than a tenth of the least radius.
         """
         q = as_float_array("q", q)
         check_concrete("q", q)
@@ -197,7 +198,8 @@ class Pile(Body):
         check_values("q", q)
         below = _TOUCHING * float(self._least) if below is None else below
         check_values("below", below, low=0.0)
-        pairs = jax.device_get(_active_pairs(self, q, jnp.asarray(below, q.dtype)))
+        pairs, least = jax.device_get(_active_pairs(self, q, jnp.asarray(below, q.dtype)))
+        check_penetration("q", least[None], self.overlap)
         if not pairs.filled:
             raise ValueError(
                 f"Argument `q` must hold bodies that touch, but no gap is up to {below:g}."
@@ -205,12 +207,9 @@ class Pile(Body):
         if pairs.overflows:
             raise ValueError(
                 f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
-                f"{type(self).__name__}), but holds more, or bodies that overlap."
+                f"{type(self).__name__}), but holds more."
             )
-        _, _, directions, scene = listed_pairs(pairs, self.mass)
-        if not directions[:, 0].any(axis=(1, 2)).all():
-            raise ValueError("Argument `q` must hold bodies with different centres.")
-        return scene
+        return listed_pairs(pairs, self.mass)[3]
 
     @property
     def overlap(self) -> jax.Array:
@@ -360,9 +359,9 @@ class Pile(Body):
 
 
 @eqx.filter_jit
-def _active_pairs(pile: Pile, q: jax.Array, below: jax.Array) -> ActivePairs:
-    """The contacts that are closed at q."""
-    return pile.active_pairs(q, q, below)
+def _active_pairs(pile: Pile, q: jax.Array, below: jax.Array) -> tuple[ActivePairs, jax.Array]:
+    """The contacts that are closed at q, and the least gap."""
+    return pile.active_pairs(q, q, below), pile.least_gap(q)
 
 
 def _turns(d: int) -> int:
