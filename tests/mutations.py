@@ -409,7 +409,7 @@ MUTATIONS = [
     Mutation("grid without the row beside", r"if row < \(0,\) \* \(d - 1\)", "if row != (0,) * (d - 1)", ("test_piles.py::test_the_grid_meets_every_near_pair_once",), "bodies/neighbours.py"),
     Mutation("grid's crowd one too many", r"ends - starts > crowd", "ends - starts > crowd + 1", ("test_piles.py::test_the_grid_meets_every_near_pair_once",), "bodies/neighbours.py"),
     Mutation("contacts of a pile that close within the step", r"for x in \(q, later\)\]\n        closed = near", "for x in (q, q)]\n        closed = near", ("test_piles.py::test_closed_contacts_are_those_with_small_gaps",), "bodies/piles.py"),
-    Mutation("cells of the grid without the way of a step", r"below \+ farther\)", "below)", ("test_piles.py::test_a_mixed_pile_finds_its_contacts_by_the_grid",), "bodies/piles.py"),
+    Mutation("cells of the grid without the way of a step", r"below \+ farther\)", "below)", ("test_piles.py::test_pairs_that_meet_within_a_step_may_be_two_cells_apart",), "bodies/piles.py"),
     Mutation("least gap of near bodies where none are near", r"lax\.cond\(found, lambda: least, of_all\)", "lax.cond(True, lambda: least, of_all)", ("test_piles.py::test_a_mixed_pile_finds_its_contacts_by_the_grid",), "bodies/piles.py"),
     Mutation("a disc pushes a polygon the wrong way", r"first\[:, None\], n, -n", "first[:, None], n, n", ("test_piles.py::test_a_mixed_pile_has_the_contacts_of_planar_bodies",), "bodies/planar_piles.py"),
     Mutation("corners that only fill a row touch walls", r"jnp\.where\(again\[:, None\], jnp\.inf, height\)", "height", ("test_piles.py::test_a_mixed_pile_has_the_contacts_of_planar_bodies",), "bodies/planar_piles.py"),
