@@ -100,7 +100,7 @@ def test_closed_contacts_are_those_with_small_gaps(packing):
 
 def test_pairs_that_meet_within_a_step_may_be_two_cells_apart():
     discs = ji.Discs(1.0, [0.5] * 80)
-    assert 0 < discs.crowd
+    assert discs.crowd > 0
     q = discs.at([[1.4 * i, 0.0] for i in range(80)])
     later = q + discs.at([[0.2 * (-1) ** i, 0.0] for i in range(80)])
     pairs = contacts(discs, q, later)
@@ -401,7 +401,7 @@ def test_bad_packings_are_named(struck):
     row = ji.Spheres(1.0, [0.1] * 3, room=1)
     with pytest.raises(ValueError, match="at most 1 contacts"):
         row.touching(row.at([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.4, 0.0, 0.0]]))
-    with pytest.raises(ValueError, match=r"no penetration \(f >= -0\.01 m\), .* value -0\.05 m"):
+    with pytest.warns(UserWarning, match=r"`q` holds bodies that overlap by 0\.05 m"):
         row.touching(row.at([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.4, 0.0, 0.0]]))
     with pytest.raises(ValueError, match="`q` must hold bodies that touch"):
         spheres.touching(10 * q)

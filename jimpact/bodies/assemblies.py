@@ -309,7 +309,7 @@ def _of_sides(heights: jax.Array, normals: jax.Array) -> jax.Array:
     return jnp.where(jnp.any(normals != 0, axis=1), heights, -jnp.inf)
 
 
-class Sides(NamedTuple):
+class FacingSides(NamedTuple):
     """Sides in contact of pairs of polygons, each from its begin to its end (g, 2)."""
 
     first: tuple[jax.Array, jax.Array]
@@ -317,7 +317,7 @@ class Sides(NamedTuple):
     swapped: jax.Array  # (g,) whether the contact at the first side's end comes first
 
 
-def _all_sides(places: _Places, pairs: _Pairs) -> Sides:
+def _all_sides(places: _Places, pairs: _Pairs) -> FacingSides:
     """Sides that were chosen at the beginning, then those that face each other now.
 
     Where a body rolls over a corner, one of the sides gives way to its neighbour, which has the
@@ -340,7 +340,7 @@ def _all_sides(places: _Places, pairs: _Pairs) -> Sides:
     def ends(sides: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
         return jnp.stack([begin for begin, _ in sides]), jnp.stack([end for _, end in sides])
 
-    return Sides(ends(first), ends(second), jnp.stack([jnp.asarray(x) for x in swapped]))
+    return FacingSides(ends(first), ends(second), jnp.stack([jnp.asarray(x) for x in swapped]))
 
 
 def _full_turns(
@@ -387,7 +387,7 @@ def facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Ar
     return side_a, side_b, jnp.where(by_b, -n_b[side_b], n_a[side_a])
 
 
-def facing_sides(sides: Sides) -> ContactPoints:
+def facing_sides(sides: FacingSides) -> ContactPoints:
     """Two contacts a pair, at the begin and at the end of the first body's side."""
     (a_begin, a_end), (b_begin, b_end) = sides.first, sides.second
     n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)

@@ -1,6 +1,7 @@
 """Piles: many discs or spheres between walls, each contact between two of them or with a wall."""
 
 import abc
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -23,7 +24,6 @@ from jimpact.bodies.base import (
     ActivePairs,
     Body,
     LinearPotential,
-    check_penetration,
     listed_pairs,
     numbered,
     over_blocks,
@@ -189,8 +189,8 @@ class Pile(Body):
             `Scene` of n velocities; contacts of bodies i < j first, then those with walls.
 
         Raises:
-            ValueError: nothing touches, more than `room` do, a bad `below`, bodies that overlap by
-                more than a tenth of the least radius.
+            ValueError: nothing touches, more than `room` do, a bad `below`. A warning says where
+                bodies overlap by more than a tenth of the least radius.
         """
         q = as_float_array("q", q)
         check_concrete("q", q)
@@ -199,7 +199,12 @@ class Pile(Body):
         below = _TOUCHING * float(self._least) if below is None else below
         check_values("below", below, low=0.0)
         pairs, least = jax.device_get(_active_pairs(self, q, jnp.asarray(below, q.dtype)))
-        check_penetration("q", least[None], self.overlap)
+        if least < -float(self.overlap):
+            warnings.warn(
+                f"Argument `q` holds bodies that overlap by {-least:.3g} m; normals mean little "
+                "there.",
+                stacklevel=2,
+            )
         if not pairs.filled:
             raise ValueError(
                 f"Argument `q` must hold bodies that touch, but no gap is up to {below:g}."

@@ -9,7 +9,7 @@ import numpy as np
 
 from jimpact._checks import as_whole, check_concrete
 from jimpact.bodies.assemblies import (
-    Sides,
+    FacingSides,
     facing_now,
     facing_sides,
     from_polygon,
@@ -134,7 +134,7 @@ class PlanarPile(InPlane):
         a, b = self._placed(q, i), self._placed(q, j)
         side_a, side_b, _ = jax.vmap(facing_now)(a, b)
         ends = [jax.vmap(side_of)(x, side) for x, side in ((a, side_a), (b, side_b))]
-        flat = facing_sides(Sides(ends[0], ends[1], jnp.zeros(len(a), bool)))
+        flat = facing_sides(FacingSides(ends[0], ends[1], jnp.zeros(len(a), bool)))
         of_sides = [x.reshape(len(a), _SLOTS, *x.shape[1:]) for x in flat]
         first, second = self.rims[i] > 0, self.rims[j] > 0
         both, swap = first & second, first[:, None, None]
