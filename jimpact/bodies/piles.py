@@ -236,16 +236,29 @@ class Pile(Body):
     def least_gap(self, q: jax.Array) -> jax.Array:
         """The least gap () [m], of those bodies that are near each other if there are any."""
 
+        others = np.arange(self.count, dtype=np.int32)
+        to_walls = jnp.min(self._wall_gaps(q), initial=jnp.inf)
+
         def of_all() -> jax.Array:
-            return jnp.min(self.gap_function(q))
+            """Body by body, so that no table holds all pairs."""
+
+            def with_one(i: jax.Array, least: jax.Array) -> jax.Array:
+                gaps = self._gaps_between(q, jnp.full_like(others, i), others)
+                return jnp.minimum(least, jnp.min(jnp.where(others == i, jnp.inf, gaps)))
+
+            return jax.lax.fori_loop(jnp.int32(0), jnp.int32(self.count), with_one, to_walls)
 
         if self.crowd == 0:
             return of_all()
         margin = MARGIN * self._least
         least, overflows = self._least_of_near(q, margin)
-        least = jnp.minimum(least, jnp.min(self._wall_gaps(q), initial=jnp.inf))
+        least = jnp.minimum(least, to_walls)
         found = (least <= margin) & ~overflows
         return jax.lax.cond(found, lambda: least, of_all)
+
+    def _gaps_between(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
+        """Gaps (g,) of bodies i and j."""
+        return self._pair_gaps(q, i, j)
 
     def _least_of_near(self, q: jax.Array, margin: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The least gap () of pairs with gaps up to `margin`; whether some are missing."""

@@ -226,6 +226,10 @@ class PlanarPile(InPlane):
 
         return over_blocks(count, one, jnp.full((i.size, _SLOTS), jnp.inf, every.dtype))
 
+    def _gaps_between(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
+        """Gaps (g,) of bodies i and j."""
+        return jnp.min(self._pairs(q, i, j).gap, axis=1)
+
     def _least_of_near(self, q: jax.Array, margin: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The least gap () of pairs with gaps up to `margin`; whether some are missing."""
         i, j, count, overflows = self._near_rows(q, q, margin)
