@@ -236,7 +236,7 @@ class Pile(Body):
     def least_gap(self, q: jax.Array) -> jax.Array:
         """The least gap () [m], of those bodies that are near each other if there are any."""
 
-        others = np.arange(self.count, dtype=np.int32)
+        others = jnp.asarray(np.arange(self.count, dtype=np.int32))
         to_walls = jnp.min(self._wall_gaps(q), initial=jnp.inf)
 
         def of_all() -> jax.Array:
