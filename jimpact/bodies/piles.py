@@ -178,7 +178,7 @@ class Pile(Body):
         Only normals of two bodies each are stored, and W has few entries in a row: an impact of
         `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
         pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
-        `packing_impact` has friction.
+        `ji.pile_contacts` has friction.
 
         Args:
             q: (n,), see `at`; not traced.
@@ -189,8 +189,8 @@ class Pile(Body):
             `Scene` of n velocities; contacts of bodies i < j first, then those with walls.
 
         Raises:
-            ValueError: nothing touches, more than `room` do, a bad `below`. A warning says where
-                bodies overlap by more than a tenth of the least radius.
+            ValueError: nothing touches, more than `room` do, a bad `below`, two bodies in one
+                place. A warning says where bodies overlap by more than a tenth of the least radius.
         """
         q = as_float_array("q", q)
         check_concrete("q", q)
@@ -214,7 +214,10 @@ class Pile(Body):
                 f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
                 f"{type(self).__name__}), but holds more."
             )
-        return listed_pairs(pairs, self.mass)[3]
+        _, _, directions, scene = listed_pairs(pairs, self.mass)
+        if not directions[:, 0].any(axis=(1, 2)).all():
+            raise ValueError("Argument `q` must hold bodies with different centres.")
+        return scene
 
     @property
     def overlap(self) -> jax.Array:
@@ -234,8 +237,7 @@ class Pile(Body):
         return near_pairs(self._of_bodies(q)[:, : self.dimension], distance, self.crowd)
 
     def least_gap(self, q: jax.Array) -> jax.Array:
-        """The least gap () [m], of those bodies that are near each other if there are any."""
-
+        """The least gap () [m]; of bodies that are near each other if there are any."""
         others = jnp.asarray(np.arange(self.count, dtype=np.int32))
         to_walls = jnp.min(self._wall_gaps(q), initial=jnp.inf)
 
