@@ -16,6 +16,7 @@ from .bodies.mujoco_scene import MujocoScene as MujocoScene, from_mujoco as from
 from .bodies.particles import Column as Column, Corner as Corner, corner as corner
 from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle as pendulum_cradle
 from .bodies.piles import Discs as Discs, Spheres as Spheres
+from .bodies.planar_piles import PlanarPile as PlanarPile
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
 from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
 from .bodies.spatial_bodies import SpatialBodies as SpatialBodies
@@ -146,6 +147,7 @@ from .motion.accelerations import (
 )
 from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
+from .motion.pile_contacts import PileContacts as PileContacts, pile_contacts as pile_contacts
 from .motion.record import (
     Motion as Motion,
     load_motion as load_motion,

@@ -60,16 +60,16 @@ def test_a_crowd_holds_the_densest_packing():
 
 @pytest.fixture(scope="module")
 def packing():
-    """340 spheres without overlaps in a corner, and where they are a step later."""
+    """480 spheres without overlaps in a corner, and where they are a step later."""
     rng = np.random.default_rng(1)
     centres, radii = [], []
-    while len(radii) < 340:
-        c, r = 0.1 + 1.5 * rng.random(3), 0.05 * (1 + 0.2 * rng.random())
+    while len(radii) < 480:
+        c, r = 0.1 + 1.7 * rng.random(3), 0.05 * (1 + 0.1 * rng.random())
         if all(np.linalg.norm(c - x) > 0.98 * (r + s) for x, s in zip(centres, radii, strict=True)):
             centres.append(c)
             radii.append(r)
     walls = [[2.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 3.0, 4.0, 0.0]]
-    spheres = ji.Spheres(1.0 + rng.random(340), radii, walls=walls)
+    spheres = ji.Spheres(1.0 + rng.random(480), radii, walls=walls)
     q = spheres.at(centres)
     later = q + 0.02 * rng.standard_normal(q.shape)
     return spheres, q, later
@@ -96,6 +96,16 @@ def test_closed_contacts_are_those_with_small_gaps(packing):
     assert sorted(np.asarray(pairs.number)[closed]) == sorted(expected)
     assert closed.sum() > 40
     assert not pairs.overflows
+
+
+def test_pairs_that_meet_within_a_step_may_be_two_cells_apart():
+    discs = ji.Discs(1.0, [0.5] * 80)
+    assert discs.crowd > 0
+    q = discs.at([[1.4 * i, 0.0] for i in range(80)])
+    later = q + discs.at([[0.2 * (-1) ** i, 0.0] for i in range(80)])
+    pairs = contacts(discs, q, later)
+    expected = [[i, i + 1] for i in range(0, 80, 2)]
+    assert sorted(np.asarray(pairs.bodies)[np.asarray(pairs.closed)].tolist()) == expected
 
 
 def test_directions_are_velocities_of_the_points_that_touch(packing):
@@ -206,6 +216,109 @@ def test_spheres_fall_into_a_box_and_come_to_rest():
     assert -1e-3 < float(np.min(motion.gaps)) < 0
 
 
+# ------------------------------------------------------------------------------- mixed piles
+
+
+def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
+    """The same gaps, normals and tangents, up to their sides; infinite gaps only fill rows."""
+    pentagon = 0.2 * np.stack(
+        [np.cos(0.4 * np.pi * np.arange(5)), np.sin(0.4 * np.pi * np.arange(5))]
+    )
+    bodies = [
+        ji.Block(0.4, 0.2, mass=2.0),
+        ji.Disc(0.15, mass=1.5),
+        ji.Polygon([[0, 0], [0.3, 0], [0.1, 0.3]], mass=0.7),
+        ji.Disc(0.1),
+        ji.Polygon(pentagon.T),
+    ]
+    pile = ji.PlanarPile(bodies, walls=[[0.0, 2.0, 0.0], [1.0, 0.0, 0.5]])
+    pairs = list(zip(*np.triu_indices(5, 1)))
+    every = ji.PlanarBodies(bodies, planes=[0.0, (-np.pi / 2, 0.5)], pairs=pairs)
+    np.testing.assert_array_equal(pile.mass, every.mass)
+    x, y = [0.0, 0.4, 0.1, -0.3, 0.6], [0.2, 0.3, 0.6, 0.5, 0.75]
+    q = np.stack([x, y, np.random.default_rng(0).random(5)], axis=1).reshape(-1)
+
+    @jax.jit
+    def parts(body, q):
+        gaps, normals = body.gaps_and_normals(q)
+        return gaps, normals, body.tangents(q)
+
+    ours, theirs = (jax.tree.map(np.asarray, parts(body, q)) for body in (pile, every))
+    used = np.isfinite(ours[0])
+    assert used.sum() == len(theirs[0])
+    order, expected = np.argsort(ours[0][used]), np.argsort(theirs[0])
+    np.testing.assert_allclose(ours[0][used][order], theirs[0][expected], atol=1e-14)
+    for found, right, signs in ((ours[1], theirs[1], (1,)), (ours[2], theirs[2], (1, -1))):
+        found, right = found[:, used][:, order], right[:, expected]
+        off = np.min([np.abs(found - sign * right).max(axis=0) for sign in signs], axis=0)
+        np.testing.assert_allclose(off, 0, atol=1e-14)
+
+
+def test_a_mixed_pile_finds_its_contacts_by_the_grid():
+    """Those of all pairs that are near, now or later, and the least gap of all."""
+    rng = np.random.default_rng(3)
+    bodies = [ji.Block(1.0, 1.0), ji.Disc(0.5)] * 60
+    pile = ji.PlanarPile(bodies, walls=[[0.0, 1.0, -0.8]])
+    cells = np.stack(np.meshgrid(np.arange(12), np.arange(10)), axis=-1).reshape(-1, 2)
+    q = np.array(pile.at([1.4, 1.1] * cells)).reshape(-1, 3)
+    q[:, 2] = rng.choice([0.0, np.pi / 2, 0.02], 120)
+    later = q + rng.uniform(-0.03, 0.03, q.shape) * [0, 1, 0]
+    later[:, 0] += np.tile([0.2, -0.2], 60)  # pairs meet
+    q, later = q.reshape(-1), later.reshape(-1)
+    assert 0 < pile.crowd < 40
+
+    @jax.jit
+    def found(q, later, far):
+        pairs = pile.active_pairs(q, later, jnp.asarray(0.06))
+        gaps = jax.lax.map(pile.gap_function, jnp.stack([q, later]))
+        return pairs, gaps, jax.lax.map(pile.least_gap, jnp.stack([q, far]))
+
+    far = np.asarray(pile.at(1.9 * cells + [0, 3]))
+    pairs, gaps, (least, apart) = found(q, later, far)
+    assert not pairs.overflows
+    assert int(pairs.filled) == int((gaps.min(axis=0) <= 0.06).sum()) > 60
+    assert least == gaps[0].min() < 0.2
+    assert apart == pytest.approx(0.9)  # none are near each other, or the wall
+    directions = np.asarray(pairs.directions)[: int(pairs.filled)]
+    np.testing.assert_allclose(np.linalg.norm(directions[:, :, 0, :2], axis=2), 1, rtol=1e-12)
+
+
+def test_bad_mixed_piles_are_named():
+    with pytest.raises(
+        TypeError, match=r"`bodies` must hold polygons, blocks and discs, .* a Dimer"
+    ):
+        ji.PlanarPile([ji.Dimer(0.1, 0.5)])
+    with pytest.raises(ValueError, match="`bodies` must hold one or more"):
+        ji.PlanarPile([])
+    with pytest.raises(ValueError, match=r"`walls` must have shape \(w, 3\)"):
+        ji.PlanarPile([ji.Disc(0.1)], walls=[0.0])
+
+
+@pytest.mark.slow
+def test_a_mixed_pile_comes_to_rest_and_goes_on():
+    """Without kinetic energy, with the weight on the floor; the next motion begins where it ends."""
+    bodies = [
+        ji.Block(0.2, 0.1, mass=2.0),
+        ji.Disc(0.06),
+        ji.Polygon([[0, 0], [0.2, 0], [0.1, 0.1]]),
+    ]
+    pile = ji.PlanarPile(bodies * 2, walls=[[0, 1.0, 0], [1.0, 0, -0.25], [-1.0, 0, -0.25]])
+    system, law = ji.System(pile, potential=ji.gravity(pile, 10.0)), ji.Moreau(0.0, friction=0.5)
+    places = [[-0.1, 0.06], [0.13, 0.07], [0.0, 0.2], [-0.1, 0.32], [0.13, 0.3], [0.0, 0.45]]
+    options = dict(samples=5, method="time_stepping", step=1e-3)
+    motion = ji.simulate(system, law, pile.at(places), np.zeros(18), 1.5, **options)
+    ji.raise_on_failed_motion(motion)
+    assert motion.kinetic_energy[-1] < 1e-9
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-10)
+    assert -2e-3 < float(motion.gaps.min()) < -1e-9  # steps leave overlaps, with which it goes on
+    later = ji.simulate(system, law, **motion.end, t_end=1.7, **options)
+    np.testing.assert_allclose(later.q[-1], motion.q[-1], atol=1e-6)
+    at = ji.pile_contacts(system, law, motion.q[-1], motion.velocity[-1], step=1e-3)
+    # everything that the walls give carries the weight
+    push = at.impulse[:, None] * at.normals + at.tangential
+    np.testing.assert_allclose(push[at.bodies[:, 1] < 0].sum(axis=0) / 1e-3, [0, 80], atol=1e-2)
+
+
 # ------------------------------------------------------------------------ impacts on packings
 
 
@@ -259,8 +372,37 @@ def test_a_packing_is_struck(struck):
     np.testing.assert_allclose(rate, expected, atol=1e-12)
 
 
+def test_a_step_of_a_packing_is_an_impact(struck):
+    """Without friction by Moreau's law; with it, ball 1 rubs on balls 2 and 3, all on the table."""
+    spheres, q, v = struck
+    system, scene = ji.System(spheres), spheres.touching(q)
+    smooth = ji.impact(ji.Moreau(0.5), scene, v)
+    step = ji.pile_contacts(system, ji.Moreau(0.5, friction=1e-12), q, v, step=1e-9)
+    np.testing.assert_allclose(step.velocity, smooth.velocity, atol=1e-6)
+    np.testing.assert_array_equal(step.bodies[:4], [[0, 1], [0, 2], [1, 2], [0, -1]])
+    np.testing.assert_allclose(step.impulse, smooth.impulse, atol=1e-6)
+    np.testing.assert_allclose(step.scene.normals, scene.normals, atol=1e-8)
+    v = v.copy()
+    v[[0, 1, 20]] = 0.0, 2.0, -3.0  # past the others; and ball 4 falls
+    v[18] = 9.0
+    rough = ji.pile_contacts(system, ji.Moreau(0.5, friction=0.1), q, v, step=1e-9)
+    falls = rough.bodies.tolist().index([3, -1])
+    assert rough.impulse[falls] == pytest.approx(2 * 1.5 * 3, abs=1e-5)
+    np.testing.assert_allclose(rough.tangential[falls], [-0.9, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(rough.velocity[[18, 20]], [9 - 0.45, 1.5], atol=1e-5)
+    with pytest.raises(ValueError, match=r"must be of a body with many contacts .* of Column"):
+        ji.pile_contacts(ji.ball_system(), ji.Moreau(0.5), [0.0], [-1.0], step=1e-3)
+    with pytest.raises(ValueError, match="must lead to a contact within the step"):
+        ji.pile_contacts(system, ji.Moreau(0.5, friction=0.1), 9 * q, 0 * v, step=1e-9)
+
+
 def test_bad_packings_are_named(struck):
     spheres, q, _ = struck
+    row = ji.Spheres(1.0, [0.1] * 3, room=1)
+    with pytest.raises(ValueError, match="at most 1 contacts"):
+        row.touching(row.at([[0.0, 0.0, 0.0], [0.2, 0.0, 0.0], [0.4, 0.0, 0.0]]))
+    with pytest.warns(UserWarning, match=r"`q` holds bodies that overlap by 0\.05 m"):
+        row.touching(row.at([[0.0, 0.0, 0.0], [0.15, 0.0, 0.0], [0.4, 0.0, 0.0]]))
     with pytest.raises(ValueError, match="`q` must hold bodies that touch"):
         spheres.touching(10 * q)
     with pytest.raises(ValueError, match="below"):

@@ -137,7 +137,7 @@ class PlanarBodies(Body):
         for polygon, discs in self.pairs.rolling:
             parts.append(_disc_on_polygon(places, np.array(discs), polygon))
         if self.pairs.sides or self.pairs.polygons:
-            parts.append(_facing_sides(_all_sides(places, self.pairs)))
+            parts.append(facing_sides(_all_sides(places, self.pairs)))
         return ContactPoints(*(jnp.concatenate(rows) for rows in zip(*parts)))
 
     def gap_function(self, q: jax.Array) -> jax.Array:
@@ -208,10 +208,10 @@ class PlanarBodies(Body):
         at = q.reshape(-1, 3)
         counts = np.array([body.points.shape[0] for body in self.bodies])
         owner = np.repeat(np.arange(len(counts)), counts)
-        points = _placed(jnp.concatenate([body.points for body in self.bodies]), at[owner])
+        points = placed(jnp.concatenate([body.points for body in self.bodies]), at[owner])
         rim = jnp.stack([jnp.asarray(body.rim, q.dtype) for body in self.bodies])
         polygons = {
-            b: _placed(body.corners[np.array(body.ring)], at[b][None])
+            b: placed(body.corners[np.array(body.ring)], at[b][None])
             for b, body in enumerate(self.bodies)
             if isinstance(body, Cornered)
         }
@@ -257,7 +257,7 @@ class _Places(NamedTuple):
     polygons: dict[int, jax.Array]  # corners (k, 2), counter-clockwise
 
 
-def _placed(points: jax.Array, at: jax.Array) -> jax.Array:
+def placed(points: jax.Array, at: jax.Array) -> jax.Array:
     """Points (p, 2) of bodies at (p or 1, 3)."""
     c, s = jnp.cos(at[:, 2]), jnp.sin(at[:, 2])
     x, y = points.T
@@ -265,8 +265,10 @@ def _placed(points: jax.Array, at: jax.Array) -> jax.Array:
 
 
 def _outward(side: jax.Array) -> jax.Array:
-    """Unit normals (.., 2) of counter-clockwise sides (.., 2)."""
-    return jnp.stack([side[..., 1], -side[..., 0]], axis=-1) / jnp.sqrt(dot(side, side))[..., None]
+    """Unit normals (.., 2) of counter-clockwise sides (.., 2); 0 of one without length."""
+    square = dot(side, side)[..., None]
+    turned = jnp.stack([side[..., 1], -side[..., 0]], axis=-1)
+    return turned / jnp.sqrt(jnp.where(square > 0, square, 1.0))
 
 
 def _discs(places: _Places, pairs: np.ndarray) -> ContactPoints:
@@ -279,10 +281,19 @@ def _discs(places: _Places, pairs: np.ndarray) -> ContactPoints:
 
 def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> ContactPoints:
     """Distances of discs from a polygon: from a side, or, beyond its ends, from a corner."""
-    begin, middle = places.polygons[polygon], places.middle[discs]
+    middle = places.middle[discs]
+    away, n = from_polygon(middle, places.polygons[polygon])
+    return ContactPoints(away - places.rim[discs], middle - away[:, None] * n, n)
+
+
+def from_polygon(middle: jax.Array, begin: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Distances (g,) of points (g, 2) from a polygon of corners (k, 2), and unit vectors from it.
+
+    Sides without length do not count.
+    """
     side = jnp.roll(begin, -1, axis=0) - begin
     normals = _outward(side)
-    heights = jnp.sum((middle[:, None] - begin[None]) * normals[None], axis=2)
+    heights = _of_sides(jnp.sum((middle[:, None] - begin[None]) * normals[None], axis=2), normals)
     nearest = jnp.argmax(heights, axis=1)  # outside, its side or one of its ends is the nearest
     a, tangent, n = begin[nearest], side[nearest], normals[nearest]
     share = dot(middle - a, tangent) / dot(tangent, tangent)
@@ -290,11 +301,15 @@ def _disc_on_polygon(places: _Places, discs: np.ndarray, polygon: int) -> Contac
     corner = a + jnp.where(share > 1, 1.0, 0.0)[:, None] * tangent
     length, toward = lengths(middle - corner)
     n = jnp.where(beyond[:, None], toward, n)
-    away = jnp.where(beyond, length, jnp.max(heights, axis=1))
-    return ContactPoints(away - places.rim[discs], middle - away[:, None] * n, n)
+    return jnp.where(beyond, length, jnp.max(heights, axis=1)), n
 
 
-class _Sides(NamedTuple):
+def _of_sides(heights: jax.Array, normals: jax.Array) -> jax.Array:
+    """Heights (.., k) over sides of these normals (k, 2), -inf over those without length."""
+    return jnp.where(jnp.any(normals != 0, axis=1), heights, -jnp.inf)
+
+
+class FacingSides(NamedTuple):
     """Sides in contact of pairs of polygons, each from its begin to its end (g, 2)."""
 
     first: tuple[jax.Array, jax.Array]
@@ -302,7 +317,7 @@ class _Sides(NamedTuple):
     swapped: jax.Array  # (g,) whether the contact at the first side's end comes first
 
 
-def _all_sides(places: _Places, pairs: _Pairs) -> _Sides:
+def _all_sides(places: _Places, pairs: _Pairs) -> FacingSides:
     """Sides that were chosen at the beginning, then those that face each other now.
 
     Where a body rolls over a corner, one of the sides gives way to its neighbour, which has the
@@ -313,19 +328,19 @@ def _all_sides(places: _Places, pairs: _Pairs) -> _Sides:
     """
     rows: list[Any] = [(_side(places, a), _side(places, b), False) for a, b in pairs.sides]
     for pair in pairs.polygons:
-        *sides, n = _facing_now(*(places.polygons[i] for i in pair))
+        *sides, n = facing_now(*(places.polygons[i] for i in pair))
         number = sides[0] + sides[1]
         for i, side, way in zip(pair, sides, (n, -n)):
             if len(places.polygons[i]) % 2:
                 number += _full_turns(places.polygons[i], side, places.angle[i], n, way)
-        both = (_side_of(places.polygons[i], side) for i, side in zip(pair, sides))
+        both = (side_of(places.polygons[i], side) for i, side in zip(pair, sides))
         rows.append((*both, number % 2 == 1))
     first, second, swapped = zip(*rows)
 
     def ends(sides: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
         return jnp.stack([begin for begin, _ in sides]), jnp.stack([end for _, end in sides])
 
-    return _Sides(ends(first), ends(second), jnp.stack([jnp.asarray(x) for x in swapped]))
+    return FacingSides(ends(first), ends(second), jnp.stack([jnp.asarray(x) for x in swapped]))
 
 
 def _full_turns(
@@ -349,21 +364,21 @@ def _off_cut(places: _Places, i: int, j: int) -> jax.Array:
     a, b = places.polygons[i], places.polygons[j]
     if (len(a) + len(b)) % 2 == 0:
         return jnp.ones((), a.dtype)
-    _, _, n = _facing_now(a, b)
+    _, _, n = facing_now(a, b)
     apart = jnp.min(b @ n) - jnp.max(a @ n)
     off = 1 - n @ jnp.array([np.cos(_CUT), np.sin(_CUT)], n.dtype) - _NEAR_CUT
     return jnp.maximum(off, apart - _TOUCHING)
 
 
-def _facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Sides () of two polygons that face each other, and the normal (2,) from a to b.
 
     The line of one side keeps the polygons apart most. The other polygon's nearest corner to this
     line is an end of its side that is most opposite.
     """
     n_a, n_b = (_outward(jnp.roll(x, -1, axis=0) - x) for x in (a, b))
-    beyond_a = jnp.min(jnp.sum((b[:, None] - a[None]) * n_a[None], axis=2), axis=0)
-    beyond_b = jnp.min(jnp.sum((a[:, None] - b[None]) * n_b[None], axis=2), axis=0)
+    beyond_a = _of_sides(jnp.min(jnp.sum((b[:, None] - a[None]) * n_a[None], axis=2), axis=0), n_a)
+    beyond_b = _of_sides(jnp.min(jnp.sum((a[:, None] - b[None]) * n_b[None], axis=2), axis=0), n_b)
     side_a, side_b = jnp.argmax(beyond_a), jnp.argmax(beyond_b)
     opposite = n_a @ n_b.T
     by_b = jnp.max(beyond_b) > jnp.max(beyond_a) + _PARALLEL
@@ -372,7 +387,7 @@ def _facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     return side_a, side_b, jnp.where(by_b, -n_b[side_b], n_a[side_a])
 
 
-def _facing_sides(sides: _Sides) -> ContactPoints:
+def facing_sides(sides: FacingSides) -> ContactPoints:
     """Two contacts a pair, at the begin and at the end of the first body's side."""
     (a_begin, a_end), (b_begin, b_end) = sides.first, sides.second
     n_a, n_b = _outward(a_end - a_begin), _outward(b_end - b_begin)
@@ -403,10 +418,10 @@ def _facing_sides(sides: _Sides) -> ContactPoints:
 
 def _side(places: _Places, side: Side) -> tuple[jax.Array, jax.Array]:
     """Its begin and its end (2,)."""
-    return _side_of(places.polygons[side[0]], side[1])
+    return side_of(places.polygons[side[0]], side[1])
 
 
-def _side_of(corners: jax.Array, side: Any) -> tuple[jax.Array, jax.Array]:
+def side_of(corners: jax.Array, side: Any) -> tuple[jax.Array, jax.Array]:
     """Begin and end (2,) of a side of a polygon with these corners (k, 2)."""
     return corners[side], corners[(side + 1) % corners.shape[0]]
 
@@ -516,7 +531,7 @@ def _sides_of(
     def shape(which: int) -> tuple[np.ndarray, np.ndarray]:
         """Corners of a body and outward normals of its sides (k, 2)."""
         body = _polygon(bodies, which)
-        corners = _placed(body.corners[np.array(body.ring)], q.reshape(-1, 3)[which][None])
+        corners = placed(body.corners[np.array(body.ring)], q.reshape(-1, 3)[which][None])
         return np.asarray(corners), np.asarray(_outward(jnp.roll(corners, -1, axis=0) - corners))
 
     best = []

@@ -11,7 +11,7 @@ import numpy as np
 
 from jimpact._checks import as_float_array, check_shape, check_values, is_traced
 from jimpact.compiling import quick_jit
-from jimpact.scene import Scene, check_mass
+from jimpact.scene import Scene, check_mass, sparse_scene
 
 STANDARD_GRAVITY = 9.80665  # m/s^2
 CLOSED_BELOW = 1e-12  # [m] gaps this small are rounding of f(q) = 0; ten times more are, too
@@ -52,6 +52,22 @@ def numbered(names: Sequence[str], count: int) -> tuple[str, ...]:
 BLOCK = 128
 
 
+def over_blocks(count: Any, one: Callable[[Any, Any], Any], start: Any) -> Any:
+    """`start` carried by `one(first_row, carry)` through the blocks that hold `count` () rows."""
+    blocks = (count + BLOCK - 1) // BLOCK
+    return jax.lax.fori_loop(jnp.int32(0), blocks, lambda i, carry: one(i * BLOCK, carry), start)
+
+
+def block(x: jax.Array, row: jax.Array) -> jax.Array:
+    """The rows of x (K, ...) from this one that are computed at once."""
+    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
+
+
+def with_block(x: jax.Array, values: jax.Array, row: jax.Array) -> jax.Array:
+    """x (K, ...) with these values from this row on."""
+    return jax.lax.dynamic_update_slice_in_dim(x, values.astype(x.dtype), row, 0)
+
+
 class ActivePairs(NamedTuple):
     """The closed contacts of many bodies in the first of K rows, a multiple of `BLOCK`.
 
@@ -60,12 +76,27 @@ class ActivePairs(NamedTuple):
 
     number: jax.Array  # (K,) of the contact among all of them; `pair_count` in unused rows
     closed: jax.Array  # (K,) whether the row is used
+    filled: jax.Array  # () how many are
     bodies: jax.Array  # (K, 2); the number of bodies stands for a wall
     # (K, d, 2, velocities): normal and tangents, of both bodies, by the velocities of each: x, y
     # and turn in a plane, x, y, z and three turns in space
     directions: jax.Array
     overflows: jax.Array  # () whether more are closed than there are rows
     reach: jax.Array  # () [m]: bodies that move farther in one step may pass each other
+
+
+def listed_pairs(pairs: ActivePairs, mass: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, Scene]:
+    """On the host: rows (m,) in order, bodies (m, 2) with -1 for walls, directions, the scene.
+
+    Contacts of two bodies come first; `mass` (n,). Walls do not move: their directions are 0.
+    """
+    size = pairs.directions.shape[3]
+    bodies = np.where(pairs.bodies == len(mass) // size, -1, pairs.bodies)[: int(pairs.filled)]
+    order = np.lexsort((pairs.number[: len(bodies)], bodies[:, 1] < 0))
+    bodies, directions = bodies[order], np.array(pairs.directions)[order]
+    directions[:, :, 1] *= (bodies[:, 1] >= 0)[:, None, None]
+    scene = sparse_scene(mass, jnp.asarray(directions[:, 0]), bodies, len(mass) // size)
+    return order, bodies, directions, scene
 
 
 class ContactPoints(NamedTuple):
@@ -183,6 +214,15 @@ class Body(eqx.Module):
     def pair_count(self) -> int | None:
         """How many contacts `active_pairs` chooses from; None: time stepping takes all contacts."""
         return None
+
+    @property
+    def overlap(self) -> Any:
+        """Penetration [m] with which a motion may start: what steps of a pile leave."""
+        return 0.0
+
+    def least_gap(self, q: jax.Array) -> jax.Array:
+        """The least gap () [m] at q (n,), of a body with `pair_count`."""
+        return jnp.min(self.gap_function(q))
 
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` [m] at q or `later`, for time stepping.

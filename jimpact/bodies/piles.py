@@ -1,13 +1,13 @@
 """Piles: many discs or spheres between walls, each contact between two of them or with a wall."""
 
 import abc
+import warnings
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.spatial import cKDTree
 
 from jimpact._checks import (
     as_float_array,
@@ -24,27 +24,39 @@ from jimpact.bodies.base import (
     ActivePairs,
     Body,
     LinearPotential,
+    listed_pairs,
     numbered,
+    over_blocks,
     positives,
     wheel,
+    with_block,
 )
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
-from jimpact.scene import Scene, sparse_scene
+from jimpact.scene import Scene
 
 # Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
 # 6, and walls. Ten times more takes ten times the memory.
 ROOM = {2: 4, 3: 7}
 
 
+# Way of a body within half a step, over the least radius, up to which the grid finds all contacts:
+# what moves farther in a step than the least radius is a `coarse_step`. Ten times more makes cells
+# hold twenty times more bodies.
+MARGIN = 0.5
+
+# Penetration over the least radius with which motions may start: each impact of a step leaves up
+# to h v / 2. Ten times more would start with bodies in each other.
+_OVERLAP = 0.1
+
 # Gap over the least radius up to which bodies touch but for rounding. Ten times more closes gaps of
 # 10 nm of bodies of a metre.
 _TOUCHING = 1e-9
 
 
-class _Pile(Body):
-    """Round bodies between flat walls: d places and the turns of each, d = 2 or 3.
+class Pile(Body):
+    """Bodies between flat walls: d places and the turns of each, d = 2 or 3; here they are round.
 
-    A kind of pile gives `dimension`, `inertia_factor` and `tangents_of`.
+    A kind of pile gives `dimension` and `tangents_of`; if round, `inertia_factor`.
     """
 
     masses: jax.Array
@@ -57,11 +69,19 @@ class _Pile(Body):
     inertia_factor = 0.0  # moment of inertia over m R^2
 
     def __init__(self, masses: Any, radii: Any, walls: Any = (), room: int | None = None):
-        d = self.dimension
         self.radii = positives("radii", radii)
         if not len(self.radii):
             raise ValueError("Argument `radii` must hold one or more, but is empty.")
         self.masses = positives("masses", masses, self.radii.shape[0])
+        self.walls = self._unit_walls(walls)
+        self.room = (
+            ROOM[self.dimension] * len(self.radii) if room is None else as_whole("room", room, 1)
+        )
+        self.crowd = self._crowd()
+
+    def _unit_walls(self, walls: Any) -> jax.Array:
+        """Rows (w, d + 1) with unit normals."""
+        d = self.dimension
         empty = len(walls) == 0
         rows = as_float_array("walls", np.reshape(walls, (-1, d + 1)) if empty else walls)
         if rows.ndim != 2 or rows.shape[1] != d + 1:
@@ -72,18 +92,21 @@ class _Pile(Body):
         length = jnp.sqrt(jnp.sum(rows[:, :d] ** 2, axis=1))
         check_values("walls", length, low=0.0, open_low=True)
         scale = jnp.stack([length] * d + [jnp.ones_like(length)], axis=1)
-        self.walls = (rows / scale).astype(self.radii.dtype)
-        self.room = ROOM[d] * len(self.radii) if room is None else as_whole("room", room, 1)
-        self.crowd = self._crowd()
+        return (rows / scale).astype(self.radii.dtype)
 
     def _crowd(self) -> int:
         """How many bodies a row of cells may hold; 0 where looking at every pair is less work."""
         if is_traced(self.radii):
             return 0
-        radii = np.asarray(self.radii)
-        crowd = crowd_of(float(radii.min()), float(radii.max()), self.dimension)
+        least, largest = float(self._least), float(self.radii.max())
+        crowd = crowd_of(least, largest + 0.5 * MARGIN * least, self.dimension)
         rows = (3 ** (self.dimension - 1) + 1) // 2
         return crowd if 2 * rows * crowd < self.count else 0
+
+    @property
+    def _least(self) -> jax.Array:
+        """The least radius () of a disc or ball within a body."""
+        return jnp.min(self.radii)
 
     @property
     def count(self) -> int:
@@ -131,8 +154,8 @@ class _Pile(Body):
 
     def _pair_gaps(self, q: jax.Array, first: Any, second: Any) -> jax.Array:
         """Gaps of these pairs (C,)."""
-        centres = self._of_bodies(q)[:, : self.dimension]
-        squares = jnp.sum((centres[first] - centres[second]) ** 2, axis=1)
+        columns = self._of_bodies(q)[:, : self.dimension].T  # one by one: five times faster
+        squares = sum((x[first] - x[second]) ** 2 for x in columns)
         return jnp.sqrt(squares) - self.radii[first] - self.radii[second]
 
     def _wall_gaps(self, q: jax.Array) -> jax.Array:
@@ -155,6 +178,7 @@ class _Pile(Body):
         Only normals of two bodies each are stored, and W has few entries in a row: an impact of
         `Moreau`, `Poisson`, `LZB` or `Compliant` costs what the contacts cost. (`scene` holds all
         pairs and every gap.) Which bodies touch is compiled in: every packing compiles anew.
+        `ji.pile_contacts` has friction.
 
         Args:
             q: (n,), see `at`; not traced.
@@ -165,100 +189,154 @@ class _Pile(Body):
             `Scene` of n velocities; contacts of bodies i < j first, then those with walls.
 
         Raises:
-            ValueError: nothing touches, a bad `below`, two bodies in one place.
+            ValueError: nothing touches, more than `room` do, a bad `below`, two bodies in one
+                place. A warning says where bodies overlap by more than a tenth of the least radius.
         """
         q = as_float_array("q", q)
         check_concrete("q", q)
         check_shape("q", q, self.mass.shape, "one number per velocity")
-        least = float(np.min(np.asarray(self.radii)))
-        below = _TOUCHING * least if below is None else below
+        check_values("q", q)
+        below = _TOUCHING * float(self._least) if below is None else below
         check_values("below", below, low=0.0)
-        places, radii = np.asarray(self._of_bodies(q))[:, : self.dimension], np.asarray(self.radii)
-        pairs = cKDTree(places).query_pairs(2 * radii.max() + below, output_type="ndarray")
-        i, j = pairs[np.lexsort(pairs.T[::-1])].T
-        away = places[i] - places[j]
-        distance = np.linalg.norm(away, axis=1)
-        if (distance == 0).any():
-            raise ValueError("Argument `q` must hold bodies with different centres.")
-        meet = distance - radii[i] - radii[j] <= below
-        body, wall = np.nonzero(np.asarray(self._wall_gaps(q)) <= below)
-        normals = np.concatenate(
-            [(away / distance[:, None])[meet], np.asarray(self.walls)[wall, : self.dimension]]
-        )
-        bodies = np.concatenate(
-            [np.stack([i, j], axis=1)[meet], np.stack([body, np.full_like(body, -1)], axis=1)]
-        )
-        if not len(bodies):
+        pairs, least = jax.device_get(_active_pairs(self, q, jnp.asarray(below, q.dtype)))
+        if least < -float(self.overlap):
+            warnings.warn(
+                f"Argument `q` holds bodies that overlap by {-least:.3g} m; normals mean little "
+                "there.",
+                stacklevel=2,
+            )
+        if not pairs.filled:
             raise ValueError(
                 f"Argument `q` must hold bodies that touch, but no gap is up to {below:g}."
             )
-        second = np.where(bodies[:, 1:] < 0, 0.0, -normals)
-        both = np.pad(
-            np.stack([normals, second], axis=1), ((0, 0), (0, 0), (0, _turns(self.dimension)))
-        )
-        directions = jnp.asarray(both.astype(q.dtype))
-        return sparse_scene(self.mass, directions, bodies, self.count)
+        if pairs.overflows:
+            raise ValueError(
+                f"Argument `q` must hold at most {self.room} contacts (the argument `room` of "
+                f"{type(self).__name__}), but holds more."
+            )
+        _, _, directions, scene = listed_pairs(pairs, self.mass)
+        if not directions[:, 0].any(axis=(1, 2)).all():
+            raise ValueError("Argument `q` must hold bodies with different centres.")
+        return scene
+
+    @property
+    def overlap(self) -> jax.Array:
+        """Penetration () [m] with which a motion may start."""
+        return _OVERLAP * self._least
 
     @property
     def pair_count(self) -> int:
         """Every pair (i, j), in both orders, and every body with every wall."""
         return self.count * (self.count + len(self.walls))
 
-    def _candidates(self, q: jax.Array, below: jax.Array) -> Candidates:
-        """Pairs of bodies, all those with gaps up to `below` among them."""
+    def _candidates(self, q: jax.Array, margin: jax.Array) -> Candidates:
+        """Pairs of bodies, all those with gaps up to `margin` among them."""
         if self.crowd == 0:
             return all_pairs(self.count)
-        distance = 2 * jnp.max(self.radii) + below
+        distance = 2 * jnp.max(self.radii) + margin
         return near_pairs(self._of_bodies(q)[:, : self.dimension], distance, self.crowd)
+
+    def least_gap(self, q: jax.Array) -> jax.Array:
+        """The least gap () [m]; of bodies that are near each other if there are any."""
+        others = jnp.asarray(np.arange(self.count, dtype=np.int32))
+        to_walls = jnp.min(self._wall_gaps(q), initial=jnp.inf)
+
+        def of_all() -> jax.Array:
+            """Body by body, so that no table holds all pairs."""
+
+            def with_one(i: jax.Array, least: jax.Array) -> jax.Array:
+                gaps = self._gaps_between(q, jnp.full_like(others, i), others)
+                return jnp.minimum(least, jnp.min(jnp.where(others == i, jnp.inf, gaps)))
+
+            return jax.lax.fori_loop(jnp.int32(0), jnp.int32(self.count), with_one, to_walls)
+
+        if self.crowd == 0:
+            return of_all()
+        margin = MARGIN * self._least
+        least, overflows = self._least_of_near(q, margin)
+        least = jnp.minimum(least, to_walls)
+        found = (least <= margin) & ~overflows
+        return jax.lax.cond(found, lambda: least, of_all)
+
+    def _gaps_between(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
+        """Gaps (g,) of bodies i and j."""
+        return self._pair_gaps(q, i, j)
+
+    def _least_of_near(self, q: jax.Array, margin: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The least gap () of pairs with gaps up to `margin`; whether some are missing."""
+        near = self._candidates(q, margin)
+        gaps = jnp.where(near.used, self._pair_gaps(q, near.first, near.second), jnp.inf)
+        return jnp.min(gaps, initial=jnp.inf), near.overflows
+
+    def _near(self, q: jax.Array, later: jax.Array, below: jax.Array) -> Candidates:
+        """Pairs of bodies, all those with gaps up to `below` at q or `later` among them."""
+        way = jnp.abs(self._of_bodies(later - q)[:, : self.dimension])
+        # each moves by half of its way from the middle; what moves farther is a `coarse_step`
+        farther = jnp.minimum(jnp.max(jnp.sum(way, axis=1)), MARGIN * self._least)
+        return self._candidates(0.5 * (q + later), below + farther)
 
     def _closed(
         self, q: jax.Array, later: jax.Array, below: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-        """Bodies i and j of contacts (C,), which of them are closed, and whether some are missing.
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Numbers of contacts (C,), which of them are closed, and whether some are missing.
 
-        A contact is closed whose gap is at most `below` at q or `later`; j counts walls after the
-        bodies.
+        A contact is closed whose gap is at most `below` at q or `later`.
         """
-        now = self._candidates(q, below)
-        closed_now = now.used & (self._pair_gaps(q, now.first, now.second) <= below)
-        pairs: list[tuple[Any, Any]] = [(now.first, now.second)]
-        overflows = now.overflows
-        if self.crowd == 0:
-            soon = self._pair_gaps(later, now.first, now.second) <= below
-            closed = [closed_now | soon]
-        else:
-            then = self._candidates(later, below)
-            first, second = then.first, then.second
-            soon = then.used & (self._pair_gaps(later, first, second) <= below)
-            closed = [closed_now, soon & (self._pair_gaps(q, first, second) > below)]
-            pairs.append((first, second))
-            overflows |= then.overflows
-        pairs.append(self._at_walls())
+        near = self._near(q, later, below)
+        gaps = [self._pair_gaps(x, near.first, near.second) for x in (q, later)]
+        closed = near.used & (jnp.minimum(*gaps) <= below)
         to_walls = jnp.minimum(self._wall_gaps(q), self._wall_gaps(later)).reshape(-1)
-        i, j = (jnp.concatenate(each) for each in zip(*pairs))
-        return i, j, jnp.concatenate([*closed, to_walls <= below]), overflows
+        stride = self.count + len(self.walls)
+        body, wall = self._at_walls()
+        number = jnp.concatenate([near.first * stride + near.second, body * stride + wall])
+        return number, jnp.concatenate([closed, to_walls <= below]), near.overflows
 
     def active_pairs(self, q: jax.Array, later: jax.Array, below: jax.Array) -> ActivePairs:
         """The contacts, at q, with gaps up to `below` at q or `later`."""
-        i, j, closed, overflows = self._closed(q, later, below)
+        numbers, closed, overflows = self._closed(q, later, below)
         rows = -(-self.room // BLOCK) * BLOCK
-        chosen = jnp.nonzero(closed, size=rows, fill_value=closed.size)[0]
-        used = chosen < closed.size
-        row = jnp.minimum(chosen, closed.size - 1)
-        i, j = jnp.where(used, i[row], 0), jnp.where(used, j[row], 0)
-        wall = j >= self.count
-        other = jnp.minimum(j, self.count - 1)
-        normal = self._normals(q, i, other, j - self.count)
-        arms = self.radii[i], jnp.where(wall, 0.0, self.radii[other])
-        directions = self._directions(normal, *arms)
+        so_far = jnp.cumsum(closed, dtype=jnp.int32)
+        count = jnp.minimum(so_far[-1], rows)
+        number = jnp.full(rows, self.pair_count, jnp.int32)
+        bodies = jnp.zeros((rows, 2), jnp.int32)
+        d = self.dimension
+        directions = jnp.zeros((rows, d, 2, d + _turns(d)), q.dtype)
+
+        def one(first: jax.Array, filled: Any) -> Any:
+            """The next rows."""
+            used, chosen = chosen_rows(so_far, first, count)
+            chosen = jnp.where(used, numbers[chosen], 0)
+            i, j, ways = self._of_contacts(q, chosen)
+            new = (
+                jnp.where(used, chosen, self.pair_count),
+                jnp.where(used[:, None], jnp.stack([i, j], axis=1), 0),
+                jnp.where(used[:, None, None, None], ways, 0.0),
+            )
+            return tuple(with_block(x, part, first) for x, part in zip(filled, new))
+
+        number, bodies, directions = over_blocks(count, one, (number, bodies, directions))
         return ActivePairs(
-            jnp.where(used, i * (self.count + len(self.walls)) + j, self.pair_count),
-            used,
-            jnp.stack([i, jnp.where(wall, self.count, other)], axis=1),
-            jnp.where(used[:, None, None, None], directions, 0.0),
-            overflows | (jnp.sum(closed) > self.room),
-            jnp.min(self.radii),
+            number,
+            jnp.asarray(np.arange(rows, dtype=np.int32)) < count,
+            count,
+            bodies,
+            directions,
+            overflows | (so_far[-1] > self.room),
+            self._least,
         )
+
+    def _of_contacts(
+        self, q: jax.Array, number: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Bodies i and j (K,) of contacts of these numbers, j = `count` for walls; see `_along`."""
+        i, j = jnp.divmod(number, jnp.int32(self.count + len(self.walls)))
+        return i, jnp.minimum(j, self.count), self._along(q, i, j)
+
+    def _along(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
+        """Normal and tangents (K, d, 2, d + turns) of contacts of body i with body or wall j."""
+        other = jnp.minimum(j, self.count - 1)
+        arm = jnp.where(j < self.count, self.radii[other], 0.0)
+        return self._directions(self._normals(q, i, other, j - self.count), self.radii[i], arm)
 
     def _normals(self, q: jax.Array, i: Any, other: Any, wall: Any) -> jax.Array:
         """Unit normals (K, d) towards body i, of a wall where its number is not negative."""
@@ -286,9 +364,24 @@ class _Pile(Body):
         ]
         return jnp.stack(both, axis=2)
 
+    def _dense(self, directions: jax.Array, i: np.ndarray, j: np.ndarray) -> jax.Array:
+        """(n, m r): r directions (m, r, 2, ..) each of contacts of body i with body or wall j."""
+        (m, r), k, row = directions.shape[:2], self.count, np.arange(i.size)
+        still = (j >= k)[:, None, None]
+        every = jnp.zeros((m, r, k, directions.shape[3]), directions.dtype)
+        every = every.at[row, :, i].add(directions[:, :, 0])
+        other = jnp.where(still, 0.0, directions[:, :, 1])
+        return every.at[row, :, np.minimum(j, k - 1)].add(other).reshape(m * r, -1).T
+
     @abc.abstractmethod
     def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Tangents t (K, d - 1, d) of normals n (K, d), and `n x t` (K, d - 1, turns)."""
+
+
+@eqx.filter_jit
+def _active_pairs(pile: Pile, q: jax.Array, below: jax.Array) -> tuple[ActivePairs, jax.Array]:
+    """The contacts that are closed at q, and the least gap."""
+    return pile.active_pairs(q, q, below), pile.least_gap(q)
 
 
 def _turns(d: int) -> int:
@@ -296,7 +389,40 @@ def _turns(d: int) -> int:
     return d * (d - 1) // 2
 
 
-class Discs(_Pile):
+def chosen_rows(
+    so_far: jax.Array, first: jax.Array, count: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Of the next block of `count` () rows: which are used, and where they are found (BLOCK,).
+
+    `so_far` (C,) is how many have been found up to each place.
+    """
+    row = first + np.arange(BLOCK, dtype=np.int32)
+    place = jnp.minimum(jnp.searchsorted(so_far, row + 1), so_far.size - 1)
+    return row < count, place
+
+
+class InPlane(Pile):
+    """A pile in a plane."""
+
+    dimension = 2
+
+    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The normal turned by a quarter, and 1."""
+        x, y = normal.T
+        return jnp.stack([-y, x], axis=1)[:, None], jnp.ones_like(x)[:, None, None]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """x, y, angle of each body."""
+        return numbered(PLANAR, self.count)
+
+    @property
+    def floors(self) -> list[tuple[float, float]]:
+        """The walls."""
+        return [(float(np.arctan2(-x, y)), float(d)) for x, y, d in np.asarray(self.walls)]
+
+
+class Discs(InPlane):
     """Discs in a plane between straight walls; q = (x, y, turn) of each in turn.
 
     Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
@@ -317,7 +443,6 @@ class Discs(_Pile):
     [0.3, 0.0, 0.0]
     """
 
-    dimension = 2
     inertia_factor = 0.5
 
     def tangent_function(self, q: jax.Array) -> jax.Array:
@@ -331,27 +456,12 @@ class Discs(_Pile):
         slid = at[:, :2] @ jnp.stack([-self.walls[:, 1], self.walls[:, 0]]) - rolled[:, None]
         return jnp.concatenate([around, slid.reshape(-1)])
 
-    def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The normal turned by a quarter, and 1."""
-        x, y = normal.T
-        return jnp.stack([-y, x], axis=1)[:, None], jnp.ones_like(x)[:, None, None]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """x, y, angle of each disc."""
-        return numbered(PLANAR, self.count)
-
-    @property
-    def floors(self) -> list[tuple[float, float]]:
-        """The walls."""
-        return [(float(np.arctan2(-x, y)), float(d)) for x, y, d in np.asarray(self.walls)]
-
     def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
         """Circles, each with the radius that shows how far it has turned."""
         return [wheel(r, at) for r, at in zip(self.radii, q.reshape(-1, 3))]
 
 
-class Spheres(_Pile):
+class Spheres(Pile):
     """Spheres in space between flat walls; q = (x, y, z) and three turns of each.
 
     Equation: `f = |c_i - c_j| - R_i - R_j`, and `f = n_w . c_i - d_w - R_i` at wall w; sliding
@@ -385,16 +495,8 @@ class Spheres(_Pile):
         k = self.count
         pairs = np.triu_indices(k, 1), self._at_walls()
         i, j = (np.concatenate(each) for each in zip(*pairs))
-        other = np.minimum(j, k - 1)
-        arm = jnp.where(j < k, self.radii[other], 0.0)
-        normal = self._normals(q, i, other, jnp.asarray(j - k))
-        directions = self._directions(normal, self.radii[i], arm)[:, 1:]  # (m, 2, 2, 6)
-        row = np.arange(i.size)
-        all_bodies = jnp.zeros((i.size, 2, k, 6), q.dtype).at[row, :, i].add(directions[:, :, 0])
-        all_bodies = all_bodies.at[row, :, other].add(
-            jnp.where((j < k)[:, None, None], directions[:, :, 1], 0.0)
-        )
-        return all_bodies.reshape(2 * i.size, 6 * k).T
+        directions = self._along(q, jnp.asarray(i), jnp.asarray(j))[:, 1:]  # (m, 2, 2, 6)
+        return self._dense(directions, i, j)
 
     def tangents_of(self, normal: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Two unit vectors at right angles to each normal, and to each other.

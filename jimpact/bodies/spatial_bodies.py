@@ -36,7 +36,7 @@ class SpatialBodies(Body):
     contact points; pairs of spheres; spheres on boxes. `between` names their bodies.
 
     The gap functions hold everywhere; `f < 0` inside a box is the depth below its nearest face. Two
-    boxes have none: `ji.from_mujoco` finds their contacts at one instant.
+    boxes have none: `ji.from_mujoco` finds their contacts at one instant, or at each time step.
 
     Args:
         bodies: `Box`, `Sphere`; their own `normal` does not count.
@@ -331,6 +331,7 @@ def _pairs(every: tuple[Solid, ...], moving: int, pairs: Sequence[Any] | None) -
         else:
             raise ValueError(
                 f"Argument `pairs` must leave out the pair {pair!r}: two boxes have no gap "
-                "function. Contacts of boxes at one instant come from `jimpact.from_mujoco`."
+                "function. Contacts of boxes come from `jimpact.from_mujoco`, in motion at each "
+                "step (docs/mujoco.md)."
             )
     return _SpatialPairs(tuple(spheres), tuple(boxes))

@@ -17,8 +17,7 @@ from jimpact._checks import (
 from jimpact.bodies.base import check_range
 from jimpact.law import Law
 from jimpact.laws.forces import Force
-from jimpact.motion.dynamics import gaps, mass_at, seen_from_base
-from jimpact.motion.stepping import is_pile
+from jimpact.motion.dynamics import is_pile, mass_at, recorded_gaps, seen_from_base
 from jimpact.motion.system import System
 from jimpact.scene import check_mass
 
@@ -140,7 +139,8 @@ def _check_system(
 ) -> jax.Array:
     """Raise for values that cannot be used, where they are known; the gaps (m,) at the start."""
     # functions of a system may close over traced numbers
-    mass, f = mass_at(system, q), gaps(system, q, start)
+    found = eqx.filter_jit(recorded_gaps) if is_pile(system) else recorded_gaps
+    mass, f = mass_at(system, q), found(system, q, start)
     if is_traced((system, q, v, start, end, mass, f)):
         return f
     if callable(system.mass):

@@ -54,6 +54,18 @@ def gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     return jnp.atleast_1d(system.body.gap_function(seen_from_base(system, q, t)))
 
 
+def is_pile(system: System) -> bool:
+    """Whether time stepping takes the closed contacts only."""
+    return system.body.pair_count is not None
+
+
+def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
+    """Gaps (m,), of a pile the least one (1,)."""
+    if is_pile(system):
+        return system.body.least_gap(seen_from_base(system, q, t))[None]
+    return gaps(system, q, t)
+
+
 def kinematics(
     system: System, q: jax.Array, v: jax.Array, t: jax.Array, *, of_tangents: bool = False
 ) -> Kinematics:

@@ -19,6 +19,7 @@ from jimpact.motion.dynamics import (
     kinematics,
     mass_at,
     not_rounding,
+    recorded_gaps,
     seen_from_base,
     user_force,
 )
@@ -485,7 +486,8 @@ def out_of_range(system: System, at: State) -> jax.Array:
 
 def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any) -> jax.Array:
     """MotionStatus () of a motion that begins here and shall last until `end`."""
-    penetrates = jnp.any(gaps(system, at.q, at.t) < -closed_below)
+    allowed = jnp.maximum(closed_below, system.body.overlap)
+    penetrates = jnp.any(recorded_gaps(system, at.q, at.t) < -allowed)
     status = jnp.where(penetrates, MOTION_CODE["penetration"], MOTION_CODE["ok"])
     status = jnp.where(out_of_range(system, at), MOTION_CODE["out_of_range"], status)
     status = jnp.where(end <= at.t, MOTION_CODE["backward"], status)

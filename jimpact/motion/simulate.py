@@ -32,11 +32,11 @@ from jimpact.motion.arguments import (
     without_closures,
 )
 from jimpact.motion.compliant_contact import compliant_motion
-from jimpact.motion.dynamics import kinetic, potential
+from jimpact.motion.dynamics import is_pile, kinetic, potential, recorded_gaps
 from jimpact.motion.event_driven import MotionProblem, Past, empty_checkpoint, event_driven
 from jimpact.motion.flow import Course, Settings, check_rtol
 from jimpact.motion.record import MOTION_CODE, Events, Motion, joined
-from jimpact.motion.stepping import recorded_gaps, time_stepping
+from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
 from jimpact.progress import progress_bar, waiting
 
@@ -155,9 +155,9 @@ def simulate(
     rtol, atol = _tolerances(method, dtype, rtol, atol)
     mu = friction_of(system, law, friction, q)
     system = without_closures(system, q, v, start)
-    below, rounding = _closed_gaps(q, f, closed_below)
+    below, rounding = closed_gaps(q, f, closed_below)
     if method != "contact_forces":
-        check_penetration("q0", f, below)
+        check_penetration("q0", f, jnp.maximum(below, system.body.overlap))
     share = jnp.asarray(slow, dtype)
     settings = Settings(
         rtol, atol, below, rounding, max_steps, mu is not None, friction_in_space(system, mu, q),
@@ -193,7 +193,7 @@ def _tolerances(
     return rtol, atol
 
 
-def _closed_gaps(
+def closed_gaps(
     q: jax.Array, f: jax.Array, closed_below: float | None
 ) -> tuple[jax.Array, jax.Array]:
     """Gaps () [m] below which a contact is closed, and below which a gap is rounding."""
@@ -298,11 +298,12 @@ def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
     """The record of a course, with its energies and gaps."""
     at = course.samples
     reached = jnp.isfinite(at.t)
+    over = _one_by_one if is_pile(system) else jax.vmap
 
     def sampled(function: Callable[..., jax.Array], *args: jax.Array) -> jax.Array:
         """A function of the samples; a NaN does not reach the derivatives of other samples."""
         rows = (jnp.where(reached.reshape(-1, *[1] * (x.ndim - 1)), x, x[:1]) for x in args)
-        values = jax.vmap(function)(*rows)
+        values = over(function)(*rows)
         each = (-1, *[1] * (values.ndim - 1))
         # times that were not reached are NaN, and so are their derivatives
         return jnp.where(reached.reshape(each), values, at.t.reshape(each))
@@ -321,6 +322,11 @@ def _recorded(system: System, times: jax.Array, course: Course) -> Motion:
         steps=course.steps,
         status=course.status,
     )
+
+
+def _one_by_one(function: Callable[..., jax.Array]) -> Callable[..., jax.Array]:
+    """As `jax.vmap`, in turn: branches that one sample does not take cost nothing."""
+    return lambda *rows: jax.lax.map(lambda row: function(*row), rows)
 
 
 def _equal_times(start: jax.Array, end: jax.Array, samples: int) -> jax.Array:

@@ -21,13 +21,12 @@ DERIVATIVES of such a step do not converge: with h the time of an impact is cons
 derivative is not. They are refused.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jimpact.bodies.base import BLOCK, ActivePairs
+from jimpact.bodies.base import ActivePairs, block, over_blocks, with_block
 from jimpact.impacts import impact
 from jimpact.law import Law, within_domains
 from jimpact.motion.dynamics import (
@@ -35,8 +34,10 @@ from jimpact.motion.dynamics import (
     definite,
     free_acceleration,
     gaps,
+    is_pile,
     mass_at,
     normals_at,
+    recorded_gaps,
     seen_from_base,
     solve_mass,
     user_force,
@@ -78,11 +79,6 @@ WHY = (
     "Argument `method` must not be 'time_stepping' where derivatives are taken: with the step the "
     "times of impacts are fixed, so that derivatives do not converge. method='events' has them."
 )
-
-
-def block(x: jax.Array, row: jax.Array) -> jax.Array:
-    """The rows of x (K, ...) from this one that are computed at once."""
-    return jax.lax.dynamic_slice_in_dim(x, row, BLOCK)
 
 
 class _AllContacts(NamedTuple):
@@ -152,11 +148,6 @@ class _ActiveContacts(NamedTuple):
         """(m,)."""
         return self.pairs.closed
 
-    def _over_blocks(self, one: Callable[[jax.Array, Any], Any], start: Any) -> Any:
-        """`start` carried by `one(first_row, carry)` through the blocks of rows that are used."""
-        blocks = (jnp.sum(self.closed) + BLOCK - 1) // BLOCK
-        return jax.lax.fori_loop(0, blocks, lambda i, carry: one(i * BLOCK, carry), start)
-
     def rates(self, v: jax.Array) -> jax.Array:
         """Gap velocities and slips (m, b) of v (n,)."""
         of_bodies = jnp.pad(v.reshape(-1, self.inverse.shape[1]), ((0, 1), (0, 0)))
@@ -164,9 +155,10 @@ class _ActiveContacts(NamedTuple):
         def one(row: jax.Array, rates: jax.Array) -> jax.Array:
             bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
             values = jnp.sum(directions * of_bodies[bodies][:, None], axis=(2, 3))
-            return jax.lax.dynamic_update_slice_in_dim(rates, values, row, 0)
+            return with_block(rates, values, row)
 
-        return self._over_blocks(one, jnp.zeros(self.pairs.directions.shape[:2], v.dtype))
+        start = jnp.zeros(self.pairs.directions.shape[:2], v.dtype)
+        return over_blocks(self.pairs.filled, one, start)
 
     def fastest(self, v: jax.Array) -> jax.Array:
         """Gap velocity () that the speeds of v could give."""
@@ -184,7 +176,8 @@ class _ActiveContacts(NamedTuple):
             each = jnp.sum(directions * block(x, row)[:, :, None, None], axis=1)
             return impulses.at[bodies].add(each)
 
-        return self._over_blocks(one, jnp.zeros_like(self.inverse))[:-1].reshape(-1)
+        start = jnp.zeros_like(self.inverse)
+        return over_blocks(self.pairs.filled, one, start)[:-1].reshape(-1)
 
     def product(self, x: jax.Array) -> jax.Array:
         """Rates (m, b) that impulses x (m, b) give."""
@@ -193,7 +186,14 @@ class _ActiveContacts(NamedTuple):
     @property
     def diagonal(self) -> jax.Array:
         """Of the Delassus matrix (m, b)."""
-        return jnp.sum(self.pairs.directions**2 * self.inverse[self.pairs.bodies][:, None], (2, 3))
+
+        def one(row: jax.Array, diagonal: jax.Array) -> jax.Array:
+            bodies, directions = (block(x, row) for x in (self.pairs.bodies, self.pairs.directions))
+            squares = directions**2 * self.inverse[bodies][:, None]
+            return with_block(diagonal, jnp.sum(squares, axis=(2, 3)), row)
+
+        start = jnp.zeros(self.pairs.directions.shape[:2], self.inverse.dtype)
+        return over_blocks(self.pairs.filled, one, start)
 
     def warm_start(self, last: Any) -> jax.Array:
         """Impulses (m, b) of the last step, 0 where the contact was open."""
@@ -204,8 +204,13 @@ class _ActiveContacts(NamedTuple):
 
     def kept(self, x: jax.Array) -> _PileImpulses:
         """Impulses x (m, b) in the form in which the next step reads them."""
-        order = jnp.argsort(self.pairs.number)
-        return _PileImpulses(self.pairs.number[order], x[order])
+
+        def in_order() -> _PileImpulses:
+            order = jnp.argsort(self.pairs.number)
+            return _PileImpulses(self.pairs.number[order], x[order])
+
+        as_it_is = _PileImpulses(self.pairs.number, x)
+        return jax.lax.cond(self.pairs.filled > 0, in_order, lambda: as_it_is)
 
     def recorded(self, values: jax.Array) -> jax.Array:
         """Values of contacts (.., m) as the record holds them: their sum (.., 1)."""
@@ -271,17 +276,6 @@ class _Trial(NamedTuple):
     tries: jax.Array  # () iterations so far, this one included
 
 
-def is_pile(system: System) -> bool:
-    """Whether time stepping takes the closed contacts only."""
-    return system.body.pair_count is not None
-
-
-def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
-    """Gaps (m,), of a pile the least one (1,)."""
-    f = gaps(system, q, t)
-    return jnp.min(f, keepdims=True) if is_pile(system) else f
-
-
 def time_stepping(
     system: System,
     law: Law,
@@ -301,33 +295,10 @@ def time_stepping(
     system, law, mu, q0, v0, times = without_derivatives(
         (system, law, mu, q0, v0, times), NotImplementedError(WHY)
     )
-    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
-    m = recorded_gaps(system, q0, times[0]).shape[0]
-
-    first = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
-    at_rest = jnp.zeros_like(first.rates(v0))
-    contacts, b = at_rest.shape
-    rest = jnp.zeros((2, m), dtype)
-    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
-    rows = 1 if is_pile(system) else max_events
-    events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
-    status = status_at_start(system, begin, times[-1], closed_below)
-    fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
-    status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
-    h = (times[1] - times[0]) / substeps.astype(dtype)
+    h = (times[1] - times[0]) / substeps.astype(q0.dtype)
     problem = _StepProblem(system, law, mu, h, closed_below, joint)
-    start = _Progress(
-        state=begin,
-        speed=zero,
-        last_impulses=first.kept(at_rest),
-        residual_velocity=zero,
-        inverse_step_size=jnp.ones((), dtype),
-        steps_since_impact=jnp.full(contacts, substeps * len(times)),
-        closing=_closing_at_start(problem, begin, contacts),
-        events=events,
-        status=status,
-        reported=jnp.int32(MOTION_CODE["ok"]),
-    )
+    start = _begin(problem, q0, v0, times, substeps, max_events)
+    dtype = q0.dtype
 
     def to_sample(progress: _Progress, t: jax.Array) -> tuple[_Progress, State]:
         """The motion up to the next sample, from t."""
@@ -343,10 +314,74 @@ def time_stepping(
         return progress, jax.tree.map(lambda x: jnp.where(fine, x, jnp.nan), progress.state)
 
     end, later = jax.lax.scan(to_sample, start, times[:-1])
-    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), begin, later)
+    samples = jax.tree.map(lambda x, rest: jnp.concatenate([x[None], rest]), start.state, later)
     steps = substeps * (times.shape[0] - 1)
     status = jnp.where(end.status == MOTION_CODE["ok"], end.reported, end.status)
     return Course(samples, end.events, steps, status)
+
+
+def step_of_pile(
+    system: System,
+    law: Law,
+    mu: jax.Array | None,
+    q: jax.Array,
+    v: jax.Array,
+    times: jax.Array,
+    closed_below: jax.Array,
+) -> tuple[ActivePairs, jax.Array, jax.Array, jax.Array]:
+    """The step of a pile between two `times`: contacts, impulses (K, b), v' (n,), status ()."""
+    problem = _StepProblem(system, law, mu, times[1] - times[0], closed_below, joint=True)
+    start = _begin(problem, q, v, times, jnp.int32(1), 1)
+    setup = _set_up(problem, start, times[0])
+    trial = _solve(problem, start, setup)
+    state, _ = _end_state(problem, start, setup, trial)
+    status, reported = _status(problem, start, setup, trial, state)
+    contacts = setup.contacts
+    assert isinstance(contacts, _ActiveContacts)
+    return contacts.pairs, trial.solution.impulse, trial.v, jnp.where(status > 0, status, reported)
+
+
+def _begin(
+    problem: _StepProblem,
+    q0: jax.Array,
+    v0: jax.Array,
+    times: jax.Array,
+    substeps: jax.Array,
+    max_events: int,
+) -> _Progress:
+    """A motion before its first step."""
+    system, law, mu, _, closed_below, _ = problem
+    zero, dtype = jnp.zeros((), q0.dtype), q0.dtype
+    m = recorded_gaps(system, q0, times[0]).shape[0]
+
+    def first() -> tuple[jax.Array, Any]:
+        """Rates of contacts, and their impulses as steps keep them."""
+        at = _contacts(system, q0, times[0], q0, times[0], closed_below, mu is not None)
+        rates = at.rates(v0)
+        return rates, at.kept(rates)
+
+    shapes = jax.eval_shape(first)
+    at_rest, impulses = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    contacts, b = at_rest.shape
+    rest = jnp.zeros((2, m), dtype)
+    begin = State(q0, v0, times[0], zero, zero, rest, rest[:0])
+    rows = 1 if is_pile(system) else max_events
+    events = no_events(rows, q0, v0, m, sides=m * max(b - 1, 1))
+    status = status_at_start(system, begin, times[-1], closed_below)
+    fails = (status == MOTION_CODE["ok"]) & ~within_domains(law)
+    status = jnp.where(fails, MOTION_CODE["law_failed"], status).astype(jnp.int32)
+    return _Progress(
+        state=begin,
+        speed=zero,
+        last_impulses=impulses,
+        residual_velocity=zero,
+        inverse_step_size=jnp.ones((), dtype),
+        steps_since_impact=jnp.full(contacts, substeps * len(times)),
+        closing=_closing_at_start(problem, begin, contacts),
+        events=events,
+        status=status,
+        reported=jnp.int32(MOTION_CODE["ok"]),
+    )
 
 
 def _contacts(

@@ -10,11 +10,11 @@ from matplotlib.patches import Circle, Rectangle
 
 from jimpact._checks import check_kind, check_shape
 from jimpact.bodies.base import Body
-from jimpact.bodies.piles import Discs, Spheres
+from jimpact.bodies.piles import Pile
 from jimpact.motion.system import System
 from jimpact.plot.motions import draw_body
 from jimpact.plot.style import COLOURS, GREY, SMALL, finish, heading, new_figure
-from jimpact.scene import Scene, as_velocity
+from jimpact.scene import PairNormals, Scene, as_velocity
 
 _GAP = 0.5  # how wide an open contact is drawn, in radii of the largest body
 _LEAST = 0.35  # radius of a small body, likewise
@@ -62,9 +62,7 @@ def system(drawn: Scene | Body | System, state: Any, title: str = "") -> Figure:
     return figure
 
 
-def force_chains(
-    pile: Discs | Spheres, q: Any, scene: Scene, impulse: Any, title: str = ""
-) -> Figure:
+def force_chains(pile: Pile, q: Any, scene: Scene, impulse: Any, title: str = "") -> Figure:
     """The impulses in a packing as lines between the centres, as thick as they are large.
 
     Spheres are seen from the side, along y; lines in front cover those behind.
@@ -72,8 +70,8 @@ def force_chains(
     Args:
         pile: its bodies.
         q: where they are (n,), as for `pile.touching(q)`.
-        scene: `pile.touching(q)`.
-        impulse: p (m,) [N s] of an impact on this scene.
+        scene: `pile.touching(q)`, or the scene of `pile_contacts`.
+        impulse: p (m,) [N s] of an impact on this scene, or of a step.
         title: above the picture.
 
     Returns:
@@ -90,9 +88,10 @@ def force_chains(
     >>> len(figure.axes[0].collections)
     1
     """
-    if not isinstance(pile, (Discs, Spheres)):
+    if not isinstance(pile, Pile):
         raise TypeError(
-            f"Argument `pile` must be Discs or Spheres, but is a {type(pile).__name__}."
+            "Argument `pile` must be Discs, Spheres or a PlanarPile, but is a "
+            f"{type(pile).__name__}."
         )
     check_kind("scene", scene, Scene)
     if scene.pairs is None or scene.size != pile.mass.shape[0]:
@@ -103,16 +102,14 @@ def force_chains(
     axis = [0, d - 1]  # seen from the side
     centres = np.asarray(q, float).reshape(pile.count, -1)[:, :d]
     first, second = scene.pairs.neighbours.bodies.T
-    towards = np.asarray(scene.pairs.directions)[:, 0, :d]
-    on_wall = centres[first] - np.asarray(pile.radii)[first, None] * towards
-    ends = np.where((second < 0)[:, None], on_wall, centres[second])
+    ends = np.where((second < 0)[:, None], _on_walls(pile, scene.pairs, centres), centres[second])
     size = np.abs(p) / (np.abs(p).max() or 1.0)
     drawn = np.flatnonzero(size > _FAINT)
     drawn = drawn[np.argsort(size[drawn])]
     figure = new_figure(5.0)
     axes = figure.subplots()
-    for centre, radius in zip(centres[:, axis], np.asarray(pile.radii)):
-        axes.add_patch(Circle(tuple(centre), radius, fc="none", ec=GREY, lw=0.4, alpha=0.5))
+    for outline in pile.outlines(np.asarray(q, float), 0.0):
+        axes.plot(*outline.T, color=GREY, lw=0.4, alpha=0.5)
     lines = np.stack([centres[first], ends], axis=1)[drawn][:, :, axis]
     widths = _THICKEST * size[drawn]
     axes.add_collection(
@@ -125,6 +122,21 @@ def force_chains(
     finish(axes)
     heading(figure, title)
     return figure
+
+
+def _on_walls(pile: Pile, pairs: PairNormals, centres: np.ndarray) -> np.ndarray:
+    """Where contacts (m, d) of bodies with walls are."""
+    d, walls = pile.dimension, np.asarray(pile.walls)
+    first, normal = pairs.neighbours.bodies[:, 0], np.asarray(pairs.directions)[:, 0]
+    n = normal[:, :d]
+    if not len(walls):
+        return centres[first]
+    offset = walls[np.argmax(n @ walls[:, :d].T, axis=1), d]
+    height = np.sum(centres[first] * n, axis=1) - offset
+    on_wall = centres[first] - height[:, None] * n
+    if d == 2:  # the lever of a corner is the part of the normal that turns its body
+        on_wall += normal[:, 2:] * np.stack([n[:, 1], -n[:, 0]], axis=1)
+    return on_wall
 
 
 def _row(axes: Axes, scene: Scene, velocity: np.ndarray) -> None:

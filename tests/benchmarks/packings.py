@@ -8,7 +8,7 @@
 lattice, of which a part is smaller and touches nothing: 2.5 contacts a sphere. Every entry is a
 process of its own: the first call (tracing, compiling, running; without a compilation cache), the
 median of the calls that follow, and the largest memory of the process. `steps`: the same packings,
-and discs, fall onto a floor. `models`: `from_mujoco` and an impact, first and second call. Times
+and discs, and discs with squares, fall onto a floor. `models`: `from_mujoco` and an impact, first and second call. Times
 are processor seconds. MuJoCo's rows: `mj_step` of the same bodies without friction (condim 1), at
 its defaults; it is another problem, a step of soft contacts.
 """
@@ -142,8 +142,8 @@ def grid(count, dimensions):
     return at if dimensions == 3 else np.insert(at, 1, 0.0, axis=1)
 
 
-def steps_of(dimensions, count, steps=100, step=1e-3):
-    """Steps of time of bodies that fall."""
+def steps_of(dimensions, count, steps=100, step=1e-3, mixed=False):
+    """Steps of time of bodies that fall; `mixed`: every second disc is a square in its circle."""
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -152,6 +152,9 @@ def steps_of(dimensions, count, steps=100, step=1e-3):
     at = grid(count, dimensions)
     kind, floor = (ji.Spheres, [0, 0, 1.0, -0.5]) if dimensions == 3 else (ji.Discs, [0, 1.0, -0.5])
     body = kind(1.0, 0.5 * np.ones(count), walls=[floor])
+    if mixed:
+        shapes = [ji.Disc(0.5), ji.Block(np.sqrt(0.5), np.sqrt(0.5))]
+        body = ji.PlanarPile([shapes[i % 2] for i in range(count)], walls=[floor])
     system = ji.System(body, potential=body.gravity(9.81))
     law, start = ji.Moreau(0.3, friction=0.5), body.at(at[:, :3] if dimensions == 3 else at[:, ::2])
 
@@ -281,6 +284,7 @@ ENTRIES = {
     ),
     "steps": lambda name, count: {
         "discs": lambda: steps_of(2, count),
+        "discs and squares": lambda: steps_of(2, count, mixed=True),
         "spheres": lambda: steps_of(3, count),
         "discs, MuJoCo": lambda: steps_in_mujoco(2, count),
         "spheres, MuJoCo": lambda: steps_in_mujoco(3, count),
@@ -289,7 +293,7 @@ ENTRIES = {
 }
 NAMES = {
     "impacts": LAWS,
-    "steps": ("discs", "discs, MuJoCo", "spheres", "spheres, MuJoCo"),
+    "steps": ("discs", "discs, MuJoCo", "discs and squares", "spheres", "spheres, MuJoCo"),
     "models": MODELS,
 }
 
