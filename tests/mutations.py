@@ -325,6 +325,8 @@ MUTATIONS = [
     Mutation("contacts that take no part are looked at", r"alone\.astype\(rate\.dtype\)", "0", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
     Mutation("one attempt to find impulses in their cones", r"np\.array\(\[100\.0, 1\.0\]\)", "np.array([100.0])", ("test_friction_solver.py::test_four_corners_that_nearly_stick_have_impulses",), "interior_points.py"),
     Mutation("a contact below the surface ends each step", r"gap = contacts\.normal\.value - below", "gap = contacts.normal.value", ("test_motion_in_space.py::test_a_contact_that_lies_below_the_surface_may_leave_it",)),
+    Mutation("corners of an edge pull each other", r"jnp\.repeat\(rows\.mean\(axis=1\), rows\.shape\[1\]\)", "sizes[m:]", ("test_motion_in_space.py::test_corners_of_an_edge_do_not_pull_each_other",)),
+    Mutation("the lowest point of a coin is its highest one", r"self\._rims\(lengths\(down", "self._rims(lengths(-down", ("test_motion_in_space.py::test_forces_of_a_coin_that_rolls_steadily",)),
     Mutation("one of two corners at the rim of their cones sticks", r"starts = starts \| \(at_rim & jnp\.any\(broken\)\)", "pass", ("test_motion_in_space.py::test_who_sticks_and_who_slides",)),
     Mutation("redundant forces are shared equally", r"return jnp\.maximum\(share, least\) if least > 0 else share", "return jnp.ones_like(share)", ("test_friction_solver.py::test_shares_of_redundant_forces",), "dense.py"),
     Mutation("friction of many contacts in a box, not a disc", r"length = jnp\.sqrt\(jnp\.sum\(side\*\*2, axis=1, keepdims=True\)\)", "length = jnp.max(jnp.abs(side), axis=1, keepdims=True)", ("test_friction_solver.py::test_friction_of_many_contacts_has_a_round_cone",)),
