@@ -33,6 +33,14 @@ _SERIES = 1e-2  # squares of angles below it go through the series: there the fo
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
 _LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
 
+# (a x b)_i = sum _CROSS[i, j, k] a_j b_k
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
+# Of quaternions, (e f)_i = sum _QUATERNION_PRODUCT[i, j, k] e_j f_k
+_QUATERNION_PRODUCT = np.zeros((4, 4, 4))
+_QUATERNION_PRODUCT[0] = np.diag([1.0, -1.0, -1.0, -1.0])
+_QUATERNION_PRODUCT[1:, 0, 1:] = _QUATERNION_PRODUCT[1:, 1:, 0] = np.eye(3)
+_QUATERNION_PRODUCT[1:, 1:, 1:] = _CROSS
+
 
 class Solid(Body):
     """A rigid body in space over a plane through the origin; q = (x, y, z, e_0, e_1, e_2, e_3).
@@ -106,13 +114,21 @@ class Solid(Body):
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
         half = 0.5 * u[3:]
         cosine, ratio = _cosine_and_sine_ratio(half @ half)
-        return jnp.concatenate([q[:3] + u[:3], _product(e, cosine, ratio * half)])
+        turn = jnp.concatenate([cosine[None], ratio * half])
+        return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
 
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
         """q after the displacement u, to second order in u: without sine and cosine."""
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
         half = 0.5 * u[3:]
-        return jnp.concatenate([q[:3] + u[:3], _product(e, 1 - 0.5 * (half @ half), half)])
+        turn = jnp.concatenate([(1 - 0.5 * (half @ half))[None], half])
+        return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
+
+    def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
+        """Gradient (7,) in q as one (6,) in the displacements, by `e' = e (0, omega) / 2`."""
+        e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
+        turns = 0.5 * jnp.tensordot(e, jnp.asarray(_QUATERNION_PRODUCT, e.dtype), (0, 1))[:, 1:]
+        return jnp.concatenate([gradient[:3], gradient[3:] @ turns])
 
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """`-(0, omega x I omega)` (6,)."""
@@ -411,22 +427,19 @@ class Coin(Solid):
 
 def rotation(q: jax.Array) -> jax.Array:
     """R (3, 3) of q (7,), from the body's axes to those of space, whatever the length of e."""
-    w, e = q[3], q[4:]
-    zero = jnp.zeros_like(w)
-    cross = jnp.stack([zero, -e[2], e[1], e[2], zero, -e[0], -e[1], e[0], zero]).reshape(3, 3)
-    turn = 2 * (w * cross + cross @ cross) / jnp.sum(q[3:] ** 2)
+    cross = jnp.asarray(-_CROSS, q.dtype) @ q[4:]
+    turn = 2 * (q[3] * cross + cross @ cross) / jnp.sum(q[3:] ** 2)
     return jnp.eye(3, dtype=q.dtype) + turn
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Vector products (.., 3), in fewer operations to compile than `jnp.cross`."""
-    return jnp.roll(a * jnp.roll(b, -1, axis=-1) - jnp.roll(a, -1, axis=-1) * b, -1, axis=-1)
+    return jnp.sum(a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1)
 
 
-def _product(e: jax.Array, w: jax.Array, u: jax.Array) -> jax.Array:
-    """Quaternion product e (w, u)."""
-    scalar = e[0] * w - e[1:] @ u
-    return jnp.append(scalar, e[0] * u + w * e[1:] + cross(e[1:], u))
+def _product(e: jax.Array, other: jax.Array) -> jax.Array:
+    """Product (4,) of the quaternions e and `other`."""
+    return (jnp.asarray(_QUATERNION_PRODUCT, e.dtype) @ other) @ e
 
 
 def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -16,6 +16,7 @@ from jimpact.motion.dynamics import (
     base_velocity,
     free_acceleration,
     kinematics,
+    kinematics_with_tangents,
     mass_at,
     not_rounding,
     solve_mass,
@@ -143,8 +144,11 @@ def contacts_at(
 ) -> Contacts:
     """Contact space of the system at (q, v, t); in space with tangents `along` (m, 2)."""
     mass = mass_at(system, q)
-    normal = kinematics(system, q, v, t)
-    tangent = kinematics(system, q, v, t, of_tangents=True) if friction else None
+    normal, tangent = (
+        kinematics_with_tangents(system, q, v, t)
+        if friction
+        else (kinematics(system, q, v, t), None)
+    )
     directions, drift = normal.gradient, normal.drift
     if tangent is not None and along is not None:
         tangent = _turned(tangent, along)
