@@ -400,6 +400,8 @@ MUTATIONS = [
     Mutation("small turns twice as large", r"half @ half\), half\)", "half @ half), 2 * half)", ("test_motion_in_space.py::test_derivatives_at_no_displacement_take_two_terms",), "solids.py"),
     Mutation("redundant contacts share by their slip", r"weight, _sizes\(w, contacts\.delassus\)\)", "weight, jnp.diagonal(w))", ("test_motion_in_space.py::test_forces_of_a_brick_that_slides_flat_have_derivatives",)),
     Mutation("steps that end slip in one go", r"jnp\.sum\(u \* growth, axis=1\)", "0.0 * jnp.sum(u * growth, axis=1)", ("test_motion_in_space.py::test_derivatives_of_a_sphere_that_begins_to_roll",), "*.py", "release"),
+    Mutation("derivatives do not see what a contact forgets", r"flow\.switch\(aim\.modes, y, aim\.target\)\[1\]", "y", ("test_contact_forces.py::test_ball_on_a_linear_spring",), "flow.py"),
+    Mutation("impulses of contact forces without derivatives", r"opened = \(aim\.modes != OPEN\)", "opened = (aim.modes == OPEN)", ("test_contact_forces.py::test_ball_on_a_linear_spring",)),
     Mutation("lost derivatives are not reported", r"lost = plan\.lost & \(end", "lost = False & (end", ("test_motion.py::test_lost_derivatives_are_reported",)),
     Mutation("slip in space turned to the wrong side", r"jnp\.where\(straight, 0\.0, u\[:, 1\]\)", "jnp.where(straight, 0.0, -u[:, 1])", ("test_motion_in_space.py::test_a_sphere_slides_until_it_rolls",), "*.py", "slow"),
     Mutation("slip in space that begins held along itself", r"jnp\.stack\(\[stick, across\], axis=1\)", "jnp.stack([across, stick], axis=1)", ("test_motion_in_space.py::test_a_sphere_that_is_pulled_begins_to_slide",), "*.py", "slow"),

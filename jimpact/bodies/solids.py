@@ -338,7 +338,7 @@ class Sphere(Solid):
 class Coin(Solid):
     """A coin, or wheel, in space over a plane, see `Solid`; its axis is the third one of the body.
 
-    Equation: with `u = R^T n` and `s = |(u_1, u_2)|` each of its two rims, at -h/2 and h/2 along the
+    Equation: with `u = R^T n` and `s = |(u_1, u_2)|` each of its two rims, at -h/2 and h/2 on the
     axis, touches with its lowest point `c = (-a u_1 / s, -a u_2 / s, -/+ h/2)`: the coin rolls. A
     coin that lies flat has no such point: with `corners=N` the rims are regular polygons, with a
     contact a corner. So it lands flat and comes to rest, and clatters where the other one rolls.

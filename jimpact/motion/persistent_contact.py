@@ -271,7 +271,7 @@ def least_regularity(dtype: jnp.dtype) -> float:
 
 
 def _sizes(dragged: jax.Array, delassus: jax.Array, m: int) -> jax.Array:
-    """Diagonal (k,) that scales forces at m contacts: that without friction, which slip does not change.
+    """Diagonal (k,) that scales forces at m contacts: without friction, as slip does not change it.
 
     Where a contact jams, that with friction: beside the other one it would be less than the ridge.
     """
