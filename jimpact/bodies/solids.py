@@ -33,13 +33,17 @@ _SERIES = 1e-2  # squares of angles below it go through the series: there the fo
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
 _LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
 
-# (a x b)_i = sum _CROSS[i, j, k] a_j b_k
-_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)
-# Of quaternions, (e f)_i = sum _QUATERNION_PRODUCT[i, j, k] e_j f_k
-_QUATERNION_PRODUCT = np.zeros((4, 4, 4))
-_QUATERNION_PRODUCT[0] = np.diag([1.0, -1.0, -1.0, -1.0])
-_QUATERNION_PRODUCT[1:, 0, 1:] = _QUATERNION_PRODUCT[1:, 1:, 0] = np.eye(3)
-_QUATERNION_PRODUCT[1:, 1:, 1:] = _CROSS
+def _quaternion_product() -> np.ndarray:
+    """(4, 4, 4): `(e f)_i = sum_jk table_ijk e_j f_k`; the last three of each form a vector."""
+    table = np.zeros((4, 4, 4))
+    table[0] = np.diag([1.0, -1.0, -1.0, -1.0])
+    table[1:, 0, 1:] = table[1:, 1:, 0] = np.eye(3)
+    table[1:, 1:, 1:] = _CROSS
+    return table
+
+
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)  # of j and k, by i
+_QUATERNION_PRODUCT = _quaternion_product()
 
 
 class Solid(Body):

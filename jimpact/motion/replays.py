@@ -122,7 +122,7 @@ def differentiable(
     return value(*(x for x, y in zip(leaves, fixed) if y is None))
 
 
-class Walk(NamedTuple):
+class Retraced(NamedTuple):
     """What a second walk through a plan gives."""
 
     states: jax.Array  # (R, rows of the state) after each row of the plan
@@ -135,7 +135,7 @@ def walk(
     rows: Any,
     busy: jax.Array,
     width: int,
-) -> Walk:
+) -> Retraced:
     """What `one(state, row)` gives, row by row: the state and `width` numbers.
 
     Between two blocks of rows lies a checkpoint; a block in which none is `busy` is left out.
@@ -153,11 +153,11 @@ def walk(
 
     blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), (rows, busy))
     values = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
-    return Walk(*jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), values))
+    return Retraced(*jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), values))
 
 
 def tables_of(
-    problem: Any, plan: MotionPlan, start: State, went: Walk, sampled: jax.Array,
+    problem: Any, plan: MotionPlan, start: State, went: Retraced, sampled: jax.Array,
     written: jax.Array, sizes: tuple[int, int],
 ) -> tuple[jax.Array, jax.Array]:  # fmt: skip
     """Samples and events, so many rows, of a walk: those of the rows (R,) `sampled`, `written`.
