@@ -545,7 +545,7 @@ def test_simulate_in_space(tmp_path, capsys):
         (
             'kind = "block"',
             'kind = "car"',
-            "must be one of Block, Box, Column, Corner, Dimer, Disc, Discs",
+            "must be one of Block, Box, Coin, Column, Corner, Dimer, Disc, Discs",
         ),
         ('kind = "block"', 'kind = "planarbodies"', "[system] must have the key `bodies`"),
         ('kind = "block"', 'kind = "pendulumcradle"', "must have the key `masses_kg`"),

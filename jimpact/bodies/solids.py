@@ -33,6 +33,7 @@ _SERIES = 1e-2  # squares of angles below it go through the series: there the fo
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
 _LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
 
+
 def _quaternion_product() -> np.ndarray:
     """(4, 4, 4): `(e f)_i = sum_jk table_ijk e_j f_k`; the last three of each form a vector."""
     table = np.zeros((4, 4, 4))
