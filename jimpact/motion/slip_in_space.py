@@ -11,8 +11,7 @@ then as smooth as in the plane.
 ERRORS of slip count by what is left of it: a small error of a small slip is a large one of its
 direction, and of all derivatives. So steps integrate `ln |u|`, too, whose error limits their
 length: each takes a part of the slip, until less than LAST is left for the landing. Within it the
-direction changes as if STEADY times this were still there: else, where friction turns slip much
-faster than it slows it, no explicit step would be stable up to the end.
+direction changes as if all of this were still there.
 
 SLIP BEGINS, at a contact that stuck, slowly: its rate r' grows from 0, while its direction follows
 the forces at a rate c / r, with c the acceleration by friction. As long as `r' < BEGINNING c` the
@@ -47,9 +46,6 @@ NO_SLIP = 1e-13
 # Of the speed scale of the motion: slip that is left for the landing. Ten times more: derivatives
 # of motions err by ten times as much where slip ends, ten times less: by rounding.
 LAST = 1e-8
-# Slip that counts as ahead in the landing, over what is left. A landing is stable where friction
-# turns slip up to six times as many times as fast as it slows it. Ten times more is as good.
-STEADY = 1e3
 # Error of `ln |u|` that a step may make, as a share of the speed scale over the slip, in tolerances
 # of the flight, and at most. Ten times more: derivatives err by ten times as much.
 TURNING, MOST_TURNING = 10.0, 1e-3
@@ -86,7 +82,7 @@ def slip_axes(contacts: Contacts, mu: jax.Array, modes: Modes, speed_scale: jax.
         lambda: moving,
     )
     last, speed = speed <= LAST * speed_scale, jnp.where(starts, 0.0, speed)
-    least = jnp.where(last, STEADY, AHEAD) * jax.lax.stop_gradient(speed)
+    least = jnp.where(last, 1.0, AHEAD) * jax.lax.stop_gradient(speed)
     return SlipAxes(along, speed, jnp.where(starts, NO_SLIP * speed_scale, least), last)
 
 
