@@ -18,7 +18,7 @@ from .bodies.pendulums import PendulumCradle as PendulumCradle, pendulum_cradle 
 from .bodies.piles import Discs as Discs, Spheres as Spheres
 from .bodies.planar_piles import PlanarPile as PlanarPile
 from .bodies.polygons import Disc as Disc, Polygon as Polygon
-from .bodies.solids import Box as Box, Solid as Solid, Sphere as Sphere
+from .bodies.solids import Box as Box, Coin as Coin, Solid as Solid, Sphere as Sphere
 from .bodies.spatial_bodies import SpatialBodies as SpatialBodies
 from .cli.study import Study as Study, cube_impacts as cube_impacts, read_study as read_study
 from .cli.study_motion import (

@@ -416,6 +416,7 @@ BODIES = {
     "PlanarBodies": "planes = [0.1]\n[[system.bodies]]\nkind = 'disc'\nradius_m = 0.1",
     "Box": "sizes_m = [0.2, 0.1, 0.3]\nrounding_m = 0.01",
     "Sphere": "radius_m = 0.1\nnormal = [0.1, 0, 1]",
+    "Coin": "radius_m = 0.1\nthickness_m = 0.01\ncorners = 8",
     "SpatialBodies": (
         "places = [[0, 0, 0, 1, 0, 0, 0]]\n[[system.bodies]]\nkind = 'sphere'\nradius_m = 0.1\n"
         "[[system.fixed]]\nkind = 'box'\nsizes_m = [0.1, 1, 1]"
@@ -545,7 +546,7 @@ def test_simulate_in_space(tmp_path, capsys):
         (
             'kind = "block"',
             'kind = "car"',
-            "must be one of Block, Box, Column, Corner, Dimer, Disc, Discs",
+            "must be one of Block, Box, Coin, Column, Corner, Dimer, Disc, Discs",
         ),
         ('kind = "block"', 'kind = "planarbodies"', "[system] must have the key `bodies`"),
         ('kind = "block"', 'kind = "pendulumcradle"', "must have the key `masses_kg`"),

@@ -11,7 +11,7 @@ import pytest
 from programs import OPTIMIZED, both_ways
 
 import jimpact as ji
-from jimpact.motion import event_driven
+from jimpact.motion import event_driven, replays
 from jimpact.motion.dynamics import kinematics
 from jimpact.motion.flow import nan_derivatives, status_at_start
 from jimpact.motion.record import MOTION_STATUS
@@ -318,7 +318,7 @@ def test_derivatives_in_what_functions_close_over():
 
 @pytest.mark.release
 def test_a_motion_of_more_steps_than_a_plan_has_rows_has_no_derivative(monkeypatch):
-    monkeypatch.setattr(event_driven, "ROWS_MORE", 16)
+    monkeypatch.setattr(replays, "ROWS_MORE", 16)
     monkeypatch.setattr(event_driven, "ROWS_PER_EVENT", 0)
     ball = ji.ball_system(base=ji.HarmonicBase(1e-3, 20.0))  # too fast for so few steps
 
@@ -793,7 +793,7 @@ def test_fit_through_event_times():
 def test_lost_derivatives_are_reported(monkeypatch):
     """Where a plan has no room for the steps, derivatives are NaN and the status says so."""
     monkeypatch.setattr(event_driven, "ROWS_PER_EVENT", 0)
-    monkeypatch.setattr(event_driven, "ROWS_MORE", 0)
+    monkeypatch.setattr(replays, "ROWS_MORE", 0)
 
     def last(height):
         motion = ji.simulate(

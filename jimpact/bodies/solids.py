@@ -1,18 +1,20 @@
-"""Bodies in space over a plane: boxes and spheres, their orientation a unit quaternion."""
+"""Bodies in space over a plane: boxes, spheres and coins, their orientation a unit quaternion."""
 
 import itertools
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jimpact._checks import as_float_array, check_shape, check_values, is_traced
+from jimpact._checks import as_float_array, as_whole, check_shape, check_values, is_traced
 from jimpact.bodies.base import (
     CIRCLE,
     Body,
     LinearPotential,
     inertia_of,
+    lengths,
     number,
     positive,
     positives,
@@ -23,10 +25,26 @@ from jimpact.scene import check_mass
 # How far a quaternion may be from length 1. Numbers written with six digits are within; ten times
 # more, and a motion could turn a body by a visible angle before it says so.
 UNIT_WITHIN = 1e-6
+# [rad] of a round coin over its plane: below it the lowest points of its rims turn about the axis
+# within a few steps. Ten times more ends motions of coins that fall flat earlier.
+FLAT = 1e-3
 _SLACK = 1e-6  # of a moment of inertia: rounding of the largest one, of a thin plate
 _SERIES = 1e-2  # squares of angles below it go through the series: there the formula is 0/0
 _UPRIGHT = (1.0, 0.0, 0.0, 0.0)  # the quaternion of no rotation
 _LEVEL = (0.0, 0.0, 1.0)  # the normal of a level ground
+
+
+def _quaternion_product() -> np.ndarray:
+    """(4, 4, 4): `(e f)_i = sum_jk table_ijk e_j f_k`; the last three of each form a vector."""
+    table = np.zeros((4, 4, 4))
+    table[0] = np.diag([1.0, -1.0, -1.0, -1.0])
+    table[1:, 0, 1:] = table[1:, 1:, 0] = np.eye(3)
+    table[1:, 1:, 1:] = _CROSS
+    return table
+
+
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)[None]).transpose(2, 0, 1)  # of j and k, by i
+_QUATERNION_PRODUCT = _quaternion_product()
 
 
 class Solid(Body):
@@ -39,9 +57,9 @@ class Solid(Body):
     a sphere of radius r about the point c_i of the body: `f_i = n . (x + R c_i) - r`, its lowest
     point slides at `t . (x' + R (omega x d_i))`, `d_i = c_i - r R^T n`, along two directions t,
     the first one that of x, both in the plane. Turning is exact: `moved` keeps the length of e.
-    A body of this kind gives `points` (m, 3) and, unless it is 0, `rim`; it holds `total_mass`
-    [kg], `inertia` (3,) or (3, 3) [kg m^2], the `middle` of its shape from the centre of mass (3,)
-    [m], and the `normal` of the plane (3,).
+    A body of this kind gives `points` (m, 3), or `points_toward`, and, unless it is 0, `rim`; it
+    holds `total_mass` [kg], `inertia` (3,) or (3, 3) [kg m^2], the `middle` of its shape from the
+    centre of mass (3,) [m], and the `normal` of the plane (3,).
 
     Source: Featherstone, Rigid Body Dynamics Algorithms (2008), ch. 2 and 4.
     """
@@ -70,6 +88,10 @@ class Solid(Body):
         """c_i (m, 3) from the centre of mass [m]."""
         raise NotImplementedError(f"{type(self).__name__} must define `points`.")
 
+    def points_toward(self, down: jax.Array) -> jax.Array:
+        """c_i (m, 3) where `-down` (3,) is the normal of the plane in the body's axes."""
+        return self.points
+
     @property
     def rim(self) -> Any:
         """r () of the spheres about them [m]."""
@@ -97,13 +119,21 @@ class Solid(Body):
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
         half = 0.5 * u[3:]
         cosine, ratio = _cosine_and_sine_ratio(half @ half)
-        return jnp.concatenate([q[:3] + u[:3], _product(e, cosine, ratio * half)])
+        turn = jnp.concatenate([cosine[None], ratio * half])
+        return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
 
     def nearby(self, q: jax.Array, u: jax.Array) -> jax.Array:
         """q after the displacement u, to second order in u: without sine and cosine."""
         e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
         half = 0.5 * u[3:]
-        return jnp.concatenate([q[:3] + u[:3], _product(e, 1 - 0.5 * (half @ half), half)])
+        turn = jnp.concatenate([(1 - 0.5 * (half @ half))[None], half])
+        return jnp.concatenate([q[:3] + u[:3], _product(e, turn)])
+
+    def pulled(self, q: jax.Array, gradient: jax.Array) -> jax.Array:
+        """Gradient (7,) in q as one (6,) in the displacements, by `e' = e (0, omega) / 2`."""
+        e = q[3:] / jnp.sqrt(jnp.sum(q[3:] ** 2))
+        turns = 0.5 * jnp.tensordot(e, jnp.asarray(_QUATERNION_PRODUCT, e.dtype), (0, 1))[:, 1:]
+        return jnp.concatenate([gradient[:3], gradient[3:] @ turns])
 
     def inertial_force(self, q: jax.Array, v: jax.Array) -> jax.Array:
         """`-(0, omega x I omega)` (6,)."""
@@ -123,13 +153,16 @@ class Solid(Body):
 
     def gap_function(self, q: jax.Array) -> jax.Array:
         """Heights of the contact points over the plane (m,)."""
-        return self.normal @ q[:3] + self.points @ (rotation(q).T @ self.normal) - self.rim
+        return self.gaps_and_normals(q)[0]
 
     def gaps_and_normals(self, q: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Heights, and columns `(n, c_i x R^T n)`."""
-        turn = cross(self.points, (rotation(q).T @ self.normal)[None])
+        up = rotation(q).T @ self.normal
+        points = self.points_toward(-up)
+        turn = cross(points, up[None])
         still = jnp.broadcast_to(self.normal[None], turn.shape)
-        return self.gap_function(q), jnp.concatenate([still, turn], axis=1).T
+        gaps = self.normal @ q[:3] + points @ up - self.rim
+        return gaps, jnp.concatenate([still, turn], axis=1).T
 
     def tangents(self, q: jax.Array) -> jax.Array:
         """H_t (6, 2 m): two directions in the plane for each contact."""
@@ -138,7 +171,8 @@ class Solid(Body):
         first = jnp.stack([n[2], none, none - n[0]]) / jnp.sqrt(n[2] ** 2 + n[0] ** 2)
         both = jnp.stack([first, cross(n, first)])
         back = rotation(q).T
-        lever = self.points - (self.rim * (back @ n))[None, :]
+        up = back @ n
+        lever = self.points_toward(-up) - (self.rim * up)[None, :]
         turn = cross(lever[:, None, :], (both @ back.T)[None, :, :])
         still = jnp.broadcast_to(both[None], turn.shape)
         return jnp.concatenate([still, turn], axis=2).reshape(-1, 6).T
@@ -306,24 +340,111 @@ class Sphere(Solid):
         return [*turning, projected(middle) + float(self.radius) * CIRCLE]
 
 
+class Coin(Solid):
+    """A coin, or wheel, in space over a plane, see `Solid`; its axis is the third one of the body.
+
+    Equation: with `u = R^T n` and `s = |(u_1, u_2)|` each of its two rims, at -h/2 and h/2 on the
+    axis, touches with its lowest point `c = (-a u_1 / s, -a u_2 / s, -/+ h/2)`: the coin rolls. A
+    coin that lies flat has no such point: with `corners=N` the rims are regular polygons, with a
+    contact a corner. So it lands flat and comes to rest, and clatters where the other one rolls.
+
+    Args:
+        radius: a > 0 [m].
+        thickness: h > 0 [m].
+        mass: m > 0 [kg].
+        inertia: about the centre of mass, (3,) along the body's axes or (3, 3) [kg m^2]; None:
+            homogeneous, `m (3 a^2 + h^2) / 12` about a diameter, `m a^2 / 2` about the axis.
+        corners: N >= 3 of each rim, 2 N contacts, those of the rim at -h/2 first; 0: round rims,
+            2 contacts, `valid` down to an angle of 1e-3 rad between coin and plane.
+        normal: of the plane (3,), z > 0: (0, 0, 1) is level.
+
+    Raises:
+        ValueError: sizes, mass or inertia not positive, 1 or 2 corners.
+
+    Source: own derivation; see `Solid`.
+
+    >>> import math, jimpact as ji
+    >>> coin, upright = ji.Coin(0.1, 0.02), [math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0]
+    >>> coin.scene(coin.touching(upright)).closed.tolist()
+    [True, True]
+    >>> len(ji.Coin(0.1, 0.02, corners=8).points)
+    16
+    """
+
+    range_in_words = "a quaternion of length 1, and a round coin that does not lie flat"
+
+    radius: jax.Array
+    thickness: jax.Array
+    corners: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        radius: Any,
+        thickness: Any,
+        mass: Any = 1.0,
+        inertia: Any = None,
+        corners: int = 0,
+        normal: Any = _LEVEL,
+    ):
+        self.radius, self.thickness = positive("radius", radius), positive("thickness", thickness)
+        self.corners = as_whole("corners", corners, 0)
+        if self.corners in (1, 2):
+            raise ValueError(
+                f"Argument `corners` must be 0 or at least 3, but has value {self.corners}."
+            )
+        across = (3 * self.radius**2 + self.thickness**2) / 12
+        homogeneous = jnp.stack([across, across, 0.5 * self.radius**2])
+        self._weigh(mass, inertia, homogeneous, None, normal)
+
+    def _rims(self, outward: jax.Array) -> jax.Array:
+        """Points (2 k, 3) of both rims in the directions `outward` (k, 2) from the axis."""
+        levels = 0.5 * self.thickness * jnp.array([-1.0, 1.0], outward.dtype)
+        each = jnp.repeat(levels, len(outward))[:, None]
+        return jnp.concatenate([jnp.tile(self.radius * outward, (2, 1)), each], axis=1)
+
+    @property
+    def points(self) -> jax.Array:
+        """Corners (2 N, 3), the first one along the first axis; none of a round coin."""
+        angle = 2 * np.pi / max(self.corners, 1) * np.arange(self.corners)
+        corners = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return self._rims(jnp.asarray(corners, self.radius.dtype))
+
+    def points_toward(self, down: jax.Array) -> jax.Array:
+        """Corners, or the lowest points (2, 3) of round rims."""
+        return self.points if self.corners else self._rims(lengths(down[None, :2])[1])
+
+    def valid(self, q: jax.Array) -> jax.Array:
+        """As of `Solid`; of round coins also the tilt beyond `FLAT`."""
+        length = super().valid(q)
+        if self.corners:
+            return length
+        tilt = lengths((rotation(q).T @ self.normal)[None, :2])[0][0]
+        return jnp.minimum(length, tilt - FLAT)
+
+    def outlines(self, q: np.ndarray, point: float) -> list[np.ndarray]:
+        """Its rims, or their corners, a diameter, and their shadow, in projection."""
+        around = np.linspace(0, 2 * np.pi, self.corners + 1) if self.corners else None
+        ring = CIRCLE if around is None else np.stack([np.cos(around), np.sin(around)], axis=1)
+        rims = np.asarray(self._rims(jnp.asarray(ring))).reshape(2, -1, 3)
+        across = np.asarray(self._rims(jnp.asarray([[-1.0, 0.0], [1.0, 0.0]])))
+        return [line for curve in (*rims, across[2:]) for line in self._drawn(q, curve)]
+
+
 def rotation(q: jax.Array) -> jax.Array:
     """R (3, 3) of q (7,), from the body's axes to those of space, whatever the length of e."""
-    w, e = q[3], q[4:]
-    zero = jnp.zeros_like(w)
-    cross = jnp.stack([zero, -e[2], e[1], e[2], zero, -e[0], -e[1], e[0], zero]).reshape(3, 3)
-    turn = 2 * (w * cross + cross @ cross) / jnp.sum(q[3:] ** 2)
+    cross = jnp.asarray(-_CROSS, q.dtype) @ q[4:]
+    turn = 2 * (q[3] * cross + cross @ cross) / jnp.sum(q[3:] ** 2)
     return jnp.eye(3, dtype=q.dtype) + turn
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Vector products (.., 3), in fewer operations to compile than `jnp.cross`."""
-    return jnp.roll(a * jnp.roll(b, -1, axis=-1) - jnp.roll(a, -1, axis=-1) * b, -1, axis=-1)
+    return jnp.sum(a[..., None, :] * jnp.tensordot(b, _CROSS.astype(b.dtype), (-1, 2)), axis=-1)
 
 
-def _product(e: jax.Array, w: jax.Array, u: jax.Array) -> jax.Array:
-    """Quaternion product e (w, u)."""
-    scalar = e[0] * w - e[1:] @ u
-    return jnp.append(scalar, e[0] * u + w * e[1:] + cross(e[1:], u))
+def _product(e: jax.Array, other: jax.Array) -> jax.Array:
+    """Product (4,) of the quaternions e and `other`."""
+    return (jnp.asarray(_QUATERNION_PRODUCT, e.dtype) @ other) @ e
 
 
 def _cosine_and_sine_ratio(square: jax.Array) -> tuple[jax.Array, jax.Array]:

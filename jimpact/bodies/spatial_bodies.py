@@ -293,7 +293,7 @@ def _from_box(x: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _check_solids(name: str, bodies: tuple[Solid, ...]) -> None:
     """Raise for what is no body in space."""
     for body in bodies:
-        if not isinstance(body, Solid):
+        if not isinstance(body, (Box, Sphere)):
             raise TypeError(
                 f"Argument `{name}` must hold boxes and spheres, but holds a {type(body).__name__}."
             )

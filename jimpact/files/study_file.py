@@ -87,7 +87,9 @@ MOTION_TABLES = {
 _UNITS = {
     **dict.fromkeys(("mass", "masses", "sphere_mass", "rod_mass"), "kg"),
     **dict.fromkeys(("disk_mass", "ball_masses"), "kg"),
-    **dict.fromkeys(("width", "height", "length", "radius", "radii", "gaps", "sizes"), "m"),
+    **dict.fromkeys(
+        ("width", "height", "length", "thickness", "radius", "radii", "gaps", "sizes"), "m"
+    ),
     **dict.fromkeys(("centre", "rounding", "disk_radius", "ball_radius"), "m"),
     "inertia": "kg_m2",
     "angle": "rad",

@@ -11,12 +11,20 @@ from jimpact._checks import as_float_array, check_kind, check_shape, check_value
 from jimpact.bodies.base import Body
 from jimpact.compiling import quick_jit
 from jimpact.contact import delassus_matrix
+from jimpact.events import stepper
 from jimpact.events.contact_flow import COMPRESSION, EXPANSION, OPEN, SLACK
 from jimpact.events.stepper import any_of
 from jimpact.laws.forces import Force
-from jimpact.motion.arguments import check_unbounded
-from jimpact.motion.dynamics import base_velocity, kinematics, user_force
-from jimpact.motion.event_driven import why_stuck
+from jimpact.motion.arguments import check_unbounded, contacts_of
+from jimpact.motion.dynamics import base_velocity, gaps, kinematics, user_force
+from jimpact.motion.event_driven import (
+    MotionProblem,
+    empty_table,
+    event_numbers,
+    event_width,
+    recorded_events,
+    why_stuck,
+)
 from jimpact.motion.flow import (
     Course,
     Flight,
@@ -27,22 +35,36 @@ from jimpact.motion.flow import (
     check_rtol,
     first_flight,
     longest_step,
-    nan_derivatives,
-    no_samples,
     one_pass,
     packed,
     put,
     roundings,
     sampled_states,
+    selected,
     status_at_start,
+    step_again,
     toward_sample,
     unpacked,
 )
 from jimpact.motion.persistent_contact import Contacts, contacts_at
-from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events, no_events, with_row
+from jimpact.motion.record import KIND_CODE, MOTION_CODE
+from jimpact.motion.replays import (
+    MotionEnd,
+    MotionPlan,
+    MotionTable,
+    differentiable,
+    empty_plan,
+    samples_before,
+    tables_of,
+    walk,
+)
 from jimpact.motion.system import System
+from jimpact.motion.transitions import After, Passed, no_jump
 from jimpact.scene import gap_velocity
 
+# Rows of a plan: a contact takes some tens of steps. Ten times more takes ten times the memory of
+# derivatives.
+ROWS_PER_EVENT = 64
 # Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off by a tenth
 # of the tolerance.
 SNAP = 1e-2
@@ -166,135 +188,182 @@ class _CompliantRun(NamedTuple):
     """A motion with contact forces up to now."""
 
     flight: Flight
-    samples: jax.Array
     fastest: jax.Array  # (m,) approach so far [m/s]
-    events: Events
+    table: MotionTable
+    event_count: jax.Array
     status: jax.Array
     apart: jax.Array  # whether all contacts are open and none closes
+    plan: MotionPlan | None
 
 
-class _CompliantProblem(NamedTuple):
-    """What does not change from pass to pass."""
+class _PlanRow(NamedTuple):
+    """Of a plan: a pass, perhaps an accepted step, perhaps an event at its end."""
 
-    system: System
-    force: Force
-    settings: Settings
-    times: jax.Array
-    start: State
-    max_events: int
+    accepted: jax.Array  # ()
+    written: jax.Array  # ()
+    aim: stepper.Step
+    fastest: jax.Array  # (m,)
 
 
 def compliant_motion(
-    system: System,
-    force: Force,
-    settings: Settings,
-    q0: jax.Array,
-    v0: jax.Array,
-    times: jax.Array,
-    max_events: int,
-    until_apart: bool = False,
+    problem: MotionProblem, max_events: int, until_apart: bool = False
 ) -> tuple[Course, State, jax.Array]:
     """The motion from `times[0]` to `times[-1]`, or until no contact works any more.
 
     Returns:
         The course, the last state, and whether all contacts are open and none closes in it.
     """
-    start = _begin(system, force, settings, q0, v0, times, max_events)
-    state = start.flight.state
-    problem = _CompliantProblem(system, force, settings, times, state, max_events)
+    end = differentiable(
+        problem,
+        lambda problem, records: _run(problem, max_events, until_apart, records),
+        lambda problem, plan: _again(problem, plan, max_events),
+    )
+    start = _start(problem)
+    samples = sampled_states(end.table.samples, start, end.reached)
+    events = recorded_events(end.table, end.event_count, problem)
+    last = unpacked(start, end.table.samples[-1][:, None])
+    assert end.more is not None
+    return Course(samples, events, end.steps, end.status), last, end.more
+
+
+def _start(problem: MotionProblem) -> State:
+    """The state at the beginning: contacts are as deep as their gaps say."""
+    gap = gaps(problem.system, problem.q0, problem.times[0])
+    x = jnp.where(jnp.abs(gap) <= problem.settings.closed_below, 0.0, -gap)
+    return problem.start._replace(contact=jnp.stack([x, jnp.zeros_like(x)]))
+
+
+def _run(problem: MotionProblem, max_events: int, until_apart: bool, records: bool) -> MotionEnd:
+    """From pass to pass; with its plan, if it `records`."""
+    start = _begin(problem, max_events, records)
 
     def going(run: _CompliantRun) -> jax.Array:
-        on = (run.status == MOTION_CODE["ok"]) & (run.flight.sample < times.shape[0])
+        on = (run.status == MOTION_CODE["ok"]) & (run.flight.sample < problem.times.shape[0])
         return on & ~run.apart if until_apart else on
 
-    end = jax.lax.while_loop(going, lambda run: _one_pass(problem, run), start)
-    table = end.samples
-    reached = jnp.arange(table.shape[0], dtype=jnp.int32) < end.flight.sample
-    table = table + nan_derivatives((system, force, q0, v0, times), reached).astype(table.dtype)
-    samples = sampled_states(table, state, end.flight.sample)
-    course = Course(samples, end.events, end.flight.steps, end.status)
-    return course, end.flight.state, end.apart
+    end = jax.lax.while_loop(going, lambda run: _one_pass(problem, max_events, run), start)
+    last = packed(end.flight.state)[:, 0]
+    table = end.table._replace(samples=end.table.samples.at[-1].set(last))
+    flight = end.flight
+    return MotionEnd(
+        table, flight.sample, end.event_count, flight.steps, end.status, end.plan, end.apart
+    )
 
 
-def _begin(
-    system: System,
-    force: Force,
-    settings: Settings,
-    q0: jax.Array,
-    v0: jax.Array,
-    times: jax.Array,
-    max_events: int,
-) -> _CompliantRun:
+def _begin(problem: MotionProblem, max_events: int, records: bool) -> _CompliantRun:
     """The run before its first pass: phases follow from gaps and their rates."""
-    contacts = contacts_at(system, q0, v0, times[0], False)
-    gap, gamma = contacts.normal.value, contacts.normal.rate
-    m, dtype = gap.shape[0], q0.dtype
-    zero, none = jnp.zeros((), dtype), jnp.zeros((2, m), dtype)
-    x = jnp.where(jnp.abs(gap) <= settings.closed_below, 0.0, -gap)
-    state = State(q0, v0, times[0], zero, zero, none, jnp.stack([x, jnp.zeros_like(x)]))
+    system, force, _, settings, _, _, times, m, _ = problem
+    state = _start(problem)
+    x, gamma = state.contact[0], kinematics(system, state.q, state.v, state.t).rate
     phase = jnp.where((x > 0) | ((x == 0) & (gamma <= 0)), COMPRESSION, OPEN)
     if not force.slackens:
         phase = jnp.where((x > 0) & (gamma > 0), EXPANSION, phase)
     flight = first_flight(system, state, phase[:, None].astype(jnp.int32), 2 * m, times)
-    events = no_events(max_events, q0, v0, m)
+    flight = toward_sample(flight, times, flight.free)
+    fastest, no = jnp.maximum(-gamma, 0.0), jnp.asarray(False)
+    plan = None
+    if records:
+        row = _PlanRow(no, no, flight.aim, fastest)
+        steps = settings.max_steps
+        plan = empty_plan(row, times.shape[0], max_events, ROWS_PER_EVENT, steps)
     return _CompliantRun(
-        toward_sample(flight, times, flight.free),
-        no_samples(state, times),
-        jax.lax.stop_gradient(jnp.maximum(-gamma, 0.0)),
-        events,
+        flight,
+        fastest,
+        empty_table(problem, state, max_events),
+        jnp.int32(0),
         status_at_start(system, state, times[-1], jnp.inf),
         jnp.all((phase == OPEN) & (gamma >= 0)),
+        plan,
     )
 
 
-def _one_pass(problem: _CompliantProblem, run: _CompliantRun) -> _CompliantRun:
+def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _CompliantRun:
     """One pass of the stepper, and what it shows."""
     system, times, flight = problem.system, problem.times, run.flight
-    flown = _flown(problem, run)
-    before, after = (f.aim.modes[:, 0] for f in (flight, flown))
+    flow, settings = _flow(problem, flight.state, run.fastest), problem.settings
+    ledger = allowed_errors(system, settings, flight.state, 1.0)[: -2 * problem.contacts]
+    depth, impulse = flow.scales.depth, flow.scales.impulse
+    rows = jnp.concatenate([ledger, settings.rtol * depth, settings.rtol * impulse])
+    flown, accept = one_pass(flow, settings, rows, times, flight)
+    at, before, after = flown.state, flight.aim.modes[:, 0], flown.aim.modes[:, 0]
     closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
-    at = flown.state
     gamma = kinematics(system, at.q, at.v, at.t).rate
-    row = {
-        "time": at.t,
-        "kind": jnp.where(jnp.any(closed), KIND_CODE["contact"], KIND_CODE["detachment"]),
-        "contacts": closed | opened,
-        "q": at.q,
-        "velocity_before": at.v,
-        "velocity_after": at.v,
-        "impulse": jnp.where(opened, at.contact[1], 0.0),
-        "tangential_impulse": jnp.zeros_like(gamma),
-    }
     happened = jnp.any(closed | opened)
-    full = happened & (run.events.count >= problem.max_events)
+    full = happened & (run.event_count >= max_events)
+    written = happened & ~full
     status = jnp.where(full, MOTION_CODE["max_events"], run.status)
-    status = jnp.where(flown.stuck, why_stuck(system, flown, problem.start.q, times), status)
-    fastest = jnp.maximum(run.fastest, jnp.maximum(-gamma, 0.0))
+    status = jnp.where(flown.stuck, why_stuck(system, flown, problem.q0, times), status)
+    kind = jnp.where(jnp.any(closed), KIND_CODE["contact"], KIND_CODE["detachment"])
+    marks = jnp.concatenate([jnp.stack([kind, 0 * kind]), (closed | opened).astype(kind.dtype)])
+    index = jnp.where(written, run.event_count, max_events)
+    table = MotionTable(
+        put(run.table.samples, packed(at)[:, 0], flight.sample),
+        put(run.table.events, _event(problem, at, opened), index),
+        put(run.table.marks, marks, index),
+    )
+    plan = run.plan
+    if plan is not None:
+        plan = plan.with_row(_PlanRow(accept, written, flight.aim, run.fastest), accept)
     return _CompliantRun(
         flown,
-        put(run.samples, packed(at)[:, 0], flight.sample),
-        jax.lax.stop_gradient(fastest),
-        with_row(run.events, happened, row),
+        jnp.maximum(run.fastest, jnp.maximum(-gamma, 0.0)),
+        table,
+        run.event_count + written.astype(jnp.int32),
         status.astype(jnp.int32),
         jnp.all((after == OPEN) & (gamma >= 0)),
+        plan,
     )
 
 
-def _flown(problem: _CompliantProblem, run: _CompliantRun) -> Flight:
-    """The flight after one pass of the stepper, on the scales of the contacts so far."""
-    system, force, settings, times, start, _ = problem
-    at, m = run.flight.state, run.fastest.shape[0]
-    contacts = contacts_at(system, at.q, at.v, at.t, False)
-    scales = _contact_scales(force, contacts, run.fastest)
+def _event(problem: MotionProblem, at: State, opened: jax.Array) -> jax.Array:
+    """Numbers of an event: the impulse of contacts that have `opened` (m,); velocities go on."""
+    none = no_jump(at, problem.contacts, problem.sides)
+    zero = jnp.zeros_like(at.t)
+    jump = none._replace(impulse=jnp.where(opened, at.contact[1], 0.0))
+    return event_numbers(at, After(at, jump, Passed(zero, zero)))
+
+
+def _flow(problem: MotionProblem, at: State, fastest: jax.Array) -> CompliantFlow:
+    """The flow from this state on, on the scales of the contacts so far."""
+    system, force, _, settings, _, _, times, m, _ = problem
+    scales = _contact_scales(force, contacts_at(system, at.q, at.v, at.t, False), fastest)
     share = jnp.full(2 * m, SNAP * settings.rtol, at.q.dtype)
     rounded, longest = roundings(settings, share, times), longest_step(system, times)
-    blank = jnp.zeros((run.samples.shape[1], 1), at.q.dtype)
-    flow = CompliantFlow(
-        system, rounded, times[0], settings.rtol, blank, start, longest, force, scales
+    blank = jnp.zeros((len(packed(at)), 1), at.q.dtype)
+    return CompliantFlow(
+        system, rounded, times[0], settings.rtol, blank, at, longest, force, scales
     )
-    ledger = allowed_errors(system, settings, at, 1.0)[: -2 * m]
-    rows = jnp.concatenate([ledger, settings.rtol * scales.depth, settings.rtol * scales.impulse])
-    return one_pass(flow, settings, rows, times, run.flight)[0]
+
+
+def _again(
+    problem: MotionProblem, plan: MotionPlan, max_events: int
+) -> tuple[jax.Array, jax.Array]:
+    """Samples and events of a run, as a smooth function of the problem and the force."""
+    times, start = problem.times, _start(problem)
+    rows: _PlanRow = jax.tree.map(lambda x: x[: plan.size], plan.rows)
+    used = jnp.arange(plan.size, dtype=jnp.int32) < plan.used
+    accepted = rows.accepted & used
+    sampled = accepted & rows.aim.target[:, -1, 0]
+
+    def one(state: State, x: Any) -> tuple[State, Any]:
+        """One row of the plan."""
+        row, sample = x
+        aim = row.aim._replace(modes=row.aim.modes.astype(jnp.int32))
+        flow = _flow(problem, state, row.fastest)
+        flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
+        state = selected(row.accepted, step_again(flow, aim, state), state)
+        after = flow.switch(aim.modes, packed(state), aim.target)[0]
+        opened = (aim.modes != OPEN) & (after == OPEN)
+        return state, (packed(state)[:, 0], _event(problem, state, opened[:, 0]))
+
+    todo = rows._replace(accepted=accepted), samples_before(sampled)
+    went = walk(one, start, todo, accepted, event_width(problem))
+    sizes = times.shape[0], max_events + 1
+    written = rows.written & accepted
+    samples, events = tables_of(problem, plan, start, went, sampled, written, sizes)
+    last = went.states[jnp.maximum(plan.used - 1, 0)]
+    last = jnp.where(plan.used > 0, last, packed(start)[:, 0])
+    return samples.at[-1].set(jnp.where(plan.lost, samples[-1], last)), events
 
 
 RTOL = 1e-9  # of `turning_impact`
@@ -339,7 +408,7 @@ def turning_impact(
 
     Returns:
         `TurningImpact`; `ended` False where it went on for 200 contact times or `max_steps`.
-        Forward derivatives (motions by contact forces have no reverse ones).
+        Derivatives in both modes.
 
     Raises:
         ValueError: sizes, NaN, penetration, a mass that is not positive, an `rtol` that single
@@ -391,6 +460,7 @@ def _turning(
         horizon,
         zero,
     )
-    times = jnp.stack([zero, horizon])
-    _, end, apart = compliant_motion(system, force, settings, q, v, times, MOST_EVENTS, True)
+    times, m = jnp.stack([zero, horizon]), contacts_of(system, q)
+    problem = MotionProblem(system, force, None, settings, q, v, times, m)
+    _, end, apart = compliant_motion(problem, MOST_EVENTS, True)
     return TurningImpact(end.v, end.q, end.t, apart)

@@ -1,5 +1,6 @@
 """Gaps, their rates and accelerations, and the acceleration that forces alone give."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -66,36 +67,69 @@ def recorded_gaps(system: System, q: jax.Array, t: jax.Array) -> jax.Array:
     return gaps(system, q, t)
 
 
-def kinematics(
-    system: System, q: jax.Array, v: jax.Array, t: jax.Array, *, of_tangents: bool = False
-) -> Kinematics:
-    """Value, rate, drift and gradient of the gaps, or of what slides (its value is 0)."""
-    body, zero, one = system.body, jnp.zeros_like(t), jnp.ones_like(t)
-
-    def place(s: jax.Array) -> jax.Array:
-        """The configuration, seen from the base, after the time s."""
-        return seen_from_base(system, body.nearby(q, s * v), t + s)
-
-    def along(s: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
-        """Velocities (k,) along the directions (n, k) after the time s; values, directions."""
-        found = (None, body.tangents(place(s))) if of_tangents else body.gaps_and_normals(place(s))
-        assert found is not None
-        value, h = found
-        assert h is not None
-        carried = base_velocity(system, t + s)
-        rate = h.T @ (v if carried is None else v - carried)
-        return rate, (jnp.zeros_like(rate) if value is None else value, h)
-
-    if of_tangents or _has_formula(system, q):
-        rate, drift, (value, h) = jax.jvp(along, (zero,), (one,), has_aux=True)
-        return Kinematics(value, rate, drift, h)
+def kinematics(system: System, q: jax.Array, v: jax.Array, t: jax.Array) -> Kinematics:
+    """Value, rate, drift and gradient of the gaps."""
+    if _has_formula(system, q):
+        return _along(system, q, v, t, system.body.gaps_and_normals)
+    zero, one = jnp.zeros_like(t), jnp.ones_like(t)
 
     def rates(s: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Gaps and gap velocities (m,) after the time s."""
-        return jax.jvp(lambda s: jnp.atleast_1d(body.gap_function(place(s))), (s,), (one,))
+        return jax.jvp(lambda s: gaps(system, system.body.nearby(q, s * v), t + s), (s,), (one,))
 
     (value, rate), (_, drift) = jax.jvp(rates, (zero,), (one,))
     return Kinematics(value, rate, drift, normals_at(system, q, t))
+
+
+def kinematics_with_tangents(
+    system: System, q: jax.Array, v: jax.Array, t: jax.Array
+) -> tuple[Kinematics, Kinematics]:
+    """That of the gaps, and that of what slides (its value is 0)."""
+    body = system.body
+
+    def tangents(at: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """What slides has no value."""
+        h = body.tangents(at)
+        assert h is not None
+        return jnp.zeros_like(h[0]), h
+
+    if not _has_formula(system, q):
+        return kinematics(system, q, v, t), _along(system, q, v, t, tangents)
+
+    def all_directions(at: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Gaps; normals, then tangents."""
+        found = body.gaps_and_normals(at)
+        assert found is not None
+        return found[0], jnp.concatenate([found[1], tangents(at)[1]], axis=1)
+
+    both = _along(system, q, v, t, all_directions)
+    m = len(both.value)
+    normal = Kinematics(both.value, both.rate[:m], both.drift[:m], both.gradient[:, :m])
+    slip = both.rate[m:]
+    return normal, Kinematics(jnp.zeros_like(slip), slip, both.drift[m:], both.gradient[:, m:])
+
+
+def _along(
+    system: System,
+    q: jax.Array,
+    v: jax.Array,
+    t: jax.Array,
+    directions: Callable[[jax.Array], tuple[jax.Array, jax.Array] | None],
+) -> Kinematics:
+    """Velocities along the directions (n, k) that a function of q gives, with some values."""
+    body, zero, one = system.body, jnp.zeros_like(t), jnp.ones_like(t)
+
+    def rates(s: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
+        """Velocities (k,) after the time s; values, directions."""
+        found = directions(seen_from_base(system, body.nearby(q, s * v), t + s))
+        assert found is not None
+        value, h = found
+        carried = base_velocity(system, t + s)
+        rate = h.T @ (v if carried is None else v - carried)
+        return rate, (value, h)
+
+    rate, drift, (value, h) = jax.jvp(rates, (zero,), (one,), has_aux=True)
+    return Kinematics(value, rate, drift, h)
 
 
 def _has_formula(system: System, q: jax.Array) -> bool:

@@ -3,25 +3,19 @@
 One loop, one pass: where an event waits it is resolved, then a step is tried. Lanes of a batch
 advance independently; an event waits until as many lanes wait as fly.
 
-DERIVATIVES   The run writes down its accepted steps and what was decided at its events
-(`MotionPlan`). A second walk through them, with all decisions fixed, is a scan: JAX
-differentiates it in both modes and any order. Its blocks of rows are checkpoints, and blocks
-without a step are skipped.
+Its derivatives are those of a second walk, `replays.py`.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 
 from jimpact.events import stepper
 from jimpact.events.batches import any_lane, over_lanes
-from jimpact.law import Law
 from jimpact.motion.dynamics import free_acceleration, gaps, mass_at, user_force
 from jimpact.motion.flow import (
     Course,
@@ -34,7 +28,6 @@ from jimpact.motion.flow import (
     encoded,
     first_flight,
     flow_of,
-    nan_derivatives,
     nan_unless,
     no_samples,
     one_pass,
@@ -49,17 +42,24 @@ from jimpact.motion.flow import (
 )
 from jimpact.motion.persistent_contact import no_modes
 from jimpact.motion.record import KIND_CODE, MOTION_CODE, Events
+from jimpact.motion.replays import (
+    MotionEnd,
+    MotionPlan,
+    MotionTable,
+    differentiable,
+    empty_plan,
+    samples_before,
+    tables_of,
+    walk,
+)
 from jimpact.motion.system import System
 from jimpact.motion.transitions import After, Decision, resolve, resolved_again, sides_of
 
 # M is singular where its scaled least eigenvalue is below this share of that at the start
 _SINGULAR = 1e-6
 AHEAD = 1e-13  # of the duration: some hundred times the least step of a flight
-# Rows of a plan, in addition to one a sample: accepted steps of a motion with derivatives. Those
-# of a motion of more steps are NaN. Ten times more takes ten times the memory of derivatives.
-ROWS_PER_EVENT, ROWS_MORE = 16, 1024
+ROWS_PER_EVENT = 16  # of a plan; ten times more takes ten times the memory of derivatives
 ROOM = 32  # numbers a contact that a run may hand over, in addition to states
-BLOCK = 16  # rows between two checkpoints
 
 
 class Past(NamedTuple):
@@ -73,7 +73,7 @@ class MotionProblem(NamedTuple):
     """What determines a motion."""
 
     system: System
-    law: Law
+    law: Any  # `Law` of impacts, or the `Force` of contacts that acts throughout
     mu: jax.Array | None
     settings: Settings
     q0: jax.Array
@@ -111,22 +111,6 @@ class PlanRow(NamedTuple):
     aim: stepper.Step
 
 
-class MotionPlan(NamedTuple):
-    """Rows of a run; those beyond `used` are not to be read."""
-
-    rows: PlanRow  # (R, ..)
-    used: jax.Array
-    lost: jax.Array  # whether there were too few
-
-
-class MotionTable(NamedTuple):
-    """What a motion writes down; rows beyond those reached hold anything."""
-
-    samples: jax.Array  # (S + 1, rows of the state)
-    events: jax.Array  # (E + 1, w)
-    marks: jax.Array  # (E + 1, 2 + m) kind, status of the law, contacts
-
-
 class _EventRun(NamedTuple):
     """A run up to now."""
 
@@ -143,18 +127,6 @@ class _EventRun(NamedTuple):
     plan: MotionPlan | None
 
 
-class _EventEnd(NamedTuple):
-    """A run at its end."""
-
-    table: MotionTable
-    reached: jax.Array  # samples
-    event_count: jax.Array
-    steps: jax.Array
-    status: jax.Array
-    plan: MotionPlan | None
-    past: jax.Array | None  # numbers for the next run
-
-
 def empty_checkpoint(q: jax.Array, v: jax.Array, contacts: int, samples: int) -> jax.Array:
     """Numbers of a `Past` for a motion that begins."""
     state = q.shape[0] + v.shape[0] + 2 * contacts + 3
@@ -167,53 +139,29 @@ def event_driven(problem: MotionProblem, max_events: int) -> tuple[Course, jax.A
     With it, where there is a `problem.past`, what the next run takes over, which goes on after the
     last of `max_events`.
     """
-    leaves, tree = jax.tree.flatten(problem)
-    fixed = [None if eqx.is_array(x) else x for x in leaves]
-
-    def rebuilt(arrays: tuple[jax.Array, ...]) -> MotionProblem:
-        """The problem with these arrays."""
-        values = iter(arrays)
-        return jax.tree.unflatten(tree, [next(values) if x is None else x for x in fixed])
-
-    @jax.custom_jvp
-    def value(*arrays: jax.Array) -> _EventEnd:
-        return _run(rebuilt(arrays), max_events, records=False)
-
-    def rule(arrays: Any, tangents: Any) -> Any:
-        """Values by the run, tangents by walking through its plan again."""
-        marked = [not isinstance(t, SymbolicZero) for t in tangents]
-        end = _run(rebuilt(jax.lax.stop_gradient(arrays)), max_events, records=True)
-        assert end.plan is not None
-        plan: MotionPlan = end.plan
-
-        def smooth(*moved: jax.Array) -> tuple[jax.Array, jax.Array]:
-            some = iter(moved)
-            inputs = [next(some) if mark else x for x, mark in zip(arrays, marked)]
-            return _again(rebuilt(tuple(inputs)), plan, max_events)
-
-        values = tuple(x for x, mark in zip(arrays, marked) if mark)
-        rates = tuple(t for t, mark in zip(tangents, marked) if mark)
-        results, slopes = jax.jvp(smooth, values, rates)
-        recorded = end.table.samples, end.table.events
-        samples, events = selected(plan.lost, recorded, results)
-        lost = plan.lost & (end.status == MOTION_CODE["ok"])
-        status = jnp.where(lost, MOTION_CODE["no_derivatives"], end.status).astype(jnp.int32)
-        table = MotionTable(samples, events, end.table.marks)
-        end = end._replace(table=table, status=status, plan=None)
-        none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), end)
-        return end, none._replace(table=MotionTable(slopes[0], slopes[1], none.table.marks))
-
-    value.defjvp(rule, symbolic_zeros=True)
-    end = value(*(x for x, y in zip(leaves, fixed) if y is None))
+    end = differentiable(
+        problem,
+        lambda problem, records: _run(problem, max_events, records),
+        lambda problem, plan: _again(problem, plan, max_events),
+    )
     samples = sampled_states(end.table.samples, problem.start, end.reached)
-    events = _events(end.table, end.event_count, problem)
-    return Course(samples, events, end.steps, end.status), end.past
+    events = recorded_events(end.table, end.event_count, problem)
+    return Course(samples, events, end.steps, end.status), end.more
 
 
 # ------------------------------------------------------------------------------ the run
 
 
-def _run(problem: MotionProblem, max_events: int, records: bool) -> _EventEnd:
+def empty_table(problem: MotionProblem, start: State, max_events: int) -> MotionTable:
+    """The table of a motion that begins in this state."""
+    return MotionTable(
+        no_samples(start, problem.times),
+        jnp.zeros((max_events + 1, event_width(problem)), start.q.dtype),
+        jnp.zeros((max_events + 1, 2 + problem.contacts), jnp.int32),
+    )
+
+
+def _run(problem: MotionProblem, max_events: int, records: bool) -> MotionEnd:
     """From event to event; with its plan, if it `records`."""
     start = _begin(problem, max_events, records)
     if problem.past is not None:
@@ -241,7 +189,7 @@ def _run(problem: MotionProblem, max_events: int, records: bool) -> _EventEnd:
     flight, past = end.flight, None
     if problem.past is not None:
         past = _pack_checkpoint(end, problem.past.numbers.shape[0])
-    return _EventEnd(
+    return MotionEnd(
         end.table, flight.sample, end.event_count, flight.steps, status, end.plan, past
     )
 
@@ -288,21 +236,14 @@ def _begin(problem: MotionProblem, max_events: int, records: bool) -> _EventRun:
     state = problem.start
     watched = 2 * m if settings.friction else m
     flight = first_flight(system, state, encoded(no_modes(m, dtype)), watched, times)
-    table = MotionTable(
-        no_samples(state, times),
-        jnp.zeros((max_events + 1, _width(problem)), dtype),
-        jnp.zeros((max_events + 1, 2 + m), jnp.int32),
-    )
+    table = empty_table(problem, state, max_events)
     zero, no, none = jnp.zeros((), dtype), jnp.asarray(False), jnp.zeros(m, bool)
     decision = Decision(no, zero, none, none, none, none, Scales(zero, zero, zero))
     last = Event(no, no, decision)
     plan = None
     if records:
-        size = min(times.shape[0] + ROWS_PER_EVENT * max_events + ROWS_MORE, settings.max_steps)
-        size = -(-size // BLOCK) * BLOCK + 1  # one more for discarded entries
         row = PlanRow(last, no, flight.aim)
-        rows = jax.tree.map(lambda x: jnp.zeros((size, *x.shape), _short(x)), row)
-        plan = MotionPlan(rows, jnp.int32(0), no)
+        plan = empty_plan(row, times.shape[0], max_events, ROWS_PER_EVENT, settings.max_steps)
     status = status_at_start(system, state, times[-1], settings.closed_below)
     if mu is not None:
         known = jnp.all(jnp.isfinite(mu))
@@ -320,11 +261,6 @@ def _begin(problem: MotionProblem, max_events: int, records: bool) -> _EventRun:
         status,
         plan,
     )
-
-
-def _short(x: jax.Array) -> Any:
-    """Modes are small numbers."""
-    return jnp.int8 if jnp.issubdtype(x.dtype, jnp.integer) else x.dtype
 
 
 def _resolved(
@@ -365,7 +301,7 @@ def _resolved(
         )
         codes = jnp.stack([outcome.kind, outcome.code])
         marks = jnp.concatenate([codes.astype(jnp.int32), outcome.contacts.astype(jnp.int32)])
-        numbers = _numbers(old, outcome.after)
+        numbers = event_numbers(old, outcome.after)
         # one that has no row any more is not resolved
         return selected(mine, selected(full, run._replace(status=status), new), run), numbers, marks
 
@@ -401,12 +337,7 @@ def _flown(problem: MotionProblem, run: _EventRun, flies: jax.Array) -> _EventRu
     plan, still = run.plan, jnp.asarray(False)
     recorded = accept | (run.waits & run.last.happens)
     if plan is not None:
-        size = plan.rows.accepted.shape[0] - 1
-        row = PlanRow(run.last, accept, begin.aim)
-        index = plan.used
-        rows = jax.tree.map(lambda all_, x: put(all_, x, index), plan.rows, row)
-        used = jnp.minimum(index + recorded.astype(jnp.int32), size)
-        plan = MotionPlan(rows, used, plan.lost | (used == size))
+        plan = plan.with_row(PlanRow(run.last, accept, begin.aim), recorded)
     return run._replace(
         flight=flight,
         waits=run.waits | (flies & jnp.any(flight.event)),
@@ -442,19 +373,19 @@ def why_stuck(system: System, flight: Flight, q0: jax.Array, times: jax.Array) -
 # ------------------------------------------------------------------------------ the record
 
 
-def _width(problem: MotionProblem) -> int:
+def event_width(problem: MotionProblem) -> int:
     """Numbers of an event."""
     return 3 + problem.q0.size + 2 * problem.v0.size + 3 * problem.contacts + problem.sides
 
 
-def _numbers(before: State, after: After) -> jax.Array:
+def event_numbers(before: State, after: After) -> jax.Array:
     """Those of one event, in a row."""
     jump = after.jump
     parts = (before.t, before.q, before.v, jump.v, jump.impulse, jump.tangential, jump.energy)
     return ravel_pytree((parts, after.passed))[0]
 
 
-def _events(table: MotionTable, count: jax.Array, problem: MotionProblem) -> Events:
+def recorded_events(table: MotionTable, count: jax.Array, problem: MotionProblem) -> Events:
     """The record of events; NaN or 0 in rows that are not used."""
     used = jnp.arange(len(table.events) - 1, dtype=count.dtype) < count
     marks = jnp.where(used[:, None], table.marks[:-1], 0)
@@ -490,22 +421,20 @@ def _again(
     system, law, mu, settings, *_ = problem
     times = problem.times
     start = problem.start
-    width = _width(problem)
-    size = plan.rows.accepted.shape[0] - 1
-    rows = jax.tree.map(lambda x: x[:size], plan.rows)
-    index = jnp.arange(size, dtype=jnp.int32)
+    width = event_width(problem)
+    rows: PlanRow = jax.tree.map(lambda x: x[: plan.size], plan.rows)
+    index = jnp.arange(plan.size, dtype=jnp.int32)
     # what an event without a step leaves is in the row after the last step
     used = index <= plan.used
     happens, accepted = rows.event.happens & used, rows.accepted & (index < plan.used)
     sampled = accepted & rows.aim.target[:, -1, 0]
     written = rows.event.written & happens
-    reached = jnp.cumsum(sampled, dtype=jnp.int32) + (~sampled).astype(jnp.int32)  # before the step
 
     def event(state: State, now: Event) -> tuple[State, jax.Array]:
         """The state after an event, and its numbers."""
         after = resolved_again(system, law, mu, settings, state, now.decision)
         new = selected(now.happens, after.state, state)
-        return new, jnp.where(now.happens, _numbers(state, after), 0.0)
+        return new, jnp.where(now.happens, event_numbers(state, after), 0.0)
 
     def step(state: State, row: PlanRow, sample: jax.Array) -> State:
         """The state after an accepted step toward this sample."""
@@ -525,53 +454,7 @@ def _again(
         state = jax.lax.cond(any_lane(row.accepted), step, lambda y, *_: y, state, row, sample)
         return state, (packed(state)[:, 0], numbers)
 
-    def at(flags: jax.Array, values: jax.Array, count: int) -> jax.Array:
-        """The values in the first rows with a flag; derivatives of further ones are NaN."""
-        values, known = _first_rows(flags, values, count)
-        return values + nan_derivatives(problem, known).astype(values.dtype)
-
     todo = PlanRow(rows.event._replace(happens=happens), accepted, rows.aim)
-    states, numbers = _in_blocks(one, start, todo, reached, (len(packed(start)), width))
-    samples = at(sampled, states, times.shape[0])
-    first = packed(start)[:, 0][None]
-    # all derivatives are NaN if rows ran out
-    inputs = [x for x in jax.tree.leaves(problem) if eqx.is_inexact_array(x)]
-    finite = [jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)).astype(first.dtype) for x in inputs]
-    unknown = jnp.where(plan.lost, jnp.nan, 0.0) * jnp.sum(jnp.stack(finite))
-    events = at(written, numbers, max_events + 1)
-    return jnp.concatenate([first, samples]) + unknown, events + unknown
-
-
-def _in_blocks(
-    one: Callable[[State, Any], tuple[State, Any]],
-    start: State,
-    rows: PlanRow,
-    reached: jax.Array,
-    sizes: tuple[int, int],
-) -> tuple[jax.Array, jax.Array]:
-    """The two arrays, of these sizes, that `one` gives for each row of the plan.
-
-    Between two blocks of rows lies a checkpoint; a block in which nothing happens is left out.
-    """
-
-    def block(state: State, xs: Any) -> tuple[State, Any]:
-        def walk(state: State) -> tuple[State, Any]:
-            return jax.lax.scan(jax.checkpoint(one), state, xs)
-
-        def stay(state: State) -> tuple[State, Any]:
-            return state, tuple(jnp.zeros((BLOCK, size), start.q.dtype) for size in sizes)
-
-        some = xs[0].event.happens | xs[0].accepted
-        return jax.lax.cond(any_lane(jnp.any(some)), walk, stay, state)
-
-    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK, *x.shape[1:]), (rows, reached))
-    values = jax.lax.scan(jax.checkpoint(block), start, blocks)[1]
-    return jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), values)
-
-
-def _first_rows(flags: jax.Array, values: jax.Array, count: int) -> tuple[jax.Array, jax.Array]:
-    """Values (count, k) of the first rows with a flag, else 0; and which of them there are."""
-    so_far, wanted = jnp.cumsum(flags, dtype=jnp.int32), jnp.arange(count, dtype=jnp.int32)
-    row = jnp.minimum(jnp.searchsorted(so_far, wanted + 1), len(flags) - 1)
-    known = wanted < so_far[-1]
-    return jnp.where(known[:, None], values[row], 0.0), known
+    went = walk(one, start, (todo, samples_before(sampled)), happens | accepted, width)
+    sizes = times.shape[0], max_events + 1
+    return tables_of(problem, plan, start, went, sampled, written, sizes)

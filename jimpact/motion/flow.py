@@ -497,7 +497,8 @@ def status_at_start(system: System, at: State, end: jax.Array, closed_below: Any
 
 def step_again(flow: MotionFlow, aim: stepper.Step, state: State) -> State:
     """The state after an accepted step, as a smooth function of the flow and the state."""
-    return _reached(flow, aim, stepper.step_again(flow, aim, _rows(flow, state)))
+    y = stepper.step_again(flow, aim, _rows(flow, state))
+    return _reached(flow, aim, flow.switch(aim.modes, y, aim.target)[1])
 
 
 def _rows(flow: MotionFlow, state: State) -> jax.Array:

@@ -16,6 +16,7 @@ from jimpact.motion.dynamics import (
     base_velocity,
     free_acceleration,
     kinematics,
+    kinematics_with_tangents,
     mass_at,
     not_rounding,
     solve_mass,
@@ -143,8 +144,11 @@ def contacts_at(
 ) -> Contacts:
     """Contact space of the system at (q, v, t); in space with tangents `along` (m, 2)."""
     mass = mass_at(system, q)
-    normal = kinematics(system, q, v, t)
-    tangent = kinematics(system, q, v, t, of_tangents=True) if friction else None
+    normal, tangent = (
+        kinematics_with_tangents(system, q, v, t)
+        if friction
+        else (kinematics(system, q, v, t), None)
+    )
     directions, drift = normal.gradient, normal.drift
     if tangent is not None and along is not None:
         tangent = _turned(tangent, along)
@@ -215,7 +219,7 @@ def forces(
         press = mu * jnp.maximum(jax.lax.stop_gradient(known[:m]), 0.0)
         share = jnp.repeat(load_shares(press, _LEAST_SHARE), drag.shape[1])
         weight = jnp.concatenate([none + 1, share])
-        return _least(w, right[:, None], held, weight, _sizes(w, contacts.delassus))[:, 0]
+        return _least(w, right[:, None], held, weight, _sizes(w, contacts.delassus, m))[:, 0]
 
     both = jax.lax.fori_loop(0, 2, shared, jnp.zeros_like(right))
     both = both.at[m:].add(-(drag * both[:m, None]).reshape(-1))
@@ -266,13 +270,16 @@ def least_regularity(dtype: jnp.dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** _LEAST_REGULARITY
 
 
-def _sizes(dragged: jax.Array, delassus: jax.Array) -> jax.Array:
-    """Diagonal (k,) that scales forces: that without friction, which slip does not change.
+def _sizes(dragged: jax.Array, delassus: jax.Array, m: int) -> jax.Array:
+    """Diagonal (k,) that scales forces at m contacts: without friction, as slip does not change it.
 
     Where a contact jams, that with friction: beside the other one it would be less than the ridge.
     """
     with_friction, without = jnp.diagonal(dragged), jnp.diagonal(delassus)
-    return jnp.where(with_friction < _JAMS * without, with_friction, without)
+    sizes = jnp.where(with_friction < _JAMS * without, with_friction, without)
+    # both rows of slip of a contact alike: else its share would depend on how they are turned
+    rows = by_contact(sizes[m:], m)
+    return jnp.concatenate([sizes[:m], jnp.repeat(rows.mean(axis=1), rows.shape[1])])
 
 
 def _without_friction(w: jax.Array, right: jax.Array, held: jax.Array) -> jax.Array:

@@ -116,12 +116,12 @@ def simulate(
 
     Returns:
         `Motion`. Pure: jit and vmap; a bad motion of a batch ends alone, with its status.
-        Method 'events' has derivatives in both modes (grad, jvp, hessian) of everything in it,
-        event times and accumulated works included, in all arrays, also those captured by the
-        system's functions. They hold for the order of events that occurs: one-sided where
-        two events change places or a contact is grazed; NaN, with status `no_derivatives`, for
-        motions of more steps than samples + 16 `max_events` + 1024. Method 'contact_forces' has
-        forward ones (jvp, jacfwd).
+        Methods 'events' and 'contact_forces' have derivatives in both modes (grad, jvp, hessian)
+        of everything in it, event times and accumulated works included, in all arrays, also those
+        captured by the system's functions. They hold for the order of events that occurs:
+        one-sided where two events change places or a contact is grazed; NaN, with status
+        `no_derivatives`, for motions of more steps than samples + 16 `max_events` + 1024 (by
+        contact forces 64 `max_events`).
 
     Raises:
         NotImplementedError: derivatives of time stepping, which do not converge with the step.
@@ -269,7 +269,9 @@ def _forced(
 ) -> Motion:
     """The motion with contact forces."""
     times = _equal_times(start, end, samples)
-    course, *_ = compliant_motion(system, force, settings, q, v, times, max_events)
+    m = contacts_of(system, q)
+    problem = MotionProblem(system, force, None, settings, q, v, times, m)
+    course, *_ = compliant_motion(problem, max_events)
     return _recorded(system, times, course)
 
 
