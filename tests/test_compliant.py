@@ -63,7 +63,11 @@ def test_energy_is_what_the_restitution_leaves():
 
 
 @pytest.mark.parametrize(
-    ("eta", "force"), [(1.5, lambda k: ji.Hertz(k)), (1.0, lambda k: ji.LinearSpring(k))]
+    ("eta", "force"),
+    [
+        (1.5, lambda k: ji.Hertz(k)),
+        pytest.param(1.0, lambda k: ji.LinearSpring(k), marks=pytest.mark.slow),
+    ],
 )
 def test_forces_without_losses(eta, force):
     """Forces without an e, and chains, are faster paths of the canonical program."""

@@ -126,7 +126,7 @@ def outcomes(a, normal, slip, mu, complementary):
     return found
 
 
-@pytest.mark.parametrize("complementary", [True, False])
+@pytest.mark.parametrize("complementary", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_planar_outcomes_are_those_of_brute_force(complementary):
     seen = {"several_outcomes": 0, "ok": 0, "infeasible": 0}
     rng = np.random.default_rng(2)
@@ -158,7 +158,7 @@ def misfit(lanes, found, rows, complementary):
     return np.maximum(np.maximum(normal, outside), power).max(axis=1) / (1 + np.abs(x).max(axis=1))
 
 
-@pytest.mark.parametrize("complementary", [True, False])
+@pytest.mark.parametrize("complementary", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_spatial_outcomes_satisfy_the_law(complementary):
     lanes = random_scenes(2)
     found = ASK[2, complementary](*lanes)
@@ -382,7 +382,7 @@ def test_shares_of_redundant_forces():
 
 
 def test_programs_do_not_grow_with_the_contacts():
-    """Twelve contacts need no more operations than nine: nothing is written out row by row."""
+    """Beyond products that are written out, more contacts need no more operations."""
 
     def operations(n):
         k, x = jnp.ones((n, n, 3)), jnp.ones((n, 3))
@@ -394,4 +394,6 @@ def test_programs_do_not_grow_with_the_contacts():
         )
         return [jax.jit(f).lower(*given).as_text().count("=") for f, *given in programs]
 
-    assert operations(12) == operations(9)
+    written_out = dense.COLUMNS_WRITTEN_OUT
+    assert operations(written_out + 4) == operations(written_out + 1)
+    assert written_out <= 12

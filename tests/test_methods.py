@@ -607,6 +607,7 @@ def test_friction_is_part_of_every_law():
     assert "contacts 3, 4 too far open to close during the impact" in str(advice).replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_contacts_that_close_again():
     """Two balls at a wall: LZB re-closes at once, Compliant waits for its gap and is right."""
     options = {"exponent": 1.0, "stiffness": 1.0, "tolerance": 5e-3}

@@ -443,7 +443,7 @@ DISCS = ji.PlanarBodies([ji.Disc(0.1)] * 3, planes=[], pairs=[(0, 1), (2, 0)])
     [
         (Apart(), LINE, 50.0, "coarse_step"),
         (DISCS, PLANE, 50.0, "coarse_step"),
-        (DISCS, PLANE, 3.0, "ok"),
+        pytest.param(DISCS, PLANE, 3.0, "ok", marks=pytest.mark.slow),
     ],
 )
 def test_bodies_that_pass_each_other_in_a_step_are_reported(body, way, speed, expected):

@@ -254,6 +254,7 @@ def test_a_mixed_pile_has_the_contacts_of_planar_bodies():
         np.testing.assert_allclose(off, 0, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_mixed_pile_finds_its_contacts_by_the_grid():
     """Those of all pairs that are near, now or later, and the least gap of all."""
     rng = np.random.default_rng(3)

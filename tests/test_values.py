@@ -139,7 +139,7 @@ def test_many_closings():
 PLASTIC = [chain([1, 1, 1], [1, 0, 0], e=0.0), chain([3, 1, 2], [1, 0.4, -0.5], e=0.0)]
 
 
-@pytest.mark.parametrize("name", ["lzb", "compliant"])
+@pytest.mark.parametrize("name", ["lzb", pytest.param("compliant", marks=pytest.mark.slow)])
 def test_plastic_contacts_share_a_velocity(name):
     out, _ = programs.values(name)(PLASTIC)
     for i, state in enumerate(PLASTIC):

@@ -13,7 +13,7 @@ from rows import CASES
 TEXT = page.PAGE.read_text(encoding="utf-8") if page.PAGE.exists() else ""
 
 
-SLOW = ("vibrating_plate",)
+SLOW = ("solitary_wave", "vibrating_plate")
 
 
 @pytest.mark.parametrize(
