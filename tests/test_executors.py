@@ -213,9 +213,7 @@ for name in sys.argv[2:] or SHARDED:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(
-            x, marks=pytest.mark.slow if x in ("moreau", "friction-lzb") else pytest.mark.release
-        )
+        pytest.param(x, marks=pytest.mark.slow if x == "moreau" else pytest.mark.release)
         for x in SHARDED
     ],
 )

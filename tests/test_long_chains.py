@@ -63,7 +63,7 @@ def test_bodies_at_the_end_of_a_row_may_separate_slowly():
     np.testing.assert_allclose(after[10:], [0.33881464, 0.33883242], atol=4e-8)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_slopes_of_a_block():
     """d v+ / d masses of 12 balls that end as a block, by momentum, in both modes."""
     rest = (0.5 * jnp.ones(ROW - 1), jnp.ones(ROW - 1))

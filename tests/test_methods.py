@@ -262,7 +262,7 @@ def test_right_or_flagged():
     [
         pytest.param(2, 0.99, marks=pytest.mark.slow),
         pytest.param(3, 0.7, marks=pytest.mark.slow),
-        pytest.param(6, 0.6, marks=pytest.mark.slow),
+        pytest.param(6, 0.6, marks=pytest.mark.release),
         pytest.param(20, 0.15, marks=pytest.mark.release),
         pytest.param(100, 0.0, marks=pytest.mark.release),
     ],
@@ -367,7 +367,7 @@ def _random_chains(bodies, wall, count, seed):
     [
         pytest.param(1e-6, marks=pytest.mark.release),
         pytest.param(1e-8, marks=pytest.mark.release),
-        pytest.param(1e-10, marks=pytest.mark.slow),
+        pytest.param(1e-10, marks=pytest.mark.release),
     ],
 )
 def test_honest_tolerance_over_random_scenes(rtol):
@@ -590,7 +590,7 @@ def test_friction_couples_contacts_with_decoupled_normals():
         assert [b.contacts for b in at.blocks] == blocks
 
 
-@pytest.mark.slow  # laws with friction compile for half a minute
+@pytest.mark.release  # laws with friction compile for half a minute
 def test_friction_is_part_of_every_law():
     """A block that slides as it strikes; its upper corners are too far away to take part."""
     block = ji.Block(0.2, 0.6, 2.0)

@@ -177,7 +177,7 @@ def test_lengths_may_be_in_any_unit():
     np.testing.assert_allclose(microns.q[-1] / 1e6, metres.q[-1], atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_table_comes_to_rest_on_four_legs():
     """Without friction nobody knows which leg carries what; it stands, wherever its middle is."""
     for off in (0.0, 0.25):
@@ -287,7 +287,7 @@ def exact_times(x):
     return jnp.sqrt(2 * q0 / g) * (1 + 2 * jnp.concatenate([jnp.zeros(1), jnp.cumsum(powers)]))
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_derivatives_over_twenty_bounces_in_both_modes():
     both = jax.jit(lambda x: (jax.jacfwd(times_of)(x), jax.jacrev(times_of)(x)))
     x = jnp.array([0.8, 1.0, G])
@@ -404,7 +404,7 @@ def test_no_event_is_missed_between_two_looks():
 # ------------------------------------------------------- persistent contact, moving base
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_ball_leaves_a_vibrating_plate():
     """It leaves when the plate falls with g: A w^2 sin(w t) = g; and hits it again."""
     w, amplitude = 20.0, 0.03
@@ -664,7 +664,7 @@ def discs_in_a_box(n, columns, duration, step, samples):
 @pytest.mark.parametrize(
     ("n", "columns", "duration"),
     [
-        pytest.param(30, 6, 1.0, marks=pytest.mark.slow),
+        pytest.param(30, 6, 1.0, marks=pytest.mark.release),
         pytest.param(150, 12, 1.5, marks=[pytest.mark.release, pytest.mark.long_run]),
     ],
 )
@@ -778,7 +778,7 @@ def test_a_mass_matrix_that_turns_singular():
     assert status(ji.simulate(nan, ji.Newton(0.5), [0.0], [1.0], 3.0)) == "not_finite"
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_fit_through_event_times():
     """Restitution from the times of six bounces; a motion that sees nothing says so."""
     ball, first = ji.ball_system(), np.sqrt(2 / G)

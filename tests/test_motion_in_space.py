@@ -278,7 +278,7 @@ def test_forces_of_a_coin_that_rolls_steadily():
     np.testing.assert_allclose(acceleration, expected, atol=1e-11)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_coin_rolls_in_a_circle():
     q0, v0, radius, _ = steadily()
     law = ji.Moreau(0.0, friction=0.9)

@@ -160,7 +160,7 @@ def test_an_overturned_block_lies_on_its_side():
     np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_a_body_on_a_tilted_plane_slides():
     """By its tangents alone, no displacements: s'' = g (sin a - mu cos a)."""
     slope = ji.PlanarBodies([ji.Block(0.2, 0.1)], planes=[0.3])

@@ -67,7 +67,7 @@ def test_the_bead_column():
     np.testing.assert_allclose(seen.value[8:], 1.0, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_times_of_one_ball_on_a_linear_wall(tmp_path):
     """Half a sine: pi / omega, its top half as late, m v omega; loaded above 1 % of it."""
     text = COLUMN.replace("newton", "lzb").replace("0.7", "1.0\nexponent = 1.0\nstiffness = 12.0")
