@@ -63,9 +63,8 @@ class PlanarPile(InPlane):
     3
     """
 
-    corners: (
-        jax.Array
-    )  # (k, K, 2) from the centre of mass, counter-clockwise, the last one repeated
+    # (k, K, 2) from the centre of mass, counter-clockwise, the last one repeated
+    corners: jax.Array
     rims: jax.Array  # (k,) of discs, 0 of polygons
     inner: jax.Array  # (k,) radius of a disc about the centre of mass within the body
     turning: jax.Array  # (k,) moments of inertia
