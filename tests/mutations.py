@@ -218,7 +218,7 @@ MUTATIONS = [
     Mutation("crossover in units of the smaller indentation", r"delta = jnp\.max\(scale\.delta\)", "delta = jnp.min(scale.delta)", ("test_compliant.py::test_offsets_of_gaps_are_in_units_of_the_larger_indentation",)),
     Mutation("parameters of contacts before a right wall in wrong order", r"m - 1 - copied\[::-1\]", "copied", ("test_seams.py::test_a_padded_chain_contains_itself",)),
     Mutation("sign of e_t in Poisson's expansion", r"\(1 \+ e_t\) \* contact\.", "(1 - e_t) * contact.", ("test_friction.py::test_disk_in_closed_form[poisson]",)),
-    Mutation("nested accumulations without the root", r"jnp\.sqrt\(settings\.accumulation\)", "settings.accumulation", ("test_motion.py::test_nested_accumulations_are_passed_below_the_root_of_slow",)),
+    Mutation("nested accumulations without the root", r"jnp\.sqrt\(settings\.accumulation\)", "settings.accumulation", ("test_motion.py::test_nested_accumulations_are_passed_below_the_root_of_slow",), marks="slow"),
     Mutation("moments of inertia of a box with 1/10", r"\(jnp\.sum\(square\) - square\) / 12", "(jnp.sum(square) - square) / 10", ("test_bodies.py::test_moments_of_inertia_of_homogeneous_solids",)),
     # --- bodies
     Mutation("a disc rolls backwards", r"q\[0\] \+ self\.rim \* q\[2\]", "q[0] - self.rim * q[2]", ("test_bodies.py::test_an_unbalanced_disc",)),
@@ -368,7 +368,7 @@ MUTATIONS = [
     Mutation("signs judged finer than the law's accuracy", r"ACCURACIES \* law\.accuracy\(contact\)", "0.0", ("test_implicit.py",)),
     # --- further rooms
     Mutation("the exit code of the module is lost", r"sys\.exit\(program\(\)\)", "program()", ("test_commands.py::test_the_module_ends_with_the_exit_code_of_the_command",)),
-    Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py::test_compare",)),
+    Mutation("shots of the command line counted from zero", r"\.shot - 1\n", ".shot\n", ("test_commands.py::test_compare",), marks="slow"),
     Mutation("vertical and horizontal bases exchanged", r"\(0 \* y, y\) if self\.direction == \"vertical\"", '(0 * y, y) if self.direction == "horizontal"', (examples("motion.system"),)),
     Mutation("limits of validity from the wrong end", r"if law == \"moreau\" else slice", 'if law == "binary" else slice', ("test_methods.py::test_limits_are_of_the_unbroken_run_from_their_end",)),
     Mutation("dispersion over the sum, not the mean", r"return deviation / mean\n", "return deviation / jnp.sum(share)\n", ("test_methods.py::test_energy_kept_and_its_dispersion",)),
@@ -411,7 +411,7 @@ MUTATIONS = [
     Mutation("bootstrap without the noise", r"fit\.noise \* np\.moveaxis", "np.moveaxis", ("test_fit.py::test_bootstrap_scatters_as_much_as_the_standard_error",)),
     Mutation("given samples of the next chunk", r"values\[number \* size : \(number \+ 1\) \* size\]", "values[(number + 1) * size : (number + 2) * size]", ("test_montecarlo.py::test_given_samples_are_used_row_by_row",)),
     Mutation("the ridge is felt where a contact jams", r"_JAMS = 1e-2", "_JAMS = 0.0", ("test_paroxysms.py::test_its_derivatives[jamming]",), "persistent_contact.py", "slow"),
-    Mutation("friction that pushes along the sliding", r"along \* mu\[:, None\], 0\.0", "-along * mu[:, None], 0.0", ("test_motion.py::test_sliding_block_comes_to_stick",)),
+    Mutation("friction that pushes along the sliding", r"along \* mu\[:, None\], 0\.0", "-along * mu[:, None], 0.0", ("test_motion.py::test_sliding_block_comes_to_stick",), marks="slow"),
     Mutation("small turns twice as large", r"half @ half\)\)\[None\], half\]", "half @ half))[None], 2 * half]", ("test_motion_in_space.py::test_derivatives_at_no_displacement_take_two_terms",), "solids.py"),
     Mutation("redundant contacts share by their slip", r"weight, _sizes\(w, contacts\.delassus, m\)\)", "weight, jnp.diagonal(w))", ("test_motion_in_space.py::test_forces_of_a_brick_that_slides_flat_have_derivatives",)),
     Mutation("steps that end slip in one go", r"jnp\.sum\(u \* growth, axis=1\)", "0.0 * jnp.sum(u * growth, axis=1)", ("test_motion_in_space.py::test_derivatives_of_a_sphere_that_begins_to_roll",), "*.py", "release"),

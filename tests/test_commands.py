@@ -235,6 +235,7 @@ def test_fit_refuses_data(tmp_path, capsys):
 # ------------------------------------------------------------------------- the other commands
 
 
+@pytest.mark.slow
 def test_compare(tmp_path, capsys):
     code, said = call(capsys, "compare", "--out", tmp_path, "--json")
     result = json.loads(said.out)
@@ -445,6 +446,7 @@ def test_every_body_has_a_table(kind):
     assert all(name.endswith("]") for name in (*body.names, *body.velocity_names))
 
 
+@pytest.mark.slow
 def test_the_study_of_the_documents(tmp_path):
     text = (Path(__file__).parents[1] / "docs" / "motions.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```toml\n(.*?)```", text, re.S)
@@ -567,6 +569,7 @@ def test_simulate_refuses(tmp_path, capsys, old, new, message):
     assert message in said.err
 
 
+@pytest.mark.slow
 def test_advise(tmp_path, capsys):
     code, said = call(capsys, "advise", "--samples", "32", "--out", tmp_path, "--json")
     result = json.loads(said.out)

@@ -104,6 +104,7 @@ def reported(found):
     return " ".join(found.warnings)
 
 
+@pytest.mark.slow
 def test_data_that_another_law_made_are_reported():
     """One e for two contacts; without sigma the noise is what momentum shows."""
     pre = np.random.default_rng(0).uniform([0.7, -0.3, -0.8], [1.3, 0.3, -0.2], (12, 3))

@@ -252,6 +252,7 @@ def check_hypercube(n, steps):
     return np.mean(~flagged)
 
 
+@pytest.mark.slow
 def test_right_or_flagged():
     assert check_hypercube(3, STEPS) > 0.6  # and not all flagged
 

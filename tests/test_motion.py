@@ -456,6 +456,7 @@ def slides():
     return jax.jit(jax.vmap(on_slope))(*np.array(rows, float).T)
 
 
+@pytest.mark.slow
 def test_sliding_block_comes_to_stick(slides):
     motion = lane(slides, 0)
     assert kinds(motion) == ["friction"]
@@ -467,6 +468,7 @@ def test_sliding_block_comes_to_stick(slides):
     np.testing.assert_allclose(motion.contact_work[-1, 1], took, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_stick_and_slip_on_a_slope(slides):
     np.testing.assert_allclose(lane(slides, 1).q[-1], [0.0, 0.2, 0.0], atol=1e-12)
     angle, slips = np.arctan(0.31), lane(slides, 2)
@@ -494,6 +496,7 @@ def test_derivatives_of_a_block_that_comes_to_stick():
         np.testing.assert_allclose(slopes, jax.jit(jax.jacfwd(exact))(x), rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_block_tips_about_its_corner(slides):
     """Steeper than width / height and rough: it turns about a fixed corner, energy conserved."""
     motion = lane(slides, 3)
@@ -508,6 +511,7 @@ def test_block_tips_about_its_corner(slides):
     assert v[-1, 2] < -1
 
 
+@pytest.mark.slow
 def test_nested_accumulations_are_passed_below_the_root_of_slow(slides):
     """Corners of one block: below 1e-3 of the fastest approach; a single contact, 1e-6 of it."""
     motion = lane(slides, 4)

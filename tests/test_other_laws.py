@@ -117,6 +117,7 @@ def test_a_matrix_of_ratios_is_that_of_each_contact_that_collides():
     assert ji.STATUS[int(wrong.status)].name == "infeasible"
 
 
+@pytest.mark.slow
 def test_statement_of_bowling():
     """Routh's increments with one energetic e: LZB's outcome for one contact and at pi/2, not else."""
     one = chain([1.0, 3.0], [2.0, 0.5], e=0.7, k=3.0)
@@ -138,6 +139,7 @@ def test_unequal_coefficients_of_routh_are_one():
     np.testing.assert_allclose(out.velocity[0, :2], [e * np.sqrt(3.0), e], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_hurmuzlu_and_marghitu_is_moreau():
     """One contact collides, contacts at rest stay closed or open: increments by increments.
 
