@@ -27,8 +27,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 matplotlib.use("Agg")
 
 # Every compiled program maps memory, and Linux lets a process have 65 530 maps: beyond, the
-# compiler aborts. A process that holds three quarters of them forgets its programs.
+# compiler aborts. A process that holds three quarters of them forgets its programs. Counting them
+# takes 60 ms then, so it waits for this many compilations; each maps memory up to 60 times.
 MANY_MAPS = 50_000
+COUNT_MAPS_AFTER = 100  # compilations
 
 # Processes side by side share the programs that took longer than this to compile.
 WORTH_SHARING = "0.2"  # seconds
@@ -64,6 +66,7 @@ DEAR = (  # groups that take longest begin first, so that no process is left alo
 
 operations = {}  # of each program that counts, by its test and the hash of its text
 running = ["imports"]  # the test that runs in this process
+uncounted = [0]  # compilations of this process since it last counted its maps
 texts = tempfile.TemporaryDirectory(prefix="jimpact-programs-")  # where JAX writes programs down
 
 
@@ -71,6 +74,7 @@ def compiled(event, duration, **_):
     """Take note of the programs that JAX has written down, and remove their texts."""
     if event != COMPILED:
         return
+    uncounted[0] += 1
     for path in Path(texts.name).iterdir():
         text = path.read_bytes()
         path.unlink()
@@ -188,5 +192,8 @@ def each_test(request):
     optimize(request.node.get_closest_marker("long_run") is not None)
     yield
     maps = Path("/proc/self/maps")
-    if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPS:
+    if uncounted[0] < COUNT_MAPS_AFTER or not maps.exists():
+        return
+    uncounted[0] = 0
+    if maps.read_bytes().count(b"\n") > MANY_MAPS:
         jax.clear_caches()
