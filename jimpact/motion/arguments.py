@@ -243,16 +243,14 @@ def contacts_of(system: System, q: jax.Array) -> int:
     return count
 
 
-def force_of(law: Law, mu: jax.Array | None) -> Force:
-    """The contact force of a law, for motions without friction."""
+def force_of(law: Law) -> Force:
+    """The contact force of a law, for motions."""
     force: Force | None = law.contact_force
     if force is None or not law.uses_gaps:
         raise TypeError(
             "Argument `law` must use gaps and have a `contact_force` (Compliant) for "
             f"method='contact_forces', but is {law!r}."
         )
-    if mu is not None:
-        raise ValueError("Argument `friction` must be 0 for method='contact_forces'.")
     check_unbounded("law", force)
     return force
 

@@ -171,7 +171,7 @@ def simulate(
         arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
         return _waited(_stepped, arguments, progress)
     if method == "contact_forces":
-        arguments = system, force_of(law, mu), settings, q, v, start, end, count, rows
+        arguments = system, force_of(law), mu, settings, q, v, start, end, count, rows
         return _waited(_forced, arguments, progress)
     arguments = system, law, mu, settings, q, v, start, end
     if _on_host(arguments):
@@ -259,6 +259,7 @@ def _events(
 def _forced(
     system: System,
     force: Force,
+    mu: jax.Array | None,
     settings: Settings,
     q: jax.Array,
     v: jax.Array,
@@ -270,7 +271,7 @@ def _forced(
     """The motion with contact forces."""
     times = _equal_times(start, end, samples)
     m = contacts_of(system, q)
-    problem = MotionProblem(system, force, None, settings, q, v, times, m)
+    problem = MotionProblem(system, force, mu, settings, q, v, times, m)
     course, *_ = compliant_motion(problem, max_events)
     return _recorded(system, times, course)
 
