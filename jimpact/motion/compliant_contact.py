@@ -61,9 +61,11 @@ from jimpact.motion.persistent_contact import (
     Modes,
     by_contact,
     choose_with_friction,
+    cone_margins,
     constraint_impulse,
     contact_powers,
     contacts_at,
+    direction,
     forces,
     friction_acceleration,
     length,
@@ -84,7 +86,7 @@ from jimpact.motion.replays import (
 )
 from jimpact.motion.slip_in_space import slip_axes
 from jimpact.motion.system import System
-from jimpact.motion.transitions import REST_SPEED, After, Passed, no_jump, slip_stops
+from jimpact.motion.transitions import REST_SPEED, After, Passed, no_jump, slip_stops, velocity_noise
 from jimpact.scene import gap_velocity
 
 # Rows of a plan: a contact takes some tens of steps. Ten times more takes ten times the memory of
@@ -93,6 +95,13 @@ ROWS_PER_EVENT = 64
 # Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off by a tenth
 # of the tolerance.
 SNAP = 1e-2
+# Step, in the time in which the stiffest or most damped contact moves by one radian. Of a body at
+# rest on its springs steps see no error, but derivatives grow in them: by 1e11 in one ten times as
+# long.
+STABLE = 0.5
+# Of the cone: contacts that have reached its rim stick only if others take over more than this.
+# Ten times more: contacts that share what they hold slide one after the other.
+WITHIN = 1e-6
 SLOWEST = 1e-12  # [m/s] scale of contacts that have not moved yet; any small one would do
 
 
@@ -162,11 +171,7 @@ class CompliantFlow(MotionFlow):
         at = unpacked(self.like, y)
         contacts, force = self.pushed(const, at)
         gamma, push = contacts.normal.rate, force.normal
-        closing = -gamma
-        bistiffness = self.force.bistiffness
-        if bistiffness is not None:
-            e = jnp.where(bistiffness.restitution > 0, bistiffness.restitution, 1.0)
-            closing = jnp.where(const.phase == EXPANSION, closing / e**2, closing)
+        closing = _unloading(self.force, const.phase, -gamma)
         friction, base = contact_powers(self.system, contacts, force, at.t)
         remembered = [closing, push]
         if force.tangential is not None:
@@ -251,7 +256,9 @@ class CompliantFlow(MotionFlow):
         if self.mu is not None:  # friction starts anew with the force
             keeps = _loaded(phase) & _loaded(after)
             rows = _mode_rows(Phases(after, side._replace(active=keeps)))
-        return rows[:, None].astype(modes.dtype), packed(at._replace(contact=contact))
+        state = packed(at._replace(contact=contact))
+        state = jnp.concatenate([state, y[len(state) :]])  # and spare rows as they are
+        return rows[:, None].astype(modes.dtype), state
 
     def begins(self, before: jax.Array, after: jax.Array) -> jax.Array:
         """Where a force sets in."""
@@ -384,8 +391,10 @@ def _begin(problem: MotionProblem, max_events: int, records: bool) -> _Compliant
         phase = _mode_rows(Phases(phase, no_modes(m, x.dtype)))
         watched, fastest = 3 * m, jnp.concatenate([fastest, slip])
     flight = first_flight(system, state, phase[:, None], watched, times)
-    flight = toward_sample(flight, times, flight.free)
-    flight = flight._replace(event=~flight.event)  # friction is still to be decided
+    contacts = contacts_at(system, state.q, state.v, state.t, False)
+    stable = _stable_step(force, flight.aim.modes, contacts, state)
+    flight = toward_sample(flight, times, jnp.minimum(flight.free, stable))
+    flight = flight._replace(event=flight.event.at[:m].set(True))  # friction is to be decided
     no = jnp.asarray(False)
     plan = None
     if records:
@@ -428,10 +437,24 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
         stopped = slip_stops(settings, side, event[2 * m :], slip, scale)
         let_go = (event[2 * m :] & side.stick) | stopped
         released = jnp.concatenate([jnp.zeros_like(let_go), let_go])
-        slides = (slip > not_rounding(REST_SPEED, slip.dtype) * scale) & ~stopped
-        slack = rest_acceleration(slip.dtype) * jnp.max(jnp.abs(known.approach))
-        choice = choose_with_friction(known, mu, side, _loaded(phase), released, slides, slack)
-        return _mode_rows(Phases(phase, choice.modes))[:, None], choice.consistent
+        fastest = jnp.max(jnp.abs(known.approach))
+        rest = not_rounding(REST_SPEED, slip.dtype) * scale + velocity_noise(settings, fastest)
+        slides, slack = (slip > rest) & ~stopped, rest_acceleration(slip.dtype) * fastest
+        loaded = _loaded(phase)
+        choice = choose_with_friction(known, mu, side, loaded, released, slides, slack)
+        # corners that sink in differently are nearly redundant: they stick where the forces of the
+        # flow, which share what they hold, can hold them
+        assert known.tangent is not None
+        moves = direction(by_contact(known.tangent.rate, m))
+        still = Modes(loaded, loaded & ~slides, jnp.where(slides, moves[:, 0], 1.0))
+        if settings.spatial:
+            still = still._replace(sign=jnp.ones_like(still.sign))
+        held = forces(known, mu, still, jnp.where(slides[:, None], moves, 0.0))
+        left = cone_margins(known, mu, held)
+        least = jnp.where(let_go, WITHIN * friction_acceleration(known, mu, held.normal), 0.0)
+        sticks = jnp.all(~still.stick | (left >= least))
+        chosen = selected(sticks, still, choice.modes)
+        return _mode_rows(Phases(phase, chosen))[:, None], choice.consistent | sticks
 
     old = run.flight.aim.modes, jnp.asarray(True)
     asked = jnp.any(event)
@@ -505,22 +528,48 @@ def _flow(
     system, force, mu, settings, _, _, times, m, _ = problem
     contacts = contacts_at(system, at.q, at.v, at.t, mu is not None)
     scales = _contact_scales(force, contacts, fastest)
-    share, axes = jnp.full(2 * m, SNAP * settings.rtol, at.q.dtype), None
+    share, axes = jnp.full(m, SNAP * settings.rtol, at.q.dtype), None
+    noise = velocity_noise(settings, jnp.max(jnp.abs(contacts.approach)))
+    share = jnp.concatenate([share, jnp.maximum(share, noise / scales.speed)])
     if mu is not None:
-        phase, side = phases_of(modes, at)
+        phase, now = phases_of(modes, at)
         push = _normal_forces(force, phase, contacts, at)
         known = with_normal_forces(contacts, push)
         if settings.spatial:
-            axes = slip_axes(known, mu, side, scales.slip)
+            axes = slip_axes(known, mu, now, scales.slip)
         most = friction_acceleration(known, mu, jnp.maximum(scales.force, push))
-        by_slip = side.active & ~side.stick & (side.sign != BEGINS)
-        sizes = jnp.where(by_slip, scales.slip, most)
-        share = jnp.concatenate([share, rest_acceleration(at.q.dtype) * sizes])
+        by_slip = now.active & ~now.stick & (now.sign != BEGINS)
+        rest = rest_acceleration(at.q.dtype)
+        side = jnp.where(by_slip, jnp.maximum(rest * scales.slip, noise), rest * most)
+        share = jnp.concatenate([share, side])
     rounded, longest = roundings(settings, share, times), longest_step(system, times)
+    longest = jnp.minimum(longest, _stable_step(force, modes, contacts, at))
     blank = jnp.zeros((len(packed(at)), 1), at.q.dtype)
     return CompliantFlow(
         system, rounded, times[0], settings.rtol, blank, at, longest, mu, axes, force, scales
     )
+
+
+def _stable_step(force: Force, modes: jax.Array, contacts: Contacts, at: State) -> jax.Array:
+    """How long a step may be () [s] beside the stiffness and damping of the loaded contacts."""
+    x, rate, m = at.contact[0], -contacts.normal.rate, len(at.contact[0])
+    phase, one = modes[:m, 0], jnp.ones_like(x)
+    x = jnp.where(x >= 0, x, 0.0)
+    stiffness = jax.jvp(lambda x: force.force(x, rate), (x,), (one,))[1]
+    damping = jax.jvp(lambda rate: force.force(x, rate), (rate,), (one,))[1]
+    both = jnp.stack([_unloading(force, phase, stiffness), damping], axis=1)
+    both = jnp.where(_loaded(phase)[:, None], both, 0.0)
+    square, rate = jnp.max(jnp.abs(contacts.delassus[:m, :m]) @ jnp.abs(both), axis=0)
+    fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(square), rate))
+    return jnp.where(fastest > 0, STABLE / jnp.where(fastest > 0, fastest, 1.0), jnp.inf)
+
+
+def _unloading(force: Force, phase: jax.Array, rate: jax.Array) -> jax.Array:
+    """Rates (m,) of indentation, or of what goes with it, faster in plastic expansion."""
+    if force.bistiffness is None:
+        return rate
+    e = jnp.where(force.bistiffness.restitution > 0, force.bistiffness.restitution, 1.0)
+    return jnp.where(phase == EXPANSION, rate / e**2, rate)
 
 
 def _again(

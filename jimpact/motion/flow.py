@@ -505,7 +505,8 @@ def one_pass(
         | (steps >= settings.max_steps)
         | out_of_range(flow.system, state),
     )
-    aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
+    begins = jnp.minimum(free, flow.longest)  # forces may have set in since `free`
+    aimed = toward_sample(moved, targets, jnp.where(sampled, begins, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
     plain = sampled | (accept & in_time)
     aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))

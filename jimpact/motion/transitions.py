@@ -431,11 +431,16 @@ def _approach(choice: ModeChoice, slip: jax.Array, held: jax.Array) -> jax.Array
     return jax.lax.stop_gradient(share * jnp.max(jnp.where(held, jnp.abs(slip), 0.0)))
 
 
+def velocity_noise(settings: Settings, acceleration: jax.Array) -> jax.Array:
+    """Velocities () that arise at this acceleration () within the rounding of time."""
+    duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
+    return ROUNDINGS * float(jnp.finfo(duration.dtype).eps) * duration * acceleration
+
+
 def _rest(settings: Settings, scales: Scales) -> jax.Array:
     """Gap velocities () that are rounding."""
-    duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
-    rounding = ROUNDINGS * float(jnp.finfo(duration.dtype).eps) * duration
-    return not_rounding(REST_SPEED, duration.dtype) * scales.speed + rounding * scales.acceleration
+    rounding = velocity_noise(settings, scales.acceleration)
+    return not_rounding(REST_SPEED, rounding.dtype) * scales.speed + rounding
 
 
 def _struck(
