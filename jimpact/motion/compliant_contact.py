@@ -267,13 +267,15 @@ class CompliantFlow(MotionFlow):
 
     def projected(self, const: Phases, at: State) -> State:
         """Slip of contacts that stick set to 0, in the metric of M."""
-        if self.mu is None:
-            return at
-        contacts = self.contacts(at)
+        return at if self.mu is None else self.stopped(const.side.active & const.side.stick, at)
+
+    def stopped(self, which: jax.Array, at: State) -> State:
+        """Slip of contacts (m,) set to 0."""
+        contacts, one = self.contacts(at), jnp.ones_like(at.contact_work[0])
         known = with_normal_forces(contacts, jnp.zeros_like(contacts.normal.rate))
         assert known.tangent is not None
         rates = jnp.concatenate([jnp.zeros_like(contacts.normal.rate), known.tangent.rate])
-        p = constraint_impulse(known, self.mu, const.side, rates)
+        p = constraint_impulse(known, self.mu, Modes(which, which, one), rates)
         return at._replace(v=at.v + contacts.moved @ p)
 
 
@@ -326,6 +328,7 @@ class _PlanRow(NamedTuple):
 
     accepted: jax.Array  # ()
     written: jax.Array  # ()
+    stopped: jax.Array  # (m,) contacts whose slip stops at its end
     aim: stepper.Step
     fastest: jax.Array
 
@@ -398,7 +401,7 @@ def _begin(problem: MotionProblem, max_events: int, records: bool) -> _Compliant
     no = jnp.asarray(False)
     plan = None
     if records:
-        row = _PlanRow(no, no, flight.aim, fastest)
+        row = _PlanRow(no, no, jnp.zeros(m, bool), flight.aim, fastest)
         steps = settings.max_steps
         plan = empty_plan(row, times.shape[0], max_events, ROWS_PER_EVENT, steps)
     return _CompliantRun(
@@ -454,6 +457,8 @@ def _with_friction(problem: MotionProblem, run: _CompliantRun) -> _CompliantRun:
         least = jnp.where(let_go, WITHIN * friction_acceleration(known, mu, held.normal), 0.0)
         sticks = jnp.all(~still.stick | (left >= least))
         chosen = selected(sticks, still, choice.modes)
+        if settings.spatial:  # a force that changes as fast as in a contact has slip begin at once
+            chosen = chosen._replace(sign=jnp.ones_like(chosen.sign))
         return _mode_rows(Phases(phase, chosen))[:, None], choice.consistent | sticks
 
     old = run.flight.aim.modes, jnp.asarray(True)
@@ -474,14 +479,16 @@ def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _C
     sizes = [depth, *[impulse] * (len(flight.state.contact) - 1)]
     rows = jnp.concatenate([ledger, settings.rtol * jnp.concatenate(sizes)])
     flown, accept = one_pass(flow, settings, rows, times, flight)
-    at, before, after = flown.state, flight.aim.modes[:m, 0], flown.aim.modes[:m, 0]
+    before, after = flight.aim.modes[:m, 0], flown.aim.modes[:m, 0]
     closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
-    gamma, slip = _rates(problem, at)
-    fastest, turned = jnp.maximum(-gamma, 0.0), jnp.zeros_like(closed)
+    gamma, slip = _rates(problem, flown.state)
+    fastest, turned, stopped = jnp.maximum(-gamma, 0.0), ~closed & closed, ~closed & closed
     if problem.mu is not None:
-        side, fired = phases_of(flight.aim.modes, at).side, flown.event[2 * m :]
-        turned = (fired & side.stick) | slip_stops(settings, side, fired, slip, flow.scales.slip)
-        fastest = jnp.concatenate([fastest, slip])
+        side, fired = phases_of(flight.aim.modes, flown.state).side, flown.event[2 * m :]
+        stopped = slip_stops(settings, side, fired, slip, flow.scales.slip)
+        turned, fastest = (fired & side.stick) | stopped, jnp.concatenate([fastest, slip])
+        flown = flown._replace(state=flow.stopped(stopped, flown.state))
+    at = flown.state
     happened = jnp.any(closed | opened | turned)
     full = happened & (run.event_count >= max_events)
     written = happened & ~full
@@ -499,7 +506,7 @@ def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _C
     )
     plan = run.plan
     if plan is not None:
-        plan = plan.with_row(_PlanRow(accept, written, flight.aim, run.fastest), accept)
+        plan = plan.with_row(_PlanRow(accept, written, stopped, flight.aim, run.fastest), accept)
     return _CompliantRun(
         flown,
         jnp.maximum(run.fastest, fastest),
@@ -589,6 +596,8 @@ def _again(
         flow = _flow(problem, state, aim.modes, row.fastest)
         flow = eqx.tree_at(lambda f: f.sample, flow, times[sample])
         state = selected(row.accepted, step_again(flow, aim, state), state)
+        if problem.mu is not None:
+            state = flow.stopped(row.stopped & row.accepted, state)
         after = flow.switch(aim.modes, packed(state), aim.target)[0]
         opened = ((aim.modes != OPEN) & (after == OPEN))[: problem.contacts, 0]
         return state, (packed(state)[:, 0], _event(problem, state, opened))
