@@ -86,7 +86,14 @@ from jimpact.motion.replays import (
 )
 from jimpact.motion.slip_in_space import slip_axes
 from jimpact.motion.system import System
-from jimpact.motion.transitions import REST_SPEED, After, Passed, no_jump, slip_stops, velocity_noise
+from jimpact.motion.transitions import (
+    REST_SPEED,
+    After,
+    Passed,
+    no_jump,
+    slip_stops,
+    velocity_noise,
+)
 from jimpact.scene import gap_velocity
 
 # Rows of a plan: a contact takes some tens of steps. Ten times more takes ten times the memory of
@@ -284,9 +291,7 @@ def _loaded(phase: jax.Array) -> jax.Array:
     return (phase == COMPRESSION) | (phase == EXPANSION)
 
 
-def _normal_forces(
-    force: Force, phase: jax.Array, contacts: Contacts, at: State
-) -> jax.Array:
+def _normal_forces(force: Force, phase: jax.Array, contacts: Contacts, at: State) -> jax.Array:
     """Forces (m,) [N] of contacts in these phases."""
     x = at.contact[0]
     push = force.force(jnp.where(x >= 0, x, 0.0), -contacts.normal.rate)
@@ -307,8 +312,9 @@ def phases_of(modes: jax.Array, like: State) -> Phases:
 
 def _mode_rows(now: Phases) -> jax.Array:
     """Rows (3 m,) of modes with friction; 0 where none acts."""
-    stick, sign = (jnp.where(now.side.active, x, 0) for x in now.side[1:])
-    return jnp.concatenate([x.astype(jnp.int32) for x in (now.phase, stick, sign)])
+    friction = jnp.stack([x.astype(jnp.int32) for x in now.side[1:]])
+    friction = jnp.where(now.side.active, friction, 0)
+    return jnp.concatenate([now.phase.astype(jnp.int32), *friction])
 
 
 class _CompliantRun(NamedTuple):
@@ -528,9 +534,7 @@ def _event(problem: MotionProblem, at: State, opened: jax.Array) -> jax.Array:
     return event_numbers(at, After(at, jump, Passed(zero, zero)))
 
 
-def _flow(
-    problem: MotionProblem, at: State, modes: jax.Array, fastest: jax.Array
-) -> CompliantFlow:
+def _flow(problem: MotionProblem, at: State, modes: jax.Array, fastest: jax.Array) -> CompliantFlow:
     """The flow from this state on, on the scales of the contacts so far."""
     system, force, mu, settings, _, _, times, m, _ = problem
     contacts = contacts_at(system, at.q, at.v, at.t, mu is not None)
