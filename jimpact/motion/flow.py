@@ -264,7 +264,7 @@ class MechanicalFlow(MotionFlow):
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
     @property
-    def spare(self) -> int:  # type: ignore[override]
+    def spare(self) -> int:
         """Gaps by integration, too: steps follow them where the base moves faster than the body."""
         return self.like.contact_work.shape[1] + super().spare
 
