@@ -146,9 +146,7 @@ def simulate(
     end = as_float_array("t_end", t_end).astype(dtype)
     f = check_motion(system, q, v, start, end)
     count = as_whole("samples", samples, 2)
-    if max_events is not None:
-        as_whole("max_events", max_events, 1)
-    rows = CHUNK if max_events is None else max_events
+    rows = CHUNK if max_events is None else as_whole("max_events", max_events, 1)
     as_whole("max_steps", max_steps, 1)
     check_values("slow", slow, low=0.0, high=1.0)
     check_choice("method", method, METHODS)
