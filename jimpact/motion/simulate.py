@@ -23,6 +23,7 @@ from jimpact.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.arguments import (
     check_motion,
+    check_pile,
     check_stepped_law,
     contacts_of,
     force_of,
@@ -152,6 +153,7 @@ def simulate(
     check_choice("method", method, METHODS)
     rtol, atol = _tolerances(method, dtype, rtol, atol)
     mu = friction_of(system, law, friction, q)
+    check_pile(system, q, mu, method)
     system = without_closures(system, q, v, start)
     below, rounding = closed_gaps(q, f, closed_below)
     if method != "contact_forces":
