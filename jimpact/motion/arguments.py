@@ -26,8 +26,8 @@ MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
 # Instants at which the base must be finite before a motion starts; what is not finite in between
 # ends the motion with the status `not_finite`.
 BASE_INSTANTS = 64
-# Contacts of a pile above which motions by events warn: 1 100 compile for more than two minutes. Ten
-# times more, and nobody is warned of that.
+# Contacts of a pile above which motions by events warn: 1 100 compile for more than two minutes.
+# Ten times more, and nobody is warned of that.
 MANY = 200
 DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
 

@@ -55,7 +55,6 @@ from jimpact.motion.flow import (
     unpacked,
 )
 from jimpact.motion.persistent_contact import (
-    BEGINS,
     Contacts,
     Forces,
     Modes,
@@ -102,9 +101,9 @@ ROWS_PER_EVENT = 64
 # Of the errors allowed: margins closer to 0 are 0. Ten times more, and events are off by a tenth
 # of the tolerance.
 SNAP = 1e-2
-# Step, in the time in which the stiffest or most damped contact moves by one radian. Of a body at
-# rest on its springs steps see no error, but derivatives grow in them: by 1e11 in one ten times as
-# long.
+# Longest step, in the time in which the stiffest or most damped contact moves by one radian. Of a
+# body at rest on its springs steps see no error. Ten times more: derivatives of its oscillations
+# are wrong; a hundred times more: they grow by 1e11 in a step.
 STABLE = 0.5
 # Of the cone: contacts that have reached its rim stick only if others take over more than this.
 # Ten times more: contacts that share what they hold slide one after the other.
@@ -549,7 +548,7 @@ def _flow(problem: MotionProblem, at: State, modes: jax.Array, fastest: jax.Arra
         if settings.spatial:
             axes = slip_axes(known, mu, now, scales.slip)
         most = friction_acceleration(known, mu, jnp.maximum(scales.force, push))
-        by_slip = now.active & ~now.stick & (now.sign != BEGINS)
+        by_slip = now.active & ~now.stick
         rest = rest_acceleration(at.q.dtype)
         side = jnp.where(by_slip, jnp.maximum(rest * scales.slip, noise), rest * most)
         share = jnp.concatenate([share, side])
