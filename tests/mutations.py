@@ -328,7 +328,7 @@ MUTATIONS = [
     Mutation("the base moves the wrong way", r"moved\(q, -_displaced\(system, t\)\)", "moved(q, _displaced(system, t))", ("test_motion.py::test_gaps_are_seen_from_the_base",)),
     Mutation("work of the base with the wrong sign", r"push @ carried, out\.status", "-(push @ carried), out.status", ("test_motion.py::test_the_base_works_at_its_own_speed",)),
     Mutation("time of a hop halved", r"2 \* jnp\.abs\(p\) / safe", "jnp.abs(p) / safe", ("test_motion.py::test_finite_accumulation_is_passed",)),
-    Mutation("plastic expansion with e for its square", r"closing / e\*\*2", "closing / e", ("test_contact_forces.py::test_a_plastic_contact_returns_its_share",)),
+    Mutation("plastic expansion with e for its square", r"rate / e\*\*2, rate", "rate / e, rate", ("test_contact_forces.py::test_a_plastic_contact_returns_its_share",)),
     Mutation("off-diagonal of a chain's Delassus matrix shifted", r"off_diagonal \* vector\[1:\], none", "off_diagonal * vector[:-1], none", ("test_scenes.py::test_chain_is_the_dense_scene",)),
     Mutation("elimination takes the pivot's row for the others", r"return jnp\.where\(number == k, row, rows - factor \* row\)", "return jnp.where(number == 0, row, rows - factor * row)", ("test_friction_solver.py::test_dense_solves_are_those_of_numpy",), "dense.py"),
     Mutation("two rows: the upper unknown ignores the lower one", r"jnp\.stack\(\[x - above \* last, last\]\)", "jnp.stack([x, last])", ("test_friction_solver.py::test_dense_solves_are_those_of_numpy",), "dense.py"),
