@@ -64,22 +64,121 @@ def test_a_dashpot_may_slacken_before_its_spring():
 
 
 def test_a_body_may_rest_on_its_springs():
-    """Two springs carry the weight m g: nothing moves."""
+    """Two springs carry the weight m g: nothing moves, and what is disturbed oscillates."""
     block = ji.Block(width=0.2, height=0.4, mass=2.0)
     sunk = 2.0 * G / 2 / 1e4
     given = (ji.System(block, potential=ji.gravity(block)), ji.Compliant(ji.LinearSpring(1e4)))
-    start = ([0.0, 0.2 - sunk, 0.0], [0.0] * 3)
-    motion = ji.simulate(*given, *start, 0.1, samples=3, method="contact_forces")
-    np.testing.assert_allclose(motion.q, [start[0]] * 3, atol=1e-12)
+    options = {"samples": 3, "method": "contact_forces", "max_events": 8}
+
+    def run(height):
+        start = (jnp.stack([0 * height, height, 0 * height]), [0.0] * 3)
+        return ji.simulate(*given, *start, 0.1, **options).q
+
+    height = jnp.asarray(0.2 - sunk)
+    q, slope = jax.jit(lambda x: jax.jvp(run, (x,), (jnp.ones_like(x),)))(height)
+    np.testing.assert_allclose(q, [[0.0, height, 0.0]] * 3, atol=1e-12)
+    np.testing.assert_allclose(slope[:, 1], np.cos(100 * np.array([0, 0.05, 0.1])), atol=1e-6)
+
+
+def on_a_slope(mu, angle):
+    """A point of 1 kg that is pushed up a slope at 1 m/s, on a spring that carries it."""
+
+    def height(q):
+        return G * (q[1] * jnp.cos(angle) - q[0] * jnp.sin(angle))
+
+    functions = {"potential": height, "tangent_function": lambda q: q[:1]}
+    system = ji.System(lambda q: q[1:], [1.0, 1.0], **functions)
+    law, sunk = ji.Compliant(ji.LinearSpring(1e4), friction=mu), G * jnp.cos(angle) / 1e4
+    start = jnp.stack([0 * sunk, -sunk]), jnp.stack([0 * sunk - 1, 0 * sunk])
+    options = {"samples": 3, "max_events": 8, "method": "contact_forces"}
+    motion = ji.simulate(system, law, *start, 1.0, **options)
+    return motion.q[-1, 0], motion
+
+
+def slid(mu, angle):
+    """Where it is after 1 s: up to a stop, and down again unless mu > tan(angle)."""
+    up = G * (jnp.sin(angle) + mu * jnp.cos(angle))
+    down = jnp.maximum(G * (jnp.sin(angle) - mu * jnp.cos(angle)), 0.0)
+    return -0.5 / up + 0.5 * down * (1 - 1 / up) ** 2
+
+
+def test_friction_on_a_slope():
+    """Sliding, sticking and work in closed form."""
+    run = jax.jit(on_a_slope)
+    for mu, angle in ((0.35, 0.3), (0.2, 0.3)):
+        place, motion = run(mu, angle)
+        assert float(place) == pytest.approx(float(slid(mu, angle)), abs=1e-12)
+        turn = 1 / (G * (np.sin(angle) + mu * np.cos(angle)))
+        assert motion.to_dict()["events"]["kind"] == ["friction"]
+        assert float(motion.events.time[0]) == pytest.approx(turn, rel=1e-9)
+        path = turn + float(place)  # up by turn / 2, then down to its place
+        work = -mu * G * np.cos(angle) * path
+        np.testing.assert_allclose(motion.contact_work[-1], [[0], [work]], atol=1e-9)
+        np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_of_friction_on_a_slope():
+    """In reverse mode, of the rest on its spring too."""
+    run = jax.jit(jax.grad(on_a_slope, (0, 1), has_aux=True))
+    for start in ((0.35, 0.3), (0.2, 0.3)):
+        np.testing.assert_allclose(run(*start)[0], jax.grad(slid, (0, 1))(*start), atol=1e-8)
+
+
+@pytest.mark.slow
+def test_a_ball_in_space_slides_and_rolls():
+    """Slip at 1.25 m/s ends at 2 u / (7 mu g), in rolling at 5/7 of it; a bounce gives mu p."""
+    ball, stiffness, mu = ji.Sphere(0.1), 1e3, 0.2
+    system, law = ji.System(ball, potential=ji.gravity(ball)), ji.LinearSpring(stiffness)
+    law = ji.Compliant(law, friction=mu)
+    options = {"samples": 3, "max_events": 8, "method": "contact_forces"}
+    at, along = [0.0, 0.0, 0.1 - G / stiffness, 1.0, 0.0, 0.0, 0.0], np.array([0.75, 1.0])
+    motion = ji.simulate(system, law, at, [*along, 0, 0, 0, 0], 1.0, **options)
+    assert float(motion.events.time[0]) == pytest.approx(2 * 1.25 / (7 * mu * G), rel=1e-9)
+    rolls = [*along * 5 / 7, 0, *np.array([-along[1], along[0]]) * 50 / 7, 0]
+    np.testing.assert_allclose(motion.velocity[-1], rolls, atol=1e-9)
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
+    at[2], along = 0.11, 2 * along
+    motion = ji.simulate(system, law, at, [*along, -0.2, 0, 0, 0], 0.2, **options)
+    push, side = (x[1] for x in (motion.events.impulse, motion.events.tangential_impulse))
+    lost = mu * push[0] * along / np.linalg.norm(along)
+    np.testing.assert_allclose(side, -lost, rtol=1e-9)
+    np.testing.assert_allclose(motion.events.velocity_after[1, :2], along - lost, atol=1e-9)
+
+
+@pytest.mark.release
+def test_a_block_comes_to_rest_with_friction():
+    """On its side, on two damped springs that sink in differently until then."""
+    law = ji.Compliant(ji.KelvinVoigt(1e5, 100.0), friction=0.6)
+    options = {"samples": 11, "max_events": 1000, "method": "contact_forces"}
+    motion = ji.simulate(
+        ji.block_system(0.2, 0.3), law, [0, 0.4, 0.3], [1.0, 0, 2.0], 3.0, **options
+    )
+    ji.raise_on_failed_motion(motion)
+    np.testing.assert_allclose(motion.velocity[-1], 0, atol=1e-12)
+    assert float(motion.q[-1, 1]) == pytest.approx(0.1 - G / 2e5, abs=1e-9)
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_box_strikes_on_its_corners_with_friction():
+    """In space: no energy is gained, and friction takes what the ledger says."""
+    box = ji.Box([0.2, 0.3, 0.1])
+    system = ji.System(box, potential=ji.gravity(box))
+    law = ji.Compliant(ji.Bistiffness(1e7, 1.5, 0.5), friction=0.4)
+    at = [0, 0, 0.3, 0.9, 0.1, 0.3, 0.09**0.5]
+    options = {"samples": 5, "max_events": 400, "method": "contact_forces"}
+    motion = ji.simulate(system, law, at, [1.0, 0, 0, 1.0, 2.0, 3.0], 0.6, **options)
+    ji.raise_on_failed_motion(motion)
+    assert int(motion.events.count) > 10
+    assert float(jnp.max(jnp.diff(motion.energy))) < 1e-9
+    np.testing.assert_allclose(motion.ledger_residual, 0, atol=1e-9)
 
 
 def test_what_contact_forces_need():
     ball = (ji.ball_system(), ji.Newton(0.5), [1.0], [0.0], 1.0)
     with pytest.raises(TypeError, match="`law` must use gaps and have a `contact_force`"):
         ji.simulate(*ball, method="contact_forces")
-    block, law = ji.block_system(1.0, 1.0), ji.Compliant(ji.Hertz(1e6))
-    with pytest.raises(ValueError, match="`friction` must be 0"):
-        ji.simulate(block, law, [0, 1, 0], [0] * 3, 1.0, friction=0.1, method="contact_forces")
 
 
 def test_a_body_under_loads_is_a_system():

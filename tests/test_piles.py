@@ -422,3 +422,12 @@ def test_dynamics_of_a_packing_are_those_of_the_dense_scene(struck, method):
     sparse = ji.impact(law, scene, v)
     np.testing.assert_allclose(sparse.velocity, dense.velocity, atol=1e-6)
     assert sparse.velocity[20] == pytest.approx(2.1, abs=1e-5)
+
+
+def test_piles_by_events_are_refused_with_friction():
+    pile = ji.PlanarPile([ji.Disc(0.1)] * 2)
+    at = pile.at([[0.0, 0.0], [0.3, 0.0]])
+    law = ji.Compliant(ji.Hertz(1e6), friction=0.1)
+    for method in ("events", "contact_forces"):
+        with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of PlanarPile"):
+            ji.simulate(ji.System(pile), law, at, np.zeros(6), 1.0, method=method)

@@ -38,7 +38,6 @@ from jimpact.scene import Scene
 # 6, and walls. Ten times more takes ten times the memory.
 ROOM = {2: 4, 3: 7}
 
-
 # Way of a body within half a step, over the least radius, up to which the grid finds all contacts:
 # what moves farther in a step than the least radius is a `coarse_step`. Ten times more makes cells
 # hold twenty times more bodies.

@@ -85,7 +85,10 @@ class SceneAdvice:
             f"{len(self.kept)} of {m} contacts suffice within {share(self.tolerance)}; "
             f"the error of v+ is {share(self.error)}"
         ]
-        lines += [f"friction, {name}: error {share(x)}" for name, x in self.friction.items()]
+        lines += [
+            f"friction, {name}: " + (f"error {share(x)}" if np.isfinite(x) else "the law fails")
+            for name, x in self.friction.items()
+        ]
         for block in self.blocks[:PRINTED]:
             ends = block.angles
             angles = f"; kinetic angles {ends[0]:.0f} to {ends[1]:.0f} degrees" if ends else ""
@@ -97,8 +100,8 @@ class SceneAdvice:
             [
                 f"{j + 1} {self.names[j]}".strip(),
                 number(self.impulses[j], ".3g"),
-                share(self.errors[j]),
-                number(self.changes[j], ".2g"),
+                share(self.errors[j]) if np.isfinite(self.errors[j]) else "not known",
+                number(self.changes[j], ".2g") if np.isfinite(self.changes[j]) else "",
                 self.reason(int(j)),
             ]
             for j in order

@@ -1,5 +1,6 @@
 """What a motion is refused for on the host, and what its arguments become."""
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +26,9 @@ MOST_STEPS = np.iinfo(np.int32).max  # they are counted in 32 bits
 # Instants at which the base must be finite before a motion starts; what is not finite in between
 # ends the motion with the status `not_finite`.
 BASE_INSTANTS = 64
+# Contacts of a pile above which motions by events warn: 1 100 compile for more than two minutes.
+# Ten times more, and nobody is warned of that.
+MANY = 200
 DIFFERENTIATED = ("gap_function", "tangent_function", "potential", "base")
 
 
@@ -219,6 +223,25 @@ def friction_of(system: System, law: Law, friction: Any, q: jax.Array) -> jax.Ar
     return jnp.broadcast_to(mu, (m,)).astype(q.dtype)
 
 
+def check_pile(system: System, q: jax.Array, mu: jax.Array | None, method: str) -> None:
+    """Raise where only time stepping moves a pile, and warn where anything else is too dear."""
+    if method == "time_stepping" or not is_pile(system):
+        return
+    name = type(system.body).__name__
+    if mu is not None:
+        raise ValueError(
+            f"Argument `friction` must be 0 for the contacts of {name} by method={method!r}: use "
+            "method='time_stepping', or few bodies as `PlanarBodies` or `SpatialBodies`."
+        )
+    m = contacts_of(system, q)
+    if m > MANY:
+        warnings.warn(
+            f"Argument `method` {method!r} computes all {m} contacts of {name} at each event, and "
+            "compiles for minutes: use method='time_stepping' for many bodies.",
+            stacklevel=3,
+        )
+
+
 def check_stepped_law(system: System, law: Law, q: jax.Array, joint: bool) -> None:
     """Raise unless time stepping of the system can use the law; `joint` as in `time_stepping`."""
     if not joint:
@@ -243,16 +266,14 @@ def contacts_of(system: System, q: jax.Array) -> int:
     return count
 
 
-def force_of(law: Law, mu: jax.Array | None) -> Force:
-    """The contact force of a law, for motions without friction."""
+def force_of(law: Law) -> Force:
+    """The contact force of a law, for motions."""
     force: Force | None = law.contact_force
     if force is None or not law.uses_gaps:
         raise TypeError(
             "Argument `law` must use gaps and have a `contact_force` (Compliant) for "
             f"method='contact_forces', but is {law!r}."
         )
-    if mu is not None:
-        raise ValueError("Argument `friction` must be 0 for method='contact_forces'.")
     check_unbounded("law", force)
     return force
 

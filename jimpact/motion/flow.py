@@ -1,5 +1,6 @@
 """Flights and persistent contact: an instance of the event-aligned stepper, `events/stepper.py`."""
 
+import abc
 import dataclasses
 from typing import Any, NamedTuple
 
@@ -26,6 +27,7 @@ from jimpact.motion.dynamics import (
 from jimpact.motion.persistent_contact import (
     BEGINS,
     Contacts,
+    Forces,
     Modes,
     cone_margins,
     constraint_impulse,
@@ -121,22 +123,36 @@ def watched(
     normal = jnp.where(modes.active, force.normal * w[:m] + slack, gap)
     if contacts.tangent is None or mu is None or force.tangential is None:
         return normal
-    cone = cone_margins(contacts, mu, force) + slack
     # sliding ends where slip does, and where its forces stop to exist: both may be in one step
     slides = any_lane(jnp.any(modes.active & ~modes.stick))  # else its product with slip is 0
     lasts = jax.lax.cond(
         slides, lambda: regularity(contacts, mu, modes, slip), lambda: jnp.ones((), w.dtype)
     ) - least_regularity(w.dtype)
-    ends = slip_margins(contacts, mu, modes, force, lasts, scales.speed)
-    side = jnp.where(modes.active, jnp.where(modes.stick, cone, ends), 1.0)
+    side = friction_margins(contacts, mu, modes, force, lasts, slack, scales.speed)
     return jnp.concatenate([normal, side])
+
+
+def friction_margins(
+    contacts: Contacts,
+    mu: jax.Array,
+    modes: Modes,
+    force: Forces,
+    lasts: jax.Array,
+    slack: jax.Array,
+    speed_scale: jax.Array,
+) -> jax.Array:
+    """What must stay positive (m,): the rest of the cone (and `slack`) of what sticks, or slip."""
+    cone = cone_margins(contacts, mu, force) + slack
+    ends = slip_margins(contacts, mu, modes, force, lasts, speed_scale)
+    return jnp.where(modes.active, jnp.where(modes.stick, cone, ends), 1.0)
 
 
 class MotionFlow(eqx.Module, stepper.Flow):
     """What flights have in common.
 
     State (rows): q, v, t, the ledger, and what contacts remember. The last of the margins is the
-    time left to the next sample. Margins are in units of their rounding.
+    time left to the next sample. Margins are in units of their rounding. In space tangents are
+    along the `axes` of the step.
     """
 
     system: System
@@ -146,8 +162,16 @@ class MotionFlow(eqx.Module, stepper.Flow):
     sizes: jax.Array  # (rows, 1): a step may make errors of `rtol` of them
     like: State  # of its shapes
     longest: jax.Array  # step ()
+    mu: jax.Array | None
+    axes: SlipAxes | None
 
-    spare = 0  # rows in addition to those of the state, which only limit the length of steps
+    @property
+    def spare(self) -> int:
+        """Rows in addition to those of the state, which only limit the length of steps.
+
+        In space logarithms of slip: steps follow it until little is left.
+        """
+        return 0 if self.axes is None else len(self.axes.speed)
 
     @property
     def taking_part(self) -> int:  # type: ignore[override]
@@ -175,8 +199,35 @@ class MotionFlow(eqx.Module, stepper.Flow):
     def spare_errors(
         self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
     ) -> list[jax.Array]:
-        """Errors that a step may make in its spare rows."""
-        return []
+        """Errors that a step of length h may make in its spare rows; `of_q`: sizes of q in it."""
+        if self.axes is None:
+            return []
+        return [turning_errors(self.axes, settings.rtol, self.speed_scale)]
+
+    @property
+    @abc.abstractmethod
+    def speed_scale(self) -> jax.Array:
+        """Speed () of the motion so far."""
+
+    def contacts(self, at: State) -> Contacts:
+        """Contact space at this state."""
+        along = None if self.axes is None else self.axes.along
+        return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None, along)
+
+    def slip(self, modes: Modes, contacts: Contacts) -> jax.Array | None:
+        """Directions of slip (m, 2) in space."""
+        if self.axes is None or contacts.tangent is None:
+            return None
+        return slip_within(self.axes, modes, contacts.tangent.rate)
+
+    def rows_of(
+        self, rates: State, at: State, modes: Modes, contacts: Contacts, force: Forces
+    ) -> list[jax.Array]:
+        """Rows of the rates, and in space those of logarithms of slip."""
+        rows = [self.regular(rates, at)]
+        if self.axes is not None:
+            rows.append(log_rates(self.axes, modes, contacts, force)[:, None])
+        return rows
 
     def projected(self, const: Any, at: State) -> State:
         """The state back on the constraints of its modes."""
@@ -204,60 +255,45 @@ class MechanicalFlow(MotionFlow):
 
     Modes (rows): for each contact, whether it is persistent, whether it sticks, the sign of its
     sliding. Margins: gaps of open contacts, normal forces of persistent ones, then friction (the
-    cone, or the speed of sliding times what is left of `regularity`). In space tangents are along
-    the `axes` of the step.
+    cone, or the speed of sliding times what is left of `regularity`).
     """
 
-    mu: jax.Array | None
     scales: Scales
     below: jax.Array  # (m,) gaps that the step begins with, 0 where they are positive
-    axes: SlipAxes | None
 
     near = 0.01  # steps in time are exact for parabolas: only the last of a landing is not in time
 
     @property
-    def spare(self) -> int:  # type: ignore[override]
-        """Rows that only limit steps: gaps by integration, in space logarithms of slip.
+    def spare(self) -> int:
+        """Gaps by integration, too: steps follow them where the base moves faster than the body."""
+        return self.like.contact_work.shape[1] + super().spare
 
-        Steps follow gaps where the base moves faster than the body, and slip until little is left.
-        """
-        m = self.like.contact_work.shape[1]
-        return m if self.axes is None else 2 * m
+    @property
+    def speed_scale(self) -> jax.Array:
+        """That of all kinetic energy."""
+        return self.scales.speed
 
     def spare_errors(
         self, settings: Settings, state: State, h: jax.Array, of_q: jax.Array
     ) -> list[jax.Array]:
-        """Errors that a step of length h may make in its spare rows; `of_q`: sizes of q in it."""
+        """Those of gaps first."""
         of_u = of_q if self.system.body.coordinates is None else h * jnp.abs(state.v)
         normal = kinematics(self.system, state.q, state.v, state.t)
         of_gap = (
             jnp.abs(normal.value) + h * jnp.abs(normal.rate) + jnp.abs(normal.gradient).T @ of_u
         )
-        errors = [settings.atol + settings.rtol * of_gap]
-        if self.axes is not None:
-            errors.append(turning_errors(self.axes, settings.rtol, self.scales.speed))
-        return errors
+        errors = settings.atol + settings.rtol * of_gap
+        return [errors, *super().spare_errors(settings, state, h, of_q)]
 
     def constants(self, modes: jax.Array) -> Modes:
         """The modes, of each contact."""
         return decoded(modes, self.sizes.dtype)
 
-    def _contacts(self, at: State) -> Contacts:
-        """Contact space at this state."""
-        along = None if self.axes is None else self.axes.along
-        return contacts_at(self.system, at.q, at.v, at.t, self.mu is not None, along)
-
-    def _slip(self, const: Modes, contacts: Contacts) -> jax.Array | None:
-        """Directions of slip (m, 2) in space."""
-        if self.axes is None or contacts.tangent is None:
-            return None
-        return slip_within(self.axes, const, contacts.tangent.rate)
-
     def field(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Rates of the state."""
         at = unpacked(self.like, y)
-        contacts = self._contacts(at)
-        force = forces(contacts, self.mu, const, self._slip(const, contacts))
+        contacts = self.contacts(at)
+        force = forces(contacts, self.mu, const, self.slip(const, contacts))
         friction, base = contact_powers(self.system, contacts, force, at.t)
         power = user_force(self.system, at.q, at.v, at.t) @ at.v
         per_contact = jnp.stack([jnp.zeros_like(friction), friction])
@@ -265,22 +301,21 @@ class MechanicalFlow(MotionFlow):
         one = jnp.ones_like(at.t)
         moves = self.system.body.rates(at.q, at.v)
         rates = State(moves, force.acceleration, one, power, base, per_contact, still)
-        spare = [jnp.where(const.active, 0.0, contacts.normal.rate)]
-        if self.axes is not None:
-            spare.append(log_rates(self.axes, const, contacts, force))
-        return jnp.concatenate([self.regular(rates, at), *(x[:, None] for x in spare)])
+        gaps_by_steps = jnp.where(const.active, 0.0, contacts.normal.rate)[:, None]
+        rows, *logs = self.rows_of(rates, at, const, contacts, force)
+        return jnp.concatenate([rows, gaps_by_steps, *logs])
 
     def margins(self, const: Modes, modes: jax.Array, y: jax.Array) -> jax.Array:
         """What must stay positive."""
         at = unpacked(self.like, y)
-        contacts = self._contacts(at)
-        slip = self._slip(const, contacts)
+        contacts = self.contacts(at)
+        slip = self.slip(const, contacts)
         margins = watched(contacts, self.mu, const, self.scales, self.below, slip)
         return self.from_margins(margins, at)
 
     def projected(self, const: Modes, at: State) -> State:
         """Gaps and velocities of persistent contacts set to 0, in the metric of M."""
-        contacts = self._contacts(at)
+        contacts = self.contacts(at)
         value, rate = contacts.normal.value, contacts.normal.rate
         if contacts.tangent is not None:  # tangentially only velocities drift
             value = jnp.concatenate([value, jnp.zeros_like(contacts.tangent.rate)])
@@ -470,7 +505,8 @@ def one_pass(
         | (steps >= settings.max_steps)
         | out_of_range(flow.system, state),
     )
-    aimed = toward_sample(moved, targets, jnp.where(sampled, free, proposed))
+    begins = jnp.minimum(free, flow.longest)  # forces may have set in since `free`
+    aimed = toward_sample(moved, targets, jnp.where(sampled, begins, proposed))
     in_time = (after.step.clock[2, 0] == 0) & (after.step.clock[3, 0] == 0)
     plain = sampled | (accept & in_time)
     aim, plan = selected(plain, (aimed.aim, aimed.plan), (moved.aim, moved.plan))
@@ -577,5 +613,5 @@ def flow_of(
         contacts = contacts_at(system, state.q, state.v, state.t, True)
         axes = slip_axes(contacts, mu, modes, scales.speed)
     return MechanicalFlow(
-        system, rounded, state.t, settings.rtol, blank, state, longest, mu, scales, below, axes
+        system, rounded, state.t, settings.rtol, blank, state, longest, mu, axes, scales, below
     )

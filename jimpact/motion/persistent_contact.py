@@ -162,6 +162,17 @@ def contacts_at(
     )
 
 
+def with_normal_forces(contacts: Contacts, push: jax.Array) -> Contacts:
+    """Contact space in which normal forces are `push` (m,), whatever friction does."""
+    m = len(push)
+    size = jnp.diagonal(contacts.delassus)[:m]
+    w = contacts.delassus.at[:, :m].set(0.0).at[:m].set(0.0)
+    pushed = contacts.approach + contacts.delassus[:, :m] @ push
+    return contacts._replace(
+        delassus=w.at[:m, :m].set(jnp.diag(size)), approach=pushed.at[:m].set(-size * push)
+    )
+
+
 def _turned(tangent: Kinematics, along: jax.Array) -> Kinematics:
     """What slides in space, along (m, 2) and at right angles to it."""
     axes = jnp.stack([along, jnp.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)

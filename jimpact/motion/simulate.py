@@ -23,6 +23,7 @@ from jimpact.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.arguments import (
     check_motion,
+    check_pile,
     check_stepped_law,
     contacts_of,
     force_of,
@@ -146,14 +147,13 @@ def simulate(
     end = as_float_array("t_end", t_end).astype(dtype)
     f = check_motion(system, q, v, start, end)
     count = as_whole("samples", samples, 2)
-    if max_events is not None:
-        as_whole("max_events", max_events, 1)
-    rows = CHUNK if max_events is None else max_events
+    rows = CHUNK if max_events is None else as_whole("max_events", max_events, 1)
     as_whole("max_steps", max_steps, 1)
     check_values("slow", slow, low=0.0, high=1.0)
     check_choice("method", method, METHODS)
     rtol, atol = _tolerances(method, dtype, rtol, atol)
     mu = friction_of(system, law, friction, q)
+    check_pile(system, q, mu, method)
     system = without_closures(system, q, v, start)
     below, rounding = closed_gaps(q, f, closed_below)
     if method != "contact_forces":
@@ -171,7 +171,7 @@ def simulate(
         arguments = system, law, mu, q, v, start, end, below, substeps, count, joint, rows
         return _waited(_stepped, arguments, progress)
     if method == "contact_forces":
-        arguments = system, force_of(law, mu), settings, q, v, start, end, count, rows
+        arguments = system, force_of(law), mu, settings, q, v, start, end, count, rows
         return _waited(_forced, arguments, progress)
     arguments = system, law, mu, settings, q, v, start, end
     if _on_host(arguments):
@@ -259,6 +259,7 @@ def _events(
 def _forced(
     system: System,
     force: Force,
+    mu: jax.Array | None,
     settings: Settings,
     q: jax.Array,
     v: jax.Array,
@@ -270,7 +271,7 @@ def _forced(
     """The motion with contact forces."""
     times = _equal_times(start, end, samples)
     m = contacts_of(system, q)
-    problem = MotionProblem(system, force, None, settings, q, v, times, m)
+    problem = MotionProblem(system, force, mu, settings, q, v, times, m)
     course, *_ = compliant_motion(problem, max_events)
     return _recorded(system, times, course)
 

@@ -188,7 +188,7 @@ def resolve(
     m = before.active.shape[0]
     stopped = jnp.zeros(m, bool)
     if settings.spatial:
-        fired, stopped = _fired_in_space(strike, before, fired)
+        fired, stopped = _fired_in_space(settings, strike, before, fired)
     stick, result = _brought_slow_to_rest(system, mu, settings, strike, struck, tight, stopped)
     jump = result.jump
     at_rest = state._replace(v=jump.v)
@@ -207,8 +207,19 @@ def resolve(
     return Outcome(after, decision, choice.modes, kind, took, code, status, wedges, choice.several)
 
 
+def slip_stops(
+    settings: Settings, before: Modes, fired: jax.Array, speed: jax.Array, speed_scale: jax.Array
+) -> jax.Array:
+    """Which contacts (m,) that slid, and whose margin has `fired`, have stopped at this `speed`.
+
+    In space a step may turn slip by so much that it lands although slip goes on.
+    """
+    slid = fired & ~before.stick
+    return slid & (speed <= STOPPED * speed_scale) if settings.spatial else slid
+
+
 def _fired_in_space(
-    strike: "_Strike", before: Modes, fired: jax.Array
+    settings: Settings, strike: "_Strike", before: Modes, fired: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """What has `fired` (2 m,), and where slip in space has stopped (m,).
 
@@ -218,8 +229,7 @@ def _fired_in_space(
     assert strike.contacts.tangent is not None
     m = before.active.shape[0]
     speed = length(by_contact(strike.contacts.tangent.rate, m))
-    slid = fired[m:] & ~before.stick
-    stopped = slid & (speed <= STOPPED * strike.scales.speed)
+    stopped = slip_stops(settings, before, fired[m:], speed, strike.scales.speed)
     return fired.at[m:].set(fired[m:] & (before.stick | stopped)), stopped
 
 
@@ -421,11 +431,16 @@ def _approach(choice: ModeChoice, slip: jax.Array, held: jax.Array) -> jax.Array
     return jax.lax.stop_gradient(share * jnp.max(jnp.where(held, jnp.abs(slip), 0.0)))
 
 
+def velocity_noise(settings: Settings, acceleration: jax.Array) -> jax.Array:
+    """Velocities () that arise at this acceleration () within the rounding of time."""
+    duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
+    return ROUNDINGS * float(jnp.finfo(duration.dtype).eps) * duration * acceleration
+
+
 def _rest(settings: Settings, scales: Scales) -> jax.Array:
     """Gap velocities () that are rounding."""
-    duration = jnp.abs(jax.lax.stop_gradient(settings.duration))
-    rounding = ROUNDINGS * float(jnp.finfo(duration.dtype).eps) * duration
-    return not_rounding(REST_SPEED, duration.dtype) * scales.speed + rounding * scales.acceleration
+    rounding = velocity_noise(settings, scales.acceleration)
+    return not_rounding(REST_SPEED, rounding.dtype) * scales.speed + rounding
 
 
 def _struck(
