@@ -145,7 +145,6 @@ from .motion.accelerations import (
     contact_problem as contact_problem,
     quasi_lagrange as quasi_lagrange,
 )
-from .motion.compliant_contact import turning_impact as turning_impact
 from .motion.fitting_motion import fit_motion as fit_motion
 from .motion.pile_contacts import PileContacts as PileContacts, pile_contacts as pile_contacts
 from .motion.record import (
@@ -164,6 +163,7 @@ from .motion.system import (
     dimer_system as dimer_system,
     gravity as gravity,
 )
+from .motion.turning_impact import turning_impact as turning_impact
 from .scene import (
     Scene as Scene,
     chain as chain,

@@ -10,7 +10,7 @@ from jimpact.bodies.blocks import Block
 from jimpact.impacts import impact
 from jimpact.laws.compliant import Compliant
 from jimpact.laws.forces import Hertz, HuntCrossley, LinearSpring
-from jimpact.motion.compliant_contact import turning_impact
+from jimpact.motion.turning_impact import turning_impact
 from jimpact.scene import chain
 
 GAPS = Block(1.0, 1.0).gap_function
