@@ -333,7 +333,7 @@ def test_what_the_sweeps_of_a_step_leave_is_part_of_its_error():
         descent=descent_lengths(k, 2),
     )
     loaded, velocity = jnp.ones((2, 1)), jnp.array([[0.0], [0.0], [1e-4], [-1e-4]])
-    after, error = flow.substep(flow.start(loaded, velocity), jnp.full((1, 1), 0.3), smooth=False)
+    after, error = flow.substep(flow.start(loaded, velocity), jnp.full((1, 1), 0.3))
     slip = np.abs(after.velocity[2:]).max()  # it takes impulses of .1, and the discs have .3
     assert slip > 2 * float(flow.tolerance[0, 0])
     assert error > 0.8 * slip
@@ -348,7 +348,7 @@ def test_a_force_that_acts_until_its_contact_turns_is_not_forgotten():
     )
     h, force = 0.1, 1.25e-3 * 100**1.5
     start = flow.start(100 * n, jnp.array([[-0.05], [-5.0]]))
-    after, error = flow.substep(start, jnp.full((1, 1), h), smooth=False)
+    after, error = flow.substep(start, jnp.full((1, 1), h))
     wrong = 0.5 * force * (h - 0.05 / (1.5 * force)) - float(after.velocity[0, 0])
     assert wrong == pytest.approx(1 / 30, rel=1e-3)
     assert wrong < error < 4 * wrong
