@@ -126,7 +126,8 @@ class Viscous(NamedTuple):
 def written_out(coupling: Any, n: int) -> jax.Array:
     """The matrix (n, n, B) of a coupling that multiplies."""
     entries = jax.tree.leaves(coupling)[0]
-    columns = jnp.eye(n, dtype=entries.dtype)[..., None] * jnp.ones(entries.shape[-1], entries.dtype)
+    one = jnp.eye(n, dtype=entries.dtype)[..., None]
+    columns = jnp.broadcast_to(one, (n, n, entries.shape[-1]))
     return jax.vmap(coupling.times, out_axes=1)(columns)
 
 

@@ -180,7 +180,7 @@ class ImplicitSteps:
         """By how much (m, B) a step's normal impulse falls with the velocity of separation."""
         if self.viscous is not None:
             return jnp.zeros_like(x)
-        some = x > 0
+        some = x > float(jnp.finfo(x.dtype).tiny) ** 0.5  # the derivative divides by the square
         slope = self.eta * self.force_scale * power(x, self.exponent) / jnp.where(some, x, 1.0)
         return h**2 * slope * self.omega / self.least**2
 
@@ -234,6 +234,8 @@ class ImplicitSteps:
         x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
         loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
         loss = loss + left + self.dropped(load, opened, gamma, after)
+        # no tangents: where nothing is stored, the slope of a root would be infinite
+        loss = jax.lax.stop_gradient(loss)
         return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
 
     def frictional_impulses(

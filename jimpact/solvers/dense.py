@@ -212,7 +212,8 @@ def regularized(
 
     The barriers keep XLA from computing what is multiplied once more for each column.
     """
-    matrix, right = jax.lax.optimization_barrier((matrix, right))
+    kept = jax.lax.optimization_barrier
+    matrix, right = kept(matrix), kept(right)  # apart: only the right side is linear in tangents
     inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
 
     def solved(right: jax.Array) -> jax.Array:
@@ -222,8 +223,8 @@ def regularized(
 
     z = solved(right)
     for _ in range(refinements):
-        missing = right - times(matrix, jax.lax.optimization_barrier(z))
-        z = z + solved(jax.lax.optimization_barrier(missing))
+        z = kept(z)
+        z = z + solved(kept(right - times(matrix, z)))
     return z
 
 
