@@ -357,6 +357,7 @@ MUTATIONS = [
     Mutation("reverse mode beyond the steps it can walk", r"most = min\(most, implicit_steps\.MOST_KEPT\)", "most = most", ("test_implicit.py::test_reverse_mode_of_many_numbers",)),
     Mutation("the square of a tiny indentation", r"some = x > float\(jnp\.finfo\(x\.dtype\)\.tiny\) \*\* 0\.5", "some = x > 0", ("test_implicit.py::test_reverse_mode_of_many_numbers",)),
     Mutation("tangents of a step by the normal rows alone", r"rows\[owner, kind\]", "rows[owner, 0]", ("test_implicit.py::test_tangents_of_the_impulses_of_a_step",)),
+    Mutation("nothing said about the method that ends", r"try \"\n", "\"\n", ("test_implicit.py::test_what_does_not_end_says_so",), "status.py"),
     Mutation("an inverse in place keeps its pivot column", r"jnp\.where\(there, 0\.0, rows\) - column", "rows - column", ("test_implicit.py::test_tangents_of_the_impulses_of_a_step",)),
     Mutation("one change of the sweeps for two", r"both = aa \* bb - ab\*\*2 > ", "both = aa * bb - ab**2 > jnp.inf + ", ("test_implicit.py::test_sweeps_of_contacts_that_stick_end_soon",)),
     Mutation("sweeps without extrapolation", r"- first \* change\.reached - second \* before\.reached", "", ("test_implicit.py::test_sweeps_of_contacts_that_stick_end_soon",)),

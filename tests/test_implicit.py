@@ -302,10 +302,13 @@ def test_random_boxes_end():
 
 
 def test_what_does_not_end_says_so():
-    """Too few steps: `max_steps`."""
+    """Too few steps: `max_steps`, which names the method that ends where contacts jam."""
     scene, v = pressed("edge")
     law = ji.LZB(0.3, 1.0, 1.5, friction=0.3, method="implicit", max_steps=5)
-    assert int(ji.impact(law, scene, v).status) == CODE["max_steps"]
+    out = ji.impact(law, scene, v)
+    assert int(out.status) == CODE["max_steps"]
+    with pytest.raises(RuntimeError, match="try method='implicit'"):
+        ji.raise_on_failure(out)
 
 
 def test_impulses_of_a_step():
