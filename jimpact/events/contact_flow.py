@@ -136,7 +136,9 @@ class Chain(NamedTuple):
 
     off_diagonal: jax.Array
 
-    dense = written_out
+    def dense(self, n: int) -> jax.Array:
+        """The matrix (n, n, B)."""
+        return written_out(self, n)
 
     def times(self, f: jax.Array) -> jax.Array:
         """`G f` (m, B)."""
@@ -185,7 +187,9 @@ class Packing:
     entries: jax.Array
     neighbours: Neighbours = dataclasses.field(metadata={"static": True})
 
-    dense = written_out
+    def dense(self, n: int) -> jax.Array:
+        """The matrix (n, n, B)."""
+        return written_out(self, n)
 
     def times(self, f: jax.Array) -> jax.Array:
         """`G f` (m, B)."""

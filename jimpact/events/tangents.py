@@ -58,11 +58,11 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
         results, rates = jax.jvp(of_values, values, tangents)
         return results, [rate for rate, needed in zip(rates, depends) if needed]
 
-    tangents = (leaves[i].tangents for i in duals)
-    results, rates = jax.vmap(push, TANGENT_AXIS, (None, TANGENT_AXIS))(*tangents)
-    rates, result_tree = iter(rates), trees[0]
+    directions = (leaves[i].tangents for i in duals)
+    results, found = jax.vmap(push, TANGENT_AXIS, (None, TANGENT_AXIS))(*directions)
+    rates = iter(found)
     return jax.tree.unflatten(
-        result_tree, [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)]
+        trees[0], [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)]
     )
 
 
