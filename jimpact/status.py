@@ -26,7 +26,12 @@ STATUS = (
     Status("inadmissible_velocity", "a contact still approaches after the impact", True),
     Status("negative_impulse", "a contact would have to pull (p < 0)", True),
     Status("infeasible", "the law has no solution for this scene", True),
-    Status("max_steps", "the step limit ended the impact before it was over", True),
+    Status(
+        "max_steps",
+        "the step limit ended the impact before it was over; for LZB and Compliant try "
+        "method='implicit'",
+        True,
+    ),
     Status("out_of_range", "an argument, or the energy of the impact, is outside its range", True),
     Status("not_finite", "the result or its input is NaN or infinite", True),
 )

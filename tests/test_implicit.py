@@ -14,6 +14,7 @@ from jimpact.contact import contact_of
 from jimpact.events import implicit_steps
 from jimpact.events.contact_flow import Chain, Dense
 from jimpact.events.impact_dynamics import method_for
+from jimpact.events.queues import SLOTS
 from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 from jimpact.status import CODE
 
@@ -167,17 +168,79 @@ def test_derivatives_with_friction():
 
 @pytest.mark.slow
 def test_reverse_mode_is_the_forward_one():
-    """Both walk the same steps: equal to rounding, on a corner and an edge."""
-    for name in ("corner", "edge"):
-        scene, v = pressed(name)
+    """Of a box on an edge, in its mass matrix: so many numbers that steps are walked back."""
+    scene, v = pressed("edge")
 
-        def after(parameters, scene=scene, v=v):
-            e, mu = parameters
-            law = ji.LZB(e, 1.0, 1.5, friction=mu, method="implicit")
-            return ji.impact(law, scene, v).velocity
+    def total(mass):
+        law = ji.LZB(0.3, 1.0, 1.5, friction=0.3, method="implicit")
+        return ji.impact(law, ji.Scene(mass, scene.normals, scene.tangents), v).velocity.sum()
 
-        at = jnp.array([0.3, 0.3])
-        np.testing.assert_allclose(jax.jacrev(after)(at), jax.jacfwd(after)(at), rtol=1e-8)
+    change = jnp.asarray(np.random.default_rng(0).normal(size=(6, 6)))
+    change = change + change.T
+    _, forward = jax.jit(lambda m: jax.jvp(total, (m,), (change,)))(scene.mass)
+    gradient = jax.jit(jax.grad(total))(scene.mass)
+    assert jnp.sum(gradient * change) == pytest.approx(float(forward), rel=1e-8)
+
+
+def test_reverse_mode_of_many_numbers(monkeypatch):
+    """Of ten balls in their masses: the forward slope; it says where it cannot walk back."""
+    masses, change = jnp.linspace(1.0, 2.0, 10), jnp.cos(jnp.arange(10.0))
+
+    def first(mass, most=9999):
+        law = ji.LZB(0.8, 1.0, 1.5, method="implicit", max_steps=most)
+        out = ji.impact(law, ji.chain(mass), np.eye(10)[0])
+        return out.velocity[0], out.status
+
+    _, forward, _ = jax.jvp(first, (masses,), (change,), has_aux=True)
+    gradient, status = jax.grad(first, has_aux=True)(masses)
+    assert gradient @ change == pytest.approx(float(forward), rel=1e-8)
+    assert status == CODE["ok"]
+    with pytest.raises(NotImplementedError, match="must be 'time' for second derivatives"):
+        jax.jacfwd(jax.grad(lambda mass: first(mass)[0]))(masses)
+    monkeypatch.setattr(implicit_steps, "MOST_KEPT", 20)
+    *_, status = jax.vjp(lambda mass: first(mass, 9998), masses, has_aux=True)
+    assert status == CODE["max_steps"]
+
+
+def test_tangents_of_the_impulses_of_a_step():
+    """Two contacts in space, one slips and unloads, one sticks: differences of the solution."""
+    rng = np.random.default_rng(1)
+    spread = rng.normal(size=(6, 6)) / 4
+    k, two = jnp.asarray(np.eye(6) + spread @ spread.T)[..., None], jnp.ones((2, 1))
+    velocity = jnp.array([0.3, -1.0, 2.0, -1.0, 0.1, 0.05])[:, None]
+    given = StepProblem(Dense(k), velocity, two, two * 0.5, 0.4 * two, descent_lengths(k, 2))
+    given = given._replace(unloading=jnp.array([[0.5], [0.0]]))
+    change = jax.tree.map(
+        lambda x: jnp.asarray(rng.normal(size=x.shape) * (np.asarray(x) != 0)), given
+    )
+    change = change._replace(descent=0 * given.descent)
+    exactly, fine = jax.jit(solve), jnp.full((1, 1), 1e-14)
+
+    def impulses(step):
+        q = jnp.zeros((6, 1))
+        for _ in range(10):
+            q, left = exactly(jax.tree.map(lambda a, b: a + step * b, given, change), q, fine)
+        assert left < 1e-13
+        return q
+
+    q = impulses(0.0)
+    slides, sticks = jnp.hypot(*q[2:4, 0]), jnp.hypot(*q[4:, 0])
+    assert 0 < q[0, 0] < 1
+    assert slides == pytest.approx(0.4 * q[0, 0])
+    assert sticks < 0.39
+    _, (rate, _) = jax.jvp(lambda p: solve(p, q, fine), (given,), (change,))
+    np.testing.assert_allclose(rate, (impulses(1e-5) - impulses(-1e-5)) / 2e-5, atol=1e-8)
+
+
+def test_slopes_of_a_queue_are_those_alone():
+    """More impacts than there are slots, of different lengths: each slope that of one impact."""
+    scene, each = ji.chain([1.0], wall=True), jnp.linspace(0.0, 0.9, 2 * SLOTS)
+
+    def after(e):
+        return ji.impact(ji.LZB(e, 1.0, 1.5, method="implicit"), scene, [1.0]).velocity[0]
+
+    slopes = jax.vmap(jax.jacfwd(after))(each)
+    np.testing.assert_allclose(slopes, -1.0, atol=1e-3)
 
 
 @pytest.mark.slow
@@ -239,10 +302,13 @@ def test_random_boxes_end():
 
 
 def test_what_does_not_end_says_so():
-    """Too few steps: `max_steps`."""
+    """Too few steps: `max_steps`, which names the method that ends where contacts jam."""
     scene, v = pressed("edge")
     law = ji.LZB(0.3, 1.0, 1.5, friction=0.3, method="implicit", max_steps=5)
-    assert int(ji.impact(law, scene, v).status) == CODE["max_steps"]
+    out = ji.impact(law, scene, v)
+    assert int(out.status) == CODE["max_steps"]
+    with pytest.raises(RuntimeError, match="try method='implicit'"):
+        ji.raise_on_failure(out)
 
 
 def test_impulses_of_a_step():
@@ -333,7 +399,7 @@ def test_what_the_sweeps_of_a_step_leave_is_part_of_its_error():
         descent=descent_lengths(k, 2),
     )
     loaded, velocity = jnp.ones((2, 1)), jnp.array([[0.0], [0.0], [1e-4], [-1e-4]])
-    after, error = flow.substep(flow.start(loaded, velocity), jnp.full((1, 1), 0.3), smooth=False)
+    after, error = flow.substep(flow.start(loaded, velocity), jnp.full((1, 1), 0.3))
     slip = np.abs(after.velocity[2:]).max()  # it takes impulses of .1, and the discs have .3
     assert slip > 2 * float(flow.tolerance[0, 0])
     assert error > 0.8 * slip
@@ -348,7 +414,7 @@ def test_a_force_that_acts_until_its_contact_turns_is_not_forgotten():
     )
     h, force = 0.1, 1.25e-3 * 100**1.5
     start = flow.start(100 * n, jnp.array([[-0.05], [-5.0]]))
-    after, error = flow.substep(start, jnp.full((1, 1), h), smooth=False)
+    after, error = flow.substep(start, jnp.full((1, 1), h))
     wrong = 0.5 * force * (h - 0.05 / (1.5 * force)) - float(after.velocity[0, 0])
     assert wrong == pytest.approx(1 / 30, rel=1e-3)
     assert wrong < error < 4 * wrong

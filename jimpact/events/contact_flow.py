@@ -123,10 +123,22 @@ class Viscous(NamedTuple):
         return jax.vmap(of_one, in_axes=-1, out_axes=-1)(self.model, x, -gamma * self.speed)
 
 
+def written_out(coupling: Any, n: int) -> jax.Array:
+    """The matrix (n, n, B) of a coupling that multiplies."""
+    entries = jax.tree.leaves(coupling)[0]
+    one = jnp.eye(n, dtype=entries.dtype)[..., None]
+    columns = jnp.broadcast_to(one, (n, n, entries.shape[-1]))
+    return jax.vmap(coupling.times, out_axes=1)(columns)
+
+
 class Chain(NamedTuple):
     """The coupling of a chain: G without its unit diagonal, (m - 1, B)."""
 
     off_diagonal: jax.Array
+
+    def dense(self, n: int) -> jax.Array:
+        """The matrix (n, n, B)."""
+        return written_out(self, n)
 
     def times(self, f: jax.Array) -> jax.Array:
         """`G f` (m, B)."""
@@ -145,6 +157,10 @@ class Dense(NamedTuple):
     """A coupling matrix (m, m, B)."""
 
     matrix: jax.Array
+
+    def dense(self, _: int) -> jax.Array:
+        """The matrix."""
+        return self.matrix
 
     def times(self, f: jax.Array) -> jax.Array:
         """`G f` (m, B)."""
@@ -170,6 +186,10 @@ class Packing:
 
     entries: jax.Array
     neighbours: Neighbours = dataclasses.field(metadata={"static": True})
+
+    def dense(self, n: int) -> jax.Array:
+        """The matrix (n, n, B)."""
+        return written_out(self, n)
 
     def times(self, f: jax.Array) -> jax.Array:
         """`G f` (m, B)."""

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from jimpact.contact import Contact
@@ -305,20 +304,11 @@ class ImpulseProgram:
 
 @dataclasses.dataclass(frozen=True)
 class ImplicitProgram(ImpulseProgram):
-    """As `ImpulseProgram`, by steps without events; both modes go through it as it is."""
+    """As `ImpulseProgram`, by steps without events."""
 
     def queues(self, *leaves: Any) -> bool:
         """Where it keeps no plan of its steps."""
-        return not self.finely
-
-    @property
-    def takes_duals(self) -> bool:
-        """No: derivatives walk the steps of the plan."""
-        return False
-
-    def reversible(self) -> "ImplicitProgram":
-        """Itself."""
-        return self
+        return not self.reverses
 
     def steps(self, problem: Problem) -> tuple[ImplicitSteps, implicit_steps.ImplicitState]:
         """The contacts of a problem, and their state before the impact."""
@@ -350,47 +340,47 @@ class ImplicitProgram(ImpulseProgram):
 
     def __call__(self, *leaves: Any) -> tuple[Any, ...]:
         """The results from the leaves of a problem; see `ImpulseProgram`."""
+        if self.reverses:
+            return self.by_plan(leaves)
+        values = without_derivatives(value_of(leaves), NotImplementedError(NO_SECOND))
+        first_only = [Dual(v, x.tangents) if is_dual(x) else v for x, v in zip(leaves, values)]
+        duals, most = any(map(is_dual, leaves)), self.most
+        if self.finely and not duals:  # the reverse mode will walk its steps
+            most = min(most, implicit_steps.MOST_KEPT)
+        flow, start = pushforward(self.steps, jax.tree.unflatten(self.tree, first_only))
+        run = implicit_steps.to_the_end(flow, start, most)
+        results = self.results(run.state)
+        return results if self.smooth else (*results, self.code(flow, run), run.passes)
 
-        def to_the_end(leaves: Any) -> tuple[implicit_steps.ImplicitRun, jax.Array]:
-            """The run and its status."""
+    def results(self, state: implicit_steps.ImplicitState) -> tuple[Any, Any, Any]:
+        """Normal impulses, tangential ones, and the time."""
+        m = len(value_of(state.indentation))
+        return *pushforward(lambda p: (p[:m], p[m:]), state.impulse), state.time
+
+    def by_plan(self, leaves: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """The results with derivatives, in a form that the reverse mode goes through, too."""
+
+        def walked(leaves: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """The results as smooth functions."""
+            still = self.steps(jax.tree.unflatten(self.tree, jax.lax.stop_gradient(leaves)))
+            run = implicit_steps.to_the_end(*still, self.most, keeps=True)
+            assert run.plan is not None
             flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
-            run = implicit_steps.to_the_end(flow, start, self.most, keeps=self.finely)
-            return run, self.code(flow, run)
-
-        def results(state: implicit_steps.ImplicitState) -> tuple[jax.Array, jax.Array, jax.Array]:
-            """Normal impulses, tangential ones, and the time."""
-            return state.impulse[:m], state.impulse[m:], state.time
-
-        @jax.custom_jvp
-        def outcome(leaves: Any) -> tuple[Any, Any]:
-            """Results with derivatives, and those without."""
-            run, code = to_the_end(leaves)
-            return results(run.state), (code, run.passes)
+            return self.results(implicit_steps.repeat(flow, start, run.plan))
 
         def tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
             """Those of the steps that were taken; events within them spoil second ones."""
             leaves = without_derivatives(primals[0], NotImplementedError(NO_SECOND))
-            run, code = to_the_end(jax.lax.stop_gradient(leaves))
-            assert run.plan is not None
-            plan, whole = run.plan, (code, run.passes)
+            return jax.jvp(walked, (leaves,), tangents)
 
-            def walked(leaves: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-                """The results as smooth functions."""
-                flow, start = self.steps(jax.tree.unflatten(self.tree, leaves))
-                return results(implicit_steps.repeat(flow, start, plan))
-
-            _, rates = jax.jvp(walked, (leaves,), tangents)
-            none = jax.tree.map(lambda x: np.zeros(x.shape, jax.dtypes.float0), whole)
-            return (results(run.state), whole), (rates, none)
-
+        outcome = jax.custom_jvp(walked)
         outcome.defjvp(tangent)
-        m = jax.tree.unflatten(self.tree, leaves).omega.shape[0]
-        smooth, whole = outcome(leaves)
-        return smooth if self.smooth else (*smooth, *whole)
+        return outcome(leaves)
 
     def code(self, flow: ImplicitSteps, run: implicit_steps.ImplicitRun) -> jax.Array:
         """Status (1, B) of a run."""
-        code = jnp.where(flow.busy(run.state), CODE["max_steps"], CODE["ok"])
+        busy = value_of(flow).busy(value_of(run.state))
+        code = jnp.where(busy, CODE["max_steps"], CODE["ok"])
         return code.astype(jnp.int32)
 
 

@@ -19,8 +19,9 @@ makes smooth steps one order better. The errors of the few dozen steps of an imp
 at about twice the one allowed in a step, but nothing bounds them where an outcome depends on its
 course without limit: a second run shows that (`check_conditioning`).
 
-Units are those of `impact_dynamics.py`. Derivatives walk the accepted steps once more, with their
-lengths fixed: they are the derivatives of what is computed, and converge with the tolerance.
+Units are those of `impact_dynamics.py`. Derivatives are those of the accepted steps with their
+lengths fixed, and converge with the tolerance. Forward mode carries all directions along (`Dual`);
+the reverse mode walks the plan of the steps once more.
 """
 
 import dataclasses
@@ -40,7 +41,8 @@ from jimpact.events.contact_flow import (
     power,
 )
 from jimpact.events.queues import run_queue, side_by_side
-from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve, solve_smooth
+from jimpact.events.tangents import dual_like, is_dual, pushforward, value_of
+from jimpact.solvers.step_impulses import StepProblem, descent_lengths, solve
 
 # The stages of friction: with 1 - 1/sqrt(2) two implicit stages are of order 2 and L-stable. No
 # other value is both.
@@ -73,9 +75,10 @@ ROUNDINGS = 64
 # A contact unloads implicitly where explicit expansion changes its force within a step by more than
 # this part. Ten times more is unstable.
 STIFF = 0.5
-# Accepted steps that derivatives can walk, in blocks; more end as `max_steps`. At the default
+# Steps that the reverse mode can walk back, in blocks; more end as `max_steps`. At the default
 # tolerance an impact takes 50 to 500. Ten times more: memory in batches.
 BLOCKS, BLOCK = 64, 64
+MOST_KEPT = BLOCKS * BLOCK
 
 
 class ImplicitState(NamedTuple):
@@ -177,7 +180,7 @@ class ImplicitSteps:
         """By how much (m, B) a step's normal impulse falls with the velocity of separation."""
         if self.viscous is not None:
             return jnp.zeros_like(x)
-        some = x > 0
+        some = x > float(jnp.finfo(x.dtype).tiny) ** 0.5  # the derivative divides by the square
         slope = self.eta * self.force_scale * power(x, self.exponent) / jnp.where(some, x, 1.0)
         return h**2 * slope * self.omega / self.least**2
 
@@ -204,9 +207,7 @@ class ImplicitSteps:
             descent = jnp.where(unloads, descent, self.sliding)
         return StepProblem(self.coupling, velocity, load, unloading, friction, descent)
 
-    def substep(
-        self, s: ImplicitState, h: jax.Array, smooth: bool
-    ) -> tuple[ImplicitState, jax.Array]:
+    def substep(self, s: ImplicitState, h: jax.Array) -> tuple[ImplicitState, jax.Array]:
         """The state after h (1, B), and its errors (1, B) that halves may not show: what it loses
         by opening within the step, what its impulses leave, and what they drop too early."""
         m = self.contacts
@@ -216,7 +217,7 @@ class ImplicitSteps:
         load = h * self.force_of(half, gamma)
         unloading = jnp.where(stiff, self.unloading(half, h), 0.0)
         impulses = self.frictional_impulses if len(s.velocity) > m else self.normal_impulses
-        impulse, rate, load, left = impulses(s, h, Middle(half, load, unloading), smooth)
+        impulse, rate, load, left = impulses(s, h, Middle(half, load, unloading))
         velocity = s.velocity + self.coupling.times(impulse)
         normal, after = impulse[:m], velocity[:m]
 
@@ -233,20 +234,22 @@ class ImplicitSteps:
         x = jnp.where(opened, -h / 2 * self.omega * after if self.gapped else 0.0, x)
         loss = self.lost(s.indentation, jnp.where(stiff, s.indentation, half), x, after)
         loss = loss + left + self.dropped(load, opened, gamma, after)
+        # no tangents: where nothing is stored, the slope of a root would be infinite
+        loss = jax.lax.stop_gradient(loss)
         return ImplicitState(x, velocity, rate, s.impulse + impulse, s.time + h), loss
 
     def frictional_impulses(
-        self, s: ImplicitState, h: jax.Array, middle: Middle, smooth: bool
+        self, s: ImplicitState, h: jax.Array, middle: Middle
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """Impulses (n, B) of both stages, those in unit time of the last one, the load, and the
         error (1, B) of the velocities that the two solves leave."""
-        m, solver = self.contacts, solve_smooth if smooth else solve
-        inner, gamma = INNER * self.tolerance, s.velocity[:m]
+        m, inner = self.contacts, INNER * self.tolerance
+        gamma = s.velocity[:m]
         half, load, unloading = middle
         # first stage of friction; the normal rows are those at the end of the step
         ahead = jnp.concatenate([gamma, s.velocity[m:] / PART])
         stage = self.problem(ahead, load, unloading, self.friction)
-        first, left = solver(stage, self.guess(s.rate, load), inner)
+        first, left = solve(stage, self.guess(s.rate, load), inner)
         if self.viscous is not None:  # the force at the velocity in the middle of the step
             load = h * self.force_of(half, gamma + self.coupling.times(first)[:m] / 2)
         side = (1 - PART) * first[m:]
@@ -255,7 +258,7 @@ class ImplicitSteps:
         # second stage, in units in which both rows have the weight PART
         stage = self.problem(base / PART, load / PART, unloading, self.friction * PART)
         guess = jnp.concatenate([first[:m] / PART, first[m:]])
-        second, left_then = solver(stage, guess, inner)
+        second, left_then = solve(stage, guess, inner)
         normal = PART * second[:m]
         impulse = jnp.concatenate([normal, side + PART * second[m:]])
         left = (1 - PART) * left + PART * left_then
@@ -271,7 +274,7 @@ class ImplicitSteps:
         return jnp.concatenate([load, rate[m:] / carried * loads])
 
     def normal_impulses(
-        self, s: ImplicitState, h: jax.Array, middle: Middle, smooth: bool
+        self, s: ImplicitState, h: jax.Array, middle: Middle
     ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
         """As `frictional_impulses`, without friction: the load, where nothing expands too fast."""
         half, load, unloading = middle
@@ -283,8 +286,7 @@ class ImplicitSteps:
         def cut(load: jax.Array, unloading: jax.Array) -> tuple[jax.Array, jax.Array]:
             """What fast expansions leave of the load."""
             problem = self.problem(s.velocity, load, unloading, self.friction)
-            solver = solve_smooth if smooth else solve
-            return solver(problem, h * s.rate, INNER * self.tolerance)
+            return solve(problem, h * s.rate, INNER * self.tolerance)
 
         some = jnp.any(unloading > 0)
         normal, left = jax.lax.cond(some, cut, lambda load, _: (load, none), load, unloading)
@@ -346,9 +348,7 @@ class ImplicitSteps:
         force = self.force_of(end.indentation, end.velocity[: self.contacts])
         return jnp.max(jnp.where(closes, h * force / 2, 0.0), axis=0, keepdims=True)
 
-    def step(
-        self, s: ImplicitState, h: jax.Array, smooth: bool = False
-    ) -> tuple[ImplicitState, jax.Array]:
+    def step(self, s: ImplicitState, h: jax.Array) -> tuple[ImplicitState, jax.Array]:
         """The state after h (1, B), whole and in halves, and its error (1, B) in tolerances."""
         lengths = jnp.stack([h, h / 2, h / 2])
         whole = jnp.asarray([True, False, False])
@@ -359,7 +359,7 @@ class ImplicitSteps:
             """The whole step first, then both halves from the same start."""
             at, big = carry
             length, is_whole = which
-            after, loss = self.substep(at, length, smooth)
+            after, loss = self.substep(at, length)
             at = jax.tree.map(lambda a, b: jnp.where(is_whole, a, b), at, after)
             big = jax.tree.map(lambda a, b: jnp.where(is_whole, b, a), big, after)
             return (at, big), jnp.where(is_whole, 0.0, loss)
@@ -391,7 +391,7 @@ def descent_of(coupling: Coupling, contacts: int) -> jax.Array:
 
 
 class Plan(NamedTuple):
-    """Lengths of the accepted steps (BLOCKS * BLOCK, 1, B), 0 where there are no more."""
+    """Lengths of the accepted steps (MOST_KEPT, 1, B), 0 where there are no more."""
 
     lengths: jax.Array
     used: jax.Array  # (1, B) how many
@@ -408,9 +408,7 @@ class ImplicitRun(NamedTuple):
     def over(self, flow: ImplicitSteps, most: int) -> jax.Array:
         """Whether (1, B) it has ended or is given up."""
         stalled = (self.length < SHORTEST) | (self.passes >= most)
-        if self.plan is not None:
-            stalled = stalled | (self.plan.used >= BLOCKS * BLOCK)
-        return stalled | ~flow.busy(self.state)
+        return stalled | ~flow.busy(value_of(self.state))
 
 
 def next_length(length: jax.Array, error: jax.Array) -> jax.Array:
@@ -423,24 +421,39 @@ def next_length(length: jax.Array, error: jax.Array) -> jax.Array:
 def attempt(
     flow: ImplicitSteps, state: ImplicitState, length: jax.Array, live: jax.Array
 ) -> tuple[ImplicitState, jax.Array, jax.Array]:
-    """State, next length and acceptance (1, B) after one step tried in `live` (1, B) runs."""
-    new, error = flow.step(flow.coasted(state), length)
+    """State, next length and acceptance (1, B) after one step tried in `live` (1, B) runs.
+
+    `flow` and `state` may have tangents (`Dual`); the length of the step has none.
+    """
+    new, error = pushforward(lambda flow, s: flow.step(flow.coasted(s), length), flow, state)
+    new, error = with_tangents_of(state, new), value_of(error)
     accepted = live & (error <= 1)
     state = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), new, state)
     return state, jnp.where(live, next_length(length, error), length), accepted
 
 
-def to_the_end(flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool) -> ImplicitRun:
-    """From the start to the end of the impact; `keeps` the plan of the steps."""
-    lanes = jnp.zeros(flow.tolerance.shape, jnp.int32)
-    plan = None
-    if keeps:
-        plan = Plan(jnp.zeros((BLOCKS * BLOCK, *lanes.shape), flow.tolerance.dtype), lanes)
-    run = ImplicitRun(start, FIRST * jnp.ones_like(flow.tolerance), lanes, plan)
+def with_tangents_of(flow: Any, state: ImplicitState) -> ImplicitState:
+    """The state with tangents where `flow` has some; guesses of impulses have none."""
+    dual = jax.tree.map(lambda x: dual_like(flow, x), state, is_leaf=is_dual)
+    return dual._replace(rate=value_of(state.rate))
+
+
+def to_the_end(
+    flow: ImplicitSteps, start: ImplicitState, most: int, keeps: bool = False
+) -> ImplicitRun:
+    """From the start to the end of the impact; `keeps` the plan of the steps.
+
+    `flow` and `start` may have tangents (`Dual`), which are carried along.
+    """
+    start = with_tangents_of((flow, start), start)
+    length = FIRST * jnp.ones_like(value_of(flow.tolerance))
+    lanes = jnp.zeros(length.shape, jnp.int32)
+    plan = Plan(jnp.zeros((MOST_KEPT, *lanes.shape), length.dtype), lanes) if keeps else None
+    run, most = ImplicitRun(start, length, lanes, plan), min(most, MOST_KEPT) if keeps else most
 
     def goes_on(flow: ImplicitSteps, run: ImplicitRun) -> jax.Array:
         """Which impacts (1, B) are not over."""
-        return ~run.over(flow, most)
+        return ~run.over(value_of(flow), most)
 
     def attempt_all(flow: ImplicitSteps, run: ImplicitRun) -> ImplicitRun:
         """One step tried in all impacts that go on."""
@@ -482,7 +495,7 @@ def _walk(
     def step(s: ImplicitState, length: jax.Array) -> tuple[ImplicitState, ImplicitState | None]:
         """One step of the plan."""
         taken = length > 0
-        new, _ = flow.step(flow.coasted(s), jnp.where(taken, length, FIRST), smooth=True)
+        new, _ = flow.step(flow.coasted(s), jnp.where(taken, length, FIRST))
         s = jax.tree.map(lambda a, b: jnp.where(taken, a, b), new, s)
         return s, s if states else None
 
@@ -511,7 +524,7 @@ def between(flow: ImplicitSteps, s: ImplicitState, ahead: jax.Array) -> Implicit
     drifted = s.indentation - ahead * flow.omega * s.velocity[: flow.contacts]
     length = ahead - (coasted.time - s.time)
     steps = ~waits & (length > 0)
-    new, _ = flow.substep(coasted, jnp.where(steps, length, FIRST), smooth=True)
+    new, _ = flow.substep(coasted, jnp.where(steps, length, FIRST))
     new = jax.tree.map(lambda a, b: jnp.where(steps, a, b), new, s)
     at = jnp.where(waits, drifted, new.indentation)
     return new._replace(indentation=at, time=s.time + ahead)

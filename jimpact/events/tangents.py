@@ -39,27 +39,30 @@ def pushforward(function: Callable[..., Any], *args: Any) -> Any:
     if not duals:
         return function(*args)
     depends: list[bool] = []  # of each result, whether it depends on a dual
+    trees: list[Any] = []  # the tree of the results
 
-    def of_values(*values: jax.Array) -> tuple[list[Any], Any]:
-        """Leaves of the results, and their tree, from the values of the duals."""
+    def of_values(*values: jax.Array) -> list[Any]:
+        """Leaves of the results, from the values of the duals."""
         replaced = dict(zip(duals, values))
         args = jax.tree.unflatten(tree, [replaced.get(i, x) for i, x in enumerate(leaves)])
         results, result_tree = jax.tree.flatten(function(*args))
         results = [jnp.asarray(x) for x in results]
         depends[:] = [isinstance(x, ad.JVPTracer) and _is_float(x) for x in results]
-        return results, result_tree
+        trees[:] = [result_tree]
+        return results
 
     values = tuple(leaves[i].value for i in duals)
 
-    def push(*tangents: jax.Array) -> list[jax.Array]:
-        """Tangents of the results that depend on a dual, in one direction."""
-        rates = jax.jvp(lambda *v: of_values(*v)[0], values, tangents)[1]
-        return [rate for rate, needed in zip(rates, depends) if needed]
+    def push(*tangents: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+        """Results, and tangents of those that depend on a dual, in one direction."""
+        results, rates = jax.jvp(of_values, values, tangents)
+        return results, [rate for rate, needed in zip(rates, depends) if needed]
 
-    results, result_tree = of_values(*values)
-    rates = iter(jax.vmap(push, TANGENT_AXIS, TANGENT_AXIS)(*(leaves[i].tangents for i in duals)))
+    directions = (leaves[i].tangents for i in duals)
+    results, found = jax.vmap(push, TANGENT_AXIS, (None, TANGENT_AXIS))(*directions)
+    rates = iter(found)
     return jax.tree.unflatten(
-        result_tree, [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)]
+        trees[0], [Dual(x, next(rates)) if needed else x for x, needed in zip(results, depends)]
     )
 
 

@@ -103,8 +103,22 @@ def _solve_two(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def inverse(matrix: jax.Array) -> jax.Array:
-    """The inverse (n, n, B), without pivots as in `solve`."""
-    return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
+    """The inverse (n, n, B), without pivots as in `solve`, which it replaces in place."""
+    n = len(matrix)
+    if n <= 2:
+        return solve(matrix, jnp.broadcast_to(unit(matrix), matrix.shape))
+    number = jnp.arange(n).reshape(n, 1, *[1] * (matrix.ndim - 2))
+
+    def eliminate(k: jax.Array, rows: jax.Array) -> jax.Array:
+        """Rows after the pivot k, whose column is that of the inverse now."""
+        here, there = number == k, number[:, 0][None] == k
+        column = jax.lax.dynamic_index_in_dim(rows, k, 1)
+        row = jax.lax.dynamic_index_in_dim(rows, k, 0)
+        scale = 1 / jax.lax.dynamic_index_in_dim(row, k, 1)
+        row = jnp.where(there, scale, row * scale)
+        return jnp.where(here, row, jnp.where(there, 0.0, rows) - column * row)
+
+    return fori_loop(0, n, eliminate, matrix)
 
 
 def solve_definite(g: jax.Array, right: jax.Array) -> jax.Array:
@@ -195,7 +209,11 @@ def regularized(
     Each refinement removes what the ridge changes where the matrix is regular, and makes the
     derivatives right in one order more: the inverse has none. In its null space the inverse is
     large, and so is its rounding: `without_null` subtracts this part of what it gives.
+
+    The barriers keep XLA from computing what is multiplied once more for each column.
     """
+    kept = jax.lax.optimization_barrier
+    matrix, right = kept(matrix), kept(right)  # apart: only the right side is linear in tangents
     inverted = jax.lax.stop_gradient(inverse(matrix + unit(matrix) * ridge[:, None]))
 
     def solved(right: jax.Array) -> jax.Array:
@@ -205,7 +223,8 @@ def regularized(
 
     z = solved(right)
     for _ in range(refinements):
-        z = z + solved(right - times(matrix, z))
+        z = kept(z)
+        z = z + solved(kept(right - times(matrix, z)))
     return z
 
 

@@ -18,8 +18,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jimpact.solvers.dense import regularized_once
+from jimpact.solvers.dense import regularized
 from jimpact.solvers.friction import in_disc
 
 # Sweeps of one solve at most; 1 to 4 are usual. What is left then is an error of the step, which
@@ -35,17 +36,16 @@ RIDGE = 1e-10
 class StepProblem(NamedTuple):
     """What the impulses (n, B) of a step have to satisfy, n = m + t."""
 
-    coupling: Any  # K (n, n, B), whose `times` multiplies
+    coupling: Any  # K (n, n, B), whose `times` multiplies and `dense` writes it out
     velocity: jax.Array  # b (n, B), the velocities without the impulses
     load: jax.Array  # F (m, B), the largest normal impulses
     unloading: jax.Array  # a >= 0 (m, B)
     friction: jax.Array  # mu (m, B)
     descent: jax.Array  # (n, B), lengths of the steps of descent, see `descent_lengths`
 
-    def projected(self, impulses: jax.Array, velocities: jax.Array) -> jax.Array:
-        """The admissible impulses (n, B) next to a step of gradient descent."""
+    def projected(self, tried: jax.Array) -> jax.Array:
+        """The admissible impulses (n, B) next to those that a step of gradient descent tries."""
         m, step = len(self.load), self.descent[: len(self.load)]
-        tried = impulses - self.descent * velocities
         cut = (self.unloading * tried[:m] + step * self.load) / (self.unloading + step)
         normal = jnp.where(self.unloading > 0, jnp.clip(cut, 0.0, self.load), self.load)
         side = tried[m:].reshape(m, -1, tried.shape[-1])
@@ -56,9 +56,24 @@ class StepProblem(NamedTuple):
         """w (n, B) after the impulses."""
         return self.velocity + self.coupling.times(impulses)
 
-    def residual(self, impulses: jax.Array) -> jax.Array:
-        """Impulses (n, B) less their projection: 0 at the solution."""
-        return impulses - self.projected(impulses, self.velocities(impulses))
+    def derivative(self, impulses: jax.Array) -> jax.Array:
+        """Of the residual `q - projected(q - d w(q))` in the impulses, (n, n, B).
+
+        A contact's projection depends on its own rows only: one direction for each kind of row.
+        """
+        n, m = len(impulses), len(self.load)
+        kinds = n // m
+        rows = np.concatenate([np.arange(m)[:, None], m + np.arange(n - m).reshape(m, -1)], axis=1)
+        owner = np.argsort(rows.ravel()) // kinds  # the contact of each row
+        tried = impulses - self.descent * self.velocities(impulses)
+        one = jnp.eye(n, dtype=tried.dtype)[..., None]
+        moved = one - self.descent[:, None] * self.coupling.dense(n)
+        matrix = jnp.broadcast_to(one, moved.shape)
+        for kind in range(kinds):
+            direction = jnp.zeros_like(tried).at[rows[:, kind]].set(1.0)
+            _, slope = jax.jvp(self.projected, (tried,), (direction,))
+            matrix = matrix - slope[:, None] * moved[rows[owner, kind]]
+        return matrix
 
 
 def descent_lengths(coupling: jax.Array, contacts: int, friction_only: bool = False) -> jax.Array:
@@ -116,12 +131,14 @@ def extrapolated(now: Move, change: Move, before: Move, weight: jax.Array) -> ja
     return now.reached - first * change.reached - second * before.reached
 
 
+@jax.custom_jvp
 def solve(
     problem: StepProblem, start: jax.Array, tolerance: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """Impulses (n, B) that leave velocities right to `tolerance` (1, B), from a guess.
 
-    And by how much (1, B) the last sweep still changed velocities.
+    And by how much (1, B) the last sweep still changed velocities. Tangents solve the tangent
+    equations of the problem, with one matrix for all directions.
     """
 
     class Sweep(NamedTuple):
@@ -144,7 +161,7 @@ def solve(
 
     def sweep(s: Sweep) -> Sweep:
         """One step of descent, and the extrapolation from it and the two before it."""
-        reached = problem.projected(s.ahead, s.velocities)
+        reached = problem.projected(s.ahead - problem.descent * s.velocities)
         now = Move(reached, reached - s.ahead)
         changes = jax.tree.map(lambda a, b: jnp.where(s.done > 0, a - b, 0.0), now, s.last)
         ahead = extrapolated(now, changes, s.change, weight)
@@ -162,22 +179,17 @@ def solve(
     return end.impulses, end.error
 
 
-def solve_smooth(
-    problem: StepProblem, start: jax.Array, tolerance: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """As `solve`, as a smooth function of the problem: derivatives solve the tangent equations."""
-    still = jax.lax.stop_gradient((problem, start, tolerance))
+@solve.defjvp
+def _solve_tangent(primals: Any, tangents: Any) -> tuple[Any, Any]:
+    """The impulses change as the residual, which stays 0, asks for; what is left has no tangent."""
+    problem, (change, _, _) = primals[0], tangents
+    impulses, left = solve(*primals)
 
-    def iterate(_residual: Any, _start: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """The impulses, and what is left."""
-        return solve(*still)
+    def reached(problem: StepProblem) -> jax.Array:
+        """Where descent from these impulses leads to."""
+        return problem.projected(impulses - problem.descent * problem.velocities(impulses))
 
-    def tangent_solve(linear: Any, right: jax.Array) -> jax.Array:
-        """The impulses (n, B) whose image under the residual's derivative is `right`."""
-        n = len(right)
-        units = jnp.broadcast_to(jnp.eye(n, dtype=right.dtype)[:, :, None], (n, *right.shape))
-        matrix = jnp.swapaxes(jax.vmap(linear)(units), 0, 1)
-        ridge = jnp.full_like(right, RIDGE)
-        return regularized_once(matrix, ridge, right)
-
-    return jax.lax.custom_root(problem.residual, still[1], iterate, tangent_solve, has_aux=True)
+    _, right = jax.jvp(reached, (problem,), (change,))
+    ridge = jnp.full_like(impulses, RIDGE)
+    rate = regularized(problem.derivative(impulses), right, ridge, 1)
+    return (impulses, left), (rate, jnp.zeros_like(left))
