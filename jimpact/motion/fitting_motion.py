@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact._checks import as_float_array
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.problem import FitProblem, Prediction
 from jimpact.law import Law
@@ -22,18 +23,28 @@ _FAILS = tuple(row.failure for row in MOTION_STATUS)
 
 
 class MotionObservable(eqx.Module):
-    """The observable of a motion."""
+    """The observable of a motion, or of K of them from several states (K, n)."""
 
     system: System
-    arguments: dict[str, Any]
+    q0: jax.Array
+    v0: jax.Array
+    options: dict[str, Any]
     observe: Observe = eqx.field(static=True)
 
     def __call__(self, law: Law) -> Prediction:
         """What is observed of the motion with this law, and the status of the motion."""
-        motion = simulate(self.system, law, **self.arguments)
-        value = self.observe(motion)
-        bad = jnp.asarray(_FAILS)[motion.status] | ~jnp.isfinite(value)
-        return Prediction(value, bad, motion.status[None])
+
+        def one(q0: jax.Array, v0: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """What is observed of one motion, whether it fails, and its status."""
+            motion = simulate(self.system, law, q0=q0, v0=v0, **self.options)
+            return self.observe(motion), jnp.asarray(_FAILS)[motion.status], motion.status
+
+        if self.q0.ndim == 1:
+            value, fails, status = one(self.q0, self.v0)
+            return Prediction(value, fails | ~jnp.isfinite(value), status[None])
+        value, fails, status = jax.vmap(one)(self.q0, self.v0)
+        bad = fails.reshape(-1, *[1] * (value.ndim - 1)) | ~jnp.isfinite(value)
+        return Prediction(value, bad, status[jnp.argmax(fails)][None])
 
 
 def fit_motion(
@@ -94,16 +105,16 @@ def fit_motion(
     0.8
     """
     record = np.asarray(measured, float)
+    q0, v0 = as_float_array("q0", q0), as_float_array("v0", v0)
     if observe is None:
-        if record.ndim != 2 or record.shape[1] != np.shape(q0)[0]:
+        *several, n = q0.shape
+        if record.ndim != q0.ndim + 1 or (*record.shape[:-2], record.shape[-1]) != q0.shape:
+            shape = ", ".join(map(str, (*several, "S", n)))
             raise ValueError(
-                f"Argument `measured` must have shape (S, {np.shape(q0)[0]}), "
-                f"but has shape {record.shape}."
+                f"Argument `measured` must have shape ({shape}), but has shape {record.shape}."
             )
-        options = {"samples": record.shape[0]} | options
-    observable = MotionObservable(
-        system, {"q0": q0, "v0": v0, "t_end": t_end} | options, observe or _positions
-    )
+        options = {"samples": record.shape[-2]} | options
+    observable = MotionObservable(system, q0, v0, {"t_end": t_end} | options, observe or _positions)
     problem = FitProblem.from_observable(
         law, observable, measured, sigma, free, bounds, priors, ties
     )
