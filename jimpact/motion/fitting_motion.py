@@ -69,7 +69,7 @@ def fit_motion(
     progress: float | None = None,
     **options: Any,
 ) -> Fit:
-    """The parameters of `law` with which `simulate` comes nearest to a measured motion.
+    """The parameters of `law` with which `simulate` comes nearest to one or more measured motions.
 
     Equation: `min sum ((observe(motion) - measured) / sigma)^2` by Levenberg-Marquardt, with the
     exact derivatives of the simulated motion, event times included: forward ones, which cost less
@@ -78,11 +78,12 @@ def fit_motion(
     Args:
         system: as in `simulate`.
         law: with start values; near enough that the events come in the right order (a record of
-            many impacts has many minima: fit its beginning first).
+            many impacts has many minima: cut it into pieces that begin in flight).
         measured: positions (S, n) at S equal times from t_start to t_end, or what `observe`
-            gives; NaN where nothing was measured.
-        q0: (n,) at the start.
-        v0: (n,) at the start.
+            gives; NaN where nothing was measured. Of K motions (pieces of a record, repeated
+            drops): (K, S, n), or K times what `observe` gives.
+        q0: (n,) at the start, (K, n) of K motions.
+        v0: (n,) at the start, (K, n) of K motions.
         t_end: [s].
         free: names of the law's parameters, or a mapping to masks over contacts, as in `fit`.
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
@@ -106,12 +107,18 @@ def fit_motion(
     """
     record = np.asarray(measured, float)
     q0, v0 = as_float_array("q0", q0), as_float_array("v0", v0)
-    if observe is None:
-        *several, n = q0.shape
-        if record.ndim != q0.ndim + 1 or (*record.shape[:-2], record.shape[-1]) != q0.shape:
-            shape = ", ".join(map(str, (*several, "S", n)))
+    for name, begin in (("q0", q0), ("v0", v0)):
+        if begin.ndim not in (1, 2) or begin.shape[:-1] != q0.shape[:-1]:
             raise ValueError(
-                f"Argument `measured` must have shape ({shape}), but has shape {record.shape}."
+                f"Argument `{name}` must have shape (n,), or (K, n) as that of the other, "
+                f"but has shape {begin.shape}."
+            )
+    if observe is None:
+        shape = (*q0.shape[:-1], "S", q0.shape[-1])
+        if record.ndim != len(shape) or (*record.shape[:-2], "S", record.shape[-1]) != shape:
+            raise ValueError(
+                f"Argument `measured` must have shape ({', '.join(map(str, shape))}), "
+                f"but has shape {record.shape}."
             )
         options = {"samples": record.shape[-2]} | options
     observable = MotionObservable(system, q0, v0, {"t_end": t_end} | options, observe or _positions)

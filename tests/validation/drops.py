@@ -412,6 +412,40 @@ def edges() -> list[str]:
     return [*head, row("impact on", "shots", "e", "mu"), row(*["---"] * 4), *lines]
 
 
+def of_an_edge(found: list[Hit], poses: np.ndarray) -> np.ndarray:
+    """Whether both corners of a side are within `NEAR` of the table, of each hit."""
+    angle = np.array([poses[hit.drop, hit.frame, 2] for hit in found])
+    tilt = (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
+    return SIDE * np.abs(np.sin(tilt)) < NEAR
+
+
+def by_events(poses: np.ndarray) -> list[str]:
+    """Section: `ji.fit_motion` on the pieces of the drops after their hits, event by event."""
+    found, frames = hits(poses), LEAD + TAIL + 1
+    q0, v0 = np.stack([hit.state for hit in found], axis=1)
+    size = np.array([1, 1, ARM])
+    own = size * np.stack([poses[hit.drop, hit.start : hit.start + frames] for hit in found])
+    own[:, 0] = np.nan  # the state itself
+    system = ji.System(BLOCK, potential=ji.gravity(BLOCK, GRAVITY))
+    training, edge = np.array([hit.drop % FOLDS > 0 for hit in found]), of_an_edge(found, poses)
+    head = ("fitted to", "pieces", "e", "mu", "left over [mm]", "held out", "left over [mm]")
+    lines = [row(*head), row(*["---"] * len(head))]
+    for what, kind in (("all hits", edge | True), ("hits on an edge", edge)):
+        chosen, other = kind & training, kind & ~training
+        measured = np.where(chosen[:, None, None], own, np.nan)
+        fit = ji.fit_motion(
+            system, ji.Moreau(0.5, friction=0.2), measured, q0, v0, (frames - 1) * FRAME,
+            ("restitution", "friction"), observe=lambda motion: size * motion.q, loss="huber",
+            samples=frames, max_events=30,
+        )  # fmt: skip
+        values = (f"{x:.3f} +- {s:.3f}" for x, s in zip(fit.value, fit.standard_error))
+        off = 1e3 * np.linalg.norm(fit.predicted - own, axis=2)[:, 1:].mean(axis=1)
+        medians = [f"{np.median(off[part]):.2f}" for part in (chosen, other)]
+        lines.append(row(what, chosen.sum(), *values, medians[0], other.sum(), medians[1]))
+        print(lines[-1], fit.warnings, flush=True)
+    return lines
+
+
 def main() -> None:
     """Write the page and the numbers of its picture."""
     poses = drops()
