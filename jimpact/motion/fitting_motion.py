@@ -42,7 +42,8 @@ class MotionObservable(eqx.Module):
         if self.q0.ndim == 1:
             value, fails, status = one(self.q0, self.v0)
             return Prediction(value, fails | ~jnp.isfinite(value), status[None])
-        value, fails, status = jax.vmap(one)(self.q0, self.v0)
+        # one after the other: lanes of a batch would wait for the one with the most events
+        value, fails, status = jax.lax.map(lambda state: one(*state), (self.q0, self.v0))
         bad = fails.reshape(-1, *[1] * (value.ndim - 1)) | ~jnp.isfinite(value)
         return Prediction(value, bad, status[jnp.argmax(fails)][None])
 
