@@ -295,7 +295,8 @@ MUTATIONS = [
     Mutation("slopes of a scan with the others held", r'slope = slope - np\.einsum\("kro,ko->kr", others, follow\)', "pass", ("test_fit.py::test_a_scan_finds_the_valleys_of_other_parameters_after_their_step",)),
     Mutation("starts far behind go on as long as others", r"np\.where\(behind, BEHIND_PASSES, SLOW_PASSES\)", "SLOW_PASSES", ("test_fit.py::test_starts_far_behind_the_best_are_given_up_sooner",)),
     Mutation("fits of their own are rivals", r"rivals & \(states\.cost", "(states.cost", ("test_fit.py::test_starts_far_behind_the_best_are_given_up_sooner",)),
-    Mutation("all motions of a fit begin alike", r"\(self\.q0, self\.v0\)\)\n        bad", "(0 * self.q0 + self.q0[:1], self.v0))\n        bad", ("test_motion.py::test_several_motions_are_fitted_at_once",), "motion/fitting_motion.py"),
+    Mutation("all motions of a fit begin alike", r"one\)\(self\.q0\[at\]", "one)(self.q0[0 * at]", ("test_motion.py::test_several_motions_are_fitted_at_once",), "motion/fitting_motion.py"),
+    Mutation("the last lot of motions is cut short", r"-\(-count // lanes\) \* lanes\), count - 1", "(count // lanes) * lanes), count - 1", ("test_motion.py::test_several_motions_are_fitted_at_once",), "motion/fitting_motion.py"),
     Mutation("the best shot for another parameter", r"merit = -np\.linalg\.inv\(after\)\[:, i, i\]", "merit = -np.linalg.inv(after)[:, 0, 0]", ("test_fit.py::test_the_next_shot_is_the_one_that_tells_most",)),
     # --- packings
     Mutation("masses of the other body in a packing", r"moved = self\.directions / self\._at_bodies\(mass\)", "moved = self.directions / self._at_bodies(mass)[:, ::-1]", ("test_piles.py::test_a_packing_has_the_contacts_of_its_body",)),

@@ -804,12 +804,20 @@ def test_several_motions_are_fitted_at_once(monkeypatch):
         return SimpleNamespace(q=heights, status=jnp.asarray(0))
 
     monkeypatch.setattr(fitting_motion, "simulate", bounces)
-    own = np.array([1.0, 2.0])[:, None, None] * 0.8 ** (2.0 * np.arange(4))[:, None]
+    monkeypatch.setattr(fitting_motion, "LANES", 2)  # the second lot has one motion
+    own = np.array([1.0, 2.0, 0.5])[:, None, None] * 0.8 ** (2.0 * np.arange(4))[:, None]
     own[1, 2] = np.nan  # was not measured
-    given = (ji.ball_system(), ji.Newton(0.7), own, [[1.0], [1.5]], [[0.0], [0.5]], 1.0)
+    given = (
+        ji.ball_system(),
+        ji.Newton(0.7),
+        own,
+        [[1.0], [1.5], [0.5]],
+        [[0.0], [0.5], [0.0]],
+        1.0,
+    )
     found = ji.fit_motion(*given, sigma=1e-3)
     np.testing.assert_allclose(found.value, 0.8, atol=1e-9)
-    assert found.degrees_of_freedom == 6
+    assert found.degrees_of_freedom == 10
     np.testing.assert_allclose(found.predicted[1, 2], 2 * 0.8**4)
 
 
