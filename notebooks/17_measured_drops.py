@@ -225,7 +225,7 @@ figure
 # better than chance (one of four), after one more measured flight it is predicted for more than
 # half of the drops. (A thick line is the same side of the square.) Predicted squares slide too far:
 # the friction that fits impacts is lower than that of sliding. The page `docs/drops.md` compares these predictions
-# with MuJoCo's, and fits e and mu to pieces of the drops with `ji.fit_motion`, event by event.
+# with MuJoCo's.
 #
 # ## Rocking
 #

@@ -19,8 +19,8 @@ from jimpact.motion.system import System
 Observe = Callable[[Motion], jax.Array]
 
 MAX_PASSES = 50  # steps of one start before it gives up
-# Motions that are simulated side by side. One by one takes eight times as long; with ten times as
-# many, all wait for the one with the most events, and linear algebra of jaxlib 0.10 may hang.
+# Motions that are simulated side by side. With ten times as many, all wait for the one with the
+# most events, and on two cores the linear algebra of jaxlib 0.10.2 hung.
 LANES = 32
 _FAILS = tuple(row.failure for row in MOTION_STATUS)
 

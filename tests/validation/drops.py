@@ -36,7 +36,6 @@ ON = 1e-3  # [m] the square turns about a corner that is nearer; noise is .04 mm
 WINDOW = 4  # frames before and after a hit while rocking; ten times more is the whole rocking
 SLOWEST = 4.0  # [rad/s] of them; .13 rad/s is noise
 HORIZON = 100  # frames after a hit in which predictions are compared; nearly all drops have them
-PIECES = 128  # of the drops, event by event; all of them take twice the time
 MUS = 0.1, 0.3, 0.6  # of the chapter's block beside measured rocking
 LAST = 199  # the last frame of a drop
 KINDS = {"first flight": 0, "flight after an impact": 1}
@@ -327,20 +326,7 @@ measured e of the corner that hits:
 
 {rocking}
 
-{edges}
-
-## Event by event
-
-`ji.fit_motion` fits pieces of the drops at once ({pieces}: all hits on an edge, and others): each begins with the state of an arc in flight, {lead} ms before
-its hit, and ends {tail} ms after it; events are located and derivatives exact. (From its first flight to rest a drop
-has 15 to 27 events. All drops end, but a fit through so many impacts has a minimum for each order of them, so
-whole drops are cut into these pieces.) Moreau's law, Huber's loss, no `sigma`: the errors take the poses of a piece for
-independent, which they are not, and are too small. *Left over*: the distance of centre and turn (the angle times the
-radius of gyration), mean over a piece, median over pieces; *held out*: of the drops whose number is divisible by
-{folds}.
-
-{events}
-"""
+{edges}"""
 
 
 def row(*cells: Any) -> str:
@@ -426,59 +412,19 @@ def edges() -> list[str]:
     return [*head, row("impact on", "shots", "e", "mu"), row(*["---"] * 4), *lines]
 
 
-def of_an_edge(found: list[Hit], poses: np.ndarray) -> np.ndarray:
-    """Whether both corners of a side are within `NEAR` of the table, of each hit."""
-    angle = np.array([poses[hit.drop, hit.frame, 2] for hit in found])
-    tilt = (angle + np.pi / 4) % (np.pi / 2) - np.pi / 4
-    return SIDE * np.abs(np.sin(tilt)) < NEAR
-
-
-def by_events(poses: np.ndarray) -> list[str]:
-    """Rows: `ji.fit_motion` on pieces of the drops after hits on a corner, and on an edge."""
-    whole, frames = hits(poses), LEAD + TAIL + 1
-    of_edges = of_an_edge(whole, poses)
-    corners = np.flatnonzero(~of_edges)
-    some = np.linspace(0, len(corners) - 1, PIECES - of_edges.sum()).astype(int)
-    found = [whole[k] for k in np.r_[np.flatnonzero(of_edges), corners[some]]]
-    edge = np.arange(PIECES) < of_edges.sum()
-    q0, v0 = np.stack([hit.state for hit in found], axis=1)
-    size = np.array([1, 1, ARM])
-    own = size * np.stack([poses[hit.drop, hit.start : hit.start + frames] for hit in found])
-    own[:, 0] = np.nan  # the state itself
-    system = ji.System(BLOCK, potential=ji.gravity(BLOCK, GRAVITY))
-    training = np.array([hit.drop % FOLDS > 0 for hit in found])
-    head = ("fitted to", "pieces", "e", "mu", "left over [mm]", "held out", "left over [mm]")
-    lines = [row(*head), row(*["---"] * len(head))]
-    for what, kind in (("a corner", ~edge), ("an edge", edge)):
-        chosen, other = kind & training, kind & ~training
-        measured = np.where(chosen[:, None, None], own, np.nan)
-        fit = ji.fit_motion(
-            system, ji.Moreau(0.5, friction=0.2), measured, q0, v0, (frames - 1) * FRAME,
-            ("restitution", "friction"), observe=lambda motion: size * motion.q, loss="huber",
-            samples=frames, max_events=30,
-        )  # fmt: skip
-        values = (f"{x:.3f} +- {s:.3f}" for x, s in zip(fit.value, fit.standard_error))
-        off = 1e3 * np.linalg.norm(fit.predicted - own, axis=2)[:, 1:].mean(axis=1)
-        medians = [f"{np.median(off[part]):.2f}" for part in (chosen, other)]
-        lines.append(row(what, chosen.sum(), *values, medians[0], other.sum(), medians[1]))
-        print(lines[-1], fit.warnings, flush=True)
-    return lines
-
-
 def main() -> None:
     """Write the page and the numbers of its picture."""
     poses = drops()
     tables, curves = predictions(simulators(), poses)
     parts = {"tables": tables, "agree": agreements(curves), "rocking": rocking_table(poses, MUS)}
-    parts |= {"edges": edges(), "events": by_events(poses)}
+    parts["edges"] = edges()
     text = {name: "\n".join(lines) for name, lines in parts.items()}
     theory = {
         "housner": float(ji.theory.housner_restitution(1.0)),
         "angle": np.degrees(float(ji.theory.rocking_kinetic_angle(1.0))),
     }
     counts = {"drops": len(poses), "impacts": len(rocking(poses).drop)}
-    counts |= {"folds": FOLDS, "members": MEMBERS, "pieces": PIECES}
-    counts |= {"lead": round(1e3 * LEAD * FRAME), "tail": round(1e3 * TAIL * FRAME)}
+    counts |= {"folds": FOLDS, "members": MEMBERS}
     PAGE.write_text(TEXT.format(**counts, **theory, **text), encoding="utf-8")
     np.savez_compressed(NUMBERS, **curves)
     print(f"written: {PAGE}")
