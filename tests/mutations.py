@@ -291,6 +291,12 @@ MUTATIONS = [
     Mutation("small-sample correction of AIC", r"2 \* k \* \(k \+ 1\) / \(n - k - 1\)", "2 * k * (k + 1) / (n - k)", ("test_selection.py::test_the_criterion_without_sigma_is_corrected_for_few_values",)),
     Mutation("height of a bounce", r"v \* jnp\.abs\(v\) / \(2 \* STANDARD_GRAVITY\)", "v * jnp.abs(v) / STANDARD_GRAVITY", ("test_observables.py::test_energies_and_bounces",)),
     Mutation("worth of angular errors upside down", r"masses\[~turns\]\.mean\(\) / masses\[turns\]\.mean\(\)", "masses[turns].mean() / masses[~turns].mean()", ("test_fit.py::test_turning_weighs_by_kinetic_energy",)),
+    Mutation("a scan takes no step of the others", r' \+ np\.einsum\("krp,kp->kr", jacobian, ahead\)', "", ("test_fit.py::test_a_scan_finds_the_valleys_of_other_parameters_after_their_step",)),
+    Mutation("slopes of a scan with the others held", r'slope = slope - np\.einsum\("kro,ko->kr", others, follow\)', "pass", ("test_fit.py::test_a_scan_finds_the_valleys_of_other_parameters_after_their_step",)),
+    Mutation("starts far behind go on as long as others", r"np\.where\(behind, BEHIND_PASSES, SLOW_PASSES\)", "SLOW_PASSES", ("test_fit.py::test_starts_far_behind_the_best_are_given_up_sooner",)),
+    Mutation("fits of their own are rivals", r"rivals & \(states\.cost", "(states.cost", ("test_fit.py::test_starts_far_behind_the_best_are_given_up_sooner",)),
+    Mutation("all motions of a fit begin alike", r"one\)\(self\.q0\[at\]", "one)(self.q0[0 * at]", ("test_motion.py::test_several_motions_are_fitted_at_once",), "motion/fitting_motion.py"),
+    Mutation("the last lot of motions is cut short", r"-\(-count // lanes\) \* lanes\), count - 1", "(count // lanes) * lanes), count - 1", ("test_motion.py::test_several_motions_are_fitted_at_once",), "motion/fitting_motion.py"),
     Mutation("the best shot for another parameter", r"merit = -np\.linalg\.inv\(after\)\[:, i, i\]", "merit = -np.linalg.inv(after)[:, 0, 0]", ("test_fit.py::test_the_next_shot_is_the_one_that_tells_most",)),
     # --- packings
     Mutation("masses of the other body in a packing", r"moved = self\.directions / self\._at_bodies\(mass\)", "moved = self.directions / self._at_bodies(mass)[:, ::-1]", ("test_piles.py::test_a_packing_has_the_contacts_of_its_body",)),

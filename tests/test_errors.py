@@ -279,6 +279,14 @@ SYSTEMS = [
         r"`measured` must have shape \(S, 1\)",
     ),
     (
+        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[1.0]], [[1.0]], [[0.0]], 1.0),
+        r"`measured` must have shape \(1, S, 1\)",
+    ),
+    (
+        lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[1.0]], [[1.0]], [0.0], 1.0),
+        r"`v0` must have shape \(n,\), or \(K, n\)",
+    ),
+    (
         lambda: ji.fit_motion(ji.ball_system(), ji.Newton(0.7), [[np.nan]], [1.0], [0.0], 1.0),
         "at least one value",
     ),

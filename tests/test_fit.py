@@ -15,6 +15,8 @@ from scipy import optimize, stats
 import jimpact as ji
 from jimpact import Law
 from jimpact.files.records import with_error
+from jimpact.fits import multistart
+from jimpact.fits.least_squares import SolverState
 from jimpact.fits.multistart import quiet
 from jimpact.fits.parameters import bounds_of, free_parameters
 from jimpact.fits.prediction import placed_fit
@@ -1401,3 +1403,53 @@ def test_a_progress_bar_can_be_asked_for(capsys):
     assert f"{count} of {count} starts done" in capsys.readouterr().err
     ji.fit(ji.Newton(0.9), PAIR, data)  # no terminal: no bar
     assert capsys.readouterr().err == ""
+
+
+# --------------------------------------------------------------------- the search, step by step
+
+
+def test_a_scan_finds_the_valleys_of_other_parameters_after_their_step():
+    """r = (cos(t) + u, u - .2): u follows by a step, so valleys of t are where cos t = -.2."""
+    t = np.linspace(-9.0, 9.0, multistart.SCANNED)
+    y, zero = np.stack([t, np.full_like(t, 5.0)], axis=1), np.zeros_like(t)  # u far from its value
+    residual = np.stack([np.cos(t) + 5.0, zero + 4.8], axis=1)
+    jacobian = np.stack([[-np.sin(t), zero], [zero + 1, zero + 1]], axis=2).transpose(1, 0, 2)
+    moved = 0.5 * (np.cos(t) + 9.8)  # Gauss-Newton in u
+    trial = y - np.stack([zero, moved], axis=1)
+    arrays = {"y": y, "trial": trial, "residual": residual, "jacobian": jacobian}
+    scan = SolverState(
+        **arrays, **dict.fromkeys(("aux", "cost", "gain", "memory", "steps", "done"))
+    )
+    own = np.arccos(-0.2)
+    found = multistart._turns(0, 2, scan, np.array([own, 0.2]))
+    expected = np.sort([s * own + 2 * np.pi * k for s in (-1, 1) for k in (-1, 0, 1)])
+    expected = expected[(np.abs(expected) < 9) & (expected != own)]
+    np.testing.assert_allclose(np.sort([at[0] for _, at in found]), expected, atol=0.02)
+    assert max(squares for squares, _ in found) < 1e-3
+
+
+@pytest.mark.parametrize(("share", "rivals", "expected"), [
+    (0.05, True, 8),  # far behind the best, and hardly gaining
+    (0.05, False, 40),  # a fit of its own
+    (0.2, True, 40),  # gains enough to catch up
+])  # fmt: skip
+def test_starts_far_behind_the_best_are_given_up_sooner(monkeypatch, share, rivals, expected):
+    """The first start is at its end with cost 1; the second, at 1e6, loses a share every 4 passes."""
+
+    def advanced(problems, states, method, limit, passes):
+        last = states.y[:, 0] == 0
+        cost = np.where(last, 1.0, (1 - share) * states.cost)
+        return replace(states, cost=cost, steps=states.steps + passes, done=last)
+
+    def begun(problems, points, method, limit):
+        count = len(points)
+        rest = dict.fromkeys(("residual", "jacobian", "aux", "gain", "trial", "memory"))
+        steps, done = np.zeros(count, int), np.zeros(count, bool)
+        return SolverState(y=points, cost=np.full(count, 1e6), steps=steps, done=done, **rest)
+
+    monkeypatch.setattr(multistart, "begin_all", begun)
+    monkeypatch.setattr(multistart, "advance_all", advanced)
+    problem = ji.FitProblem.from_shots(ji.Newton(0.9), PAIR, ji.Experiments(SHOTS, SHOTS[:, ::-1]))
+    problems, points = multistart.repeated(problem.residuals, 2), np.array([[0.0], [1.0]])
+    states = multistart.run(problems, points, "levenberg-marquardt", 40, quiet, rivals=rivals)
+    assert states.steps[1] == expected

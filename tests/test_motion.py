@@ -11,7 +11,7 @@ import pytest
 from programs import OPTIMIZED, both_ways
 
 import jimpact as ji
-from jimpact.motion import event_driven, replays
+from jimpact.motion import event_driven, fitting_motion, replays
 from jimpact.motion.dynamics import kinematics
 from jimpact.motion.flow import nan_derivatives, status_at_start
 from jimpact.motion.record import MOTION_STATUS
@@ -784,14 +784,41 @@ def test_a_mass_matrix_that_turns_singular():
 
 @pytest.mark.release
 def test_fit_through_event_times():
-    """Restitution from the times of six bounces; a motion that sees nothing says so."""
-    ball, first = ji.ball_system(), np.sqrt(2 / G)
-    times = first + 2 * first * np.cumsum(np.r_[0, 0.75 ** np.arange(1, 6)])
-    given = (ball, ji.Newton(0.7), times, [1.0], [0.0], 3.0)
+    """Two balls dropped from 1 and .25 m: each bounces in the times of its own height."""
+    heights = np.array([[1.0], [0.25]])
+    times = np.sqrt(2 * heights / G) * (1 + 2 * np.cumsum(np.r_[0, 0.75 ** np.arange(1, 6)]))
+    given = (ji.ball_system(), ji.Newton(0.7), times, heights, np.zeros((2, 1)), 3.0)
     found = ji.fit_motion(*given, observe=lambda m: m.events.time[:6], sigma=1e-3)
     np.testing.assert_allclose(found.value, 0.75, atol=1e-9)
-    assert found.degrees_of_freedom == 5
+    assert found.degrees_of_freedom == 11
     assert found.rank == 1
+
+
+def test_several_motions_are_fitted_at_once(monkeypatch):
+    """A motion of closed form in the place of the simulated one: heights of bounces, h e^2, ..."""
+
+    def bounces(system, law, q0, v0, t_end, samples):
+        heights = (q0 + v0)[None] * (law.restitution**2) ** jnp.arange(samples, dtype=q0.dtype)[
+            :, None
+        ]
+        return SimpleNamespace(q=heights, status=jnp.asarray(0))
+
+    monkeypatch.setattr(fitting_motion, "simulate", bounces)
+    monkeypatch.setattr(fitting_motion, "LANES", 2)  # the second lot has one motion
+    own = np.array([1.0, 2.0, 0.5])[:, None, None] * 0.8 ** (2.0 * np.arange(4))[:, None]
+    own[1, 2] = np.nan  # was not measured
+    given = (
+        ji.ball_system(),
+        ji.Newton(0.7),
+        own,
+        [[1.0], [1.5], [0.5]],
+        [[0.0], [0.5], [0.0]],
+        1.0,
+    )
+    found = ji.fit_motion(*given, sigma=1e-3)
+    np.testing.assert_allclose(found.value, 0.8, atol=1e-9)
+    assert found.degrees_of_freedom == 10
+    np.testing.assert_allclose(found.predicted[1, 2], 2 * 0.8**4)
 
 
 def test_lost_derivatives_are_reported(monkeypatch):

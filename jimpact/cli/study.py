@@ -79,14 +79,13 @@ class Study:
 
     def _problem(self, of_shots: Callable[..., FitProblem]) -> FitProblem:
         """The same, that of shots made by this function."""
-        names = ("free", "bounds", "priors")
-        parameters: dict[str, Any] = {name: getattr(self, name) for name in names}
+        choice = self.free, self.bounds, self.priors
         if self.measured is not None:
             value, sigma, observe = self.measured
-            return FitProblem.from_observable(self.law, observe, value, sigma, **parameters)
+            return FitProblem.from_observable(self.law, observe, value, sigma, *choice)
         if self.experiments is None:
             raise ValueError(NO_DATA)
-        return of_shots(self.law, self.scene, self.experiments, **parameters)
+        return of_shots(self.law, self.scene, self.experiments, *choice)
 
 
 def read_study(path: str | Path, law: str | None = None) -> Study:

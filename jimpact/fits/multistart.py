@@ -209,7 +209,10 @@ def run(
     Rivals are starts of one problem: those far behind the best are given up sooner. Progress
     counts `what`, with those of `earlier` runs of the same search.
     """
-    few = problems.measured.shape[1:2] <= (FEW,)  # then all fits share the program for all lanes
+    # fits of few shots, or of few values in a row, share the program for all lanes; motions take
+    # too long for that
+    listed = isinstance(problems.observe, Shots) or problems.measured.ndim == 2
+    few = listed and problems.measured.shape[1] <= FEW
     lanes = LANES if few or len(points) > 1 else 1  # not a program for each number of points
     points = points.astype(problems.offset.dtype)
     limit: Any = max_steps

@@ -568,15 +568,12 @@ class FitProblem:
 
 
 def of_shots(
-    law: Law,
-    scene: Scene | None,
-    experiments: Experiments,
-    free: Any = DEFAULT_FREE,
-    bounds: Mapping[str, Any] | None = None,
-    priors: Mapping[str, Any] | None = None,
-    ties: Mapping[str, Any] | None = None,
+    law: Law, scene: Scene | None, experiments: Experiments, free: Any = DEFAULT_FREE, *known: Any
 ) -> FitProblem:
-    """`FitProblem.from_shots`, but errors of v- count as if v+ had them, until a law is found."""
+    """`FitProblem.from_shots`, but errors of v- count as if v+ had them, until a law is found.
+
+    `known`: bounds, priors and ties.
+    """
     check_kind("law", law, Law)
     check_kind("experiments", experiments, Experiments)
     check_concrete("law", law)
@@ -599,7 +596,7 @@ def of_shots(
     observe = Shots(_in(dtype, stacked), np.asarray(filled, dtype), n)  # type: ignore[arg-type]
     sigma = None if experiments.sigma is None else np.asarray(experiments.sigma)
     errors = experiments.natural_errors(scene) if sigma is None else sigma
-    choice = _choice(law, observe, free, bounds, priors, ties)
+    choice = _choice(law, observe, free, *known)
     if law is not fixed:
         choice = choice._replace(limits=_limits_of_scene(choice))
     problem = _build(choice, observe, post, sigma, errors, dtype, unit, energy, alike)
@@ -635,9 +632,9 @@ def _choice(
     law: Law,
     observe: Observable,
     free: Any,
-    bounds: Mapping[str, Any] | None,
-    priors: Mapping[str, Any] | None,
-    ties: Mapping[str, Any] | None,
+    bounds: Mapping[str, Any] | None = None,
+    priors: Mapping[str, Any] | None = None,
+    ties: Mapping[str, Any] | None = None,
 ) -> _Choice:
     """The user's choices, checked."""
     functions = checked_ties(law, ties)

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-import equinox as eqx
+import jax
 import numpy as np
 
 from jimpact.contact import contact_of
@@ -16,6 +16,7 @@ PART_OF_NOISE = 0.1
 # Tolerance for such data: one, since each compiles a program. Standard errors move by .1 %; at one
 # ten times more derivatives lose another digit.
 COARSE = 1e-4
+_CONTACT = jax.jit(contact_of)  # remembers the shapes that it has seen; only these are asked for
 
 
 def tolerated(
@@ -28,7 +29,7 @@ def tolerated(
     if data.sigma is None or getattr(law, "rtol", COARSE) is not None:
         return law, ()
     pre, sigma = np.asarray(data.pre), np.asarray(data.sigma)
-    shapes = eqx.filter_eval_shape(contact_of, data.largest_scene(scene), pre[0])
+    shapes = _CONTACT.eval_shape(data.largest_scene(scene), pre[0])
     if not 0 < law.accuracy(shapes) < COARSE:
         return law, ()
     normals = data.each(scene, lambda each: np.asarray(each.normals))

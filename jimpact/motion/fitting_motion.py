@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jimpact._checks import as_float_array
 from jimpact.fits.fitting import Fit, fit
 from jimpact.fits.problem import FitProblem, Prediction
 from jimpact.law import Law
@@ -18,22 +19,39 @@ from jimpact.motion.system import System
 Observe = Callable[[Motion], jax.Array]
 
 MAX_PASSES = 50  # steps of one start before it gives up
+# Motions that are simulated side by side. With ten times as many, all wait for the one with the
+# most events, and on two cores the linear algebra of jaxlib 0.10.2 hung.
+LANES = 32
 _FAILS = tuple(row.failure for row in MOTION_STATUS)
 
 
 class MotionObservable(eqx.Module):
-    """The observable of a motion."""
+    """The observable of a motion, or of K of them from several states (K, n)."""
 
     system: System
-    arguments: dict[str, Any]
+    q0: jax.Array
+    v0: jax.Array
+    options: dict[str, Any]
     observe: Observe = eqx.field(static=True)
 
     def __call__(self, law: Law) -> Prediction:
         """What is observed of the motion with this law, and the status of the motion."""
-        motion = simulate(self.system, law, **self.arguments)
-        value = self.observe(motion)
-        bad = jnp.asarray(_FAILS)[motion.status] | ~jnp.isfinite(value)
-        return Prediction(value, bad, motion.status[None])
+
+        def one(q0: jax.Array, v0: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+            """What is observed of one motion, whether it fails, and its status."""
+            motion = simulate(self.system, law, q0=q0, v0=v0, **self.options)
+            return self.observe(motion), jnp.asarray(_FAILS)[motion.status], motion.status
+
+        if self.q0.ndim == 1:
+            value, fails, status = one(self.q0, self.v0)
+            return Prediction(value, fails | ~jnp.isfinite(value), status[None])
+        count = len(self.q0)
+        lanes = min(count, LANES)
+        rows = np.minimum(np.arange(-(-count // lanes) * lanes), count - 1).reshape(-1, lanes)
+        some = jax.lax.map(lambda at: jax.vmap(one)(self.q0[at], self.v0[at]), jnp.asarray(rows))
+        value, fails, status = (x.reshape(-1, *x.shape[2:])[:count] for x in some)
+        bad = fails.reshape(-1, *[1] * (value.ndim - 1)) | ~jnp.isfinite(value)
+        return Prediction(value, bad, status[jnp.argmax(fails)][None])
 
 
 def fit_motion(
@@ -58,7 +76,7 @@ def fit_motion(
     progress: float | None = None,
     **options: Any,
 ) -> Fit:
-    """The parameters of `law` with which `simulate` comes nearest to a measured motion.
+    """The parameters of `law` with which `simulate` comes nearest to one or more measured motions.
 
     Equation: `min sum ((observe(motion) - measured) / sigma)^2` by Levenberg-Marquardt, with the
     exact derivatives of the simulated motion, event times included: forward ones, which cost less
@@ -67,11 +85,12 @@ def fit_motion(
     Args:
         system: as in `simulate`.
         law: with start values; near enough that the events come in the right order (a record of
-            many impacts has many minima: fit its beginning first).
+            many impacts has many minima: cut it into pieces that begin in flight).
         measured: positions (S, n) at S equal times from t_start to t_end, or what `observe`
-            gives; NaN where nothing was measured.
-        q0: (n,) at the start.
-        v0: (n,) at the start.
+            gives; NaN where nothing was measured. Of K motions (pieces of a record, repeated
+            drops): (K, S, n), or K times what `observe` gives.
+        q0: (n,) at the start, (K, n) of K motions.
+        v0: (n,) at the start, (K, n) of K motions.
         t_end: [s].
         free: names of the law's parameters, or a mapping to masks over contacts, as in `fit`.
         sigma: standard errors of the measurement, scalar or shaped like it; None: estimated.
@@ -94,16 +113,22 @@ def fit_motion(
     0.8
     """
     record = np.asarray(measured, float)
-    if observe is None:
-        if record.ndim != 2 or record.shape[1] != np.shape(q0)[0]:
+    q0, v0 = as_float_array("q0", q0), as_float_array("v0", v0)
+    for name, begin in (("q0", q0), ("v0", v0)):
+        if begin.ndim not in (1, 2) or begin.shape[:-1] != q0.shape[:-1]:
             raise ValueError(
-                f"Argument `measured` must have shape (S, {np.shape(q0)[0]}), "
+                f"Argument `{name}` must have shape (n,), or (K, n) as that of the other, "
+                f"but has shape {begin.shape}."
+            )
+    if observe is None:
+        shape = (*q0.shape[:-1], "S", q0.shape[-1])
+        if record.ndim != len(shape) or (*record.shape[:-2], "S", record.shape[-1]) != shape:
+            raise ValueError(
+                f"Argument `measured` must have shape ({', '.join(map(str, shape))}), "
                 f"but has shape {record.shape}."
             )
-        options = {"samples": record.shape[0]} | options
-    observable = MotionObservable(
-        system, {"q0": q0, "v0": v0, "t_end": t_end} | options, observe or _positions
-    )
+        options = {"samples": record.shape[-2]} | options
+    observable = MotionObservable(system, q0, v0, {"t_end": t_end} | options, observe or _positions)
     problem = FitProblem.from_observable(
         law, observable, measured, sigma, free, bounds, priors, ties
     )
