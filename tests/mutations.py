@@ -429,6 +429,7 @@ MUTATIONS = [
     Mutation("steps that end slip in one go", r"jnp\.sum\(u \* growth, axis=1\)", "0.0 * jnp.sum(u * growth, axis=1)", ("test_motion_in_space.py::test_derivatives_of_a_sphere_that_begins_to_roll",), "*.py", "release"),
     Mutation("derivatives do not see what a contact forgets", r"flow\.switch\(aim\.modes, y, aim\.target\)\[1\]", "y", ("test_contact_forces.py::test_ball_on_a_linear_spring",), "flow.py"),
     Mutation("impulses of contact forces without derivatives", r"opened = \(\(aim\.modes != OPEN\)", "opened = ((aim.modes == OPEN)", ("test_contact_forces.py::test_ball_on_a_linear_spring",)),
+    Mutation("after a contact that is needed all others are kept", r"waiting, runs = waiting\[needed:\], runs - len\(counts\)", "kept, waiting = kept + waiting[needed:], []", ("test_methods.py::test_one_of_two_contacts_at_the_same_place_is_left_out",), "scene_advice.py"),
     Mutation("steps longer than the stiffness allows", r"\nSTABLE = 0\.5", "\nSTABLE = 50.0", ("test_contact_forces.py::test_a_body_may_rest_on_its_springs",), "compliant_flow.py"),
     Mutation("contacts of contact forces that always stick", r"~still\.stick \| \(left >= least\)", "~still.stick | (left >= left)", ("test_contact_forces.py::test_friction_on_a_slope",), "compliant_contact.py"),
     Mutation("friction of contact forces pulls", r"set\(-size \* push\)", "set(size * push)", ("test_contact_forces.py::test_friction_on_a_slope",), "persistent_contact.py"),

@@ -672,6 +672,15 @@ def test_contacts_that_an_impact_needs():
     assert second.reason(0) == "left out: no effect"
 
 
+def test_one_of_two_contacts_at_the_same_place_is_left_out():
+    """Two balls fall, each on two contacts that act alike: any two of one ball are too many."""
+    scene = ji.Scene(jnp.ones(2), jnp.array([[1.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]]))
+    advice = ji.simplest_scene(ji.Moreau(0.5), scene, [-1.0, -1.0])
+    np.testing.assert_allclose(advice.errors, 0, atol=1e-12)
+    assert [contact // 2 for contact in advice.kept] == [0, 1]
+    assert advice.error == pytest.approx(0, abs=1e-12)
+
+
 def test_friction_that_an_impact_needs():
     """A ball rolls on after 2/7 of its slip, which is oblique to both tangents."""
     v = np.zeros(15)

@@ -125,8 +125,8 @@ def simplest_scene(
 
     Equation: error `sqrt(dv^T M dv) / sqrt(v-^T M v-)`, dv the change of v+ by what is left out.
     A contact without impulse can be left out exactly: nothing approaches in its group of coupled
-    contacts, or no load reaches it. Each of the others is left out by itself, then those of the
-    least errors together, as many as `tolerance` allows. Before that, friction is left out, or
+    contacts, or no load reaches it. Each of the others is left out by itself, then together with
+    those of smaller errors, where `tolerance` allows it. Before that, friction is left out, or
     given one direction at each contact, that of its impulse (planar), where that suffices.
 
     Args:
@@ -349,15 +349,27 @@ def _together(
     tolerance: float,
     runs: int,
 ) -> tuple[np.ndarray, float]:
-    """The fewest contacts that suffice, those of the largest errors, and the error of v+.
+    """Contacts that suffice, as few as this order allows, and the error of v+.
 
-    Contacts whose error is not known come first: they have less impulse.
+    Contacts whose error is not known come first: they have less impulse. As many of the first ones
+    as possible are left out together, the next one is kept, and so on with those after it.
     """
     order = working[np.argsort(np.nan_to_num(errors[working], nan=-1.0), kind="stable")]
-    silent = np.flatnonzero(~np.isin(np.arange(len(errors)), working))
-    counts = np.unique(np.linspace(0, max(len(order) - 1, 0), min(runs, len(order) + 1), dtype=int))
-    left_out = [[*silent, *order[:count]] for count in counts]
-    error = norm.of_changes(trial.changes(v, left_out, whole.velocity[0]))
-    suffice = np.flatnonzero(error <= tolerance)
-    best = int(suffice[-1]) if len(suffice) else 0
-    return np.sort(order[counts[best] :]), float(error[best])
+    left_out = np.flatnonzero(~np.isin(np.arange(len(errors)), working)).tolist()
+    kept: list[int] = []
+    least = float(norm.of_changes(trial.changes(v, [left_out], whole.velocity[0]))[0])
+    waiting = order.tolist()
+    while waiting and runs > 0:
+        last = len(waiting) - (not kept)  # one is always kept
+        counts = np.unique(np.linspace(1, last, min(runs, last), dtype=int))
+        sets = [left_out + waiting[:count] for count in counts]
+        error = norm.of_changes(trial.changes(v, sets, whole.velocity[0])) if sets else np.ones(0)
+        suffice = np.flatnonzero(error <= tolerance)
+        best = int(suffice[-1]) if len(suffice) else -1
+        if best >= 0:
+            left_out, least = sets[best], float(error[best])
+        done = int(counts[best]) if best >= 0 else 0
+        needed = int(counts[best + 1]) if best + 1 < len(counts) else done + 1
+        kept += waiting[done:needed]
+        waiting, runs = waiting[needed:], runs - len(counts)
+    return np.sort(np.array(kept + waiting, dtype=int)), least
