@@ -453,6 +453,8 @@ MUTATIONS = [
     Mutation("levers of a mixed pile", r"lever\[\.\.\., 0\] \* ways\[\.\.\., 1\] - lever", "lever[..., 0] * ways[..., 1] + lever", ("test_piles.py::test_a_mixed_pile_has_the_contacts_of_planar_bodies",), "bodies/planar_piles.py"),
     Mutation("friction of a pile acts on the other body", r"ways\[:, 1:, 0, :places\]", "ways[:, 1:, 1, :places]", ("test_piles.py::test_a_step_of_a_packing_is_an_impact",), "motion/pile_contacts.py"),
     Mutation("a pile does not go on from where it ends", r"_OVERLAP = 0\.1", "_OVERLAP = 0.0", ("test_piles.py::test_a_mixed_pile_comes_to_rest_and_goes_on",), "bodies/piles.py", "slow"),
+    Mutation("piles by events take friction", r"if mu is not None:\n        raise ValueError\(\n            f\"Argument `friction` must be 0", "if False:\n        raise ValueError(\n            f\"Argument `friction` must be 0", ("test_piles.py::test_piles_by_events_are_refused_with_friction",), "motion/arguments.py"),
+    Mutation("piles by events say nothing of many contacts", r"if m > MANY:", "if m < 0:", ("test_piles.py::test_piles_of_many_contacts_warn_by_events",), "motion/arguments.py"),
     Mutation("arms of spheres on the wrong side", r"jnp\.stack\(\[t2, -t1\], axis=1\)", "jnp.stack([-t2, t1], axis=1)", ("test_piles.py::test_directions_are_velocities_of_the_points_that_touch",), "bodies/piles.py"),
     Mutation("spheres of the inertia of discs", r"inertia_factor = 0\.4", "inertia_factor = 0.5", ("test_piles.py::test_spheres_are_a_body_like_others",), "bodies/piles.py"),
     Mutation("bodies at rest pass each other", r"TURN \* speeds \+ setup\.slow", "TURN * speeds", ("test_motion_stepped.py::test_pulses_overturn_the_blocks_that_housner_says",), marks="slow"),

@@ -1,5 +1,7 @@
 """Piles of discs and spheres: pairs by the grid against all pairs, contacts against definitions."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import jimpact as ji
 from jimpact.bodies.neighbours import crowd_of, near_pairs
+from jimpact.motion.arguments import check_pile
 
 
 def brute_force(points, distance):
@@ -431,3 +434,14 @@ def test_piles_by_events_are_refused_with_friction():
     for method in ("events", "contact_forces"):
         with pytest.raises(ValueError, match="`friction` must be 0 for the contacts of PlanarPile"):
             ji.simulate(ji.System(pile), law, at, np.zeros(6), 1.0, method=method)
+
+
+def test_piles_of_many_contacts_warn_by_events():
+    for count, warns in ((14, False), (15, True)):  # 182 and 210 contacts, two for each pair
+        pile = ji.PlanarPile([ji.Disc(0.1)] * count)
+        at = pile.at(np.stack([0.3 * np.arange(count), np.zeros(count)], axis=1))
+        arguments = ji.System(pile), jnp.asarray(at), None
+        check_pile(*arguments, "time_stepping")
+        with warnings.catch_warnings(record=True) as said:
+            check_pile(*arguments, "events")
+        assert ["compiles for minutes" in str(x.message) for x in said] == [True] * warns
