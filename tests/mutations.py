@@ -322,7 +322,7 @@ MUTATIONS = [
     Mutation("far contacts take part in an advice", r"far = opened & ~_can_close\(", "far = opened & ~opened & ~_can_close(", ("test_methods.py::test_far_contacts_take_no_part",)),
     Mutation("friction does not couple contacts", r"if not friction:\n", "if True:\n", ("test_methods.py::test_friction_couples_contacts_with_decoupled_normals",)),
     Mutation("advice takes LZB for the truth where contacts re-close", r"apart > tolerance / SMALL_PART", "apart > 1", ("test_methods.py::test_contacts_that_close_again",), marks="slow"),
-    Mutation("contacts of the largest errors are left out", r"np\.sort\(order\[counts\[best\] :\]\)", "np.sort(order[: len(order) - counts[best]])", ("test_methods.py::test_contacts_that_an_impact_needs",)),
+    Mutation("contacts of the largest errors are left out", r"argsort\(np\.nan_to_num\(errors\[working\]", "argsort(-np.nan_to_num(errors[working]", ("test_methods.py::test_contacts_that_an_impact_needs",)),
     Mutation("unwatched velocities count", r"dv = change\[:, self\.watched\]", "dv = change[:, : len(self.watched)] if len(self.watched) > 1 else change[:, -1:]", ("test_methods.py::test_contacts_that_an_impact_needs",)),
     Mutation("one direction of friction across its impulse", r"tangents \* way\[None\]", "tangents * way[None, :, ::-1]", ("test_methods.py::test_friction_that_an_impact_needs",)),
     Mutation("the law farthest from the measured velocities", r"min\(self\.distances\.values\(\)", "max(self.distances.values()", ("test_pictures.py::test_the_law_closest_to_the_measured_velocities_is_named",)),
