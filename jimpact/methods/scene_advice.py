@@ -357,19 +357,16 @@ def _together(
     order = working[np.argsort(np.nan_to_num(errors[working], nan=-1.0), kind="stable")]
     left_out = np.flatnonzero(~np.isin(np.arange(len(errors)), working)).tolist()
     kept: list[int] = []
-    least = float(norm.of_changes(trial.changes(v, [left_out], whole.velocity[0]))[0])
     waiting = order.tolist()
-    while waiting and runs > 0:
-        last = len(waiting) - (not kept)  # one is always kept
-        counts = np.unique(np.linspace(1, last, min(runs, last), dtype=int))
+    while True:
+        last = max(len(waiting) - (not kept), 0)  # one is always kept
+        counts = np.unique(np.linspace(0, last, min(runs, last) + 1, dtype=int))
         sets = [left_out + waiting[:count] for count in counts]
-        error = norm.of_changes(trial.changes(v, sets, whole.velocity[0])) if sets else np.ones(0)
+        error = norm.of_changes(trial.changes(v, sets, whole.velocity[0]))
         suffice = np.flatnonzero(error <= tolerance)
-        best = int(suffice[-1]) if len(suffice) else -1
-        if best >= 0:
-            left_out, least = sets[best], float(error[best])
-        done = int(counts[best]) if best >= 0 else 0
-        needed = int(counts[best + 1]) if best + 1 < len(counts) else done + 1
-        kept += waiting[done:needed]
-        waiting, runs = waiting[needed:], runs - len(counts)
-    return np.sort(np.array(kept + waiting, dtype=int)), least
+        best = int(suffice[-1]) if len(suffice) else 0
+        left_out, left = sets[best], waiting[counts[best] :]
+        needed = counts[best + 1] - counts[best] if best + 1 < len(counts) else 1
+        kept, waiting, runs = kept + left[:needed], left[needed:], runs - last
+        if runs <= 0 or not waiting:
+            return np.sort(np.array(kept + waiting, dtype=int)), float(error[best])

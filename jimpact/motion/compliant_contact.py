@@ -247,10 +247,8 @@ def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _C
     """One pass of the stepper, and what it shows."""
     run = _with_friction(problem, run)
     system, times, flight, m = problem.system, problem.times, run.flight, problem.contacts
-    flow, settings = (
-        compliant_flow(problem, flight.state, flight.aim.modes, run.fastest),
-        problem.settings,
-    )
+    flow = compliant_flow(problem, flight.state, flight.aim.modes, run.fastest)
+    settings = problem.settings
     ledger = allowed_errors(system, settings, flight.state, 1.0)[: -flight.state.contact.size]
     depth, impulse = flow.scales.depth, flow.scales.impulse
     sizes = [depth, *[impulse] * (len(flight.state.contact) - 1)]
@@ -259,7 +257,8 @@ def _one_pass(problem: MotionProblem, max_events: int, run: _CompliantRun) -> _C
     before, after = flight.aim.modes[:m, 0], flown.aim.modes[:m, 0]
     closed, opened = (before == OPEN) & (after != OPEN), (before != OPEN) & (after == OPEN)
     gamma, slip = _rates(problem, flown.state)
-    fastest, turned, stopped = jnp.maximum(-gamma, 0.0), ~closed & closed, ~closed & closed
+    fastest, none = jnp.maximum(-gamma, 0.0), jnp.zeros(m, bool)
+    turned, stopped = none, none
     if problem.mu is not None:
         side, fired = phases_of(flight.aim.modes, flown.state).side, flown.event[2 * m :]
         stopped = slip_stops(settings, side, fired, slip, flow.scales.slip)

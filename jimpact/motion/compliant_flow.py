@@ -31,6 +31,7 @@ from jimpact.motion.persistent_contact import (
     friction_acceleration,
     no_modes,
     rest_acceleration,
+    slip_frames,
     with_normal_forces,
 )
 from jimpact.motion.slip_in_space import slip_axes
@@ -132,10 +133,8 @@ class CompliantFlow(MotionFlow):
         """Tangential forces, in space along the tangents of the body."""
         if self.axes is None:
             return tangential
-        along = self.axes.along
-        across = jnp.stack([-along[:, 1], along[:, 0]], axis=1)
-        each = by_contact(tangential, len(along))
-        return (each[:, :1] * along + each[:, 1:] * across).reshape(-1)
+        each = by_contact(tangential, len(self.axes.along))
+        return jnp.einsum("mj,mjk->mk", each, slip_frames(self.axes.along)).reshape(-1)
 
     def margins(self, const: Phases, modes: jax.Array, y: jax.Array) -> jax.Array:
         """Where a gap closes, a force ends or returns; where compression or friction turns."""

@@ -173,9 +173,14 @@ def with_normal_forces(contacts: Contacts, push: jax.Array) -> Contacts:
     )
 
 
+def slip_frames(along: jax.Array) -> jax.Array:
+    """Axes (m, 2, 2) in the tangent plane of each contact: `along` (m, 2), and at right angles."""
+    return jnp.stack([along, jnp.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)
+
+
 def _turned(tangent: Kinematics, along: jax.Array) -> Kinematics:
     """What slides in space, along (m, 2) and at right angles to it."""
-    axes = jnp.stack([along, jnp.stack([-along[:, 1], along[:, 0]], axis=1)], axis=1)
+    axes = slip_frames(along)
 
     def turned(rows: jax.Array) -> jax.Array:
         """Rows (.., 2 m) along the axes."""
