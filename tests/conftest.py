@@ -157,7 +157,7 @@ def pytest_terminal_summary(terminalreporter, config):
 
 def group(nodeid):
     """Tests that share programs run in one process: those of a law, else those of a file."""
-    stem = Path(nodeid.split("::")[0]).stem
+    stem = Path(nodeid.split("::")[0]).stem.removesuffix("_inside")
     laws = sorted(programs_of_laws.LAWS, key=len, reverse=True) if stem in BY_LAW else ()
     return next((law for law in laws if law in nodeid), OF_LAW.get(stem, stem))
 

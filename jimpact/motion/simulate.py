@@ -36,10 +36,11 @@ from jimpact.motion.compliant_contact import compliant_motion
 from jimpact.motion.dynamics import is_pile, kinetic, potential, recorded_gaps
 from jimpact.motion.event_driven import MotionProblem, Past, empty_checkpoint, event_driven
 from jimpact.motion.flow import Course, Settings, check_rtol
-from jimpact.motion.record import MOTION_CODE, Events, Motion, joined
+from jimpact.motion.record import Events, Motion, joined
 from jimpact.motion.stepping import time_stepping
 from jimpact.motion.system import System
 from jimpact.progress import progress_bar, waiting
+from jimpact.status import CODE
 
 # [m] Contacts with smaller gaps take part in an impact. Ten times more, and balls a few nanometres
 # apart are struck together.
@@ -229,7 +230,7 @@ def _in_runs(arguments: tuple[Any, ...], samples: int, most: int, progress: floa
             left = jnp.asarray(np.int32(most - CHUNK * len(parts)))
             motion, numbers = _events(*(*arguments, Past(left, numbers), samples, CHUNK))
             parts.append(motion.events)
-            if int(motion.status) != MOTION_CODE["max_events"] or CHUNK * len(parts) >= most:
+            if int(motion.status) != CODE["max_events"] or CHUNK * len(parts) >= most:
                 return dataclasses.replace(motion, events=joined(parts, most))
             show("motion", float(motion.events.time[-1] - start), float(end - start))
 

@@ -1,0 +1,211 @@
+"""One end-to-end call a command; what is refused is one line on stderr and exit code 2."""
+
+import inspect
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands_cases import BODIES, SAMPLED, SHOTS, STUDY, VERBS, call, written
+
+import jimpact as ji
+from jimpact import HarmonicBase
+from jimpact.cli.commands import _per_contact
+from jimpact.cli.main import keep_programs
+from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
+from jimpact.files import study_file
+from jimpact.plot.chapter.figures import CAPTIONS
+
+
+@pytest.mark.slow
+def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
+    """The bundled three balls: one e; corrected; all free; the other laws; a picture."""
+    command = [sys.executable, "-m", "jimpact.cli", "fit", "--json"]
+    monkeypatch.delenv("COLUMNS", raising=False)
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert all(len(line) <= 80 for line in done.stderr.splitlines())
+    fits = json.loads(done.stdout)["fits"]
+    for name, rms in (("as measured", 0.0166), ("momentum corrected", 0.0089)):
+        np.testing.assert_allclose(fits[name]["parameters"][0]["value"], 0.9911, atol=1e-4)
+        np.testing.assert_allclose(fits[name]["rms"], rms, atol=5e-5)
+    assert fits["all free"]["rank"] == 2
+    assert len(fits["all free"]["parameters"]) == 3
+    np.testing.assert_allclose(fits["Newton"]["parameters"][0]["value"], 0.61185, atol=1e-5)
+    assert "1.0422" in fits["as measured"]["warnings"][0]
+    assert "1.0103" in fits["as measured"]["warnings"][1]
+    assert (tmp_path / "jimpact-fit.png").stat().st_size > 10_000
+
+
+def test_a_fit_with_one_value_per_contact_keeps_the_options_of_its_law(tmp_path):
+    text = STUDY.replace("[1.0, 1.0]", "[1.0, 1.0, 1.0]").replace('"Newton"', '"lzb"\nrtol = 1e-5')
+    shots = SHOTS.replace("0.83", "0.83,0,0.1").replace("1.62", "1.62,0,0.2")
+    shots = shots.replace("post_2[m/s]", "post_2[m/s],pre_3[m/s],post_3[m/s]")
+    study, all_free = _per_contact(ji.read_study(written(tmp_path, text, shots)))
+    assert (study.law.rtol, all_free.law.rtol) == (1e-5, 1e-5)
+    np.testing.assert_array_equal(study.law.restitution, [0.9, 0.9])
+    np.testing.assert_array_equal(study.free["restitution"], [1, 1])
+
+
+def interrupted(arguments, folder, moment):
+    """Exit code and stderr of a command that gets ctrl-C at a moment: seconds, or a condition.
+
+    The exit code is None if the command ended before that moment.
+    """
+    command = [sys.executable, "-m", "jimpact.cli", *arguments]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # an ignored one would be inherited
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=folder,
+    )
+    try:
+        end = time.monotonic() + (math.inf if callable(moment) else moment)
+        while time.monotonic() < end and process.poll() is None:
+            if callable(moment) and moment():
+                break
+            time.sleep(0.02)
+        ended = process.poll() is not None
+        process.send_signal(signal.SIGINT)
+        message = process.communicate()[1]
+    finally:
+        process.kill()
+    return None if ended else process.returncode, message
+
+
+@pytest.mark.slow
+def test_ctrl_c_keeps_finished_chunks(tmp_path):
+    path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
+    run = tmp_path / "run"
+    options = ["montecarlo", path, "--folder", "run"]
+    code, message = interrupted(options, tmp_path, lambda: list(run.glob("chunk-*.npz")))
+    assert code == 130
+    assert "Finished chunks are in 'run': the same command continues from there." in message
+    assert "Traceback" not in message
+
+
+@pytest.mark.parametrize(
+    "verb",
+    [
+        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
+        for x in VERBS
+    ],
+)
+def test_ctrl_c_while_importing_and_compiling(verb, tmp_path, monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")  # so that there is something to compile
+    monkeypatch.setenv("JIMPACT_CACHE", "")
+    for moment in (0.7, 1.5, 3.0, 4.5):
+        code, message = interrupted([verb], tmp_path, moment)
+        if code is None:
+            break  # this machine had done it all before ctrl-C
+        assert code == 130
+        assert message.splitlines()[-1].startswith("jimpact")
+        assert "Traceback" not in message
+
+
+def test_the_module_ends_with_the_exit_code_of_the_command():
+    command = [sys.executable, "-m", "jimpact.cli", "fti"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "Did you mean fit?" in done.stderr
+
+
+def test_where_programs_are_kept(tmp_path, monkeypatch):
+    folder, enabled = "JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"
+    for name in (folder, enabled, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JIMPACT_CACHE"):
+        monkeypatch.setenv(name, "")
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    kept = keep_programs(no_cache=False)
+    assert kept.startswith(str(tmp_path / "jimpact"))
+    assert os.environ.pop(folder) == os.path.join(kept, "jax")
+    monkeypatch.setenv("JIMPACT_CACHE", "")
+    assert keep_programs(no_cache=False) is None
+    assert folder not in os.environ
+    monkeypatch.setenv("JIMPACT_CACHE", "mine")
+    assert keep_programs(no_cache=False).startswith("mine")
+    monkeypatch.setenv("JIMPACT_CACHE", "other")
+    keep_programs(no_cache=False)  # what is set already stays
+    assert os.environ[folder].startswith("mine")
+    assert enabled not in os.environ
+    assert keep_programs(no_cache=True) is None
+    assert os.environ[enabled] == "false"
+
+
+@pytest.mark.parametrize("kind", BODIES)
+def test_every_body_has_a_table(kind):
+    """By its constructor's arguments; its coordinates and velocities have names with units."""
+    table = tomllib.loads(f"[system]\nkind = '{kind}'\n{BODIES[kind]}")["system"]
+    body = body_of("[system]", table)
+    assert type(body) is getattr(ji, kind)
+    q = np.zeros(len(body.names))
+    velocities = body.mass_matrix(q).shape[0]
+    assert len(body.names) == (body.coordinates or velocities)
+    assert len(body.velocity_names) == velocities
+    assert all(name.endswith("]") for name in (*body.names, *body.velocity_names))
+
+
+def test_figure(tmp_path, capsys):
+    listed = call(capsys, "figure")[1].out
+    numbers = [line.split()[0] for line in listed.splitlines()]
+    assert numbers == list(CAPTIONS)
+    assert json.loads(call(capsys, "figure", "--json")[1].out) == CAPTIONS
+    assert len(call(capsys, "figure", "--csv")[1].out.splitlines()) == 1 + len(CAPTIONS)
+    code, said = call(capsys, "figure", "6.3a", "--out", str(tmp_path))
+    assert code == 0
+    assert said.out.startswith("Figure 6.3a: ")
+    assert (tmp_path / "jimpact-figure-6.3a.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fit", "--out", "file/a.png"],
+        ["fit", "--out", "file/deep/a.png"],
+        ["fit", "--report", "file/a.html"],
+        ["simulate", "--gif", "file/a.gif"],
+        ["simulate", "--portrait", "file/a.png"],
+        ["montecarlo", "--folder", "file/chunks"],
+        ["fit", "--report", "folder.html"],
+    ],
+)
+def test_unwritable_places_are_refused_before_anything_is_computed(
+    tmp_path, capsys, monkeypatch, arguments
+):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.html").mkdir()
+    monkeypatch.setattr("jimpact.cli.main.keep_programs", None)  # a command that runs would call it
+    code, said = call(capsys, *arguments)
+    assert code == 2
+    assert f"{arguments[1]} must be" in said.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "function"),
+    [
+        (study_file.MOTION_KEYS.values(), ji.simulate),
+        (study_file.FIT.allowed, ji.fit),
+        (study_file.MOTION_TABLES["fit"].allowed, ji.fit_motion),
+        (study_file.BASE_KEYS.values(), HarmonicBase),
+        ([SAMPLING_ARGUMENTS.get(x, x) for x in study_file.SAMPLING.allowed], ji.monte_carlo),
+    ],
+)
+def test_keys_of_studies_are_arguments_of_functions(arguments, function):
+    parameters = inspect.signature(function).parameters
+    passed_on = any(x.kind is x.VAR_KEYWORD for x in parameters.values())
+    assert passed_on or set(arguments) <= set(parameters)
+
+
+def test_nothing_imports_the_command_line():
+    package = Path(ji.__file__).parent
+    for path in package.rglob("*.py"):
+        if path.parent.name != "cli":
+            assert "jimpact.cli" not in path.read_text(encoding="utf-8"), path
