@@ -3,7 +3,7 @@
 The suite spends most of its time on compiling. So tests compile with little optimization, in half
 the time; `programs.values`, the held values and tests marked `long_run` compile with all of it. A
 session reports the tests with the largest programs; the whole default suite fails if it compiles
-more than BUDGET programs.
+more than BUDGET programs, and a test whose programs have products below the highest precision.
 """
 
 import hashlib
@@ -65,6 +65,7 @@ DEAR = (  # groups that take longest begin first, so that no process is left alo
 )
 
 operations = {}  # of each program that counts, by its test and the hash of its text
+coarse = []  # products of the test that runs that ask for less than the highest precision
 running = ["imports"]  # the test that runs in this process
 uncounted = [0]  # compilations of this process since it last counted its maps
 texts = tempfile.TemporaryDirectory(prefix="jimpact-programs-")  # where JAX writes programs down
@@ -82,6 +83,7 @@ def compiled(event, duration, **_):
         name = hashlib.sha256(text).hexdigest()
         if count >= COUNTS_FROM and name not in operations:
             operations[name] = running[0], count
+            coarse.extend(programs_of_laws.below_highest(text.decode()))
 
 
 def optimize(fully):
@@ -190,7 +192,9 @@ def each_test(request):
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002
     optimize(request.node.get_closest_marker("long_run") is not None)
+    coarse.clear()
     yield
+    assert not coarse, "products below the highest precision (`full_precision`): " + coarse[0]
     maps = Path("/proc/self/maps")
     if uncounted[0] < COUNT_MAPS_AFTER or not maps.exists():
         return

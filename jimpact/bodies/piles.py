@@ -32,6 +32,7 @@ from jimpact.bodies.base import (
     with_block,
 )
 from jimpact.bodies.neighbours import Candidates, all_pairs, crowd_of, near_pairs
+from jimpact.compiling import precise_jit
 from jimpact.scene import Scene
 
 # Contacts per body that may be closed by default, by dimension: equal discs have 3, equal spheres
@@ -377,7 +378,7 @@ class Pile(Body):
         """Tangents t (K, d - 1, d) of normals n (K, d), and `n x t` (K, d - 1, turns)."""
 
 
-@eqx.filter_jit
+@precise_jit
 def _active_pairs(pile: Pile, q: jax.Array, below: jax.Array) -> tuple[ActivePairs, jax.Array]:
     """The contacts that are closed at q, and the least gap."""
     return pile.active_pairs(q, q, below), pile.least_gap(q)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import optimistix as optx
 
 from jimpact._checks import as_float_array, check_values
+from jimpact.compiling import precise_jit
 from jimpact.impacts import impact
 from jimpact.law import with_parameter
 from jimpact.laws.compliant import Compliant
@@ -92,7 +93,7 @@ def calibrate(force: Force, restitution: Any, mass: Any, speed: Any) -> Force:
     return with_parameter(force, "damping", _each(_damping, undamped, m, v, e))
 
 
-@eqx.filter_jit
+@precise_jit
 def _each(function: Any, force: Force, *values: jax.Array) -> jax.Array:
     """`function(force, *values)` of scalars, over their common shape."""
     arrays = eqx.filter(force, eqx.is_array)

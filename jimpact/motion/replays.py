@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
+from jimpact.compiling import full_precision
 from jimpact.events.batches import any_lane
 from jimpact.motion.flow import State, nan_derivatives, packed, put, selected
 from jimpact.status import CODE
@@ -94,6 +95,7 @@ def differentiable(
     def value(*arrays: jax.Array) -> MotionEnd:
         return run(rebuilt(arrays), False)
 
+    @full_precision
     def rule(arrays: Any, tangents: Any) -> Any:
         """Values by the run, tangents by walking through its plan again."""
         marked = [not isinstance(t, SymbolicZero) for t in tangents]

@@ -18,7 +18,7 @@ from jimpact._checks import (
     is_traced,
 )
 from jimpact.bodies.base import check_penetration
-from jimpact.compiling import is_top_level_call, quick_jit
+from jimpact.compiling import full_precision, is_top_level_call, quick_jit
 from jimpact.law import Law
 from jimpact.laws.forces import Force
 from jimpact.motion.arguments import (
@@ -59,6 +59,7 @@ MOST_EVENTS = 100_000  # default `max_events` on the host; more only delays the 
 METHODS = ("events", "time_stepping", "contact_forces")
 
 
+@full_precision
 def simulate(
     system: System,
     law: Law,
