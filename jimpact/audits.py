@@ -142,7 +142,7 @@ def summary(out: Impact, scene: Scene, velocity: Any) -> str:
     >>> import jimpact as ji
     >>> scene, v = ji.chain([1.0, 1.0]), [1.0, 0.0]
     >>> print(ji.summary(ji.impact(ji.Newton(0.5), scene, v), scene, v).splitlines()[0])
-    status         ok: the impact is resolved within tolerance
+    status         ok: resolved within tolerance
     """
     codes = np.asarray(out.status)
     if codes.ndim:

@@ -18,7 +18,7 @@ class Status(NamedTuple):
 # wins, so rows go from mild to grave. `failure` marks impacts without a usable outcome and motions
 # that end before t_end.
 STATUS = (
-    Status("ok", "the impact is resolved within tolerance, the motion reaches t_end", False),
+    Status("ok", "resolved within tolerance", False),
     Status("impulse_not_unique", "v+ is determined, the impulses are one of many", False),
     Status("order_dependent", "the outcome depends on the order of adjacent collisions", False),
     Status("several_outcomes", "the law allows several outcomes, this is one of them", False),

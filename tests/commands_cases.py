@@ -1,6 +1,5 @@
 """What tests of commands share."""
 
-import pytest
 from command_line import main
 
 SHOTS = "pre_1[m/s],pre_2[m/s],post_1[m/s],post_2[m/s]\n1,0,0.21,0.83\n2,0,0.42,1.62\n"
@@ -37,11 +36,6 @@ chunk = 256
 low = 0.0
 high = [1e-5, 2e-5]
 """
-
-
-@pytest.fixture(autouse=True)
-def in_its_own_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 def written(folder, study=STUDY, shots=SHOTS):

@@ -1,8 +1,6 @@
 """What tests of selection share."""
 
-import jax
 import numpy as np
-import pytest
 
 import jimpact as ji
 
@@ -19,17 +17,3 @@ def after(e, noise=0.0, seed=0):
     """What a pair with these restitution coefficients does, and an error of measurement."""
     v = SPEED[:, None] * np.stack([(1 - 2 * e) / 3, (1 + e) / 3], axis=1)
     return v + noise * np.random.default_rng(seed).normal(size=v.shape)
-
-
-@pytest.fixture(scope="module")
-def found():
-    return ji.fit(
-        ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01)
-    )
-
-
-@pytest.fixture
-def lenient():
-    """The sampler mixes types and ranks, which the suite's flags forbid."""
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        yield

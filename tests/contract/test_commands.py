@@ -37,6 +37,11 @@ samples = 5
 """
 
 
+@pytest.fixture(autouse=True)
+def in_its_own_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
 def test_a_study_knows_priors_and_names_of_entries(tmp_path):
     text = STUDY.replace("restitution = 0.9", "restitution = [0.9, 0.8]")
     text = text.replace("[1.0, 1.0]", "[1.0, 1.0, 1.0]") + (

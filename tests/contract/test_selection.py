@@ -16,6 +16,20 @@ from jimpact import Scatter, read_study
 
 
 @pytest.fixture(scope="module")
+def found():
+    return ji.fit(
+        ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01)
+    )
+
+
+@pytest.fixture
+def lenient():
+    """The sampler mixes types and ranks, which the suite's flags forbid."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
+
+
+@pytest.fixture(scope="module")
 def every():
     data = ji.Experiments(PRE, after(np.full(12, 0.8), 0.01), sigma=0.01)
     return ji.fit_laws(PAIR, data, ["moreau", "newton", "restitution_matrix"], speed=True)

@@ -24,6 +24,11 @@ from jimpact.files import study_file
 from jimpact.plot.chapter.figures import CAPTIONS
 
 
+@pytest.fixture(autouse=True)
+def in_its_own_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.mark.slow
 def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
     """The bundled three balls: one e; corrected; all free; the other laws; a picture."""

@@ -1,10 +1,11 @@
 """Which law, restitution by speed, scatter between shots, the posterior."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.special import erf
-from selection_cases import PAIR
+from selection_cases import PAIR, PRE, after
 
 import jimpact as ji
 from jimpact.fits.posterior import _priors
@@ -12,6 +13,20 @@ from jimpact.fits.selection import _candidates
 from jimpact.law import with_parameter
 from jimpact.laws.velocity_dependent import approach_speed
 from jimpact.registry import simplest_first
+
+
+@pytest.fixture(scope="module")
+def found():
+    return ji.fit(
+        ji.Newton(0.5), PAIR, ji.Experiments(PRE, after(np.full(12, 0.7), 0.01), sigma=0.01)
+    )
+
+
+@pytest.fixture
+def lenient():
+    """The sampler mixes types and ranks, which the suite's flags forbid."""
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        yield
 
 
 def test_compliant_is_compared_where_gaps_matter():
