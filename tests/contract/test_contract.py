@@ -236,7 +236,9 @@ def test_one_bad_lane_stays_alone(name):
     alone, _ = programs.values(name)([good])
     assert programs.names(out.status)[0] == "not_finite"
     assert failed(out.status).tolist() == [True, failed(alone.status[0]), True]
-    np.testing.assert_array_equal(out.velocity[1], alone.velocity[0])
+    # its place in the batch decides how a processor rounds it
+    error = np.abs(out.velocity[1] - alone.velocity[0]).max()
+    assert error <= LAWS[name].accuracy * np.abs(good.velocity).max()
     with pytest.raises(RuntimeError, match=r"not_finite: .*at 0"):
         ji.raise_on_failure(out)
 

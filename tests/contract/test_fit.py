@@ -575,7 +575,9 @@ def test_a_saved_fit_is_the_same_fit(tmp_path, options):
     assert (str(again), again.to_dict()) == (str(found), found.to_dict())
     for a, b in zip(*(jax.tree.leaves(x.problem.residuals) for x in (found, again))):
         np.testing.assert_allclose(a, b, rtol=1e-12)
-    np.testing.assert_array_equal(again.problem.residual([0.7]), found.problem.residual([0.7]))
+    # the weights of the saved problem come from another program: rounding of a few products
+    residuals = [x.problem.residual([0.7]) for x in (again, found)]
+    np.testing.assert_allclose(*residuals, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(again.predict(SHOTS).low, found.predict(SHOTS).low, rtol=1e-12)
     record = json.loads(path.read_text())
     assert record["versions"]["jax"] == jax.__version__

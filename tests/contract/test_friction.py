@@ -17,7 +17,6 @@ from friction_reference import blocks, regularized, routh, small_steps
 from programs import CODE, OPTIMIZED, failed, names
 
 import jimpact as ji
-from jimpact.events import queues
 
 close = np.testing.assert_allclose
 
@@ -38,15 +37,6 @@ LAWS = {
     ),
 }
 KINEMATIC = ("newton", "moreau", "matrix", "binary")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def few_slots():
-    """Fewer slots than impacts, so that the batches of these tests are queues."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(queues, "SLOTS", 8)
-        patch.setattr(queues, "FREE", 3)
-        yield
 
 
 @functools.cache
