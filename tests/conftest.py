@@ -107,8 +107,9 @@ def pytest_configure(config):
     optimize(False)
     if hasattr(config, "workerinput"):
         return
-    if "XLA_FLAGS" not in os.environ and is_known(QUICK):
-        os.environ["XLA_FLAGS"] = QUICK
+    flags = os.environ.get("XLA_FLAGS", "")
+    if QUICK.partition("=")[0] not in flags and is_known(QUICK):
+        os.environ["XLA_FLAGS"] = f"{flags} {QUICK}".strip()
     config.pluginmanager.register(Workers())
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         folder = tempfile.TemporaryDirectory(prefix="jimpact-tests-")
