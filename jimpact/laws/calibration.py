@@ -1,7 +1,7 @@
 """Requested against measured restitution: the damping that gives a pair its coefficient.
 
 A pair's coefficient of restitution does not determine what a chain does: forces with the same e at
-the same speed spread an impact differently. `compare_rheologies` shows it.
+the same speed spread an impact differently (docs/compliant.md).
 """
 
 from typing import Any

@@ -385,7 +385,7 @@ def test_stability(tmp_path, capsys):
 def test_bare_call_greets(capsys):
     code, said = call(capsys)
     assert code == 0
-    for verb in (*VERBS, "figure", "new", "laws"):
+    for verb in (*VERBS, "new", "laws"):
         assert f"{verb}" in said.out
     assert max(map(len, said.out.splitlines())) <= 80
 
@@ -472,8 +472,6 @@ def test_laws(capsys, tmp_path, monkeypatch):
         (["chart", "--methods", "magic"], "`methods` must be one of"),
         (["chart", "--shot", "2"], "--shot must lie in [1, 1], but is 2"),
         (["chart", "three_balls_gaps.toml"], "--velocity must be given"),
-        (["figure", "6.10"], "`number` must be one of 5.5, 6.1, 6.2, 6.3a"),
-        (["figure", "6.4", "--out", "6.9"], "--out must end in .png"),
         (["stability", "--methods", "rk5"], "`methods` must be one of"),
     ],
 )

@@ -21,7 +21,6 @@ from jimpact.cli.commands import _per_contact
 from jimpact.cli.main import keep_programs
 from jimpact.cli.study import SAMPLING_ARGUMENTS, body_of
 from jimpact.files import study_file
-from jimpact.plot.chapter.figures import CAPTIONS
 
 
 @pytest.fixture(autouse=True)
@@ -156,18 +155,6 @@ def test_every_body_has_a_table(kind):
     assert len(body.names) == (body.coordinates or velocities)
     assert len(body.velocity_names) == velocities
     assert all(name.endswith("]") for name in (*body.names, *body.velocity_names))
-
-
-def test_figure(tmp_path, capsys):
-    listed = call(capsys, "figure")[1].out
-    numbers = [line.split()[0] for line in listed.splitlines()]
-    assert numbers == list(CAPTIONS)
-    assert json.loads(call(capsys, "figure", "--json")[1].out) == CAPTIONS
-    assert len(call(capsys, "figure", "--csv")[1].out.splitlines()) == 1 + len(CAPTIONS)
-    code, said = call(capsys, "figure", "6.3a", "--out", str(tmp_path))
-    assert code == 0
-    assert said.out.startswith("Figure 6.3a: ")
-    assert (tmp_path / "jimpact-figure-6.3a.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize(
