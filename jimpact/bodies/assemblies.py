@@ -24,6 +24,7 @@ from jimpact.bodies.base import (
     planar_weight,
 )
 from jimpact.bodies.polygons import Cornered, Disc
+from jimpact.compiling import full_precision
 
 # [rad] Direction between two polygons, of which one has an odd number of sides, at which their two
 # contacts change places, see `_all_sides`: none of the usual slopes.
@@ -127,6 +128,7 @@ class PlanarBodies(Body):
         """`V = g sum m_i y_i`."""
         return planar_weight(self.mass, acceleration)
 
+    @full_precision
     def contacts(self, q: jax.Array) -> ContactPoints:
         """Gaps, points and normals at q (3 b,); `between` says of which bodies."""
         places, parts = self._places(q), []
