@@ -28,7 +28,7 @@ def in_its_own_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_fit_as_a_user_runs_it(tmp_path, monkeypatch):
     """The bundled three balls: one e; corrected; all free; the other laws; a picture."""
     command = [sys.executable, "-m", "jimpact.cli", "fit", "--json"]
@@ -85,7 +85,7 @@ def interrupted(arguments, folder, moment):
     return None if ended else process.returncode, message
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_ctrl_c_keeps_finished_chunks(tmp_path):
     path = written(tmp_path, SAMPLED.replace("samples = 600", "samples = 100_000_000"))
     run = tmp_path / "run"
@@ -99,7 +99,7 @@ def test_ctrl_c_keeps_finished_chunks(tmp_path):
 @pytest.mark.parametrize(
     "verb",
     [
-        pytest.param(x, marks=pytest.mark.slow if x == "simulate" else pytest.mark.release)
+        pytest.param(x, marks=pytest.mark.release if x == "simulate" else pytest.mark.release)
         for x in VERBS
     ],
 )

@@ -225,7 +225,7 @@ def test_a_motion_goes_on():
         jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * 2), found).then(later)
 
 
-@pytest.mark.slow
+@pytest.mark.release
 def test_picture_of_a_motion(tmp_path):
     system, found = rocked(ji.HarmonicBase(0.01, 4.0, direction="vertical"))
     figure = ji.plot.motion(found, "dimer", system=system)
