@@ -166,6 +166,7 @@ class PlanarBodies(Body):
         moves = moving(self.between, len(self.bodies))[..., None]
         return (jnp.asarray(moves, q.dtype) * rows).reshape(len(moves), -1).T
 
+    @full_precision
     def valid(self, q: jax.Array) -> jax.Array:
         """The least of the margins () [m], see the class."""
         places, margins = self._places(q), [super().valid(q)[None]]
@@ -372,6 +373,7 @@ def _off_cut(places: _Places, i: int, j: int) -> jax.Array:
     return jnp.maximum(off, apart - _TOUCHING)
 
 
+@full_precision
 def facing_now(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Sides () of two polygons that face each other, and the normal (2,) from a to b.
 

@@ -158,6 +158,7 @@ class Residuals(eqx.Module):
         error = jnp.where(self.weight > 0, error, 0.0)  # its derivatives may be NaN
         return self.mixed(error * self.weight).reshape(-1), prediction
 
+    @full_precision
     def mixed(self, weighted: Any) -> Any:
         """Weighted errors, shaped like what was measured, as independent ones."""
         if self.mixing is None:
