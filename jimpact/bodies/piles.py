@@ -335,9 +335,12 @@ class Pile(Body):
 
     def _along(self, q: jax.Array, i: jax.Array, j: jax.Array) -> jax.Array:
         """Normal and tangents (K, d, 2, d + turns) of contacts of body i with body or wall j."""
-        other = jnp.minimum(j, self.count - 1)
-        arm = jnp.where(j < self.count, self.radii[other], 0.0)
-        return self._directions(self._normals(q, i, other, j - self.count), self.radii[i], arm)
+        other, bodies = jnp.minimum(j, self.count - 1), j < self.count
+        # forces act at one point of both bodies, in the middle of a gap or an overlap: only so do
+        # they keep the angular momentum
+        half = jnp.where(bodies, 0.5 * self._pair_gaps(q, i, other), 0.0)
+        first, second = self.radii[i] + half, jnp.where(bodies, self.radii[other] + half, 0.0)
+        return self._directions(self._normals(q, i, other, j - self.count), first, second)
 
     def _normals(self, q: jax.Array, i: Any, other: Any, wall: Any) -> jax.Array:
         """Unit normals (K, d) towards body i, of a wall where its number is not negative."""

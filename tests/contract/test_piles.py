@@ -59,7 +59,7 @@ def test_pairs_that_meet_within_a_step_may_be_two_cells_apart():
 
 
 def test_directions_are_velocities_of_the_points_that_touch(packing):
-    """gamma and slip by (v_i - w_i x R_i n) - (v_j + w_j x R_j n), walls at rest."""
+    """gamma and slip of both bodies at the middle of their gap or overlap, walls at rest."""
     spheres, q, _ = packing
     pairs = contacts(spheres, q, q)
     closed = np.asarray(pairs.closed)
@@ -72,14 +72,15 @@ def test_directions_are_velocities_of_the_points_that_touch(packing):
     for (a, b), number, found, way in zip(
         bodies, np.asarray(pairs.number)[closed], rates, directions, strict=True
     ):
-        n = way[0, 0, :3]
+        n, half = way[0, 0, :3], 0.0
         if b < spheres.count:
+            half = 0.5 * (np.linalg.norm(at[a] - at[b]) - radii[a] - radii[b])
             np.testing.assert_allclose(n, (at[a] - at[b]) / np.linalg.norm(at[a] - at[b]))
         else:
             wall = np.asarray(spheres.walls)[number % (spheres.count + 3) - spheres.count]
             np.testing.assert_array_equal(n, wall[:3])
-        point = v[a, :3] - radii[a] * np.cross(v[a, 3:], n)
-        point -= v[b, :3] + radii[b] * np.cross(v[b, 3:], n)
+        point = v[a, :3] - (radii[a] + half) * np.cross(v[a, 3:], n)
+        point -= v[b, :3] + (radii[b] + half) * np.cross(v[b, 3:], n)
         t1, t2 = way[1:, 0, :3]
         np.testing.assert_allclose(
             np.stack([n, t1, t2]) @ np.stack([n, t1, t2]).T, np.eye(3), atol=1e-15
