@@ -473,6 +473,9 @@ def _search(problem: _FrictionProblem) -> tuple[_Modes, jax.Array, jax.Array]:
     started = problem.complementary and (planar or problem.load is None)
     if started and planar:
         x, code = _by_lemke(problem)
+        solved = jnp.all(jnp.isfinite(x))  # not on a singular support: sweeps start from 0
+        x = jnp.where(solved, x, 0.0)
+        code = jnp.where(solved, code, CODE["ok"])
     elif started:
         x = within_cones(
             problem.matrix,
