@@ -151,6 +151,24 @@ def block_inverse(matrix: jax.Array) -> jax.Array:
     return fori_loop(0, m, eliminate, matrix)
 
 
+def block_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
+    """`matrix^-1 right` (m, b, c) of one matrix (m, b, m, b), block by block, without pivots."""
+    m, b = matrix.shape[:2]
+    perturbation = float(jnp.finfo(matrix.dtype).eps) ** 2  # of a block that is singular
+    rows = jnp.concatenate([matrix.reshape(m, b, m * b), right], axis=2)
+
+    def eliminate(i: jax.Array, rows: jax.Array) -> jax.Array:
+        """Rows after the block pivot i."""
+        row = jax.lax.dynamic_index_in_dim(rows, i, 0, keepdims=False)
+        block = jax.lax.dynamic_slice_in_dim(row, i * b, b, axis=1)
+        row = _small_inverse(block[..., None], perturbation)[..., 0] @ row
+        column = jax.lax.dynamic_slice_in_dim(rows, i * b, b, axis=2)
+        rows = rows - jnp.einsum("jab,bk->jak", column, row)
+        return jax.lax.dynamic_update_index_in_dim(rows, row, i, 0)
+
+    return fori_loop(0, m, eliminate, rows)[..., m * b :]
+
+
 def _small_inverse(block: jax.Array, perturbation: float) -> jax.Array:
     """Inverses of blocks (b, b, N) by cofactors, b = 2 or 3."""
     small = jnp.abs(_small_determinant(block)) < perturbation
