@@ -27,8 +27,10 @@ import numpy as np
 from jimpact.loops import fori_loop
 
 # Rows up to which one system is solved by the loop, not by LAPACK: in a batch that is three to six
-# times as fast. With ten times more the cubic cost of many contacts would not be blocked.
-_BY_LOOP = 4
+# times as fast for 4 rows, and independent batched triangular solves of LAPACK can wait for each
+# other for ever on few cores (jaxlib 0.10). With ten times more the cubic cost of many contacts
+# would not be blocked.
+_BY_LOOP = 16
 # Columns up to which products are written out: a reduction does not fuse with what follows it, and
 # is no vector operation: four times as long for the 12 of four contacts with friction in space. Ten
 # times more would make large programs of long chains.

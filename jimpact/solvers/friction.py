@@ -181,6 +181,8 @@ def solve(
     code = jnp.where(jnp.any(moves > root), CODE["several_outcomes"], code)
     status = jnp.maximum(status, code)
     x = _on_modes(problem, modes, inverted, x)
+    wrong = ~(_misfit(fixed, jax.lax.stop_gradient(x)[..., None])[0] <= fixed.tolerance)
+    status = jnp.where(wrong & (status < CODE["infeasible"]), CODE["max_steps"], status)
     x = x.at[:, 1:].add(drag * x[:, :1]) * scale * size
     p = jnp.where(x[:, 0] < 0, 0.0, x[:, 0]) if complementary else x[:, 0]  # rounding
     free = jax.lax.stop_gradient(scale)[..., None] * free.reshape(*scale.shape, -1)
